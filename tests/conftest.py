@@ -1,0 +1,62 @@
+"""The suite runs with every shape annotation of the package checked (jaxtyping + beartype); users never pay for it."""
+
+import os
+from collections.abc import Callable, Iterable, Sequence
+from fractions import Fraction
+from pathlib import Path
+
+os.environ.setdefault("NUMBA_CACHE_DIR", str(Path(__file__).parents[1] / ".venv" / "numba-cache"))
+
+from jaxtyping import install_import_hook
+
+# ints may stand for floats, as PEP 484 says
+install_import_hook("swimm3r", "beartype.beartype(conf=beartype.BeartypeConf(is_pep484_tower=True))")
+
+import av
+import numpy as np
+import pytest
+import torch
+
+torch.set_num_threads(1)  # two xdist workers share two cores
+
+SHARED = Path(os.environ.get("SWIMM3R_SHARED", Path(__file__).parents[2] / "shared"))
+
+
+@pytest.fixture(scope="session")
+def shared() -> Path:
+    """../shared: real footage and reference numbers that are not ours to commit."""
+    if not (SHARED / "data").is_dir():
+        pytest.skip(f"{SHARED} is not here: nothing was checked against real footage or reference numbers")
+    return SHARED
+
+
+@pytest.fixture
+def write_video() -> Callable[..., Path]:
+    """Encodes uint8 RGB frames; `times` in seconds (30 per second by default), further options go to the stream."""
+
+    def write(
+        path: Path,
+        frames: Iterable[np.ndarray],
+        times: Sequence[float] | None = None,
+        codec: str = "libx264",
+        **stream_options: object,
+    ) -> Path:
+        tick = Fraction(1, 6000)
+        with av.open(str(path), "w") as file:
+            options = {"preset": "ultrafast", "crf": "8"} if codec == "libx264" else {}
+            if codec == "libx265":
+                options = {"preset": "ultrafast", "x265-params": "log-level=none"}
+            stream = file.add_stream(codec, rate=30, options=options)
+            stream.pix_fmt, stream.codec_context.time_base = "yuv420p", tick
+            for name, value in stream_options.items():
+                setattr(stream.codec_context, name, value)
+            for i, picture in enumerate(frames):
+                if i == 0:
+                    stream.height, stream.width = picture.shape[:2]
+                frame = av.VideoFrame.from_ndarray(np.ascontiguousarray(picture), "rgb24")
+                frame.pts, frame.time_base = round((times[i] if times is not None else i / 30) / tick), tick
+                file.mux(stream.encode(frame))
+            file.mux(stream.encode())
+        return path
+
+    return write
