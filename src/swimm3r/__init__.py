@@ -1,0 +1,65 @@
+"""Swimm3R: underwater video in; camera poses, the water, a restored point cloud and a map that renders out.
+
+    frames = swimm3r.read_frames("dive.mp4", fps=5)
+    rec = swimm3r.reconstruct(frames, swimm3r.ColmapSettings())
+
+Names load on first use, so that importing the package, and every --help, is instant.
+"""
+
+from importlib import import_module
+from typing import TYPE_CHECKING
+
+if TYPE_CHECKING:
+    from swimm3r.frame_settings import FrameSettings
+    from swimm3r.medium import Medium, MediumFit, add_water, remove_water
+    from swimm3r.prepare import read_frames
+    from swimm3r.presets import PRESETS, RunSettings
+    from swimm3r.reconstruction import Reconstruction
+    from swimm3r.run import run_pipeline
+    from swimm3r.sfm import reconstruct
+    from swimm3r.sfm.settings import ColmapSettings
+    from swimm3r.synthetic import DiveSettings, write_dive
+
+_HOME = {
+    "FrameSettings": "frame_settings",
+    "Medium": "medium",
+    "MediumFit": "medium",
+    "add_water": "medium",
+    "remove_water": "medium",
+    "read_frames": "prepare",
+    "PRESETS": "presets",
+    "RunSettings": "presets",
+    "Reconstruction": "reconstruction",
+    "run_pipeline": "run",
+    "reconstruct": "sfm",
+    "ColmapSettings": "sfm.settings",
+    "DiveSettings": "synthetic",
+    "write_dive": "synthetic",
+}
+
+__all__ = [
+    "PRESETS",
+    "ColmapSettings",
+    "DiveSettings",
+    "FrameSettings",
+    "Medium",
+    "MediumFit",
+    "Reconstruction",
+    "RunSettings",
+    "add_water",
+    "read_frames",
+    "reconstruct",
+    "remove_water",
+    "run_pipeline",
+    "write_dive",
+]
+
+
+def __getattr__(name: str) -> object:
+    if name not in _HOME:
+        raise AttributeError(f"module 'swimm3r' has no attribute {name!r}")
+    return getattr(import_module(f"swimm3r.{_HOME[name]}"), name)
+
+
+def __dir__() -> list[str]:
+    return __all__

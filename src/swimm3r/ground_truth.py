@@ -1,0 +1,61 @@
+"""What is known for certain about a dive: reference poses, and for synthetic dives depth, clear colours and the water.
+
+On disk a folder beside the pictures: cameras.json; z_depth/NAME.npz (key z_depth), clear/NAME.png and medium.json where
+they exist. A cameras.json alone is a reference, too.
+"""
+
+import json
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+import torch
+from jaxtyping import Float
+from torch import Tensor
+
+from swimm3r.cameras import Cameras
+from swimm3r.io import cameras_json, images
+from swimm3r.medium import Medium
+from swimm3r.reconstruction import cameras_of
+
+FOLDER = "truth"  # where a synthetic dive keeps it, beside images/
+
+
+@dataclass(frozen=True)
+class GroundTruth:
+    """Reference poses of named frames; `folder` holds the rest where there is any."""
+
+    names: tuple[str, ...]
+    cameras: Cameras
+    metric: bool
+    medium: Medium | None = None  # scene-wide, [3], on pixel values as stored
+    folder: Path | None = None
+
+    def z_depth(self, name: str) -> Float[Tensor, "h w"] | None:
+        """Exact depth along the optical axis, 0 where the ray meets nothing; None where the reference has none."""
+        path = self._path("z_depth", f"{name}.npz")
+        if path is None:
+            return None
+        with np.load(path) as stored:
+            return torch.from_numpy(stored["z_depth"].astype(np.float32))
+
+    def clear(self, name: str) -> Float[Tensor, "h w 3"] | None:
+        """The picture without water, 0..1; None where the reference has none."""
+        path = self._path("clear", f"{name}.png")
+        return None if path is None else torch.from_numpy(images.read_rgb(path).astype(np.float32)) / 255
+
+    def _path(self, kind: str, file: str) -> Path | None:
+        path = None if self.folder is None else self.folder / kind / file
+        return path if path is not None and path.is_file() else None
+
+
+def read_ground_truth(path: Path) -> GroundTruth:
+    """Read a truth folder or a cameras.json. Raises InputError where it is neither."""
+    folder = path if path.is_dir() else None
+    table = cameras_json.read_cameras(path / "cameras.json" if folder else path)
+    medium = None
+    if folder and (folder / "medium.json").is_file():
+        medium = Medium(
+            **{k: torch.tensor(v) for k, v in json.loads((folder / "medium.json").read_text(encoding="utf-8")).items()}
+        )
+    return GroundTruth(table.names, cameras_of(table), table.units == "metres", medium, folder)

@@ -1,0 +1,1 @@
+"""Formats <-> numpy arrays and records; no mathematics."""

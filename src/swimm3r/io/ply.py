@@ -1,0 +1,74 @@
+"""Coloured point clouds as PLY (Turk 1994), binary little-endian: float x y z, uchar red green blue."""
+
+from pathlib import Path
+
+import numpy as np
+from jaxtyping import Float, Float32
+
+from swimm3r.errors import InputError
+from swimm3r.io.atomic import atomic_path
+
+_RECORD = np.dtype([(axis, "<f4") for axis in "xyz"] + [(colour, "u1") for colour in ("red", "green", "blue")])
+_TYPES = {
+    **dict.fromkeys(("char", "int8"), "i1"),
+    **dict.fromkeys(("uchar", "uint8"), "u1"),
+    **dict.fromkeys(("short", "int16"), "<i2"),
+    **dict.fromkeys(("ushort", "uint16"), "<u2"),
+    **dict.fromkeys(("int", "int32"), "<i4"),
+    **dict.fromkeys(("uint", "uint32"), "<u4"),
+    **dict.fromkeys(("float", "float32"), "<f4"),
+    **dict.fromkeys(("double", "float64"), "<f8"),
+}
+
+
+def write_points(path: Path, xyz: Float[np.ndarray, "n 3"], rgb: Float[np.ndarray, "n 3"]) -> None:
+    """Write a cloud, whole or not at all; colours 0..1 are clipped and rounded to 8 bits."""
+    points = np.empty(len(xyz), _RECORD)
+    for axis, name in enumerate("xyz"):
+        points[name] = xyz[:, axis]
+    for channel, name in enumerate(("red", "green", "blue")):
+        points[name] = np.clip(rgb[:, channel], 0, 1) * 255 + 0.5
+    kinds = ["float"] * 3 + ["uchar"] * 3
+    properties = "".join(f"property {kind} {name}\n" for kind, name in zip(kinds, _RECORD.names or (), strict=True))
+    header = f"ply\nformat binary_little_endian 1.0\nelement vertex {len(xyz)}\n{properties}end_header\n"
+    with atomic_path(path) as draft, draft.open("wb") as file:
+        file.write(header.encode("ascii"))
+        file.write(points.tobytes())
+
+
+def read_points(path: Path) -> tuple[Float32[np.ndarray, "n 3"], Float32[np.ndarray, "n 3"]]:
+    """Positions and colours 0..1 of a cloud. Raises InputError.
+
+    Other tools' clouds are read too where they are binary little-endian, begin with the vertices, and give them
+    scalar properties; those that are neither position nor colour are left out.
+    """
+    try:
+        data = path.read_bytes()
+        head, found, body = data.partition(b"end_header\n")
+        lines = head.decode("ascii").splitlines()
+        if not found or lines[:2] != ["ply", "format binary_little_endian 1.0"]:
+            raise ValueError("a binary little-endian header was expected")
+        count, record = _vertices(lines[2:])
+        points = np.frombuffer(body, record, count)
+        xyz = np.stack([points[name] for name in "xyz"], -1).astype(np.float32)
+        rgb = np.stack([points[name] for name in ("red", "green", "blue")], -1)
+    except (OSError, ValueError, KeyError) as error:
+        raise InputError(
+            f"{path} cannot be read as a coloured point cloud ({error})",
+            cause="the file is missing, cut off, or a PLY of another kind (text, big-endian, without colours)",
+            hint="save it as binary PLY with colours, in CloudCompare or MeshLab for example",
+        ) from error
+    return xyz, rgb.astype(np.float32) / (1 if rgb.dtype.kind == "f" else np.iinfo(rgb.dtype).max)
+
+
+def _vertices(lines: list[str]) -> tuple[int, np.dtype]:
+    """How many vertices, and how each one lies in the file."""
+    words = [line.split() for line in lines if not line.startswith(("comment", "obj_info"))]
+    if not words or words[0][:2] != ["element", "vertex"]:
+        raise ValueError("the vertices were expected first")
+    fields = []
+    for word in words[1:]:
+        if word[0] != "property":
+            break  # the next element: faces
+        fields.append((word[2], _TYPES[word[1]]))
+    return int(words[0][2]), np.dtype(fields)

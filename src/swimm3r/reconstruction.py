@@ -1,0 +1,216 @@
+"""What structure from motion knows about a dive; the one record every back end fills and every later stage reads.
+
+On disk (`save`, `load`) it is a folder: sparse/ (COLMAP model), cameras.json, z_depth/NAME.npz, matches.npz,
+medium.json, points.ply (restored colours), points_raw.ply, reconstruction.json (back end, metric flag, cautions).
+"""
+
+import json
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+import torch
+from jaxtyping import Float, Int
+from torch import Tensor
+
+from swimm3r.cameras import Cameras
+from swimm3r.io import cameras_json, colmap, medium_json, ply
+from swimm3r.io.atomic import atomic_path, write_text
+from swimm3r.io.cache import ArrayCache
+from swimm3r.medium import MediumFit
+
+_CACHE = ArrayCache(max_bytes=1 << 30)
+
+
+@dataclass(frozen=True)
+class Points:
+    """Sparse points with the colours they have in the pictures."""
+
+    xyz: Float[Tensor, "p 3"]  # world, float64
+    rgb: Float[Tensor, "p 3"]  # raw, 0..1
+    error: Float[Tensor, " p"]  # mean reprojection error, pixels
+
+
+@dataclass(frozen=True)
+class Tracks:
+    """Which point was seen where: one row per observation."""
+
+    point: Int[Tensor, " o"]  # index into Points
+    frame: Int[Tensor, " o"]  # index into Reconstruction.names
+    xy: Float[Tensor, "o 2"]  # pixels of the prepared frame
+
+
+@dataclass(frozen=True)
+class Matches:
+    """Two-view correspondences that survived geometric verification: one row each."""
+
+    i: Int[Tensor, " m"]  # index into Reconstruction.names
+    j: Int[Tensor, " m"]
+    xy_i: Float[Tensor, "m 2"]  # pixels of the prepared frames
+    xy_j: Float[Tensor, "m 2"]
+    confidence: Float[Tensor, " m"]  # 1 for verified feature matches, the network's own for learned ones
+
+
+@dataclass(frozen=True)
+class DepthMap:
+    """Dense depth of one frame; 0 where nothing is known."""
+
+    z_depth: Float[Tensor, "h w"]  # along the optical axis, scene units
+    confidence: Float[Tensor, "h w"]  # 0..1
+
+
+@dataclass(frozen=True)
+class DepthMaps:
+    """Depth maps kept on disk, one NAME.npz per frame."""
+
+    folder: Path
+
+    def path(self, name: str) -> Path:
+        """Where the map of a frame is stored."""
+        return self.folder / f"{name}.npz"
+
+    def __contains__(self, name: str) -> bool:
+        return self.path(name).is_file()
+
+    def __getitem__(self, name: str) -> DepthMap:
+        def load() -> tuple[np.ndarray, np.ndarray]:
+            with np.load(self.path(name)) as stored:
+                return stored["z_depth"], stored["confidence"]
+
+        z_depth, confidence = _CACHE.get((self.folder, name), load)
+        return DepthMap(torch.from_numpy(z_depth.astype(np.float32)), torch.from_numpy(confidence.astype(np.float32)))
+
+    def write(self, name: str, depth: DepthMap) -> None:
+        """Store the map of a frame: depth as float32, confidence as float16."""
+        path = self.path(name)
+        with atomic_path(path) as draft:
+            np.savez_compressed(
+                draft,
+                z_depth=depth.z_depth.numpy().astype(np.float32),
+                confidence=depth.confidence.numpy().astype(np.float16),
+            )
+
+
+@dataclass(frozen=True)
+class DenseCloud:
+    """The fused dense points: colours in the water, and with the water removed, averaged over each point's track."""
+
+    xyz: Float[Tensor, "n 3"]
+    raw: Float[Tensor, "n 3"]  # 0..1
+    restored: Float[Tensor, "n 3"]  # 0..1
+
+
+@dataclass(frozen=True)
+class Caution:
+    """Something about the result that its user should know, in plain words."""
+
+    what: str
+    advice: str
+
+
+@dataclass(frozen=True)
+class Reconstruction:
+    """Cameras, points, tracks, two-view matches, dense depth and water of the registered frames of a dive."""
+
+    names: tuple[str, ...]  # registered frames; everything is indexed by their order
+    cameras: Cameras
+    points: Points
+    tracks: Tracks
+    matches: Matches
+    depth: DepthMaps
+    backend: str
+    metric: bool = False
+    medium: MediumFit | None = None  # on pixel values as stored, what the pipeline uses
+    medium_linear: MediumFit | None = None  # in linear light, what the water table shows
+    cloud: DenseCloud | None = None
+    cautions: tuple[Caution, ...] = ()
+
+    def index(self, name: str) -> int:
+        """The position of a registered frame by its name."""
+        return self.names.index(name)
+
+
+def save(rec: Reconstruction, folder: Path) -> None:
+    """Write a reconstruction into a folder; depth maps already live under it."""
+    sparse = colmap.ColmapModel(
+        names=rec.names,
+        model=rec.cameras.model,
+        width=rec.cameras.width,
+        height=rec.cameras.height,
+        K=rec.cameras.K.numpy(),
+        distortion=rec.cameras.distortion.numpy(),
+        cam2world=rec.cameras.cam2world.numpy(),
+        xyz=rec.points.xyz.numpy(),
+        rgb=(rec.points.rgb.numpy() * 255).round().astype(np.uint8),
+        error=rec.points.error.numpy(),
+        track_point=rec.tracks.point.numpy(),
+        track_frame=rec.tracks.frame.numpy(),
+        track_xy=rec.tracks.xy.numpy(),
+    )
+    colmap.write_model(folder / "sparse", sparse)
+    cameras_json.write_cameras(
+        folder / "cameras.json",
+        cameras_json.CameraTable(
+            names=rec.names,
+            width=rec.cameras.width,
+            height=rec.cameras.height,
+            model=rec.cameras.model,
+            K=rec.cameras.K.numpy(),
+            distortion=rec.cameras.distortion.numpy(),
+            cam2world=rec.cameras.cam2world.numpy(),
+            units="metres" if rec.metric else "scene units",
+        ),
+    )
+    with atomic_path(folder / "matches.npz") as draft:
+        np.savez_compressed(draft, **{name: tensor.numpy() for name, tensor in vars(rec.matches).items()})
+    fits = {"stored": rec.medium, "linear": rec.medium_linear}
+    medium_json.write_fits(folder / "medium.json", {name: fit for name, fit in fits.items() if fit is not None})
+    if rec.cloud is not None:
+        ply.write_points(folder / "points.ply", rec.cloud.xyz.numpy(), rec.cloud.restored.numpy())
+        ply.write_points(folder / "points_raw.ply", rec.cloud.xyz.numpy(), rec.cloud.raw.numpy())
+    about = {"backend": rec.backend, "metric": rec.metric, "cautions": [vars(caution) for caution in rec.cautions]}
+    write_text(folder / "reconstruction.json", json.dumps(about, indent=2) + "\n")
+
+
+def load(folder: Path) -> Reconstruction:
+    """Read what `save` wrote."""
+    sparse = colmap.read_model(folder / "sparse")
+    about = json.loads((folder / "reconstruction.json").read_text(encoding="utf-8"))
+    with np.load(folder / "matches.npz") as stored:
+        matches = Matches(**{name: torch.from_numpy(stored[name]) for name in stored.files})
+    fits = medium_json.read_fits(folder / "medium.json")
+    cloud = None
+    if (folder / "points.ply").is_file():
+        xyz, restored = ply.read_points(folder / "points.ply")
+        _, raw = ply.read_points(folder / "points_raw.ply")
+        cloud = DenseCloud(torch.from_numpy(xyz), torch.from_numpy(raw), torch.from_numpy(restored))
+    return Reconstruction(
+        names=sparse.names,
+        cameras=cameras_of(sparse),
+        points=Points(
+            torch.from_numpy(sparse.xyz),
+            torch.from_numpy(sparse.rgb.astype(np.float32)) / 255,
+            torch.from_numpy(sparse.error),
+        ),
+        tracks=Tracks(*(torch.from_numpy(a) for a in (sparse.track_point, sparse.track_frame, sparse.track_xy))),
+        matches=matches,
+        depth=DepthMaps(folder / "z_depth"),
+        backend=about["backend"],
+        metric=about["metric"],
+        medium=fits.get("stored"),
+        medium_linear=fits.get("linear"),
+        cloud=cloud,
+        cautions=tuple(Caution(**caution) for caution in about["cautions"]),
+    )
+
+
+def cameras_of(table: colmap.ColmapModel | cameras_json.CameraTable) -> Cameras:
+    """The cameras of a table read from disk."""
+    return Cameras(
+        torch.from_numpy(table.K),
+        torch.from_numpy(table.distortion),
+        torch.from_numpy(table.cam2world),
+        table.width,
+        table.height,
+        table.model,
+    )

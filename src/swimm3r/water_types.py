@@ -1,0 +1,49 @@
+"""The four families of water of the paper, for augmentation and for synthetic dives.
+
+    Binf ~ U(family), beta_D,R ~ U(0.3, 2.0) (cyan: U(0.7, 1.6)), beta_D,G, beta_D,B ~ U(0.04, 0.85),
+    beta_B = r beta_D with r ~ U(0, 1) per channel            (paper, "Parametric water-type augmentation")
+
+Coefficients are 1/m and act on pixel values as stored (sRGB), as the paper applies them.
+"""
+
+from dataclasses import dataclass
+from typing import Literal
+
+import torch
+
+from swimm3r.medium import Medium
+
+Family = Literal["cyan", "teal", "green", "warm"]
+Interval = tuple[float, float]
+
+
+@dataclass(frozen=True)
+class WaterType:
+    """Where the coefficients of one family lie, per RGB channel."""
+
+    Binf: tuple[Interval, Interval, Interval]
+    beta_D: tuple[Interval, Interval, Interval]  # 1/m
+
+
+_CLEAR_CHANNEL = (0.04, 0.85)
+FAMILIES: dict[Family, WaterType] = {
+    "cyan": WaterType(
+        ((0.02, 0.08), (0.30, 0.50), (0.30, 0.45)),
+        ((0.7, 1.6), _CLEAR_CHANNEL, _CLEAR_CHANNEL),  # red nearly gone: the regime where it can only be guessed
+    ),
+    "teal": WaterType(((0.05, 0.15), (0.45, 0.70), (0.30, 0.55)), ((0.3, 2.0), _CLEAR_CHANNEL, _CLEAR_CHANNEL)),
+    "green": WaterType(((0.10, 0.25), (0.30, 0.50), (0.10, 0.30)), ((0.3, 2.0), _CLEAR_CHANNEL, _CLEAR_CHANNEL)),
+    "warm": WaterType(((0.20, 0.40), (0.15, 0.30), (0.10, 0.25)), ((0.3, 2.0), _CLEAR_CHANNEL, _CLEAR_CHANNEL)),
+}
+
+
+def sample(family: Family, generator: torch.Generator) -> Medium:
+    """One water of a family: fields of shape [3], float32."""
+    water = FAMILIES[family]
+    beta_D = _uniform(water.beta_D, generator)
+    return Medium(_uniform(water.Binf, generator), beta_D, beta_D * torch.rand(3, generator=generator))
+
+
+def _uniform(intervals: tuple[Interval, Interval, Interval], generator: torch.Generator) -> torch.Tensor:
+    low, high = torch.tensor(intervals).unbind(-1)
+    return low + (high - low) * torch.rand(3, generator=generator)

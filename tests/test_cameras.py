@@ -1,0 +1,90 @@
+import math
+
+import pytest
+import torch
+
+from swimm3r.cameras import (
+    CameraModel,
+    Cameras,
+    directions,
+    image_directions,
+    pixel_grid,
+    project,
+    ray_depth_from_z,
+    resized,
+    unproject,
+    z_depth_from_ray,
+)
+
+LENSES: dict[CameraModel, list[float]] = {
+    "PINHOLE": [],
+    "SIMPLE_RADIAL": [-0.12],
+    "OPENCV": [0.11, -0.05, 0.003, -0.002],
+    "OPENCV_FISHEYE": [-0.02, 0.01, -0.004, 0.001],
+}
+
+
+def two_cameras(model: CameraModel) -> Cameras:
+    K = torch.tensor([[300.0, 0, 201.0], [0, 310.0, 148.0], [0, 0, 1]], dtype=torch.float64).repeat(2, 1, 1)
+    cam2world = torch.eye(4, dtype=torch.float64).repeat(2, 1, 1)
+    a = 0.3
+    cam2world[1, :3, :3] = torch.tensor([[math.cos(a), 0, math.sin(a)], [0, 1, 0], [-math.sin(a), 0, math.cos(a)]])
+    cam2world[1, :3, 3] = torch.tensor([0.5, -0.2, 0.1])
+    return Cameras(K, torch.tensor([LENSES[model]] * 2, dtype=torch.float64), cam2world, 400, 300, model)
+
+
+@pytest.mark.parametrize("model", LENSES)
+def test_projecting_undoes_unprojecting(model: CameraModel):
+    cameras = two_cameras(model)
+    pixels = pixel_grid(300, 400).reshape(-1, 2)[::97].double().repeat(2, 1, 1)
+    z = torch.linspace(0.5, 9.0, pixels.shape[1], dtype=torch.float64).repeat(2, 1)
+    again, z_again = project(cameras, unproject(cameras, pixels, z))
+    torch.testing.assert_close(again, pixels, atol=1e-5, rtol=0)
+    torch.testing.assert_close(z_again, z)
+
+
+@pytest.mark.parametrize("model", LENSES)
+def test_models_agree_with_colmap(model: CameraModel):
+    pycolmap = pytest.importorskip("pycolmap")
+    cameras = two_cameras(model)
+    K = cameras.K[0]
+    focal = [K[0, 0], K[1, 1]]
+    if model == "SIMPLE_RADIAL":
+        K[1, 1] = K[0, 0]
+        focal = [K[0, 0]]
+    theirs = pycolmap.Camera(model=model, width=400, height=300, params=[*focal, K[0, 2], K[1, 2], *LENSES[model]])
+    pixels = pixel_grid(300, 400).reshape(-1, 2)[::611].double()
+    ours = directions(cameras[0], pixels[None])[0, :, :2]
+    torch.testing.assert_close(ours, torch.from_numpy(theirs.cam_from_img(pixels.numpy())), atol=1e-7, rtol=0)
+
+
+def test_a_ray_the_lens_cannot_see_is_nan():
+    cameras = two_cameras("SIMPLE_RADIAL")  # k < 0 folds back beyond r = 1.67
+    far_outside = torch.tensor([[[5000.0, 5000.0]]], dtype=torch.float64)
+    assert directions(cameras[0], far_outside)[..., :2].isnan().all()
+
+
+def test_ray_depth_is_the_distance_from_the_centre():
+    cameras = two_cameras("OPENCV")
+    rays = image_directions(cameras[1])
+    z = torch.full((300, 400), 2.0)
+    points = unproject(cameras[1], pixel_grid(300, 400).reshape(1, -1, 2), z.reshape(1, -1))
+    distance = torch.linalg.vector_norm(points - cameras.centres[1].float(), dim=-1).reshape(300, 400)
+    torch.testing.assert_close(ray_depth_from_z(z, rays), distance)
+    torch.testing.assert_close(z_depth_from_ray(ray_depth_from_z(z, rays), rays), z)
+
+
+def test_resizing_keeps_the_rays():
+    cameras = two_cameras("OPENCV")[0]
+    half = resized(cameras, 200, 150)
+    pixels = torch.tensor([[[10.0, 20.0], [399.0, 299.0]]], dtype=torch.float64)
+    torch.testing.assert_close(directions(half, pixels / 2), directions(cameras, pixels))
+
+
+def test_wrong_number_of_distortion_parameters_is_refused():
+    with pytest.raises(ValueError, match="OPENCV has 4 distortion parameters, got 1"):
+        Cameras(torch.eye(3)[None], torch.zeros(1, 1), torch.eye(4)[None].double(), 4, 3, "OPENCV")
+
+
+def test_no_pixels_have_no_rays():
+    assert directions(two_cameras("OPENCV"), torch.zeros(2, 0, 2, dtype=torch.float64)).shape == (2, 0, 3)
