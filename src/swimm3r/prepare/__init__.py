@@ -1,0 +1,44 @@
+"""A video or a folder of stills -> the frames a run works on, on disk, with frames.json beside them."""
+
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+from swimm3r.frame_settings import FrameSettings
+from swimm3r.progress import Progress, silent
+
+if TYPE_CHECKING:
+    import swimm3r.frames
+
+__all__ = ["check_source", "load_frames", "read_frames"]
+
+
+def read_frames(
+    source: str | Path,
+    settings: FrameSettings | None = None,
+    folder: Path | None = None,
+    progress: Progress = silent,
+    **changes: Any,
+) -> "swimm3r.frames.Frames":
+    """The frames of a video or a folder of stills, prepared into `folder`.
+
+    Without a folder they go into the user's cache and are found there the next time. `changes` replace single settings:
+    `read_frames("dive.mp4", fps=2)`. What `folder` held of an earlier preparation is replaced. Raises InputError on
+    what cannot be used, and OSError where the disk refuses; then nothing is left behind.
+    """
+    from swimm3r.prepare import reading
+
+    return reading.read_frames(source, settings, folder, progress, **changes)
+
+
+def load_frames(folder: Path) -> "swimm3r.frames.Frames":
+    """What `read_frames` prepared in a folder. Raises InputError where that is not whole."""
+    from swimm3r.prepare import reading
+
+    return reading.load_frames(folder)
+
+
+def check_source(source: Path) -> None:
+    """Raises InputError where a source is plainly no video and no folder of pictures; cheap, and writes nothing."""
+    from swimm3r.prepare import reading
+
+    reading.check_source(source)
