@@ -1,0 +1,26 @@
+"""A procedural dive with exact ground truth: seafloor, camera path, water, caustics, marine snow, a fish."""
+
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+from swimm3r.progress import Progress, silent
+from swimm3r.synthetic.settings import Coefficients, DiveSettings
+
+if TYPE_CHECKING:
+    import swimm3r.synthetic.dive
+
+__all__ = ["Coefficients", "DiveSettings", "make_dive", "write_dive"]
+
+
+def make_dive(settings: DiveSettings) -> "swimm3r.synthetic.dive.Dive":
+    """The seafloor, path and water of a dive; pictures are rendered one by one, by `Dive.frame`."""
+    from swimm3r.synthetic import dive
+
+    return dive.make_dive(settings)
+
+
+def write_dive(settings: DiveSettings, folder: Path, progress: Progress = silent) -> None:
+    """Render a dive into a folder: images/ and truth/. Raises InputError where another dive's pictures lie there."""
+    from swimm3r.synthetic import dive
+
+    dive.write_dive(settings, folder, progress)

@@ -1,0 +1,171 @@
+"""A synthetic dive: pictures through known water, with everything about them known.
+
+    raw = add_water(clear, ray_depth, medium), and Binf where a ray meets nothing      (paper Eq. 1-3)
+
+on values as stored (sRGB), before fish, snow, vignetting and noise. Truth is of the still scene: depth and `clear` are
+what lies behind the fish, and `usable` is False wherever it shows. Caustics are light, not water: `clear` has them.
+Where a ray meets nothing, depth is 0 and `clear` is black.
+
+On disk: images/NAME, and truth/ as `ground_truth` reads it, with masks/NAME.png (0 at the fish) if there is one.
+"""
+
+import json
+from dataclasses import asdict, dataclass
+from pathlib import Path
+
+import numpy as np
+import torch
+from jaxtyping import Bool, Float
+from torch import Tensor
+
+from swimm3r import water_types
+from swimm3r.cameras import Cameras, directions, pixel_grid, ray_depth_from_z, resized
+from swimm3r.errors import InputError
+from swimm3r.ground_truth import FOLDER
+from swimm3r.io import cameras_json, images
+from swimm3r.io.atomic import atomic_path, write_text
+from swimm3r.medium import Medium, add_water, srgb_from_linear
+from swimm3r.progress import Progress, silent
+from swimm3r.synthetic import disturbances
+from swimm3r.synthetic.path import camera_path
+from swimm3r.synthetic.render import SAMPLES, render
+from swimm3r.synthetic.seafloor import Seafloor, make_seafloor
+from swimm3r.synthetic.settings import DiveSettings
+
+_FRAMES_PER_SECOND = 5.0  # the speed of caustics; the pace of the path depends on the number of frames
+
+
+@dataclass(frozen=True)
+class DiveFrame:
+    """One picture and the truth about it."""
+
+    raw: Float[Tensor, "h w 3"]  # what the camera stores, 0..1 (noise may overshoot)
+    clear: Float[Tensor, "h w 3"]  # J
+    z_depth: Float[Tensor, "h w"]  # m, 0 where the ray meets nothing
+    ray_depth: Float[Tensor, "h w"]  # m
+    usable: Bool[Tensor, "h w"]  # False where the moving object shows
+
+
+@dataclass(frozen=True)
+class Dive:
+    """A dive whose frames are rendered when asked for."""
+
+    settings: DiveSettings
+    names: tuple[str, ...]  # of the pictures, with extension
+    cameras: Cameras  # metres
+    medium: Medium  # [3], 1/m
+    floor: Seafloor
+
+    def __len__(self) -> int:
+        return len(self.names)
+
+    def frame(self, i: int) -> DiveFrame:
+        """Render frame i; the same every time."""
+        settings, camera = self.settings, self.cameras[i]
+        rays, sample_rays = _rays(camera), _rays(resized(camera, SAMPLES * camera.width, SAMPLES * camera.height))
+        radiance, z = render(
+            self.floor,
+            camera.cam2world[0].numpy(),
+            rays.numpy(),
+            sample_rays.numpy(),
+            i / _FRAMES_PER_SECOND,
+            settings.caustics,
+        )
+        clear = srgb_from_linear(torch.from_numpy(radiance)).clamp(0, 1).float()
+        z_depth = torch.from_numpy(z).float()
+        ray_depth = ray_depth_from_z(z_depth, rays.float())
+        raw = torch.where((z_depth > 0)[..., None], add_water(clear, ray_depth, self.medium), self.medium.Binf)
+        usable = torch.ones_like(z_depth, dtype=torch.bool)
+        rng = np.random.default_rng([settings.seed, 2, i])
+        if settings.moving_object:
+            phase = np.random.default_rng([settings.seed, 3]).random()
+            seen = disturbances.fish(sample_rays, z_depth, float(i), phase)
+            raw, usable = disturbances.with_fish(raw, seen, self.medium), disturbances.untouched(seen)
+        if settings.marine_snow:
+            raw = disturbances.marine_snow(raw, camera, settings.marine_snow, self.medium, rng)
+        if settings.vignetting:
+            raw = disturbances.vignette(raw, settings.vignetting)
+        if settings.noise:
+            raw = disturbances.sensor_noise(raw, settings.noise, rng)
+        return DiveFrame(raw, clear, z_depth, ray_depth, usable)
+
+
+def make_dive(settings: DiveSettings) -> Dive:
+    """The seafloor, path and water of a dive; pictures are rendered by `Dive.frame`."""
+    floor = make_seafloor(settings.seed)
+    focal = settings.width / 2 / np.tan(np.radians(settings.fov) / 2)
+    K = torch.tensor([[focal, 0, settings.width / 2], [0, focal, settings.height / 2], [0, 0, 1]], dtype=torch.float64)
+    cameras = Cameras(
+        K=K.repeat(settings.frames, 1, 1),
+        distortion=torch.zeros(settings.frames, 0, dtype=torch.float64),
+        cam2world=torch.from_numpy(camera_path(floor, settings.frames, settings.seed)),
+        width=settings.width,
+        height=settings.height,
+    )
+    return Dive(settings, _names(settings), cameras, water(settings), floor)
+
+
+def write_dive(settings: DiveSettings, folder: Path, progress: Progress = silent) -> None:
+    """Render a dive into a folder: images/ and truth/; one that is there already, whole, is left alone.
+
+    truth/dive.json, written last, holds the settings. Raises InputError where another dive's pictures lie there.
+    """
+    record, described = folder / FOLDER / "dive.json", json.dumps(asdict(settings), indent=2) + "\n"
+    if record.is_file() and record.read_text(encoding="utf-8") == described:
+        return
+    strangers = {path.name for path in (folder / "images").glob("*")} - set(_names(settings))
+    if strangers:
+        raise InputError(
+            f"{folder / 'images'} holds pictures that are not of this dive, {min(strangers)} for one",
+            cause="a dive of other settings was written there before",
+            hint="an empty or a new folder",
+        )
+    dive, truth = make_dive(settings), folder / FOLDER
+    for i, name in enumerate(dive.names):
+        progress("rendering", i, len(dive))
+        frame = dive.frame(i)
+        images.write_rgb(folder / "images" / name, frame.raw.numpy())
+        images.write_rgb(truth / "clear" / f"{name}.png", frame.clear.numpy())
+        with atomic_path(truth / "z_depth" / f"{name}.npz") as draft:
+            np.savez_compressed(draft, z_depth=frame.z_depth.numpy())
+        if settings.moving_object:
+            mask = frame.usable.numpy().astype(np.uint8)[..., None].repeat(3, 2) * 255
+            images.write_rgb(truth / "masks" / f"{name}.png", mask)
+            if settings.give_masks:
+                images.write_rgb(folder / "masks" / f"{name}.png", mask)
+    write_text(
+        truth / "medium.json", json.dumps({k: v.tolist() for k, v in vars(dive.medium).items()}, indent=2) + "\n"
+    )
+    cameras_json.write_cameras(
+        truth / "cameras.json",
+        cameras_json.CameraTable(
+            names=dive.names,
+            width=settings.width,
+            height=settings.height,
+            model=dive.cameras.model,
+            K=dive.cameras.K.numpy(),
+            distortion=dive.cameras.distortion.numpy(),
+            cam2world=dive.cameras.cam2world.numpy(),
+            units="metres",
+        ),
+    )
+    write_text(record, described)
+    progress("rendering", len(dive), len(dive))
+
+
+def water(settings: DiveSettings) -> Medium:
+    """The water of a dive: drawn from a family, or as given."""
+    if settings.family is not None:
+        return water_types.sample(settings.family, torch.Generator().manual_seed(settings.seed))
+    given = settings.coefficients
+    return Medium(torch.tensor(given.Binf), torch.tensor(given.beta_D), torch.tensor(given.beta_B))
+
+
+def _names(settings: DiveSettings) -> tuple[str, ...]:
+    return tuple(f"{i:04d}.png" for i in range(settings.frames))
+
+
+def _rays(camera: Cameras) -> Float[Tensor, "h w 3"]:
+    """`cameras.image_directions` in float64: the ray cast is exact to less than a float32 of a pixel."""
+    grid = pixel_grid(camera.height, camera.width).double().reshape(1, -1, 2)
+    return directions(camera, grid).reshape(camera.height, camera.width, 3)
