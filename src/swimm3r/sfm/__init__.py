@@ -1,0 +1,42 @@
+"""Structure from motion: frames in, one `Reconstruction` out, whichever method found it."""
+
+from pathlib import Path
+from tempfile import mkdtemp
+from typing import TYPE_CHECKING
+
+from swimm3r.errors import InputError
+from swimm3r.progress import Progress, silent
+from swimm3r.sfm.settings import ColmapSettings, SfmSettings
+
+if TYPE_CHECKING:
+    import swimm3r.frames
+    import swimm3r.reconstruction
+
+__all__ = ["ColmapSettings", "SfmSettings", "reconstruct"]
+
+
+def reconstruct(
+    frames: "swimm3r.frames.Frames",
+    settings: SfmSettings | None = None,
+    folder: Path | None = None,
+    progress: Progress = silent,
+) -> "swimm3r.reconstruction.Reconstruction":
+    """Cameras, points, dense depth, water and restored cloud of a set of frames, of which only `frames.train` is used.
+
+    Works in `folder` (a new temporary one by default) and goes on from what an interrupted call left there.
+    Raises InputError for fewer than 2 frames and RegistrationError where too few can be placed.
+    """
+    settings = settings or ColmapSettings()
+    frames = frames.train
+    if len(frames) < 2:
+        raise InputError(
+            f"structure from motion needs at least 2 frames, got {len(frames)}",
+            cause="the clip is too short or the sampling too coarse",
+            hint="a longer clip or a higher --fps",
+        )
+    folder = folder or Path(mkdtemp(prefix="swimm3r-sfm-"))
+    match settings:
+        case ColmapSettings():
+            from swimm3r.sfm import weights_free
+
+            return weights_free.reconstruct(frames, settings, folder, progress)

@@ -1,0 +1,108 @@
+"""Depth for every pixel of a picture whose depth map has gaps, and where there is no surface at all."""
+
+import numpy as np
+import torch
+from jaxtyping import Float
+from scipy import ndimage
+from scipy.sparse import coo_matrix, diags
+from scipy.sparse.linalg import spsolve
+from torch import Tensor
+
+from swimm3r.reconstruction import DepthMap
+from swimm3r.sfm.open_water import open_water_mask
+
+_COARSE = 96  # long side of the grid on which unknown depth is filled
+LUMA = torch.tensor([0.299, 0.587, 0.114])
+
+
+def sea_share(
+    image: Float[Tensor, "h w 3"], z_depth: Float[Tensor, "h w"], veil: Float[Tensor, "3"]
+) -> Float[Tensor, "h w"]:
+    """How surely a pixel shows water only: open water, unknown depth around it in the same colour; soft where hazy."""
+    water = open_water_mask(image, z_depth, veil).float()
+    if not water.any():
+        return water
+    reach = 0.02 * max(image.shape[:2])
+    nearby = blur(water[..., None], reach)
+    local = blur(water[..., None] * image, reach) / nearby.clamp(min=1e-6)
+    away = (blur(image, 0.7) - local).square().sum(-1) / (2 * 0.02**2)
+    hard = torch.maximum(torch.exp(-away) * (nearby[..., 0] > 1e-3), water)
+    guide = blur(image @ LUMA[:, None], 0.7)[..., 0]
+    soft = local_linear(guide, hard[..., None], torch.ones_like(hard)[..., None], reach / 2, 2e-5)[..., 0]
+    share = blur(torch.maximum(soft, hard)[..., None], reach / 5)[..., 0]
+    return torch.where(z_depth > 0, 0.0, share.clamp(0, 1))
+
+
+def fill_z_depth(image: Float[Tensor, "h w 3"], depth: DepthMap, sea: Float[Tensor, "h w"]) -> Float[Tensor, "h w"]:
+    """Depth for every pixel: known values stay, gaps follow their surroundings along similar colours.
+
+    Inverse depth is diffused on a coarse grid and fitted to the picture by local linear models, no farther than the
+    farthest known surface. `sea` (0..1) says where there is none; what is filled in there means nothing.
+    """
+    known = depth.z_depth > 0
+    if not known.any():
+        raise ValueError("a depth map without a single known pixel cannot be filled")
+    middle = float(depth.z_depth[known].median())
+    inverse = torch.where(known, middle / depth.z_depth.clamp(min=1e-9), 0.0)
+    trust = torch.where(known, depth.confidence.clamp(min=0.05), 0.0)
+    coarse = _diffused(image, inverse, trust, sea)
+    guide = image @ LUMA
+    smooth = local_linear(guide, coarse[..., None], (1.001 - sea)[..., None], 0.01 * max(image.shape[:2]), 1e-3)[..., 0]
+    farthest = float(np.quantile(inverse[known].numpy(), 0.01))
+    filled = smooth.clamp(min=farthest, max=float(inverse[known].max()))
+    return middle / torch.where(known, inverse, filled)
+
+
+def _diffused(
+    image: Float[Tensor, "h w 3"],
+    inverse: Float[Tensor, "h w"],
+    trust: Float[Tensor, "h w"],
+    sea: Float[Tensor, "h w"],
+) -> Float[Tensor, "h w"]:
+    """Inverse depth everywhere, from a sparse linear system on a coarse grid.
+
+    Neighbouring cells conduct with exp(-|dI|^2 / 0.04^2), and not at all into the sea, which is no surface.
+    """
+    height, width = inverse.shape
+    factor = max(1.0, max(height, width) / _COARSE)
+    size = (max(2, round(height / factor)), max(2, round(width / factor)))
+
+    def shrink(x: Tensor) -> np.ndarray:
+        return torch.nn.functional.interpolate(x[None], size, mode="area")[0].double().numpy()
+
+    colour, land = shrink(image.permute(2, 0, 1)), 1 - shrink(sea[None])[0]
+    weight = shrink(trust[None])[0]
+    value = shrink((trust * inverse)[None])[0] / np.maximum(weight, 1e-9)
+    index = np.arange(weight.size).reshape(size)
+    a = np.concatenate([index[:-1].ravel(), index[:, :-1].ravel()])
+    b = np.concatenate([index[1:].ravel(), index[:, 1:].ravel()])
+    flat = colour.reshape(3, -1)
+    g = np.exp(-((flat[:, a] - flat[:, b]) ** 2).sum(0) / 0.04**2) * land.ravel()[a] * land.ravel()[b] + 1e-4
+    n = index.size
+    affinity = coo_matrix((np.r_[g, g], (np.r_[a, b], np.r_[b, a])), shape=(n, n)).tocsr()
+    laplacian = diags(np.asarray(affinity.sum(1)).ravel()) - affinity
+    solved = spsolve((laplacian + diags(10 * weight.ravel() + 1e-8)).tocsc(), (10 * weight * value).ravel())
+    grid = torch.from_numpy(np.asarray(solved, dtype=np.float32)).reshape(1, 1, *size)
+    return torch.nn.functional.interpolate(grid, (height, width), mode="bilinear", align_corners=False)[0, 0]
+
+
+def blur(x: Float[Tensor, "h w c"], sigma: float) -> Float[Tensor, "h w c"]:
+    """Gaussian blur over rows and columns."""
+    return torch.from_numpy(ndimage.gaussian_filter(x.numpy(), (sigma, sigma, 0), truncate=2.5))
+
+
+def local_linear(
+    guide: Float[Tensor, "h w"],
+    value: Float[Tensor, "h w c"],
+    weight: Float[Tensor, "h w c"],
+    sigma: float,
+    ridge: float,
+) -> Float[Tensor, "h w c"]:
+    """`value` as a locally linear function of `guide` (a weighted guided filter with Gaussian windows)."""
+    g = guide[..., None]
+    total = blur(weight, sigma).clamp(min=1e-8)
+    mean_g, mean_v = blur(weight * g, sigma) / total, blur(weight * value, sigma) / total
+    covariance = blur(weight * g * value, sigma) / total - mean_g * mean_v
+    variance = (blur(weight * g * g, sigma) / total - mean_g**2).clamp(min=0)
+    slope = covariance / (variance + ridge)
+    return mean_v + slope * (g - mean_g)

@@ -1,0 +1,171 @@
+"""Pictures and points as they would look without the water: the inverse of Eq. 2, kept from amplifying noise.
+
+    D = I - B(z),   J = D / T_D(z)
+
+Where T_D is small the quotient is noise, so per channel with s = T_D:
+
+    detail    J = S + s^2 / (s^2 + (noise / texture)^2) (J - S)     S: local linear fit of D / s to I's brightness
+    colour    J = w J + (1 - w) k G,  w = s^2 / (s^2 + (veil_error / colour_error)^2)
+              G: the channels weighted by how well they see; k: this channel's share of colour where it does see
+    horizon   in open water, and where no channel sees (max w -> 0), the picture's own veil remains
+
+Near the camera all weights are 1 and J is the plain inverse. Nothing is stretched; `display_gains` is a separate step.
+"""
+
+import torch
+from jaxtyping import Float
+from torch import Tensor
+
+from swimm3r.cameras import Cameras, image_directions
+from swimm3r.frames import Frames
+from swimm3r.medium import MediumFit, backscatter, linear_from_srgb, remove_water, srgb_from_linear, transmittances
+from swimm3r.progress import Progress, silent
+from swimm3r.reconstruction import DenseCloud, DepthMap, Reconstruction
+from swimm3r.sfm.depth_filling import LUMA, blur, fill_z_depth, local_linear, sea_share
+from swimm3r.sfm.settings import RestoreSettings
+from swimm3r.sfm.tracks import DenseTracks, cubes, ray_depth_map
+
+
+def restore_picture(
+    image: Float[Tensor, "h w 3"],
+    depth: DepthMap,
+    camera: Cameras,
+    fit: MediumFit,
+    settings: RestoreSettings | None = None,
+) -> Float[Tensor, "h w 3"]:
+    """The whole picture without its water, as stored values in 0..1; unknown depth is filled in along the edges."""
+    settings = settings or RestoreSettings()
+    veil = srgb_from_linear(fit.medium.Binf) if fit.encoding == "linear" else fit.medium.Binf
+    sea = sea_share(image, depth.z_depth, veil)
+    z_depth = fill_z_depth(image, depth, sea)
+    ray_depth = ray_depth_map(z_depth, image_directions(camera).float())
+    I = linear_from_srgb(image) if fit.encoding == "linear" else image
+    ray_depth = torch.where(depth.z_depth == 0, _not_beyond_white(I, ray_depth, fit), ray_depth)
+    medium = fit.at(ray_depth)
+    T_D, _ = transmittances(ray_depth, medium)
+    direct = I - backscatter(ray_depth, medium)
+    J = _without_noise(direct, T_D, I @ LUMA, settings)
+    J = _horizon(J, T_D, I, sea, settings)
+    return (srgb_from_linear(J.clamp(min=0)) if fit.encoding == "linear" else J).clamp(0, 1)
+
+
+def restored_cloud(
+    rec: Reconstruction,
+    frames: Frames,
+    tracks: DenseTracks,
+    fit: MediumFit,
+    settings: RestoreSettings | None = None,
+    progress: Progress = silent,
+) -> DenseCloud:
+    """The tracks as points: raw and restored colours averaged over the sightings, thinned by voxels.
+
+    Restored colours are weighted by confidence and mean T_D squared, the inverse variance of an amplified colour.
+    """
+    settings = settings or RestoreSettings()
+    n = len(tracks.xyz)
+    raw, restored = torch.zeros(n, 3), torch.zeros(n, 3)
+    raw_weight, restored_weight = torch.zeros(n, 1), torch.zeros(n, 3)
+    order = torch.argsort(tracks.frame, stable=True)
+    bounds = torch.searchsorted(tracks.frame[order], torch.arange(len(rec.names) + 1))
+    for i, name in enumerate(rec.names):
+        progress("restoring points", i, len(rec.names))
+        mine = order[bounds[i] : bounds[i + 1]]
+        if len(mine) == 0:
+            continue
+        I = frames.image(frames.index(name)).reshape(-1, 3)[tracks.pixel[mine]]
+        light = linear_from_srgb(I) if fit.encoding == "linear" else I
+        z, trust = tracks.ray_depth[mine], tracks.confidence[mine, None].clamp(min=0.01)
+        medium = fit.at(z)
+        T_D, _ = transmittances(z, medium)
+        weight = trust * T_D.clamp(min=0.01) ** 2
+        raw.index_add_(0, tracks.track[mine], I * trust)
+        raw_weight.index_add_(0, tracks.track[mine], trust)
+        restored.index_add_(0, tracks.track[mine], remove_water(light, z, medium) * weight)
+        restored_weight.index_add_(0, tracks.track[mine], weight)
+    progress("restoring points", len(rec.names), len(rec.names))
+    J = restored / restored_weight.clamp(min=1e-12)
+    if fit.encoding == "linear":
+        J = srgb_from_linear(J.clamp(min=0))
+    cloud = DenseCloud(tracks.xyz, (raw / raw_weight.clamp(min=1e-12)).clamp(0, 1), J.clamp(0, 1))
+    return _thinned(cloud, settings.max_points)
+
+
+def display_gains(restored: Float[Tensor, "n 3"]) -> Float[Tensor, "3"]:
+    """Gains that make a dive's restored colours grey, between 0.5 and 2; brightness stays.
+
+    The inverse of the water gives surfaces under the light that reaches their depth, which is tinted. The tint is the
+    6-norm of the colours (Finlayson & Trezzi 2004): bright surfaces count most, weeds and shade hardly. This is for
+    pictures to look at and nothing else: it is no part of J.
+    """
+    seen = restored[(restored < 0.99).all(-1)].double()
+    if len(seen) == 0:
+        return torch.ones(3)
+    tint = (seen.clamp(min=0) ** 6).mean(0) ** (1 / 6)
+    return (tint.mean() / tint.clamp(min=0.01)).clamp(0.5, 2.0).float()
+
+
+def _not_beyond_white(
+    I: Float[Tensor, "h w 3"], ray_depth: Float[Tensor, "h w"], fit: MediumFit
+) -> Float[Tensor, "h w"]:
+    """A guessed ray depth, shortened until the blurred J stays below 0.9."""
+    smooth = blur(I, 0.01 * max(I.shape[:2]))
+    share = torch.zeros_like(ray_depth)
+    for trial in torch.linspace(0.05, 1.0, 20):
+        J = remove_water(smooth, trial * ray_depth, fit.at(trial * ray_depth))
+        share = torch.where(J.amax(-1) < 0.9, trial, share)
+    return ray_depth * blur(share[..., None], 0.01 * max(I.shape[:2]))[..., 0]
+
+
+def _without_noise(
+    direct: Float[Tensor, "h w 3"],
+    T_D: Float[Tensor, "h w 3"],
+    brightness: Float[Tensor, "h w"],
+    settings: RestoreSettings,
+) -> Float[Tensor, "h w 3"]:
+    """D / T_D with detail and then colour held back where T_D does not carry them."""
+    floor = settings.veil_error / settings.colour_error
+    J = direct / T_D.clamp(min=floor / 2)
+    smooth = local_linear(brightness, J, T_D**2 + 1e-6, settings.window * max(brightness.shape) / 2, settings.noise**2)
+    J = smooth + T_D**2 / (T_D**2 + (settings.noise / settings.texture) ** 2) * (J - smooth)
+    sees = T_D**2 / (T_D**2 + floor**2)
+    weight = sees**2
+    grey = (weight * J).sum(-1, keepdim=True) / weight.sum(-1, keepdim=True).clamp(min=1e-6)
+    well = weight.prod(-1, keepdim=True) * ((J > 0) & (J < 1)).all(-1, keepdim=True)
+    share = (well * J).sum((0, 1)) + 1e-3
+    share = share / share.mean()
+    used = (weight * share).sum(-1, keepdim=True) / weight.sum(-1, keepdim=True).clamp(min=1e-6)
+    return sees * J + (1 - sees) * share * grey / used.clamp(min=1e-3)
+
+
+def _horizon(
+    J: Float[Tensor, "h w 3"],
+    T_D: Float[Tensor, "h w 3"],
+    I: Float[Tensor, "h w 3"],
+    sea: Float[Tensor, "h w"],
+    settings: RestoreSettings,
+) -> Float[Tensor, "h w 3"]:
+    """The veil itself where there is no surface, or no channel that sees it."""
+    floor = settings.veil_error / settings.colour_error
+    best = T_D.amax(-1, keepdim=True)
+    sees = best**2 / (best**2 + floor**2) * (1 - sea[..., None])
+    return sees * J + (1 - sees) * I
+
+
+def _thinned(cloud: DenseCloud, count: int) -> DenseCloud:
+    """One averaged point per voxel, with voxels just large enough to leave at most `count`."""
+    n = len(cloud.xyz)
+    if n <= count:
+        return cloud
+    low, high = (torch.quantile(cloud.xyz[:: max(1, n // 100_000)], q, dim=0) for q in (0.02, 0.98))
+    size = float((high - low).amax()) / max(1.0, count**0.5)
+    while True:
+        which, number = cubes(cloud.xyz, torch.tensor([size]))
+        if len(number) <= count:
+            break
+        size *= max(1.05, (len(number) / count) ** 0.4)
+
+    def average(x: Tensor) -> Tensor:
+        total = torch.zeros(len(number), 3, dtype=torch.float64).index_add_(0, which, x.double())
+        return (total / number[:, None]).float()
+
+    return DenseCloud(average(cloud.xyz), average(cloud.raw), average(cloud.restored))

@@ -1,0 +1,216 @@
+"""Every number of the structure-from-motion stage, with its reason; torch-free, so that --help is instant."""
+
+from dataclasses import dataclass, field
+from typing import Literal
+
+
+@dataclass(frozen=True)
+class PlaneSweepSettings:
+    """Dense depth of posed frames (`sfm/plane_sweep.py`)."""
+
+    long_side: int = 640
+    """Pixels of the longer side at which depth is computed; larger frames get it upsampled along their edges."""
+    sources: int = 5
+    """Frames each frame is compared with."""
+    angle_deg: float = 8.0
+    """Triangulation angle at which a source counts most: less is imprecise, more hides surfaces and changes them."""
+    planes: int = 128
+    """Most planes of the coarse sweep, even in inverse depth; fewer where views are close: one per pixel of motion."""
+    window: int = 3
+    """Half width of the coarse sweep's NCC window, in pixels of the half-size picture."""
+    noise: float = 0.8 / 255
+    """Standard deviation of grey below which a window says nothing."""
+    smooth: float = 0.15
+    """Price of one plane of disagreement between neighbours in the semi-global step; a jump costs eight times that."""
+    rounds: int = 3
+    """Rounds of slanted-plane refinement at full working size."""
+    smooth_fine: float = 0.05
+    """Price there of one source pixel of disagreement with the neighbours."""
+    min_ncc: float = 0.4
+    """Correlation with the sources below which a depth is dropped."""
+    min_peak: float = 0.12
+    """Share by which 1 - NCC must rise 2.5 pixels beside a match; below, the depth is dropped as undetermined."""
+    tolerance: float = 0.015
+    """Relative difference in depth up to which two frames agree; or what the reprojection error allows, if more."""
+    agreeing: int = 2
+    """Other frames that must agree with a depth."""
+    speck: int = 48
+    """Connected patches smaller than this are dropped, pixels at working size."""
+    threads: int = 0
+    """Frames computed at once; 0 takes every core, at most 8."""
+
+
+@dataclass(frozen=True)
+class TrackSettings:
+    """Pixels of several depth maps grouped into surface points (`sfm/tracks.py`)."""
+
+    tolerance: float = 0.02
+    """Relative difference in z depth up to which two frames show the same point."""
+    max_colour_change: float = 0.3
+    """Largest change of a channel between two sightings; water alone changes less between neighbouring distances."""
+    max_views: int = 12
+    """Other frames in which the points of one frame are looked up."""
+    min_overlap: float = 0.1
+    max_tracks: int = 1_000_000
+
+
+@dataclass(frozen=True)
+class RestoreSettings:
+    """Pictures and points with the water removed (`sfm/restore.py`). Values are 0..1."""
+
+    noise: float = 0.01
+    """Standard deviation of a pixel: sensor and compression."""
+    texture: float = 0.1
+    """Standard deviation of J within a small window."""
+    veil_error: float = 0.006
+    """What B(z) may be wrong by; where T_D is not well above it, J is taken from the channels that still see."""
+    colour_error: float = 0.12
+    """Error of J that would be accepted."""
+    window: float = 0.02
+    """Standard deviation of the local windows, as a share of the long side."""
+    max_points: int = 500_000
+    """Of the restored cloud, thinned by voxels."""
+    white_balance: bool = True
+    """Grey-world gains, one triple per dive, on pictures made for looking at; points and scores stay physical."""
+
+
+@dataclass(frozen=True)
+class SeathruSettings:
+    """The water from pictures and depth (`sfm/seathru.py`). Values are 0..1, standard deviations without unit."""
+
+    tracks: TrackSettings = field(default_factory=TrackSettings)
+    max_pixels: int = 300_000
+    """Single pixels drawn from all frames together."""
+    open_water_pixels: int = 2_000
+    """Most pixels of open water taken from one frame."""
+    patch_pixels: float = 12.0
+    """Edge of a patch of surface, in pixels of its farthest sighting; at most 1/32 of the picture's long side."""
+    patch_sightings: int = 6
+    """Fewest pixels of a patch in a frame."""
+    patch_offset: float = 0.15
+    """Largest distance between the centroids of a patch and of what a frame shows of it, in edges."""
+    range_bins: int = 10
+    dark_fraction: float = 0.01  # Sea-Thru: the darkest 1 % of each range bin
+    min_bin_pixels: int = 50
+    dark_std: float = 0.015
+    """How far the dark envelope of one range bin may stray."""
+    dark_reflectance: float = 0.02
+    """J of the darkest 1 %: black things are rarely quite black."""
+    dark_reflectance_std: float = 0.03
+    lsac_f: float = 2.0
+    """Sea-Thru's f: the illuminant is f times the local average colour, so surfaces reflect 1 / f on average."""
+    mean_reflectance_std: float = 0.5
+    """Of ln(1 / f) for a whole dive: what the grey-world guess is worth."""
+    average_std: float = 0.3
+    """Of the ln of one range bin's average colour."""
+    slope_std: float = 0.1
+    """Of b times the median depth in beta_D(z) = a exp(b z)."""
+    open_water_std: float = 0.01
+    min_open_water: int = 200
+    min_samples: int = 500
+    min_tracks: int = 100
+    min_depth_ratio: float = 1.05
+    """Farthest over nearest sighting of a point that enters the fit."""
+    black: float = 0.002
+    saturated: float = 0.98
+    max_observations: int = 200_000
+    start_observations: int = 5_000
+    min_redundancy: float = 3.0
+    """At least so many observations share one error."""
+    loss_scale: float = 0.02
+    """Residuals beyond it count as outliers."""
+    reweightings: int = 6
+    depth_error: float = 0.01
+    """Relative error of one sighting's ray depth, beyond what all sightings of a point share."""
+    gain_std: float = 0.1
+    """First guess of how much exposure and white balance vary between frames; then estimated."""
+    gain_evidence: float = 0.85
+    """Gains are used where they shrink the residuals below this share."""
+    std_inflation: float = 2.0
+    """Of the standard deviations beyond what residuals show (benchmarks/seathru_calibration.py)."""
+    identifiable_std: float = 0.08
+    """A coefficient is identifiable below this relative standard deviation (benchmarks/seathru_calibration.py)."""
+
+
+@dataclass(frozen=True)
+class FeatureSettings:
+    """SIFT and its matching (`sfm/sift.py`)."""
+
+    count: int = 2048
+    """Most keypoints of a frame; one with two orientations counts once."""
+    peak_threshold: float = 0.003
+    """Contrast a keypoint needs, of 1; COLMAP's 0.0067 starves in haze."""
+    faint_threshold: float = 0.001
+    """The same for frames that yield fewer than `count`: it places 14 of ruie_murky's 14 frames, not 12."""
+    equalise: float = 0.0
+    """Clip limit of the local contrast equalisation (CLAHE) before detection; 0 leaves pictures as they are."""
+    long_side: int = 1000
+    """Larger frames are reduced to this many pixels for detection."""
+    max_ratio: float = 0.8
+    """Nearest over second nearest descriptor, angles."""
+
+
+@dataclass(frozen=True)
+class MappingSettings:
+    """From verified matches to cameras and points (`sfm/mapping.py`)."""
+
+    method: Literal["auto", "incremental", "global"] = "auto"
+    """Auto takes the global method (GLOMAP) from `global_from` frames on."""
+    global_from: int = 100
+    lens_frames: int = 40
+    """Best connected frames on which the lens is found before the global method places all."""
+    focal_ladder: tuple[float, ...] = (0.75, 1.1, 0.6, 1.5)
+    """Focal lengths per image width that are tried in turn while frames are left over; no lens is known better."""
+    k1: float = 0.03
+    """Radial distortion the ladder starts from: what a flat port leaves of a corrected lens."""
+    enough: float = 1.0
+    """Share of the frames at which the ladder is left early."""
+    retry_ratio: float = 0.9
+    """Ratio test of the second matching of frames that were left over."""
+    min_frames: int = 3
+    min_share: float = 0.2
+    """Share of the frames below which the result is refused."""
+    thin_points: int = 150
+    """Points seen by the mean frame below which a model may well be a passing animal (dolphin_dynamic 93,
+    ruie_murky 219); it is refused unless it holds `thin_share` of the frames."""
+    thin_share: float = 0.6
+    opencv_gain: float = 0.03
+    """Relative drop of the reprojection error that buys OPENCV's further parameters where the model is "auto"."""
+
+
+@dataclass(frozen=True)
+class ColmapSettings:
+    """Structure from motion without weights: pycolmap, plane sweep, Sea-Thru."""
+
+    camera: Literal["auto", "SIMPLE_RADIAL", "OPENCV", "OPENCV_FISHEYE"] = "auto"
+    """One lens for the whole clip. Auto: SIMPLE_RADIAL, or OPENCV where it explains the matches clearly better."""
+    focal: float | None = None
+    """Focal length, pixels of the prepared frames; measured in water unless `housing` is flat."""
+    k1: float | None = None
+    k2: float | None = None
+    k3: float | None = None
+    """OPENCV_FISHEYE only, as k4."""
+    k4: float | None = None
+    p1: float | None = None
+    p2: float | None = None
+    intrinsics: Literal["prior", "fixed"] = "prior"
+    """Whether the numbers above are a start for refinement or the truth."""
+    housing: Literal["none", "flat", "dome"] = "none"
+    """A flat port lengthens the focal length by water's 1.333; given and assumed ones are multiplied by it."""
+    pairs: Literal["auto", "exhaustive", "sequential"] = "auto"
+    """Auto: every pair up to `exhaustive_to` frames; above, neighbours in time (video) and frames that look alike."""
+    exhaustive_to: int = 60
+    overlap: int = 10
+    """Neighbours in time each frame is matched with, and some at doubling distances."""
+    loops: int = 6
+    """Frames elsewhere in the clip that look most alike (VLAD), matched with each frame; 5 times that for stills."""
+    threads: int = 0
+    """0: every core."""
+    features: FeatureSettings = field(default_factory=FeatureSettings)
+    mapping: MappingSettings = field(default_factory=MappingSettings)
+    depth: PlaneSweepSettings = field(default_factory=PlaneSweepSettings)
+    water: SeathruSettings = field(default_factory=SeathruSettings)
+    restore: RestoreSettings = field(default_factory=RestoreSettings)
+
+
+SfmSettings = ColmapSettings

@@ -1,0 +1,126 @@
+"""SIFT for hazy pictures: where the keypoints are, what they look like, and which of two pictures' keypoints agree.
+
+Haze lowers contrast, not shape, so the detector's threshold is lowered and, where asked, local contrast is equalised
+(CLAHE) before detection. Two keypoints match if each is the other's nearest in angle between descriptors, and nearer
+than `max_ratio` times the second nearest from both sides (Lowe 2004).
+"""
+
+from dataclasses import dataclass
+from typing import TYPE_CHECKING, no_type_check
+
+import numba
+import numpy as np
+import torch
+from jaxtyping import Bool, Float, Int
+from torch import Tensor
+
+from swimm3r.sfm.settings import FeatureSettings
+
+if TYPE_CHECKING:
+    import pycolmap
+
+_MAX_ANGLE = 0.7  # radians between descriptors beyond which the nearest neighbour is a stranger (COLMAP's limit)
+_UPSAMPLE_BELOW = 700  # long side in pixels; small pictures have their detail at half a pixel's blur, large ones do not
+
+
+@dataclass(frozen=True)
+class Features:
+    """The keypoints of one picture, as COLMAP stores them."""
+
+    keypoints: np.ndarray  # [n, 4] float32: x, y, scale, orientation; pixels of the full picture
+    descriptors: np.ndarray  # [n, 128] uint8
+
+
+def extract_features(image: Float[Tensor, "h w 3"], usable: Bool[Tensor, "h w"], settings: FeatureSettings) -> Features:
+    """Keypoints of a picture outside its mask."""
+    import cv2
+    import pycolmap
+
+    # Rec. 601 luma, as every SIFT is fed
+    grey = (image.numpy() @ np.array([0.299, 0.587, 0.114], np.float32) * 255).round().astype(np.uint8)
+    height, width = grey.shape
+    scale = min(1.0, settings.long_side / max(height, width))
+    if scale < 1:
+        grey = cv2.resize(grey, (round(width * scale), round(height * scale)), interpolation=cv2.INTER_AREA)
+    if settings.equalise > 0:
+        grey = cv2.createCLAHE(settings.equalise, (8, 8)).apply(grey)
+
+    options = pycolmap.FeatureExtractionOptions()
+    options.num_threads = 1
+    options.sift.max_num_features = settings.count
+    options.sift.peak_threshold = settings.peak_threshold
+    options.sift.first_octave = -1 if max(grey.shape) < _UPSAMPLE_BELOW else 0
+    grey = np.ascontiguousarray(grey)
+    found, described = _detect(grey, options)
+    if len(found) < settings.count:  # water this murky leaves little else than faint keypoints
+        options.sift.peak_threshold = settings.faint_threshold
+        found, described = _detect(grey, options)
+    if len(found) == 0:
+        return Features(np.zeros((0, 4), np.float32), np.zeros((0, 128), np.uint8))
+    keypoints = pycolmap.keypoints_to_matrix(found).astype(np.float32)
+    keypoints[:, 0] *= width / grey.shape[1]
+    keypoints[:, 1] *= height / grey.shape[0]
+    keypoints[:, 2] /= scale
+    x = np.clip(keypoints[:, 0].astype(int), 0, width - 1)
+    y = np.clip(keypoints[:, 1].astype(int), 0, height - 1)
+    kept = usable.numpy()[y, x]
+    return Features(keypoints[kept], described.data[kept])
+
+
+def match_descriptors(a: Float[Tensor, "m 128"], b: Float[Tensor, "n 128"], max_ratio: float) -> Int[Tensor, "k 2"]:
+    """Pairs of rows that agree; descriptors have unit length."""
+    if len(a) < 2 or len(b) < 2:
+        return torch.zeros(0, 2, dtype=torch.int64)
+    row, column = _mutual((a @ b.mT).numpy(), max_ratio, _MAX_ANGLE)
+    return torch.from_numpy(np.stack([row, column], 1))
+
+
+def unit_descriptors(descriptors: np.ndarray) -> Float[Tensor, "n 128"]:
+    """Stored descriptors as float unit vectors."""
+    d = torch.from_numpy(descriptors.astype(np.float32))
+    return d / d.norm(dim=1, keepdim=True).clamp(min=1e-6)
+
+
+def _detect(
+    grey: np.ndarray, options: "pycolmap.FeatureExtractionOptions"
+) -> "tuple[pycolmap.FeatureKeypoints, pycolmap.FeatureDescriptors]":
+    import pycolmap
+
+    return pycolmap.FeatureExtractor.create(options, pycolmap.Device.cpu).extract_from_uint8_array(grey)
+
+
+@numba.njit(cache=True)
+@no_type_check  # the tests' shape checks would wrap what Numba must compile
+def _mutual(similarity, max_ratio, max_angle):  # one pass over memory: four reductions of it take three times as long
+    m, n = similarity.shape
+    row_of, first, second = np.zeros(n, np.int64), np.full(n, -1, np.float32), np.full(n, -1, np.float32)
+    column_of, best, next_best = np.zeros(m, np.int64), np.full(m, -1, np.float32), np.full(m, -1, np.float32)
+    for i in range(m):
+        s1, s2, k = np.float32(-1), np.float32(-1), 0
+        for j in range(n):
+            s = similarity[i, j]
+            if s > s2:
+                if s > s1:
+                    s2, s1, k = s1, s, j
+                else:
+                    s2 = s
+            if s > second[j]:
+                if s > first[j]:
+                    second[j], first[j], row_of[j] = first[j], s, i
+                else:
+                    second[j] = s
+        column_of[i], best[i], next_best[i] = k, s1, s2
+    rows, columns = np.zeros(m, np.int64), np.zeros(m, np.int64)
+    count = 0
+    for i in range(m):
+        j = column_of[i]
+        angle = np.arccos(min(best[i], np.float32(1)))
+        if (
+            row_of[j] == i
+            and angle <= max_angle
+            and angle <= max_ratio * np.arccos(min(next_best[i], np.float32(1)))
+            and angle <= max_ratio * np.arccos(min(second[j], np.float32(1)))
+        ):
+            rows[count], columns[count] = i, j
+            count += 1
+    return rows[:count], columns[:count]

@@ -1,0 +1,352 @@
+"""One colour channel of the water: what its pixels say, and the bounded least squares that weighs it (see seathru.py).
+
+Cameras in video change exposure and white balance from frame to frame: I = g_f (J T_D + B). The gains g_f are estimated
+with the water, and the residuals of a frame are whitened against the gain error tau that is left,
+
+    r' = r - (1 - 1 / sqrt(1 + tau^2 |p|^2)) p (p . r) / |p|^2,    p = its prediction in units of its noise,
+
+so that brightness common to a whole frame says little about the water. Depths are in units of their median.
+"""
+
+from collections.abc import Callable
+from dataclasses import dataclass, replace
+
+import numpy as np
+
+from swimm3r.sfm.settings import SeathruSettings
+
+BINF, LOG_BETA_B, LOG_BETA_D, SLOPE, DARK, LOG_MEAN = range(6)  # the unknowns
+LOWER = np.array([0.0, np.log(0.01), np.log(0.01), -2.0, 0.0, np.log(0.02)])
+UPPER = np.array([1.0, np.log(10.0), np.log(10.0), 0.0, 0.2, np.log(1.5)])
+_STEPS = 50
+_SWEEPS = 30  # alternations between gains and J; each is a few sums
+
+
+@dataclass(frozen=True)
+class Pixels:
+    """All samples of one channel."""
+
+    I: np.ndarray
+    brightness: np.ndarray  # mean of the channels: what "darkest" means
+    z: np.ndarray
+    frame: np.ndarray  # 0.. without gaps
+    open_water: np.ndarray
+
+
+@dataclass(frozen=True)
+class Sightings:
+    """Those samples that show points seen from several distances; `point` counts 0.. without gaps."""
+
+    rows: np.ndarray  # into the samples
+    z: np.ndarray
+    point: np.ndarray
+    frame: np.ndarray
+    I: np.ndarray
+
+
+@dataclass(frozen=True)
+class ChannelFit:
+    """The unknowns at the optimum, and their covariance."""
+
+    x: np.ndarray
+    covariance: np.ndarray
+
+
+@dataclass(frozen=True)
+class _RangeBins:
+    z_dark: np.ndarray  # median depth of the darkest pixels of each bin
+    dark: np.ndarray
+    z_mean: np.ndarray
+    mean: np.ndarray
+
+
+@dataclass(frozen=True)
+class _Evidence:
+    """What is known besides the sightings."""
+
+    bins: _RangeBins
+    open_water: tuple[float, float] | None  # median and its standard deviation
+    alone: bool  # no sightings
+    lower: np.ndarray
+    upper: np.ndarray
+
+
+@dataclass(frozen=True)
+class _Noise:
+    """How the sightings err: weights are square roots of inverse variances."""
+
+    weight: np.ndarray
+    gain_std: float  # tau
+
+
+def fit_channel(pixels: Pixels, sightings: Sightings | None, settings: SeathruSettings) -> ChannelFit:
+    """The water of one channel, with frame gains only where steady exposure leaves far larger residuals.
+
+    A camera that rises over flat ground with changing exposure looks like one with a steady exposure in other water:
+    gains that are not needed would only blur the answer.
+    """
+    if sightings is None:
+        evidence = _evidence(pixels, 0.0, True, settings)
+        x = _best_start(evidence, None, 0.0, settings)
+        return ChannelFit(x, _covariance(x, evidence, None, None, settings))
+    fit, spread = _fit_sightings(pixels, sightings, 0.0, settings)
+    if len(np.unique(sightings.frame)) > 2:
+        varying, smaller = _fit_sightings(pixels, sightings, settings.gain_std, settings)
+        if smaller < settings.gain_evidence * spread:
+            return varying
+    return fit
+
+
+def _fit_sightings(
+    pixels: Pixels, sightings: Sightings, gain_std: float, settings: SeathruSettings
+) -> tuple[ChannelFit, float]:
+    """Robust least squares from a grid of starts, refined on all sightings; and the spread of their residuals.
+
+    Residuals count in units of `scale * sqrt(redundancy)`: their spread, and how many of them repeat the same error
+    (estimated from how much the gradients of whole frames scatter).
+    """
+    evidence = _evidence(pixels, 0.0, False, settings)
+    x = _best_start(evidence, sightings, gain_std, settings)
+    robust, redundancy = np.ones(len(sightings.z)), settings.min_redundancy
+    gain, tau = np.ones(pixels.frame.max() + 1), gain_std
+    seen, noise = sightings, _Noise(robust, tau)
+    for _ in range(settings.reweightings):
+        r = _residuals(x, seen, robust)
+        scale = float(np.clip(1.4826 * np.median(np.abs(r)), 1e-3, settings.loss_scale))
+        robust = 1 / np.sqrt(1 + (r / (2 * scale)) ** 2)
+        if gain_std > 0:
+            gain, tau = _gains(x, sightings, robust / scale**2, tau, len(gain))
+            seen = replace(sightings, I=sightings.I / gain[sightings.frame])
+            evidence = _evidence(replace(pixels, I=pixels.I / gain[pixels.frame]), tau, False, settings)
+        noise = _Noise(np.sqrt(robust / redundancy) / scale, tau)
+        x = _solve(x, evidence, seen, noise, settings)
+        redundancy = max(settings.min_redundancy, _redundancy(x, seen, _Noise(np.sqrt(robust) / scale, tau)))
+    spread = float(np.median(np.abs(_residuals(x, seen, robust))))
+    return ChannelFit(x, _covariance(x, evidence, seen, noise, settings)), spread
+
+
+def _evidence(pixels: Pixels, gain_std: float, alone: bool, settings: SeathruSettings) -> _Evidence:
+    water = _open_water_colour(pixels.open_water, gain_std, settings)
+    lower, upper = LOWER.copy(), UPPER.copy()
+    upper[BINF] = _largest_Binf(pixels.I, pixels.z)
+    if water is not None:
+        upper[BINF] = min(1.0, max(upper[BINF], water[0] + 3 * water[1]))
+    return _Evidence(_range_bins(pixels, settings), water, alone, lower, upper)
+
+
+def _range_bins(pixels: Pixels, settings: SeathruSettings) -> _RangeBins:
+    """The darkest pixels (by brightness) and the average of each of `range_bins` equal depth intervals."""
+    I, brightness, z = pixels.I, pixels.brightness, pixels.z
+    edges = np.linspace(np.quantile(z, 0.002), np.quantile(z, 0.998), settings.range_bins + 1)
+    which = np.digitize(z, edges[1:-1])
+    rows = []
+    for k in range(settings.range_bins):
+        inside = np.flatnonzero(which == k)
+        if len(inside) < settings.min_bin_pixels:
+            continue
+        count = int(np.ceil(settings.dark_fraction * len(inside)))
+        darkest = inside[np.argpartition(brightness[inside], count - 1)[:count]]
+        rows.append((np.median(z[darkest]), np.median(I[darkest]), np.median(z[inside]), np.mean(I[inside])))
+    if not rows:  # few samples: one bin is all there is
+        darkest = np.argsort(brightness, kind="stable")[: max(1, int(settings.dark_fraction * len(z)))]
+        rows.append((np.median(z[darkest]), np.median(I[darkest]), np.median(z), np.mean(I)))
+    return _RangeBins(*np.array(rows).T)
+
+
+def _open_water_colour(I: np.ndarray, gain_std: float, settings: SeathruSettings) -> tuple[float, float] | None:
+    if len(I) < settings.min_open_water:
+        return None
+    spread = 1.4826 * np.median(np.abs(I - np.median(I)))
+    middle = float(np.median(I))
+    return middle, float(np.hypot(np.hypot(spread / 2, gain_std * middle), settings.open_water_std))
+
+
+def _largest_Binf(I: np.ndarray, z: np.ndarray) -> float:
+    """The veiling light is hardly brighter than the brightest things in the farthest tenth of the scene."""
+    far = z >= np.quantile(z, 0.9)
+    return float(np.clip(1.2 * np.quantile(I[far], 0.98), 0.02, 1.0))
+
+
+def _attenuations(x: np.ndarray, z: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """T_D and B at depths z."""
+    T_D = np.exp(-np.exp(x[LOG_BETA_D] + x[SLOPE] * z) * z)
+    return T_D, x[BINF] * -np.expm1(-np.exp(x[LOG_BETA_B]) * z)
+
+
+def _points(T_D: np.ndarray, direct: np.ndarray, point: np.ndarray, weight: np.ndarray) -> np.ndarray:
+    """J of every point by weighted least squares, kept within 0..1."""
+    weighted = weight * T_D
+    J = np.bincount(point, weighted * direct) / np.bincount(point, weighted * T_D).clip(1e-12)
+    return J.clip(0.0, 1.0)
+
+
+def _residuals(x: np.ndarray, seen: Sightings, weight: np.ndarray) -> np.ndarray:
+    """I - B - J T_D with the J of every point eliminated."""
+    T_D, B = _attenuations(x, seen.z)
+    direct = seen.I - B
+    return direct - _points(T_D, direct, seen.point, weight)[seen.point] * T_D
+
+
+def _whitened(x: np.ndarray, seen: Sightings, noise: _Noise) -> np.ndarray:
+    """The residuals in units of their noise, blind to a common gain of each frame as far as gains are uncertain."""
+    residuals = _residuals(x, seen, noise.weight**2)
+    r, p = noise.weight * residuals, noise.weight * (seen.I - residuals)
+    square = np.bincount(seen.frame, p * p).clip(1e-12)
+    share = (1 - 1 / np.sqrt(1 + noise.gain_std**2 * square)) / square
+    return r - p * (share * np.bincount(seen.frame, p * r))[seen.frame]
+
+
+def _gains(
+    x: np.ndarray, seen: Sightings, weight: np.ndarray, gain_std: float, frames: int
+) -> tuple[np.ndarray, float]:
+    """The gain of every frame, 1 on average and 1 where a frame has no sightings, and how much gains vary."""
+    T_D, B = _attenuations(x, seen.z)
+    gain, present = np.ones(frames), np.unique(seen.frame)
+    stay = 1 / gain_std**2
+    for _ in range(_SWEEPS):
+        J = _points(T_D, seen.I / gain[seen.frame] - B, seen.point, weight)
+        p = J[seen.point] * T_D + B
+        top = np.bincount(seen.frame, weight * seen.I * p, frames) + stay
+        gain = top / (np.bincount(seen.frame, weight * p * p, frames) + stay)
+        gain /= np.exp(np.log(gain)[present].mean())
+    return gain, float(np.clip(np.sqrt(np.mean(np.log(gain)[present] ** 2)), 1e-3, 0.15))
+
+
+def _prior_residuals(x: np.ndarray, evidence: _Evidence, settings: SeathruSettings) -> np.ndarray:
+    """Everything but the tracks, each in its own standard deviations.
+
+    Light cannot be missing, so B above the dark envelope is a fault, and a bin without anything black is none. Without
+    sightings nothing tells J' from B: then the darkest pixels are taken for black, as Sea-Thru does.
+    """
+    bins = evidence.bins
+    T_D, B = _attenuations(x, bins.z_dark)
+    dark = (bins.dark - B - x[DARK] * T_D) / settings.dark_std
+    if not evidence.alone:
+        dark = np.where(dark < 0, 3.0 * dark, np.sqrt(2 * (np.sqrt(1 + dark.clip(0) ** 2) - 1)))
+    T_D, B = _attenuations(x, bins.z_mean)
+    floor = settings.dark_std
+    direct = np.logaddexp(0.0, (bins.mean - B) / floor) * floor  # a soft max(., 0)
+    average = (np.log(direct) - x[LOG_MEAN] - np.log(T_D)) / np.hypot(settings.average_std, floor / direct)
+    single = [
+        x[DARK] / 0.003 if evidence.alone else (x[DARK] - settings.dark_reflectance) / settings.dark_reflectance_std,
+        (x[LOG_MEAN] + np.log(settings.lsac_f)) / settings.mean_reflectance_std,
+        (x[LOG_BETA_B] - x[LOG_BETA_D] + 0.7) / 1.0,  # r = beta_B / beta_D is U(0, 1) in the paper: log mean -1, std 1
+        x[SLOPE] / settings.slope_std,
+    ]
+    if evidence.open_water is not None:
+        single.append((x[BINF] - evidence.open_water[0]) / evidence.open_water[1])
+    return np.concatenate([dark, average / np.sqrt(len(average)), single])
+
+
+def _solve(
+    start: np.ndarray, evidence: _Evidence, seen: Sightings | None, noise: _Noise | None, settings: SeathruSettings
+) -> np.ndarray:
+    """Levenberg-Marquardt within the bounds: unknowns that press against a bound are left out of the step.
+
+    Six unknowns and up to 10^5 residuals: normal equations are 20 times cheaper than a general solver's SVD.
+    """
+
+    def residuals(x: np.ndarray) -> np.ndarray:
+        prior = _prior_residuals(x, evidence, settings)
+        return prior if seen is None or noise is None else np.concatenate([prior, _whitened(x, seen, noise)])
+
+    x = np.clip(start, evidence.lower, evidence.upper)
+    r, damping = residuals(x), 1e-3
+    for _ in range(_STEPS):
+        rows = _jacobian(residuals, x, r)
+        gradient, information = rows.T @ r, rows.T @ rows
+        pressed = ((x <= evidence.lower) & (gradient > 0)) | ((x >= evidence.upper) & (gradient < 0))
+        free = np.flatnonzero(~pressed)
+        before = r @ r
+        while damping < 1e8:
+            system = information[np.ix_(free, free)]
+            step = np.zeros_like(x)
+            step[free] = -np.linalg.solve(system + np.diag(damping * np.diag(system) + 1e-9), gradient[free])
+            tried = np.clip(x + step, evidence.lower, evidence.upper)
+            r_tried = residuals(tried)
+            if r_tried @ r_tried < before:
+                x, r, damping = tried, r_tried, max(damping / 8, 1e-9)
+                break
+            damping *= 6
+        if before - r @ r < 1e-7 * before:
+            break
+    return x
+
+
+def _best_start(
+    evidence: _Evidence, sightings: Sightings | None, gain_std: float, settings: SeathruSettings
+) -> np.ndarray:
+    """The best local optimum from a grid of starts, on few sightings."""
+    few = None if sightings is None else _thinned(sightings, settings.start_observations)
+    noise = None if few is None else _Noise(np.full(len(few.z), 1 / settings.loss_scale), gain_std)
+    best, lowest = None, np.inf
+    for start in _starts(evidence):
+        x = _solve(start, evidence, few, noise, settings)
+        cost = (_prior_residuals(x, evidence, settings) ** 2).sum()
+        if few is not None and noise is not None:
+            cost += 2 * (np.sqrt(1 + _whitened(x, few, noise) ** 2) - 1).sum()
+        if cost < lowest:
+            best, lowest = x, cost
+    assert best is not None
+    return best
+
+
+def _starts(evidence: _Evidence) -> list[np.ndarray]:
+    Binf = evidence.open_water[0] if evidence.open_water is not None else 0.7 * evidence.upper[BINF]
+    return [
+        np.array([Binf, np.log(beta_B), np.log(beta_D), 0.0, 0.02, np.log(0.4)])
+        for beta_B in (0.1, 0.5, 2.0)
+        for beta_D in (0.2, 0.7, 2.0)
+    ]
+
+
+def _thinned(seen: Sightings, count: int) -> Sightings:
+    """Every k-th point, so that about `count` sightings remain."""
+    step = max(1, int(np.ceil(len(seen.z) / count)))
+    rows = np.flatnonzero(seen.point % step == 0)
+    return Sightings(seen.rows[rows], seen.z[rows], seen.point[rows] // step, seen.frame[rows], seen.I[rows])
+
+
+def _jacobian(residuals: Callable[[np.ndarray], np.ndarray], x: np.ndarray, at_x: np.ndarray) -> np.ndarray:
+    """By forward differences; the unknowns are all of order 1."""
+    return np.stack([(residuals(x + 1e-6 * e) - at_x) / 1e-6 for e in np.eye(len(x))], -1)
+
+
+def _scores(x: np.ndarray, seen: Sightings, noise: _Noise) -> tuple[np.ndarray, np.ndarray]:
+    """Information of the sightings about the unknowns they see, and the gradient each frame contributes."""
+    r = _whitened(x, seen, noise)
+    rows = _jacobian(lambda y: _whitened(y, seen, noise), x, r)[:, :4]
+    gradient = np.stack([np.bincount(seen.frame, rows[:, i] * r) for i in range(rows.shape[1])], -1)
+    return rows.T @ rows, gradient[np.unique(seen.frame)]
+
+
+def _redundancy(x: np.ndarray, seen: Sightings, noise: _Noise) -> float:
+    """By how much the gradients of whole frames scatter more than independent residuals would let them."""
+    information, gradient = _scores(x, seen, noise)
+    gradient = gradient - gradient.mean(0)
+    values, vectors = np.linalg.eigh(information)
+    visible = values > 1e-6 * values.max()
+    whitened = gradient @ vectors[:, visible] / np.sqrt(values[visible])
+    return float((whitened**2).sum() / visible.sum() * len(gradient) / max(1, len(gradient) - 1))
+
+
+def _covariance(
+    x: np.ndarray, evidence: _Evidence, seen: Sightings | None, noise: _Noise | None, settings: SeathruSettings
+) -> np.ndarray:
+    """From the curvature at the optimum; unknowns at a bound keep their freedom to leave it.
+
+    On top comes what errors of depth do, which no residual shows: where sightings of a point differ by s in ln z and
+    each is wrong by `depth_error`, differences in depth are overrated by depth_error^2 / s^2, and the betas with them.
+    """
+    at_x = _prior_residuals(x, evidence, settings)
+    prior = _jacobian(lambda y: _prior_residuals(y, evidence, settings), x, at_x)
+    information = prior.T @ prior
+    if seen is None or noise is None:
+        return np.linalg.inv(information + 1e-9 * np.eye(len(x)))
+    information[:4, :4] += _scores(x, seen, noise)[0]
+    log_z = np.log(seen.z)
+    log_z = log_z - (np.bincount(seen.point, log_z) / np.bincount(seen.point))[seen.point]
+    overrated = settings.depth_error**2 / np.mean(log_z**2)
+    extra = np.zeros(len(x))
+    extra[[LOG_BETA_B, LOG_BETA_D]] = overrated**2
+    return np.linalg.inv(information + 1e-9 * np.eye(len(x))) + np.diag(extra)
