@@ -1,0 +1,173 @@
+"""The differentiable underwater Beta-splat rasteriser: one function, three back ends.
+
+    I = B_inf + sum_i w_i (c_i e^{-beta_D z_i} - B_inf e^{-beta_B z_i}),   w_i = T_i alpha_i
+
+which is the paper's Eqs. ugs_veil and ugs_render after summation by parts (raster.md 1). `numba` runs on the CPU,
+`warp` on CUDA, `reference` is the literal float64 oracle for tiny scenes.
+"""
+
+from dataclasses import dataclass
+from types import ModuleType
+from typing import Any, Literal
+
+import torch
+from torch import Tensor
+
+from swimm3r.errors import DeviceError
+from swimm3r.raster import reference
+from swimm3r.raster.records import (
+    ALPHA_MAX,
+    ALPHA_MIN,
+    T_MIN,
+    TILE,
+    Bins,
+    MediumMaps,
+    Primitives2D,
+    RasterOutput,
+    SggBuffers,
+)
+
+__all__ = [
+    "ALPHA_MAX",
+    "ALPHA_MIN",
+    "TILE",
+    "T_MIN",
+    "Backend",
+    "Bins",
+    "MediumMaps",
+    "Primitives2D",
+    "RasterOutput",
+    "SggBuffers",
+    "bin_primitives",
+    "rasterize",
+]
+
+Backend = Literal["auto", "numba", "warp", "reference"]
+
+
+def bin_primitives(p: Primitives2D, height: int, width: int, *, alpha_min: float = ALPHA_MIN) -> Bins:
+    """Sort primitives into 16 x 16 tiles, front to back, on their device; without gradient, and exact.
+
+    Worth calling only to rasterise the same primitives twice: `rasterize` bins by itself.
+    """
+    return _kernels("warp" if p.mean2d.is_cuda else "numba").bin_primitives(_detached(p), height, width, alpha_min)
+
+
+def rasterize(
+    p: Primitives2D,
+    medium: MediumMaps | None,
+    height: int,
+    width: int,
+    *,
+    alpha_min: float = ALPHA_MIN,
+    sgg: SggBuffers | None = None,
+    bins: Bins | None = None,
+    backend: Backend = "auto",
+) -> RasterOutput:
+    """Underwater image, clear image, z depth (not normalised) and alpha of one camera; differentiable in p and medium.
+
+    `medium=None` is clear water: no veil, no attenuation. Pairs fainter than `alpha_min` are skipped. `sgg` is added to
+    in place when the gradient is taken. `auto` takes Numba on the CPU and Warp on CUDA, both in float32; `reference`
+    keeps the inputs' precision. Outputs and gradients have the inputs' dtype.
+    Raises ValueError where shapes, or `bins` made for another image, do not fit.
+    """
+    _check(p, medium, height, width)
+    if bins is not None and (bins.height, bins.width, bins.alpha_min) != (height, width, alpha_min):
+        raise ValueError(
+            f"bins are for {bins.height} x {bins.width} pixels and alpha_min {bins.alpha_min:g}, "
+            f"the image is {height} x {width} with alpha_min {alpha_min:g}"
+        )
+    if bins is not None and len(bins.packed) != len(p.mean2d):
+        raise ValueError(f"bins hold {len(bins.packed)} primitives, got {len(p.mean2d)}")
+    if backend == "auto":
+        backend = "warp" if p.mean2d.is_cuda else "numba"
+    if medium is None:
+        medium = MediumMaps(*p.mean2d.new_zeros(3, 3, height, width))
+    dtype = p.mean2d.dtype
+    if backend == "reference":
+        job = _Job(backend, height, width, alpha_min, sgg, None)
+        return RasterOutput(*_Rasterize.apply(job, *p, *medium))
+    p = Primitives2D(*(t.float().contiguous() for t in p))
+    medium = MediumMaps(*(t.float().contiguous() for t in medium))
+    if bins is None:
+        bins = _kernels(backend).bin_primitives(_detached(p), height, width, alpha_min)
+    job = _Job(backend, height, width, alpha_min, sgg, bins)
+    return RasterOutput(*(image.to(dtype) for image in _Rasterize.apply(job, *p, *medium)))
+
+
+@dataclass(frozen=True)
+class _Job:
+    """One call of `rasterize`, without its tensors."""
+
+    backend: Literal["numba", "warp", "reference"]
+    height: int
+    width: int
+    alpha_min: float
+    sgg: SggBuffers | None
+    bins: Bins | None
+
+
+class _Rasterize(torch.autograd.Function):
+    """Saves inputs, bins and the four images; no memory per pair."""
+
+    @staticmethod
+    def forward(ctx: Any, job: _Job, *tensors: Tensor) -> tuple[Tensor, ...]:
+        p, medium = Primitives2D(*tensors[:6]), MediumMaps(*tensors[6:])
+        if job.bins is None:
+            out = reference.render(p, medium, job.height, job.width, job.alpha_min)
+        else:
+            out = _kernels(job.backend).forward(job.bins, p, medium)
+        ctx.job = job
+        ctx.save_for_backward(*tensors, *out)
+        return tuple(out)
+
+    @staticmethod
+    @torch.autograd.function.once_differentiable
+    def backward(ctx: Any, *cotangents: Tensor) -> tuple[Tensor | None, ...]:
+        job, saved = ctx.job, ctx.saved_tensors
+        p, medium, out = Primitives2D(*saved[:6]), MediumMaps(*saved[6:9]), RasterOutput(*saved[9:])
+        cotangent = RasterOutput(*cotangents)
+        if job.bins is None:
+            grads, medium_grads = reference.adjoint(p, medium, job.height, job.width, job.alpha_min, cotangent, job.sgg)
+        else:
+            with_medium = any(ctx.needs_input_grad[7:])
+            kernels = _kernels(job.backend)
+            grads, medium_grads = kernels.backward(job.bins, p, medium, out, cotangent, job.sgg, with_medium)
+        return None, *grads, *(medium_grads or (None, None, None))
+
+
+def _kernels(backend: Backend) -> ModuleType:
+    """A fast back end, imported when first used: Numba and Warp take half a second each."""
+    if backend == "numba":
+        from swimm3r.raster import numba_cpu
+
+        return numba_cpu
+    try:
+        from swimm3r.raster import warp_gpu
+    except ModuleNotFoundError as error:
+        if error.name != "warp":
+            raise
+        raise DeviceError(
+            "The GPU rasteriser needs NVIDIA Warp, which is not installed.",
+            cause="Swimm3R was installed without its cuda extra.",
+            hint="pip install 'swimm3r[cuda]', or move the tensors to the CPU.",
+        ) from error
+    return warp_gpu
+
+
+def _detached(p: Primitives2D) -> Primitives2D:
+    return Primitives2D(*(t.detach().float().contiguous() for t in p))
+
+
+def _check(p: Primitives2D, medium: MediumMaps | None, height: int, width: int) -> None:
+    n = len(p.mean2d)
+    expected = {"mean2d": (n, 2), "conic": (n, 3), "color": (n, 3), "opacity": (n,), "beta": (n,), "depth": (n,)}
+    for name, shape in expected.items():
+        got = tuple(getattr(p, name).shape)
+        if got != shape:
+            raise ValueError(f"{name} of {n} primitives must have shape {shape}, got {got}")
+    if height < 1 or width < 1:
+        raise ValueError(f"an image needs at least one pixel, got {height} x {width}")
+    for name, maps in zip(MediumMaps._fields, medium or (), strict=False):
+        if tuple(maps.shape) != (3, height, width):
+            raise ValueError(f"{name} must have shape (3, {height}, {width}), got {tuple(maps.shape)}")

@@ -1,0 +1,369 @@
+"""The CPU kernels: a tile at a time, with an inner loop over pixels that LLVM turns into SIMD.
+
+A tile's 256 pixels live in a workspace, one row per quantity, in the order of 4 x 4 blocks: the pixels that an ellipse
+covers in four image rows are then one contiguous range. What keeps the loops over that range vectorised (raster.md 6,
+asserted by tests): a one-dimensional workspace, unsigned indices, constant row offsets, float32 constants, and no call
+that is not inlined. Short loops one after the other beat one long loop: fewer values spill, and the long chain of the
+coverage overlaps with itself.
+"""
+
+import zlib
+from pathlib import Path
+from typing import no_type_check
+
+import numpy as np
+from numba import njit
+
+from swimm3r.raster import bins, numba_math, pairmath
+from swimm3r.raster.bins import COLOR, CONIC_A, CONIC_B, CONIC_C, DEPTH, EXPONENT, LOG2_O, MEAN_X, MEAN_Y, R2_MAX
+from swimm3r.raster.numba_math import maximum, minimum, prefetch, select, vec3
+from swimm3r.raster.records import TILE
+
+_pair = pairmath.make(numba_math.inlined, numba_math.exp2, numba_math.log2, minimum, maximum, select, vec3, np.float32)
+half_slope, coverage, advance, transmittance = _pair.half_slope, _pair.coverage, _pair.advance, _pair.transmittance
+seen_colour, colour_slope, payloads = _pair.seen_colour, _pair.colour_slope, _pair.payloads
+shape_slopes, depth_slope = _pair.shape_slopes, _pair.depth_slope
+
+# Numba's cache looks at the kernel's own file only. The sources that are inlined into a kernel enter its signature
+# through this number, the default of an argument that nobody passes: editing pairmath.py recompiles.
+SOURCES = zlib.crc32(b"".join(Path(str(m.__file__)).read_bytes() for m in (pairmath, numba_math, bins)))
+
+PIXELS = TILE * TILE
+STRIDE = PIXELS + 16  # rows 4 KiB apart would share cache sets, and loads would wait for stores to another row
+AHEAD = 6  # pairs: the packed records are random reads from L3
+CHECK = 16  # pairs between two looks whether the whole tile has ended
+# first and beyond-the-last pixel of a row of blocks, by the mask of its four columns (masks have no holes)
+FIRST = np.array([0] + [16 * ((m & -m).bit_length() - 1) for m in range(1, 16)], np.uintp)
+BEYOND = np.array([16 * m.bit_length() for m in range(16)], np.uintp)
+NEG_LOG2_E, LN_2 = np.float32(-pairmath.LOG2_E), np.float32(pairmath.LN_2)
+ZERO, HALF, ONE, TWO = np.float32(0.0), np.float32(0.5), np.float32(1.0), np.float32(2.0)
+
+# Rows of the workspace: pixel centre, transmittance, weight, exponents of the water, B_inf (adjoint: dL/dI B_inf)
+X, Y, T, W, KB0, KB1, KB2, KD0, KD1, KD2, B0, B1, B2 = (np.uintp(STRIDE * k) for k in range(13))
+# forward: sums of the underwater colour, the clear colour, z
+I0, I1, I2, J0, J1, J2, Z = (np.uintp(STRIDE * k) for k in range(13, 20))
+FORWARD_ROWS = 20
+# adjoint: dL/d rgb, clear, z depth, alpha; what lies behind, of the full, geometry and depth payloads;
+G0, G1, G2, C0, C1, C2, GZ, GA, RF, RG, RD = (np.uintp(STRIDE * k) for k in range(13, 24))
+# sums of w E_B, w z E_B, w z c E_D; per pair: u and log2 u, the two shape slopes, dL/dr2 of each payload
+VB0, VB1, VB2, ZB0, ZB1, ZB2, ZD0, ZD1, ZD2 = (np.uintp(STRIDE * k) for k in range(24, 33))
+U, LOG_U, P, Q, TF, TG, TD = (np.uintp(STRIDE * k) for k in range(33, 40))
+ADJOINT_ROWS = 40
+
+# Columns of a slot
+MEAN, CONIC, COL, OPACITY, BETA, Z_WATER, Z_DIRECT, GEO, GEO_ABS, FULL_ABS, DEPTH_MEAN = (
+    0, 2, 5, 8, 9, 10, 11, 12, 14, 16, 18,
+)  # fmt: skip
+PLAIN, WITH_SGG = 12, 20
+
+kernel = njit(nogil=True, cache=True, error_model="numpy", fastmath=numba_math.FLAGS)
+adjoint_kernel = njit(nogil=True, cache=True, error_model="numpy", fastmath=numba_math.FLAGS | {"reassoc"})
+
+
+@no_type_check
+@numba_math.inlined
+def block_order(y, x):
+    """Workspace column of pixel (y, x) of a tile."""
+    return 64 * (y >> 2) + 16 * (x >> 2) + 4 * (y & 3) + (x & 3)
+
+
+@no_type_check
+@numba_math.inlined
+def gather(ws, row, image, tile_y, tile_x):
+    """Copy one tile of an image into a row; beyond the image its edge repeats."""
+    height, width = image.shape
+    for y in range(TILE):
+        image_y = min(tile_y + y, height - 1)
+        if tile_x + TILE <= width:
+            for x in range(TILE):
+                ws[row + np.uintp(block_order(y, x))] = image[image_y, tile_x + x]
+        else:
+            for x in range(TILE):
+                ws[row + np.uintp(block_order(y, x))] = image[image_y, min(tile_x + x, width - 1)]
+
+
+@no_type_check
+@numba_math.inlined
+def put_back(ws, row, image, tile_y, tile_x):
+    """Copy a row into its tile of an image."""
+    height, width = image.shape
+    for y in range(min(TILE, height - tile_y)):
+        if tile_x + TILE <= width:
+            for x in range(TILE):
+                image[tile_y + y, tile_x + x] = ws[row + np.uintp(block_order(y, x))]
+        else:
+            for x in range(width - tile_x):
+                image[tile_y + y, tile_x + x] = ws[row + np.uintp(block_order(y, x))]
+
+
+@no_type_check
+@numba_math.inlined
+def begin_tile(ws, tile_y, tile_x, height, width, binf, beta_b, beta_d):
+    """Pixel centres, T = 1, B_inf, and the betas as exponents of 2."""
+    for y in range(TILE):
+        for x in range(TILE):
+            q = np.uintp(block_order(y, x))
+            ws[X + q], ws[Y + q] = np.float32(x) + HALF, np.float32(y) + HALF
+            # a pixel outside the image has ended before it begins
+            ws[T + q] = ONE if tile_y + y < height and tile_x + x < width else -ONE
+    for k in range(3):
+        row = np.uintp(k * STRIDE)
+        gather(ws, B0 + row, binf[k], tile_y, tile_x)
+        gather(ws, KB0 + row, beta_b[k], tile_y, tile_x)
+        gather(ws, KD0 + row, beta_d[k], tile_y, tile_x)
+    for q in range(KB0, B0):
+        ws[q] *= NEG_LOG2_E
+
+
+@no_type_check
+@numba_math.inlined
+def all_ended(ws):
+    """Whether no pixel of the tile can change any more."""
+    most = -ONE
+    for q in range(T, T + np.uintp(PIXELS)):
+        most = maximum(most, ws[q])
+    return most <= ZERO
+
+
+@no_type_check
+@kernel
+def forward_tiles(
+    first,
+    beyond,
+    packed,
+    tile_start,
+    ids,
+    blocks,
+    binf,
+    beta_b,
+    beta_d,
+    rgb,
+    clear,
+    z_depth,
+    alpha_out,
+    sources=SOURCES,
+):
+    """Images of the tiles first..beyond-1."""
+    height, width = z_depth.shape
+    columns = (width + TILE - 1) // TILE
+    ws = np.zeros(FORWARD_ROWS * STRIDE, np.float32)
+    for tile in range(first, beyond):
+        tile_y, tile_x = (tile // columns) * TILE, (tile % columns) * TILE
+        begin_tile(ws, tile_y, tile_x, height, width, binf, beta_b, beta_d)
+        ws[I0:] = ZERO
+        begin, end = tile_start[tile], tile_start[tile + 1]
+        for entry in range(begin, end):
+            if (entry - begin) % CHECK == CHECK - 1 and all_ended(ws):
+                break
+            prefetch(packed, ids[min(entry + AHEAD, end - 1)])
+            p, mask = packed[ids[entry]], blocks[entry]
+            mean_x, mean_y = p[MEAN_X] - np.float32(tile_x), p[MEAN_Y] - np.float32(tile_y)
+            conic, color = (p[CONIC_A], p[CONIC_B], p[CONIC_C]), (p[COLOR], p[COLOR + 1], p[COLOR + 2])
+            log2_o, exponent, r2_max, z = p[LOG2_O], p[EXPONENT], p[R2_MAX], p[DEPTH]
+            for block_row in range(4):
+                hit = (mask >> (4 * block_row)) & 15
+                q0, q1 = np.uintp(64 * block_row) + FIRST[hit], np.uintp(64 * block_row) + BEYOND[hit]
+                for q in range(q0, q1):
+                    alpha, _, _, _ = coverage(ws[X + q] - mean_x, ws[Y + q] - mean_y, conic, log2_o, exponent, r2_max)
+                    ws[W + q], ws[T + q] = advance(ws[T + q], alpha)
+                for q in range(q0, q1):
+                    w = ws[W + q]
+                    E_B = transmittance((ws[KB0 + q], ws[KB1 + q], ws[KB2 + q]), z)
+                    E_D = transmittance((ws[KD0 + q], ws[KD1 + q], ws[KD2 + q]), z)
+                    F = seen_colour(color, (ws[B0 + q], ws[B1 + q], ws[B2 + q]), E_B, E_D)
+                    ws[I0 + q] += w * F[0]
+                    ws[I1 + q] += w * F[1]
+                    ws[I2 + q] += w * F[2]
+                    ws[J0 + q] += w * color[0]
+                    ws[J1 + q] += w * color[1]
+                    ws[J2 + q] += w * color[2]
+                    ws[Z + q] += w * z
+        for q in range(np.uintp(PIXELS)):
+            ws[I0 + q] += ws[B0 + q]
+            ws[I1 + q] += ws[B1 + q]
+            ws[I2 + q] += ws[B2 + q]
+            ws[T + q] = ONE - abs(ws[T + q])
+        for k in range(3):
+            put_back(ws, I0 + np.uintp(k * STRIDE), rgb[k], tile_y, tile_x)
+            put_back(ws, J0 + np.uintp(k * STRIDE), clear[k], tile_y, tile_x)
+        put_back(ws, Z, z_depth, tile_y, tile_x)
+        put_back(ws, T, alpha_out, tile_y, tile_x)
+
+
+@no_type_check
+@numba_math.inlined
+def begin_adjoint(ws, tile_y, tile_x, g_rgb, g_clear, g_z, g_alpha, rgb, clear, z_depth, alpha_out):
+    """dL/d image of a tile's pixels, and R = sum_j w_j e_j of the three payloads, which the forward images know."""
+    for k in range(3):
+        row = np.uintp(k * STRIDE)
+        gather(ws, G0 + row, g_rgb[k], tile_y, tile_x)
+        gather(ws, C0 + row, g_clear[k], tile_y, tile_x)
+        gather(ws, VB0 + row, rgb[k], tile_y, tile_x)
+        gather(ws, ZB0 + row, clear[k], tile_y, tile_x)
+    gather(ws, GZ, g_z, tile_y, tile_x)
+    gather(ws, GA, g_alpha, tile_y, tile_x)
+    gather(ws, ZD0, z_depth, tile_y, tile_x)
+    gather(ws, ZD1, alpha_out, tile_y, tile_x)
+    for q in range(np.uintp(PIXELS)):
+        depth = ws[GZ + q] * ws[ZD0 + q]
+        both = depth + ws[GA + q] * ws[ZD1 + q]
+        g, g_clear_q = (ws[G0 + q], ws[G1 + q], ws[G2 + q]), (ws[C0 + q], ws[C1 + q], ws[C2 + q])
+        J, B = (ws[ZB0 + q], ws[ZB1 + q], ws[ZB2 + q]), (ws[B0 + q], ws[B1 + q], ws[B2 + q])
+        image = g[0] * (ws[VB0 + q] - B[0]) + g[1] * (ws[VB1 + q] - B[1]) + g[2] * (ws[VB2 + q] - B[2])
+        other = g_clear_q[0] * J[0] + g_clear_q[1] * J[1] + g_clear_q[2] * J[2] + both
+        ws[RF + q] = image + other
+        ws[RG + q] = g[0] * J[0] + g[1] * J[1] + g[2] * J[2] + other
+        ws[RD + q] = depth
+        ws[B0 + q], ws[B1 + q], ws[B2 + q] = g[0] * B[0], g[1] * B[1], g[2] * B[2]
+    ws[VB0:U] = ZERO
+
+
+@no_type_check
+@numba_math.inlined
+def end_adjoint(ws, tile_y, tile_x, d_binf, d_beta_b, d_beta_d):
+    """Gradients of a tile's water: g V, g B_inf sum w z E_B, -g sum w z c E_D."""
+    for k in range(3):
+        row = np.uintp(k * STRIDE)
+        for q in range(row, row + np.uintp(PIXELS)):
+            ws[VB0 + q] = ws[G0 + q] * (ONE - ws[VB0 + q])
+            ws[ZB0 + q] *= ws[B0 + q]
+            ws[ZD0 + q] *= -ws[G0 + q]
+        put_back(ws, VB0 + row, d_binf[k], tile_y, tile_x)
+        put_back(ws, ZB0 + row, d_beta_b[k], tile_y, tile_x)
+        put_back(ws, ZD0 + row, d_beta_d[k], tile_y, tile_x)
+
+
+@no_type_check
+@adjoint_kernel
+def adjoint_tiles(
+    first, beyond, packed, tile_start, ids, blocks, slot, binf, beta_b, beta_d, g_rgb, g_clear, g_z, g_alpha,
+    rgb, clear, z_depth, alpha_out, slots, d_binf, d_beta_b, d_beta_d, with_sgg, sources=SOURCES,
+):  # fmt: skip
+    """Slots and water gradients of the tiles first..beyond-1; None for `with_sgg` or `d_binf` leaves that part out."""
+    height, width = z_depth.shape
+    columns = (width + TILE - 1) // TILE
+    ws = np.zeros(ADJOINT_ROWS * STRIDE, np.float32)
+    for tile in range(first, beyond):
+        tile_y, tile_x = (tile // columns) * TILE, (tile % columns) * TILE
+        begin_tile(ws, tile_y, tile_x, height, width, binf, beta_b, beta_d)
+        begin_adjoint(ws, tile_y, tile_x, g_rgb, g_clear, g_z, g_alpha, rgb, clear, z_depth, alpha_out)
+        begin, end = tile_start[tile], tile_start[tile + 1]
+        ended = False
+        for entry in range(begin, end):
+            out = slots[slot[entry]]
+            if (entry - begin) % CHECK == CHECK - 1 and not ended:
+                ended = all_ended(ws)
+            if ended:
+                out[:] = ZERO
+                continue
+            prefetch(packed, ids[min(entry + AHEAD, end - 1)])
+            p, mask = packed[ids[entry]], blocks[entry]
+            mean_x, mean_y = p[MEAN_X] - np.float32(tile_x), p[MEAN_Y] - np.float32(tile_y)
+            conic, color = (p[CONIC_A], p[CONIC_B], p[CONIC_C]), (p[COLOR], p[COLOR + 1], p[COLOR + 2])
+            log2_o, exponent, r2_max, z = p[LOG2_O], p[EXPONENT], p[R2_MAX], p[DEPTH]
+            mx = my = xx = xy = yy = red = green = blue = opacity = beta = z_water = z_direct = ZERO
+            geo_x = geo_y = abs_geo_x = abs_geo_y = abs_x = abs_y = depth_x = depth_y = ZERO
+            for block_row in range(4):
+                hit = (mask >> (4 * block_row)) & 15
+                q0, q1 = np.uintp(64 * block_row) + FIRST[hit], np.uintp(64 * block_row) + BEYOND[hit]
+                for q in range(q0, q1):
+                    before = ws[T + q]
+                    alpha, shaped, ws[U + q], ws[LOG_U + q] = coverage(
+                        ws[X + q] - mean_x, ws[Y + q] - mean_y, conic, log2_o, exponent, r2_max
+                    )
+                    w, ws[T + q] = advance(before, alpha)
+                    ws[W + q] = w
+                    ws[P + q], ws[Q + q] = shape_slopes(w, before, alpha, shaped, ws[U + q])
+                for q in range(q0, q1):
+                    w = ws[W + q]
+                    k_b, k_d = (ws[KB0 + q], ws[KB1 + q], ws[KB2 + q]), (ws[KD0 + q], ws[KD1 + q], ws[KD2 + q])
+                    E_B, E_D = transmittance(k_b, z), transmittance(k_d, z)
+                    g, g_veil = (ws[G0 + q], ws[G1 + q], ws[G2 + q]), (ws[B0 + q], ws[B1 + q], ws[B2 + q])
+                    g_clear_q = (ws[C0 + q], ws[C1 + q], ws[C2 + q])
+                    slope = colour_slope(g, g_clear_q, E_D)
+                    full, geo, depth = payloads(color, z, E_B, slope, g, g_veil, g_clear_q, ws[GZ + q], ws[GA + q])
+                    red += w * slope[0]
+                    green += w * slope[1]
+                    blue += w * slope[2]
+                    z_water += w * depth_slope(color, E_B, E_D, g, g_veil, k_b, k_d)
+                    z_direct += w * ws[GZ + q]
+                    if d_binf is not None:
+                        ws[VB0 + q] += w * E_B[0]
+                        ws[VB1 + q] += w * E_B[1]
+                        ws[VB2 + q] += w * E_B[2]
+                        wz = w * z
+                        ws[ZB0 + q] += wz * E_B[0]
+                        ws[ZB1 + q] += wz * E_B[1]
+                        ws[ZB2 + q] += wz * E_B[2]
+                        ws[ZD0 + q] += wz * color[0] * E_D[0]
+                        ws[ZD1 + q] += wz * color[1] * E_D[1]
+                        ws[ZD2 + q] += wz * color[2] * E_D[2]
+                    behind = ws[RF + q] - w * full
+                    ws[RF + q] = behind
+                    ws[TF + q] = ws[P + q] * full - ws[Q + q] * behind
+                    if with_sgg is not None:
+                        behind_geo, behind_depth = ws[RG + q] - w * geo, ws[RD + q] - w * depth
+                        ws[RG + q], ws[RD + q] = behind_geo, behind_depth
+                        ws[TG + q] = ws[P + q] * geo - ws[Q + q] * behind_geo
+                        ws[TD + q] = ws[P + q] * depth - ws[Q + q] * behind_depth
+                for q in range(q0, q1):
+                    dx, dy, t = ws[X + q] - mean_x, ws[Y + q] - mean_y, ws[TF + q]
+                    half_x, half_y = half_slope(dx, dy, conic)
+                    mx += t * half_x
+                    my += t * half_y
+                    xx += t * dx * dx
+                    xy += t * dx * dy
+                    yy += t * dy * dy
+                    tu = t * ws[U + q]
+                    opacity += tu
+                    beta += tu * ws[LOG_U + q]
+                    if with_sgg is not None:
+                        abs_x += abs(t * half_x)
+                        abs_y += abs(t * half_y)
+                        t_geo, t_depth = ws[TG + q], ws[TD + q]
+                        geo_x += t_geo * half_x
+                        geo_y += t_geo * half_y
+                        abs_geo_x += abs(t_geo * half_x)
+                        abs_geo_y += abs(t_geo * half_y)
+                        depth_x += t_depth * half_x
+                        depth_y += t_depth * half_y
+            out[MEAN], out[MEAN + 1], out[CONIC], out[CONIC + 1], out[CONIC + 2] = mx, my, xx, xy, yy
+            out[COL], out[COL + 1], out[COL + 2] = red, green, blue
+            out[OPACITY], out[BETA], out[Z_WATER], out[Z_DIRECT] = opacity, beta, z_water, z_direct
+            if with_sgg is not None:
+                out[GEO], out[GEO + 1], out[GEO_ABS], out[GEO_ABS + 1] = geo_x, geo_y, abs_geo_x, abs_geo_y
+                out[FULL_ABS], out[FULL_ABS + 1], out[DEPTH_MEAN], out[DEPTH_MEAN + 1] = abs_x, abs_y, depth_x, depth_y
+        if d_binf is not None:
+            end_adjoint(ws, tile_y, tile_x, d_binf, d_beta_b, d_beta_d)
+
+
+@no_type_check
+@kernel
+def sum_slots(
+    first, beyond, packed, order, first_slot, slots,
+    d_mean, d_conic, d_color, d_opacity, d_beta, d_depth, geo, med, geo_abs, full_abs, depth_iso, sources=SOURCES,
+):  # fmt: skip
+    """Gradients of the primitives order[first..beyond-1]: sums of slots, times what all pairs of a primitive share."""
+    s = np.empty(WITH_SGG, np.float32)
+    for rank in range(first, beyond):
+        s[:] = ZERO
+        for k in range(first_slot[rank], first_slot[rank + 1]):
+            for c in range(slots.shape[1]):
+                s[c] += slots[k, c]
+        i = order[rank]
+        exponent = packed[i, EXPONENT]
+        twice = TWO * exponent  # dL/dmean = 2 b sum t (conic d), d = pixel - mean, dr2/dmean = -2 (conic d)
+        d_mean[i, 0], d_mean[i, 1] = twice * s[MEAN], twice * s[MEAN + 1]
+        d_conic[i, 0], d_conic[i, 1] = -exponent * s[CONIC], -twice * s[CONIC + 1]
+        d_conic[i, 2] = -exponent * s[CONIC + 2]
+        d_color[i, 0], d_color[i, 1], d_color[i, 2] = s[COL], s[COL + 1], s[COL + 2]
+        d_opacity[i], d_beta[i] = s[OPACITY] / TWO ** packed[i, LOG2_O], LN_2 * s[BETA]
+        d_depth[i] = LN_2 * s[Z_WATER] + s[Z_DIRECT]
+        if geo is not None:
+            for c in range(2):
+                geo[i, c] += twice * s[GEO + c]
+                med[i, c] += d_mean[i, c] - twice * s[GEO + c]
+                geo_abs[i, c] += twice * s[GEO_ABS + c]
+                full_abs[i, c] += twice * s[FULL_ABS + c]
+                depth_iso[i, c] += twice * s[DEPTH_MEAN + c]
+            depth_iso[i, 2] += s[Z_DIRECT]

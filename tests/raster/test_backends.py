@@ -1,0 +1,205 @@
+"""Every fast back end against the float64 oracle on scenes small enough for it."""
+
+from collections.abc import Callable
+from pathlib import Path
+from typing import NamedTuple
+
+import numpy as np
+import pytest
+import torch
+
+from swimm3r.raster import Backend, MediumMaps, Primitives2D, RasterOutput, SggBuffers, bin_primitives, rasterize
+
+Scene = Callable[..., tuple[Primitives2D, MediumMaps]]
+VECTORS = np.load(Path(__file__).parents[1] / "data" / "uwbs_vectors.npz")
+FAST: list[Backend] = ["numba", "warp"]
+backends = pytest.mark.parametrize("backend", FAST)
+
+
+class Step(NamedTuple):
+    """Images, gradients and buffers of one forward and adjoint pass."""
+
+    out: RasterOutput
+    grads: tuple[torch.Tensor, ...]
+    sgg: SggBuffers
+
+
+def step(backend: Backend, p: Primitives2D, medium: MediumMaps, alpha_min: float = 1 / 255) -> Step:
+    """A pass with a fixed random cotangent for each of the four images; float32 except in the reference."""
+    dtype = torch.float64 if backend == "reference" else torch.float32
+    leaves = [t.to(dtype).requires_grad_() for t in (*p, *medium)]
+    height, width = medium.binf.shape[1:]
+    sgg = SggBuffers(*(b.to(dtype) for b in SggBuffers.zeros(len(p.depth))))
+    out = rasterize(
+        Primitives2D(*leaves[:6]), MediumMaps(*leaves[6:]), height, width,
+        alpha_min=alpha_min, sgg=sgg, backend=backend,
+    )  # fmt: skip
+    rng = torch.Generator().manual_seed(9)
+    cotangent = [torch.randn(image.shape, generator=rng).to(dtype) for image in out]
+    grads = torch.autograd.grad(out, leaves, cotangent)
+    return Step(RasterOutput(*(image.detach() for image in out)), grads, sgg)
+
+
+NAMES = (*Primitives2D._fields, *MediumMaps._fields)
+
+
+def assert_same_step(got: Step, expected: Step, tolerance: float = 3e-6) -> None:
+    """Images to 1e-5, gradients to `tolerance` of their norm."""
+    for name, a, b in zip(RasterOutput._fields, got.out, expected.out, strict=True):
+        torch.testing.assert_close(a.double(), b.double(), rtol=0, atol=1e-5, msg=lambda m, name=name: f"{name}: {m}")
+    pairs = [*zip(NAMES, got.grads, expected.grads, strict=True)]
+    pairs += [*zip(SggBuffers._fields, got.sgg, expected.sgg, strict=True)]
+    for name, a, b in pairs:
+        error = (a.double() - b.double()).norm()
+        assert error <= tolerance * b.double().norm() + 1e-12, f"{name}: off by {error / b.double().norm():.1e}"
+
+
+@backends
+@pytest.mark.parametrize("alpha_min", [1 / 255, 0.0])
+@pytest.mark.parametrize(("n", "height", "width"), [(60, 29, 37), (1, 5, 3), (200, 48, 64)])
+def test_a_pass_agrees_with_the_oracle(
+    backend: Backend, n: int, height: int, width: int, alpha_min: float, scene: Scene
+):
+    p, medium = scene(n, height, width)
+    assert_same_step(step(backend, p, medium, alpha_min), step("reference", p, medium, alpha_min))
+
+
+@backends
+def test_an_opaque_stack_ends_the_pixel_where_the_oracle_ends_it(backend: Backend, scene: Scene):
+    p, medium = scene(80, 20, 20)
+    p = p._replace(opacity=torch.full_like(p.opacity, 0.98), conic=p.conic / 30)
+    expected = step("reference", p, medium)
+    assert (expected.out.alpha > 0.999).any()
+    assert (expected.out.alpha < 1 - 1e-4).all()
+    assert_same_step(step(backend, p, medium), expected, 2e-5)  # R / (1 - alpha) magnifies float32's rounding 50 times
+
+
+@backends
+def test_a_capped_pair_keeps_its_colour_gradient_and_loses_its_shape_gradient(backend: Backend):
+    p = Primitives2D(
+        torch.tensor([[0.5, 0.5]]), torch.tensor([[0.01, 0.0, 0.01]]), torch.rand(1, 3), torch.tensor([1.0]),
+        torch.tensor([2.0]), torch.tensor([1.5]),
+    )  # fmt: skip
+    medium = MediumMaps(*torch.rand(3, 3, 1, 1, generator=torch.Generator().manual_seed(0)))
+    got, expected = step(backend, p, medium), step("reference", p, medium)
+    assert_same_step(got, expected)
+    grads = dict(zip(NAMES, got.grads, strict=True))
+    assert got.out.alpha.item() == pytest.approx(0.999)
+    assert grads["color"].all()
+    assert not grads["opacity"].any()
+    assert not grads["mean2d"].any()
+
+
+@backends
+def test_without_primitives_every_pixel_is_open_water(backend: Backend, scene: Scene):
+    p, medium = scene(0, 20, 33)
+    got = step(backend, p, medium)
+    torch.testing.assert_close(got.out.rgb.double(), medium.binf, rtol=0, atol=1e-6)
+    assert not got.out.alpha.any()
+    assert not got.grads[NAMES.index("beta_b")].any()
+
+
+@backends
+def test_primitives_behind_the_camera_or_outside_the_image_or_broken_change_nothing(backend: Backend, scene: Scene):
+    p, medium = scene(40, 40, 50)
+    first = Primitives2D(*(t[:20] for t in p))
+    p.depth[20:25] = -1.0
+    p.depth[25:27] = float("nan")
+    p.mean2d[27:32] += 1000
+    p.conic[32:36, 1] = 10  # not positive definite
+    p.opacity[36:38] = 0
+    p.mean2d[38:] = float("inf")
+    got, expected = step(backend, p, medium), step(backend, first, medium)
+    torch.testing.assert_close(got.out, expected.out, rtol=0, atol=0)
+    assert not any(g[20:].any() for g in got.grads[:6])
+
+
+@backends
+def test_most_tiles_may_be_empty(backend: Backend, scene: Scene):
+    p, medium = scene(3, 40, 200)
+    p.mean2d[:] = torch.tensor([100.0, 21.0], dtype=torch.float64)
+    assert_same_step(step(backend, p, medium), step("reference", p, medium))
+
+
+@backends
+def test_order_of_the_input_does_not_matter(backend: Backend, scene: Scene):
+    p, medium = scene(60, 29, 37)
+    shuffle = torch.randperm(60, generator=torch.Generator().manual_seed(2))
+    a, b = step(backend, p, medium), step(backend, Primitives2D(*(t[shuffle] for t in p)), medium)
+    torch.testing.assert_close(a.out, b.out, rtol=0, atol=0)
+    torch.testing.assert_close(a.grads[0][shuffle], b.grads[0], rtol=1e-5, atol=1e-6)
+
+
+@backends
+@pytest.mark.parametrize("case", ["px00", "px01", "px02", "px03", "px05"])
+def test_a_one_pixel_image_reproduces_the_published_pixel(backend: Backend, case: str):
+    """A centred primitive has alpha = opacity. px04 goes on below T = 1e-4, where a rasteriser ends the pixel."""
+    x = {k: torch.from_numpy(np.array(VECTORS[f"{case}_in_{k}"])).float() for k in ("alpha", "c", "z")}
+    n = len(x["alpha"])
+    p = Primitives2D(
+        torch.full((n, 2), 0.5), torch.tensor([[0.1, 0.0, 0.1]]).repeat(n, 1), x["c"], x["alpha"],
+        torch.full((n,), 2.0), x["z"],
+    )  # fmt: skip
+    medium = MediumMaps(
+        *(torch.from_numpy(VECTORS[f"{case}_in_{k}"]).float()[:, None, None] for k in ("Binf", "bB", "bD"))
+    )
+    leaves = [p.opacity.requires_grad_(), p.color.requires_grad_(), p.depth.requires_grad_(), *medium]
+    for leaf in leaves:
+        leaf.requires_grad_()
+    out = rasterize(p, medium, 1, 1, alpha_min=0.0, backend=backend)
+    for key, image in zip(("I", "J", "depth", "acc"), out, strict=True):
+        torch.testing.assert_close(
+            image.detach().flatten().double(),
+            torch.from_numpy(VECTORS[f"{case}_out_{key}"]).flatten(),
+            rtol=1e-5,
+            atol=1e-6,
+        )
+    cotangent = [
+        torch.from_numpy(np.array(VECTORS[f"{case}_in_{k}"])).float().reshape(image.shape)
+        for k, image in zip(("gI", "gJ", "gZ", "gA"), out, strict=True)
+    ]
+    grads = torch.autograd.grad(out, leaves, cotangent)
+    for key, grad in zip(("dalpha", "dc", "dz", "dBinf", "dbB", "dbD"), grads, strict=True):
+        expected = torch.from_numpy(VECTORS[f"{case}_out_{key}"])
+        torch.testing.assert_close(grad.double().reshape(expected.shape), expected, rtol=1e-4, atol=1e-5)
+
+
+@backends
+def test_bins_made_once_serve_many_calls(backend: Backend, scene: Scene):
+    p, medium = scene(60, 29, 37)
+    p, medium = Primitives2D(*(t.float() for t in p)), MediumMaps(*(t.float() for t in medium))
+    bins = bin_primitives(p, 29, 37)
+    torch.testing.assert_close(
+        rasterize(p, medium, 29, 37, bins=bins, backend=backend), rasterize(p, medium, 29, 37, backend=backend)
+    )
+    with pytest.raises(ValueError, match="bins are for 29 x 37"):
+        rasterize(p, medium, 29, 37, bins=bins, alpha_min=0.0, backend=backend)
+
+
+@backends
+def test_clear_water_shows_the_clear_image(backend: Backend, scene: Scene):
+    p, _ = scene(60, 29, 37)
+    out = rasterize(p, None, 29, 37, backend=backend)
+    torch.testing.assert_close(out.rgb, out.clear)
+    assert out.rgb.dtype == torch.float64
+
+
+@backends
+def test_the_depth_branch_alone_is_the_isolated_depth_gradient(backend: Backend, scene: Scene):
+    p, medium = scene(60, 29, 37)
+    p, medium = Primitives2D(*(t.float() for t in p)), MediumMaps(*(t.float() for t in medium))
+    weight = torch.rand(29, 37, generator=torch.Generator().manual_seed(4))
+    mean2d, depth = p.mean2d.requires_grad_(), p.depth.requires_grad_()
+    sgg = SggBuffers.zeros(60)
+    out = rasterize(p, medium, 29, 37, sgg=sgg, backend=backend)
+    ((out.z_depth * weight).sum() + out.rgb.square().sum()).backward()
+    d_mean, d_depth = torch.autograd.grad(
+        rasterize(p, medium, 29, 37, backend=backend).z_depth, (mean2d, depth), weight
+    )
+    torch.testing.assert_close(sgg.depth_iso, torch.cat([d_mean, d_depth[:, None]], 1), rtol=1e-4, atol=1e-4)
+
+
+def test_maps_of_another_size_are_refused(scene: Scene):
+    p, medium = scene(5, 8, 8)
+    with pytest.raises(ValueError, match=r"binf must have shape \(3, 8, 9\)"):
+        rasterize(p, medium, 8, 9)

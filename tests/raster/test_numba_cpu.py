@@ -1,0 +1,131 @@
+"""What only the CPU back end promises: threads do not change a bit, the inner loops are SIMD, tiles are exact."""
+
+import platform
+import re
+from collections.abc import Callable
+
+import numba
+import numpy as np
+import pytest
+import torch
+
+from swimm3r.raster import (
+    ALPHA_MIN,
+    MediumMaps,
+    Primitives2D,
+    SggBuffers,
+    bin_primitives,
+    numba_kernels,
+    numba_math,
+    rasterize,
+)
+
+Scene = Callable[..., tuple[Primitives2D, MediumMaps]]
+
+
+def float32(scene: tuple[Primitives2D, MediumMaps]) -> tuple[Primitives2D, MediumMaps]:
+    p, medium = scene
+    return Primitives2D(*(t.float() for t in p)), MediumMaps(*(t.float() for t in medium))
+
+
+def full_pass(p: Primitives2D, medium: MediumMaps) -> list[torch.Tensor]:
+    """Everything a training step reads from the rasteriser."""
+    leaves = [t.detach().requires_grad_() for t in (*p, *medium)]
+    sgg = SggBuffers.zeros(len(p.depth))
+    height, width = medium.binf.shape[1:]
+    out = rasterize(Primitives2D(*leaves[:6]), MediumMaps(*leaves[6:]), height, width, sgg=sgg)
+    rng = torch.Generator().manual_seed(1)
+    grads = torch.autograd.grad(out, leaves, [torch.randn(image.shape, generator=rng) for image in out])
+    return [*out, *grads, *sgg]
+
+
+def test_the_number_of_threads_changes_no_bit(scene: Scene):
+    p, medium = float32(scene(3000, 150, 200))
+    before = torch.get_num_threads()
+    try:
+        results = []
+        for threads in (1, 2, 3):
+            torch.set_num_threads(threads)
+            results.append(full_pass(p, medium))
+    finally:
+        torch.set_num_threads(before)
+    for other in results[1:]:
+        for a, b in zip(results[0], other, strict=True):
+            assert torch.equal(a, b)
+
+
+X86 = platform.machine() in ("x86_64", "AMD64")
+PACKED = r"\tv?(?:f\w+\d|mul|add|sub)ps\s" if X86 else r"\t(?:fml[as]|fmul|fadd|fsub)(?:\.4s\s+v\d|\s+v\d+\.4s)"
+JUMP = r"\sj\w+\s+" if X86 else r"\s(?:b\.?\w*|cbn?z\s+\w+,|tbn?z\s+\w+,[^,\n]*,)\s*"
+
+
+def packed_operations(assembly: str) -> list[int]:
+    """SIMD arithmetic instructions in each loop without a call (a block that jumps back to itself), most first."""
+    counts = []
+    for block in re.split(r"\n(?=\.?LBB\d+_\d+:)", assembly):
+        label = block.split(":", 1)[0]
+        if re.search(JUMP + re.escape(label) + r"\b", block) and not re.search(r"\t(?:call|bl)", block):
+            counts.append(len(re.findall(PACKED, block)))
+    return sorted(counts, reverse=True)
+
+
+@pytest.mark.parametrize(("kernel", "expected"), [("forward_tiles", [50, 25]), ("adjoint_tiles", [90, 30, 25])])
+def test_the_loops_over_pixels_are_simd(kernel: str, expected: list[int], scene: Scene):
+    full_pass(*float32(scene(10, 20, 20)))
+    assemblies = getattr(numba_kernels, kernel).inspect_asm()
+    assert assemblies
+    for assembly in assemblies.values():
+        found = packed_operations(assembly)
+        assert all(n >= least for n, least in zip(found, expected, strict=False)), found
+        if X86 and re.search(r"\tvfmadd", assembly):  # a machine with AVX2: 8 lanes
+            assert re.search(r"%[yz]mm", assembly)
+
+
+def test_the_guard_sees_a_loop_that_is_not_simd():
+    """libm's exp2 in place of the polynomial is the easiest way to lose the lanes."""
+
+    @numba.njit(error_model="numpy")
+    def with_libm(x, out):
+        for i in range(len(out)):
+            out[i] = np.exp2(x[i]) * np.log2(x[i]) + np.sin(x[i])
+
+    with_libm(np.ones(8, np.float32), np.zeros(8, np.float32))
+    (assembly,) = with_libm.inspect_asm().values()
+    assert max(packed_operations(assembly), default=0) < 3
+
+
+def test_every_covered_pixel_is_in_a_tile_list_and_every_listed_tile_is_touched(scene: Scene):
+    p, _ = float32(scene(200, 70, 90))
+    bins = bin_primitives(p, 70, 90)
+    listed = {(t, int(i)) for t in range(30) for i in bins.ids[bins.tile_start[t] : bins.tile_start[t + 1]]}
+    y, x = np.mgrid[0:70, 0:90] + 0.5
+    covered, near = set(), set()
+    r2_max = 1 - (ALPHA_MIN / p.opacity.double()) ** (1 / p.beta.double())
+    for i in range(200):
+        dx, dy = x - p.mean2d[i, 0].item(), y - p.mean2d[i, 1].item()
+        a, b, c = p.conic[i].tolist()
+        r2 = a * dx**2 + 2 * b * dx * dy + c * dy**2
+        for limit, found in ((1.0, covered), (1.6, near)):  # near: the ellipse may pass between pixel centres
+            rows, columns = np.nonzero(r2 < limit * r2_max[i].item() - (1e-5 if limit == 1 else -0.2))
+            found |= {(t, i) for t in np.unique(rows // 16 * 6 + columns // 16).tolist()}
+    assert covered <= listed <= near
+
+
+def test_tile_lists_run_front_to_back_and_slots_group_by_primitive(scene: Scene):
+    p, _ = float32(scene(200, 70, 90))
+    bins = bin_primitives(p, 70, 90)
+    for t in range(30):
+        z = p.depth[bins.ids[bins.tile_start[t] : bins.tile_start[t + 1]]]
+        assert (z.diff() >= 0).all()
+    assert torch.equal(bins.cpu.slot.sort().values, torch.arange(len(bins.ids), dtype=torch.int32))
+    owner = torch.empty_like(bins.ids)
+    owner[bins.cpu.slot.long()] = bins.ids
+    assert torch.equal(owner, bins.cpu.order.repeat_interleave(bins.cpu.first_slot.diff()))
+
+
+def test_the_polynomials_are_good_to_float32():
+    x = np.linspace(-79, 20, 20001).astype(np.float32)
+    power = np.array([numba_math.exp2(v) for v in x])
+    np.testing.assert_allclose(power, np.exp2(x.astype(float)), rtol=4e-7)
+    u = np.geomspace(1e-6, 1, 20001).astype(np.float32)
+    np.testing.assert_allclose([numba_math.log2(v) for v in u], np.log2(u.astype(float)), rtol=3e-7, atol=1e-7)
