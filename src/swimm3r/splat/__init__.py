@@ -1,0 +1,36 @@
+"""Splatting: a reconstruction in, a map that renders with its water, without it, and as depth out."""
+
+from pathlib import Path
+from tempfile import mkdtemp
+from typing import TYPE_CHECKING
+
+from swimm3r.progress import Progress, silent
+from swimm3r.splat.settings import SplatSettings, UwbsSettings
+
+if TYPE_CHECKING:
+    import swimm3r.frames
+    import swimm3r.reconstruction
+    import swimm3r.splat.rendering
+
+__all__ = ["SplatSettings", "UwbsSettings", "train"]
+
+
+def train(
+    reconstruction: "swimm3r.reconstruction.Reconstruction",
+    frames: "swimm3r.frames.Frames",
+    settings: SplatSettings | None = None,
+    folder: Path | None = None,
+    progress: Progress = silent,
+) -> "swimm3r.splat.rendering.SplatMap":
+    """A map of the reconstruction, trained on the registered of `frames.train`.
+
+    Works in `folder` (a new temporary one by default) and goes on exactly from what an interrupted call left there.
+    Raises InputError where no training frame is registered.
+    """
+    settings = settings or UwbsSettings()
+    folder = folder or Path(mkdtemp(prefix="swimm3r-splat-"))
+    match settings:
+        case UwbsSettings():
+            from swimm3r.splat.recipes import uwbs
+
+            return uwbs.train(reconstruction, frames, settings, folder, progress)

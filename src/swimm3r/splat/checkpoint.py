@@ -1,0 +1,100 @@
+"""Maps and training states on disk, as safetensors: tensors under their names, everything else in the header.
+
+map.safetensors (`schema` 1) holds the primitives as stored (before activation), the medium network, and in its header
+the recipe, its settings, the metric flag and the working unit. A checkpoint adds the optimiser's moments and the step.
+"""
+
+import json
+from dataclasses import asdict, dataclass, fields, is_dataclass
+from pathlib import Path
+from typing import Any, get_type_hints
+
+from safetensors import SafetensorError, safe_open
+from safetensors.torch import save_file
+from torch import Tensor
+
+from swimm3r.errors import InputError
+from swimm3r.io.atomic import atomic_path
+from swimm3r.splat.medium_field import MediumField
+from swimm3r.splat.primitives import BetaPrimitives
+from swimm3r.splat.rendering import SplatMap
+from swimm3r.splat.settings import UwbsSettings
+
+SCHEMA = 1
+_RECIPES = {"uwbs-static": UwbsSettings}
+
+
+@dataclass(frozen=True)
+class Stored:
+    """The tensors of a file and its header."""
+
+    tensors: dict[str, Tensor]
+    about: dict[str, Any]
+
+
+def save_map(path: Path, scene: SplatMap) -> None:
+    """Write a map, whole or not at all."""
+    tensors = {f"primitives.{name}": values for name, values in scene.primitives._asdict().items()}
+    tensors |= {f"field.{name}": values for name, values in scene.field.state_dict().items()}
+    about = {
+        "recipe": "uwbs-static",
+        "settings": asdict(scene.settings),
+        "metric": scene.metric,
+        "length": scene.length,
+    }
+    write(path, Stored(tensors, about))
+
+
+def load_map(path: Path) -> SplatMap:
+    """Read what `save_map` wrote. Raises InputError for a file that is damaged or of another kind."""
+    stored = read(path)
+    about = stored.about
+    if about.get("recipe") not in _RECIPES:
+        raise _foreign(path, f"its recipe is {about.get('recipe')!r}")
+    settings = settings_from(UwbsSettings, about["settings"])
+    try:
+        field = MediumField(settings.medium.hidden)
+        field.load_state_dict(
+            {k.removeprefix("field."): v for k, v in stored.tensors.items() if k.startswith("field.")}
+        )
+        primitives = BetaPrimitives(*(stored.tensors[f"primitives.{name}"] for name in BetaPrimitives._fields))
+    except (KeyError, RuntimeError) as error:
+        raise _foreign(path, str(error)) from error
+    return SplatMap(primitives, field.requires_grad_(False), settings, about["metric"], about["length"])
+
+
+def write(path: Path, stored: Stored) -> None:
+    """Tensors and header in one file, whole or not at all."""
+    tensors = {name: values.detach().contiguous() for name, values in stored.tensors.items()}
+    with atomic_path(path) as draft:
+        save_file(tensors, draft, {"swimm3r": json.dumps({"schema": SCHEMA, **stored.about}, sort_keys=True)})
+
+
+def read(path: Path) -> Stored:
+    """Read what `write` wrote. Raises InputError for a file that is missing, damaged or of another kind."""
+    try:
+        with safe_open(path, "pt") as file:
+            header = file.metadata() or {}
+            if "swimm3r" not in header:
+                raise _foreign(path, "it has no Swimm3R header")
+            about = json.loads(header["swimm3r"])
+            if about.get("schema") != SCHEMA:
+                raise _foreign(path, f"its schema is {about.get('schema')}, this version reads {SCHEMA}")
+            return Stored({name: file.get_tensor(name) for name in file.keys()}, about)  # noqa: SIM118
+    except (OSError, SafetensorError, ValueError) as error:
+        raise _foreign(path, str(error)) from error
+
+
+def settings_from(kind: type, values: dict[str, Any]) -> Any:
+    """A settings dataclass from its `asdict`, nested ones by their annotations."""
+    hints = get_type_hints(kind)
+    nested = {f.name: hints[f.name] for f in fields(kind) if is_dataclass(hints[f.name])}
+    return kind(**{k: settings_from(nested[k], v) if k in nested else v for k, v in values.items()})
+
+
+def _foreign(path: Path, why: str) -> InputError:
+    return InputError(
+        f"{path} is not a map that can be read: {why}.",
+        cause="the file is damaged, of another version, or of another program",
+        hint="train the map again",
+    )

@@ -1,0 +1,92 @@
+"""Primitives move to where they are needed: relocation, growth and noise (MCMC-GS; for Beta kernels uwbs.md 1.8, 5).
+
+A primitive of opacity o that is replaced by n copies in its place gives each 1 - (1 - o)^(1/n): together they block as
+much light as before, for any kernel, without touching scale or exponent.
+"""
+
+from dataclasses import dataclass
+
+import torch
+from jaxtyping import Float, Int
+from torch import Tensor
+
+from swimm3r.splat.conditioning import rotation_block
+from swimm3r.splat.primitives import BetaPrimitives, select
+
+_LARGEST = 1 - 2.0**-23
+_GATE = 100.0  # sharpness of the noise's gate around the dead opacity
+
+
+@dataclass(frozen=True)
+class Densified:
+    """The primitives after a round, and which rows of the optimiser start anew."""
+
+    primitives: BetaPrimitives
+    source: Int[Tensor, " n"]  # where each row came from
+    restarted: Int[Tensor, " m"]  # rows whose moments are zeroed
+    relocated: int
+    added: int
+
+
+def shared_opacity(opacity: Float[Tensor, "*n"], copies: Float[Tensor, "*n"], least: float) -> Float[Tensor, "*n"]:
+    """Opacity of each of `copies` primitives that take the place of one."""
+    return (1 - (1 - opacity) ** (1 / copies)).clamp(least, _LARGEST)
+
+
+def relocate_and_grow(p: BetaPrimitives, target: int, dead_opacity: float, rng: torch.Generator) -> Densified:
+    """Dead primitives take half of a live one, drawn by opacity; then more are drawn from all until `target` exist."""
+    opacity = torch.sigmoid(p.opacity)
+    n = len(opacity)
+    source = torch.arange(n)
+    dead = (opacity <= dead_opacity).nonzero()[:, 0]
+    alive = (opacity > dead_opacity).nonzero()[:, 0]
+    restarted = [torch.zeros(0, dtype=torch.int64)]
+    if len(dead) and len(alive):
+        drawn = alive[_draw(opacity[alive], len(dead), rng)]
+        opacity = _shared(opacity, drawn, dead_opacity)
+        source[dead] = drawn
+        opacity[dead] = opacity[drawn]
+        restarted.append(drawn)
+    added = max(0, target - n) if len(alive) else 0
+    if added:
+        drawn = _draw(opacity, added, rng)
+        opacity = _shared(opacity, drawn, dead_opacity)
+        source = torch.cat([source, source[drawn]])
+        opacity = torch.cat([opacity, opacity[drawn]])
+        restarted += [drawn, torch.arange(n, n + added)]
+    moved = select(p, source)
+    changed = source != torch.arange(len(source))
+    touched = torch.cat(restarted).unique()
+    raw = moved.opacity.clone()
+    rows = torch.cat([touched, changed.nonzero()[:, 0]]).unique()
+    raw[rows] = opacity[rows].logit()  # untouched rows keep their bits
+    return Densified(moved._replace(opacity=raw), source, touched, len(dead) if len(alive) else 0, added)
+
+
+def noise(p: BetaPrimitives, rate: float, dead_opacity: float, rng: torch.Generator) -> Float[Tensor, "n 3"]:
+    """Random displacement within each primitive's own shape, V11 eps, of those near death only (MCMC-GS's gate)."""
+    opacity = torch.sigmoid(p.opacity)
+    at = (opacity < dead_opacity + 0.2).nonzero()[:, 0]  # the gate is below 1e-8 beyond
+    q = select(p, at)
+    L = rotation_block(q.lower[:, :3]) * torch.nn.functional.softplus(q.scale[:, None, :3])
+    eps = (
+        torch.randn(len(at), 3, 1, generator=rng)
+        * rate
+        * torch.sigmoid(-_GATE * (opacity[at] - dead_opacity))[:, None, None]
+    )
+    moved = torch.zeros_like(p.xyz)
+    moved[at] = (L @ (L.mT @ eps))[..., 0]
+    return moved
+
+
+def _draw(weights: Float[Tensor, " n"], count: int, rng: torch.Generator) -> Int[Tensor, " count"]:
+    """Rows drawn with replacement; by the cumulative sum, as torch.multinomial stops at 2^24 categories."""
+    edges = weights.double().cumsum(0)
+    return torch.searchsorted(edges, torch.rand(count, generator=rng, dtype=torch.float64) * edges[-1]).clamp(
+        max=len(weights) - 1
+    )
+
+
+def _shared(opacity: Float[Tensor, " n"], drawn: Int[Tensor, " m"], least: float) -> Float[Tensor, " n"]:
+    copies = torch.bincount(drawn, minlength=len(opacity)) + 1
+    return torch.where(copies > 1, shared_opacity(opacity, copies.to(opacity), least), opacity)

@@ -1,0 +1,109 @@
+"""The terms of Eq. uwbs_total, each a mean; `recipes.uwbs` weighs and adds them. Pictures are channels first."""
+
+from dataclasses import dataclass
+from typing import Any
+
+import torch
+from jaxtyping import Bool, Float
+from torch import Tensor
+from torch.nn.functional import conv2d, softplus
+
+from swimm3r.raster import RasterOutput
+from swimm3r.splat import ssim_cpu
+from swimm3r.splat.primitives import BetaPrimitives
+
+_NEAREST = 1e-3  # of the scene's unit: the least depth whose inverse is taken
+
+
+@dataclass(frozen=True)
+class Photometric:
+    """Eq. 3dgs_loss and its two parts; the parts are for the record."""
+
+    loss: Float[Tensor, ""]
+    l1: float
+    ssim: float
+
+
+def photometric(
+    render: Float[Tensor, "3 h w"], target: Float[Tensor, "3 h w"], seen: Bool[Tensor, "h w"], ssim_weight: float
+) -> Photometric:
+    """(1 - w) L1 + w (1 - SSIM) (Eq. 3dgs_loss), SSIM zero-padded; pixels not `seen` count as matched."""
+    if not bool(seen.all()):
+        target = torch.where(seen, target, render.detach())
+    if render.is_cuda or render.dtype != torch.float32:
+        l1, ssim = (render - target).abs().mean(), mean_ssim(render, target)
+        loss = (1 - ssim_weight) * l1 + ssim_weight * (1 - ssim)
+        return Photometric(loss, float(l1.detach()), float(ssim.detach()))
+    l1, ssim, gradient = ssim_cpu.photometric(render, target, ssim_weight)
+    value = torch.tensor((1 - ssim_weight) * l1 + ssim_weight * (1 - ssim))
+    gradient = torch.where(seen, gradient, 0.0)
+    return Photometric(_KnownGradient.apply(render, value, gradient), l1, ssim)
+
+
+class _KnownGradient(torch.autograd.Function):
+    """A value whose gradient has been computed along with it."""
+
+    @staticmethod
+    def forward(ctx: Any, x: Tensor, value: Tensor, gradient: Tensor) -> Tensor:
+        ctx.save_for_backward(gradient)
+        return value.clone()
+
+    @staticmethod
+    @torch.autograd.function.once_differentiable
+    def backward(ctx: Any, *cotangents: Tensor) -> tuple[Tensor | None, ...]:
+        (gradient,) = ctx.saved_tensors
+        return cotangents[0] * gradient, None, None
+
+
+def mean_ssim(x: Float[Tensor, "3 h w"], y: Float[Tensor, "3 h w"]) -> Float[Tensor, ""]:
+    """Mean SSIM, 11 x 11 Gaussian window of sigma 1.5, zero padding, in torch operations: the oracle of `ssim_cpu`."""
+    offsets = torch.arange(ssim_cpu.WINDOW, dtype=x.dtype, device=x.device) - ssim_cpu.HALF
+    weights = torch.exp(-0.5 * (offsets / ssim_cpu.SIGMA) ** 2)
+    window = torch.outer(weights, weights)[None, None] / weights.sum() ** 2
+
+    def blur(v: Tensor) -> Tensor:
+        return conv2d(v[:, None], window, padding=ssim_cpu.HALF)[:, 0]
+
+    mx, my = blur(x), blur(y)
+    sx, sy, sxy = blur(x * x) - mx * mx, blur(y * y) - my * my, blur(x * y) - mx * my
+    C1, C2 = float(ssim_cpu.C1), float(ssim_cpu.C2)
+    S = (2 * mx * my + C1) * (2 * sxy + C2) / ((mx * mx + my * my + C1) * (sx + sy + C2))
+    return S.mean()
+
+
+def mean_opacity(p: BetaPrimitives) -> Float[Tensor, ""]:
+    """L_opa (Eq. mcmc_reg): what keeps primitives that explain nothing from living on."""
+    return torch.sigmoid(p.opacity).mean()
+
+
+def mean_scale(p: BetaPrimitives) -> Float[Tensor, ""]:
+    """L_scale (Eq. mcmc_reg), of the spatial scales of all primitives; UBS's code takes three primitives by a slip."""
+    return softplus(p.scale[:, :3]).mean()
+
+
+def oversize(p: BetaPrimitives, radius: Float[Tensor, " n"], limit: float) -> Float[Tensor, ""]:
+    """L_rad (Eq. radius_reg): mean spatial scale of the primitives whose radius exceeds `limit` pixels, 0 for none."""
+    large = (radius > limit).nonzero()[:, 0]
+    if not len(large):
+        return p.scale.new_zeros(())
+    return softplus(p.scale[large, :3]).mean()
+
+
+def depth_error(
+    images: RasterOutput,
+    z_depth: Float[Tensor, "h w"],
+    weight: Float[Tensor, "h w"],
+    least_alpha: float,
+) -> Float[Tensor, ""]:
+    """L_depth (Eq. depth_reg): mean of w log(1 + |1/D^ - 1/D|) over pixels of known depth that the map covers.
+
+    D^ is the expected depth. `weight` is the edge-aware weight, 0 where the prior is unknown.
+    """
+    valid = (weight > 0) & (images.alpha.detach() > least_alpha)
+    at = valid.flatten().nonzero()[:, 0]
+    if not len(at):
+        return images.z_depth.new_zeros(())
+    alpha, total = images.alpha.flatten()[at], images.z_depth.flatten()[at]
+    prior = z_depth.flatten()[at].clamp(min=_NEAREST)
+    rendered = (total / alpha).clamp(min=_NEAREST)
+    return (weight.flatten()[at] * torch.log1p((1 / rendered - 1 / prior).abs())).mean()

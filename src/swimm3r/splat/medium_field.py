@@ -1,0 +1,148 @@
+"""The water as a field over ray directions: A_phi of Eq. ambient_medium.
+
+    (Binf, beta_B, beta_D)(u) = sigma_med[A_phi(SH(d(u)))]
+
+SH are the real spherical harmonics of degrees 0..3 of the pixel's unit ray in world axes, A_phi a 1x1 convolutional
+network with ReLU hidden layers, sigma_med a sigmoid for Binf and a softplus for the betas, which are per unit of ray
+depth. The field is smooth, so it is evaluated on a grid of pixels and interpolated in between (stride 1 is exact).
+"""
+
+import math
+from dataclasses import dataclass
+
+import torch
+from jaxtyping import Float
+from torch import Tensor, nn
+from torch.nn.functional import interpolate, sigmoid, softplus
+
+from swimm3r.medium import Medium
+from swimm3r.raster import MediumMaps
+from swimm3r.splat.primitives import inverse_softplus
+from swimm3r.splat.projection import Pinhole
+from swimm3r.splat.settings import MediumFieldSettings
+
+HARMONICS = 16
+
+
+class MediumField(nn.Module):
+    """The network and the unit it answers in."""
+
+    length: Tensor  # scene units per working unit; betas are divided by it
+
+    def __init__(self, hidden: int) -> None:
+        super().__init__()
+        self.network = nn.Sequential(
+            nn.Conv2d(HARMONICS, hidden, 1),
+            nn.ReLU(),
+            nn.Conv2d(hidden, hidden, 1),
+            nn.ReLU(),
+            nn.Conv2d(hidden, 9, 1),
+        )
+        self.register_buffer("length", torch.ones(()))
+
+    def forward(self, directions: Float[Tensor, "h w 3"]) -> Float[Tensor, "9 h w"]:
+        """Binf, beta_B and beta_D, in this order, of unit directions in world axes."""
+        raw = self.network(spherical_harmonics(directions).permute(2, 0, 1)[None])[0]
+        return torch.cat([sigmoid(raw[:3]), softplus(raw[3:]) / self.length])
+
+
+@dataclass(frozen=True)
+class FieldGrid:
+    """The field on a grid of one camera's pixels, corners included."""
+
+    values: Float[Tensor, "9 gh gw"]
+    step: tuple[float, float]  # pixels between neighbours, down and right
+
+
+def initial_field(medium: Medium | None, settings: MediumFieldSettings, rng: torch.Generator) -> MediumField:
+    """A field that is `medium` (coefficients per working unit) in every direction; without one, grey and thin water."""
+    field = MediumField(settings.hidden)
+    with torch.no_grad():
+        for layer in field.network:
+            if isinstance(layer, nn.Conv2d):
+                bound = 1 / math.sqrt(layer.in_channels)  # torch's own default, but from our generator
+                layer.weight.uniform_(-bound, bound, generator=rng)
+                assert layer.bias is not None
+                layer.bias.uniform_(-bound, bound, generator=rng)
+        grey = torch.full((3,), 0.5)
+        start = medium or Medium(grey, torch.full((3,), settings.prior), torch.full((3,), settings.prior))
+        last = field.network[-1]
+        assert isinstance(last, nn.Conv2d)
+        assert last.bias is not None
+        last.weight.zero_()  # the last layer learns first, from the medium as it is
+        betas = torch.cat([start.beta_B, start.beta_D]).float().clamp(min=1e-3)
+        last.bias.copy_(torch.cat([start.Binf.float().clamp(0.01, 0.99).logit(), inverse_softplus(betas)]))
+    return field
+
+
+def grid_of(field: MediumField, view: Pinhole, stride: int) -> FieldGrid:
+    """The field on about every stride-th pixel of a view; its pose may carry a gradient."""
+    rows, columns = (max(2, math.ceil((size - 1) / stride) + 1) for size in (view.height, view.width))
+    y = torch.linspace(0.5, view.height - 0.5, rows, device=view.R.device)
+    x = torch.linspace(0.5, view.width - 0.5, columns, device=view.R.device)
+    rays = torch.stack(
+        [
+            ((x - view.cx) / view.fx).expand(rows, columns),
+            ((y - view.cy) / view.fy)[:, None].expand(rows, columns),
+            torch.ones(rows, columns, device=view.R.device),
+        ],
+        -1,
+    )
+    directions = torch.nn.functional.normalize(rays @ view.R, dim=-1)  # R^T to the world
+    step = ((view.height - 1) / (rows - 1), (view.width - 1) / (columns - 1))
+    return FieldGrid(field(directions.to(field.length)), step)
+
+
+def medium_at_pixels(grid: FieldGrid, height: int, width: int) -> MediumMaps:
+    """The field at every pixel, betas per unit of ray depth."""
+    if grid.values.shape[1:] != (height, width):
+        maps = interpolate(grid.values[None], (height, width), mode="bilinear", align_corners=True)[0]
+    else:
+        maps = grid.values
+    return MediumMaps(maps[:3], maps[3:6], maps[6:])
+
+
+def per_z_depth(maps: MediumMaps, view: Pinhole) -> MediumMaps:
+    """Betas for a rasteriser that blends z depth: times the length of the pixel's ray at z = 1, which is exact."""
+    x = (torch.arange(view.width, device=maps.binf.device) + 0.5 - view.cx) / view.fx
+    y = (torch.arange(view.height, device=maps.binf.device) + 0.5 - view.cy) / view.fy
+    length = (1 + x * x + (y * y)[:, None]).sqrt().to(maps.binf)
+    return MediumMaps(maps.binf, maps.beta_b * length, maps.beta_d * length)
+
+
+def smoothness(grid: FieldGrid) -> Float[Tensor, ""]:
+    """L_smooth (Eq. medium_smooth): mean absolute difference of neighbouring pixels, down plus right, of all nine maps.
+
+    Along an interpolated edge the differences between pixels add up to those between grid points, so those over the
+    step have the same mean wherever neighbouring edges slope the same way.
+    """
+    down, right = grid.values.diff(dim=1), grid.values.diff(dim=2)
+    return down.abs().mean() / grid.step[0] + right.abs().mean() / grid.step[1]
+
+
+def spherical_harmonics(d: Float[Tensor, "*n 3"]) -> Float[Tensor, "*n 16"]:
+    """Real orthonormal spherical harmonics of degrees 0..3 of unit vectors."""
+    x, y, z = d.unbind(-1)
+    xx, yy, zz = x * x, y * y, z * z
+    pi = math.pi
+    return torch.stack(
+        [
+            torch.full_like(x, 0.5 / math.sqrt(pi)),
+            math.sqrt(3 / (4 * pi)) * y,
+            math.sqrt(3 / (4 * pi)) * z,
+            math.sqrt(3 / (4 * pi)) * x,
+            0.5 * math.sqrt(15 / pi) * x * y,
+            0.5 * math.sqrt(15 / pi) * y * z,
+            0.25 * math.sqrt(5 / pi) * (3 * zz - 1),
+            0.5 * math.sqrt(15 / pi) * x * z,
+            0.25 * math.sqrt(15 / pi) * (xx - yy),
+            0.25 * math.sqrt(35 / (2 * pi)) * y * (3 * xx - yy),
+            0.5 * math.sqrt(105 / pi) * x * y * z,
+            0.25 * math.sqrt(21 / (2 * pi)) * y * (5 * zz - 1),
+            0.25 * math.sqrt(7 / pi) * z * (5 * zz - 3),
+            0.25 * math.sqrt(21 / (2 * pi)) * x * (5 * zz - 1),
+            0.25 * math.sqrt(105 / pi) * z * (xx - yy),
+            0.25 * math.sqrt(35 / (2 * pi)) * x * (xx - 3 * yy),
+        ],
+        -1,
+    )

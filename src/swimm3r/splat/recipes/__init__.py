@@ -1,0 +1,1 @@
+"""What each published method trains: its losses and its schedule."""

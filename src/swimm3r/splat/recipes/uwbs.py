@@ -1,0 +1,217 @@
+"""Underwater Beta Splatting, static: the objective of Eq. uwbs_total, its schedule, and one step of it.
+
+L = L_3DGS + lambda_opa L_opa + lambda_scale L_scale + lambda_depth L_depth + lambda_smooth L_smooth + lambda_rad L_rad
+"""
+
+import hashlib
+import json
+import math
+from dataclasses import asdict, dataclass
+from pathlib import Path
+
+import torch
+from torch import Tensor
+
+from swimm3r.frames import Frames
+from swimm3r.medium import Medium
+from swimm3r.progress import Progress, silent
+from swimm3r.reconstruction import Reconstruction
+from swimm3r.splat import checkpoint, densify, losses, training
+from swimm3r.splat.medium_field import MediumField, initial_field, smoothness
+from swimm3r.splat.optimiser import Moments, adam_step, fresh, log_linear
+from swimm3r.splat.primitives import BetaPrimitives, initial_primitives, rescaled
+from swimm3r.splat.projection import pinhole
+from swimm3r.splat.rendering import Drawing, SplatMap, draw
+from swimm3r.splat.settings import UwbsSettings
+from swimm3r.splat.views import TrainingViews, View, working_scale
+
+
+@dataclass(frozen=True)
+class State:
+    """Primitives, water, and the optimiser's memory of both."""
+
+    primitives: BetaPrimitives
+    field: MediumField
+    moments: dict[str, Moments]  # of "xyz" ... and of the field's parameters by "field.*"
+
+
+@dataclass(frozen=True)
+class Uwbs:
+    """The recipe for one scene (`training.Recipe`)."""
+
+    settings: UwbsSettings
+    rec: Reconstruction
+    scale: float  # working units per scene unit
+    radius: float  # of the cameras' path, working units
+
+    def start(self) -> State:
+        """Primitives on the cloud, and the reconstruction's water in every direction."""
+        settings = self.settings
+        p = initial_primitives(self.rec, settings.initial, training.generator(settings.seed, 0, 2))
+        p = BetaPrimitives(*(values.contiguous() for values in rescaled(p, self.scale)))
+        medium = None
+        if self.rec.medium is not None:
+            fit = self.rec.medium.medium
+            medium = Medium(fit.Binf, fit.beta_D / self.scale, fit.beta_B / self.scale)
+        field = initial_field(medium, settings.medium, training.generator(settings.seed, 0, 3))
+        return State(p, field, {name: fresh(values) for name, values in _parameters(p, field).items()})
+
+    def step(self, state: State, view: View, step: int) -> tuple[State, dict[str, float]]:
+        """One view: forward, adjoint, densification on its cadence, Adam."""
+        settings, share = self.settings, step / self.settings.iterations
+        parameters = _parameters(state.primitives, state.field)
+        p = BetaPrimitives(*(values.detach().requires_grad_() for values in state.primitives))
+        drawing = draw(p, state.field, pinhole(view.camera), settings)
+        loss, numbers = objective(p, drawing, view, settings, self._regularised(share))
+        leaves = [*p, *state.field.network.parameters()]
+        gradients = dict(zip(parameters, torch.autograd.grad(loss, leaves, materialize_grads=True), strict=True))
+        numbers |= {"primitives": float(len(p.xyz))}
+        rates = self._rates(step)
+        if self._densifies(step):
+            state, gradients, counts = self._densified(state, gradients, step, rates["xyz"])
+            numbers |= counts
+        _clip_field(gradients)
+        with torch.no_grad():
+            adam_step(_parameters(state.primitives, state.field), gradients, state.moments, rates)
+        return state, numbers
+
+    def stored(self, state: State) -> dict[str, Tensor]:
+        """Parameters by name; their moments after .first, .second and .steps."""
+        tensors = {f"parameter.{name}": t for name, t in _parameters(state.primitives, state.field).items()}
+        for name, m in state.moments.items():
+            tensors |= {f"first.{name}": m.first, f"second.{name}": m.second, f"steps.{name}": m.steps}
+        return tensors
+
+    def restored(self, tensors: dict[str, Tensor]) -> State:
+        """The inverse of `stored`."""
+        field = MediumField(self.settings.medium.hidden)
+        names = [key.removeprefix("parameter.") for key in tensors if key.startswith("parameter.")]
+        with torch.no_grad():
+            for name, parameter in field.network.named_parameters():
+                parameter.copy_(tensors[f"parameter.field.{name}"])
+        p = BetaPrimitives(*(tensors[f"parameter.{name}"] for name in BetaPrimitives._fields))
+        moments = {k: Moments(tensors[f"first.{k}"], tensors[f"second.{k}"], tensors[f"steps.{k}"]) for k in names}
+        return State(p, field, {name: moments[name] for name in _parameters(p, field)})
+
+    def _regularised(self, share: float) -> bool:
+        return self.settings.densify.begin < share <= self.settings.densify.end
+
+    def _every(self) -> int:
+        d = self.settings.densify
+        return max(d.min_every, round(d.every * self.settings.iterations))
+
+    def _densifies(self, step: int) -> bool:
+        return step % self._every() == 0 and self._regularised(step / self.settings.iterations)
+
+    def _rates(self, step: int) -> dict[str, float]:
+        r, share = self.settings.rates, step / self.settings.iterations
+        rates = {name: getattr(r, name) for name in BetaPrimitives._fields}
+        rates["xyz"] = self.radius * log_linear(r.xyz, r.xyz_end, share)
+        medium = log_linear(r.medium, r.medium_end, share)
+        return rates | {name: medium for name in _FIELD_NAMES}
+
+    def _densified(
+        self, state: State, gradients: dict[str, Tensor], step: int, rate: float
+    ) -> tuple[State, dict[str, Tensor], dict[str, float]]:
+        """Relocation and growth, then noise; rows that start anew get no gradient of this step."""
+        d = self.settings.densify
+        n = len(state.primitives.xyz)
+        growth = d.growth ** (self._every() / (d.every * self.settings.iterations))
+        target = max(n, min(d.max_primitives, int(growth * n)))
+        rng = training.generator(self.settings.seed, step, 4)
+        with torch.no_grad():
+            done = densify.relocate_and_grow(state.primitives, target, d.dead_opacity, rng)
+            p = done.primitives
+            p = p._replace(xyz=p.xyz + densify.noise(p, d.noise * rate, d.dead_opacity, rng))
+            moments, gradients = dict(state.moments), dict(gradients)
+            appended = len(p.xyz) - n
+            stale = torch.cat(
+                [done.restarted, (done.source != torch.arange(len(done.source))).nonzero()[:, 0]]
+            ).unique()
+            for name in BetaPrimitives._fields:
+                m = moments[name]
+                first, second = _extended(m.first, appended), _extended(m.second, appended)
+                gradient = _extended(gradients[name], appended)
+                first[done.restarted], second[done.restarted] = 0, 0  # as UBS: sources and copies, not the slots reused
+                gradient[stale] = 0
+                moments[name], gradients[name] = Moments(first, second, m.steps), gradient
+        counts = {"relocated": float(done.relocated), "added": float(done.added)}
+        return State(p, state.field, moments), gradients, counts
+
+
+def objective(
+    p: BetaPrimitives, drawing: Drawing, view: View, settings: UwbsSettings, regularised: bool
+) -> tuple[Tensor, dict[str, float]]:
+    """Eq. uwbs_total, and its terms unweighted. Opacity and scale count only while `regularised`."""
+    w = settings.weights
+    photo = losses.photometric(drawing.images.rgb, view.rgb, view.seen, w.ssim)
+    depth = losses.depth_error(drawing.images, view.z_depth, view.depth_weight, w.depth_alpha)
+    smooth = smoothness(drawing.grid)
+    large = losses.oversize(p, drawing.projection.radius, w.max_radius * view.camera.width / 1280)
+    total = photo.loss + w.depth * depth + w.medium_smoothness * smooth + w.radius * large
+    numbers = {"l1": photo.l1, "ssim": photo.ssim, "depth": depth, "medium_smoothness": smooth, "radius": large}
+    if regularised:
+        opacity, scale = losses.mean_opacity(p), losses.mean_scale(p)
+        total = total + w.opacity * opacity + w.scale * scale
+        numbers |= {"opacity": opacity, "scale": scale}
+    return total, {"loss": float(total.detach())} | {k: float(torch.as_tensor(v).detach()) for k, v in numbers.items()}
+
+
+def train(
+    rec: Reconstruction, frames: Frames, settings: UwbsSettings, folder: Path, progress: Progress = silent
+) -> SplatMap:
+    """Train a map in `folder`: checkpoint/, metrics.jsonl, and at the end map.safetensors, in the scene's own unit."""
+    scale = working_scale(rec, settings)
+    views = TrainingViews(rec, frames, settings, scale)
+    recipe = Uwbs(settings, rec, scale, path_radius(rec, scale, settings.working_depth))
+    final = training.run(recipe, views, _schedule(settings, rec, views), folder, progress)
+    field = MediumField(settings.medium.hidden)
+    field.load_state_dict(final.field.state_dict())
+    field.length.fill_(1 / scale)
+    primitives = BetaPrimitives(*(values.detach().clone() for values in rescaled(final.primitives, 1 / scale)))
+    scene = SplatMap(primitives, field.requires_grad_(False), settings, rec.metric, 1 / scale)
+    checkpoint.save_map(folder / "map.safetensors", scene)
+    return scene
+
+
+def path_radius(rec: Reconstruction, scale: float, working_depth: float) -> float:
+    """1.1 times the largest distance of a camera from their mean, working units (UBS); a third of the depth at least.
+
+    The floor keeps a camera that hardly moves from freezing its scene.
+    """
+    centres = rec.cameras.centres
+    spread = float(torch.linalg.vector_norm(centres - centres.mean(0), dim=-1).max())
+    return max(1.1 * spread * scale, working_depth / 3)
+
+
+_FIELD_NAMES = tuple(f"field.{name}" for name, _ in MediumField(1).network.named_parameters())
+
+
+def _parameters(p: BetaPrimitives, field: MediumField) -> dict[str, Tensor]:
+    of_field: dict[str, Tensor] = {f"field.{name}": t for name, t in field.network.named_parameters()}
+    return {**p._asdict(), **of_field}
+
+
+def _extended(rows: Tensor, count: int) -> Tensor:
+    return torch.cat([rows, rows.new_zeros(count, *rows.shape[1:])])
+
+
+def _clip_field(gradients: dict[str, Tensor]) -> None:
+    """The field's gradient is held to a norm of 1e-3 (WaterSplatting)."""
+    of_field = [gradients[name] for name in _FIELD_NAMES]
+    norm = float(torch.stack([g.norm() for g in of_field]).norm())
+    if norm > 1e-3:
+        for g in of_field:
+            g.mul_(1e-3 / norm)
+
+
+def _schedule(settings: UwbsSettings, rec: Reconstruction, views: TrainingViews) -> training.Schedule:
+    everything = [asdict(settings), views.names, rec.cameras.cam2world.tolist(), rec.cameras.K.tolist()]
+    digest = hashlib.sha256(json.dumps(everything, sort_keys=True).encode()).hexdigest()[:16]
+    return training.Schedule(
+        iterations=settings.iterations,
+        log_every=max(1, math.ceil(settings.log_every * settings.iterations)),
+        checkpoint_every=max(1, math.ceil(settings.checkpoint_every * settings.iterations)),
+        seed=settings.seed,
+        fingerprint=digest,
+    )

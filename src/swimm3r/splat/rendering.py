@@ -1,0 +1,100 @@
+"""A trained map and its pictures: with the water, without it, the water alone, and depth."""
+
+from dataclasses import dataclass, replace
+
+import torch
+from jaxtyping import Float
+from torch import Tensor
+
+from swimm3r.cameras import Cameras
+from swimm3r.medium import Medium
+from swimm3r.raster import RasterOutput, rasterize
+from swimm3r.splat.medium_field import FieldGrid, MediumField, grid_of, medium_at_pixels, per_z_depth
+from swimm3r.splat.primitives import BetaPrimitives
+from swimm3r.splat.projection import Pinhole, Projection, pinhole, project
+from swimm3r.splat.settings import UwbsSettings
+
+_SEEN = 1e-3  # alpha below which a pixel has no depth
+
+
+@dataclass(frozen=True)
+class RenderOutput:
+    """One view of a map."""
+
+    rgb: Float[Tensor, "h w 3"]  # as the camera sees it
+    clear: Float[Tensor, "h w 3"]  # J, without the water
+    veil: Float[Tensor, "h w 3"]  # Binf V, the light of the water alone (Eq. ugs_veil)
+    z_depth: Float[Tensor, "h w"]  # expected, scene units; 0 where nothing is
+    alpha: Float[Tensor, "h w"]
+    medium: Medium  # per pixel, [h, w, 3], per scene unit of ray depth
+
+
+@dataclass(frozen=True)
+class SplatMap:
+    """Primitives and water of one scene, in the unit and axes of its reconstruction."""
+
+    primitives: BetaPrimitives
+    field: MediumField
+    settings: UwbsSettings
+    metric: bool
+    length: float = 1.0  # scene units per working unit (`settings.py`)
+
+    def render(self, camera: Cameras) -> RenderOutput:
+        """The view of one pinhole camera, without gradient. Raises ValueError where the camera has distortion."""
+        with torch.no_grad():
+            return render(self, camera)
+
+
+@dataclass(frozen=True)
+class Drawing:
+    """A view as the rasteriser makes it, channels first, with what the losses need."""
+
+    images: RasterOutput
+    projection: Projection
+    grid: FieldGrid
+
+
+def draw(p: BetaPrimitives, field: MediumField, view: Pinhole, settings: UwbsSettings) -> Drawing:
+    """Project, evaluate the water and rasterise; differentiable in everything, the pose included."""
+    projection = project(p, view, settings.render)
+    grid = grid_of(field, view, settings.medium.stride)
+    maps = medium_at_pixels(grid, view.height, view.width)
+    if settings.render.depth == "ray":
+        maps = per_z_depth(maps, view)
+    images = rasterize(projection.primitives, maps, view.height, view.width, alpha_min=settings.render.alpha_min)
+    return Drawing(images, projection, grid)
+
+
+def expected_z_depth(images: RasterOutput) -> Float[Tensor, "h w"]:
+    """Mean z depth of what a pixel shows; 0 where it shows nothing but water."""
+    return torch.where(images.alpha > _SEEN, images.z_depth / images.alpha.clamp(min=_SEEN), 0.0)
+
+
+def in_scene_units(settings: UwbsSettings, length: float) -> UwbsSettings:
+    """Settings whose lengths are scene units instead of working units."""
+    return replace(settings, render=replace(settings.render, near=settings.render.near * length))
+
+
+def render(scene: SplatMap, camera: Cameras) -> RenderOutput:
+    """One view of a map. Raises ValueError where the camera has distortion or is more than one."""
+    settings = in_scene_units(scene.settings, scene.length)
+    view = pinhole(camera)
+    projected = project(scene.primitives, view, settings.render).primitives
+    medium = medium_at_pixels(grid_of(scene.field, view, settings.medium.stride), view.height, view.width)
+    maps = per_z_depth(medium, view) if settings.render.depth == "ray" else medium
+    height, width, alpha_min = view.height, view.width, settings.render.alpha_min
+    images = rasterize(projected, maps, height, width, alpha_min=alpha_min)
+    black = projected._replace(color=torch.zeros_like(projected.color))
+    veil = rasterize(black, maps, height, width, alpha_min=alpha_min).rgb
+    return RenderOutput(
+        rgb=images.rgb.permute(1, 2, 0),
+        clear=images.clear.permute(1, 2, 0),
+        veil=veil.permute(1, 2, 0),
+        z_depth=expected_z_depth(images),
+        alpha=images.alpha,
+        medium=Medium(
+            Binf=medium.binf.permute(1, 2, 0),
+            beta_D=medium.beta_d.permute(1, 2, 0),
+            beta_B=medium.beta_b.permute(1, 2, 0),
+        ),
+    )

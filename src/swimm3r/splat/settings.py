@@ -1,0 +1,141 @@
+"""Every number of a map's training, with its reason; torch-free, so that --help is instant.
+
+Windows and cadences are fractions of `iterations`, exact at the paper's 20,000. Lengths are in working units: metres,
+or, where the reconstruction has no scale, a third of its median depth (`working_depth`).
+"""
+
+from dataclasses import dataclass, field
+from typing import Literal
+
+
+@dataclass(frozen=True)
+class RenderSettings:
+    """How a primitive meets a camera."""
+
+    depth: Literal["ray", "z"] = "ray"
+    """The depth that attenuates: along the ray (exact), or along the optical axis as WaterSplatting and UBS have it."""
+    alpha_min: float = 1 / 255
+    """Pairs fainter than this are skipped; 0 for parity with the papers, which skip nothing."""
+    near: float = 0.01
+    """Primitives nearer than this z depth are not drawn."""
+    covariance: Literal["symmetric", "upper"] = "symmetric"
+    """The conditional covariance is not symmetric: its mean with its transpose, or its upper triangle as UBS has it."""
+    rotation: Literal["first_order", "exponential"] = "first_order"
+    """I + A as UBS has it, or the rotation exp(A)."""
+
+
+@dataclass(frozen=True)
+class InitialSettings:
+    """The primitives and the water that training starts from."""
+
+    primitives: int = 400_000
+    """Points of the restored cloud that become primitives, one per voxel."""
+    directions: Literal["mean", "uniform"] = "mean"
+    """Mean of the conditioned direction: that of the frames which see the point, or drawn from a cube as UBS does,
+    which hides 9 of 10 primitives in any one view."""
+    scale: float = 1.0
+    """Spatial scale, in root mean square distances to the 3 nearest neighbours."""
+    opacity: float = 0.5
+    max_views: int = 64
+    """Frames asked whether they see a point."""
+
+
+@dataclass(frozen=True)
+class MediumFieldSettings:
+    """The ambient field A_phi of Eq. ambient_medium."""
+
+    hidden: int = 128  # two hidden layers of WaterSplatting's width
+    stride: int = 8
+    """Pixels between the directions at which the field is evaluated; between them its maps are interpolated."""
+    prior: float = 0.3
+    """Beta per working unit where the reconstruction has no medium."""
+
+
+@dataclass(frozen=True)
+class LearningRates:
+    """Of Adam (eps 1e-15), UBS's values; positions and the medium decay log-linearly over the run."""
+
+    xyz: float = 1.6e-4
+    """Times the scene's radius, as is its end."""
+    xyz_end: float = 1.6e-6
+    query_mean: float = 1e-3
+    rgb: float = 1e-3
+    opacity: float = 5e-2
+    beta: float = 1e-3
+    scale: float = 5e-3
+    lower: float = 1e-3
+    medium: float = 1e-3
+    medium_end: float = 1.5e-4
+
+
+@dataclass(frozen=True)
+class LossWeights:
+    """Eq. uwbs_total."""
+
+    ssim: float = 0.2
+    opacity: float = 0.01
+    scale: float = 0.01
+    depth: float = 0.1
+    medium_smoothness: float = 1.0
+    radius: float = 0.1
+    max_radius: float = 256.0
+    """Projected radius, pixels of a 1280 pixel wide picture, beyond which a primitive counts as veil."""
+    depth_confidence: float = 0.3
+    """Least confidence of a depth that regularises."""
+    depth_alpha: float = 0.5
+    """Least alpha of a pixel whose depth is regularised."""
+
+
+@dataclass(frozen=True)
+class DensifySettings:
+    """Relocation, growth and noise of the primitives (MCMC-GS, for Beta kernels as UBS has it)."""
+
+    max_primitives: int = 800_000
+    begin: float = 0.025  # 500 of 20,000
+    end: float = 0.5  # 10,000 of 20,000; opacity and scale are regularised in the same window
+    every: float = 0.005  # 100 of 20,000
+    min_every: int = 20
+    """Fewest steps between two rounds, whatever `every` says; growth is made up for."""
+    growth: float = 1.02
+    """Per round at `every`."""
+    dead_opacity: float = 0.005
+    noise: float = 1e6
+    """UBS's rate for static scenes, times the positions' learning rate."""
+
+
+@dataclass(frozen=True)
+class UwbsSettings:
+    """Underwater Beta Splatting, static."""
+
+    iterations: int = 20_000
+    long_side: int = 1600
+    """Longer side of the training pictures, pixels; they are never enlarged."""
+    working_depth: float = 3.0
+    """Median depth, working units, that a scene without metric scale is given while it is trained."""
+    initial: InitialSettings = field(default_factory=InitialSettings)
+    render: RenderSettings = field(default_factory=RenderSettings)
+    medium: MediumFieldSettings = field(default_factory=MediumFieldSettings)
+    rates: LearningRates = field(default_factory=LearningRates)
+    weights: LossWeights = field(default_factory=LossWeights)
+    densify: DensifySettings = field(default_factory=DensifySettings)
+    seed: int = 0
+    log_every: float = 0.005
+    checkpoint_every: float = 0.1
+
+
+@dataclass(frozen=True)
+class PoseRefinementSettings:
+    """A camera refined against a frozen map (3R-GS's protocol for test frames, with the paper's 300 steps)."""
+
+    steps: int = 300
+    rate: float = 8e-4
+    """Of Adam, for a rotation in the 6D form and a translation in working units; decays to 1 %."""
+    long_side: int = 240
+    """Longer side of the picture the pose is refined on."""
+    edge: float = 4.0
+    """Pixels count whose gradient exceeds this many medians."""
+    min_edges: float = 0.01
+    """Share of the picture below which every pixel counts instead."""
+
+
+SplatSettings = UwbsSettings

@@ -1,0 +1,113 @@
+"""The training loop: which view when, the record of every few steps, checkpoints, and going on where it stopped.
+
+A recipe brings the step itself. Everything random is drawn from the seed and the step, so a state needs no generators,
+and a run that was interrupted ends with the same bits as one that was not (at the same number of threads).
+"""
+
+import json
+import logging
+import time
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Protocol, TypeVar, runtime_checkable
+
+import torch
+
+from swimm3r.io.atomic import write_text
+from swimm3r.progress import Progress
+from swimm3r.splat import checkpoint
+from swimm3r.splat.views import TrainingViews, View
+
+log = logging.getLogger(__name__)
+
+State = TypeVar("State")
+
+
+@runtime_checkable  # so that the suite can check calls against it
+class Recipe(Protocol[State]):
+    """What a method brings to the loop."""
+
+    def start(self) -> State:
+        """The state before step 1."""
+        ...
+
+    def step(self, state: State, view: View, step: int) -> tuple[State, dict[str, float]]:
+        """The state after training on one view, and the numbers of the step; steps count from 1."""
+        ...
+
+    def stored(self, state: State) -> dict[str, torch.Tensor]:
+        """Everything in a state, by name."""
+        ...
+
+    def restored(self, tensors: dict[str, torch.Tensor]) -> State:
+        """The state that `stored` was made of."""
+        ...
+
+
+@dataclass(frozen=True)
+class Schedule:
+    """How long, and how often something is written."""
+
+    iterations: int
+    log_every: int
+    checkpoint_every: int
+    seed: int
+    fingerprint: str  # of settings and input: a checkpoint of another training is not continued
+
+
+def generator(seed: int, step: int, purpose: int) -> torch.Generator:
+    """The randomness of one purpose in one step."""
+    mixed = (seed * 1_000_003 + step) * 1_009 + purpose
+    return torch.Generator().manual_seed(mixed % (1 << 63))
+
+
+def view_of_step(step: int, views: int, seed: int) -> int:
+    """Each epoch visits every view once, in its own order; steps count from 1."""
+    epoch, place = divmod(step - 1, views)
+    return int(torch.randperm(views, generator=generator(seed, epoch, 1))[place])
+
+
+def run(recipe: Recipe[State], views: TrainingViews, schedule: Schedule, folder: Path, progress: Progress) -> State:
+    """Train from the checkpoint in `folder`, if there is one of this training, else from the start."""
+    path, metrics = folder / "checkpoint" / "state.safetensors", folder / "metrics.jsonl"
+    folder.mkdir(parents=True, exist_ok=True)
+    state, done = _resume(recipe, path, metrics, schedule)
+    started, cpu_started, first = time.perf_counter(), time.process_time(), done
+    averages: dict[str, list[float]] = {}
+    for step in range(done + 1, schedule.iterations + 1):
+        progress("training the map", step - 1, schedule.iterations)
+        view = views[view_of_step(step, len(views), schedule.seed)]
+        state, numbers = recipe.step(state, view, step)
+        for name, value in numbers.items():
+            averages.setdefault(name, []).append(value)
+        last = step == schedule.iterations
+        if step % schedule.log_every == 0 or last:
+            row = {"step": step} | {name: sum(v) / len(v) for name, v in averages.items()}
+            row["seconds_per_step"] = (time.perf_counter() - started) / (step - first)
+            row["cpu_seconds_per_step"] = (time.process_time() - cpu_started) / (step - first)
+            with metrics.open("a", encoding="utf-8") as file:
+                file.write(json.dumps(row) + "\n")
+            averages = {}
+        if step % schedule.checkpoint_every == 0 or last:
+            about = {"step": step, "fingerprint": schedule.fingerprint}
+            checkpoint.write(path, checkpoint.Stored(recipe.stored(state), about))
+    progress("training the map", schedule.iterations, schedule.iterations)
+    return state
+
+
+def _resume(recipe: Recipe[State], path: Path, metrics: Path, schedule: Schedule) -> tuple[State, int]:
+    """The state to go on from, and its step; rows of metrics beyond it are dropped."""
+    done = 0
+    state = None
+    if path.is_file():
+        stored = checkpoint.read(path)
+        if stored.about.get("fingerprint") == schedule.fingerprint:
+            state, done = recipe.restored(stored.tensors), stored.about["step"]
+            log.info("going on from step %d", done)
+        else:
+            log.warning("%s belongs to a training with other settings or input; starting anew", path)
+    if metrics.is_file():
+        rows = metrics.read_text(encoding="utf-8").splitlines()
+        whole = [row for row in rows if row.endswith("}") and json.loads(row)["step"] <= done]
+        write_text(metrics, "".join(row + "\n" for row in whole))
+    return (recipe.start(), 0) if state is None else (state, done)

@@ -1,0 +1,176 @@
+"""What a map is trained on: undistorted pictures of one size, their masks and depth, in working units.
+
+Every frame becomes a pinhole picture with its own K at the training size. Depth along the optical axis is the same
+number on both grids. What the frame does not show, or its mask excludes, is not `seen` and takes no part in any loss.
+"""
+
+from dataclasses import dataclass, replace
+from functools import lru_cache
+
+import numpy as np
+import torch
+from jaxtyping import Bool, Float
+from torch import Tensor
+
+from swimm3r.cameras import Cameras, distorted_grid, project, resized
+from swimm3r.errors import InputError
+from swimm3r.frames import Frames
+from swimm3r.io.cache import ArrayCache
+from swimm3r.reconstruction import Reconstruction
+from swimm3r.splat.settings import UwbsSettings
+
+
+@dataclass(frozen=True)
+class View:
+    """One training picture."""
+
+    name: str
+    camera: Cameras  # one pinhole, working units
+    rgb: Float[Tensor, "3 h w"]
+    seen: Bool[Tensor, "h w"]
+    z_depth: Float[Tensor, "h w"]  # working units, 0 = unknown
+    depth_weight: Float[Tensor, "h w"]  # edge-aware, 0 where the depth is unknown or doubtful
+
+
+class TrainingViews:
+    """The registered training frames as views; pictures are made when asked for and kept in a bounded cache."""
+
+    def __init__(self, rec: Reconstruction, frames: Frames, settings: UwbsSettings, scale: float) -> None:
+        self.rec, self.frames, self.settings, self.scale = rec, frames, settings, scale
+        train = {frame.name for frame in frames.train}
+        self.names = tuple(name for name in rec.names if name in train)
+        if not self.names:
+            raise InputError(
+                "None of the training frames is registered in the reconstruction.",
+                cause="the reconstruction was made of other pictures, or its names differ",
+                hint="the folder of pictures the reconstruction was made of",
+            )
+        self._cache = ArrayCache(max_bytes=768 << 20)
+
+    def __len__(self) -> int:
+        return len(self.names)
+
+    def __getitem__(self, k: int) -> View:
+        name = self.names[k]
+        i = self.rec.index(name)
+        lens = self.rec.cameras[i]
+        canvas = pinhole_canvas(lens, self.settings.long_side)
+
+        def make() -> tuple[np.ndarray, ...]:
+            f = self.frames.index(name)
+            rgb, seen = undistorted(self.frames.image(f), self.frames.mask(f), lens, canvas)
+            stored = (rgb * 255).round().to(torch.uint8).permute(2, 0, 1).contiguous().numpy()
+            z_depth, weight = self._depth(name, lens, canvas, rgb, seen)
+            return stored, seen.numpy(), z_depth.half().numpy(), weight.half().numpy()
+
+        rgb, seen, z_depth, weight = self._cache.get(name, make)
+        cam2world = canvas.cam2world.clone()
+        cam2world[:, :3, 3] *= self.scale
+        return View(
+            name,
+            replace(canvas, cam2world=cam2world),
+            torch.from_numpy(rgb.astype(np.float32)) / 255,
+            torch.from_numpy(seen.copy()),
+            torch.from_numpy(z_depth.astype(np.float32)),
+            torch.from_numpy(weight.astype(np.float32)),
+        )
+
+    def _depth(
+        self, name: str, lens: Cameras, canvas: Cameras, rgb: Float[Tensor, "h w 3"], seen: Bool[Tensor, "h w"]
+    ) -> tuple[Float[Tensor, "h w"], Float[Tensor, "h w"]]:
+        if name not in self.rec.depth:
+            return torch.zeros(canvas.height, canvas.width), torch.zeros(canvas.height, canvas.width)
+        depth = self.rec.depth[name]
+        column, row, _ = _grid(_key(lens), _key(canvas))
+        row = np.clip(row.round().astype(np.int64), 0, lens.height - 1)
+        column = np.clip(column.round().astype(np.int64), 0, lens.width - 1)
+        z_depth, confidence = depth.z_depth[row, column], depth.confidence[row, column]
+        known = seen & z_depth.isfinite() & (z_depth > 0) & (confidence >= self.settings.weights.depth_confidence)
+        return torch.where(known, z_depth * self.scale, 0.0), torch.where(known, edge_weight(rgb), 0.0)
+
+
+def pinhole_canvas(lens: Cameras, long_side: int) -> Cameras:
+    """The camera of a frame without its distortion, and no larger than `long_side`; 0 keeps the frame's size."""
+    scale = min(1.0, long_side / max(lens.width, lens.height)) if long_side else 1.0
+    small = resized(lens, max(2, round(lens.width * scale)), max(2, round(lens.height * scale)))
+    return replace(small, distortion=small.distortion[:, :0], model="PINHOLE")
+
+
+def undistorted(
+    picture: Float[Tensor, "h w 3"], mask: Bool[Tensor, "h w"], lens: Cameras, canvas: Cameras
+) -> tuple[Float[Tensor, "ch cw 3"], Bool[Tensor, "ch cw"]]:
+    """A frame's picture on its pinhole canvas, and which of its pixels the frame shows and its mask admits."""
+    import cv2
+
+    size = (canvas.width, canvas.height)
+    rgb, usable = picture.numpy(), mask.numpy().astype(np.float32)
+    if (lens.width, lens.height) != size:  # smaller first, by area, so that nothing aliases
+        rgb = cv2.resize(rgb, size, interpolation=cv2.INTER_AREA)
+        usable = cv2.resize(usable, size, interpolation=cv2.INTER_AREA)
+        lens = resized(lens, *size)
+    if lens.distortion.numel() and bool(lens.distortion.any()):
+        column, row, inside = _grid(_key(lens), _key(canvas))
+        rgb = cv2.remap(rgb, column, row, cv2.INTER_LINEAR, borderMode=cv2.BORDER_REPLICATE)
+        usable = cv2.remap(usable, column, row, cv2.INTER_LINEAR) * inside
+    return torch.from_numpy(rgb), torch.from_numpy(usable > 0.999)
+
+
+def edge_weight(rgb: Float[Tensor, "h w 3"]) -> Float[Tensor, "h w"]:
+    """w_n of Eq. depth_reg: e^-|dI/dx| + e^-|dI/dy| of the channel means: depth is free to step where colour does."""
+    right = torch.nn.functional.pad(rgb.diff(dim=1).abs().mean(-1), (0, 1))
+    down = torch.nn.functional.pad(rgb.diff(dim=0).abs().mean(-1), (0, 0, 0, 1))
+    return torch.exp(-right) + torch.exp(-down)
+
+
+def working_scale(rec: Reconstruction, settings: UwbsSettings) -> float:
+    """Working units per scene unit: 1 for a metric reconstruction, else what gives the scene its `working_depth`."""
+    return 1.0 if rec.metric else settings.working_depth / median_z_depth(rec)
+
+
+def median_z_depth(rec: Reconstruction) -> float:
+    """Median z depth of the sparse points in the frames that track them; of all points in all frames without tracks."""
+    depths = []
+    for i in range(len(rec.names)):
+        mine = rec.tracks.point[rec.tracks.frame == i]
+        points = rec.points.xyz[mine] if len(rec.tracks.point) else rec.points.xyz
+        depths.append(project(rec.cameras[i], points[None])[1][0])
+    z = torch.cat(depths)
+    z = z[z > 0]
+    if not len(z):
+        raise InputError(
+            "The reconstruction has no point in front of a camera.",
+            cause="it holds poses alone, or its axes are not OpenCV's",
+            hint="a reconstruction with sparse points",
+        )
+    return float(z.median())
+
+
+_Key = tuple[tuple[float, ...], tuple[float, ...], int, int, str]
+
+
+def _key(camera: Cameras) -> _Key:
+    return (
+        tuple(camera.K[0].flatten().tolist()),
+        tuple(camera.distortion[0].tolist()),
+        camera.width,
+        camera.height,
+        camera.model,
+    )
+
+
+@lru_cache(maxsize=8)  # one lens per clip as a rule
+def _grid(lens: _Key, canvas: _Key) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """`distorted_grid` as columns and rows (index coordinates) and the pixels shown, for OpenCV."""
+
+    def camera(key: _Key) -> Cameras:
+        K, distortion, width, height, model = key
+        identity = torch.eye(4, dtype=torch.float64)[None]
+        return Cameras(
+            torch.tensor(K, dtype=torch.float64).reshape(1, 3, 3),
+            torch.tensor(distortion, dtype=torch.float64).reshape(1, -1),
+            identity, width, height, model,
+        )  # fmt: skip
+
+    pixels, shown = distorted_grid(camera(lens), camera(canvas))
+    column, row = (pixels - 0.5).float().unbind(-1)
+    return column.contiguous().numpy(), row.contiguous().numpy(), shown.numpy()

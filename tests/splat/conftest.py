@@ -1,0 +1,134 @@
+"""Primitives, cameras and a tiny dive for the map's tests."""
+
+from collections.abc import Callable
+from dataclasses import dataclass
+from pathlib import Path
+
+import pytest
+import torch
+
+from swimm3r.cameras import Cameras
+from swimm3r.frames import Frame, Frames
+from swimm3r.io.images import write_rgb
+from swimm3r.medium import AttenuationCurve, Medium, MediumFit
+from swimm3r.reconstruction import DenseCloud, DepthMap, DepthMaps, Matches, Points, Reconstruction, Tracks
+from swimm3r.splat.medium_field import initial_field
+from swimm3r.splat.primitives import BetaPrimitives, inverse_softplus
+from swimm3r.splat.rendering import SplatMap
+from swimm3r.splat.settings import MediumFieldSettings, UwbsSettings
+
+
+@pytest.fixture
+def primitives() -> Callable[..., BetaPrimitives]:
+    """Random primitives two to five units in front of the origin: `primitives(n, c=3, seed=0)`, float64."""
+
+    def make(n: int, c: int = 3, seed: int = 0) -> BetaPrimitives:
+        rng = torch.Generator().manual_seed(seed)
+
+        def normal(*shape: int) -> torch.Tensor:
+            return torch.randn(*shape, generator=rng, dtype=torch.float64)
+
+        xyz = normal(n, 3) * torch.tensor([0.8, 0.6, 0.6]) + torch.tensor([0.0, 0.0, 3.5])
+        direction = torch.nn.functional.normalize(xyz, dim=-1) + 0.3 * normal(n, 3)
+        time = torch.rand(n, c - 3, generator=rng, dtype=torch.float64)
+        scale = torch.cat([-1.8 + 0.5 * normal(n, 3), 0.5 + 0.3 * normal(n, c)], -1)
+        beta = torch.cat([0.4 * normal(n, 1), -0.5 + 0.8 * normal(n, c)], -1)
+        lower = 0.4 * normal(n, (3 + c) * (2 + c) // 2)
+        rgb = torch.rand(n, 3, generator=rng, dtype=torch.float64)
+        return BetaPrimitives(xyz, torch.cat([direction, time], -1), rgb, 1 + normal(n), beta, scale, lower)
+
+    return make
+
+
+@pytest.fixture
+def camera() -> Callable[..., Cameras]:
+    """A slightly turned pinhole camera near the origin, principal point off centre: `camera(width=80, height=56)`."""
+
+    def make(width: int = 80, height: int = 56) -> Cameras:
+        K = torch.tensor([[70.0, 0, 0.46 * width], [0, 66.0, 0.55 * height], [0, 0, 1]], dtype=torch.float64)
+        K[:2, :2] *= width / 80
+        pose = torch.eye(4, dtype=torch.float64)
+        pose[:3, :3] = torch.linalg.matrix_exp(
+            torch.tensor([[0, -0.05, 0.1], [0.05, 0, -0.08], [-0.1, 0.08, 0]], dtype=torch.float64)
+        )
+        pose[:3, 3] = torch.tensor([0.1, -0.05, 0.2])
+        return Cameras(K[None], torch.zeros(1, 0, dtype=torch.float64), pose[None], width, height)
+
+    return make
+
+
+WATER = Medium(torch.tensor([0.1, 0.4, 0.5]), torch.tensor([0.4, 0.15, 0.1]), torch.tensor([0.3, 0.2, 0.2]))
+
+
+@pytest.fixture
+def wall() -> Callable[..., SplatMap]:
+    """An opaque textured wall around z = 3 in known water: `wall(n=1500)`."""
+    return make_wall
+
+
+def make_wall(n: int = 1500) -> SplatMap:
+    rng = torch.Generator().manual_seed(0)
+    x, y = 2.6 * (2 * torch.rand(2, n, generator=rng) - 1)
+    xyz = torch.stack([x, 0.8 * y, 3 + 0.2 * torch.sin(2 * x) * torch.cos(3 * y)], -1)
+    waves = [torch.sin(5 * x + 2 * y), torch.sin(7 * y - x), torch.cos(4 * x - 5 * y)]
+    spread = torch.cat([torch.full((n, 3), 0.25), torch.ones(n, 3)], -1)
+    p = BetaPrimitives(
+        xyz,
+        torch.nn.functional.normalize(xyz, dim=-1),
+        0.5 + 0.35 * torch.stack(waves, -1),
+        torch.full((n,), 3.0),
+        torch.zeros(n, 4),
+        inverse_softplus(spread),
+        torch.zeros(n, 15),
+    )
+    field = initial_field(WATER, MediumFieldSettings(), torch.Generator().manual_seed(0)).requires_grad_(False)
+    return SplatMap(p, field, UwbsSettings(), True)
+
+
+@dataclass(frozen=True)
+class TinyDive:
+    """Nine pictures of the wall, two of them held back, with what structure from motion would know."""
+
+    rec: Reconstruction
+    frames: Frames
+    truth: SplatMap
+    cameras: Cameras  # of all nine
+
+
+@pytest.fixture(scope="session")
+def tiny_dive(tmp_path_factory: pytest.TempPathFactory) -> TinyDive:
+    folder: Path = tmp_path_factory.mktemp("tiny")
+    truth, width, height, count = make_wall(), 64, 48, 9
+    K = torch.tensor([[60.0, 0, 33], [0, 60, 23], [0, 0, 1]], dtype=torch.float64).repeat(count, 1, 1)
+    poses = torch.eye(4, dtype=torch.float64).repeat(count, 1, 1)
+    poses[:, 0, 3] = torch.linspace(-0.6, 0.6, count)
+    poses[:, 1, 3] = 0.2 * torch.sin(torch.arange(count))
+    cameras = Cameras(K, torch.zeros(count, 0, dtype=torch.float64), poses, width, height)
+    depth = DepthMaps(folder / "z_depth")
+    listed = []
+    for i in range(count):
+        out = truth.render(cameras[i])
+        path = folder / f"{i}.png"
+        write_rgb(path, out.rgb.numpy())
+        depth.write(path.name, DepthMap(out.z_depth, torch.ones_like(out.z_depth)))
+        listed.append(Frame(path.name, path, float(i), 1.0, "test" if i % 8 == 0 else "train"))
+    frames = Frames(tuple(listed), width, height, True)
+    flat = torch.zeros(3)
+    xyz, rgb = truth.primitives.xyz, truth.primitives.rgb
+    none = torch.zeros(0, dtype=torch.int64)
+    rec = Reconstruction(
+        names=frames.train.names,
+        cameras=cameras[1:8],
+        points=Points(xyz.double(), rgb, torch.zeros(len(xyz))),
+        tracks=Tracks(none, none, torch.zeros(0, 2)),
+        matches=Matches(none, none, torch.zeros(0, 2), torch.zeros(0, 2), torch.zeros(0)),
+        depth=depth,
+        backend="truth",
+        metric=True,
+        medium=MediumFit(
+            WATER, AttenuationCurve(WATER.beta_D, flat, flat, flat), Medium(flat, flat, flat),
+            {name: torch.ones(3, dtype=torch.bool) for name in ("Binf", "beta_D", "beta_B")}, (1.0, 4.0), "srgb",
+        ),
+        cloud=DenseCloud(xyz, rgb, rgb),
+    )  # fmt: skip
+    return TinyDive(rec, frames, truth, cameras)

@@ -1,0 +1,102 @@
+"""The water as a field over directions."""
+
+from dataclasses import replace
+
+import numpy as np
+import torch
+
+from swimm3r.medium import Medium
+from swimm3r.splat.medium_field import (
+    grid_of,
+    initial_field,
+    medium_at_pixels,
+    per_z_depth,
+    smoothness,
+    spherical_harmonics,
+)
+from swimm3r.splat.projection import pinhole
+from swimm3r.splat.settings import MediumFieldSettings
+
+WATER = Medium(torch.tensor([0.1, 0.4, 0.5]), torch.tensor([0.4, 0.15, 0.1]), torch.tensor([0.3, 0.2, 0.25]))
+
+
+def rough_field():
+    """A field as training leaves it: different in every direction."""
+    field = initial_field(WATER, MediumFieldSettings(), torch.Generator().manual_seed(0))
+    with torch.no_grad():
+        field.network[-1].weight.normal_(0, 0.3, generator=torch.Generator().manual_seed(1))
+    return field
+
+
+def test_the_harmonics_are_orthonormal_on_the_sphere():
+    z, weights = (torch.from_numpy(a) for a in np.polynomial.legendre.leggauss(8))
+    turn = torch.arange(16).double() * (2 * torch.pi / 16)
+    r = (1 - z * z).sqrt()
+    d = torch.stack([r[:, None] * turn.cos(), r[:, None] * turn.sin(), z[:, None].expand(-1, 16)], -1).double()
+    Y = spherical_harmonics(d)
+    gram = torch.einsum("zti,ztj,z->ij", Y, Y, weights) * (2 * torch.pi / 16)
+    torch.testing.assert_close(gram, torch.eye(16, dtype=gram.dtype), atol=1e-9, rtol=0)
+
+
+def test_the_first_field_is_the_given_water_in_every_direction(camera):
+    view = pinhole(camera())
+    field = initial_field(WATER, MediumFieldSettings(), torch.Generator().manual_seed(0))
+    maps = medium_at_pixels(grid_of(field, view, 8), view.height, view.width)
+    for got, expected in zip(maps, (WATER.Binf, WATER.beta_B, WATER.beta_D), strict=True):
+        torch.testing.assert_close(got, expected[:, None, None].expand_as(got), atol=1e-5, rtol=1e-4)
+
+
+def test_a_change_of_unit_divides_the_betas_only(camera):
+    view, field = pinhole(camera()), rough_field()
+    before = grid_of(field, view, 8).values.detach()
+    field.length.fill_(4.0)
+    after = grid_of(field, view, 8).values.detach()
+    torch.testing.assert_close(after[:3], before[:3])
+    torch.testing.assert_close(after[3:], before[3:] / 4)
+
+
+def test_interpolating_between_grid_points_changes_a_rough_field_little(camera):
+    view, field = pinhole(camera(160, 112)), rough_field()
+    exact = medium_at_pixels(grid_of(field, view, 1), view.height, view.width)
+    coarse = medium_at_pixels(grid_of(field, view, 8), view.height, view.width)
+    for a, b in zip(coarse, exact, strict=True):
+        assert (a - b).abs().max() < 0.02 * (b.max() - b.min())
+
+
+def test_the_field_is_seen_at_pixel_centres_of_the_turned_camera(camera):
+    view, field = pinhole(camera()), rough_field()
+    maps = medium_at_pixels(grid_of(field, view, 1), view.height, view.width)
+    ray = torch.tensor([(11.5 - view.cx) / view.fx, (7.5 - view.cy) / view.fy, 1.0])
+    direction = torch.nn.functional.normalize(view.R.T @ ray, dim=-1)
+    expected = field(direction[None, None])[:, 0, 0]
+    torch.testing.assert_close(torch.cat([m[:, 7, 11] for m in maps]), expected, atol=1e-6, rtol=1e-5)
+
+
+def test_smoothness_on_the_grid_is_that_of_the_interpolated_pixels(camera):
+    view = pinhole(camera(129, 97))
+    grid = grid_of(rough_field(), view, 8)
+    pixels = torch.cat(medium_at_pixels(grid, view.height, view.width))
+    on_pixels = pixels.diff(dim=1).abs().mean() + pixels.diff(dim=2).abs().mean()
+    torch.testing.assert_close(smoothness(grid), on_pixels, rtol=0.05, atol=0)
+
+
+def test_uniform_water_is_perfectly_smooth(camera):
+    field = initial_field(WATER, MediumFieldSettings(), torch.Generator().manual_seed(0))
+    assert smoothness(grid_of(field, pinhole(camera()), 8)) < 1e-7
+
+
+def test_betas_for_z_depth_attenuate_as_much_as_betas_along_the_ray(camera):
+    view, field = pinhole(camera()), rough_field()
+    maps = medium_at_pixels(grid_of(field, view, 4), view.height, view.width)
+    scaled = per_z_depth(maps, view)
+    ray = torch.tensor([(3.5 - view.cx) / view.fx, (50.5 - view.cy) / view.fy, 1.0])
+    z_depth = 2.7
+    torch.testing.assert_close(scaled.beta_d[:, 50, 3] * z_depth, maps.beta_d[:, 50, 3] * z_depth * ray.norm())
+    assert torch.equal(scaled.binf, maps.binf)
+
+
+def test_the_pose_reaches_the_field(camera):
+    view = pinhole(camera())
+    R = view.R.clone().requires_grad_()
+    value = grid_of(rough_field(), replace(view, R=R), 8).values.square().sum()
+    assert torch.autograd.grad(value, R)[0].abs().max() > 1e-3

@@ -1,0 +1,58 @@
+"""A pose refined against a frozen map."""
+
+from dataclasses import replace
+
+import pytest
+import torch
+
+from swimm3r.cameras import project
+from swimm3r.geometry import relative_poses, rotation_angle, so3_exp
+from swimm3r.splat.poses import edges, moved, refine_pose
+from swimm3r.splat.settings import PoseRefinementSettings
+
+SEEN = torch.ones(48, 64, dtype=torch.bool)
+
+
+def test_a_disturbed_pose_finds_its_way_back(tiny_dive):
+    true, picture = tiny_dive.cameras[3], tiny_dive.frames.image(3)
+    pose = true.cam2world.clone()
+    pose[0, :3, :3] = pose[0, :3, :3] @ so3_exp(torch.tensor([0.012, -0.01, 0.015], dtype=torch.float64))
+    pose[0, :3, 3] += torch.tensor([0.02, -0.015, 0.02])
+    settings = PoseRefinementSettings(steps=120, rate=2e-3)
+    refined = refine_pose(tiny_dive.truth, replace(true, cam2world=pose), picture, SEEN, settings)
+
+    def turned(camera) -> float:
+        return float(rotation_angle(relative_poses(true.cam2world, camera.cam2world)[0, :3, :3]))
+
+    def pixels_off(camera) -> float:
+        points = tiny_dive.rec.points.xyz[None]
+        return float((project(camera, points)[0] - project(true, points)[0]).norm(dim=-1).median())
+
+    disturbed = replace(true, cam2world=pose)
+    assert refined.loss < 0.2 * refined.start_loss
+    assert turned(refined.camera) < 0.4 * turned(disturbed)
+    assert pixels_off(disturbed) > 1
+    assert pixels_off(refined.camera) < 0.1  # before a wall, a shift and a turn are hard to tell apart: both may remain
+
+
+def test_a_pose_that_is_right_stays(tiny_dive):
+    true = tiny_dive.cameras[3]
+    refined = refine_pose(tiny_dive.truth, true, tiny_dive.frames.image(3), SEEN, PoseRefinementSettings(steps=5))
+    assert refined.loss <= refined.start_loss
+    assert (refined.camera.centres - true.centres).norm() < 5e-3
+
+
+def test_no_motion_is_the_given_pose():
+    pose = torch.eye(4, dtype=torch.float64)
+    assert torch.equal(moved(pose, torch.zeros(9), 3.0), pose)
+    assert moved(pose, torch.tensor([0.1, 0, 0, 0, 0, 0, 0, 0, 0]), 3.0)[0, 3] == pytest.approx(0.3)
+
+
+def test_a_flat_picture_is_compared_everywhere():
+    flat = torch.full((48, 64, 3), 0.4)
+    assert edges(flat, SEEN, PoseRefinementSettings()).all()
+    stepped = flat.clone()
+    stepped[:, 32:] = 0.8
+    found = edges(stepped, SEEN, PoseRefinementSettings())
+    assert found[:, 31:33].all()
+    assert not found[:, :30].any()

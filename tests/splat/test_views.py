@@ -1,0 +1,91 @@
+"""Frames become pinhole pictures."""
+
+from dataclasses import replace
+
+import pytest
+import torch
+
+from swimm3r.cameras import Cameras, image_directions
+from swimm3r.errors import InputError
+from swimm3r.splat.settings import UwbsSettings
+from swimm3r.splat.views import TrainingViews, median_z_depth, pinhole_canvas, undistorted, working_scale
+
+
+def lens(width: int = 96, height: int = 64, k: float = -0.15) -> Cameras:
+    K = torch.tensor([[[70.0, 0, 49], [0, 70, 31], [0, 0, 1]]], dtype=torch.float64)
+    pose = torch.eye(4, dtype=torch.float64)[None]
+    return Cameras(K, torch.tensor([[k]], dtype=torch.float64), pose, width, height, "SIMPLE_RADIAL")
+
+
+def scenery(camera: Cameras) -> torch.Tensor:
+    """A smooth pattern at infinity, as a camera sees it."""
+    x, y, _ = image_directions(camera).float().unbind(-1)
+    return torch.stack(
+        [0.5 + 0.4 * torch.sin(4 * x + y), 0.5 + 0.4 * torch.cos(3 * y), 0.5 + 0.3 * torch.sin(5 * x)], -1
+    )
+
+
+@pytest.mark.parametrize("long_side", [0, 48])
+def test_an_undistorted_picture_shows_what_a_pinhole_camera_would(long_side: int):
+    camera = lens()
+    canvas = pinhole_canvas(camera, long_side)
+    assert max(canvas.width, canvas.height) == (long_side or 96)
+    got, seen = undistorted(scenery(camera), torch.ones(64, 96, dtype=torch.bool), camera, canvas)
+    assert seen.double().mean() > 0.95
+    inner = seen[2:-2, 2:-2]
+    error = (got - scenery(canvas))[2:-2, 2:-2][inner].abs()
+    assert error.max() < (0.02 if long_side else 0.005)
+
+
+def test_a_picture_without_distortion_keeps_its_bits():
+    camera = replace(lens(), distortion=torch.zeros(1, 1, dtype=torch.float64))
+    picture = torch.rand(64, 96, 3)
+    got, seen = undistorted(picture, torch.ones(64, 96, dtype=torch.bool), camera, pinhole_canvas(camera, 0))
+    assert torch.equal(got, picture)
+    assert seen.all()
+
+
+def test_what_the_lens_did_not_see_is_not_seen():
+    """A pincushion lens's picture does not reach the corners of its pinhole canvas."""
+    camera = lens(k=0.3)
+    _, seen = undistorted(scenery(camera), torch.ones(64, 96, dtype=torch.bool), camera, pinhole_canvas(camera, 0))
+    assert not seen[0, 0]
+    assert seen[32, 48]
+
+
+def test_a_mask_is_undistorted_with_its_picture():
+    camera = lens()
+    mask = torch.ones(64, 96, dtype=torch.bool)
+    mask[:, :48] = False
+    _, seen = undistorted(scenery(camera), mask, camera, pinhole_canvas(camera, 0))
+    assert not seen[:, :46].any()
+    assert seen[20:40, 52:80].all()
+
+
+def test_views_are_the_registered_training_frames_with_pictures_and_depth_in_working_units(tiny_dive):
+    views = TrainingViews(tiny_dive.rec, tiny_dive.frames, UwbsSettings(), 2.0)
+    assert views.names == tiny_dive.rec.names
+    view = views[2]
+    picture = tiny_dive.frames.image(tiny_dive.frames.index(view.name))
+    torch.testing.assert_close(view.rgb.permute(1, 2, 0), picture, atol=1e-6, rtol=0)
+    expected = 2 * tiny_dive.rec.depth[view.name].z_depth
+    torch.testing.assert_close(view.z_depth, expected, rtol=1e-3, atol=0)
+    torch.testing.assert_close(view.camera.centres[0], 2 * tiny_dive.rec.cameras.centres[2])
+
+
+def test_test_frames_are_never_views(tiny_dive):
+    rec = replace(tiny_dive.rec, names=("0.png", *tiny_dive.rec.names[1:]))
+    assert "0.png" not in TrainingViews(rec, tiny_dive.frames, UwbsSettings(), 1.0).names
+
+
+def test_frames_of_another_dive_are_refused(tiny_dive):
+    rec = replace(tiny_dive.rec, names=tuple(f"other_{name}" for name in tiny_dive.rec.names))
+    with pytest.raises(InputError, match="registered"):
+        TrainingViews(rec, tiny_dive.frames, UwbsSettings(), 1.0)
+
+
+def test_a_scene_without_scale_is_trained_at_the_working_depth(tiny_dive):
+    settings = UwbsSettings()
+    assert working_scale(tiny_dive.rec, settings) == 1
+    scaleless = replace(tiny_dive.rec, metric=False)
+    assert median_z_depth(scaleless) * working_scale(scaleless, settings) == pytest.approx(settings.working_depth)
