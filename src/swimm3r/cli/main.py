@@ -1,0 +1,61 @@
+"""`swimm3r COMMAND ...`: parses, runs one command and turns what users can mend into messages and exit codes."""
+
+import errno
+import logging
+import sys
+from collections.abc import Sequence
+
+import tyro
+
+from swimm3r.cli.demo import demo
+from swimm3r.cli.doctor import doctor
+from swimm3r.cli.report import report
+from swimm3r.cli.run import commands_for_preset
+from swimm3r.errors import StorageError, Swimm3rError
+from swimm3r.presets import PRESETS
+
+_INTERRUPTED = 130
+_STORAGE_ERRORS = {errno.ENOSPC, errno.EDQUOT, errno.EROFS, errno.EACCES, errno.EPERM, errno.EFBIG}
+
+
+def main(arguments: Sequence[str] | None = None) -> None:
+    """Run one command; leaves through SystemExit with the documented code."""
+    arguments = list(sys.argv[1:] if arguments is None else arguments)
+    logging.basicConfig(level=logging.WARNING, format="%(message)s")
+    commands = {**commands_for_preset(_named_preset(arguments)), "demo": demo, "doctor": doctor, "report": report}
+    try:
+        tyro.extras.subcommand_cli_from_dict(
+            commands,
+            prog="swimm3r",
+            description="Underwater video in; camera poses, water, restored pictures and a restored point cloud out.",
+            args=arguments,
+        )
+    except Swimm3rError as error:
+        _fail(error)
+    except KeyboardInterrupt:
+        print("\nInterrupted. What is finished is kept: the same command goes on from here.", file=sys.stderr)
+        raise SystemExit(_INTERRUPTED) from None
+    except OSError as error:
+        if error.errno not in _STORAGE_ERRORS:
+            raise
+        _fail(
+            StorageError(
+                f"cannot write {error.filename or 'to the run folder'}: {error.strerror}",
+                cause="the disk is full, over quota or read-only",
+                hint="free some space or choose another --out; the same command then goes on from here",
+            )
+        )
+
+
+def _fail(error: Swimm3rError) -> None:
+    print(f"swimm3r: {error}", file=sys.stderr)
+    raise SystemExit(error.exit_code)
+
+
+def _named_preset(arguments: Sequence[str]) -> str:
+    """The preset decides the defaults that --help shows, so it is found before tyro parses; tyro checks its name."""
+    for here, after in zip(arguments, [*arguments[1:], ""], strict=True):
+        name = after if here == "--preset" else here.removeprefix("--preset=")
+        if name != here and name in PRESETS:
+            return name
+    return "default"

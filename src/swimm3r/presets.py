@@ -1,0 +1,31 @@
+"""The settings of a whole run, and the three starting points users choose from; torch-free."""
+
+from dataclasses import dataclass, field
+
+from swimm3r.frame_settings import FrameSettings
+from swimm3r.sfm.settings import ColmapSettings, FeatureSettings, PlaneSweepSettings, RestoreSettings, SfmSettings
+
+
+@dataclass(frozen=True)
+class RunSettings:
+    """Everything that decides what a run computes."""
+
+    frames: FrameSettings = field(default_factory=FrameSettings)
+    sfm: SfmSettings = field(default_factory=ColmapSettings)
+
+
+PRESETS: dict[str, RunSettings] = {
+    "fast": RunSettings(  # a look at a dive on a laptop
+        frames=FrameSettings(long_side=960),
+        sfm=ColmapSettings(depth=PlaneSweepSettings(long_side=480, sources=4)),
+    ),
+    "default": RunSettings(),
+    "best": RunSettings(  # hours rather than minutes for a long dive
+        frames=FrameSettings(long_side=0),
+        sfm=ColmapSettings(
+            features=FeatureSettings(count=4096, long_side=1600),
+            depth=PlaneSweepSettings(long_side=1280, sources=8),
+            restore=RestoreSettings(max_points=2_000_000),
+        ),
+    ),
+}

@@ -1,0 +1,131 @@
+"""Puts the page of a run together: what the run folder holds -> the template's fields."""
+
+import json
+from dataclasses import dataclass
+from importlib.resources import files
+from pathlib import Path
+
+import jinja2
+import numpy as np
+import torch
+
+from swimm3r import reconstruction
+from swimm3r.frames import Frames
+from swimm3r.io import images
+from swimm3r.io.atomic import write_text
+from swimm3r.medium import MediumFit, backscatter, transmittances
+from swimm3r.prepare import load_frames
+from swimm3r.reconstruction import Reconstruction
+from swimm3r.report import charts
+
+_SHOWN_FRAMES = 8
+
+
+@dataclass(frozen=True)
+class Triptych:
+    """One frame as data URIs: as filmed, without water, and its depth."""
+
+    name: str
+    raw: str
+    restored: str | None
+    depth: str | None
+
+
+def write(folder: Path) -> Path:
+    """Write RUN/report.html and return its path."""
+    summary = json.loads((folder / "summary.json").read_text(encoding="utf-8"))
+    frames = load_frames(folder / "prepare")
+    rec = reconstruction.load(folder / "sfm") if (folder / "sfm" / "reconstruction.json").is_file() else None
+    template = jinja2.Environment(autoescape=True, undefined=jinja2.StrictUndefined, trim_blocks=True).from_string(
+        files("swimm3r.report").joinpath("page.html.j2").read_text(encoding="utf-8")
+    )
+    page = template.render(
+        title=Path(summary["input"]["path"]).name,
+        summary=summary,
+        cautions=summary.get("cautions", []),
+        pictures=_triptychs(rec, frames, folder) if rec else [],
+        plan=_plan(rec) if rec and rec.cloud is not None and len(rec.cloud.xyz) else None,
+        water=_water(rec) if rec and rec.medium else None,
+        missing=[name for name in frames.train.names if rec and name not in set(rec.names)],
+        versions=json.loads((folder / "versions.json").read_text(encoding="utf-8")),
+        settings=(folder / "settings.yaml").read_text(encoding="utf-8"),
+    )
+    path = folder / "report.html"
+    write_text(path, page)
+    return path
+
+
+def _triptychs(rec: Reconstruction, frames: Frames, folder: Path) -> list[Triptych]:
+    """A few registered frames, evenly spread over the dive."""
+    chosen = sorted({round(i) for i in np.linspace(0, len(rec.names) - 1, _SHOWN_FRAMES)})
+    names = [rec.names[i] for i in chosen]
+    depths = {name: rec.depth[name].z_depth.numpy() for name in names if name in rec.depth}
+    known = np.concatenate([z[z > 0] for z in depths.values()]) if depths else np.empty(0)
+    near, far = np.quantile(known, [0.01, 0.99]) if known.size else (1.0, 2.0)
+    rows = []
+    for name in names:
+        raw = (frames.image(frames.index(name)).numpy() * 255).round().astype(np.uint8)
+        restored = folder / "sfm" / "restored" / f"{name}.png"
+        rows.append(
+            Triptych(
+                name,
+                charts.picture(raw),
+                charts.picture(images.read_rgb(restored)) if restored.is_file() else None,
+                charts.picture(charts.depth_picture(depths[name], near, far)) if name in depths else None,
+            )
+        )
+    return rows
+
+
+def _plan(rec: Reconstruction) -> dict[str, str]:
+    """The map from above, before and after, with the camera path."""
+    assert rec.cloud is not None
+    view = charts.plan_view(
+        rec.cloud.xyz.numpy(), rec.cloud.raw.numpy(), rec.cloud.restored.numpy(), rec.cameras.cam2world.numpy()
+    )
+    return {
+        "raw": charts.picture(view.raw, 760, 90),
+        "restored": charts.picture(view.restored, 760, 90),
+        "overlay": charts.path_overlay(view),
+        "unit": "metres" if rec.metric else "scene units",
+    }
+
+
+def _water(rec: Reconstruction) -> dict[str, object]:
+    """The two curves a scientist looks for, in the encoding the pipeline fitted, and the open water's colour."""
+    assert rec.medium is not None
+    fit = rec.medium
+    unit = "m" if rec.metric else "scene units"
+    return {
+        "swatch": "rgb({:.0f},{:.0f},{:.0f})".format(*(fit.medium.Binf * 255).tolist()),
+        "backscatter": _chart(fit, "B(z), backscatter", unit, lambda z: backscatter(z, fit.at(z))),
+        "transmittance": _chart(fit, "T_D(z), direct light kept", unit, lambda z: transmittances(z, fit.at(z))[0]),
+        "tables": [_table(f, rec.metric) for f in (rec.medium_linear, rec.medium) if f is not None],
+    }
+
+
+def _table(fit: MediumFit, metric: bool) -> dict[str, object]:
+    """The coefficients of one fit with their standard deviations; those the frames leave open are marked."""
+    unit = "1/m" if metric else "per scene unit"
+    labels = {
+        "Binf": "veiling light Binf",
+        "beta_D": f"attenuation beta_D at the median depth, {unit}",
+        "beta_B": f"backscatter beta_B, {unit}",
+    }
+    rows = []
+    for name, label in labels.items():
+        values, errors = getattr(fit.medium, name).tolist(), getattr(fit.std, name).tolist()
+        known = fit.identifiable[name].tolist()
+        cells = [{"text": f"{v:.3f} \u00b1 {e:.3f}", "known": k} for v, e, k in zip(values, errors, known, strict=True)]
+        rows.append({"label": label, "cells": cells})
+    return {"title": "in linear light" if fit.encoding == "linear" else "on stored pixel values", "rows": rows}
+
+
+def _chart(fit: MediumFit, label: str, unit: str, law) -> str:
+    z = torch.linspace(0, fit.z_range[1] * 1.25, 60)
+    values = law(z).numpy()
+    curves = [
+        charts.Curve(z.numpy(), values[:, c], charts.CHANNELS[c], "RGB"[c], solid_until=fit.z_range[1])
+        for c in range(3)
+    ]
+    return charts.line_chart(curves, f"ray depth z, {unit}", label)

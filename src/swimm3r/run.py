@@ -1,0 +1,250 @@
+"""The pipeline over a run folder: prepare -> sfm -> eval, each stage resumable, its record in summary.json.
+
+A stage is reused when its settings and everything before it are unchanged (a hash, the stage's `key`); one that was cut
+short goes on from what it left on disk; one whose settings changed is made again from the start, with all after it.
+"""
+
+import json
+import platform
+import shutil
+import sys
+import time
+from collections.abc import Callable
+from dataclasses import asdict
+from hashlib import sha256
+from importlib.metadata import version
+from pathlib import Path
+
+import yaml
+
+from swimm3r import reconstruction
+from swimm3r import summary as sections
+from swimm3r.errors import InputError, StorageError
+from swimm3r.frames import Frames
+from swimm3r.ground_truth import FOLDER as TRUTH_FOLDER
+from swimm3r.ground_truth import GroundTruth, read_ground_truth
+from swimm3r.io.atomic import write_text
+from swimm3r.prepare import check_source, load_frames, read_frames
+from swimm3r.presets import RunSettings
+from swimm3r.progress import Progress, silent
+from swimm3r.reconstruction import Reconstruction
+from swimm3r.report import write_report
+from swimm3r.sfm import reconstruct
+
+SCHEMA = 1
+STAGES = ("prepare", "sfm", "eval")
+_FOLDERS = {"prepare": "prepare", "sfm": "sfm", "eval": None}
+_SPARE_BYTES = 64 << 20  # below this a stage is not begun: COLMAP's database does not survive a full disk
+
+
+def run_pipeline(
+    source: Path,
+    folder: Path,
+    settings: RunSettings | None = None,
+    *,
+    reference: Path | None = None,
+    last_stage: str = "eval",
+    progress: Progress = silent,
+) -> dict:
+    """Run the stages up to `last_stage` and return the summary (layout: docs/conventions.md).
+
+    `reference` is a cameras.json to score against; a synthetic dive brings its own truth. Raises the errors of its
+    stages (`swimm3r.errors`) and InputError where `folder` belongs to another input.
+    """
+    settings = settings or RunSettings()
+    check_source(source)
+    fingerprint = _fingerprint(source, folder)
+    is_new = not folder.exists()
+    record = _Record(folder, source, fingerprint)
+    write_text(folder / "settings.yaml", yaml.safe_dump(_plain(asdict(settings)), sort_keys=False))
+    write_text(folder / "versions.json", json.dumps(_versions(), indent=2) + "\n")
+    truth = _truth(source, reference)
+
+    key = _key("prepare", fingerprint, asdict(settings.frames))
+    try:
+        frames = record.stage(
+            "prepare",
+            key,
+            make=lambda: read_frames(source, settings.frames, folder / "prepare", progress),
+            reuse=lambda: load_frames(folder / "prepare"),
+        )
+    except InputError:
+        if is_new:
+            shutil.rmtree(folder)  # there is nothing in it that a corrected input could go on from
+        raise
+    record.summary["input"] |= {
+        "frames": len(frames),
+        "train": len(frames.train),
+        "test": len(frames.test),
+        "width": frames.width,
+        "height": frames.height,
+    }
+    if last_stage == "prepare":
+        return record.close()
+
+    key = _key("sfm", key, {type(settings.sfm).__name__: asdict(settings.sfm)})
+    rec = record.stage(
+        "sfm",
+        key,
+        make=lambda: reconstruct(frames, settings.sfm, folder / "sfm", progress),
+        reuse=lambda: reconstruction.load(folder / "sfm"),
+    )
+    record.summary |= sections.sfm_sections(rec, frames)
+    if last_stage == "sfm":
+        return record.close()
+
+    key = _key("eval", key, {"reference": str(reference)})
+    record.stage("eval", key, make=lambda: record.summary.update(_scores(rec, frames, truth, folder, progress)))
+    summary = record.close()
+    write_report(folder)
+    return summary
+
+
+def _scores(
+    rec: Reconstruction, frames: Frames, truth: GroundTruth | None, folder: Path, progress: Progress
+) -> dict[str, object]:
+    return {
+        "restored": {"sfm": sections.restored_section(folder / "sfm" / "restored", rec.names, progress)},
+        "truth": sections.truth_section(rec, frames, truth, progress) if truth else None,
+    }
+
+
+class _Record:
+    """summary.json and log.jsonl of a run folder, kept current on disk."""
+
+    def __init__(self, folder: Path, source: Path, fingerprint: str) -> None:
+        self.folder = folder
+        path = folder / "summary.json"
+        self.summary: dict = {"schema": SCHEMA, "input": {}, "stages": {}}
+        if path.is_file():
+            before = json.loads(path.read_text(encoding="utf-8"))
+            if before["input"]["fingerprint"] != fingerprint:
+                raise InputError(
+                    f"{folder} holds a run of another input ({before['input']['path']})",
+                    cause="the same --out was given for two inputs, or the input's files changed since",
+                    hint="another --out, or remove that folder",
+                )
+            self.summary["stages"] = before["stages"]
+        elif folder.exists() and any(folder.iterdir()):
+            raise InputError(
+                f"{folder} is not empty and is not a run folder",
+                cause="--out names a folder with other things in it",
+                hint="an --out that does not exist yet",
+            )
+        self.summary["input"] = {"path": str(source.resolve()), "fingerprint": fingerprint}
+        self._write()
+
+    def stage(self, name: str, key: str, make: Callable, reuse: Callable | None = None):
+        """Do a stage, or reuse it where it is done with the same key."""
+        before = self.summary["stages"].get(name, {})
+        if before.get("key") == key and before.get("status") == "done" and reuse:
+            self._log("reused", stage=name)
+            return reuse()
+        if before.get("key") not in (None, key):
+            self._forget(name)
+        self._check_space()
+        self.summary["stages"][name] = {"status": "running", "key": key}
+        self._write()
+        self._log("started", stage=name)
+        wall, cpu = time.perf_counter(), time.process_time()
+        try:
+            result = make()
+        except BaseException as error:
+            self._check_space(error)  # before the log, which a full disk would not take either
+            self._log("stopped", stage=name, error=f"{type(error).__name__}: {error}")
+            raise
+        self.summary["stages"][name] = {
+            "seconds": round(time.perf_counter() - wall, 2),
+            "cpu_seconds": round(time.process_time() - cpu, 2),
+            "peak_mb": _peak_mb(),
+            "status": "done",
+            "key": key,
+        }
+        self._write()
+        self._log("done", stage=name, **self.summary["stages"][name])
+        return result
+
+    def _check_space(self, error: BaseException | None = None) -> None:
+        """Raise StorageError where too little space is left; `error` is what the lack of it may have caused."""
+        free = shutil.disk_usage(self.folder).free
+        if free < _SPARE_BYTES:
+            raise StorageError(
+                f"only {free / 1e6:.0f} MB are left on the disk of {self.folder}",
+                cause="the disk is full or over quota",
+                hint="free some space or choose another --out; the same command then goes on from here",
+            ) from error
+
+    def close(self) -> dict:
+        """Write the summary a last time."""
+        self._write()
+        return self.summary
+
+    def _forget(self, name: str) -> None:
+        """Drop a stage made with other settings, and everything that was made from it."""
+        for later in STAGES[STAGES.index(name) :]:
+            self.summary["stages"].pop(later, None)
+            if _FOLDERS[later]:
+                shutil.rmtree(self.folder / _FOLDERS[later], ignore_errors=True)
+
+    def _write(self) -> None:
+        write_text(self.folder / "summary.json", json.dumps(self.summary, indent=2) + "\n")
+
+    def _log(self, event: str, **details: object) -> None:
+        line = json.dumps({"time": time.strftime("%Y-%m-%dT%H:%M:%S%z"), "event": event, **details})
+        with (self.folder / "log.jsonl").open("a", encoding="utf-8") as log:
+            log.write(line + "\n")
+
+
+def _truth(source: Path, reference: Path | None) -> GroundTruth | None:
+    if reference is not None:
+        return read_ground_truth(reference)
+    beside = source / TRUTH_FOLDER
+    return read_ground_truth(beside) if beside.is_dir() else None
+
+
+def _fingerprint(source: Path, folder: Path) -> str:
+    """What tells one input from another: names, sizes and times of its files, not where it lies.
+
+    A run folder inside the input is no part of it.
+    """
+    files = [source]
+    if source.is_dir():
+        files = sorted(p for p in source.rglob("*") if p.is_file() and not p.resolve().is_relative_to(folder.resolve()))
+    digest = sha256()
+    for path in files:
+        stat = path.stat()
+        digest.update(f"{path.relative_to(source.parent)}|{stat.st_size}|{stat.st_mtime_ns}\n".encode())
+    return digest.hexdigest()[:16]
+
+
+def _key(stage: str, before: str, settings: dict) -> str:
+    text = json.dumps([stage, before, _plain(settings)], sort_keys=True)
+    return sha256(text.encode()).hexdigest()[:16]
+
+
+def _plain(value: object) -> object:
+    """Settings as JSON and YAML know them."""
+    match value:
+        case dict():
+            return {key: _plain(item) for key, item in value.items()}
+        case list() | tuple():
+            return [_plain(item) for item in value]
+        case Path():
+            return str(value)
+        case _:
+            return value
+
+
+def _versions() -> dict[str, str]:
+    packages = ("swimm3r", "torch", "numpy", "scipy", "numba", "pycolmap", "opencv-python-headless", "av")
+    return {"python": platform.python_version(), "platform": platform.platform()} | {p: version(p) for p in packages}
+
+
+def _peak_mb() -> int | None:
+    """Peak memory of this process so far; None on Windows, which has no getrusage."""
+    if sys.platform == "win32":
+        return None
+    import resource
+
+    per_mb = 1024**2 if sys.platform == "darwin" else 1024
+    return round(resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / per_mb)

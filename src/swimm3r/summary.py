@@ -1,0 +1,184 @@
+"""The sections of summary.json: records in, plain numbers out (layout: docs/conventions.md)."""
+
+from collections.abc import Sequence
+from pathlib import Path
+
+import torch
+from jaxtyping import Float
+from torch import Tensor
+
+from swimm3r.cameras import Cameras, directions, image_directions, ray_depth_from_z
+from swimm3r.evaluate import NotComputed, summary_entries
+from swimm3r.evaluate.depth import depth_scores
+from swimm3r.evaluate.matches import epipolar_errors, match_scores
+from swimm3r.evaluate.poses import absolute_pose_errors, pose_scores
+from swimm3r.evaluate.underwater import clear_psnr, uciqe, uiqm, water_scores
+from swimm3r.frames import Frames
+from swimm3r.geometry import DegenerateAlignmentError, align_poses, align_similarity
+from swimm3r.ground_truth import GroundTruth
+from swimm3r.io import images
+from swimm3r.medium import MediumFit, remove_water, rescale
+from swimm3r.progress import Progress, silent
+from swimm3r.reconstruction import Reconstruction
+
+_NO_WEIGHTS = NotComputed("needs the URanker weights, which this version does not load")
+
+
+def sfm_sections(rec: Reconstruction, frames: Frames) -> dict[str, object]:
+    """ "sfm", "medium" and "cautions": what structure from motion found."""
+    cameras = rec.cameras
+    errors = epipolar_errors(
+        rec.matches.i,
+        rec.matches.j,
+        _undistorted(cameras, rec.matches.i, rec.matches.xy_i),
+        _undistorted(cameras, rec.matches.j, rec.matches.xy_j),
+        cameras.K,
+        cameras.cam2world,
+    )
+    epipolar = match_scores(errors)
+    observations = torch.bincount(rec.tracks.point, minlength=len(rec.points.xyz)).double()
+    sfm = {
+        "backend": rec.backend,
+        "frames": len(frames.train),
+        "registered": len(rec.names),
+        "points": len(rec.points.xyz),
+        "dense_points": 0 if rec.cloud is None else len(rec.cloud.xyz),
+        "reprojection_px": ((rec.points.error.double() * observations).sum() / observations.sum()).item(),
+        "epipolar_px": epipolar.epipolar_px,
+        "inlier_1px": epipolar.inlier_1px,
+        "epipolar_variant": epipolar.variant,
+        "metric": rec.metric,
+    }
+    sections: dict[str, object] = {"sfm": summary_entries(sfm)}
+    if rec.medium is not None:
+        sections["medium"] = {"sfm": _medium_section(rec.medium, rec.metric)}
+        if rec.medium_linear is not None:
+            sections["medium"] = {**sections["medium"], "sfm_linear": _medium_section(rec.medium_linear, rec.metric)}
+    sections["cautions"] = [
+        *({"what": what, "advice": ""} for what in frames.cautions),
+        *(vars(caution) for caution in rec.cautions),
+    ]
+    return sections
+
+
+def restored_section(folder: Path, names: Sequence[str], progress: Progress = silent) -> dict[str, object]:
+    """Reference-free scores of the restored pictures, native size, averaged over frames."""
+    scores = []
+    names = [name for name in names if (folder / f"{name}.png").is_file()]
+    if not names:
+        nothing = NotComputed("no frame was restored")
+        return summary_entries({"uiqm": nothing, "uciqe": nothing, "urank": nothing})
+    for done, name in enumerate(names):
+        progress("scoring restored pictures", done, len(names))
+        rgb = torch.from_numpy(images.read_rgb(folder / f"{name}.png")).float() / 255
+        scores.append((uiqm(rgb).uiqm, uciqe(rgb)))
+    mean = torch.tensor(scores).mean(0).tolist()
+    return summary_entries(
+        {
+            "uiqm": mean[0],
+            "uiqm_variant": "FUnIE-GAN, native size",
+            "uciqe": mean[1],
+            "uciqe_variant": "CIELAB, own units",
+            "urank": _NO_WEIGHTS,
+        }
+    )
+
+
+def truth_section(
+    rec: Reconstruction, frames: Frames, truth: GroundTruth, progress: Progress = silent
+) -> dict[str, object]:
+    """Errors against reference poses and, where the truth has them, depth, clear colours and water."""
+    reference = {name: i for i, name in enumerate(truth.names)}
+    wanted = [name for name in frames.train.names if name in reference]
+    if len(wanted) < 2:
+        reason = NotComputed(f"{len(wanted)} frames of this run are named in the reference, at least 2 are needed")
+        return summary_entries(dict.fromkeys(("rotation_deg", "translation_deg", "ate", "depth_absrel"), reason))
+    placed = {name: i for i, name in enumerate(rec.names)}
+    registered = torch.tensor([name in placed for name in wanted])
+    estimated = torch.eye(4, dtype=torch.float64).repeat(len(wanted), 1, 1)
+    estimated[registered] = rec.cameras.cam2world[[placed[name] for name in wanted if name in placed]]
+    true = truth.cameras.cam2world[[reference[name] for name in wanted]]
+    poses = pose_scores(estimated, true, registered)
+    section: dict[str, object] = {
+        "rotation_deg": poses.rotation_deg,
+        "translation_deg": poses.translation_deg,
+        "ate": poses.ate,
+        "pose_variant": poses.variant,
+    }
+    if registered.sum() >= 2:
+        section["rotation_median_deg"] = absolute_pose_errors(
+            estimated[registered], true[registered]
+        ).rotation_median_deg
+    scale = _scale_to_truth(estimated[registered], true[registered])
+    if isinstance(scale, NotComputed):
+        section["depth_absrel"] = scale
+        return summary_entries(section)
+    section |= _depth_section(rec, truth, scale)
+    entries = summary_entries(section)
+    if truth.medium is not None and rec.medium is not None:
+        entries["sfm"] = _water_section(rescale(rec.medium, scale), frames.test, truth, progress)
+    return entries
+
+
+def _medium_section(fit: MediumFit, metric: bool) -> dict[str, object]:
+    return {
+        **{name: value.tolist() for name, value in vars(fit.medium).items()},
+        "identifiable": {name: flags.tolist() for name, flags in fit.identifiable.items()},
+        "unit": "1/m" if metric else "per scene unit",
+        "encoding": fit.encoding,
+    }
+
+
+def _undistorted(cameras: Cameras, frame: Tensor, xy: Float[Tensor, "m 2"]) -> Float[Tensor, "m 2"]:
+    """Pixels as a pinhole camera with the same K would see them."""
+    straight = torch.empty_like(xy, dtype=torch.float64)
+    for i in range(len(cameras)):
+        rows = frame == i
+        rays = directions(cameras[i], xy[rows].double()[None])[0]
+        straight[rows] = (rays @ cameras.K[i].double().T)[:, :2]
+    return straight
+
+
+def _scale_to_truth(estimated: Float[Tensor, "n 4 4"], true: Float[Tensor, "n 4 4"]) -> float | NotComputed:
+    """Length in the truth's unit per length of the reconstruction."""
+    try:
+        return align_similarity(estimated[:, :3, 3], true[:, :3, 3]).scale.item()
+    except DegenerateAlignmentError:
+        try:
+            return align_poses(estimated, true).scale.item()
+        except DegenerateAlignmentError as failure:
+            return NotComputed(str(failure))
+
+
+def _depth_section(rec: Reconstruction, truth: GroundTruth, scale: float) -> dict[str, object]:
+    """Depth of the pixels that have one, in the truth's unit through the poses' scale."""
+    pairs = [
+        (rec.depth[name].z_depth * scale, true)
+        for name in rec.names
+        if name in rec.depth and name in truth.names and (true := truth.z_depth(name)) is not None
+    ]
+    if not pairs:
+        return {"depth_absrel": NotComputed("the reference has no depth")}
+    scores = depth_scores([p for p, _ in pairs], [t for _, t in pairs], align="none")
+    return {"depth_absrel": scores.absrel, "depth_coverage": scores.coverage, "depth_variant": "scaled by the poses"}
+
+
+def _water_section(fit: MediumFit, held_out: Frames, truth: GroundTruth, progress: Progress) -> dict[str, object]:
+    """The water's errors, and the clear colours it gives at true depth, over the frames nothing was fitted to."""
+    assert truth.medium is not None
+    ray_depths, psnrs = [], []
+    for done, frame in enumerate(held_out):
+        progress("scoring against the truth", done, len(held_out))
+        z_depth, clear = truth.z_depth(frame.name), truth.clear(frame.name)
+        if z_depth is None or clear is None:
+            continue
+        rays = image_directions(truth.cameras[truth.names.index(frame.name)]).float()
+        ray_depth = ray_depth_from_z(z_depth, rays)
+        ray_depths.append(ray_depth)
+        restored = remove_water(held_out.image(done), ray_depth, fit.at(ray_depth))
+        psnrs.append(clear_psnr(restored, clear, ray_depth, truth.medium))
+    if not ray_depths:
+        return summary_entries({"clear_psnr": NotComputed("the truth has no depth of a held-out frame")})
+    known = [value for value in psnrs if not isinstance(value, NotComputed)]
+    mean = sum(known) / len(known) if known else psnrs[0]
+    return summary_entries({"clear_psnr": mean}) | water_scores(fit, ray_depths, truth.medium).summary()

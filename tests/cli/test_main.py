@@ -1,0 +1,55 @@
+"""Exit codes and messages, as a user meets them."""
+
+from pathlib import Path
+
+import pytest
+
+from swimm3r.cli.main import main
+
+
+def outcome(capsys: pytest.CaptureFixture[str], *arguments: str) -> tuple[int, str]:
+    with pytest.raises(SystemExit) as stop:
+        main(arguments)
+    return stop.value.code, capsys.readouterr().err
+
+
+def test_a_missing_input_is_exit_3_with_cause_and_advice(capsys: pytest.CaptureFixture[str], tmp_path: Path):
+    code, message = outcome(capsys, "run", str(tmp_path / "dive.mp4"), "--out", str(tmp_path / "run"))
+    assert code == 3
+    assert "dive.mp4" in message
+    assert "Likely cause:" in message
+    assert "Try:" in message
+    assert not (tmp_path / "run").exists()
+
+
+def test_an_unknown_option_is_exit_2(capsys: pytest.CaptureFixture[str], tmp_path: Path):
+    assert outcome(capsys, "run", str(tmp_path), "--out", str(tmp_path), "--fsp", "5")[0] == 2
+
+
+def test_ctrl_c_is_exit_130_and_says_that_nothing_is_lost(
+    capsys: pytest.CaptureFixture[str], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+):
+    def interrupted(*_: object, **__: object) -> None:
+        raise KeyboardInterrupt
+
+    monkeypatch.setattr("swimm3r.run.run_pipeline", interrupted)
+    code, message = outcome(capsys, "run", str(tmp_path), "--out", str(tmp_path / "run"))
+    assert code == 130
+    assert "goes on from here" in message
+
+
+def test_a_folder_that_cannot_be_written_is_exit_7(capsys: pytest.CaptureFixture[str], tmp_path: Path):
+    (tmp_path / "pictures").mkdir()
+    (tmp_path / "pictures" / "a.png").write_bytes(b"")
+    code, message = outcome(capsys, "run", str(tmp_path / "pictures"), "--out", "/sys/run")
+    assert code == 7
+    assert "/sys" in message
+
+
+def test_the_preset_sets_the_defaults(capsys: pytest.CaptureFixture[str]):
+    shown = {}
+    for preset in ("fast", "best"):
+        with pytest.raises(SystemExit):
+            main(["run", "--preset", preset, "--help"])
+        shown[preset] = capsys.readouterr().out
+    assert shown["fast"] != shown["best"]
