@@ -1,0 +1,154 @@
+"""CPU time of a whole training step beside that of the rasteriser alone, part by part.
+
+    python benchmarks/train_step.py [--sizes S M L] [--threads N] [--repeats N]
+
+The primitives are those of benchmarks/raster.py, lifted into space so that one camera sees them all, with conditioning
+that does something. CPU-ms are process CPU time summed over threads, medians. The bar is a ratio of 1.5 at M.
+"""
+
+import argparse
+import resource
+import statistics
+import time
+from collections.abc import Callable
+from typing import Any
+
+import torch
+
+from raster import SIZES, Size, workload
+from swimm3r.cameras import Cameras
+from swimm3r.raster import MediumMaps, rasterize
+from swimm3r.splat.medium_field import grid_of, initial_field, medium_at_pixels, per_z_depth
+from swimm3r.splat.optimiser import adam_step, fresh
+from swimm3r.splat.primitives import BetaPrimitives, inverse_softplus
+from swimm3r.splat.projection import pinhole, project
+from swimm3r.splat.recipes import uwbs
+from swimm3r.splat.rendering import Drawing
+from swimm3r.splat.settings import UwbsSettings
+from swimm3r.splat.views import View
+
+
+def camera(size: Size) -> Cameras:
+    """A camera of about 65 degrees at the origin."""
+    f = 0.78 * size.width
+    K = torch.tensor([[f, 0, size.width / 2], [0, f, size.height / 2], [0, 0, 1]], dtype=torch.float64)
+    pose = torch.eye(4, dtype=torch.float64)[None]
+    return Cameras(K[None], torch.zeros(1, 0, dtype=torch.float64), pose, size.width, size.height)
+
+
+def lifted(size: Size) -> BetaPrimitives:
+    """Primitives in space that project to about the ellipses of the rasteriser's workload."""
+    p, _ = workload(size)
+    rng = torch.Generator().manual_seed(2)
+    n, K = size.primitives, camera(size).K[0].float()
+    xy = (p.mean2d - K[:2, 2]) / K[0, 0]
+    xyz = torch.cat([xy, torch.ones(n, 1)], -1) * p.depth[:, None]
+    covariance = torch.linalg.inv(torch.stack([p.conic[:, :2], p.conic[:, 1:]], 1).double())
+    axes = torch.linalg.eigvalsh(covariance).sqrt().float() * (p.depth / K[0, 0])[:, None]
+    spatial = torch.cat([axes, axes.mean(-1, keepdim=True)], -1)
+    direction = torch.nn.functional.normalize(xyz, dim=-1) + 0.05 * torch.randn(n, 3, generator=rng)
+    return BetaPrimitives(
+        xyz=xyz,
+        query_mean=direction,
+        rgb=p.color,
+        opacity=p.opacity.logit(),
+        beta=torch.cat([(p.beta / 4).log()[:, None], 0.1 * torch.randn(n, 3, generator=rng)], -1),
+        scale=inverse_softplus(torch.cat([spatial, torch.ones(n, 3)], -1)),
+        lower=0.05 * torch.randn(n, 15, generator=rng),
+    )
+
+
+def cpu_ms(work: Callable[[], Any], repeats: int) -> float:
+    """Median CPU milliseconds of a call, all threads; the first call is not counted."""
+    times = []
+    for _ in range(repeats + 1):
+        start = time.process_time()
+        work()
+        times.append(1e3 * (time.process_time() - start))
+    return statistics.median(times[1:])
+
+
+def measure(size: Size, repeats: int) -> dict[str, float]:
+    """CPU-ms of the step and of its parts."""
+    settings = UwbsSettings(iterations=20_000)
+    rng = torch.Generator().manual_seed(1)
+    height, width = size.height, size.width
+    recipe = uwbs.Uwbs(settings, None, 1.0, 1.0)  # the reconstruction is read at the start only
+    p, field = lifted(size), initial_field(None, settings.medium, rng)
+    state = uwbs.State(p, field, {name: fresh(t) for name, t in uwbs._parameters(p, field).items()})
+    prior = 1 + 9 * torch.rand(height, width, generator=rng)
+    view = View(
+        "benchmark", camera(size), torch.rand(3, height, width, generator=rng),
+        torch.ones(height, width, dtype=torch.bool), prior, torch.full((height, width), 1.8),
+    )  # fmt: skip
+    sight = pinhole(view.camera)
+    leaves = BetaPrimitives(*(t.clone().requires_grad_() for t in p))
+
+    seen = project(leaves, sight, settings.render)
+    plane = [t.detach().requires_grad_() for t in seen.primitives]
+    water = per_z_depth(medium_at_pixels(grid_of(field, sight, settings.medium.stride), height, width), sight)
+    maps = [t.detach().requires_grad_() for t in water]
+    images = rasterize(type(seen.primitives)(*plane), MediumMaps(*maps), height, width)
+    drawn = [t.detach().requires_grad_() for t in images]
+    cotangent = [torch.randn(t.shape, generator=rng) / t.numel() for t in images]
+    on_plane = [torch.randn(t.shape, generator=rng) for t in plane]
+    on_maps = [torch.randn(t.shape, generator=rng) for t in maps]
+    drawing = Drawing(type(images)(*drawn), seen, grid_of(field, sight, settings.medium.stride))
+
+    def raster() -> None:
+        out = rasterize(type(seen.primitives)(*plane), MediumMaps(*maps), height, width)
+        torch.autograd.grad(out, [*plane, *maps], cotangent)
+
+    def projection() -> None:
+        out = project(leaves, sight, settings.render).primitives
+        torch.autograd.grad(out, [t for t in leaves], on_plane, allow_unused=True)
+
+    def medium() -> None:
+        out = per_z_depth(medium_at_pixels(grid_of(field, sight, settings.medium.stride), height, width), sight)
+        torch.autograd.grad(out, list(field.network.parameters()), on_maps)
+
+    def losses() -> None:
+        loss, _ = uwbs.objective(leaves, drawing, view, settings, True)
+        torch.autograd.grad(loss, [*drawn, leaves.opacity, leaves.scale], allow_unused=True)
+
+    parameters = uwbs._parameters(BetaPrimitives(*(t.clone() for t in p)), field)
+    moments = {name: fresh(t) for name, t in parameters.items()}
+    gradients = {name: torch.randn(t.shape, generator=rng) for name, t in parameters.items()}
+    rates = recipe._rates(1)
+
+    def adam() -> None:
+        with torch.no_grad():
+            adam_step(parameters, gradients, moments, rates)
+
+    works = {"raster": raster, "projection": projection, "medium": medium, "losses": losses, "adam": adam}
+    parts = {name: cpu_ms(work, repeats) for name, work in works.items()}
+    held = {"state": state}
+
+    def step() -> None:
+        held["state"], _ = recipe.step(held["state"], view, 7_001)  # regularised, no round of densification
+
+    return {"step": cpu_ms(step, repeats)} | parts
+
+
+def main() -> None:
+    """Print the table."""
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("--sizes", nargs="+", default=["S", "M"], choices=["S", "M", "L"])
+    parser.add_argument("--threads", type=int, default=torch.get_num_threads())
+    parser.add_argument("--repeats", type=int, default=7)
+    arguments = parser.parse_args()
+    torch.set_num_threads(arguments.threads)
+    print(f"{arguments.threads} threads; CPU-ms")
+    print("| size | step | raster | step / raster | projection | medium | losses | adam | peak MB |")
+    print("|---|---|---|---|---|---|---|---|---|")
+    for name in arguments.sizes:
+        row = measure(SIZES[name], arguments.repeats)
+        peak = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 1024
+        print(
+            f"| {name} | {row['step']:.0f} | {row['raster']:.0f} | {row['step'] / row['raster']:.2f} "
+            f"| {row['projection']:.0f} | {row['medium']:.0f} | {row['losses']:.0f} | {row['adam']:.0f} | {peak:.0f} |"
+        )
+
+
+if __name__ == "__main__":
+    main()
