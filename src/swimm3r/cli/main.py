@@ -11,6 +11,7 @@ from swimm3r.cli.demo import demo
 from swimm3r.cli.doctor import doctor
 from swimm3r.cli.report import report
 from swimm3r.cli.run import commands_for_preset
+from swimm3r.cli.weights import weights
 from swimm3r.errors import StorageError, Swimm3rError
 from swimm3r.presets import PRESETS
 
@@ -22,7 +23,13 @@ def main(arguments: Sequence[str] | None = None) -> None:
     """Run one command; leaves through SystemExit with the documented code."""
     arguments = list(sys.argv[1:] if arguments is None else arguments)
     logging.basicConfig(level=logging.WARNING, format="%(message)s")
-    commands = {**commands_for_preset(_named_preset(arguments)), "demo": demo, "doctor": doctor, "report": report}
+    commands = {
+        **commands_for_preset(_named_preset(arguments)),
+        "demo": demo,
+        "doctor": doctor,
+        "report": report,
+        "weights": weights,
+    }
     try:
         tyro.extras.subcommand_cli_from_dict(
             commands,

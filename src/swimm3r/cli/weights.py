@@ -1,0 +1,75 @@
+"""`swimm3r weights list|get|verify|path`: which model weights exist, which are here, and how the others come here."""
+
+from pathlib import Path
+from typing import Annotated
+
+from tyro.conf import Positional, arg, subcommand
+
+from swimm3r import weights as store
+from swimm3r.cli.console import drawn_progress
+from swimm3r.errors import WeightsError
+
+
+def list_all() -> None:
+    """Print every file this program can use: what for, its size, its licence, and where it lies. No network."""
+    for entry in store.MANIFEST:
+        size = "size not published" if entry.about_mb is None else f"{entry.about_mb:,.4g} MB"
+        print(f"{entry.name:<20} {_whereabouts(entry.name)}\n    {entry.purpose}; {size}\n    {entry.licence}")
+    print(f"Downloads go to {store.directory()}")
+
+
+def get(name: Positional[str], /, accept_license: bool = False) -> None:
+    """Download weights, or go on with an interrupted download, and print where they lie.
+
+    Args:
+        name: as `swimm3r weights list` names them.
+        accept_license: you have read the licence of non-commercial weights and your use is within it.
+    """
+    with drawn_progress() as progress:
+        path = store.fetch(name, accept_licence=accept_license, progress=progress)
+    print(path)
+
+
+def verify(name: Positional[str], /, path: Path | None = None) -> None:
+    """Read a whole file and compare its checksum with the published one, else with that of its first use.
+
+    Args:
+        name: as `swimm3r weights list` names them.
+        path: the file, where it lies elsewhere.
+    """
+    checked = store.verify(name, path)
+    outcome = {
+        "published": "is the published file",
+        "first use": "is unchanged since its first use here (no checksum is published)",
+        "nothing": "has no published checksum; this one is kept to compare with from now on",
+    }[checked.against]
+    print(f"{checked.path} {outcome}: {checked.size:,} bytes, sha256 {checked.sha256}")
+
+
+def path(name: Positional[str] | None = None, /) -> None:
+    """Print the path of weights, for scripts; without a name the folder downloads go to. No network.
+
+    Args:
+        name: as `swimm3r weights list` names them.
+    """
+    print(store.directory() if name is None else store.require(name))
+
+
+_Action = (
+    Annotated[None, subcommand("list", constructor=list_all)]
+    | Annotated[None, subcommand("get", constructor=get)]
+    | Annotated[None, subcommand("verify", constructor=verify)]
+    | Annotated[None, subcommand("path", constructor=path)]
+)
+
+
+def weights(action: Annotated[_Action, arg(name="")]) -> None:
+    """List, download, check and find model weights. Nothing but --backend mast3r and some scores needs any."""
+
+
+def _whereabouts(name: str) -> str:
+    try:
+        found = store.find(name)
+    except WeightsError as damaged:
+        return damaged.what
+    return "not here" if found is None else str(found)
