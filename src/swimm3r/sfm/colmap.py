@@ -193,6 +193,7 @@ def _map(
         match_pairs(store, again, looser, threads, progress, again=True)
         model = mapping.refine(store, model, settings, progress).model  # a better lens places more
         model = mapping.place_leftovers(store, model, settings, progress)
+    model = mapping.replace_misplaced(store, model, settings, progress)
     sizes = [model.num_reg_images(), *(m.num_reg_images() for m in models[1:])]
     thin = model.compute_mean_observations_per_reg_image() < settings.mapping.thin_points
     share = settings.mapping.thin_share if thin else settings.mapping.min_share

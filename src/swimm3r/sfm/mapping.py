@@ -20,6 +20,7 @@ from swimm3r.cameras import DISTORTION_PARAMETERS, distort
 from swimm3r.errors import UsageError
 from swimm3r.progress import Progress
 from swimm3r.sfm.feature_database import MIN_INLIERS, FeatureDatabase
+from swimm3r.sfm.resection import misplaced_frames
 from swimm3r.sfm.settings import ColmapSettings
 
 if TYPE_CHECKING:
@@ -32,6 +33,7 @@ _CLEARLY = 1.1
 _GLOBAL_ENOUGH = 0.9  # share of the frames below which the incremental method has its turn, too
 _MAX_ERROR = 4.0  # pixels, where COLMAP drops observations
 _MAX_TANGENTIAL = 0.1  # a lens some 10 degrees askew behind its port
+_ROUNDS = 3
 _LOOSE_INLIERS, _LOOSE_SHARE = 15, 0.15  # to place a frame that COLMAP's 30 and 0.25 left over
 
 
@@ -124,6 +126,26 @@ def place_leftovers(
         model.write_binary(folder)
         models = _map_in_turn(store, settings, "placing the frames left over", progress, goes_on_from=Path(folder))
     return max([model, *models], key=lambda m: _merit([m]))
+
+
+def replace_misplaced(
+    store: FeatureDatabase, model: "pycolmap.Reconstruction", settings: ColmapSettings, progress: Progress
+) -> "pycolmap.Reconstruction":
+    """The model with frames that stood in the wrong place taken out and placed again, where that explains more."""
+    import pycolmap
+
+    for _ in range(_ROUNDS):
+        misplaced = misplaced_frames(store, model)
+        if not misplaced:
+            break
+        rest = pycolmap.Reconstruction(model)
+        for image_id in misplaced:
+            rest.deregister_frame(rest.images[image_id].frame_id)
+        again = place_leftovers(store, rest, settings, progress)
+        if _merit([again]) <= _merit([model]):
+            break
+        model = again
+    return model
 
 
 def refine(
