@@ -42,6 +42,7 @@ def moved(model: pycolmap.Reconstruction, degrees: float) -> pycolmap.Reconstruc
     swing = pycolmap.Rigid3d(turn, centre - turn.matrix() @ centre)
     out = pycolmap.Reconstruction(model)
     image = out.images[WRONG]
+    assert image.frame is not None
     image.frame.set_cam_from_world(image.camera_id, image.cam_from_world() * swing)
     return out
 
