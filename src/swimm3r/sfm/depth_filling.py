@@ -3,7 +3,6 @@
 import numpy as np
 import torch
 from jaxtyping import Float
-from scipy import ndimage
 from scipy.sparse import coo_matrix, diags
 from scipy.sparse.linalg import spsolve
 from torch import Tensor
@@ -88,7 +87,11 @@ def _diffused(
 
 def blur(x: Float[Tensor, "h w c"], sigma: float) -> Float[Tensor, "h w c"]:
     """Gaussian blur over rows and columns."""
-    return torch.from_numpy(ndimage.gaussian_filter(x.numpy(), (sigma, sigma, 0), truncate=2.5))
+    import cv2
+
+    size = 2 * round(2.5 * sigma) + 1
+    blurred = cv2.GaussianBlur(x.numpy(), (size, size), sigma, borderType=cv2.BORDER_REFLECT)
+    return torch.from_numpy(blurred.reshape(x.shape))
 
 
 def local_linear(

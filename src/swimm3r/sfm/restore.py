@@ -13,10 +13,9 @@ Near the camera all weights are 1 and J is the plain inverse. Nothing is stretch
 """
 
 import torch
-from jaxtyping import Float
+from jaxtyping import Bool, Float
 from torch import Tensor
 
-from swimm3r.cameras import Cameras, image_directions
 from swimm3r.frames import Frames
 from swimm3r.medium import MediumFit, backscatter, linear_from_srgb, remove_water, srgb_from_linear, transmittances
 from swimm3r.progress import Progress, silent
@@ -29,18 +28,21 @@ from swimm3r.sfm.tracks import DenseTracks, cubes, ray_depth_map
 def restore_picture(
     image: Float[Tensor, "h w 3"],
     depth: DepthMap,
-    camera: Cameras,
+    rays: Float[Tensor, "h w 3"],
     fit: MediumFit,
     settings: RestoreSettings | None = None,
 ) -> Float[Tensor, "h w 3"]:
-    """The whole picture without its water, as stored values in 0..1; unknown depth is filled in along the edges."""
+    """The whole picture without its water, as stored values in 0..1; unknown depth is filled in along the edges.
+
+    `rays` are the directions of the pixels with z = 1 (`cameras.image_directions`).
+    """
     settings = settings or RestoreSettings()
     veil = srgb_from_linear(fit.medium.Binf) if fit.encoding == "linear" else fit.medium.Binf
     sea = sea_share(image, depth.z_depth, veil)
     z_depth = fill_z_depth(image, depth, sea)
-    ray_depth = ray_depth_map(z_depth, image_directions(camera).float())
+    ray_depth = ray_depth_map(z_depth, rays)
     I = linear_from_srgb(image) if fit.encoding == "linear" else image
-    ray_depth = torch.where(depth.z_depth == 0, _not_beyond_white(I, ray_depth, fit), ray_depth)
+    ray_depth = _not_beyond_white(I, ray_depth, depth.z_depth == 0, fit)
     medium = fit.at(ray_depth)
     T_D, _ = transmittances(ray_depth, medium)
     direct = I - backscatter(ray_depth, medium)
@@ -105,15 +107,18 @@ def display_gains(restored: Float[Tensor, "n 3"]) -> Float[Tensor, "3"]:
 
 
 def _not_beyond_white(
-    I: Float[Tensor, "h w 3"], ray_depth: Float[Tensor, "h w"], fit: MediumFit
+    I: Float[Tensor, "h w 3"], ray_depth: Float[Tensor, "h w"], guessed: Bool[Tensor, "h w"], fit: MediumFit
 ) -> Float[Tensor, "h w"]:
-    """A guessed ray depth, shortened until the blurred J stays below 0.9."""
-    smooth = blur(I, 0.01 * max(I.shape[:2]))
-    share = torch.zeros_like(ray_depth)
+    """Ray depth, shortened where it is a guess until the blurred J stays below 0.9."""
+    reach = 0.01 * max(I.shape[:2])
+    smooth, far = blur(I, reach)[guessed], ray_depth[guessed]
+    shortened = torch.zeros_like(far)
     for trial in torch.linspace(0.05, 1.0, 20):
-        J = remove_water(smooth, trial * ray_depth, fit.at(trial * ray_depth))
-        share = torch.where(J.amax(-1) < 0.9, trial, share)
-    return ray_depth * blur(share[..., None], 0.01 * max(I.shape[:2]))[..., 0]
+        J = remove_water(smooth, trial * far, fit.at(trial * far))
+        shortened = torch.where(J.amax(-1) < 0.9, trial, shortened)
+    share = torch.ones_like(ray_depth)
+    share[guessed] = shortened
+    return torch.where(guessed, ray_depth * blur(share[..., None], reach)[..., 0], ray_depth)
 
 
 def _without_noise(

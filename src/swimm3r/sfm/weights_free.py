@@ -16,7 +16,7 @@ from swimm3r.sfm.plane_sweep import estimate_depth
 from swimm3r.sfm.restore import display_gains, restore_picture, restored_cloud
 from swimm3r.sfm.seathru import fit_medium
 from swimm3r.sfm.settings import ColmapSettings, RestoreSettings
-from swimm3r.sfm.tracks import fuse_depth
+from swimm3r.sfm.tracks import fuse_depth, shared_rays
 from swimm3r.sfm.water_samples import gather_samples
 
 
@@ -61,10 +61,11 @@ def write_restored_pictures(
     assert rec.medium is not None
     assert rec.cloud is not None
     gains = display_gains(rec.cloud.restored) if settings.white_balance else torch.ones(3)
+    rays = shared_rays(rec.cameras)
     for i, name in enumerate(rec.names):
         progress("restoring pictures", i, len(rec.names))
         depth = rec.depth[name]
         if (depth.z_depth > 0).any():
-            J = restore_picture(frames.image(frames.index(name)), depth, rec.cameras[i], rec.medium, settings)
+            J = restore_picture(frames.image(frames.index(name)), depth, rays[i], rec.medium, settings)
             images.write_rgb(folder / f"{name}.png", (J * gains).clamp(0, 1).numpy())
     progress("restoring pictures", len(rec.names), len(rec.names))
