@@ -28,12 +28,15 @@ class Medium:
 
 @dataclass(frozen=True)
 class AttenuationCurve:
-    """Sea-Thru's depth-dependent attenuation beta_D(z) = a exp(b z) + c exp(d z), with a, c >= 0 and b, d <= 0."""
+    """Sea-Thru's depth-dependent attenuation beta_D(z) = a exp(b z) + c exp(d z), with a, c >= 0 and b, d <= 0.
 
-    a: Float[Tensor, "3"]  # 1/unit
-    b: Float[Tensor, "3"]  # 1/unit
-    c: Float[Tensor, "3"]  # 1/unit
-    d: Float[Tensor, "3"]  # 1/unit
+    One curve for a scene, or one per pixel.
+    """
+
+    a: Float[Tensor, "*#pixels 3"]  # 1/unit
+    b: Float[Tensor, "*#pixels 3"]  # 1/unit
+    c: Float[Tensor, "*#pixels 3"]  # 1/unit
+    d: Float[Tensor, "*#pixels 3"]  # 1/unit
 
     def at(self, ray_depth: Float[Tensor, "*pixels"]) -> Float[Tensor, "*pixels 3"]:
         """beta_D at each depth, 1/unit."""

@@ -101,3 +101,20 @@ class AlignmentSettings:
     parity: bool = False
     """The reference's habits: the root's pose is free, pixel centres are at whole numbers, and the result is the one
     before the last step."""
+
+
+@dataclass(frozen=True)
+class LoraSettings:
+    """Which layers of the frozen network get a trained low-rank update (`sfm/mast3r/lora.py`)."""
+
+    reading: Literal["A", "A2", "B", "C", "D"] = "A"
+    """What the paper's "patch embedding and projection layers" are. A: the layers called `proj` of patch embedding and
+    self-attention (2,584,576 trained numbers); A2: those of patch embedding and encoder; B: patch and decoder
+    embedding; C: A with qkv and the decoder embedding; D: patch embedding, every layer of the encoder, decoder
+    embedding. All of them adapt the four projections of the decoder's cross-attention."""
+    rank: int = 16
+    """Of those layers (paper, implementation details)."""
+    cross_rank: int = 8
+    """Of the decoder's cross-attention projections."""
+    alpha_per_rank: float = 1.0
+    """The update is alpha / rank times B A; the paper gives no alpha."""
