@@ -135,3 +135,12 @@ def test_white_balance_makes_tinted_surfaces_grey():
     tinted = torch.linspace(0.1, 0.7, 300)[:, None] * torch.tensor([0.6, 1.0, 0.9])
     balanced = tinted * display_gains(tinted)
     torch.testing.assert_close(balanced[:, 0], balanced[:, 1], atol=1e-3, rtol=1e-3)
+
+
+def test_display_gains_colour_surfaces_and_leave_open_water_as_it_was(teal, dive):
+    image, depth = horizon_picture(teal)
+    camera = replace(dive.rec.cameras[0], width=128, height=96)
+    plain = restore_picture(image, depth, rays_of(camera), exact(teal))
+    gained = restore_picture(image, depth, rays_of(camera), exact(teal), gains=torch.tensor([1.2, 0.9, 0.9]))
+    torch.testing.assert_close(gained[:20], plain[:20])
+    assert (gained[70:, :, 1] < 0.95 * plain[70:, :, 1]).float().mean() > 0.9

@@ -9,7 +9,7 @@ Where T_D is small the quotient is noise, so per channel with s = T_D:
               G: the channels weighted by how well they see; k: this channel's share of colour where it does see
     horizon   in open water, and where no channel sees (max w -> 0), the picture's own veil remains
 
-Near the camera all weights are 1 and J is the plain inverse. Nothing is stretched; `display_gains` is a separate step.
+Near the camera all weights are 1 and J is the plain inverse. Nothing is stretched; `display_gains` serve the eye alone.
 """
 
 import torch
@@ -24,6 +24,8 @@ from swimm3r.sfm.depth_filling import LUMA, blur, fill_z_depth, local_linear, se
 from swimm3r.sfm.settings import RestoreSettings
 from swimm3r.sfm.tracks import DenseTracks, cubes, ray_depth_map
 
+_MAX_TINT = 1.0  # times the other channels, for blurred colours at a guessed distance
+
 
 def restore_picture(
     image: Float[Tensor, "h w 3"],
@@ -31,10 +33,12 @@ def restore_picture(
     rays: Float[Tensor, "h w 3"],
     fit: MediumFit,
     settings: RestoreSettings | None = None,
+    gains: Float[Tensor, "3"] | None = None,
 ) -> Float[Tensor, "h w 3"]:
     """The whole picture without its water, as stored values in 0..1; unknown depth is filled in along the edges.
 
-    `rays` are the directions of the pixels with z = 1 (`cameras.image_directions`).
+    `rays` are the directions of the pixels with z = 1 (`cameras.image_directions`). `gains` (`display_gains`) colour
+    surfaces and not the open water behind them, which keeps the colour the diver saw.
     """
     settings = settings or RestoreSettings()
     veil = srgb_from_linear(fit.medium.Binf) if fit.encoding == "linear" else fit.medium.Binf
@@ -47,8 +51,8 @@ def restore_picture(
     T_D, _ = transmittances(ray_depth, medium)
     direct = I - backscatter(ray_depth, medium)
     J = _without_noise(direct, T_D, I @ LUMA, settings)
-    J = _horizon(J, T_D, I, sea, settings)
-    return (srgb_from_linear(J.clamp(min=0)) if fit.encoding == "linear" else J).clamp(0, 1)
+    stored = srgb_from_linear(J.clamp(min=0)) if fit.encoding == "linear" else J
+    return _horizon(stored if gains is None else stored * gains, T_D, image, sea, settings).clamp(0, 1)
 
 
 def restored_cloud(
@@ -109,13 +113,19 @@ def display_gains(restored: Float[Tensor, "n 3"]) -> Float[Tensor, "3"]:
 def _not_beyond_white(
     I: Float[Tensor, "h w 3"], ray_depth: Float[Tensor, "h w"], guessed: Bool[Tensor, "h w"], fit: MediumFit
 ) -> Float[Tensor, "h w"]:
-    """Ray depth, shortened where it is a guess until the blurred J stays below 0.9."""
+    """Ray depth, shortened where it is a guess until the blurred J is a colour that surfaces have.
+
+    That is below 0.9, and in the channel that the water takes first not far above the others: too long a path shows as
+    glaring red first.
+    """
+    first = int(fit.medium.beta_D.argmax())
     reach = 0.01 * max(I.shape[:2])
     smooth, far = blur(I, reach)[guessed], ray_depth[guessed]
     shortened = torch.zeros_like(far)
     for trial in torch.linspace(0.05, 1.0, 20):
         J = remove_water(smooth, trial * far, fit.at(trial * far))
-        shortened = torch.where(J.amax(-1) < 0.9, trial, shortened)
+        others = torch.cat([J[:, :first], J[:, first + 1 :]], dim=-1).amax(-1)
+        shortened = torch.where((J.amax(-1) < 0.9) & (J[:, first] < _MAX_TINT * others), trial, shortened)
     share = torch.ones_like(ray_depth)
     share[guessed] = shortened
     return torch.where(guessed, ray_depth * blur(share[..., None], reach)[..., 0], ray_depth)
@@ -143,9 +153,9 @@ def _without_noise(
 
 
 def _horizon(
-    J: Float[Tensor, "h w 3"],
+    surface: Float[Tensor, "h w 3"],
     T_D: Float[Tensor, "h w 3"],
-    I: Float[Tensor, "h w 3"],
+    image: Float[Tensor, "h w 3"],
     sea: Float[Tensor, "h w"],
     settings: RestoreSettings,
 ) -> Float[Tensor, "h w 3"]:
@@ -153,7 +163,7 @@ def _horizon(
     floor = settings.veil_error / settings.colour_error
     best = T_D.amax(-1, keepdim=True)
     sees = best**2 / (best**2 + floor**2) * (1 - sea[..., None])
-    return sees * J + (1 - sees) * I
+    return sees * surface + (1 - sees) * image
 
 
 def _thinned(cloud: DenseCloud, count: int) -> DenseCloud:

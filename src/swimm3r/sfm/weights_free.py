@@ -3,8 +3,6 @@
 from dataclasses import replace
 from pathlib import Path
 
-import torch
-
 from swimm3r import reconstruction
 from swimm3r.errors import InputError
 from swimm3r.frames import Frames
@@ -60,12 +58,12 @@ def write_restored_pictures(
     """folder/NAME.png for every registered frame with some known depth, white-balanced for the eye where asked for."""
     assert rec.medium is not None
     assert rec.cloud is not None
-    gains = display_gains(rec.cloud.restored) if settings.white_balance else torch.ones(3)
+    gains = display_gains(rec.cloud.restored) if settings.white_balance else None
     rays = shared_rays(rec.cameras)
     for i, name in enumerate(rec.names):
         progress("restoring pictures", i, len(rec.names))
         depth = rec.depth[name]
         if (depth.z_depth > 0).any():
-            J = restore_picture(frames.image(frames.index(name)), depth, rays[i], rec.medium, settings)
-            images.write_rgb(folder / f"{name}.png", (J * gains).clamp(0, 1).numpy())
+            J = restore_picture(frames.image(frames.index(name)), depth, rays[i], rec.medium, settings, gains)
+            images.write_rgb(folder / f"{name}.png", J.numpy())
     progress("restoring pictures", len(rec.names), len(rec.names))
