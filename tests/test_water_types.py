@@ -1,7 +1,8 @@
 import pytest
 import torch
 
-from swimm3r.water_types import FAMILIES, Family, sample
+from swimm3r.medium import Medium
+from swimm3r.water_types import FAMILIES, Family, draw, sample
 
 DRAWS = 300
 
@@ -40,3 +41,30 @@ def test_only_cyan_water_narrows_red_to_where_it_is_nearly_gone():
 def test_one_seed_is_one_water():
     first, second = (sample("green", torch.Generator().manual_seed(9)) for _ in range(2))
     assert all(torch.equal(a, b) for a, b in zip(vars(first).values(), vars(second).values(), strict=True))
+
+
+def family_of(water: Medium) -> Family | None:
+    """The only family whose red and blue veil both fit; the intervals of the four do not all overlap."""
+    fits = [
+        name
+        for name, kind in FAMILIES.items()
+        if all(low <= float(value) <= high for value, (low, high) in zip(water.Binf, kind.Binf, strict=True))
+    ]
+    return fits[0] if len(fits) == 1 else None
+
+
+def test_half_of_the_pictures_get_water_and_every_family_is_drawn_as_often():
+    generator = torch.Generator().manual_seed(11)
+    drawn = [draw(generator) for _ in range(2000)]
+    given = [water for water in drawn if water is not None]
+    assert abs(len(given) / len(drawn) - 0.5) < 0.04
+    families = [family_of(water) for water in given]
+    assert families.count(None) < 0.1 * len(families)
+    for name in FAMILIES:
+        assert abs(families.count(name) / len(families) - 0.25) < 0.05, name
+
+
+def test_augmentation_can_be_switched_off_and_always_on():
+    generator = torch.Generator().manual_seed(1)
+    assert all(draw(generator, 0.0) is None for _ in range(50))
+    assert all(draw(generator, 1.0) is not None for _ in range(50))

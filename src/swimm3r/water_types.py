@@ -44,6 +44,17 @@ def sample(family: Family, generator: torch.Generator) -> Medium:
     return Medium(_uniform(water.Binf, generator), beta_D, beta_D * torch.rand(3, generator=generator))
 
 
+def draw(generator: torch.Generator, probability: float = 0.5) -> Medium | None:
+    """With that probability one water of a family drawn evenly, else None: the augmentation of the paper.
+
+    `add_water` with it turns a clear picture into a student's; both frames of a pair take the same water.
+    """
+    if torch.rand(1, generator=generator).item() >= probability:
+        return None
+    names = list(FAMILIES)
+    return sample(names[int(torch.randint(len(names), (1,), generator=generator))], generator)
+
+
 def _uniform(intervals: tuple[Interval, Interval, Interval], generator: torch.Generator) -> torch.Tensor:
     low, high = torch.tensor(intervals).unbind(-1)
     return low + (high - low) * torch.rand(3, generator=generator)

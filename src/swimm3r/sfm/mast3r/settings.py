@@ -118,3 +118,28 @@ class LoraSettings:
     """Of the decoder's cross-attention projections."""
     alpha_per_rank: float = 1.0
     """The update is alpha / rank times B A; the paper gives no alpha."""
+
+
+@dataclass(frozen=True)
+class ObjectiveSettings:
+    """What is minimised (`sfm/distill.py`); the defaults are the paper's, Eq. geom to stage1_objective."""
+
+    encoder: float = 0.5
+    decoder: float = 0.5
+    descriptors: float = 2.0
+    clean: float = 0.0
+    """Weight of the same distances with the student on the clear pictures; Dark3R's 0.3, not in this paper."""
+    reduction: Literal["mean", "token", "sum"] = "mean"
+    """The paper writes squared norms without saying over what: mean over all elements; sum over channels and mean over
+    tokens or pixels; or the sum, which makes the encoder's term thousands of times larger than the descriptors'."""
+    decoder_levels: Literal["last", "all"] = "last"
+    """The decoder's normalised output, or the outputs of all its blocks."""
+    forward: float = 1.0
+    inverse: float = 1.0
+    saturation: float = 1.0
+    anchor: float = 0.5
+    """Inside L_sat, of the veiling light's distance to the dim pixels' colour. It pulls Binf below the truth wherever
+    the dimmest pixels are nearer than the open water; 0 leaves it out."""
+    anchor_quantile: float = 0.05
+    min_transmittance: float = 0.05
+    """eps_inv of Eq. swimm3r_render_inverse; the paper gives none. At 1/20 a noise of 1/255 stays below 0.08."""
