@@ -56,18 +56,18 @@ def reconstruct(frames: Frames, settings: ColmapSettings, folder: Path, progress
         fill_features(store, frames, settings.features, threads, progress)
         pairs = choose_pairs(store, frames, settings)
         match_pairs(store, pairs, settings.features, threads, progress)
-    for leftover in folder.glob(".mapping.*"):  # of a killed run
-        shutil.rmtree(leftover)
-    # mapping writes lenses, and matches of frames left over, into a copy: the database holds what every run agrees on
-    working = FeatureDatabase(folder / "mapping.db", len(frames))
-    with atomic_path(working.path) as draft:
-        shutil.copyfile(store.path, draft)
-    try:
-        model, sizes, cautions = _map(working, frames, pairs, settings, progress)
-        rec = _record(model, working, frames, folder)
-        found = implausible(rec, working, frames)
-    finally:
-        working.path.unlink(missing_ok=True)
+        for leftover in folder.glob(".mapping.*"):  # of a killed run
+            shutil.rmtree(leftover)
+        # mapping writes lenses, and matches of frames left over, into a copy: the database holds what all runs agree on
+        working = FeatureDatabase(folder / "mapping.db", len(frames))
+        try:
+            with atomic_path(working.path) as draft:
+                shutil.copyfile(store.path, draft)
+            model, sizes, cautions = _map(working, frames, pairs, settings, progress)
+            rec = _record(model, working, frames, folder)
+            found = implausible(rec, working, frames)
+        finally:
+            working.path.unlink(missing_ok=True)
     cautions += _registration_cautions(len(rec.names), sizes, frames)
     if settings.housing == "flat":
         cautions.append(

@@ -5,6 +5,7 @@ fundamental matrix and homography as long as nobody knows the focal length, so t
 """
 
 import json
+import shutil
 from collections.abc import Iterator, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from contextlib import contextmanager
@@ -17,6 +18,7 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
+from swimm3r.errors import StorageError
 from swimm3r.frames import Frames
 from swimm3r.io.atomic import write_text
 from swimm3r.progress import Progress, silent
@@ -28,7 +30,9 @@ if TYPE_CHECKING:
 
 MIN_INLIERS = 15  # of a pair; COLMAP's limit, below it chance agrees with some geometry
 _HINT_OF_OVERLAP = 8  # matches
-_BATCH = 32  # pairs per transaction: what a killed run loses
+_BATCH = 32  # frames or pairs per transaction: what a killed run loses
+_SPARE_BYTES = 48 << 20  # a batch of frames is at most 32 * 0.6 MB, twice that in the journal
+_HELD = 200  # frames in memory while matching: 0.3 GB
 
 
 @dataclass(frozen=True)
@@ -48,6 +52,24 @@ class FeatureDatabase:
             yield database
         finally:
             database.close()
+
+    @contextmanager
+    def transaction(self) -> "Iterator[pycolmap.Database]":
+        """The open database, whose writes are kept together or not at all.
+
+        Raises StorageError before the disk is full: a transaction that cannot be finished aborts the whole process.
+        """
+        import pycolmap
+
+        free = shutil.disk_usage(self.path.parent).free
+        if free < _SPARE_BYTES:
+            raise StorageError(
+                f"only {free / 1e6:.0f} MB are left on the disk of {self.path.parent}",
+                cause="the disk filled up, or a quota is used up",
+                hint="free some space, or choose another --out, and run the same command again: it goes on from here",
+            )
+        with self.open() as database, pycolmap.DatabaseTransaction(database):
+            yield database
 
 
 def start_database(
@@ -73,7 +95,7 @@ def start_database(
     about.unlink(missing_ok=True)
     for leftover in folder.glob("database.db*"):
         leftover.unlink()
-    with out.open() as database, pycolmap.DatabaseTransaction(database):
+    with out.transaction() as database:
         camera_id = database.write_camera(camera, use_camera_id=True)
         sensor = pycolmap.sensor_t(pycolmap.SensorType.CAMERA, camera_id)
         rig = pycolmap.Rig()
@@ -98,20 +120,20 @@ def fill_features(
 
     with store.open() as database:
         missing = [i for i in range(store.frames) if not database.exists_keypoints(i + 1)]
-        done = store.frames - len(missing)
+    done = store.frames - len(missing)
 
-        def extract(i: int) -> tuple[int, Features]:
-            return i, extract_features(frames.image(i), frames.mask(i), settings)
+    def extract(i: int) -> tuple[int, Features]:
+        return i, extract_features(frames.image(i), frames.mask(i), settings)
 
-        progress("finding features", done, store.frames)
-        for start in range(0, len(missing), _BATCH):
-            with ThreadPoolExecutor(threads) as pool, pycolmap.DatabaseTransaction(database):
-                for i, found in pool.map(extract, missing[start : start + _BATCH]):
-                    database.write_keypoints(i + 1, found.keypoints)
-                    described = pycolmap.FeatureDescriptors(pycolmap.FeatureExtractorType.SIFT, found.descriptors)
-                    database.write_descriptors(i + 1, described)
-                    done += 1
-                    progress("finding features", done, store.frames)
+    progress("finding features", done, store.frames)
+    for start in range(0, len(missing), _BATCH):
+        with ThreadPoolExecutor(threads) as pool, store.transaction() as database:
+            for i, found in pool.map(extract, missing[start : start + _BATCH]):
+                database.write_keypoints(i + 1, found.keypoints)
+                described = pycolmap.FeatureDescriptors(pycolmap.FeatureExtractorType.SIFT, found.descriptors)
+                database.write_descriptors(i + 1, described)
+                done += 1
+                progress("finding features", done, store.frames)
 
 
 def match_pairs(
@@ -136,44 +158,45 @@ def match_pairs(
             missing = [(i, j) for i, j in pairs if len(database.read_matches(i + 1, j + 1)) >= _HINT_OF_OVERLAP]
         else:
             missing = [(i, j) for i, j in pairs if not database.exists_two_view_geometry(i + 1, j + 1)]
-        done = len(pairs) - len(missing)
-        held: dict[int, tuple[np.ndarray, Float[Tensor, "n 128"]]] = {}
+    done = len(pairs) - len(missing)
+    held: dict[int, tuple[np.ndarray, Float[Tensor, "n 128"]]] = {}
 
-        def features(i: int) -> tuple[np.ndarray, Float[Tensor, "n 128"]]:
-            if i not in held:
-                keypoints = database.read_keypoints(i + 1)[:, :2].astype(np.float64)
-                held[i] = keypoints, unit_descriptors(database.read_descriptors(i + 1).data)
-            return held[i]
+    def match(pair: tuple[int, int]) -> "tuple[np.ndarray, pycolmap.TwoViewGeometry]":
+        (xy_i, d_i), (xy_j, d_j) = held[pair[0]], held[pair[1]]
+        matches = match_descriptors(d_i, d_j, settings.max_ratio).numpy().astype(np.uint32)
+        if len(matches) < MIN_INLIERS:
+            return matches, pycolmap.TwoViewGeometry()
+        return matches, pycolmap.estimate_two_view_geometry(camera, xy_i, camera, xy_j, matches, verification)
 
-        def match(pair: tuple[int, int]) -> "tuple[np.ndarray, pycolmap.TwoViewGeometry]":
-            (xy_i, d_i), (xy_j, d_j) = held[pair[0]], held[pair[1]]
-            matches = match_descriptors(d_i, d_j, settings.max_ratio).numpy().astype(np.uint32)
-            if len(matches) < MIN_INLIERS:
-                return matches, pycolmap.TwoViewGeometry()
-            return matches, pycolmap.estimate_two_view_geometry(camera, xy_i, camera, xy_j, matches, verification)
+    torch_threads = torch.get_num_threads()
+    torch.set_num_threads(1)  # pairs are the parallel unit
+    try:
+        progress(what, done, len(pairs))
+        for start in range(0, len(missing), _BATCH):
+            batch = missing[start : start + _BATCH]
+            with ThreadPoolExecutor(threads) as pool, store.transaction() as database:
+                _hold_features(held, {i for pair in batch for i in pair}, database)
+                for (i, j), (matches, geometry) in zip(batch, pool.map(match, batch), strict=True):
+                    if again:
+                        old = database.read_two_view_geometry(i + 1, j + 1)
+                        if len(old.inlier_matches) < len(geometry.inlier_matches):
+                            database.update_two_view_geometry(i + 1, j + 1, geometry)
+                    else:
+                        database.write_matches(i + 1, j + 1, matches)
+                        database.write_two_view_geometry(i + 1, j + 1, geometry)
+                    done += 1
+                    progress(what, done, len(pairs))
+    finally:
+        torch.set_num_threads(torch_threads)
 
-        torch_threads = torch.get_num_threads()
-        torch.set_num_threads(1)  # pairs are the parallel unit
-        try:
-            progress(what, done, len(pairs))
-            for start in range(0, len(missing), _BATCH):
-                batch = missing[start : start + _BATCH]
-                needed = {i for pair in batch for i in pair}
-                for i in needed:
-                    features(i)
-                for i in list(held):
-                    if len(held) > 200 and i not in needed:  # 200 frames are 0.3 GB
-                        del held[i]
-                with ThreadPoolExecutor(threads) as pool, pycolmap.DatabaseTransaction(database):
-                    for (i, j), (matches, geometry) in zip(batch, pool.map(match, batch), strict=True):
-                        if again:
-                            old = database.read_two_view_geometry(i + 1, j + 1)
-                            if len(old.inlier_matches) < len(geometry.inlier_matches):
-                                database.update_two_view_geometry(i + 1, j + 1, geometry)
-                        else:
-                            database.write_matches(i + 1, j + 1, matches)
-                            database.write_two_view_geometry(i + 1, j + 1, geometry)
-                        done += 1
-                        progress(what, done, len(pairs))
-        finally:
-            torch.set_num_threads(torch_threads)
+
+def _hold_features(
+    held: dict[int, tuple[np.ndarray, Float[Tensor, "n 128"]]], needed: set[int], database: "pycolmap.Database"
+) -> None:
+    """Load what is needed; drop what is not while there is too much."""
+    for i in needed - held.keys():
+        keypoints = database.read_keypoints(i + 1)[:, :2].astype(np.float64)
+        held[i] = keypoints, unit_descriptors(database.read_descriptors(i + 1).data)
+    for i in list(held):
+        if len(held) > _HELD and i not in needed:
+            del held[i]

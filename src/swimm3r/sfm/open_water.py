@@ -2,8 +2,8 @@
 
 Such a region has no depth and next to no texture (the local standard deviation, after removing slopes, of any channel
 in 7 x 7 pixels), is large, reaches the upper or a side edge of the picture, is in its brightest channel brighter than
-the darkest fifth of what has texture (veil only grows with distance; shadows and urchins are smooth, too), and the
-surfaces at its rim are among the far ones: smooth sand close by has no depth either.
+the darkest fifth of what has texture (veil only grows with distance; shadows and urchins are smooth, too), or, where it
+is small, than half of it, and the surfaces at its rim are among the far ones: smooth sand has no depth either.
 """
 
 import numpy as np
@@ -35,8 +35,14 @@ def open_water_mask(
     smooth = local_texture(image).numpy() < max_texture
     crowded = _box(known.astype(np.float32), _RIM) > 0.1
     value = ndimage.gaussian_filter(image.numpy(), (1.0, 1.0, 0.0))
-    dim = np.quantile(value[~smooth] if (~smooth).any() else value.reshape(-1, 3), 0.2, axis=0)
-    bright = np.take_along_axis(value - dim, value.argmax(-1)[..., None], -1)[..., 0] >= 0
+    textured = value[~smooth] if (~smooth).any() else value.reshape(-1, 3)
+
+    def brighter_than(share: float) -> np.ndarray:
+        """In the pixel's brightest channel, than this share of what has texture."""
+        difference = value - np.quantile(textured, share, axis=0)
+        return np.take_along_axis(difference, value.argmax(-1)[..., None], -1)[..., 0] >= 0
+
+    bright, brightest = brighter_than(0.2), brighter_than(0.5)
     alike = np.zeros_like(bright)
     if veil is not None:
         alike = np.abs(value - veil.numpy()).max(-1) < 0.05
@@ -50,7 +56,11 @@ def open_water_mask(
     reaching = {0, *np.unique(labels[:edge]), *np.unique(labels[:, :edge]), *np.unique(labels[:, -edge:])} - {0}
     for k in sorted(reaching):
         region = labels == k
-        if region.mean() < (0.1 if alike[region].mean() > 0.5 else 1.0) * min_share:
+        if alike[region].mean() > 0.5:
+            needed = 0.1 * min_share
+        else:
+            needed = min_share if brightest[region].mean() > 0.5 else 5 * min_share
+        if region.mean() < needed:
             continue
         rim = np.logical_and(ndimage.binary_dilation(region, iterations=2 * _RIM), known)
         if rim.sum() < _FEW or np.median(z_depth.numpy()[rim]) >= 0.8 * middle:
