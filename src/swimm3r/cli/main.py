@@ -7,6 +7,7 @@ from collections.abc import Sequence
 
 import tyro
 
+from swimm3r.cli.datasets import datasets
 from swimm3r.cli.demo import demo
 from swimm3r.cli.doctor import doctor
 from swimm3r.cli.report import report
@@ -28,6 +29,7 @@ def main(arguments: Sequence[str] | None = None) -> None:
         "demo": demo,
         "doctor": doctor,
         "report": report,
+        "datasets": datasets,
         "weights": weights,
     }
     try:
