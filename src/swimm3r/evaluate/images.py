@@ -10,7 +10,7 @@ from dataclasses import dataclass
 from typing import Literal
 
 import torch
-from jaxtyping import Float
+from jaxtyping import Bool, Float
 from scipy.ndimage import gaussian_filter
 from torch import Tensor
 from torch.nn.functional import conv2d
@@ -37,19 +37,31 @@ class ViewScores:
 
 
 def view_scores(
-    render: Float[Tensor, "h w 3"], target: Float[Tensor, "h w 3"], perceptual: Lpips | NotComputed
+    render: Float[Tensor, "h w 3"],
+    target: Float[Tensor, "h w 3"],
+    perceptual: Lpips | NotComputed,
+    seen: Bool[Tensor, "h w"] | None = None,
 ) -> ViewScores:
-    """Every score of one view, both pictures as their 8-bit files show them."""
+    """Every score of one view, both pictures as their 8-bit files show them.
+
+    Pixels not `seen` (masked out) do not count in the PSNRs; the scores that look at surroundings take them as matched.
+    Raises ValueError where no pixel is seen.
+    """
     render, target = as_8_bit(render), as_8_bit(target)
+    if seen is None:
+        seen = torch.ones(target.shape[:2], dtype=torch.bool)
+    if not bool(seen.any()):
+        raise ValueError("no pixel of the view is seen, so there is nothing to score")
+    target = torch.where(seen[..., None], target, render)
     if isinstance(perceptual, NotComputed):
         perceived, variant = perceptual, "SSIM zero-padded"
     else:
         perceived, variant = lpips(render, target, perceptual), f"SSIM zero-padded, {perceptual.variant}"
     return ViewScores(
-        psnr=psnr(render, target),
+        psnr=psnr(render[seen], target[seen]),
         ssim=ssim(render, target),
         lpips=perceived,
-        blur4_psnr=blur4_psnr(target),
+        blur4_psnr=blur4_psnr(target, seen),
         sharpness=sharpness(render, target),
         views=1,
         variant=variant,
@@ -115,10 +127,11 @@ def ssim(render: Float[Tensor, "h w 3"], target: Float[Tensor, "h w 3"], border:
     return (brightness * structure).mean().item()
 
 
-def blur4_psnr(target: Float[Tensor, "h w 3"]) -> float:
-    """PSNR of a picture against itself blurred with a Gaussian of sigma 4 px (mirrored borders), dB."""
+def blur4_psnr(target: Float[Tensor, "h w 3"], seen: Bool[Tensor, "h w"] | None = None) -> float:
+    """PSNR of a picture against itself blurred with a Gaussian of sigma 4 px (mirrored borders), dB, where `seen`."""
     blurred = gaussian_filter(target.double().numpy(), sigma=(4, 4, 0), mode="reflect")
-    return psnr(torch.from_numpy(blurred), target)
+    errors = torch.from_numpy(blurred) - target.double()
+    return psnr_from_errors(errors if seen is None else errors[seen])
 
 
 def sharpness(render: Float[Tensor, "h w 3"], target: Float[Tensor, "h w 3"]) -> float | NotComputed:

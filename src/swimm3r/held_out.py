@@ -1,0 +1,182 @@
+"""How well a map shows the frames it never saw: where they were taken, how the map looks from there, the scores.
+
+A frame's first pose comes from a reference where one is given, else from its matches with points of the reconstruction,
+else from its neighbours in time. Then it is refined on the frozen map (`splat.poses`), for a score should be about the
+map and not about a pose that is a pixel off. Scores count the pixels that the lens shows and the mask admits, on the
+pinhole canvas of the training size.
+"""
+
+from collections import Counter
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+from pathlib import Path
+from typing import Literal
+
+from jaxtyping import Float
+from torch import Tensor
+
+from swimm3r import weights
+from swimm3r.cameras import Cameras, distorted_grid, resized
+from swimm3r.evaluate import NotComputed
+from swimm3r.evaluate.images import ViewScores, mean_view_scores, view_scores
+from swimm3r.evaluate.lpips import Lpips, load_lpips
+from swimm3r.frames import Frames
+from swimm3r.geometry import DegenerateAlignmentError, align_poses, align_similarity
+from swimm3r.ground_truth import GroundTruth
+from swimm3r.localization import landmarks_of, locate, neighbours, pose_from_neighbours
+from swimm3r.progress import Progress, silent
+from swimm3r.reconstruction import Reconstruction
+from swimm3r.renders import depth_span, write_view
+from swimm3r.sfm.settings import FeatureSettings
+from swimm3r.splat.poses import refine_pose
+from swimm3r.splat.rendering import SplatMap
+from swimm3r.splat.settings import PoseRefinementSettings
+from swimm3r.splat.views import pinhole_canvas, undistorted
+
+Source = Literal["reference", "2D-3D matches", "neighbours"]
+_WITNESSES = 6  # registered frames, the nearest in time, that a held-out frame is matched with
+
+
+@dataclass(frozen=True)
+class FirstPose:
+    """Where a frame's refinement starts."""
+
+    cam2world: Float[Tensor, "4 4"]
+    source: Source
+
+
+@dataclass(frozen=True)
+class HeldOutView:
+    """One frame that training did not see, as the map shows it."""
+
+    name: str
+    lens: Cameras  # the frame's own camera, its pose refined
+    canvas: Cameras  # its pinhole at the training size
+    window: "Window"  # of the canvas that was rendered and scored
+    source: Source
+    scores: ViewScores
+
+
+def first_poses(
+    rec: Reconstruction,
+    frames: Frames,
+    features: FeatureSettings,
+    reference: GroundTruth | None = None,
+    progress: Progress = silent,
+) -> dict[str, FirstPose]:
+    """A pose of every test frame in the axes and unit of the reconstruction."""
+    known = {} if reference is None else _from_reference(rec, reference)
+    landmarks = landmarks_of(rec, frames, features)
+    poses = {}
+    for done, frame in enumerate(frames.test):
+        progress("placing test frames", done, len(frames.test))
+        if frame.name in known:
+            poses[frame.name] = FirstPose(known[frame.name], "reference")
+            continue
+        near = neighbours(rec, frames, frame.name, _WITNESSES)
+        f, lens = frames.index(frame.name), rec.cameras[rec.index(near[0])]
+        located = locate(frames.image(f), frames.mask(f), lens, [landmarks(name) for name in near], features)
+        if located is None:
+            poses[frame.name] = FirstPose(pose_from_neighbours(rec, frames, frame.name), "neighbours")
+        else:
+            poses[frame.name] = FirstPose(located.cam2world, "2D-3D matches")
+    progress("placing test frames", len(frames.test), len(frames.test))
+    return poses
+
+
+def score_views(
+    scene: SplatMap,
+    rec: Reconstruction,
+    frames: Frames,
+    poses: dict[str, FirstPose],
+    folder: Path,
+    settings: PoseRefinementSettings | None = None,
+    progress: Progress = silent,
+) -> list[HeldOutView]:
+    """Refine, render and score each frame of `poses`; its pictures go to folder/NAME_{rgb,clear,z_depth,veil}.png."""
+    perceptual = published_lpips()
+    views = []
+    span = depth_span(rec)
+    for done, (name, first) in enumerate(poses.items()):
+        progress("scoring test frames", done, len(poses))
+        f = frames.index(name)
+        lens = rec.cameras[rec.index(neighbours(rec, frames, name, 1)[0])]
+        lens = replace(lens, cam2world=first.cam2world[None].to(lens.cam2world))
+        lens = refine_pose(scene, lens, frames.image(f), frames.mask(f), settings).camera
+        canvas = pinhole_canvas(lens, scene.settings.long_side)
+        window = visible_window(lens, canvas)
+        target, seen = (
+            part[window.rows, window.columns] for part in undistorted(frames.image(f), frames.mask(f), lens, canvas)
+        )
+        out = scene.render(cut(canvas, window))
+        write_view(folder, name, out, span)
+        scores = view_scores(out.rgb, target, perceptual, seen)
+        views.append(HeldOutView(name, lens, canvas, window, first.source, scores))
+    progress("scoring test frames", len(poses), len(poses))
+    return views
+
+
+def protocol(views: Sequence[HeldOutView], settings: PoseRefinementSettings) -> str:
+    """In words, how the poses of the scored frames came about."""
+    counts = Counter(view.source for view in views)
+    starts = ", ".join(f"{count} from {source}" for source, count in counts.items())
+    return f"every 8th frame; poses {starts}, refined {settings.steps} steps on the frozen map"
+
+
+def mean_scores(views: Sequence[HeldOutView]) -> ViewScores:
+    """The scores averaged over frames."""
+    return mean_view_scores([view.scores for view in views])
+
+
+@dataclass(frozen=True)
+class Window:
+    """A rectangle of a canvas: rows and columns."""
+
+    rows: slice
+    columns: slice
+
+
+def visible_window(lens: Cameras, canvas: Cameras) -> Window:
+    """The part of a lens's pinhole canvas that its picture fills, cut straight."""
+    shown = distorted_grid(resized(lens, canvas.width, canvas.height), canvas)[1]
+    top, bottom, left, right = 0, canvas.height, 0, canvas.width
+    while True:
+        part = shown[top:bottom, left:right]
+        # the side that misses the most of its length goes first; a hole inside is no matter of borders
+        missing = [float((~edge).float().mean()) for edge in (part[0], part[-1], part[:, 0], part[:, -1])]
+        worst = missing.index(max(missing))
+        if missing[worst] == 0 or min(part.shape) <= 16:
+            return Window(slice(top, bottom), slice(left, right))
+        top, bottom = top + (worst == 0), bottom - (worst == 1)
+        left, right = left + (worst == 2), right - (worst == 3)
+
+
+def cut(canvas: Cameras, window: Window) -> Cameras:
+    """The cameras of a window of a pinhole canvas."""
+    K = canvas.K.clone()
+    K[:, 0, 2] -= window.columns.start
+    K[:, 1, 2] -= window.rows.start
+    height, width = (part.stop - part.start for part in (window.rows, window.columns))
+    return replace(canvas, K=K, width=width, height=height)
+
+
+def published_lpips() -> Lpips | NotComputed:
+    """LPIPS where its two weight files are on this computer."""
+    return load_lpips(weights.find("vgg16"), weights.find("lpips-vgg"))
+
+
+def _from_reference(rec: Reconstruction, reference: GroundTruth) -> dict[str, Float[Tensor, "4 4"]]:
+    """The reference's poses in the reconstruction's axes and unit; none where the frames they share do not align."""
+    place = {name: i for i, name in enumerate(reference.names)}
+    shared = [name for name in rec.names if name in place]
+    theirs = reference.cameras.cam2world[[place[name] for name in shared]].double()
+    ours = rec.cameras.cam2world[[rec.index(name) for name in shared]].double()
+    try:
+        to_ours = align_similarity(theirs[:, :3, 3], ours[:, :3, 3])
+    except DegenerateAlignmentError:
+        try:
+            to_ours = align_poses(theirs, ours)
+        except DegenerateAlignmentError:
+            return {}
+    moved = to_ours.poses(reference.cameras.cam2world.double())
+    return {name: moved[i] for name, i in place.items()}

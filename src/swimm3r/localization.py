@@ -1,0 +1,124 @@
+"""Where a picture was taken, from pixels that match points of the reconstruction: PnP with RANSAC over SIFT.
+
+A *landmark* is a keypoint of a registered frame that lies on the sighting of a triangulated point. A picture's
+keypoints are matched with the landmarks of frames that may show the same place; its pose reprojects most of them.
+"""
+
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+from functools import lru_cache
+
+import torch
+from jaxtyping import Bool, Float
+from scipy.spatial import KDTree
+from torch import Tensor
+
+from swimm3r.cameras import Cameras
+from swimm3r.frames import Frames
+from swimm3r.geometry import pose_from, so3_exp, so3_log
+from swimm3r.reconstruction import Reconstruction
+from swimm3r.sfm.colmap import absolute_pose
+from swimm3r.sfm.settings import FeatureSettings
+from swimm3r.sfm.sift import extract_features, match_descriptors, unit_descriptors
+
+MIN_INLIERS = 12
+"""Landmarks that agree on a pose before it is believed: 6 of them fix it, and strangers agree on a few more."""
+_MAX_ERROR = 4.0  # pixels of a picture of 1000; never less than _LEAST_ERROR
+_LEAST_ERROR = 2.5
+_SAME_KEYPOINT = 1.0  # pixels between a sighting and the keypoint that it is
+_MAX_STEPS = 2.0  # a pose is carried on by at most this many steps of its neighbours
+
+
+@dataclass(frozen=True)
+class Landmarks:
+    """What one registered frame knows about its points."""
+
+    descriptors: Float[Tensor, "n 128"]  # of unit length
+    xyz: Float[Tensor, "n 3"]  # world
+
+
+@dataclass(frozen=True)
+class Located:
+    """A picture's pose and how many landmarks agree on it."""
+
+    cam2world: Float[Tensor, "4 4"]
+    inliers: int
+
+
+def landmarks_of(
+    rec: Reconstruction, frames: Frames, settings: FeatureSettings, keep: int = 64
+) -> Callable[[str], Landmarks]:
+    """The landmarks of a registered frame by its name; those of the last `keep` frames asked for are remembered."""
+
+    import pycolmap
+
+    pycolmap.logging.minloglevel = pycolmap.logging.Level.ERROR.value
+
+    @lru_cache(maxsize=keep)
+    def of(name: str) -> Landmarks:
+        f = frames.index(name)
+        found = extract_features(frames.image(f), frames.mask(f), settings)
+        mine = rec.tracks.frame == rec.index(name)
+        sightings, points = rec.tracks.xy[mine].double(), rec.tracks.point[mine]
+        if not len(sightings) or not len(found.keypoints):
+            return Landmarks(torch.zeros(0, 128), torch.zeros(0, 3, dtype=torch.float64))
+        distance, row = KDTree(sightings.numpy()).query(found.keypoints[:, :2])
+        near = torch.from_numpy(distance < _SAME_KEYPOINT)
+        xyz = rec.points.xyz[points[torch.from_numpy(row)[near]]].double()
+        return Landmarks(unit_descriptors(found.descriptors)[near], xyz)
+
+    return of
+
+
+def locate(
+    picture: Float[Tensor, "h w 3"],
+    mask: Bool[Tensor, "h w"],
+    lens: Cameras,
+    near: Sequence[Landmarks],
+    settings: FeatureSettings,
+) -> Located | None:
+    """The pose of a picture taken through `lens` (one camera, its pose unused); None where too few landmarks agree."""
+    found = extract_features(picture, mask, settings)
+    described = unit_descriptors(found.descriptors)
+    keypoints = torch.from_numpy(found.keypoints[:, :2]).double()
+    pixels, points = [], []
+    for landmarks in near:
+        pairs = match_descriptors(described, landmarks.descriptors, settings.max_ratio)
+        pixels.append(keypoints[pairs[:, 0]])
+        points.append(landmarks.xyz[pairs[:, 1]])
+    if sum(len(part) for part in pixels) < MIN_INLIERS:
+        return None
+    max_error = max(_LEAST_ERROR, _MAX_ERROR * max(lens.width, lens.height) / 1000)
+    # one point seen by several frames is one witness
+    both = torch.unique(torch.cat([torch.cat(pixels), torch.cat(points)], -1), dim=0)
+    estimate = absolute_pose(both[:, :2], both[:, 2:], lens, max_error)
+    if estimate is None or int(estimate[1].sum()) < MIN_INLIERS:
+        return None
+    return Located(estimate[0], int(estimate[1].sum()))
+
+
+def between(before: Float[Tensor, "4 4"], after: Float[Tensor, "4 4"], share: float) -> Float[Tensor, "4 4"]:
+    """The pose at `share` of the way from one to the other: evenly turned, evenly moved; carried on outside 0..1."""
+    share = min(max(share, -_MAX_STEPS), 1 + _MAX_STEPS)
+    turn = so3_exp(share * so3_log(before[:3, :3].mT @ after[:3, :3]))
+    return pose_from(before[:3, :3] @ turn, before[:3, 3] + share * (after[:3, 3] - before[:3, 3]))
+
+
+def neighbours(rec: Reconstruction, frames: Frames, name: str, count: int) -> list[str]:
+    """The registered frames nearest to a frame in the order of the dive, nearest first."""
+    place = {frame.name: i for i, frame in enumerate(frames)}
+    known = [other for other in rec.names if other in place and other != name]
+    return sorted(known, key=lambda other: abs(place[other] - place[name]))[:count]
+
+
+def pose_from_neighbours(rec: Reconstruction, frames: Frames, name: str) -> Float[Tensor, "4 4"]:
+    """Between the registered frames before and after in time, or carried on from the two nearest at an end."""
+    time = {frame.name: frame.time for frame in frames}
+    near = neighbours(rec, frames, name, len(rec.names))
+    earlier = [other for other in near if time[other] <= time[name]]
+    later = [other for other in near if time[other] > time[name]]
+    pair = (earlier[0], later[0]) if earlier and later else (near[0], near[min(1, len(near) - 1)])
+    first, second = sorted(pair, key=lambda other: time[other])
+    poses = rec.cameras.cam2world[[rec.index(first), rec.index(second)]].double()
+    span = time[second] - time[first]
+    return between(poses[0], poses[1], (time[name] - time[first]) / span if span > 0 else 0.0)

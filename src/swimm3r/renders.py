@@ -1,0 +1,131 @@
+"""A map's views on disk: pictures of one camera, and a flight along the path of the dive."""
+
+from collections.abc import Iterable
+from dataclasses import replace
+from fractions import Fraction
+from pathlib import Path, PurePosixPath
+
+import numpy as np
+import torch
+from jaxtyping import Float, UInt8
+from scipy.ndimage import gaussian_filter1d
+from torch import Tensor
+
+from swimm3r import reconstruction
+from swimm3r.cameras import Cameras, project
+from swimm3r.errors import InputError
+from swimm3r.geometry import pose_from, quaternion_from_rotation, rotation_from_quaternion
+from swimm3r.io import cameras_json, images
+from swimm3r.io.atomic import atomic_path
+from swimm3r.progress import Progress, silent
+from swimm3r.reconstruction import Reconstruction
+from swimm3r.report.charts import depth_picture
+from swimm3r.splat.checkpoint import load_map
+from swimm3r.splat.rendering import RenderOutput, SplatMap
+from swimm3r.splat.views import pinhole_canvas
+
+KINDS = ("rgb", "clear", "z_depth", "veil")
+_RATE = 15  # pictures per second of the flight
+_SMOOTH = 1.5  # frames of the dive over which the flight's hand steadies
+
+
+def write_view(folder: Path, name: str, out: RenderOutput, near_far: tuple[float, float]) -> None:
+    """NAME_rgb.png, _clear, _veil, and _z_depth in colours, near red and far blue over `near_far` (scene units)."""
+    for kind in ("rgb", "clear", "veil"):
+        images.write_rgb(folder / f"{name}_{kind}.png", getattr(out, kind).numpy())
+    images.write_rgb(folder / f"{name}_z_depth.png", depth_picture(out.z_depth.numpy(), *near_far))
+
+
+def depth_span(rec: Reconstruction) -> tuple[float, float]:
+    """The z depths between which all but the nearest and farthest fiftieth of the frames' points lie, scene units."""
+    depths = []
+    for i in range(len(rec.names)):
+        mine = rec.tracks.point[rec.tracks.frame == i]
+        points = rec.points.xyz[mine] if len(rec.tracks.point) else rec.points.xyz
+        depths.append(project(rec.cameras[i], points[None])[1][0])
+    z = torch.cat(depths)
+    near, far = np.quantile(z[z > 0].numpy(), [0.02, 0.98]).tolist()
+    return near, max(far, near * 1.01)
+
+
+def smooth_path(cam2world: Float[Tensor, "c 4 4"], count: int) -> Float[Tensor, "f 4 4"]:
+    """`count` poses along a path of cameras, without the shaking of the hand that held them."""
+    q = quaternion_from_rotation(cam2world[:, :3, :3].double()).numpy().copy()
+    for i in range(1, len(q)):  # q and -q are one rotation, but not on the way in between
+        if q[i] @ q[i - 1] < 0:
+            q[i] *= -1
+    stations = np.concatenate([cam2world[:, :3, 3].double().numpy(), q], 1)
+    at = np.linspace(0, len(stations) - 1, count)
+    dense = np.stack([np.interp(at, np.arange(len(stations)), column) for column in stations.T], 1)
+    per_frame = (count - 1) / max(1, len(stations) - 1)
+    steady = torch.from_numpy(gaussian_filter1d(dense, _SMOOTH * per_frame, axis=0, mode="nearest"))
+    return pose_from(rotation_from_quaternion(steady[:, 3:]), steady[:, :3])
+
+
+def write_flythrough(
+    path: Path, scene: SplatMap, canvas: Cameras, cam2world: Float[Tensor, "c 4 4"], count: int,
+    progress: Progress = silent,
+) -> None:  # fmt: skip
+    """An H.264 video of `count` views along the cameras' path: with the water, and beside it without."""
+
+    def views() -> Iterable[UInt8[np.ndarray, "h w 3"]]:
+        for i, pose in enumerate(smooth_path(cam2world, count)):
+            progress("filming the flight", i, count)
+            out = scene.render(replace(canvas, cam2world=pose[None]))
+            both = torch.cat([out.rgb, out.clear], 1)
+            yield (both.clamp(0, 1) * 255).round().to(torch.uint8).numpy()
+        progress("filming the flight", count, count)
+
+    with atomic_path(path) as draft:
+        _encode(draft, views())
+
+
+def render_run(
+    folder: Path,
+    cameras: Path | None = None,
+    out: Path | None = None,
+    long_side: int = 0,
+    flight: int = 0,
+    progress: Progress = silent,
+) -> Path:
+    """Pictures of a finished run's map from the cameras of a cameras.json, by default those of training; into `out`.
+
+    Raises InputError where the run has no map, or a name in the file leads out of the folder.
+    """
+    scene, rec = load_map(folder / "splat" / "map.safetensors"), reconstruction.load(folder / "sfm")
+    table = cameras_json.read_cameras(cameras or folder / "sfm" / "cameras.json")
+    stations, out = reconstruction.cameras_of(table), out or folder / "renders" / "views"
+    for name in table.names:
+        if PurePosixPath(name).is_absolute() or ".." in PurePosixPath(name).parts:
+            raise InputError(
+                f"{cameras} names a picture outside its folder: {name}",
+                cause="the file was made by another program, or was tampered with",
+                hint="names relative to the picture folder",
+            )
+    span = depth_span(rec)
+    for i, name in enumerate(table.names):
+        progress("rendering", i, len(table.names))
+        write_view(out, name, scene.render(pinhole_canvas(stations[i], long_side)), span)
+    progress("rendering", len(table.names), len(table.names))
+    if flight:
+        canvas = pinhole_canvas(stations[0], long_side)
+        write_flythrough(out / "flythrough.mp4", scene, canvas, stations.cam2world, flight, progress)
+    return out
+
+
+def _encode(path: Path, pictures: Iterable[UInt8[np.ndarray, "h w 3"]]) -> None:
+    import av
+
+    tick = Fraction(1, _RATE)
+    # the header goes first, so that a browser shows the video before it has it all
+    with av.open(str(path), "w", format="mp4", options={"movflags": "faststart"}) as file:
+        stream = file.add_stream("libx264", rate=_RATE, options={"crf": "23", "preset": "medium"})
+        stream.pix_fmt, stream.codec_context.time_base = "yuv420p", tick
+        for i, picture in enumerate(pictures):
+            height, width = (size // 2 * 2 for size in picture.shape[:2])  # 4:2:0 halves both
+            if i == 0:
+                stream.height, stream.width = height, width
+            frame = av.VideoFrame.from_ndarray(np.ascontiguousarray(picture[:height, :width]), "rgb24")
+            frame.pts, frame.time_base = i, tick
+            file.mux(stream.encode(frame))
+        file.mux(stream.encode())

@@ -1,0 +1,64 @@
+"""Frames that training did not see: placed, rendered, scored."""
+
+from dataclasses import replace
+
+import torch
+
+from swimm3r.cameras import Cameras
+from swimm3r.ground_truth import GroundTruth
+from swimm3r.held_out import cut, first_poses, visible_window
+from swimm3r.renders import smooth_path
+from swimm3r.sfm.settings import FeatureSettings
+from swimm3r.splat.views import pinhole_canvas
+
+
+def lens(k1: float) -> Cameras:
+    K = torch.tensor([[60.0, 0, 33], [0, 60, 23], [0, 0, 1]], dtype=torch.float64)[None]
+    pose = torch.eye(4, dtype=torch.float64)[None]
+    return Cameras(K, torch.tensor([[k1]], dtype=torch.float64), pose, 64, 48, "SIMPLE_RADIAL")
+
+
+def test_the_window_of_a_lens_without_distortion_is_the_whole_canvas():
+    window = visible_window(lens(0.0), pinhole_canvas(lens(0.0), 0))
+    assert (window.rows, window.columns) == (slice(0, 48), slice(0, 64))
+
+
+def test_the_window_leaves_out_what_the_lens_does_not_show():
+    camera = lens(0.25)
+    canvas = pinhole_canvas(camera, 0)
+    window = visible_window(camera, canvas)
+    assert window.columns.start > 0
+    assert window.columns.stop - window.columns.start > 40
+    inner = cut(canvas, window)
+    assert (inner.width, inner.height) == (
+        window.columns.stop - window.columns.start,
+        window.rows.stop - window.rows.start,
+    )
+    assert inner.K[0, 0, 2] == canvas.K[0, 0, 2] - window.columns.start
+    assert visible_window(camera, canvas) == window
+
+
+def test_reference_poses_are_aligned_and_their_rotations_stay_rotations(tiny_dive):
+    scale, shift = 3.0, torch.tensor([5.0, -2.0, 1.0], dtype=torch.float64)
+    theirs = tiny_dive.cameras.cam2world.clone()
+    theirs[:, :3, 3] = theirs[:, :3, 3] * scale + shift
+    reference = GroundTruth(tiny_dive.frames.names, replace(tiny_dive.cameras, cam2world=theirs), True)
+    poses = first_poses(tiny_dive.rec, tiny_dive.frames, FeatureSettings(), reference)
+    assert set(poses) == set(tiny_dive.frames.test.names)
+    for name, pose in poses.items():
+        assert pose.source == "reference"
+        torch.testing.assert_close(pose.cam2world, tiny_dive.cameras.cam2world[tiny_dive.frames.index(name)])
+
+
+def test_a_smooth_path_begins_and_ends_near_the_dive_and_holds_rotations():
+    rng = torch.Generator().manual_seed(0)
+    poses = torch.eye(4, dtype=torch.float64).repeat(12, 1, 1)
+    poses[:, 0, 3] = torch.arange(12)
+    poses[:, 1, 3] = 0.3 * torch.rand(12, generator=rng)
+    path = smooth_path(poses, 50)
+    assert path.shape == (50, 4, 4)
+    torch.testing.assert_close(path[:, :3, :3] @ path[:, :3, :3].mT, torch.eye(3).double().expand(50, 3, 3))
+    assert path[:, 0, 3].diff().min() > 0
+    assert path[:, 1, 3].diff().abs().max() < 0.1 * poses[:, 1, 3].diff().abs().max()
+    assert path[0, 0, 3] < 1.5
+    assert path[-1, 0, 3] > 9.5

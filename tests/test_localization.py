@@ -1,0 +1,139 @@
+"""Where a picture was taken, by its keypoints."""
+
+from dataclasses import replace
+
+import pytest
+import torch
+
+from swimm3r.cameras import Cameras, project
+from swimm3r.frames import Frame, Frames
+from swimm3r.geometry import pose_from, relative_poses, rotation_angle, so3_exp
+from swimm3r.io.images import write_rgb
+from swimm3r.localization import (
+    Landmarks,
+    between,
+    landmarks_of,
+    locate,
+    neighbours,
+    pose_from_neighbours,
+)
+from swimm3r.reconstruction import DepthMaps, Matches, Points, Reconstruction, Tracks
+from swimm3r.sfm.settings import FeatureSettings
+from swimm3r.sfm.sift import extract_features
+
+SETTINGS = FeatureSettings(count=600)
+
+
+@pytest.fixture(scope="module")
+def plane(tmp_path_factory: pytest.TempPathFactory) -> tuple[Reconstruction, Frames, Cameras]:
+    """Four pictures of a blotchy plane at z = 2 from a camera that slides and turns; the third is not registered."""
+    folder = tmp_path_factory.mktemp("plane")
+    rng = torch.Generator().manual_seed(0)
+    blotches = sum(
+        torch.nn.functional.interpolate(torch.rand(1, 3, n, n, generator=rng), (640, 640), mode="bicubic")[0] / n**0.3
+        for n in (12, 40, 120)
+    )
+    texture = (blotches - blotches.min()) / (blotches.max() - blotches.min())
+    K = torch.tensor([[220.0, 0, 120], [0, 220, 90], [0, 0, 1]], dtype=torch.float64).repeat(4, 1, 1)
+    turns = torch.tensor([[0, 0, 0], [0.02, 0, 0.01], [0.03, -0.01, 0.02], [0.02, -0.02, 0.03]], dtype=torch.float64)
+    centres = torch.tensor([[-0.15, 0, 0], [-0.05, 0.02, 0.02], [0.05, 0.02, 0.03], [0.15, 0, 0]], dtype=torch.float64)
+    cameras = Cameras(K, torch.zeros(4, 0, dtype=torch.float64), pose_from(so3_exp(turns), centres), 240, 180)
+    registered = [0, 1, 3]
+    frames, points, rows = [], [], []
+    for i in range(4):
+        xy = _on_plane(cameras[i])
+        at = (xy / 1.6).float().reshape(1, 180, 240, 2)  # the texture spans x, y in -1.6..1.6
+        picture = torch.nn.functional.grid_sample(texture[None], at, align_corners=False)[0].permute(1, 2, 0)
+        path = folder / f"{i}.png"
+        write_rgb(path, picture.numpy())
+        frames.append(Frame(path.name, path, float(i), 1.0, "train"))
+        if i not in registered:
+            continue
+        keypoints = torch.from_numpy(extract_features(picture, torch.ones(180, 240).bool(), SETTINGS).keypoints)
+        for x, y in keypoints[:, :2].double():
+            rows.append((len(points), registered.index(i), x, y))
+            points.append(_at(cameras[i], x, y))
+    listed = Frames(tuple(frames), 240, 180, True)
+    none = torch.zeros(0, dtype=torch.int64)
+    rec = Reconstruction(
+        names=tuple(frames[i].name for i in registered),
+        cameras=cameras[registered],
+        points=Points(torch.stack(points), torch.zeros(len(points), 3), torch.zeros(len(points))),
+        tracks=Tracks(
+            torch.tensor([r[0] for r in rows]),
+            torch.tensor([r[1] for r in rows]),
+            torch.tensor([[r[2], r[3]] for r in rows]),
+        ),
+        matches=Matches(none, none, torch.zeros(0, 2), torch.zeros(0, 2), torch.zeros(0)),
+        depth=DepthMaps(folder),
+        backend="truth",
+    )
+    return rec, listed, cameras
+
+
+def _at(camera: Cameras, x: torch.Tensor, y: torch.Tensor) -> torch.Tensor:
+    ray = torch.linalg.solve(camera.K[0], torch.tensor([float(x), float(y), 1.0], dtype=torch.float64))
+    ray = camera.cam2world[0, :3, :3] @ ray
+    return camera.centres[0] + ray * (2 - camera.centres[0, 2]) / ray[2]
+
+
+def _on_plane(camera: Cameras) -> torch.Tensor:
+    y, x = torch.meshgrid(torch.arange(180) + 0.5, torch.arange(240) + 0.5, indexing="ij")
+    rays = torch.stack([x, y, torch.ones_like(x)], -1).reshape(-1, 3).double()
+    rays = torch.linalg.solve(camera.K[0], rays.mT).mT @ camera.cam2world[0, :3, :3].mT
+    return (camera.centres[0] + rays * ((2 - camera.centres[0, 2]) / rays[:, 2])[:, None])[:, :2]
+
+
+def test_a_picture_is_placed_where_it_was_taken(plane):
+    rec, frames, cameras = plane
+    landmarks = landmarks_of(rec, frames, SETTINGS)
+    near = [landmarks(name) for name in neighbours(rec, frames, "2.png", 3)]
+    lens = replace(rec.cameras[0])
+    found = locate(frames.image(2), frames.mask(2), lens, near, SETTINGS)
+    assert found is not None
+    assert found.inliers > 50
+    assert rotation_angle(relative_poses(cameras.cam2world[2], found.cam2world)[:3, :3]) < 3e-3
+    points = rec.points.xyz[None]
+    there = replace(lens, cam2world=found.cam2world[None])
+    assert (project(there, points)[0] - project(cameras[2], points)[0]).norm(dim=-1).median() < 0.5
+
+
+def test_a_picture_of_another_place_is_not_placed(plane):
+    rec, frames, _ = plane
+    landmarks = landmarks_of(rec, frames, SETTINGS)
+    noise = torch.rand(180, 240, 3, generator=torch.Generator().manual_seed(1))
+    assert locate(noise, frames.mask(0), rec.cameras[0], [landmarks("0.png"), landmarks("1.png")], SETTINGS) is None
+
+
+def test_nothing_to_match_with_is_no_pose(plane):
+    rec, frames, _ = plane
+    nothing = Landmarks(torch.zeros(0, 128), torch.zeros(0, 3, dtype=torch.float64))
+    assert locate(frames.image(0), frames.mask(0), rec.cameras[0], [nothing], SETTINGS) is None
+
+
+def test_neighbours_come_nearest_first(plane):
+    rec, frames, _ = plane
+    assert neighbours(rec, frames, "2.png", 2) == ["1.png", "3.png"]
+
+
+def test_half_way_is_half_the_turn_and_half_the_motion():
+    turn = torch.tensor([0.0, 0.4, 0.0], dtype=torch.float64)
+    start = torch.eye(4, dtype=torch.float64)
+    end = pose_from(so3_exp(turn), torch.tensor([2.0, 0, 0], dtype=torch.float64))
+    torch.testing.assert_close(between(start, end, 0.5)[:3, :3], so3_exp(turn / 2))
+    assert between(start, end, 0.5)[0, 3] == pytest.approx(1)
+    torch.testing.assert_close(between(start, end, 1.0), end)
+    assert between(start, end, -0.5)[0, 3] == pytest.approx(-1)  # carried on
+
+
+def test_a_frame_without_matches_is_placed_between_its_neighbours(plane):
+    rec, frames, cameras = plane
+    pose = pose_from_neighbours(rec, frames, "2.png")
+    torch.testing.assert_close(pose, between(cameras.cam2world[1], cameras.cam2world[3], 0.5))
+
+
+def test_a_frame_before_the_first_is_carried_on_backwards(plane):
+    rec, frames, cameras = plane
+    later = replace(rec, names=("1.png", "3.png"), cameras=cameras[[1, 3]])
+    pose = pose_from_neighbours(later, frames, "0.png")
+    torch.testing.assert_close(pose, between(cameras.cam2world[1], cameras.cam2world[3], -0.5))
