@@ -2,6 +2,7 @@
 
     frames = swimm3r.read_frames("dive.mp4", fps=5)
     rec = swimm3r.reconstruct(frames, swimm3r.ColmapSettings())
+    scene = swimm3r.train(rec, frames, swimm3r.uwbs(iterations=20_000))
 
 Names load on first use, so that importing the package, and every --help, is instant.
 """
@@ -18,6 +19,10 @@ if TYPE_CHECKING:
     from swimm3r.run import run_pipeline
     from swimm3r.sfm import reconstruct
     from swimm3r.sfm.settings import ColmapSettings
+    from swimm3r.splat import train
+    from swimm3r.splat.checkpoint import load_map
+    from swimm3r.splat.rendering import SplatMap
+    from swimm3r.splat.settings import UwbsSettings, uwbs
     from swimm3r.synthetic import DiveSettings, write_dive
 
 _HOME = {
@@ -33,6 +38,11 @@ _HOME = {
     "run_pipeline": "run",
     "reconstruct": "sfm",
     "ColmapSettings": "sfm.settings",
+    "SplatMap": "splat.rendering",
+    "UwbsSettings": "splat.settings",
+    "load_map": "splat.checkpoint",
+    "train": "splat",
+    "uwbs": "splat.settings",
     "DiveSettings": "synthetic",
     "write_dive": "synthetic",
 }
@@ -46,11 +56,16 @@ __all__ = [
     "MediumFit",
     "Reconstruction",
     "RunSettings",
+    "SplatMap",
+    "UwbsSettings",
     "add_water",
+    "load_map",
     "read_frames",
     "reconstruct",
     "remove_water",
     "run_pipeline",
+    "train",
+    "uwbs",
     "write_dive",
 ]
 

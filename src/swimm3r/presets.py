@@ -4,6 +4,20 @@ from dataclasses import dataclass, field
 
 from swimm3r.frame_settings import FrameSettings
 from swimm3r.sfm.settings import ColmapSettings, FeatureSettings, PlaneSweepSettings, RestoreSettings, SfmSettings
+from swimm3r.splat.settings import (
+    DensifySettings,
+    InitialSettings,
+    PoseRefinementSettings,
+    SplatSettings,
+    UwbsSettings,
+)
+
+LAPTOP = UwbsSettings(  # the paper's settings are made for a GPU
+    iterations=5000,
+    long_side=640,
+    initial=InitialSettings(primitives=50_000),
+    densify=DensifySettings(max_primitives=100_000),
+)
 
 
 @dataclass(frozen=True)
@@ -12,12 +26,20 @@ class RunSettings:
 
     frames: FrameSettings = field(default_factory=FrameSettings)
     sfm: SfmSettings = field(default_factory=ColmapSettings)
+    splat: SplatSettings = field(default=LAPTOP)
+    test: PoseRefinementSettings = field(default_factory=PoseRefinementSettings)
 
 
 PRESETS: dict[str, RunSettings] = {
     "fast": RunSettings(  # a look at a dive on a laptop
         frames=FrameSettings(long_side=960),
         sfm=ColmapSettings(depth=PlaneSweepSettings(long_side=480, sources=4)),
+        splat=UwbsSettings(
+            iterations=1500,
+            long_side=480,
+            initial=InitialSettings(primitives=25_000),
+            densify=DensifySettings(max_primitives=50_000),
+        ),
     ),
     "default": RunSettings(),
     "best": RunSettings(  # hours rather than minutes for a long dive
@@ -27,5 +49,6 @@ PRESETS: dict[str, RunSettings] = {
             depth=PlaneSweepSettings(long_side=1280, sources=8),
             restore=RestoreSettings(max_points=2_000_000),
         ),
+        splat=UwbsSettings(long_side=0),
     ),
 }

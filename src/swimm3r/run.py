@@ -1,4 +1,4 @@
-"""The pipeline over a run folder: prepare -> sfm -> eval, each stage resumable, its record in summary.json.
+"""The pipeline over a run folder: prepare -> sfm -> splat -> eval, each stage resumable, its record in summary.json.
 
 A stage is reused when its settings and everything before it are unchanged (a hash, the stage's `key`); one that was cut
 short goes on from what it left on disk; one whose settings changed is made again from the start, with all after it.
@@ -10,30 +10,39 @@ import shutil
 import sys
 import time
 from collections.abc import Callable
-from dataclasses import asdict
+from dataclasses import asdict, dataclass
 from hashlib import sha256
 from importlib.metadata import version
 from pathlib import Path
 
 import yaml
 
-from swimm3r import reconstruction
+from swimm3r import held_out, reconstruction
 from swimm3r import summary as sections
 from swimm3r.errors import InputError, StorageError
 from swimm3r.frames import Frames
 from swimm3r.ground_truth import FOLDER as TRUTH_FOLDER
 from swimm3r.ground_truth import GroundTruth, read_ground_truth
 from swimm3r.io.atomic import write_text
+from swimm3r.io.colmap import read_model
 from swimm3r.prepare import check_source, load_frames, read_frames
 from swimm3r.presets import RunSettings
 from swimm3r.progress import Progress, silent
 from swimm3r.reconstruction import Reconstruction
+from swimm3r.renders import write_flythrough
 from swimm3r.report import write_report
 from swimm3r.sfm import reconstruct
+from swimm3r.sfm.importers import model_cameras
+from swimm3r.sfm.settings import ColmapModelSettings
+from swimm3r.splat import train
+from swimm3r.splat.checkpoint import load_map
+from swimm3r.splat.rendering import SplatMap
 
 SCHEMA = 1
-STAGES = ("prepare", "sfm", "eval")
-_FOLDERS = {"prepare": "prepare", "sfm": "sfm", "eval": None}
+STAGES = ("prepare", "sfm", "splat", "eval")
+_FOLDERS = {"prepare": "prepare", "sfm": "sfm", "splat": "splat", "eval": "renders"}
+_SCORES = ("test", "restored", "truth")  # the sections that the last stage makes
+_FLIGHT = 90  # pictures of the fly-through
 _SPARE_BYTES = 64 << 20  # below this a stage is not begun: COLMAP's database does not survive a full disk
 
 
@@ -83,30 +92,102 @@ def run_pipeline(
         return record.close()
 
     key = _key("sfm", key, {type(settings.sfm).__name__: asdict(settings.sfm)})
-    rec = record.stage(
-        "sfm",
-        key,
-        make=lambda: reconstruct(frames, settings.sfm, folder / "sfm", progress),
-        reuse=lambda: reconstruction.load(folder / "sfm"),
-    )
-    record.summary |= sections.sfm_sections(rec, frames)
+    record.stage("sfm", key, make=lambda: reconstruct(frames, settings.sfm, folder / "sfm", progress), reuse=lambda: None)
+    # as it is on disk, to the last bit: an interrupted training must find the same poses again
+    rec = reconstruction.load(folder / "sfm")
+    record.add(sections.sfm_sections(rec, frames))
     if last_stage == "sfm":
         return record.close()
 
-    key = _key("eval", key, {"reference": str(reference)})
-    record.stage("eval", key, make=lambda: record.summary.update(_scores(rec, frames, truth, folder, progress)))
+    key = _key("splat", key, asdict(settings.splat))
+    scene = record.stage(
+        "splat",
+        key,
+        make=lambda: train(rec, frames, settings.splat, folder / "splat", progress),
+        reuse=lambda: load_map(folder / "splat" / "map.safetensors"),
+    )
+    record.add(sections.splat_sections(scene, rec, folder / "splat"))
+    if last_stage == "splat":
+        return record.close()
+
+    key = _key("eval", key, {"reference": str(reference), "test": asdict(settings.test)})
+    record.stage(
+        "eval",
+        key,
+        make=lambda: record.add(_scores(_Run(folder, frames, rec, scene), settings, truth, progress)),
+        reuse=record.keep_scores,
+    )
     summary = record.close()
     write_report(folder)
     return summary
 
 
-def _scores(
-    rec: Reconstruction, frames: Frames, truth: GroundTruth | None, folder: Path, progress: Progress
-) -> dict[str, object]:
+@dataclass(frozen=True)
+class _Run:
+    """What a finished run holds."""
+
+    folder: Path
+    frames: Frames
+    rec: Reconstruction
+    scene: SplatMap
+
+
+def evaluate_run(
+    folder: Path,
+    settings: RunSettings | None = None,
+    *,
+    reference: Path | None = None,
+    progress: Progress = silent,
+) -> dict:
+    """Score a finished run again, its test frames' poses found anew, and return the summary.
+
+    Only `settings.test` and the features of `settings.sfm` are used. Raises InputError where the run has no map yet.
+    """
+    settings = settings or RunSettings()
+    if not (folder / "splat" / "map.safetensors").is_file() or not (folder / "summary.json").is_file():
+        raise InputError(
+            f"{folder} holds no finished map",
+            cause="it is another folder, or the run was interrupted, or stopped after structure from motion",
+            hint="swimm3r run INPUT --out RUN, which goes on where it stopped",
+        )
+    before = json.loads((folder / "summary.json").read_text(encoding="utf-8"))
+    source = Path(before["input"]["path"])
+    record = _Record(folder, source, before["input"]["fingerprint"])
+    record.summary |= {name: section for name, section in before.items() if name not in _SCORES}
+    frames, rec = load_frames(folder / "prepare"), reconstruction.load(folder / "sfm")
+    run = _Run(folder, frames, rec, load_map(folder / "splat" / "map.safetensors"))
+    truth = _truth(source, reference)
+    key = _key("eval", before["stages"]["splat"]["key"], {"reference": str(reference), "test": asdict(settings.test)})
+    record.stage("eval", key, make=lambda: record.add(_scores(run, settings, truth, progress)))
+    summary = record.close()
+    write_report(folder)
+    return summary
+
+
+def _scores(run: _Run, settings: RunSettings, truth: GroundTruth | None, progress: Progress) -> dict[str, object]:
+    folder, frames, rec, scene = run.folder, run.frames, run.rec, run.scene
+    poses = held_out.first_poses(rec, frames, settings.sfm.features, _reference(settings, frames, truth), progress)
+    views = held_out.score_views(scene, rec, frames, poses, folder / "renders" / "test", settings.test, progress)
+    canvas = held_out.cut(views[0].canvas, views[0].window)
+    write_flythrough(folder / "renders" / "flythrough.mp4", scene, canvas, rec.cameras.cam2world, _FLIGHT, progress)
     return {
-        "restored": {"sfm": sections.restored_section(folder / "sfm" / "restored", rec.names, progress)},
-        "truth": sections.truth_section(rec, frames, truth, progress) if truth else None,
+        "test": sections.test_section(views, settings.test),
+        "restored": {
+            "sfm": sections.restored_section(folder / "sfm" / "restored", rec.names, progress),
+            "splat": sections.restored_section(
+                folder / "renders" / "test", [f"{view.name}_clear" for view in views], progress
+            ),
+        },
+        "truth": sections.truth_section(rec, frames, truth, scene, views, progress) if truth else None,
     }
+
+
+def _reference(settings: RunSettings, frames: Frames, truth: GroundTruth | None) -> GroundTruth | None:
+    """Poses of the test frames that somebody else knows."""
+    if truth is None and isinstance(settings.sfm, ColmapModelSettings):
+        names, cameras = model_cameras(frames, read_model(settings.sfm.model))
+        return GroundTruth(names, cameras, metric=False)
+    return truth
 
 
 class _Record:
@@ -116,6 +197,7 @@ class _Record:
         self.folder = folder
         path = folder / "summary.json"
         self.summary: dict = {"schema": SCHEMA, "input": {}, "stages": {}}
+        self._scores_before: dict = {}
         if path.is_file():
             before = json.loads(path.read_text(encoding="utf-8"))
             if before["input"]["fingerprint"] != fingerprint:
@@ -125,6 +207,7 @@ class _Record:
                     hint="another --out, or remove that folder",
                 )
             self.summary["stages"] = before["stages"]
+            self._scores_before = {name: before[name] for name in _SCORES if name in before}
         elif folder.exists() and any(folder.iterdir()):
             raise InputError(
                 f"{folder} is not empty and is not a run folder",
@@ -133,6 +216,18 @@ class _Record:
             )
         self.summary["input"] = {"path": str(source.resolve()), "fingerprint": fingerprint}
         self._write()
+
+    def add(self, found: dict[str, object]) -> None:
+        """Sections for the summary; what a section already holds of an earlier stage stays."""
+        for name, section in found.items():
+            before = self.summary.get(name)
+            if isinstance(before, dict) and isinstance(section, dict):
+                section = {**before, **section}
+            self.summary[name] = section
+
+    def keep_scores(self) -> None:
+        """The sections of the last stage as the summary had them."""
+        self.add(self._scores_before)
 
     def stage(self, name: str, key: str, make: Callable, reuse: Callable | None = None):
         """Do a stage, or reuse it where it is done with the same key."""

@@ -1,26 +1,34 @@
 """The sections of summary.json: records in, plain numbers out (layout: docs/conventions.md)."""
 
+import json
 from collections.abc import Sequence
 from pathlib import Path
 
 import torch
-from jaxtyping import Float
+from jaxtyping import Bool, Float
 from torch import Tensor
 
-from swimm3r.cameras import Cameras, directions, image_directions, ray_depth_from_z
+from swimm3r.cameras import Cameras, directions, distorted_grid, image_directions, ray_depth_from_z
 from swimm3r.evaluate import NotComputed, summary_entries
 from swimm3r.evaluate.depth import depth_scores
 from swimm3r.evaluate.matches import epipolar_errors, match_scores
 from swimm3r.evaluate.poses import absolute_pose_errors, pose_scores
-from swimm3r.evaluate.underwater import clear_psnr, uciqe, uiqm, water_scores
+from swimm3r.evaluate.underwater import clear_psnr, uciqe, uiqm, water_scores, water_scores_from_views
 from swimm3r.frames import Frames
 from swimm3r.geometry import DegenerateAlignmentError, align_poses, align_similarity
 from swimm3r.ground_truth import GroundTruth
+from swimm3r.held_out import HeldOutView, cut, mean_scores, protocol
 from swimm3r.io import images
-from swimm3r.medium import MediumFit, remove_water, rescale
+from swimm3r.medium import Medium, MediumFit, remove_water, rescale
 from swimm3r.progress import Progress, silent
 from swimm3r.reconstruction import Reconstruction
+from swimm3r.splat.medium_field import grid_of
+from swimm3r.splat.projection import pinhole
+from swimm3r.splat.rendering import SplatMap
+from swimm3r.splat.settings import PoseRefinementSettings
+from swimm3r.splat.views import pinhole_canvas, undistorted
 
+_ASKED = 16  # training views that the map's mean water is taken over
 _NO_WEIGHTS = NotComputed("needs the URanker weights, which this version does not load")
 
 
@@ -84,10 +92,55 @@ def restored_section(folder: Path, names: Sequence[str], progress: Progress = si
     )
 
 
+def splat_sections(scene: SplatMap, rec: Reconstruction, folder: Path) -> dict[str, object]:
+    """ "splat" and the map's own water in "medium": the field's mean over the training views."""
+    rows = (folder / "metrics.jsonl").read_text(encoding="utf-8").splitlines()
+    last = json.loads(rows[-1])
+    section = {
+        "recipe": "uwbs-static",
+        "primitives": len(scene.primitives.xyz),
+        "iterations": scene.settings.iterations,
+        "seconds_per_iteration": last["seconds_per_step"],
+        "cpu_seconds_per_iteration": last["cpu_seconds_per_step"],
+        "device": "cpu",
+    }
+    water = mean_medium(scene, rec)
+    medium = {
+        **{name: value.tolist() for name, value in vars(water).items()},
+        "identifiable": {name: flags.tolist() for name, flags in _identifiable(rec).items()},
+        "unit": "1/m" if scene.metric else "per scene unit",
+        "encoding": "srgb",
+    }
+    return {"splat": section, "medium": {"splat": medium}}
+
+
+def test_section(views: Sequence[HeldOutView], settings: PoseRefinementSettings) -> dict[str, object]:
+    """Mean scores of the frames that training did not see, and how they were placed."""
+    scores = mean_scores(views)
+    return summary_entries({**vars(scores), "protocol": protocol(views, settings)})
+
+
+def mean_medium(scene: SplatMap, rec: Reconstruction) -> Medium:
+    """The map's water averaged over the directions that the training frames look in, per scene unit of ray depth."""
+    every = max(1, len(rec.names) // _ASKED)
+    with torch.no_grad():
+        values = [
+            grid_of(scene.field, pinhole(pinhole_canvas(rec.cameras[i], 64)), 8).values.flatten(1).mean(1)
+            for i in range(0, len(rec.names), every)
+        ]
+    mean = torch.stack(values).mean(0)
+    return Medium(mean[:3], beta_B=mean[3:6], beta_D=mean[6:])
+
+
 def truth_section(
-    rec: Reconstruction, frames: Frames, truth: GroundTruth, progress: Progress = silent
+    rec: Reconstruction,
+    frames: Frames,
+    truth: GroundTruth,
+    scene: SplatMap | None = None,
+    views: Sequence[HeldOutView] = (),
+    progress: Progress = silent,
 ) -> dict[str, object]:
-    """Errors against reference poses and, where the truth has them, depth, clear colours and water."""
+    """Errors against reference poses and, where the truth has them, depth, clear colours and water of sfm and map."""
     reference = {name: i for i, name in enumerate(truth.names)}
     wanted = [name for name in frames.train.names if name in reference]
     if len(wanted) < 2:
@@ -117,6 +170,8 @@ def truth_section(
     entries = summary_entries(section)
     if truth.medium is not None and rec.medium is not None:
         entries["sfm"] = _water_section(rescale(rec.medium, scale), frames.test, truth, progress)
+    if truth.medium is not None and scene is not None:
+        entries["splat"] = _map_water_section(scene, rec, views, truth, scale)
     return entries
 
 
@@ -182,3 +237,41 @@ def _water_section(fit: MediumFit, held_out: Frames, truth: GroundTruth, progres
     known = [value for value in psnrs if not isinstance(value, NotComputed)]
     mean = sum(known) / len(known) if known else psnrs[0]
     return summary_entries({"clear_psnr": mean}) | water_scores(fit, ray_depths, truth.medium).summary()
+
+
+def _map_water_section(
+    scene: SplatMap, rec: Reconstruction, views: Sequence[HeldOutView], truth: GroundTruth, scale: float
+) -> dict[str, object]:
+    """The same of a map: its water field at true ray depth, and its own clear rendering, on the held-out views."""
+    assert truth.medium is not None
+    media, psnrs = [], []
+    for view in views:
+        z_depth, clear = truth.z_depth(view.name), truth.clear(view.name)
+        if z_depth is None or clear is None:
+            continue
+        rows, columns = view.window.rows, view.window.columns
+        everything = torch.ones(clear.shape[:2], dtype=torch.bool)
+        true_clear, shown = undistorted(clear, everything, view.lens, view.canvas)
+        pixels = distorted_grid(view.lens, view.canvas)[0]
+        x = pixels[..., 0].long().clamp(0, view.lens.width - 1)
+        y = pixels[..., 1].long().clamp(0, view.lens.height - 1)
+        true_z = torch.where(shown, z_depth[y, x], 0.0)
+        ray_depth = ray_depth_from_z(true_z, image_directions(view.canvas).float())[rows, columns]
+        out = scene.render(cut(view.canvas, view.window))
+        media.append((ray_depth, Medium(out.medium.Binf, out.medium.beta_D / scale, out.medium.beta_B / scale)))
+        psnrs.append(clear_psnr(out.clear, true_clear[rows, columns], ray_depth, truth.medium))
+    if not media:
+        return summary_entries({"clear_psnr": NotComputed("the truth has no depth of a held-out frame")})
+    water = mean_medium(scene, rec)
+    coefficients = Medium(water.Binf, water.beta_D / scale, water.beta_B / scale)
+    known = [value for value in psnrs if not isinstance(value, NotComputed)]
+    mean = sum(known) / len(known) if known else psnrs[0]
+    scores = water_scores_from_views(media, coefficients, _identifiable(rec), truth.medium)
+    return summary_entries({"clear_psnr": mean}) | scores.summary()
+
+
+def _identifiable(rec: Reconstruction) -> dict[str, Bool[Tensor, "3"]]:
+    """What the frames determine, by the fit of structure from motion; training sees the same frames."""
+    if rec.medium is not None:
+        return rec.medium.identifiable
+    return {name: torch.zeros(3, dtype=torch.bool) for name in ("Binf", "beta_D", "beta_B")}

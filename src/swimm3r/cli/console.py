@@ -79,7 +79,18 @@ def print_summary(summary: dict, folder: Path) -> None:
             table.add_row(name, *cells)
         console.print(table)
         console.print("In brackets: not determined by these frames.", style="dim")
+    test = summary.get("test")
+    if test:
+        console.print(
+            f"{test['views']} test frames: PSNR {_shown(test['psnr'], 1)} dB"
+            f" (if blurred by 4 px: {_shown(test['blur4_psnr'], 1)}), SSIM {test['ssim']:.3f},"
+            f" sharpness {_shown(test['sharpness'], 2)}"
+        )
     for caution in summary.get("cautions", []):
         console.print(f"[bold yellow]![/] {caution['what']} {caution['advice']}")
     if (folder / "report.html").is_file():
         console.print(f"Report: {folder / 'report.html'}")
+
+
+def _shown(value: float | None, digits: int) -> str:
+    return "-" if value is None else f"{value:.{digits}f}"

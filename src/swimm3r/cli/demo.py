@@ -1,5 +1,6 @@
 """`swimm3r demo`: a synthetic dive with known truth through the whole pipeline; proves the installation."""
 
+from dataclasses import replace
 from pathlib import Path
 from typing import Annotated
 
@@ -17,11 +18,12 @@ def demo(out: Path = Path("runs/demo"), dive: Annotated[DiveSettings, arg(name="
         out: the run folder; the dive itself goes to OUT-dive beside it.
         dive: what the synthetic dive looks like.
     """
+    settings = replace(PRESETS["default"], splat=PRESETS["fast"].splat)
     from swimm3r.run import run_pipeline
     from swimm3r.synthetic import write_dive
 
     folder = out.with_name(f"{out.name}-dive")
     with drawn_progress() as progress:
         write_dive(dive, folder, progress)
-        summary = run_pipeline(folder, out, PRESETS["default"], progress=progress)
+        summary = run_pipeline(folder, out, settings, progress=progress)
     print_summary(summary, out)

@@ -2,14 +2,16 @@
 
 import errno
 import logging
+import os
 import sys
 from collections.abc import Sequence
 
 import tyro
 
-from swimm3r.cli.datasets import datasets
 from swimm3r.cli.demo import demo
 from swimm3r.cli.doctor import doctor
+from swimm3r.cli.evaluate import evaluate
+from swimm3r.cli.render import render
 from swimm3r.cli.report import report
 from swimm3r.cli.run import commands_for_preset
 from swimm3r.cli.weights import weights
@@ -23,20 +25,23 @@ _STORAGE_ERRORS = {errno.ENOSPC, errno.EDQUOT, errno.EROFS, errno.EACCES, errno.
 def main(arguments: Sequence[str] | None = None) -> None:
     """Run one command; leaves through SystemExit with the documented code."""
     arguments = list(sys.argv[1:] if arguments is None else arguments)
+    # before torch loads OpenMP: waiting threads that spin cost a busy machine more time than the work they wait for
+    os.environ.setdefault("OMP_WAIT_POLICY", "PASSIVE")
     logging.basicConfig(level=logging.WARNING, format="%(message)s")
     commands = {
         **commands_for_preset(_named_preset(arguments)),
         "demo": demo,
         "doctor": doctor,
+        "eval": evaluate,
+        "render": render,
         "report": report,
-        "datasets": datasets,
         "weights": weights,
     }
     try:
         tyro.extras.subcommand_cli_from_dict(
             commands,
             prog="swimm3r",
-            description="Underwater video in; camera poses, water, restored pictures and a restored point cloud out.",
+            description="Underwater video in; camera poses, water, a restored cloud and a map that renders out.",
             args=arguments,
         )
     except Swimm3rError as error:

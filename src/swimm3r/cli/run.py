@@ -1,4 +1,4 @@
-"""`swimm3r run`, `prepare` and `sfm`: the pipeline, whole or up to a stage."""
+"""`swimm3r run`, `prepare`, `sfm` and `splat`: the pipeline, whole or up to a stage."""
 
 from collections.abc import Callable
 from pathlib import Path
@@ -7,9 +7,11 @@ from typing import Annotated, Literal
 from tyro.conf import Positional, arg
 
 from swimm3r.cli.console import drawn_progress, print_summary
+from swimm3r.errors import UsageError
 from swimm3r.frame_settings import FrameSettings
 from swimm3r.presets import PRESETS, RunSettings
-from swimm3r.sfm.settings import ColmapSettings
+from swimm3r.sfm.settings import ColmapModelSettings, ColmapSettings
+from swimm3r.splat.settings import PoseRefinementSettings, UwbsSettings
 
 Preset = Literal["fast", "default", "best"]
 _FLAT = arg(name="")  # --fps, not --frames.fps; what lies deeper keeps its prefix: --depth.planes
@@ -18,6 +20,7 @@ _FLAT = arg(name="")  # --fps, not --frames.fps; what lies deeper keeps its pref
 def commands_for_preset(name: str) -> dict[str, Callable]:
     """The commands that share the pipeline's settings, with the defaults of a preset."""
     defaults = PRESETS[name]
+    assert isinstance(defaults.sfm, ColmapSettings)
 
     def prepare(
         source: Positional[Path],
@@ -34,7 +37,7 @@ def commands_for_preset(name: str) -> dict[str, Callable]:
             preset: what the other defaults aim at.
             frames: which frames to take.
         """
-        _pipeline(source, out, RunSettings(frames=frames, sfm=defaults.sfm), None, "prepare")
+        _pipeline(source, out, RunSettings(frames, defaults.sfm, defaults.splat, defaults.test), None, "prepare")
 
     def sfm(
         source: Positional[Path],
@@ -45,7 +48,7 @@ def commands_for_preset(name: str) -> dict[str, Callable]:
         frames: Annotated[FrameSettings, _FLAT] = defaults.frames,
         sfm: Annotated[ColmapSettings, _FLAT] = defaults.sfm,
     ) -> None:
-        """Poses, dense depth, water, restored pictures and the restored cloud, without the scores.
+        """Poses, dense depth, water, restored pictures and the restored cloud, without map and scores.
 
         Args:
             source: a video, or a folder of pictures.
@@ -55,7 +58,52 @@ def commands_for_preset(name: str) -> dict[str, Callable]:
             frames: which frames to take.
             sfm: how poses, depth and water are found.
         """
-        _pipeline(source, out, RunSettings(frames=frames, sfm=sfm), reference, "sfm")
+        _pipeline(source, out, RunSettings(frames, sfm, defaults.splat, defaults.test), reference, "sfm")
+
+    def splat(
+        source: Positional[Path | None] = None,
+        /,
+        *,
+        out: Path,
+        colmap: Path | None = None,
+        images: Path | None = None,
+        preset: Preset = "default",
+        reference: Path | None = None,
+        frames: Annotated[FrameSettings, _FLAT] = defaults.frames,
+        sfm: Annotated[ColmapSettings, _FLAT] = defaults.sfm,
+        splat: UwbsSettings = defaults.splat,
+        test: PoseRefinementSettings = defaults.test,
+    ) -> None:
+        """A map of a dive, or of any COLMAP model: swimm3r splat --colmap sparse/0 --images pictures/ --out RUN.
+
+        Args:
+            source: a video, or a folder of pictures; or give --colmap and --images.
+            out: the run folder.
+            colmap: a COLMAP model whose poses and points are taken as they are.
+            images: the pictures it was made of; its names are relative to this folder.
+            preset: what the other defaults aim at.
+            reference: a cameras.json with poses to compare with.
+            frames: which frames to take.
+            sfm: how poses, depth and water are found; with --colmap, depth and water alone.
+            splat: how the map is trained.
+            test: how the test frames' poses are refined.
+        """
+        if (colmap is None) != (images is None) or (source is None) == (images is None):
+            raise UsageError(
+                "a map is trained on a source, or on --colmap with --images",
+                cause="both were given, or one half of the pair is missing",
+                hint="swimm3r splat dive.mp4 --out RUN, or swimm3r splat --colmap DIR --images DIR --out RUN",
+            )
+        poses = (
+            sfm
+            if colmap is None
+            else ColmapModelSettings(
+                colmap.resolve(), features=sfm.features, depth=sfm.depth, water=sfm.water, restore=sfm.restore
+            )
+        )
+        given = source or images
+        assert given is not None
+        _pipeline(given, out, RunSettings(frames, poses, splat, test), reference, "eval")
 
     def run(
         source: Positional[Path],
@@ -65,6 +113,8 @@ def commands_for_preset(name: str) -> dict[str, Callable]:
         reference: Path | None = None,
         frames: Annotated[FrameSettings, _FLAT] = defaults.frames,
         sfm: Annotated[ColmapSettings, _FLAT] = defaults.sfm,
+        splat: UwbsSettings = defaults.splat,
+        test: PoseRefinementSettings = defaults.test,
     ) -> None:
         """Everything, from a clip to the report page. The same command again goes on where it was interrupted.
 
@@ -75,10 +125,12 @@ def commands_for_preset(name: str) -> dict[str, Callable]:
             reference: a cameras.json with poses to compare with.
             frames: which frames to take.
             sfm: how poses, depth and water are found.
+            splat: how the map is trained.
+            test: how the test frames' poses are refined.
         """
-        _pipeline(source, out, RunSettings(frames=frames, sfm=sfm), reference, "eval")
+        _pipeline(source, out, RunSettings(frames, sfm, splat, test), reference, "eval")
 
-    return {"run": run, "prepare": prepare, "sfm": sfm}
+    return {"run": run, "prepare": prepare, "sfm": sfm, "splat": splat}
 
 
 def _pipeline(source: Path, out: Path, settings: RunSettings, reference: Path | None, last: str) -> None:

@@ -1,5 +1,6 @@
 """Puts the page of a run together: what the run folder holds -> the template's fields."""
 
+import base64
 import json
 from dataclasses import dataclass
 from importlib.resources import files
@@ -19,6 +20,9 @@ from swimm3r.reconstruction import Reconstruction
 from swimm3r.report import charts
 
 _SHOWN_FRAMES = 8
+_SHOWN_TESTS = 4
+_KINDS = ("rgb", "clear", "z_depth")
+_EMBEDDED_BYTES = 6 << 20  # a video up to this size travels inside the page, a larger one lies beside it
 
 
 @dataclass(frozen=True)
@@ -29,6 +33,17 @@ class Triptych:
     raw: str
     restored: str | None
     depth: str | None
+
+
+@dataclass(frozen=True)
+class TestRow:
+    """One frame that training did not see, as data URIs."""
+
+    name: str
+    taken: str
+    rgb: str
+    clear: str
+    depth: str
 
 
 def write(folder: Path) -> Path:
@@ -44,6 +59,9 @@ def write(folder: Path) -> Path:
         summary=summary,
         cautions=summary.get("cautions", []),
         pictures=_triptychs(rec, frames, folder) if rec else [],
+        tests=_test_rows(frames, folder) if "test" in summary else [],
+        flight=_flight(folder / "renders" / "flythrough.mp4"),
+        truths=_truth_rows(summary.get("truth")),
         plan=_plan(rec) if rec and rec.cloud is not None and len(rec.cloud.xyz) else None,
         water=_water(rec) if rec and rec.medium else None,
         missing=[name for name in frames.train.names if rec and name not in set(rec.names)],
@@ -75,6 +93,47 @@ def _triptychs(rec: Reconstruction, frames: Frames, folder: Path) -> list[Tripty
             )
         )
     return rows
+
+
+def _test_rows(frames: Frames, folder: Path) -> list[TestRow]:
+    """A few test frames, evenly spread, beside what the map shows from there."""
+    names = frames.test.names
+    chosen = sorted({round(i) for i in np.linspace(0, len(names) - 1, _SHOWN_TESTS)})
+    rows = []
+    for name in (names[i] for i in chosen):
+        taken = (frames.image(frames.index(name)).numpy() * 255).round().astype(np.uint8)
+        seen = (images.read_rgb(folder / "renders" / "test" / f"{name}_{kind}.png") for kind in _KINDS)
+        rows.append(TestRow(name, charts.picture(taken, 480), *(charts.picture(picture, 480) for picture in seen)))
+    return rows
+
+
+def _flight(path: Path) -> str | None:
+    """The fly-through as a data URI, or its place beside the page where it is large; None without one."""
+    if not path.is_file():
+        return None
+    if path.stat().st_size > _EMBEDDED_BYTES:
+        return f"renders/{path.name}"
+    return "data:video/mp4;base64," + base64.b64encode(path.read_bytes()).decode()
+
+
+def _truth_rows(truth: dict | None) -> list[tuple[str, str, str]]:
+    """Errors against the truth: name, of structure from motion, of the map."""
+    if not truth:
+        return []
+
+    def text(value: object) -> str:
+        match value:
+            case float() | int():
+                return f"{value:.4f}"
+            case list():
+                return " ".join("-" if v is None else f"{v:.4f}" for v in value)
+            case _:
+                return ""
+
+    rows = [(name, text(value), "") for name, value in truth.items() if isinstance(value, float)]
+    of_sfm, of_map = truth.get("sfm", {}), truth.get("splat", {})
+    both = [name for name in {**of_sfm, **of_map} if not name.endswith("_reason")]
+    return rows + [(name, text(of_sfm.get(name)), text(of_map.get(name))) for name in both]
 
 
 def _plan(rec: Reconstruction) -> dict[str, str]:

@@ -1,6 +1,7 @@
 """Every number of the structure-from-motion stage, with its reason; torch-free, so that --help is instant."""
 
 from dataclasses import dataclass, field
+from pathlib import Path
 from typing import Literal
 
 
@@ -213,4 +214,16 @@ class ColmapSettings:
     restore: RestoreSettings = field(default_factory=RestoreSettings)
 
 
-SfmSettings = ColmapSettings
+@dataclass(frozen=True)
+class ColmapModelSettings:
+    """Poses and points of a COLMAP model that exists; depth, water and cloud are found as without one."""
+
+    model: Path
+    """The folder with cameras, images and points3D (.bin or .txt), or one above its sparse/0."""
+    features: FeatureSettings = field(default_factory=FeatureSettings)
+    depth: PlaneSweepSettings = field(default_factory=PlaneSweepSettings)
+    water: SeathruSettings = field(default_factory=SeathruSettings)
+    restore: RestoreSettings = field(default_factory=RestoreSettings)
+
+
+SfmSettings = ColmapSettings | ColmapModelSettings

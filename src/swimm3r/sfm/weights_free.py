@@ -13,7 +13,7 @@ from swimm3r.sfm import colmap
 from swimm3r.sfm.plane_sweep import estimate_depth
 from swimm3r.sfm.restore import display_gains, restore_picture, restored_cloud
 from swimm3r.sfm.seathru import fit_medium
-from swimm3r.sfm.settings import ColmapSettings, RestoreSettings
+from swimm3r.sfm.settings import ColmapSettings, RestoreSettings, SfmSettings
 from swimm3r.sfm.tracks import fuse_depth, shared_rays
 from swimm3r.sfm.water_samples import gather_samples
 
@@ -32,7 +32,7 @@ def reconstruct(frames: Frames, settings: ColmapSettings, folder: Path, progress
 
 
 def with_water(
-    rec: Reconstruction, frames: Frames, settings: ColmapSettings, folder: Path, progress: Progress = silent
+    rec: Reconstruction, frames: Frames, settings: SfmSettings, folder: Path, progress: Progress = silent
 ) -> Reconstruction:
     """The reconstruction with its water, in both encodings, its restored cloud, and the restored pictures on disk.
 

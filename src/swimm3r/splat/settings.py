@@ -139,3 +139,4 @@ class PoseRefinementSettings:
 
 
 SplatSettings = UwbsSettings
+uwbs = UwbsSettings  # as the Python API calls it: swimm3r.train(rec, frames, swimm3r.uwbs(iterations=20_000))

@@ -1,0 +1,31 @@
+"""`swimm3r render`: pictures and a flight from a finished map."""
+
+from pathlib import Path
+
+from tyro.conf import Positional
+
+from swimm3r.cli.console import drawn_progress
+
+
+def render(
+    run: Positional[Path],
+    /,
+    cameras: Path | None = None,
+    out: Path | None = None,
+    long_side: int = 0,
+    flight: int = 0,
+) -> None:
+    """Render a run's map: with its water, without it, the water alone, and depth.
+
+    Args:
+        run: the run folder.
+        cameras: a cameras.json in the axes of RUN/sfm/cameras.json, whose cameras (lens distortion left out) are
+            rendered; the training cameras otherwise.
+        out: where the pictures go; RUN/renders/views otherwise.
+        long_side: longer side of the pictures, pixels, at most the cameras' own; 0 is the cameras' own.
+        flight: film a flight of this many pictures along the cameras, too: OUT/flythrough.mp4.
+    """
+    from swimm3r.renders import render_run
+
+    with drawn_progress() as progress:
+        print(render_run(run, cameras, out, long_side, flight, progress))
