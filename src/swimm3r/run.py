@@ -92,7 +92,9 @@ def run_pipeline(
         return record.close()
 
     key = _key("sfm", key, {type(settings.sfm).__name__: asdict(settings.sfm)})
-    record.stage("sfm", key, make=lambda: reconstruct(frames, settings.sfm, folder / "sfm", progress), reuse=lambda: None)
+    record.stage(
+        "sfm", key, make=lambda: reconstruct(frames, settings.sfm, folder / "sfm", progress), reuse=lambda: None
+    )
     # as it is on disk, to the last bit: an interrupted training must find the same poses again
     rec = reconstruction.load(folder / "sfm")
     record.add(sections.sfm_sections(rec, frames))
