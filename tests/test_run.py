@@ -222,6 +222,17 @@ def test_too_little_disk_is_said_before_anything_is_begun(dive: Path, tmp_path: 
         run_pipeline(dive, tmp_path / "run")
 
 
+def test_a_disk_that_fills_under_the_database_is_said_with_its_exit_code(dive: Path, tmp_path: Path):
+    """Stands in for a full disk: no file may grow beyond 1 MB, which the prepared frames do not, the database does."""
+    folder = tmp_path / "run"
+    command = f"ulimit -f 1000; exec {sys.executable} -m swimm3r sfm {dive} --out {folder} --preset fast"
+    done = subprocess.run(["bash", "-c", command], capture_output=True, text=True, check=False)
+    assert done.returncode == 7, done.stderr
+    assert "database" in done.stderr
+    assert "Traceback" not in done.stderr
+    assert json.loads((folder / "summary.json").read_text())["stages"]["prepare"]["status"] == "done"
+
+
 @pytest.mark.parametrize("marker", ["sfm/database.db", "sfm/reconstruction.json"])
 def test_a_killed_run_goes_on(marker: str, dive: Path, finished: tuple[Path, dict], tmp_path: Path):
     folder = tmp_path / "run"

@@ -8,6 +8,7 @@ from collections.abc import Sequence
 
 import tyro
 
+from swimm3r.cli.datasets import datasets
 from swimm3r.cli.demo import demo
 from swimm3r.cli.doctor import doctor
 from swimm3r.cli.evaluate import evaluate
@@ -35,6 +36,7 @@ def main(arguments: Sequence[str] | None = None) -> None:
         "eval": evaluate,
         "render": render,
         "report": report,
+        "datasets": datasets,
         "weights": weights,
     }
     try:

@@ -2,10 +2,12 @@
 
 Frames stand in it as 000000, 000001, ... in the order of `Frames`, all of one camera. Two-view geometry is verified by
 fundamental matrix and homography as long as nobody knows the focal length, so that matches outlive any guess of it.
+
+Nothing is written in COLMAP's transactions: one that meets a full disk aborts the process. Instead the last write of a
+frame (keypoints) and of a pair (two-view geometry) says that it is complete.
 """
 
 import json
-import shutil
 from collections.abc import Iterator, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from contextlib import contextmanager
@@ -18,7 +20,6 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
-from swimm3r.errors import StorageError
 from swimm3r.frames import Frames
 from swimm3r.io.atomic import write_text
 from swimm3r.progress import Progress, silent
@@ -30,8 +31,7 @@ if TYPE_CHECKING:
 
 MIN_INLIERS = 15  # of a pair; COLMAP's limit, below it chance agrees with some geometry
 _HINT_OF_OVERLAP = 8  # matches
-_BATCH = 32  # frames or pairs per transaction: what a killed run loses
-_SPARE_BYTES = 48 << 20  # a batch of frames is at most 32 * 0.6 MB, twice that in the journal
+_BATCH = 32  # frames or pairs worked on together: what a killed run loses
 _HELD = 200  # frames in memory while matching: 0.3 GB
 
 
@@ -52,24 +52,6 @@ class FeatureDatabase:
             yield database
         finally:
             database.close()
-
-    @contextmanager
-    def transaction(self) -> "Iterator[pycolmap.Database]":
-        """The open database, whose writes are kept together or not at all.
-
-        Raises StorageError before the disk is full: a transaction that cannot be finished aborts the whole process.
-        """
-        import pycolmap
-
-        free = shutil.disk_usage(self.path.parent).free
-        if free < _SPARE_BYTES:
-            raise StorageError(
-                f"only {free / 1e6:.0f} MB are left on the disk of {self.path.parent}",
-                cause="the disk filled up, or a quota is used up",
-                hint="free some space, or choose another --out, and run the same command again: it goes on from here",
-            )
-        with self.open() as database, pycolmap.DatabaseTransaction(database):
-            yield database
 
 
 def start_database(
@@ -95,7 +77,7 @@ def start_database(
     about.unlink(missing_ok=True)
     for leftover in folder.glob("database.db*"):
         leftover.unlink()
-    with out.transaction() as database:
+    with out.open() as database:
         camera_id = database.write_camera(camera, use_camera_id=True)
         sensor = pycolmap.sensor_t(pycolmap.SensorType.CAMERA, camera_id)
         rig = pycolmap.Rig()
@@ -127,11 +109,12 @@ def fill_features(
 
     progress("finding features", done, store.frames)
     for start in range(0, len(missing), _BATCH):
-        with ThreadPoolExecutor(threads) as pool, store.transaction() as database:
+        with ThreadPoolExecutor(threads) as pool, store.open() as database:
             for i, found in pool.map(extract, missing[start : start + _BATCH]):
-                database.write_keypoints(i + 1, found.keypoints)
                 described = pycolmap.FeatureDescriptors(pycolmap.FeatureExtractorType.SIFT, found.descriptors)
-                database.write_descriptors(i + 1, described)
+                if not database.exists_descriptors(i + 1):
+                    database.write_descriptors(i + 1, described)
+                database.write_keypoints(i + 1, found.keypoints)
                 done += 1
                 progress("finding features", done, store.frames)
 
@@ -174,7 +157,7 @@ def match_pairs(
         progress(what, done, len(pairs))
         for start in range(0, len(missing), _BATCH):
             batch = missing[start : start + _BATCH]
-            with ThreadPoolExecutor(threads) as pool, store.transaction() as database:
+            with ThreadPoolExecutor(threads) as pool, store.open() as database:
                 _hold_features(held, {i for pair in batch for i in pair}, database)
                 for (i, j), (matches, geometry) in zip(batch, pool.map(match, batch), strict=True):
                     if again:
@@ -182,7 +165,8 @@ def match_pairs(
                         if len(old.inlier_matches) < len(geometry.inlier_matches):
                             database.update_two_view_geometry(i + 1, j + 1, geometry)
                     else:
-                        database.write_matches(i + 1, j + 1, matches)
+                        if not database.exists_matches(i + 1, j + 1):
+                            database.write_matches(i + 1, j + 1, matches)
                         database.write_two_view_geometry(i + 1, j + 1, geometry)
                     done += 1
                     progress(what, done, len(pairs))
