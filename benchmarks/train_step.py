@@ -73,7 +73,7 @@ def measure(size: Size, repeats: int) -> dict[str, float]:
     settings = UwbsSettings(iterations=20_000)
     rng = torch.Generator().manual_seed(1)
     height, width = size.height, size.width
-    recipe = uwbs.Uwbs(settings, None, 1.0, 1.0)  # the reconstruction is read at the start only
+    recipe = uwbs.Uwbs(settings, None, 1.0, 1.0, None)  # the reconstruction is read at the start only
     p, field = lifted(size), initial_field(None, settings.medium, rng)
     state = uwbs.State(p, field, {name: fresh(t) for name, t in uwbs._parameters(p, field).items()})
     prior = 1 + 9 * torch.rand(height, width, generator=rng)
@@ -108,7 +108,7 @@ def measure(size: Size, repeats: int) -> dict[str, float]:
         torch.autograd.grad(out, list(field.network.parameters()), on_maps)
 
     def losses() -> None:
-        loss, _ = uwbs.objective(leaves, drawing, view, settings, True)
+        loss, _ = uwbs.objective(leaves, drawing, view, settings, None, True)
         torch.autograd.grad(loss, [*drawn, leaves.opacity, leaves.scale], allow_unused=True)
 
     parameters = uwbs._parameters(BetaPrimitives(*(t.clone() for t in p)), field)

@@ -7,12 +7,14 @@ import torch
 
 from swimm3r.medium import Medium
 from swimm3r.splat.medium_field import (
+    deviation,
     grid_of,
     initial_field,
     medium_at_pixels,
     per_z_depth,
     smoothness,
     spherical_harmonics,
+    water_prior,
 )
 from swimm3r.splat.projection import pinhole
 from swimm3r.splat.settings import MediumFieldSettings
@@ -100,3 +102,15 @@ def test_the_pose_reaches_the_field(camera):
     R = view.R.clone().requires_grad_()
     value = grid_of(rough_field(), replace(view, R=R), 8).values.square().sum()
     assert torch.autograd.grad(value, R)[0].abs().max() > 1e-3
+
+
+def test_the_prior_is_what_the_first_field_says_in_the_fields_own_unit(camera, tiny_dive):
+    fit, length = tiny_dive.rec.medium, 0.25
+    settings = MediumFieldSettings(hidden=16)
+    water = Medium(fit.medium.Binf, fit.medium.beta_D * length, fit.medium.beta_B * length)
+    prior = water_prior(fit, length, settings)
+    grid = grid_of(initial_field(water, settings, torch.Generator().manual_seed(0)), pinhole(camera()), 8)
+    assert deviation(grid, prior) < 1e-8
+    one_off = replace(grid, values=grid.values * torch.cat([torch.ones(8), torch.tensor([1.1])])[:, None, None])
+    expected = (torch.tensor(1.1).log() / settings.least_std) ** 2 / 9
+    torch.testing.assert_close(deviation(one_off, prior), expected, rtol=1e-4, atol=0)

@@ -11,7 +11,7 @@ from swimm3r.evaluate.images import psnr
 from swimm3r.splat import train
 from swimm3r.splat.checkpoint import load_map
 from swimm3r.splat.rendering import SplatMap
-from swimm3r.splat.settings import DensifySettings, InitialSettings, UwbsSettings
+from swimm3r.splat.settings import DensifySettings, InitialSettings, MediumFieldSettings, UwbsSettings
 from swimm3r.splat.training import view_of_step
 
 SETTINGS = UwbsSettings(
@@ -93,6 +93,18 @@ def test_a_scene_in_another_unit_trains_to_the_same_map_in_that_unit(tiny_dive, 
     view = tiny_dive.cameras[4]
     metric = train(tiny_dive.rec, tiny_dive.frames, few, tmp_path / "metric")
     assert psnr(scene.render(view).rgb, metric.render(view).rgb) > 35
+
+
+def test_the_water_waits_for_the_primitives(tiny_dive, tmp_path):
+    still = replace(SETTINGS, iterations=10, medium=MediumFieldSettings(begin=1.0))
+    moving = replace(SETTINGS, iterations=10, medium=MediumFieldSettings(begin=0.0))
+    water = [
+        train(tiny_dive.rec, tiny_dive.frames, settings, tmp_path / str(i)).render(tiny_dive.cameras[0]).medium.beta_D
+        for i, settings in enumerate((still, moving))
+    ]
+    known = tiny_dive.rec.medium.medium.beta_D.expand_as(water[0])
+    torch.testing.assert_close(water[0], known)
+    assert (water[1] - known).abs().max() > 1e-4
 
 
 def test_an_epoch_visits_every_view_once_and_each_in_its_own_order():

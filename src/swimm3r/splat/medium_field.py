@@ -15,7 +15,7 @@ from jaxtyping import Float
 from torch import Tensor, nn
 from torch.nn.functional import interpolate, sigmoid, softplus
 
-from swimm3r.medium import Medium
+from swimm3r.medium import Medium, MediumFit
 from swimm3r.raster import MediumMaps
 from swimm3r.splat.primitives import inverse_softplus
 from swimm3r.splat.projection import Pinhole
@@ -108,6 +108,35 @@ def per_z_depth(maps: MediumMaps, view: Pinhole) -> MediumMaps:
     y = (torch.arange(view.height, device=maps.binf.device) + 0.5 - view.cy) / view.fy
     length = (1 + x * x + (y * y)[:, None]).sqrt().to(maps.binf)
     return MediumMaps(maps.binf, maps.beta_b * length, maps.beta_d * length)
+
+
+@dataclass(frozen=True)
+class WaterPrior:
+    """What the reconstruction knows about the water: Binf, then ln beta_B and ln beta_D, as the field orders them."""
+
+    mean: Float[Tensor, "9"]
+    std: Float[Tensor, "9"]
+
+
+def water_prior(fit: MediumFit, length: float, settings: MediumFieldSettings) -> WaterPrior:
+    """The prior of a fit for a field whose betas are per `length` scene units."""
+
+    def logs(name: str) -> tuple[Float[Tensor, "3"], Float[Tensor, "3"]]:
+        beta = getattr(fit.medium, name).double().clamp(min=1e-6)
+        return torch.log(beta * length), getattr(fit.std, name).double() / beta
+
+    mean_B, std_B = logs("beta_B")
+    mean_D, std_D = logs("beta_D")
+    std = torch.cat([fit.std.Binf.double(), std_B, std_D])
+    return WaterPrior(
+        torch.cat([fit.medium.Binf.double(), mean_B, mean_D]).float(), std.clamp(min=settings.least_std).float()
+    )
+
+
+def deviation(grid: FieldGrid, prior: WaterPrior) -> Float[Tensor, ""]:
+    """Mean squared deviation of the field from the prior, in its standard deviations."""
+    here = torch.cat([grid.values[:3], grid.values[3:].clamp(min=1e-6).log()])
+    return ((here - prior.mean[:, None, None]) / prior.std[:, None, None]).square().mean()
 
 
 def smoothness(grid: FieldGrid) -> Float[Tensor, ""]:

@@ -49,6 +49,11 @@ class MediumFieldSettings:
     """Pixels between the directions at which the field is evaluated; between them its maps are interpolated."""
     prior: float = 0.3
     """Beta per working unit where the reconstruction has no medium."""
+    begin: float = 0.1
+    """Share of the run before which the water stays the reconstruction's: it learns so much faster than the primitives
+    that it would explain their first transparency."""
+    least_std: float = 0.1
+    """The reconstruction's water is not held tighter than this: betas relative, Binf in pixel values."""
 
 
 @dataclass(frozen=True)
@@ -77,6 +82,9 @@ class LossWeights:
     scale: float = 0.01
     depth: float = 0.1
     medium_smoothness: float = 1.0
+    medium_prior: float = 0.01
+    """Of the squared deviation from the reconstruction's water in its standard deviations; 0 is the paper's objective.
+    Colours and water can trade places in a map, and without it they do."""
     radius: float = 0.1
     max_radius: float = 256.0
     """Projected radius, pixels of a 1280 pixel wide picture, beyond which a primitive counts as veil."""

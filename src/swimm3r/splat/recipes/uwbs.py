@@ -1,6 +1,8 @@
 """Underwater Beta Splatting, static: the objective of Eq. uwbs_total, its schedule, and one step of it.
 
 L = L_3DGS + lambda_opa L_opa + lambda_scale L_scale + lambda_depth L_depth + lambda_smooth L_smooth + lambda_rad L_rad
+
+and, beyond the paper, a term that holds the water to what structure from motion measured (`LossWeights.medium_prior`).
 """
 
 import hashlib
@@ -17,7 +19,7 @@ from swimm3r.medium import Medium
 from swimm3r.progress import Progress, silent
 from swimm3r.reconstruction import Reconstruction
 from swimm3r.splat import checkpoint, densify, losses, training
-from swimm3r.splat.medium_field import MediumField, initial_field, smoothness
+from swimm3r.splat.medium_field import MediumField, WaterPrior, deviation, initial_field, smoothness, water_prior
 from swimm3r.splat.optimiser import Moments, adam_step, fresh, log_linear
 from swimm3r.splat.primitives import BetaPrimitives, initial_primitives, rescaled
 from swimm3r.splat.projection import pinhole
@@ -43,6 +45,7 @@ class Uwbs:
     rec: Reconstruction
     scale: float  # working units per scene unit
     radius: float  # of the cameras' path, working units
+    prior: WaterPrior | None  # None where the reconstruction has no water
 
     def start(self) -> State:
         """Primitives on the cloud, and the reconstruction's water in every direction."""
@@ -62,7 +65,7 @@ class Uwbs:
         parameters = _parameters(state.primitives, state.field)
         p = BetaPrimitives(*(values.detach().requires_grad_() for values in state.primitives))
         drawing = draw(p, state.field, pinhole(view.camera), settings)
-        loss, numbers = objective(p, drawing, view, settings, self._regularised(share))
+        loss, numbers = objective(p, drawing, view, settings, self.prior, self._regularised(share))
         leaves = [*p, *state.field.network.parameters()]
         gradients = dict(zip(parameters, torch.autograd.grad(loss, leaves, materialize_grads=True), strict=True))
         numbers |= {"primitives": float(len(p.xyz))}
@@ -108,6 +111,8 @@ class Uwbs:
         rates = {name: getattr(r, name) for name in BetaPrimitives._fields}
         rates["xyz"] = self.radius * log_linear(r.xyz, r.xyz_end, share)
         medium = log_linear(r.medium, r.medium_end, share)
+        if self.prior is not None and share <= self.settings.medium.begin:
+            medium = 0.0
         return rates | {name: medium for name in _FIELD_NAMES}
 
     def _densified(
@@ -140,7 +145,12 @@ class Uwbs:
 
 
 def objective(
-    p: BetaPrimitives, drawing: Drawing, view: View, settings: UwbsSettings, regularised: bool
+    p: BetaPrimitives,
+    drawing: Drawing,
+    view: View,
+    settings: UwbsSettings,
+    prior: WaterPrior | None,
+    regularised: bool,
 ) -> tuple[Tensor, dict[str, float]]:
     """Eq. uwbs_total, and its terms unweighted. Opacity and scale count only while `regularised`."""
     w = settings.weights
@@ -150,6 +160,10 @@ def objective(
     large = losses.oversize(p, drawing.projection.radius, w.max_radius * view.camera.width / 1280)
     total = photo.loss + w.depth * depth + w.medium_smoothness * smooth + w.radius * large
     numbers = {"l1": photo.l1, "ssim": photo.ssim, "depth": depth, "medium_smoothness": smooth, "radius": large}
+    if prior is not None:
+        off = deviation(drawing.grid, prior)
+        total = total + w.medium_prior * off
+        numbers |= {"medium_prior": off}
     if regularised:
         opacity, scale = losses.mean_opacity(p), losses.mean_scale(p)
         total = total + w.opacity * opacity + w.scale * scale
@@ -163,7 +177,8 @@ def train(
     """Train a map in `folder`: checkpoint/, metrics.jsonl, and at the end map.safetensors, in the scene's own unit."""
     scale = working_scale(rec, settings)
     views = TrainingViews(rec, frames, settings, scale)
-    recipe = Uwbs(settings, rec, scale, path_radius(rec, scale, settings.working_depth))
+    prior = None if rec.medium is None else water_prior(rec.medium, 1 / scale, settings.medium)
+    recipe = Uwbs(settings, rec, scale, path_radius(rec, scale, settings.working_depth), prior)
     final = training.run(recipe, views, _schedule(settings, rec, views), folder, progress)
     field = MediumField(settings.medium.hidden)
     field.load_state_dict(final.field.state_dict())
