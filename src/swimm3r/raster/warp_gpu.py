@@ -62,16 +62,18 @@ float v[32];
 #pragma unroll
 for (int i = 0; i < 32; ++i) v[i] = i < 20 ? values[i] : 0.0f;
 const int lane = threadIdx.x & 31;
-#pragma unroll
-for (int half = 16; half > 0; half >>= 1) {
-    const bool upper = (lane & half) != 0;
-    #pragma unroll
-    for (int i = 0; i < half; ++i) {
-        const float keep = upper ? v[i + half] : v[i];
-        const float give = upper ? v[i] : v[i + half];
-        v[i] = keep + __shfl_xor_sync(0xffffffffu, give, half);
-    }
+// constant bounds: a loop over `half` around this keeps v in local memory, as its trip counts are not known in time
+#define HALVE(half) { \\
+    const bool upper = (lane & half) != 0; \\
+    _Pragma("unroll") \\
+    for (int i = 0; i < half; ++i) { \\
+        const float keep = upper ? v[i + half] : v[i]; \\
+        const float give = upper ? v[i] : v[i + half]; \\
+        v[i] = keep + __shfl_xor_sync(0xffffffffu, give, half); \\
+    } \\
 }
+HALVE(16) HALVE(8) HALVE(4) HALVE(2) HALVE(1)
+#undef HALVE
 if (lane < 20) atomicAdd(row + lane, v[0]);
 #else
 for (int i = 0; i < 20; ++i) row[i] += values[i];
