@@ -72,7 +72,7 @@ def initial_primitives(rec: Reconstruction, settings: InitialSettings, rng: torc
         query_mean=directions,
         rgb=rgb,
         opacity=torch.full((n,), settings.opacity).logit(),
-        beta=torch.zeros(n, 4),
+        beta=torch.tensor([0.0, *[settings.view_exponent] * 3]).repeat(n, 1),
         scale=inverse_softplus(scale),
         lower=1e-5 * torch.randn(n, 15, generator=rng),
     )

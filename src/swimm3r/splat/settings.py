@@ -33,6 +33,8 @@ class InitialSettings:
     directions: Literal["mean", "uniform"] = "mean"
     """Mean of the conditioned direction: that of the frames which see the point, or drawn from a cube as UBS does,
     which hides 9 of 10 primitives in any one view."""
+    view_exponent: float = 0.0
+    """Stored exponent of the conditioned directions: how fast a primitive fades seen from elsewhere, as 4 exp of it."""
     scale: float = 1.0
     """Spatial scale, in root mean square distances to the 3 nearest neighbours."""
     opacity: float = 0.5
