@@ -41,7 +41,7 @@ def scene(b: int = 2, seed: int = 0) -> tuple[torch.Tensor, torch.Tensor, Medium
 
 
 def test_the_paper_weighs_encoder_and_decoder_by_a_half_descriptors_by_two_and_the_rest_by_one():
-    ones = [torch.tensor([v]) for v in (1.0, 10.0, 100.0, 1e3, 1e4, 1e5, 1e6)]
+    ones = [torch.tensor([v]) for v in (1.0, 10.0, 100.0, 1e3, 1e4, 1e5, 1e6, 1e7)]
     assert LossTerms(*ones).total(PAPER).item() == 0.5 + 5.0 + 200.0 + 1e3 + 1e4 + 1e5 + 0.5e6
 
 

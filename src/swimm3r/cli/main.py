@@ -4,7 +4,7 @@ import errno
 import logging
 import os
 import sys
-from collections.abc import Sequence
+from collections.abc import Collection, Sequence
 
 import tyro
 
@@ -15,9 +15,11 @@ from swimm3r.cli.evaluate import evaluate
 from swimm3r.cli.render import render
 from swimm3r.cli.report import report
 from swimm3r.cli.run import commands_for_preset
+from swimm3r.cli.train_sfm import command_for_recipe
 from swimm3r.cli.weights import weights
 from swimm3r.errors import StorageError, Swimm3rError
 from swimm3r.presets import PRESETS
+from swimm3r.sfm.training_settings import RECIPES
 
 _INTERRUPTED = 130
 _STORAGE_ERRORS = {errno.ENOSPC, errno.EDQUOT, errno.EROFS, errno.EACCES, errno.EPERM, errno.EFBIG}
@@ -30,13 +32,14 @@ def main(arguments: Sequence[str] | None = None) -> None:
     os.environ.setdefault("OMP_WAIT_POLICY", "PASSIVE")
     logging.basicConfig(level=logging.WARNING, format="%(message)s")
     commands = {
-        **commands_for_preset(_named_preset(arguments)),
+        **commands_for_preset(_named("--preset", arguments, PRESETS, "default")),
         "demo": demo,
         "doctor": doctor,
         "eval": evaluate,
         "render": render,
         "report": report,
         "datasets": datasets,
+        "train-sfm": command_for_recipe(_named("--recipe", arguments, RECIPES, "swimm3r")),
         "weights": weights,
     }
     try:
@@ -68,10 +71,10 @@ def _fail(error: Swimm3rError) -> None:
     raise SystemExit(error.exit_code)
 
 
-def _named_preset(arguments: Sequence[str]) -> str:
-    """The preset decides the defaults that --help shows, so it is found before tyro parses; tyro checks its name."""
+def _named(option: str, arguments: Sequence[str], known: Collection[str], default: str) -> str:
+    """What decides the defaults that --help shows is found before tyro parses; tyro checks the name."""
     for here, after in zip(arguments, [*arguments[1:], ""], strict=True):
-        name = after if here == "--preset" else here.removeprefix("--preset=")
-        if name != here and name in PRESETS:
+        name = after if here == option else here.removeprefix(f"{option}=")
+        if name != here and name in known:
             return name
-    return "default"
+    return default

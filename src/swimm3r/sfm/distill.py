@@ -13,7 +13,7 @@ Q_0.05 is a pixel's colour, and dim pixels are near or black: in haze it lies be
 downwards by construction. `benchmarks/veil_anchor.py` says by how much.
 """
 
-from dataclasses import dataclass, fields
+from dataclasses import dataclass
 
 import torch
 from jaxtyping import Bool, Float
@@ -44,16 +44,14 @@ class LossTerms:
     inverse: Float[Tensor, " b"]
     overshoot: Float[Tensor, " b"]  # first part of L_sat
     anchor: Float[Tensor, " b"]  # second part, without its 0.5
+    clean: Float[Tensor, " b"]  # L_geom of the student on the clear pictures
 
     def total(self, s: ObjectiveSettings) -> Float[Tensor, " b"]:
         """L_SfM of each pair."""
         geometry = s.encoder * self.encoder + s.decoder * self.decoder + s.descriptors * self.descriptors
         saturation = self.overshoot + s.anchor * self.anchor
-        return geometry + s.forward * self.forward + s.inverse * self.inverse + s.saturation * saturation
-
-    def means(self) -> dict[str, float]:
-        """Each term over the batch, for the record."""
-        return {f.name: float(getattr(self, f.name).detach().mean()) for f in fields(self)}
+        physics = s.forward * self.forward + s.inverse * self.inverse + s.saturation * saturation
+        return geometry + physics + s.clean * self.clean
 
 
 @dataclass(frozen=True)

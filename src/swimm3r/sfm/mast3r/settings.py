@@ -143,3 +143,8 @@ class ObjectiveSettings:
     anchor_quantile: float = 0.05
     min_transmittance: float = 0.05
     """eps_inv of Eq. swimm3r_render_inverse; the paper gives none. At 1/20 a noise of 1/255 stays below 0.08."""
+
+    @property
+    def physics(self) -> bool:
+        """Whether the water is trained at all."""
+        return self.forward > 0 or self.inverse > 0 or self.saturation > 0

@@ -1,0 +1,64 @@
+"""`swimm3r train-sfm`: distils the frozen network into a low-rank student that sees through water."""
+
+import sys
+from collections.abc import Callable
+from pathlib import Path
+from typing import Annotated, Literal
+
+from tyro.conf import Positional, arg
+
+from swimm3r.cli.console import drawn_progress
+from swimm3r.sfm.training_settings import RECIPES, TrainSettings
+
+Recipe = Literal[
+    "swimm3r",
+    "without-forward",
+    "without-inverse",
+    "without-saturation",
+    "without-augmentation",
+    "distillation-only",
+    "dark3r",
+]
+
+
+def command_for_recipe(name: str) -> Callable:
+    """The command, with the defaults of a recipe."""
+
+    def train_sfm(
+        data: Positional[Path],
+        /,
+        out: Path,
+        weights: Path | None = None,
+        base_licence: str | None = None,
+        recipe: Recipe = "swimm3r",
+        device: Literal["auto", "cpu", "cuda"] = "auto",
+        settings: Annotated[TrainSettings, arg(name="")] = RECIPES[name],
+    ) -> None:
+        """Train adapters and physics head on pairs of raw and clean pictures. The same command again goes on.
+
+        Under torchrun every process takes its share of each batch.
+
+        Args:
+            data: a folder of data sets (swimm3r datasets shows what it holds).
+            out: the training's folder; OUT/adapter.safetensors is the result.
+            weights: the base checkpoint; by default the MASt3R weights of this computer.
+            base_licence: the base checkpoint's licence, where it is not one that Swimm3R knows.
+            recipe: what the other defaults aim at: the paper's system, one of its ablations, or Dark3R.
+            device: where the network runs.
+            settings: every number of the training.
+        """
+        from swimm3r.sfm.train_sfm import train_sfm as run
+        from swimm3r.sfm.training import Estimate
+
+        def announce(e: Estimate) -> None:
+            print(
+                f"{e.pairs} pairs, {e.steps} steps, {e.trained:,} trained numbers; "
+                f"about {e.seconds_per_step:.3g} s per step, {e.hours:.2g} h in all, {e.peak_mb:.0f} MB",
+                file=sys.stderr,
+            )
+
+        with drawn_progress() as progress:
+            adapter = run(data, out, settings, weights, base_licence, device, announce, progress)
+        print(f"Adapter: {adapter}")
+
+    return train_sfm

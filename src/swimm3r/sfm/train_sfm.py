@@ -1,0 +1,61 @@
+"""From a folder of data sets and a base checkpoint to a trained adapter: what surrounds the loop of `training.py`."""
+
+import os
+from collections.abc import Callable
+from pathlib import Path
+
+import torch
+
+from swimm3r import weights as published
+from swimm3r.datasets import make_pairs, read_tree
+from swimm3r.errors import DeviceError
+from swimm3r.progress import Progress, silent
+from swimm3r.sfm import training
+from swimm3r.sfm.adapter_file import Base, fingerprint
+from swimm3r.sfm.mast3r import checkpoint
+from swimm3r.sfm.training_data import split_data
+from swimm3r.sfm.training_scores import score
+from swimm3r.sfm.training_settings import TrainSettings
+
+
+def train_sfm(
+    data: Path,
+    folder: Path,
+    settings: TrainSettings,
+    weights: Path | None = None,
+    base_licence: str | None = None,
+    device: str = "auto",
+    announce: Callable[[training.Estimate], None] = lambda estimate: None,
+    progress: Progress = silent,
+) -> Path:
+    """Trains on every trainable pair below `data` and returns the adapter's path.
+
+    Raises InputError for a folder without trainable pairs, WeightsError for a missing or damaged checkpoint, and
+    DeviceError for an accelerator that is not there.
+    """
+    place = _device(device)
+    low = settings.precision == "bfloat16" or (settings.precision == "auto" and place.type == "cuda")
+    path = published.require("mast3r", weights)
+    state, _ = checkpoint.read(path)
+    base = Base(path.name, fingerprint(state), base_licence or _licence(path))
+    del state
+    network = checkpoint.load(path, place, torch.bfloat16 if low else torch.float32)
+    sequences = read_tree(data).sequences
+    pairs = [make_pairs(sequence, settings.pairs) for sequence in sequences]
+    patch = network.architecture.patch
+    train, validation = split_data(sequences, pairs, settings.size, settings.validation, settings.max_pairs, patch)
+    return training.train(network, base, train, validation, settings, folder, score, announce, progress)
+
+
+def _device(name: str) -> torch.device:
+    there = torch.cuda.is_available()
+    if name == "cuda" and not there:
+        raise DeviceError("there is no CUDA device", cause="no GPU, or torch's CPU build", hint="--device cpu")
+    if name == "cpu" or not there:
+        return torch.device("cpu")
+    return torch.device("cuda", int(os.environ.get("LOCAL_RANK", "0")))
+
+
+def _licence(path: Path) -> str:
+    known = (w.licence for w in published.MANIFEST if w.filename == path.name)
+    return next(known, f"not stated: {path.name} is no published checkpoint that Swimm3R knows")

@@ -1,0 +1,79 @@
+"""Every number of medium-aware training, and the recipes; torch-free, so that --help is instant."""
+
+from dataclasses import dataclass, field, replace
+from typing import Literal
+
+from swimm3r.datasets.settings import PairSettings
+from swimm3r.errors import UsageError
+from swimm3r.sfm.mast3r.settings import LoraSettings, ObjectiveSettings
+
+
+@dataclass(frozen=True)
+class TrainSettings:
+    """Distillation of the frozen network into its low-rank student, with the physics head (`sfm/training.py`)."""
+
+    lora: LoraSettings = field(default_factory=LoraSettings)
+    objective: ObjectiveSettings = field(default_factory=ObjectiveSettings)
+    pairs: PairSettings = field(default_factory=PairSettings)
+    water_probability: float = 0.5
+    """p of the paper's parametric water-type augmentation."""
+    learning_rate: float = 5e-4
+    weight_decay: float = 1e-4
+    epochs: int = 20
+    batch: int = 4
+    """Pairs per step, over all processes together."""
+    micro_batch: int = 0
+    """Pairs per forward pass, their gradients added up to the batch; 0 is the whole batch. Less memory, same result."""
+    size: int = 512
+    """Long side of the network's pictures, pixels."""
+    precision: Literal["auto", "float32", "bfloat16"] = "auto"
+    """Of the frozen trunk; adapters, heads and losses stay float32. auto: bfloat16 on a GPU."""
+    seed: int = 0
+    """Decides adapters, head, order of the pairs and water."""
+    validation: int = 16
+    """Pairs drawn from the training sequences, never trained on, scored after each epoch; 0 for none."""
+    max_pairs: int = 0
+    """Most pairs trained on, drawn evenly; 0 is no limit."""
+    log_every: int = 10
+    """Steps between rows of metrics.jsonl, each the mean of its steps."""
+    checkpoint_every: int = 200
+    """Steps between states that an interrupted training goes on from; the end of an epoch is always one."""
+
+    def __post_init__(self) -> None:
+        positive = ("learning_rate", "epochs", "batch", "log_every", "checkpoint_every")
+        wrong = [name for name in positive if not getattr(self, name) > 0]
+        wrong += [n for n in ("weight_decay", "micro_batch", "validation", "max_pairs") if not getattr(self, n) >= 0]
+        if not 0 <= self.water_probability <= 1:
+            wrong.append("water_probability")
+        if self.size < 16:
+            wrong.append("size")
+        if wrong:
+            raise UsageError(
+                f"{wrong[0]} cannot be {getattr(self, wrong[0])}",
+                cause="a slip in the command or the settings",
+                hint="leave it out for the default; swimm3r train-sfm --help shows them",
+            )
+
+
+def _without(*terms: Literal["forward", "inverse", "saturation"]) -> TrainSettings:
+    paper = ObjectiveSettings()
+    kept = {name: 0.0 if name in terms else getattr(paper, name) for name in ("forward", "inverse", "saturation")}
+    return TrainSettings(objective=replace(paper, **kept))
+
+
+RECIPES: dict[str, TrainSettings] = {
+    "swimm3r": TrainSettings(),
+    # Tab. swimm3r_flsea_ablation
+    "without-forward": _without("forward"),
+    "without-inverse": _without("inverse"),
+    "without-saturation": _without("saturation"),
+    "without-augmentation": replace(TrainSettings(), water_probability=0.0),
+    "distillation-only": _without("forward", "inverse", "saturation"),
+    # Dark3R as a system of its own: three feature levels alike, the student also on clear pictures, no water
+    "dark3r": TrainSettings(
+        objective=ObjectiveSettings(
+            encoder=1.0, decoder=1.0, descriptors=1.0, clean=0.3, forward=0.0, inverse=0.0, saturation=0.0
+        ),
+        water_probability=0.0,
+    ),
+}

@@ -1,0 +1,343 @@
+"""Training: that it learns, that it goes on after a kill with the same bits, and that two processes are as one."""
+
+import json
+import multiprocessing
+import os
+import signal
+import subprocess
+import sys
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+import tifffile
+import torch
+
+from swimm3r.cli.train_sfm import Recipe
+from swimm3r.datasets import PairSettings, make_pairs, read_tree
+from swimm3r.errors import InputError, UsageError, WeightsError
+from swimm3r.io.images import write_rgb
+from swimm3r.sfm import adapter_file
+from swimm3r.sfm.adapter_file import Base, fingerprint
+from swimm3r.sfm.mast3r import checkpoint
+from swimm3r.sfm.mast3r.network import Architecture, Mast3r
+from swimm3r.sfm.mast3r.settings import ObjectiveSettings
+from swimm3r.sfm.student import Student, new_student
+from swimm3r.sfm.train_sfm import train_sfm
+from swimm3r.sfm.training import Workers, batch_size, pairs_of_step, train
+from swimm3r.sfm.training_data import PairData, split_data
+from swimm3r.sfm.training_scores import score
+from swimm3r.sfm.training_settings import RECIPES, TrainSettings
+from swimm3r.synthetic import DiveSettings, write_dive
+
+BASE = Base("small.safetensors", "0" * 64, "made in a test")
+SETTINGS = TrainSettings(
+    pairs=PairSettings(min_overlap=0.1, max_overlap=1.0), learning_rate=5e-3, epochs=2, size=64, log_every=1,
+    checkpoint_every=1, validation=0, precision="float32",
+)  # fmt: skip
+
+
+@pytest.fixture(scope="module")
+def network() -> Mast3r:
+    with torch.random.fork_rng():
+        torch.manual_seed(0)
+        small = Architecture(
+            64, 2, 1, 64, 4, 1, dpt_layer_dims=(4, 6, 8, 10), dpt_feature_dim=8, dpt_last_dims=(4, 4),
+            local_hidden_dim=64, descriptor_dim=6,
+        )  # fmt: skip
+        return Mast3r(small).eval().requires_grad_(False)
+
+
+@pytest.fixture(scope="module")
+def dive(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    folder = tmp_path_factory.mktemp("data")
+    write_dive(DiveSettings(frames=6, width=64, height=48, family="green"), folder / "green")
+    return folder
+
+
+@pytest.fixture(scope="module")
+def eight(dive: Path) -> PairData:
+    return pairs_of(dive)
+
+
+@pytest.fixture(scope="module")
+def none(eight: PairData) -> PairData:
+    """Nothing to validate on."""
+    return replace(eight, pairs=())
+
+
+def pairs_of(folder: Path, count: int = 8) -> PairData:
+    sequences = read_tree(folder).sequences
+    pairs = [make_pairs(s, SETTINGS.pairs) for s in sequences]
+    data, _ = split_data(sequences, pairs, SETTINGS.size, 0, count)
+    assert len(data) == count
+    return data
+
+
+def nothing(student: Student, data: PairData) -> dict[str, float | None]:
+    return {}
+
+
+def rows(folder: Path) -> list[dict]:
+    return [json.loads(line) for line in (folder / "metrics.jsonl").read_text().splitlines()]
+
+
+def learned(path: Path) -> dict[str, torch.Tensor]:
+    from safetensors.torch import load_file
+
+    return load_file(path)
+
+
+def test_eight_pairs_can_be_learned_by_heart(network: Mast3r, eight: PairData, none: PairData, tmp_path: Path):
+    settings = replace(SETTINGS, epochs=20, checkpoint_every=1000, water_probability=0.0)
+    train(network, BASE, eight, none, settings, tmp_path, nothing)
+    per_step = rows(tmp_path)
+    assert len(per_step) == 40
+
+    def mean(name: str, part: slice) -> float:
+        return float(np.mean([row[name] for row in per_step[part]]))
+
+    first, last = slice(0, 6), slice(-6, None)
+    assert mean("loss", last) < 0.6 * mean("loss", first)
+    for name in ("forward", "inverse", "overshoot"):
+        assert mean(name, last) < mean(name, first), name
+
+
+def test_the_teacher_is_left_as_it_was(network: Mast3r, eight: PairData, none: PairData, tmp_path: Path):
+    before = fingerprint(network.state_dict())
+    train(network, BASE, eight, none, SETTINGS, tmp_path, nothing)
+    assert fingerprint(network.state_dict()) == before
+    picture = eight.item(0, 0.0, torch.Generator()).clean
+    tokens = network.encode(picture).tokens
+    again = adapter_file.load(tmp_path / "adapter.safetensors", network)
+    with again.adapters.off():
+        assert torch.equal(network.encode(picture).tokens, tokens)  # the trained adapters no longer hung on it
+    assert not torch.allclose(network.encode(picture).tokens, tokens)
+    again.adapters.detach()
+
+
+def killed_at(step: int):
+    def watch(what: str, done: int, total: int, /) -> None:
+        if done == step:
+            os.kill(os.getpid(), signal.SIGKILL)
+
+    return watch
+
+
+@pytest.mark.skipif(sys.platform == "win32", reason="Windows has no kill -9")
+def test_killed_and_started_again_it_ends_with_the_same_bits(
+    network: Mast3r, eight: PairData, none: PairData, tmp_path: Path
+):
+    whole = train(network, BASE, eight, none, SETTINGS, tmp_path / "whole", nothing)
+    settings = replace(SETTINGS, checkpoint_every=2)  # so that step 3 has to be done again
+    cut = tmp_path / "cut"
+    context = multiprocessing.get_context("fork")
+    child = context.Process(
+        target=train, args=(network, BASE, eight, none, settings, cut, nothing), kwargs={"progress": killed_at(3)}
+    )
+    child.start()
+    child.join(120)
+    assert child.exitcode == -signal.SIGKILL
+    assert [row["step"] for row in rows(cut)] == [1, 2, 3]
+    resumed = train(network, BASE, eight, none, settings, cut, nothing)
+    expected, found = learned(whole), learned(resumed)
+    assert expected.keys() == found.keys()
+    assert all(torch.equal(expected[name], found[name]) for name in expected)
+    values = [
+        [{k: v for k, v in r.items() if k != "seconds_per_step"} for r in rows(p.parent)] for p in (whole, resumed)
+    ]
+    assert values[0] == values[1]
+
+
+def test_a_finished_training_is_not_done_again(network: Mast3r, eight: PairData, none: PairData, tmp_path: Path):
+    path = train(network, BASE, eight, none, SETTINGS, tmp_path, nothing)
+    before = (path.stat().st_mtime_ns, rows(tmp_path))
+    train(network, BASE, eight, none, SETTINGS, tmp_path, nothing)
+    assert (path.stat().st_mtime_ns, rows(tmp_path)) == before
+
+
+def test_the_state_of_another_training_is_refused_not_overwritten(
+    network: Mast3r, eight: PairData, none: PairData, tmp_path: Path
+):
+    train(network, BASE, eight, none, replace(SETTINGS, epochs=1), tmp_path, nothing)
+    for other in (replace(SETTINGS, epochs=1, seed=1), replace(SETTINGS, epochs=1, water_probability=0.1)):
+        with pytest.raises(InputError, match="other settings"):
+            train(network, BASE, eight, none, other, tmp_path, nothing)
+    (tmp_path / "state.safetensors").write_bytes(b"half a file")
+    with pytest.raises(InputError, match="cannot go on"):
+        train(network, BASE, eight, none, replace(SETTINGS, epochs=1), tmp_path, nothing)
+
+
+def test_accumulated_micro_batches_are_the_batch(network: Mast3r, eight: PairData, none: PairData, tmp_path: Path):
+    settings = replace(SETTINGS, epochs=1)
+    train(network, BASE, eight, none, settings, tmp_path / "whole", nothing)
+    train(network, BASE, eight, none, replace(settings, micro_batch=1), tmp_path / "parts", nothing)
+    for one, other in zip(rows(tmp_path / "whole"), rows(tmp_path / "parts"), strict=True):
+        assert one["loss"] == pytest.approx(other["loss"], rel=1e-4)
+
+
+def test_two_processes_of_torchrun_have_the_loss_curve_of_one(network: Mast3r, dive: Path, tmp_path: Path):
+    weights = tmp_path / "small.safetensors"
+    checkpoint.save(network, weights)
+    settings = replace(SETTINGS, epochs=1, max_pairs=8)
+    train_sfm(dive, tmp_path / "one", settings, weights, device="cpu")
+    options = "--epochs 1 --max-pairs 8 --size 64 --log-every 1 --checkpoint-every 1 --validation 0 --device cpu"
+    options += " --precision float32 --learning-rate 0.005 --pairs.min-overlap 0.1 --pairs.max-overlap 1.0"
+    command = [
+        sys.executable, "-m", "torch.distributed.run", "--standalone", "--nproc-per-node", "2", "-m", "swimm3r",
+        "train-sfm", str(dive), "--out", str(tmp_path / "two"), "--weights", str(weights), *options.split(),
+    ]  # fmt: skip
+    done = subprocess.run(command, capture_output=True, text=True, env={**os.environ, "OMP_NUM_THREADS": "1"})
+    assert done.returncode == 0, done.stderr[-2000:]
+    one, two = rows(tmp_path / "one"), rows(tmp_path / "two")
+    assert [row["step"] for row in two] == [1, 2]
+    for a, b in zip(one, two, strict=True):
+        for name in ("loss", "encoder", "decoder", "descriptors", "forward", "inverse", "overshoot", "anchor"):
+            assert a[name] == pytest.approx(b[name], rel=1e-3, abs=1e-6), name
+    expected, found = (learned(tmp_path / k / "adapter.safetensors") for k in ("one", "two"))
+    for name in expected:
+        torch.testing.assert_close(found[name], expected[name], atol=2e-3, rtol=1e-2)
+
+
+def test_a_batch_that_does_not_divide_among_the_processes_is_refused():
+    assert batch_size(TrainSettings(batch=4), 100, Workers(0, 2)) == 4
+    assert batch_size(TrainSettings(batch=4), 3) == 3
+    with pytest.raises(UsageError, match="3 processes"):
+        batch_size(TrainSettings(batch=4), 100, Workers(0, 3))
+    with pytest.raises(InputError, match="too few"):
+        batch_size(TrainSettings(batch=4), 1, Workers(0, 2))
+
+
+def test_an_epoch_takes_every_pair_once_and_the_next_in_another_order():
+    epochs = [[pairs_of_step(1 + e * 3 + k, 12, 4, seed=5) for k in range(3)] for e in range(2)]
+    flat = [[i for batch in epoch for i in batch] for epoch in epochs]
+    assert sorted(flat[0]) == sorted(flat[1]) == list(range(12))
+    assert flat[0] != flat[1]
+
+
+def test_the_adapter_holds_no_base_weight_and_says_what_it_belongs_to(
+    network: Mast3r, eight: PairData, none: PairData, tmp_path: Path
+):
+    base = Base("x.pth", fingerprint(network.state_dict()), "CC BY-NC-SA 4.0")
+    path = train(network, base, eight, none, replace(SETTINGS, epochs=1), tmp_path, nothing)
+    header = adapter_file.describe(path)
+    assert header["base"] == {"name": "x.pth", "sha256": base.sha256, "licence": "CC BY-NC-SA 4.0"}
+    assert header["trained"]["settings"]["seed"] == 0
+    names = learned(path).keys()
+    assert all(".lora_" in name or name.startswith("head.") for name in names)
+    assert not names & network.state_dict().keys()
+    student = adapter_file.load(path, network, base.sha256)
+    student.adapters.detach()
+    with pytest.raises(WeightsError, match="trained on"):
+        adapter_file.load(path, network, "f" * 64)
+    path.write_bytes(path.read_bytes()[:1000])
+    with pytest.raises(WeightsError, match="cannot be used"):
+        adapter_file.load(path, network)
+
+
+def test_a_file_of_peft_alone_is_no_adapter_file(network: Mast3r, tmp_path: Path):
+    from safetensors.torch import save_file
+
+    save_file({"x": torch.zeros(1)}, tmp_path / "a.safetensors")
+    with pytest.raises(WeightsError, match="no adapter file"):
+        adapter_file.load(tmp_path / "a.safetensors", network)
+
+
+def test_one_network_has_one_fingerprint_whatever_its_file(network: Mast3r, tmp_path: Path):
+    for name in ("a.pth", "a.safetensors"):
+        checkpoint.save(network, tmp_path / name)
+    marks = {fingerprint(checkpoint.read(tmp_path / name)[0]) for name in ("a.pth", "a.safetensors")}
+    assert marks == {fingerprint(network.state_dict())}
+
+
+def test_the_recipes_are_the_papers_system_its_ablations_and_dark3r():
+    assert set(RECIPES) == set(Recipe.__args__)
+    full = RECIPES["swimm3r"]
+    assert (full.learning_rate, full.weight_decay, full.epochs, full.batch, full.water_probability) == (
+        5e-4, 1e-4, 20, 4, 0.5,
+    )  # fmt: skip
+    for name in ("forward", "inverse", "saturation"):
+        ablated = RECIPES[f"without-{name}"].objective
+        assert ablated == replace(full.objective, **{name: 0.0})
+    assert RECIPES["without-augmentation"] == replace(full, water_probability=0.0)
+    assert not RECIPES["distillation-only"].objective.physics
+    dark = RECIPES["dark3r"].objective
+    assert (dark.clean, dark.physics) == (0.3, False)
+
+
+@pytest.mark.parametrize("recipe", ["distillation-only", "dark3r"])
+def test_without_physics_there_is_no_head(
+    network: Mast3r, eight: PairData, none: PairData, tmp_path: Path, recipe: str
+):
+    settings = replace(SETTINGS, objective=RECIPES[recipe].objective, epochs=1)
+    path = train(network, BASE, eight, none, settings, tmp_path, nothing)
+    assert not [name for name in learned(path) if name.startswith("head.")]
+    last = rows(tmp_path)[-1]
+    assert last["forward"] == last["inverse"] == last["anchor"] == 0
+    assert last["encoder"] > 0
+    assert (last["clean"] == 0) == (recipe == "distillation-only")
+
+
+def test_before_its_first_step_the_student_is_the_teacher(network: Mast3r, eight: PairData):
+    student = new_student(network, SETTINGS.lora, ObjectiveSettings(), 0)
+    item = eight.item(0, 0.0, torch.Generator())
+    batch = {"clean": item.clean[None], "ray_depth": item.ray_depth[None], "valid": item.valid[None]}
+    same = student(raw=item.clean[None], **batch)
+    assert same["encoder"] == same["decoder"] == same["descriptors"] == 0
+    assert student(raw=item.raw[None], **batch)["encoder"] > 0
+    student.adapters.detach()
+
+
+def test_one_epoch_on_a_tree_in_flseas_layout_runs_from_the_command_line(
+    network: Mast3r, dive: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+):
+    from swimm3r.cli.main import main
+
+    rng = np.random.default_rng(0)
+    for region, name in (("canyons", "flatiron"), ("red_sea", "pier_path"), ("canyons", "tiny_canyon")):
+        folder = tmp_path / "archive" / region / name / name
+        for k in range(5):
+            stamp = 16233051861828957 + k * 5_000_000
+            for kind, end in (("imgs", ""), ("seaErra", "_SeaErra")):
+                (folder / kind).mkdir(parents=True, exist_ok=True)
+                values = rng.integers(0, 255, (38, 60, 3), dtype=np.uint8).repeat(2, 0).repeat(2, 1)
+                tifffile.imwrite(folder / kind / f"{stamp}{end}.tiff", values)
+            (folder / "depth").mkdir(exist_ok=True)
+            depth = rng.uniform(1, 5, (76, 120)).astype(np.float32)
+            tifffile.imwrite(folder / "depth" / f"{stamp}_SeaErra_abs_depth.tif", depth)
+    weights = tmp_path / "small.safetensors"
+    checkpoint.save(network, weights)
+    out = tmp_path / "out"
+    main(
+        ["train-sfm", str(tmp_path / "archive"), "--out", str(out), "--weights", str(weights), "--device", "cpu",
+         "--epochs", "1", "--size", "64", "--validation", "2", "--base-licence", "made in a test"]
+    )  # fmt: skip
+    told = capsys.readouterr()
+    assert "Adapter:" in told.out
+    assert "trained numbers" in told.err
+    (validation,) = (row["validation"] for row in rows(out) if "validation" in row)
+    assert validation["depth_absrel"] > 0
+    assert validation["rotation_deg"] is None  # FLSea has no poses
+    header = adapter_file.describe(out / "adapter.safetensors")
+    assert header["base"]["licence"] == "made in a test"
+    assert header["base"]["sha256"] == fingerprint(network.state_dict())
+
+
+def test_validation_knows_pose_depth_and_restoration_of_a_dive(network: Mast3r, eight: PairData):
+    student = new_student(network, SETTINGS.lora, ObjectiveSettings(), 0).eval()
+    with torch.no_grad():
+        scores = score(student, eight)
+    assert set(scores) == {"depth_absrel", "rotation_deg", "translation_deg", "restored_psnr", "raw_psnr", "loss"}
+    assert all(v is not None and np.isfinite(v) for v in scores.values())
+    student.adapters.detach()
+
+
+def test_training_without_a_clean_picture_anywhere_says_so(network: Mast3r, tmp_path: Path):
+    for k in range(3):
+        write_rgb(
+            tmp_path / "flatiron" / "imgs" / f"{16233051861828957 + k * 5_000_000}.png", np.zeros((8, 8, 3), np.uint8)
+        )
+    sequences = read_tree(tmp_path).sequences
+    with pytest.raises(InputError, match="no pair"):
+        split_data(sequences, [make_pairs(s, PairSettings()) for s in sequences], 64, 0, 0)
