@@ -18,7 +18,7 @@ if TYPE_CHECKING:
     from swimm3r.reconstruction import Reconstruction
     from swimm3r.run import run_pipeline
     from swimm3r.sfm import reconstruct
-    from swimm3r.sfm.settings import ColmapSettings
+    from swimm3r.sfm.settings import ColmapSettings, Mast3rSettings
     from swimm3r.splat import train
     from swimm3r.splat.checkpoint import load_map
     from swimm3r.splat.rendering import SplatMap
@@ -38,6 +38,7 @@ _HOME = {
     "run_pipeline": "run",
     "reconstruct": "sfm",
     "ColmapSettings": "sfm.settings",
+    "Mast3rSettings": "sfm.settings",
     "SplatMap": "splat.rendering",
     "UwbsSettings": "splat.settings",
     "load_map": "splat.checkpoint",
@@ -52,6 +53,7 @@ __all__ = [
     "ColmapSettings",
     "DiveSettings",
     "FrameSettings",
+    "Mast3rSettings",
     "Medium",
     "MediumFit",
     "Reconstruction",

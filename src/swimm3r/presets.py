@@ -3,7 +3,15 @@
 from dataclasses import dataclass, field
 
 from swimm3r.frame_settings import FrameSettings
-from swimm3r.sfm.settings import ColmapSettings, FeatureSettings, PlaneSweepSettings, RestoreSettings, SfmSettings
+from swimm3r.sfm.mast3r.settings import AlignmentSettings
+from swimm3r.sfm.settings import (
+    ColmapSettings,
+    FeatureSettings,
+    Mast3rSettings,
+    PlaneSweepSettings,
+    RestoreSettings,
+    SfmSettings,
+)
 from swimm3r.splat.settings import (
     DensifySettings,
     InitialSettings,
@@ -51,4 +59,13 @@ PRESETS: dict[str, RunSettings] = {
         ),
         splat=UwbsSettings(long_side=0),
     ),
+}
+
+MAST3R_PRESETS: dict[str, Mast3rSettings] = {  # the same aims with --backend mast3r
+    "fast": Mast3rSettings(
+        graph="video-2-1",
+        alignment=AlignmentSettings(intrinsics="shared", coarse_iterations=150, fine_iterations=150),
+    ),
+    "default": Mast3rSettings(),
+    "best": Mast3rSettings(graph="video-6-4", bundle_adjustment=True, restore=RestoreSettings(max_points=2_000_000)),
 }

@@ -1,5 +1,6 @@
 """What the command line draws: progress with time left, and the outcome in a few lines."""
 
+import logging
 import sys
 import time
 from collections.abc import Iterator
@@ -14,6 +15,13 @@ from rich.table import Table
 from swimm3r.progress import Progress
 
 _LINE_EVERY_S = 10.0  # in logs, where a bar cannot be redrawn
+
+
+class MessagePrinter(logging.Handler):
+    """Prints messages to what stderr is at that moment: above the bars, while any are drawn."""
+
+    def emit(self, record: logging.LogRecord) -> None:
+        print(self.format(record), file=sys.stderr, flush=True)
 
 
 @contextmanager

@@ -8,6 +8,7 @@ from collections.abc import Collection, Sequence
 
 import tyro
 
+from swimm3r.cli.console import MessagePrinter
 from swimm3r.cli.datasets import datasets
 from swimm3r.cli.demo import demo
 from swimm3r.cli.doctor import doctor
@@ -30,9 +31,13 @@ def main(arguments: Sequence[str] | None = None) -> None:
     arguments = list(sys.argv[1:] if arguments is None else arguments)
     # before torch loads OpenMP: waiting threads that spin cost a busy machine more time than the work they wait for
     os.environ.setdefault("OMP_WAIT_POLICY", "PASSIVE")
-    logging.basicConfig(level=logging.WARNING, format="%(message)s")
+    logging.basicConfig(level=logging.WARNING, format="%(message)s", handlers=[MessagePrinter()])
+    logging.getLogger("swimm3r").setLevel(logging.INFO)
     commands = {
-        **commands_for_preset(_named("--preset", arguments, PRESETS, "default")),
+        **commands_for_preset(
+            _named("--preset", arguments, PRESETS, "default"),
+            _named("--backend", arguments, ("colmap", "mast3r"), "colmap"),
+        ),
         "demo": demo,
         "doctor": doctor,
         "eval": evaluate,

@@ -6,21 +6,25 @@ from typing import Annotated, Literal
 
 from tyro.conf import Positional, arg
 
+from swimm3r import weights
 from swimm3r.cli.console import drawn_progress, print_summary
 from swimm3r.errors import UsageError
 from swimm3r.frame_settings import FrameSettings
-from swimm3r.presets import PRESETS, RunSettings
-from swimm3r.sfm.settings import ColmapModelSettings, ColmapSettings
+from swimm3r.presets import MAST3R_PRESETS, PRESETS, RunSettings
+from swimm3r.sfm.settings import ColmapModelSettings, ColmapSettings, Mast3rSettings
 from swimm3r.splat.settings import PoseRefinementSettings, UwbsSettings
 
 Preset = Literal["fast", "default", "best"]
+Backend = Literal["colmap", "mast3r"]
 _FLAT = arg(name="")  # --fps, not --frames.fps; what lies deeper keeps its prefix: --depth.planes
 
 
-def commands_for_preset(name: str) -> dict[str, Callable]:
-    """The commands that share the pipeline's settings, with the defaults of a preset."""
+def commands_for_preset(name: str, backend: str = "colmap") -> dict[str, Callable]:
+    """The commands that share the pipeline's settings, with the defaults of a preset and the options of a back end."""
     defaults = PRESETS[name]
     assert isinstance(defaults.sfm, ColmapSettings)
+    sfm_defaults = MAST3R_PRESETS[name] if backend == "mast3r" else defaults.sfm
+    sfm_settings = Annotated[type(sfm_defaults), _FLAT]
 
     def prepare(
         source: Positional[Path],
@@ -44,9 +48,10 @@ def commands_for_preset(name: str) -> dict[str, Callable]:
         /,
         out: Path,
         preset: Preset = "default",
+        backend: Backend = "colmap",
         reference: Path | None = None,
         frames: Annotated[FrameSettings, _FLAT] = defaults.frames,
-        sfm: Annotated[ColmapSettings, _FLAT] = defaults.sfm,
+        sfm: sfm_settings = sfm_defaults,
     ) -> None:
         """Poses, dense depth, water, restored pictures and the restored cloud, without map and scores.
 
@@ -54,6 +59,7 @@ def commands_for_preset(name: str) -> dict[str, Callable]:
             source: a video, or a folder of pictures.
             out: the run folder.
             preset: what the other defaults aim at.
+            backend: how poses and depth are found; mast3r needs weights. `--backend mast3r --help` shows its options.
             reference: a cameras.json with poses to compare with.
             frames: which frames to take.
             sfm: how poses, depth and water are found.
@@ -110,9 +116,10 @@ def commands_for_preset(name: str) -> dict[str, Callable]:
         /,
         out: Path,
         preset: Preset = "default",
+        backend: Backend = "colmap",
         reference: Path | None = None,
         frames: Annotated[FrameSettings, _FLAT] = defaults.frames,
-        sfm: Annotated[ColmapSettings, _FLAT] = defaults.sfm,
+        sfm: sfm_settings = sfm_defaults,
         splat: UwbsSettings = defaults.splat,
         test: PoseRefinementSettings = defaults.test,
     ) -> None:
@@ -122,6 +129,7 @@ def commands_for_preset(name: str) -> dict[str, Callable]:
             source: a video, or a folder of pictures.
             out: the run folder.
             preset: what the other defaults aim at.
+            backend: how poses and depth are found; mast3r needs weights. `--backend mast3r --help` shows its options.
             reference: a cameras.json with poses to compare with.
             frames: which frames to take.
             sfm: how poses, depth and water are found.
@@ -134,6 +142,11 @@ def commands_for_preset(name: str) -> dict[str, Callable]:
 
 
 def _pipeline(source: Path, out: Path, settings: RunSettings, reference: Path | None, last: str) -> None:
+    if isinstance(settings.sfm, Mast3rSettings):  # before minutes of preparing frames
+        from swimm3r.sfm.pairs import parse_graph
+
+        parse_graph(settings.sfm.graph)
+        weights.require("mast3r", settings.sfm.weights)
     from swimm3r.run import run_pipeline
 
     with drawn_progress() as progress:

@@ -6,13 +6,13 @@ from typing import TYPE_CHECKING
 
 from swimm3r.errors import InputError
 from swimm3r.progress import Progress, silent
-from swimm3r.sfm.settings import ColmapModelSettings, ColmapSettings, SfmSettings
+from swimm3r.sfm.settings import ColmapModelSettings, ColmapSettings, Mast3rSettings, SfmSettings
 
 if TYPE_CHECKING:
     import swimm3r.frames
     import swimm3r.reconstruction
 
-__all__ = ["ColmapModelSettings", "ColmapSettings", "SfmSettings", "reconstruct"]
+__all__ = ["ColmapModelSettings", "ColmapSettings", "Mast3rSettings", "SfmSettings", "reconstruct"]
 
 
 def reconstruct(
@@ -40,6 +40,10 @@ def reconstruct(
             from swimm3r.sfm import weights_free
 
             return weights_free.reconstruct(frames, settings, folder, progress)
+        case Mast3rSettings():
+            from swimm3r.sfm.mast3r import backend
+
+            return backend.reconstruct(frames, settings, folder, progress)
         case ColmapModelSettings():
             from swimm3r.sfm import importers
 

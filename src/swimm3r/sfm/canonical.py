@@ -73,7 +73,7 @@ def add_pass(
             cause="the weights are damaged, or half precision overflowed",
             hint="swimm3r weights verify mast3r, and run the network in float32",
         )
-    points, confidence = points.double().cpu(), confidence.double().cpu()
+    points, confidence = points.cpu().double(), confidence.cpu().double()  # not every device has float64
     weight = confidence - 0.999
     anchor = spread_anchors(points, subsample)
     distance = (points - anchor)[..., :2].norm(dim=-1).clamp(min=_NEAREST)

@@ -15,9 +15,9 @@ from swimm3r.frames import Frames
 from swimm3r.io.colmap import ColmapModel, read_model
 from swimm3r.progress import Progress, silent
 from swimm3r.reconstruction import DepthMaps, Matches, Points, Reconstruction, Tracks, cameras_of
-from swimm3r.sfm import weights_free
 from swimm3r.sfm.plane_sweep import estimate_depth
 from swimm3r.sfm.settings import ColmapModelSettings
+from swimm3r.sfm.water import with_water
 
 _ASPECT = 0.01  # relative difference of aspect ratios beyond which pictures are not those of the model
 
@@ -29,7 +29,7 @@ def reconstruct(
     rec = from_model(frames, read_model(settings.model), folder)
     reconstruction.save(rec, folder)
     estimate_depth(rec, frames, settings.depth, progress)
-    rec = weights_free.with_water(rec, frames, settings, folder, progress)
+    rec = with_water(rec, frames, settings, folder, progress)
     reconstruction.save(rec, folder)
     return rec
 

@@ -4,6 +4,8 @@ from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Literal
 
+from swimm3r.sfm.mast3r.settings import AlignmentSettings, MatchingSettings
+
 
 @dataclass(frozen=True)
 class PlaneSweepSettings:
@@ -215,6 +217,62 @@ class ColmapSettings:
 
 
 @dataclass(frozen=True)
+class Mast3rSettings:
+    """Structure from motion by the MASt3R network: pointmaps and matches of pairs of frames, aligned; Sea-Thru."""
+
+    weights: Path | None = None
+    """The checkpoint (.pth or .safetensors); else the one that `swimm3r weights path mast3r` prints."""
+    graph: str = "video"
+    """Pairs to look at: video[-WINDOW-CLOSURES], complete, swin-K, logwin-K, oneref-FRAME, retrieval-KEYS-K."""
+    similarity: Literal["cosine", "asmk"] = "cosine"
+    """How frames that look alike are found, from the encoder's tokens; asmk needs mast3r-retrieval and its codebook."""
+    size: int = 512
+    """Long side of the pictures the network sees; it was trained at 512."""
+    square_ok: bool = False
+    """Square pictures stay square; else they lose a quarter of their height, as in training."""
+    device: Literal["auto", "cpu", "cuda", "mps"] = "auto"
+    precision: Literal["float32", "bfloat16", "float16"] = "float32"
+    """Of the network's trunk; its heads are always float32."""
+    camera: Literal["PINHOLE", "SIMPLE_RADIAL", "OPENCV", "OPENCV_FISHEYE"] = "PINHOLE"
+    """One lens for the whole clip; its distortion is removed before the network sees a picture."""
+    focal: float | None = None
+    """Focal length, pixels of the prepared frames, in water: where the alignment starts from; `alignment.intrinsics`
+    says whether it stays there. A lens with distortion stays."""
+    k1: float | None = None
+    k2: float | None = None
+    k3: float | None = None
+    """OPENCV_FISHEYE only, as k4."""
+    k4: float | None = None
+    p1: float | None = None
+    p2: float | None = None
+    min_matches: int = 16
+    """Pairs with fewer matches than this are taken for strangers: a few pixels agree by chance."""
+    min_share: float = 0.9
+    """Share of the frames that must hang together through matches; the few others are left out, under a caution."""
+    max_matches: int = 2_000_000
+    """Of all pairs together in the alignment, drawn evenly from each: what bounds its memory, not its accuracy."""
+    max_error: float = 3.0
+    """Pixels of the network's picture that a match may miss its point by; others are no tracks and not exported."""
+    max_points: int = 200_000
+    """Sparse points that are kept, those seen in most frames first."""
+    min_confidence: float = 1.5
+    """Of the pointmaps (1 and up) below which a pixel's depth is unknown; the reference's viewer has it, too."""
+    bundle_adjustment: bool = False
+    """Poses and points once more by COLMAP's bundle adjustment of the tracks."""
+    memory_mb: int = 2048
+    """For encodings and running sums of frames that are held at once; what does not fit waits on disk."""
+    cache: Path | None = None
+    """Folder of encodings and pair results, keyed by content, that several runs may share; else the run's own, removed
+    at its end."""
+    matching: MatchingSettings = field(default_factory=MatchingSettings)
+    alignment: AlignmentSettings = field(default_factory=lambda: AlignmentSettings(intrinsics="shared"))
+    features: FeatureSettings = field(default_factory=FeatureSettings)
+    """By which held-out frames find their place beside a finished reconstruction."""
+    water: SeathruSettings = field(default_factory=SeathruSettings)
+    restore: RestoreSettings = field(default_factory=RestoreSettings)
+
+
+@dataclass(frozen=True)
 class ColmapModelSettings:
     """Poses and points of a COLMAP model that exists; depth, water and cloud are found as without one."""
 
@@ -226,4 +284,4 @@ class ColmapModelSettings:
     restore: RestoreSettings = field(default_factory=RestoreSettings)
 
 
-SfmSettings = ColmapSettings | ColmapModelSettings
+SfmSettings = ColmapSettings | Mast3rSettings | ColmapModelSettings

@@ -1,21 +1,15 @@
 """Structure from motion without weights: COLMAP poses -> plane-sweep depth -> Sea-Thru water -> restored cloud."""
 
-from dataclasses import replace
 from pathlib import Path
 
 from swimm3r import reconstruction
-from swimm3r.errors import InputError
 from swimm3r.frames import Frames
-from swimm3r.io import images
 from swimm3r.progress import Progress, silent
-from swimm3r.reconstruction import Caution, Reconstruction
+from swimm3r.reconstruction import Reconstruction
 from swimm3r.sfm import colmap
 from swimm3r.sfm.plane_sweep import estimate_depth
-from swimm3r.sfm.restore import display_gains, restore_picture, restored_cloud
-from swimm3r.sfm.seathru import fit_medium
-from swimm3r.sfm.settings import ColmapSettings, RestoreSettings, SfmSettings
-from swimm3r.sfm.tracks import fuse_depth, shared_rays
-from swimm3r.sfm.water_samples import gather_samples
+from swimm3r.sfm.settings import ColmapSettings
+from swimm3r.sfm.water import with_water
 
 
 def reconstruct(frames: Frames, settings: ColmapSettings, folder: Path, progress: Progress = silent) -> Reconstruction:
@@ -29,41 +23,3 @@ def reconstruct(frames: Frames, settings: ColmapSettings, folder: Path, progress
     rec = with_water(rec, frames, settings, folder, progress)
     reconstruction.save(rec, folder)
     return rec
-
-
-def with_water(
-    rec: Reconstruction, frames: Frames, settings: SfmSettings, folder: Path, progress: Progress = silent
-) -> Reconstruction:
-    """The reconstruction with its water, in both encodings, its restored cloud, and the restored pictures on disk.
-
-    Where depth is too scarce to tell the water, the poses and depth stand without it, under a caution.
-    """
-    tracks = fuse_depth(rec, frames, settings.water.tracks, progress)
-    samples = gather_samples(rec, frames, tracks, settings.water, progress)
-    try:
-        stored = fit_medium(samples, settings.water, "srgb")
-        linear = fit_medium(samples, settings.water, "linear")
-    except InputError as failure:
-        caution = Caution(f"The water was not estimated: {failure.what}.", f"Try: {failure.hint}")
-        return replace(rec, cautions=(*rec.cautions, caution))
-    cloud = restored_cloud(rec, frames, tracks, stored, settings.restore, progress)
-    rec = replace(rec, medium=stored, medium_linear=linear, cloud=cloud)
-    write_restored_pictures(rec, frames, settings.restore, folder / "restored", progress)
-    return rec
-
-
-def write_restored_pictures(
-    rec: Reconstruction, frames: Frames, settings: RestoreSettings, folder: Path, progress: Progress = silent
-) -> None:
-    """folder/NAME.png for every registered frame with some known depth, white-balanced for the eye where asked for."""
-    assert rec.medium is not None
-    assert rec.cloud is not None
-    gains = display_gains(rec.cloud.restored) if settings.white_balance else None
-    rays = shared_rays(rec.cameras)
-    for i, name in enumerate(rec.names):
-        progress("restoring pictures", i, len(rec.names))
-        depth = rec.depth[name]
-        if (depth.z_depth > 0).any():
-            J = restore_picture(frames.image(frames.index(name)), depth, rays[i], rec.medium, settings, gains)
-            images.write_rgb(folder / f"{name}.png", J.numpy())
-    progress("restoring pictures", len(rec.names), len(rec.names))

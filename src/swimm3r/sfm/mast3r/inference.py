@@ -18,7 +18,7 @@ from swimm3r.sfm.mast3r.network import Encoded, Mast3r
 
 @dataclass(frozen=True)
 class ViewPrediction:
-    """Maps of one view in one pass, on the CPU; None where the head was not asked for."""
+    """Maps of one view in one pass, on the network's device; None where the head was not asked for."""
 
     points: Float[Tensor, "h w 3"] | None = None  # in the camera of the pass's first view, metres
     confidence: Float[Tensor, "h w"] | None = None  # >= 1
@@ -73,10 +73,9 @@ def predict_pairs(
     `image` gives the network's picture (-1..1, see `preprocess.to_network`) of a frame; `heads` says whether pointmaps
     and descriptors are wanted. 1 GiB holds 340 encodings of 512 x 384 pixels in float32.
     """
-    device = network.decoder_embed.weight.device
 
     def encode(i: int) -> Encoded:
-        return network.encode(image(i)[None].to(device))
+        return network.encode(image(i)[None].to(network.device))
 
     cache = EncodingCache(encode, cache_bytes)
     for done, (i, j) in enumerate(pairs):
@@ -106,9 +105,9 @@ def _one_pass(
         maps = {}
         if wants_points:
             points = network.pointmap(view, which)
-            maps |= {"points": points.points[0].cpu(), "confidence": points.confidence[0].cpu()}
+            maps |= {"points": points.points[0], "confidence": points.confidence[0]}
         if wants_descriptors:
             found = network.descriptors(view, which)
-            maps |= {"descriptors": found.descriptors[0].cpu(), "descriptor_confidence": found.confidence[0].cpu()}
+            maps |= {"descriptors": found.descriptors[0], "descriptor_confidence": found.confidence[0]}
         predictions.append(ViewPrediction(**maps))
     return predictions[0], predictions[1]

@@ -227,6 +227,11 @@ class Mast3r(nn.Module):
         self.downstream_head1 = ViewHead(sizes)
         self.downstream_head2 = ViewHead(sizes)
 
+    @property
+    def device(self) -> torch.device:
+        """Where the weights are."""
+        return self.mask_token.device
+
     def set_precision(self, dtype: torch.dtype) -> "Mast3r":
         """The trunk in `dtype` (float32, bfloat16, float16), the heads in float32."""
         self.to(dtype)

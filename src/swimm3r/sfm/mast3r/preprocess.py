@@ -16,7 +16,7 @@ from PIL import Image
 from torch import Tensor
 from torch.nn import functional as F
 
-from swimm3r.cameras import Cameras, distort, pixel_grid
+from swimm3r.cameras import Cameras, distorted_grid
 
 
 @dataclass(frozen=True)
@@ -117,12 +117,8 @@ def remove_distortion(
     if camera.model == "PINHOLE":
         return picture, mask, camera
     pinhole = replace(camera, model="PINHOLE", distortion=camera.distortion[:, :0])
-    K = camera.K[0].double()
-    grid = pixel_grid(camera.height, camera.width).double()
-    xy = torch.linalg.solve(K[:2, :2], (grid - K[:2, 2])[..., None])[..., 0]
-    source = distort(xy, camera.distortion[0].double(), camera.model) @ K[:2, :2].T + K[:2, 2]
+    source, inside = distorted_grid(camera, pinhole)
     size = torch.tensor([camera.width, camera.height], dtype=source.dtype)
-    inside = ((source > 0) & (source < size)).all(-1)
     sampled = F.grid_sample(
         torch.cat([picture, mask[..., None].to(picture)], dim=-1).permute(2, 0, 1)[None],
         (source / size * 2 - 1).to(picture)[None],
