@@ -44,13 +44,13 @@ def fit(I: torch.Tensor, scene: Frames, settings: ObjectiveSettings, steps: int)
 
 def scene(seed: int, farther: float) -> Frames:
     """Two frames of a dive, their depths stretched: clear pictures, ray depths, where they are known."""
-    dive = make_dive(DiveSettings(frames=8, width=120, height=80, seed=seed))
+    dive = make_dive(DiveSettings(frames=8, width=60, height=40, seed=seed))
     frames = [dive.frame(i) for i in (1, 5)]
     z = torch.stack([f.ray_depth for f in frames]) * farther
     return torch.stack([f.clear for f in frames]), z, z > 0
 
 
-def main(waters: int = 3, steps: int = 400) -> None:
+def main(waters: int = 3, steps: int = 250) -> None:
     """Print the table."""
     print("family  median z  anchor   Binf - truth (R G B)       |T_D|    |B(z)|")
     for family in water_types.FAMILIES:

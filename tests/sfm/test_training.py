@@ -1,5 +1,6 @@
 """Training: that it learns, that it goes on after a kill with the same bits, and that two processes are as one."""
 
+import copy
 import json
 import multiprocessing
 import os
@@ -175,6 +176,27 @@ def test_accumulated_micro_batches_are_the_batch(network: Mast3r, eight: PairDat
     train(network, BASE, eight, none, replace(settings, micro_batch=1), tmp_path / "parts", nothing)
     for one, other in zip(rows(tmp_path / "whole"), rows(tmp_path / "parts"), strict=True):
         assert one["loss"] == pytest.approx(other["loss"], rel=1e-4)
+
+
+def test_a_trunk_of_low_precision_trains_the_same_parameters(
+    network: Mast3r, eight: PairData, none: PairData, tmp_path: Path
+):
+    low = copy.deepcopy(network).set_precision(torch.bfloat16)
+    path = train(low, BASE, eight, none, replace(SETTINGS, epochs=1), tmp_path, nothing)
+    assert {v.dtype for v in learned(path).values()} == {torch.float32}
+    assert all(np.isfinite(row["loss"]) for row in rows(tmp_path))
+
+
+def test_a_batch_may_mix_pictures_of_several_shapes(
+    network: Mast3r, dive: Path, eight: PairData, none: PairData, tmp_path: Path
+):
+    write_dive(DiveSettings(frames=4, width=64, height=32, family="teal"), tmp_path / "data" / "wide")
+    wide = pairs_of(tmp_path / "data", 2)
+    both = PairData(
+        eight.sequences + wide.sequences, eight.pairs[:2] + tuple((1, pair) for _, pair in wide.pairs), SETTINGS.size
+    )
+    train(network, BASE, both, none, replace(SETTINGS, epochs=1), tmp_path / "out", nothing)
+    assert rows(tmp_path / "out")[0]["forward"] > 0
 
 
 def test_two_processes_of_torchrun_have_the_loss_curve_of_one(network: Mast3r, dive: Path, tmp_path: Path):

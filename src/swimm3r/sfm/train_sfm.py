@@ -12,6 +12,7 @@ from swimm3r.errors import DeviceError
 from swimm3r.progress import Progress, silent
 from swimm3r.sfm import training
 from swimm3r.sfm.adapter_file import Base, fingerprint
+from swimm3r.sfm.made_targets import with_made_targets
 from swimm3r.sfm.mast3r import checkpoint
 from swimm3r.sfm.training_data import split_data
 from swimm3r.sfm.training_scores import score
@@ -28,7 +29,7 @@ def train_sfm(
     announce: Callable[[training.Estimate], None] = lambda estimate: None,
     progress: Progress = silent,
 ) -> Path:
-    """Trains on every trainable pair below `data` and returns the adapter's path.
+    """Trains on every trainable pair below `data` and returns the adapter's path; Sea-Thru's targets are made first.
 
     Raises InputError for a folder without trainable pairs, WeightsError for a missing or damaged checkpoint, and
     DeviceError for an accelerator that is not there.
@@ -40,7 +41,7 @@ def train_sfm(
     base = Base(path.name, fingerprint(state), base_licence or _licence(path))
     del state
     network = checkpoint.load(path, place, torch.bfloat16 if low else torch.float32)
-    sequences = read_tree(data).sequences
+    sequences = with_made_targets(read_tree(data).sequences, folder / "made", progress)
     pairs = [make_pairs(sequence, settings.pairs) for sequence in sequences]
     patch = network.architecture.patch
     train, validation = split_data(sequences, pairs, settings.size, settings.validation, settings.max_pairs, patch)
