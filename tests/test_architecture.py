@@ -94,7 +94,8 @@ def test_importing_the_package_loads_nothing_heavy():
 
 
 def test_help_loads_no_torch():
-    for command in ("", "run", "demo", "sfm", "prepare", "doctor", "weights get", "datasets", "train-sfm"):
+    commands = ["run", "demo", "sfm", "splat", "render", "eval", "prepare", "doctor", "datasets", "train-sfm"]
+    for command in ("", "weights get", *commands):
         snippet = (
             "from swimm3r.cli.main import main\n"
             f"try:\n    main([*'{command}'.split(), '--help'])\nexcept SystemExit as stop:\n    assert stop.code == 0"

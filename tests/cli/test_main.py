@@ -26,6 +26,19 @@ def test_an_unknown_option_is_exit_2(capsys: pytest.CaptureFixture[str], tmp_pat
     assert outcome(capsys, "run", str(tmp_path), "--out", str(tmp_path), "--fsp", "5")[0] == 2
 
 
+def test_half_a_colmap_model_is_exit_2(capsys: pytest.CaptureFixture[str], tmp_path: Path):
+    code, message = outcome(capsys, "splat", "--colmap", str(tmp_path), "--out", str(tmp_path / "run"))
+    assert code == 2
+    assert "--images" in message
+
+
+@pytest.mark.parametrize("command", ["eval", "render"])
+def test_a_folder_without_a_map_is_exit_3(command: str, capsys: pytest.CaptureFixture[str], tmp_path: Path):
+    code, message = outcome(capsys, command, str(tmp_path))
+    assert code == 3
+    assert "Try:" in message
+
+
 def test_ctrl_c_is_exit_130_and_says_that_nothing_is_lost(
     capsys: pytest.CaptureFixture[str], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ):

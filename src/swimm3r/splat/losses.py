@@ -107,3 +107,9 @@ def depth_error(
     prior = z_depth.flatten()[at].clamp(min=_NEAREST)
     rendered = (total / alpha).clamp(min=_NEAREST)
     return (weight.flatten()[at] * torch.log1p((1 / rendered - 1 / prior).abs())).mean()
+
+
+def uncovered(images: RasterOutput, weight: Float[Tensor, "h w"]) -> Float[Tensor, ""]:
+    """Mean of 1 - alpha over the pixels where a surface is known to be; 0 where none is known."""
+    known = weight > 0
+    return torch.where(known, 1 - images.alpha, 0.0).sum() / known.sum().clamp(min=1)

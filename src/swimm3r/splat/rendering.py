@@ -15,6 +15,7 @@ from swimm3r.splat.projection import Pinhole, Projection, pinhole, project
 from swimm3r.splat.settings import UwbsSettings
 
 _SEEN = 1e-3  # alpha below which a pixel has no depth
+_COVERED = 0.5  # alpha from which on a pixel's clear colour is that of a surface
 
 
 @dataclass(frozen=True)
@@ -22,7 +23,7 @@ class RenderOutput:
     """One view of a map."""
 
     rgb: Float[Tensor, "h w 3"]  # as the camera sees it
-    clear: Float[Tensor, "h w 3"]  # J, without the water
+    clear: Float[Tensor, "h w 3"]  # J, without the water: the colour of what covers a pixel; black where nothing does
     veil: Float[Tensor, "h w 3"]  # Binf V, the light of the water alone (Eq. ugs_veil)
     z_depth: Float[Tensor, "h w"]  # expected, scene units; 0 where nothing is
     alpha: Float[Tensor, "h w"]
@@ -70,6 +71,14 @@ def expected_z_depth(images: RasterOutput) -> Float[Tensor, "h w"]:
     return torch.where(images.alpha > _SEEN, images.z_depth / images.alpha.clamp(min=_SEEN), 0.0)
 
 
+def surface_colour(images: RasterOutput) -> Float[Tensor, "3 h w"]:
+    """Mean clear colour of what covers a pixel; it fades to black where less than half of the pixel is covered.
+
+    The blended clear colour itself is as dark as the pixel is transparent: the light of what lies behind is missing.
+    """
+    return images.clear / images.alpha.clamp(min=_COVERED)
+
+
 def in_scene_units(settings: UwbsSettings, length: float) -> UwbsSettings:
     """Settings whose lengths are scene units instead of working units."""
     return replace(settings, render=replace(settings.render, near=settings.render.near * length))
@@ -88,7 +97,7 @@ def render(scene: SplatMap, camera: Cameras) -> RenderOutput:
     veil = rasterize(black, maps, height, width, alpha_min=alpha_min).rgb
     return RenderOutput(
         rgb=images.rgb.permute(1, 2, 0),
-        clear=images.clear.permute(1, 2, 0),
+        clear=surface_colour(images).permute(1, 2, 0),
         veil=veil.permute(1, 2, 0),
         z_depth=expected_z_depth(images),
         alpha=images.alpha,

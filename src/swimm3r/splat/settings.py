@@ -54,7 +54,7 @@ class MediumFieldSettings:
     begin: float = 0.1
     """Share of the run before which the water stays the reconstruction's: it learns so much faster than the primitives
     that it would explain their first transparency."""
-    least_std: float = 0.1
+    least_std: float = 0.05
     """The reconstruction's water is not held tighter than this: betas relative, Binf in pixel values."""
 
 
@@ -90,6 +90,9 @@ class LossWeights:
     radius: float = 0.1
     max_radius: float = 256.0
     """Projected radius, pixels of a 1280 pixel wide picture, beyond which a primitive counts as veil."""
+    coverage: float = 0.05
+    """Of the light that passes a surface whose depth is known; 0 is the paper's objective. A map may leave a surface
+    half transparent and let the veil behind it fill in; its clear colours are then dark."""
     depth_confidence: float = 0.3
     """Least confidence of a depth that regularises."""
     depth_alpha: float = 0.5

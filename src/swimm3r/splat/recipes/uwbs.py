@@ -2,7 +2,8 @@
 
 L = L_3DGS + lambda_opa L_opa + lambda_scale L_scale + lambda_depth L_depth + lambda_smooth L_smooth + lambda_rad L_rad
 
-and, beyond the paper, a term that holds the water to what structure from motion measured (`LossWeights.medium_prior`).
+and, beyond the paper, terms that hold the water to what structure from motion measured (`LossWeights.medium_prior`) and
+known surfaces opaque (`coverage`).
 """
 
 import hashlib
@@ -157,9 +158,11 @@ def objective(
     photo = losses.photometric(drawing.images.rgb, view.rgb, view.seen, w.ssim)
     depth = losses.depth_error(drawing.images, view.z_depth, view.depth_weight, w.depth_alpha)
     smooth = smoothness(drawing.grid)
+    open_share = losses.uncovered(drawing.images, view.depth_weight)
     large = losses.oversize(p, drawing.projection.radius, w.max_radius * view.camera.width / 1280)
-    total = photo.loss + w.depth * depth + w.medium_smoothness * smooth + w.radius * large
-    numbers = {"l1": photo.l1, "ssim": photo.ssim, "depth": depth, "medium_smoothness": smooth, "radius": large}
+    total = photo.loss + w.depth * depth + w.coverage * open_share + w.medium_smoothness * smooth + w.radius * large
+    numbers = {"l1": photo.l1, "ssim": photo.ssim, "depth": depth, "uncovered": open_share}
+    numbers |= {"medium_smoothness": smooth, "radius": large}
     if prior is not None:
         off = deviation(drawing.grid, prior)
         total = total + w.medium_prior * off
