@@ -24,7 +24,7 @@ from swimm3r.frames import Frames
 from swimm3r.ground_truth import FOLDER as TRUTH_FOLDER
 from swimm3r.ground_truth import GroundTruth, read_ground_truth
 from swimm3r.io.atomic import write_text
-from swimm3r.io.colmap import read_model
+from swimm3r.io.foreign.model import read_foreign
 from swimm3r.prepare import check_source, load_frames, read_frames
 from swimm3r.presets import RunSettings
 from swimm3r.progress import Progress, silent
@@ -187,7 +187,7 @@ def _scores(run: _Run, settings: RunSettings, truth: GroundTruth | None, progres
 def _reference(settings: RunSettings, frames: Frames, truth: GroundTruth | None) -> GroundTruth | None:
     """Poses of the test frames that somebody else knows."""
     if truth is None and isinstance(settings.sfm, ColmapModelSettings):
-        names, cameras = model_cameras(frames, read_model(settings.sfm.model))
+        names, cameras = model_cameras(frames, read_foreign(settings.sfm.model).model)
         return GroundTruth(names, cameras, metric=False)
     return truth
 

@@ -51,7 +51,9 @@ def sfm_sections(rec: Reconstruction, frames: Frames) -> dict[str, object]:
         "registered": len(rec.names),
         "points": len(rec.points.xyz),
         "dense_points": 0 if rec.cloud is None else len(rec.cloud.xyz),
-        "reprojection_px": ((rec.points.error.double() * observations).sum() / observations.sum()).item(),
+        "reprojection_px": ((rec.points.error.double() * observations).sum() / observations.sum()).item()
+        if len(rec.tracks.point)
+        else NotComputed("no sightings of points are known"),
         "epipolar_px": epipolar.epipolar_px,
         "inlier_1px": epipolar.inlier_1px,
         "epipolar_variant": epipolar.variant,

@@ -74,7 +74,7 @@ def print_summary(summary: dict, folder: Path) -> None:
     if sfm:
         console.print(
             f"Registered {sfm['registered']} of {sfm['frames']} frames, {sfm['points']:,} points, "
-            f"reprojection error {sfm['reprojection_px']:.2f} px"
+            + ("" if sfm["reprojection_px"] is None else f"reprojection error {sfm['reprojection_px']:.2f} px")
         )
     water = summary.get("medium", {}).get("sfm")
     if water:

@@ -85,7 +85,7 @@ def commands_for_preset(name: str, backend: str = "colmap") -> dict[str, Callabl
         Args:
             source: a video, or a folder of pictures; or give --colmap and --images.
             out: the run folder.
-            colmap: a COLMAP model whose poses and points are taken as they are.
+            colmap: a COLMAP model (or transforms.json, cameras.xml, sfm_data.json, predictions.npz) taken as it is.
             images: the pictures it was made of; its names are relative to this folder.
             preset: what the other defaults aim at.
             reference: a cameras.json with poses to compare with.

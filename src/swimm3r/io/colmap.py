@@ -104,13 +104,7 @@ def from_pycolmap(model: "pycolmap.Reconstruction") -> ColmapModel:
             hint="use another sub-model (sparse/0, sparse/1, ...)",
         )
     names = tuple(image.name for image in images)
-    for name in names:
-        if PurePosixPath(name).is_absolute() or ".." in PurePosixPath(name).parts:
-            raise InputError(
-                f"the COLMAP model names a picture outside its folder: {name}",
-                cause="the model was made with absolute paths, or was tampered with",
-                hint="make it again with names relative to the picture folder",
-            )
+    check_names(names)
     cameras = [model.cameras[image.camera_id] for image in images]
     sizes = sorted({(camera.width, camera.height) for camera in cameras})
     if len(sizes) > 1:
@@ -149,6 +143,17 @@ def from_pycolmap(model: "pycolmap.Reconstruction") -> ColmapModel:
         track_frame=np.array([frame for _, frame, _, _ in observations], np.int64),
         track_xy=np.array([seen[image][k] for _, _, image, k in observations], np.float64).reshape(-1, 2),
     )
+
+
+def check_names(names: tuple[str, ...]) -> None:
+    """Raises InputError for a picture's name that leads out of its folder."""
+    for name in names:
+        if PurePosixPath(name).is_absolute() or ".." in PurePosixPath(name).parts:
+            raise InputError(
+                f"the model names a picture outside its folder: {name}",
+                cause="the model was made with absolute paths, or was tampered with",
+                hint="make it again with names relative to the picture folder",
+            )
 
 
 def to_pycolmap(model: ColmapModel) -> "pycolmap.Reconstruction":

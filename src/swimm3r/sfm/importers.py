@@ -1,8 +1,12 @@
-"""Poses and points that another program found, completed here: COLMAP model -> depth -> water -> restored cloud.
+"""Poses and points that another program found, completed here: its files -> depth -> water -> restored cloud.
+
+Which files are read says `io.foreign.model.read_foreign`. Scale, intrinsics and points stay as they are; matches are
+the pairs of sightings of one point; depth that comes with the file is taken, else it is swept.
 
 Frames that the model places but the split holds back take no part; their poses serve as reference (`model_cameras`).
 """
 
+from dataclasses import replace
 from pathlib import Path, PurePosixPath
 
 import numpy as np
@@ -12,11 +16,23 @@ from swimm3r import reconstruction
 from swimm3r.cameras import Cameras, resized
 from swimm3r.errors import InputError
 from swimm3r.frames import Frames
-from swimm3r.io.colmap import ColmapModel, read_model
+from swimm3r.io.colmap import ColmapModel
+from swimm3r.io.foreign.model import ForeignModel, read_foreign
 from swimm3r.progress import Progress, silent
-from swimm3r.reconstruction import DepthMaps, Matches, Points, Reconstruction, Tracks, cameras_of
+from swimm3r.reconstruction import (
+    Caution,
+    DepthMap,
+    DepthMaps,
+    Matches,
+    Points,
+    Reconstruction,
+    Tracks,
+    cameras_of,
+)
+from swimm3r.sfm.match_tracks import MatchTracks, as_points
 from swimm3r.sfm.plane_sweep import estimate_depth
 from swimm3r.sfm.settings import ColmapModelSettings
+from swimm3r.sfm.sweep_views import on_frame_grid
 from swimm3r.sfm.water import with_water
 
 _ASPECT = 0.01  # relative difference of aspect ratios beyond which pictures are not those of the model
@@ -26,9 +42,13 @@ def reconstruct(
     frames: Frames, settings: ColmapModelSettings, folder: Path, progress: Progress = silent
 ) -> Reconstruction:
     """The reconstruction of the frames that the model names. Raises InputError where fewer than 2 of them are in it."""
-    rec = from_model(frames, read_model(settings.model), folder)
+    foreign = read_foreign(settings.model)
+    rec = from_foreign(frames, foreign, folder)
     reconstruction.save(rec, folder)
-    estimate_depth(rec, frames, settings.depth, progress)
+    if foreign.depth is None:
+        estimate_depth(rec, frames, settings.depth, progress)
+    else:
+        write_depth(rec, frames, foreign, progress)
     rec = with_water(rec, frames, settings, folder, progress)
     reconstruction.save(rec, folder)
     return rec
@@ -46,6 +66,8 @@ def from_model(frames: Frames, model: ColmapModel, folder: Path) -> Reconstructi
     row_of = {row: i for i, row in enumerate(rows)}
     kept = np.isin(model.track_frame, rows)
     point, new_point = np.unique(model.track_point[kept], return_inverse=True)
+    if len(model.track_point) == 0:  # a cloud that nobody says who saw
+        point = np.arange(len(model.xyz))
     cameras = _at_frame_size(cameras_of(model)[rows], frames)
     scale = np.array([frames.width / model.width, frames.height / model.height])
     none = torch.zeros(0, dtype=torch.int64)
@@ -66,6 +88,58 @@ def from_model(frames: Frames, model: ColmapModel, folder: Path) -> Reconstructi
         depth=DepthMaps(folder / "z_depth"),
         backend="COLMAP model",
     )
+
+
+def from_foreign(frames: Frames, foreign: ForeignModel, folder: Path) -> Reconstruction:
+    """`from_model` with what the program knows besides: its name, whether lengths are metres, colours, matches."""
+    rec = from_model(frames, foreign.model, folder)
+    cautions = ()
+    if len(rec.tracks.point) == 0 and foreign.depth is None:
+        caution = Caution(
+            f"{foreign.program}'s file has no sightings of points, so depth and water cannot be found from it.",
+            "Export a COLMAP model from the same program, or let swimm3r find the poses itself.",
+        )
+        cautions = (caution,)
+    if not foreign.coloured:
+        order = [frames.index(name) for name in rec.names]
+        points, _ = as_points(_as_match_tracks(rec), rec.tracks.xy, rec.cameras, frames, order)
+        rec = replace(rec, points=points)
+    return replace(
+        rec, backend=foreign.program, metric=foreign.metric, matches=matches_of(rec.tracks), cautions=cautions
+    )
+
+
+def matches_of(tracks: Tracks, reach: int = 3) -> Matches:
+    """Pairs of sightings of one point, each with the next few frames that see it; confidence 1."""
+    order = torch.from_numpy(np.lexsort((tracks.frame.numpy(), tracks.point.numpy())))
+    point, frame, xy = tracks.point[order], tracks.frame[order], tracks.xy[order].float()
+    pairs = []
+    for step in range(1, reach + 1):
+        first = torch.nonzero(point[step:] == point[:-step])[:, 0]
+        pairs.append(torch.stack([first, first + step], -1))
+    a, b = torch.cat(pairs).T
+    return Matches(frame[a], frame[b], xy[a], xy[b], torch.ones(len(a)))
+
+
+def write_depth(rec: Reconstruction, frames: Frames, foreign: ForeignModel, progress: Progress = silent) -> None:
+    """The program's own depth maps on the grid of the prepared frames."""
+    dense = foreign.depth
+    assert dense is not None
+    height, width = dense.z_depth.shape[1:]
+    names, rows = _named(frames, foreign.model)
+    canvas = Cameras(
+        torch.from_numpy(dense.K[rows]), torch.zeros(len(rows), 0).double(), rec.cameras.cam2world, width, height
+    )
+    for k, (name, row) in enumerate(zip(names, rows, strict=True)):
+        progress("depth", k, len(rows))
+        z_depth, share, grey = (torch.from_numpy(a[row]).float() for a in (dense.z_depth, dense.confidence, dense.grey))
+        inverse = torch.where(z_depth > 0, 1 / z_depth.clamp(min=1e-12), 0.0)
+        picture = frames.image(frames.index(name))
+        q, share = on_frame_grid(inverse, share, grey, picture, rec.cameras[k], canvas[k])
+        known = (q > 0) & frames.mask(frames.index(name))
+        z = torch.where(known, 1 / q.clamp(min=1e-12), 0.0)
+        rec.depth.write(name, DepthMap(z, torch.where(known, share, 0.0)))
+    progress("depth", len(rows), len(rows))
 
 
 def model_cameras(frames: Frames, model: ColmapModel) -> tuple[tuple[str, ...], Cameras]:
@@ -94,3 +168,8 @@ def _at_frame_size(cameras: Cameras, frames: Frames) -> Cameras:
     if (width, height) == (cameras.width, cameras.height):
         return cameras
     return resized(cameras, width, height)
+
+
+def _as_match_tracks(rec: Reconstruction) -> MatchTracks:
+    whole = rec.tracks.xy.floor().long()
+    return MatchTracks(rec.points.xyz, rec.tracks.point, rec.tracks.frame, whole)

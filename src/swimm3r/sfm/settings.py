@@ -277,7 +277,8 @@ class ColmapModelSettings:
     """Poses and points of a COLMAP model that exists; depth, water and cloud are found as without one."""
 
     model: Path
-    """The folder with cameras, images and points3D (.bin or .txt), or one above its sparse/0."""
+    """The folder with cameras, images and points3D (.bin or .txt), or one above its sparse/0; or another program's file
+    (`io.foreign.model.read_foreign`)."""
     features: FeatureSettings = field(default_factory=FeatureSettings)
     depth: PlaneSweepSettings = field(default_factory=PlaneSweepSettings)
     water: SeathruSettings = field(default_factory=SeathruSettings)

@@ -1,0 +1,1 @@
+"""Reconstructions made by other programs, read from their own files: poses, lens, points, sightings, depth, scale."""
