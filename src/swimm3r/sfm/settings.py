@@ -131,7 +131,7 @@ class SeathruSettings:
     """Gains are used where they shrink the residuals below this share."""
     std_inflation: float = 2.0
     """Of the standard deviations beyond what residuals show (benchmarks/seathru_calibration.py)."""
-    identifiable_std: float = 0.08
+    identifiable_std: float = 0.065
     """A coefficient is identifiable below this relative standard deviation (benchmarks/seathru_calibration.py)."""
 
 
