@@ -36,7 +36,7 @@ def main(arguments: Sequence[str] | None = None) -> None:
     commands = {
         **commands_for_preset(
             _named("--preset", arguments, PRESETS, "default"),
-            _named("--backend", arguments, ("colmap", "mast3r"), "colmap"),
+            _named("--backend", arguments, ("colmap", "mast3r", "swimm3r"), "colmap"),
         ),
         "demo": demo,
         "doctor": doctor,

@@ -11,11 +11,11 @@ from swimm3r.cli.console import drawn_progress, print_summary
 from swimm3r.errors import UsageError
 from swimm3r.frame_settings import FrameSettings
 from swimm3r.presets import MAST3R_PRESETS, PRESETS, RunSettings
-from swimm3r.sfm.settings import ColmapModelSettings, ColmapSettings, Mast3rSettings
+from swimm3r.sfm.settings import ColmapModelSettings, ColmapSettings, Mast3rSettings, SfmSettings
 from swimm3r.splat.settings import PoseRefinementSettings, UwbsSettings
 
 Preset = Literal["fast", "default", "best"]
-Backend = Literal["colmap", "mast3r"]
+Backend = Literal["colmap", "mast3r", "swimm3r"]
 _FLAT = arg(name="")  # --fps, not --frames.fps; what lies deeper keeps its prefix: --depth.planes
 
 
@@ -23,7 +23,7 @@ def commands_for_preset(name: str, backend: str = "colmap") -> dict[str, Callabl
     """The commands that share the pipeline's settings, with the defaults of a preset and the options of a back end."""
     defaults = PRESETS[name]
     assert isinstance(defaults.sfm, ColmapSettings)
-    sfm_defaults = MAST3R_PRESETS[name] if backend == "mast3r" else defaults.sfm
+    sfm_defaults = MAST3R_PRESETS[name] if backend != "colmap" else defaults.sfm
     sfm_settings = Annotated[type(sfm_defaults), _FLAT]
 
     def prepare(
@@ -59,11 +59,13 @@ def commands_for_preset(name: str, backend: str = "colmap") -> dict[str, Callabl
             source: a video, or a folder of pictures.
             out: the run folder.
             preset: what the other defaults aim at.
-            backend: how poses and depth are found; mast3r needs weights. `--backend mast3r --help` shows its options.
+            backend: how poses and depth are found; mast3r needs weights, swimm3r an adapter, too. `--backend mast3r
+                --help` shows its options.
             reference: a cameras.json with poses to compare with.
             frames: which frames to take.
             sfm: how poses, depth and water are found.
         """
+        _require_adapter(backend, sfm)
         _pipeline(source, out, RunSettings(frames, sfm, defaults.splat, defaults.test), reference, "sfm")
 
     def splat(
@@ -129,16 +131,27 @@ def commands_for_preset(name: str, backend: str = "colmap") -> dict[str, Callabl
             source: a video, or a folder of pictures.
             out: the run folder.
             preset: what the other defaults aim at.
-            backend: how poses and depth are found; mast3r needs weights. `--backend mast3r --help` shows its options.
+            backend: how poses and depth are found; mast3r needs weights, swimm3r an adapter, too. `--backend mast3r
+                --help` shows its options.
             reference: a cameras.json with poses to compare with.
             frames: which frames to take.
             sfm: how poses, depth and water are found.
             splat: how the map is trained.
             test: how the test frames' poses are refined.
         """
+        _require_adapter(backend, sfm)
         _pipeline(source, out, RunSettings(frames, sfm, splat, test), reference, "eval")
 
     return {"run": run, "prepare": prepare, "sfm": sfm, "splat": splat}
+
+
+def _require_adapter(backend: Backend, settings: SfmSettings) -> None:
+    if backend == "swimm3r" and isinstance(settings, Mast3rSettings) and settings.adapter is None:
+        raise UsageError(
+            "--backend swimm3r needs --adapter FILE",
+            cause="medium-aware structure from motion is MASt3R with a trained adapter, and none is published",
+            hint="train one with swimm3r train-sfm; or --backend mast3r, which does without",
+        )
 
 
 def _pipeline(source: Path, out: Path, settings: RunSettings, reference: Path | None, last: str) -> None:
@@ -147,6 +160,10 @@ def _pipeline(source: Path, out: Path, settings: RunSettings, reference: Path | 
 
         parse_graph(settings.sfm.graph)
         weights.require("mast3r", settings.sfm.weights)
+        if settings.sfm.adapter is not None:
+            from swimm3r.sfm import adapter_file
+
+            adapter_file.describe(settings.sfm.adapter)
     from swimm3r.run import run_pipeline
 
     with drawn_progress() as progress:

@@ -12,17 +12,29 @@ Where T_D is small the quotient is noise, so per channel with s = T_D:
 Near the camera all weights are 1 and J is the plain inverse. Nothing is stretched; `display_gains` serve the eye alone.
 """
 
+from collections.abc import Callable
+
 import torch
-from jaxtyping import Bool, Float
+from jaxtyping import Bool, Float, Int
 from torch import Tensor
 
 from swimm3r.frames import Frames
-from swimm3r.medium import MediumFit, backscatter, linear_from_srgb, remove_water, srgb_from_linear, transmittances
+from swimm3r.medium import (
+    Medium,
+    MediumFit,
+    backscatter,
+    linear_from_srgb,
+    remove_water,
+    srgb_from_linear,
+    transmittances,
+)
 from swimm3r.progress import Progress, silent
 from swimm3r.reconstruction import DenseCloud, DepthMap, Reconstruction
 from swimm3r.sfm.depth_filling import LUMA, blur, fill_z_depth, local_linear, sea_share
 from swimm3r.sfm.settings import RestoreSettings
 from swimm3r.sfm.tracks import DenseTracks, cubes, ray_depth_map
+
+MediumOfPixels = Callable[[str, Int[Tensor, " n"], Float[Tensor, " n"]], Medium]  # frame, pixels, ray depth
 
 _MAX_TINT = 1.0  # times the other channels, for blurred colours at a guessed distance
 
@@ -62,10 +74,12 @@ def restored_cloud(
     fit: MediumFit,
     settings: RestoreSettings | None = None,
     progress: Progress = silent,
+    medium_at: MediumOfPixels | None = None,
 ) -> DenseCloud:
     """The tracks as points: raw and restored colours averaged over the sightings, thinned by voxels.
 
     Restored colours are weighted by confidence and mean T_D squared, the inverse variance of an amplified colour.
+    `medium_at` gives each pixel its own water in the place of the dive's, in the encoding of `fit`.
     """
     settings = settings or RestoreSettings()
     n = len(tracks.xyz)
@@ -81,7 +95,7 @@ def restored_cloud(
         I = frames.image(frames.index(name)).reshape(-1, 3)[tracks.pixel[mine]]
         light = linear_from_srgb(I) if fit.encoding == "linear" else I
         z, trust = tracks.ray_depth[mine], tracks.confidence[mine, None].clamp(min=0.01)
-        medium = fit.at(z)
+        medium = fit.at(z) if medium_at is None else medium_at(name, tracks.pixel[mine], z)
         T_D, _ = transmittances(z, medium)
         weight = trust * T_D.clamp(min=0.01) ** 2
         raw.index_add_(0, tracks.track[mine], I * trust)

@@ -222,6 +222,8 @@ class Mast3rSettings:
 
     weights: Path | None = None
     """The checkpoint (.pth or .safetensors); else the one that `swimm3r weights path mast3r` prints."""
+    adapter: Path | None = None
+    """An adapter.safetensors of train-sfm: matches and depth are then the student's, and the water its head's."""
     graph: str = "video"
     """Pairs to look at: video[-WINDOW-CLOSURES], complete, swin-K, logwin-K, oneref-FRAME, retrieval-KEYS-K."""
     similarity: Literal["cosine", "asmk"] = "cosine"

@@ -19,21 +19,24 @@ from swimm3r.errors import RegistrationError
 from swimm3r.frames import Frames
 from swimm3r.progress import Progress, silent
 from swimm3r.reconstruction import Caution, DepthMap, DepthMaps, Matches, Reconstruction
-from swimm3r.sfm import aligned_depth, colmap, match_tracks
+from swimm3r.sfm import aligned_depth, colmap, match_tracks, predicted_water
 from swimm3r.sfm.alignment import Alignment, align, dense_z_depth
 from swimm3r.sfm.alignment_problem import AnchoredPair, Known
 from swimm3r.sfm.canonical import AnchoredFrame, anchors_of
 from swimm3r.sfm.depth_filling import LUMA
-from swimm3r.sfm.mast3r.pair_run import Said, load_network, look_at_pairs
+from swimm3r.sfm.mast3r.encodings import EncodingStore
+from swimm3r.sfm.mast3r.pair_run import Said, load_network, look_at_pairs, put_on
 from swimm3r.sfm.mast3r.pair_store import PairRecord
 from swimm3r.sfm.mast3r.pictures import NetworkPictures, network_pictures
 from swimm3r.sfm.match_tracks import FrameMatches, MatchTracks
 from swimm3r.sfm.matching import PixelMatches
 from swimm3r.sfm.pairs import groups, parse_graph
+from swimm3r.sfm.physics_head import PhysicsHead
 from swimm3r.sfm.settings import Mast3rSettings
 from swimm3r.sfm.sweep_views import on_frame_grid
 from swimm3r.sfm.water import with_water
 
+_WATER = "water"  # of what the physics head read, in the working folder
 _FOLDER = "mast3r"  # of what is kept until the run is done, in the working folder
 
 
@@ -50,18 +53,47 @@ def reconstruct(frames: Frames, settings: Mast3rSettings, folder: Path, progress
         graph = parse_graph(settings.graph)
         pictures = network_pictures(frames, settings)
         network = load_network(settings)
+        head = None if settings.adapter is None else put_on(network, settings.adapter, settings)
         said = look_at_pairs(network, pictures, graph, settings, cache, progress)
-        rec = _place(said, pictures, settings, folder, progress)
+        read_water = None
+        if head is not None:
+            encodings = EncodingStore(network, pictures, cache / "encodings")
+            read_water = _WaterReader(head, encodings, folder / _WATER)
+        rec = _place(said, pictures, settings, folder, progress, read_water)
         reconstruction.save(rec, folder)
-    rec = with_water(rec, frames, settings, folder, progress)
+    if settings.adapter is None:
+        rec = with_water(rec, frames, settings, folder, progress)
+    else:
+        predicted = predicted_water.read(folder / _WATER, network_pictures(frames, settings))
+        rec = with_water(rec, frames, settings, folder, progress, predicted)
     reconstruction.save(rec, folder)
     if settings.cache is None:
         shutil.rmtree(cache, ignore_errors=True)
     return rec
 
 
+@dataclass(frozen=True)
+class _WaterReader:
+    """Reads each frame's water from its encoding and keeps it."""
+
+    head: PhysicsHead
+    encodings: EncodingStore
+    folder: Path
+
+    def keep(self, f: int, name: str, scale: float) -> None:
+        """The water of frame `f`; `scale` is the reconstruction's unit per metre of the network."""
+        with torch.no_grad():
+            maps = self.head(self.encodings[f])
+        predicted_water.write(maps, scale, self.folder, name)
+
+
 def _place(
-    said: Said, pictures: NetworkPictures, settings: Mast3rSettings, folder: Path, progress: Progress
+    said: Said,
+    pictures: NetworkPictures,
+    settings: Mast3rSettings,
+    folder: Path,
+    progress: Progress,
+    water: _WaterReader | None = None,
 ) -> Reconstruction:
     """The aligned record, without water; depth maps are written on the way."""
     frames = pictures.frames
@@ -84,12 +116,16 @@ def _place(
             matches.confidence,
         ),
         depth=DepthMaps(folder / "z_depth"),
-        backend="mast3r",
+        backend="mast3r" if settings.adapter is None else "swimm3r",
         cautions=tuple(cautions),
     )
     if settings.bundle_adjustment:
         rec = colmap.bundle_adjust(rec)
     _write_depth(rec, said, kept, pairs, aligned.alignment, pictures, settings, progress)
+    if water is not None:
+        for k, f in enumerate(kept):
+            before = said.frame_store.read(f).anchored.anchor_depth.clamp(min=1e-9)
+            water.keep(f, rec.names[k], float((aligned.alignment.anchor_z_depth[k] / before).median().clamp(min=1e-9)))
     return rec
 
 

@@ -14,6 +14,7 @@ import torch
 from swimm3r import weights
 from swimm3r.errors import DeviceError
 from swimm3r.progress import Progress, silent
+from swimm3r.sfm import adapter_file
 from swimm3r.sfm.alignment_problem import Predicted
 from swimm3r.sfm.mast3r import checkpoint
 from swimm3r.sfm.mast3r.encodings import EncodingStore, frame_similarity
@@ -25,6 +26,7 @@ from swimm3r.sfm.mast3r.plan import make_plan
 from swimm3r.sfm.mast3r.settings import AlignmentSettings, PairGraph, Retrieval, Video
 from swimm3r.sfm.matching import DescriptorMap, match_views
 from swimm3r.sfm.pairs import Pairs, make_pairs
+from swimm3r.sfm.physics_head import PhysicsHead
 from swimm3r.sfm.settings import Mast3rSettings
 
 log = logging.getLogger(__name__)
@@ -34,6 +36,17 @@ def load_network(settings: Mast3rSettings) -> Mast3r:
     """The network of the settings' checkpoint on their device."""
     path = weights.require("mast3r", settings.weights)
     return checkpoint.load(path, _device(settings.device), getattr(torch, settings.precision))
+
+
+def put_on(network: Mast3r, adapter: Path, settings: Mast3rSettings) -> PhysicsHead | None:
+    """Makes the network the student of an adapter file, for good, and returns its physics head, if it has one.
+
+    Raises WeightsError for a file that is missing or damaged, or that was trained on other weights.
+    """
+    state, _ = checkpoint.read(weights.require("mast3r", settings.weights))
+    student = adapter_file.load(adapter, network, adapter_file.fingerprint(state))
+    student.adapters.merge()
+    return student.head
 
 
 @dataclass(frozen=True)

@@ -20,6 +20,7 @@ from swimm3r.sfm.mast3r.preprocess import (
     K_to_picture,
     framing,
     mask_to_network,
+    pixels_to_network,
     pixels_to_picture,
     remove_distortion,
     to_network,
@@ -81,6 +82,14 @@ class NetworkPictures:
         pinhole = replace(self.lens, model="PINHOLE", distortion=self.lens.distortion[:, :0])
         rays = directions(pinhole, straight[None])
         return project(replace(self.lens, cam2world=torch.eye(4, dtype=torch.float64)[None]), rays)[0][0]
+
+    def from_frame(self, xy: Float[Tensor, "m 2"]) -> Float[Tensor, "m 2"]:
+        """The inverse of `to_frame`; NaN where the lens has no ray."""
+        straight = xy.double()
+        if self.lens.model != "PINHOLE":
+            K = self.lens.K[0].double()
+            straight = directions(self.lens, straight[None])[0, :, :2] @ K[:2, :2].T + K[:2, 2]
+        return pixels_to_network(straight, self.framing)
 
     def _undistorted(self, i: int) -> tuple[Tensor, Tensor]:
         picture, mask, _ = remove_distortion(self.frames.image(i), self.frames.mask(i), self.lens)

@@ -1,0 +1,108 @@
+"""The head's water laid over a dive: with the true coefficients it restores the truth, in any unit."""
+
+from dataclasses import replace
+from pathlib import Path
+
+import pytest
+import torch
+
+from swimm3r.errors import InputError
+from swimm3r.medium import AttenuationCurve, Medium
+from swimm3r.sfm.mast3r.pictures import NetworkPictures, network_pictures
+from swimm3r.sfm.physics_head import WaterMaps
+from swimm3r.sfm.predicted_water import PredictedWater, dive_fit, read, restore_predicted, write
+from swimm3r.sfm.restore import restored_cloud
+from swimm3r.sfm.settings import Mast3rSettings, SeathruSettings
+from swimm3r.sfm.tracks import fuse_depth
+
+
+@pytest.fixture
+def pictures(dive) -> NetworkPictures:
+    return network_pictures(dive.frames, Mast3rSettings(size=96))
+
+
+def maps(medium: Medium, pictures: NetworkPictures, metres: float = 1.0) -> WaterMaps:
+    """What a perfect head would say, per `metres` of the scene's unit; half of the attenuation in each exponential."""
+    frame = pictures.framing
+    half = (0.5 * metres * medium.beta_D).expand(1, frame.network_height, frame.network_width, 3)
+    zero = torch.zeros_like(half)
+    return WaterMaps(medium.Binf[None], metres * medium.beta_B[None], AttenuationCurve(half, zero, half, zero))
+
+
+@pytest.fixture
+def water(dive, pictures: NetworkPictures, tmp_path: Path) -> PredictedWater:
+    """Written by a head whose metre is half of the scene's unit: the scale puts it right."""
+    for name in dive.rec.names:
+        write(maps(dive.medium, pictures, metres=0.5), 0.5, tmp_path / "water", name)
+    found = read(tmp_path / "water", pictures)
+    assert found is not None
+    return found
+
+
+def test_the_dives_water_is_what_the_frames_say(dive, water: PredictedWater):
+    fit = dive_fit(water, dive.rec, SeathruSettings())
+    for name in ("Binf", "beta_D", "beta_B"):
+        torch.testing.assert_close(getattr(fit.medium, name), getattr(dive.medium, name), atol=1e-4, rtol=1e-4)
+        assert fit.identifiable[name].all()
+    assert fit.encoding == "srgb"
+    z = torch.linspace(*fit.z_range, 5)
+    torch.testing.assert_close(fit.at(z).beta_D, dive.medium.beta_D.expand(5, 3), atol=1e-4, rtol=1e-4)
+
+
+def test_a_coefficient_the_frames_disagree_on_is_not_identifiable(dive, pictures: NetworkPictures, tmp_path: Path):
+    for i, name in enumerate(dive.rec.names):
+        other = replace(dive.medium, beta_B=dive.medium.beta_B * (1 + 0.5 * i))
+        write(maps(other, pictures), 1.0, tmp_path, name)
+    found = read(tmp_path, pictures)
+    assert found is not None
+    fit = dive_fit(found, dive.rec, SeathruSettings())
+    assert not fit.identifiable["beta_B"].any()
+    assert fit.identifiable["Binf"].all()
+
+
+def test_true_water_restores_the_cloud_to_its_clear_colours(dive, water: PredictedWater):
+    tracks = fuse_depth(dive.rec, dive.frames, SeathruSettings().tracks)
+    fit = dive_fit(water, dive.rec, SeathruSettings())
+    cloud = restored_cloud(dive.rec, dive.frames, tracks, fit, medium_at=water.at)
+    truth = dive.seafloor(cloud.xyz[:, :2])
+    by_head = (cloud.restored - truth).abs().mean()
+    assert by_head < 0.5 * (cloud.raw - truth).abs().mean()
+    torch.testing.assert_close(
+        cloud.restored, restored_cloud(dive.rec, dive.frames, tracks, fit).restored, atol=1e-3, rtol=0
+    )
+
+
+def test_restored_pictures_are_clear(dive, water: PredictedWater, tmp_path: Path):
+    from swimm3r.io.images import read_rgb
+
+    restore_predicted(dive.rec, dive.frames, water, tmp_path / "restored")
+    for i, name in enumerate(dive.rec.names):
+        J = torch.from_numpy(read_rgb(tmp_path / "restored" / f"{name}.png").astype("float32")) / 255
+        known = dive.rec.depth[name].z_depth > 0
+        raw = dive.frames.image(dive.frames.index(name))
+        error = (J - dive.clear[i])[known].abs().mean()
+        assert error < 0.3 * (raw - dive.clear[i])[known].abs().mean()
+
+
+def test_the_water_follows_the_pixels_through_resize_and_crop(dive, pictures: NetworkPictures, tmp_path: Path):
+    """A curve that grows from left to right does so on the prepared frame, too."""
+    m = maps(dive.medium, pictures)
+    ramp = torch.linspace(0.2, 1.0, pictures.framing.network_width)[:, None] * torch.ones_like(m.curve.a)
+    write(replace(m, curve=replace(m.curve, a=ramp)), 1.0, tmp_path, "x.png")
+    found = read(tmp_path, pictures)
+    assert found is not None
+    pixels = torch.arange(dive.frames.width)
+    beta_D = found.at("x.png", pixels, torch.ones(len(pixels))).beta_D[:, 0] - 0.5 * dive.medium.beta_D[0]
+    x = (pixels + 0.5) / dive.frames.width
+    torch.testing.assert_close(beta_D[8:-8], (0.2 + 0.8 * x)[8:-8], atol=0.02, rtol=0)
+
+
+def test_without_a_head_there_is_no_predicted_water(pictures: NetworkPictures, tmp_path: Path):
+    assert read(tmp_path / "nothing", pictures) is None
+
+
+def test_without_any_depth_it_says_so(dive, water: PredictedWater, tmp_path: Path):
+    from swimm3r.reconstruction import DepthMaps
+
+    with pytest.raises(InputError, match="no frame has any depth"):
+        dive_fit(water, replace(dive.rec, depth=DepthMaps(tmp_path / "none")), SeathruSettings())
