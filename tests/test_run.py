@@ -137,7 +137,7 @@ def test_a_map_is_trained_on_any_colmap_model(dive: Path, finished: tuple[Path, 
     summary = run_pipeline(dive / "images", tmp_path / "run", own)
     assert summary["sfm"]["backend"] == "COLMAP model"
     assert summary["sfm"]["registered"] == finished[1]["sfm"]["registered"]
-    assert summary["sfm"]["epipolar_px"] is None
+    assert summary["sfm"]["epipolar_px"] < 1  # of the sightings of common points
     assert "from 2D-3D matches" in summary["test"]["protocol"]  # the model has no test frame
     assert summary["test"]["psnr"] > 20
 
