@@ -337,7 +337,8 @@ def test_one_epoch_on_a_tree_in_flseas_layout_runs_from_the_command_line(
     )  # fmt: skip
     told = capsys.readouterr()
     assert "Adapter:" in told.out
-    assert "trained numbers" in told.err
+    # two training sequences of five shots half a second apart, 4 + 3 + 1 pairs each; two held back, none of a test dive
+    assert "14 pairs, 3 steps" in told.err
     (validation,) = (row["validation"] for row in rows(out) if "validation" in row)
     assert validation["depth_absrel"] > 0
     assert validation["rotation_deg"] is None  # FLSea has no poses
