@@ -9,6 +9,7 @@ import subprocess
 import sys
 from dataclasses import replace
 from pathlib import Path
+from types import ModuleType
 
 import numpy as np
 import pytest
@@ -25,11 +26,12 @@ from swimm3r.sfm.mast3r import checkpoint
 from swimm3r.sfm.mast3r.network import Architecture, Mast3r
 from swimm3r.sfm.mast3r.settings import ObjectiveSettings
 from swimm3r.sfm.student import Student, new_student
-from swimm3r.sfm.train_sfm import train_sfm
+from swimm3r.sfm.train_sfm import retrieved_pairs, train_sfm
 from swimm3r.sfm.training import Workers, batch_size, pairs_of_step, train
 from swimm3r.sfm.training_data import PairData, split_data
 from swimm3r.sfm.training_scores import score
 from swimm3r.sfm.training_settings import RECIPES, TrainSettings
+from swimm3r.sfm.training_state import Rows
 from swimm3r.synthetic import DiveSettings, write_dive
 
 BASE = Base("small.safetensors", "0" * 64, "made in a test")
@@ -345,6 +347,50 @@ def test_one_epoch_on_a_tree_in_flseas_layout_runs_from_the_command_line(
     header = adapter_file.describe(out / "adapter.safetensors")
     assert header["base"]["licence"] == "made in a test"
     assert header["base"]["sha256"] == fingerprint(network.state_dict())
+
+
+def test_shots_that_look_alike_far_apart_are_paired_where_poses_do_not_tell(network: Mast3r, tmp_path: Path):
+    rng = np.random.default_rng(0)
+    places = [rng.integers(0, 255, (12, 16, 3), dtype=np.uint8).repeat(4, 0).repeat(4, 1) for _ in range(6)]
+    for k, place in enumerate([0, 1, 2, 3, 4, 5, 0, 1]):  # the dive comes back to where it began
+        for kind in ("raw", "clean"):
+            write_rgb(tmp_path / kind / f"{k}.png", places[place])
+    (sequence,) = read_tree(tmp_path).sequences
+    settings = PairSettings(reach=4, retrieved=1)
+    known = make_pairs(sequence, settings)
+    found = {(p.i, p.j) for p in retrieved_pairs(network, sequence, known, settings, 64)}
+    assert {(0, 6), (1, 7)} <= found
+    assert all(j - i >= 4 for i, j in found)
+    told = [replace(pair, overlap=0.5) for pair in known]
+    assert retrieved_pairs(network, sequence, told, settings, 64) == []
+
+
+def test_tensorboard_gets_every_number_of_a_row_and_is_asked_for_where_it_is_missing(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+):
+    written: list[tuple[str, float, int]] = []
+
+    class Writer:
+        def __init__(self, folder: str) -> None:
+            assert folder == str(tmp_path / "board")
+
+        def add_scalar(self, name: str, value: float, step: int) -> None:
+            written.append((name, value, step))
+
+        def flush(self) -> None:
+            pass
+
+    module = ModuleType("torch.utils.tensorboard.writer")
+    module.SummaryWriter = Writer
+    monkeypatch.setitem(sys.modules, "torch.utils.tensorboard", ModuleType("torch.utils.tensorboard"))
+    monkeypatch.setitem(sys.modules, "torch.utils.tensorboard.writer", module)
+    Rows(tmp_path / "metrics.jsonl", tmp_path / "board").append(
+        {"step": 3, "loss": 0.5, "validation": {"a": 1.0, "b": None}}
+    )
+    assert written == [("loss", 0.5, 3), ("validation/a", 1.0, 3)]
+    monkeypatch.setitem(sys.modules, "torch.utils.tensorboard.writer", None)
+    with pytest.raises(UsageError, match="package tensorboard"):
+        Rows(tmp_path / "metrics.jsonl", tmp_path / "board")
 
 
 def test_validation_knows_pose_depth_and_restoration_of_a_dive(network: Mast3r, eight: PairData):

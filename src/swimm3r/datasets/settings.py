@@ -19,3 +19,6 @@ class PairSettings:
     """Shots between the two where not even time tells."""
     per_shot: int = 4
     """Most partners of a shot among the later ones."""
+    retrieved: int = 0
+    """Where poses do not tell: partners per shot beyond `reach` that look alike to the network; it encodes every shot
+    once for it, before training."""

@@ -121,7 +121,7 @@ def _run(
         if done < total:
             announce(_estimate(student, data, settings, total, size, workers))
     model = _shared(student) if workers.count > 1 else student
-    rows = Rows(metrics)
+    rows = Rows(metrics, folder / "tensorboard" if settings.tensorboard and workers.first else None)
     with ThreadPoolExecutor(_LOADERS) as pool:
         coming = _load(pool, data, settings, size, done + 1, workers) if done < total else []
         for step in range(done + 1, total + 1):
@@ -274,7 +274,7 @@ def _mean_over_workers(terms: dict[str, Tensor], workers: Workers) -> dict[str, 
 
 
 def _fingerprint(settings: TrainSettings, base: Base, data: PairData) -> str:
-    same = replace(settings, log_every=1, checkpoint_every=1)  # they change nothing that is learned
+    same = replace(settings, log_every=1, checkpoint_every=1, tensorboard=False)  # they change nothing that is learned
     described = json.dumps([asdict(same), base.sha256, data.fingerprint()], sort_keys=True)
     return hashlib.sha256(described.encode()).hexdigest()
 

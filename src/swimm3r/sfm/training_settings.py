@@ -36,6 +36,8 @@ class TrainSettings:
     """Most pairs trained on, drawn evenly; 0 is no limit."""
     log_every: int = 10
     """Steps between rows of metrics.jsonl, each the mean of its steps."""
+    tensorboard: bool = False
+    """Write the rows of metrics.jsonl for TensorBoard, too (pip install tensorboard)."""
     checkpoint_every: int = 200
     """Steps between states that an interrupted training goes on from; the end of an epoch is always one."""
 

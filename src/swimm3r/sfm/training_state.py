@@ -3,14 +3,16 @@
 import json
 import logging
 import time
+from collections.abc import Iterator, Mapping
 from pathlib import Path
+from typing import Any
 
 import torch
 from safetensors import SafetensorError, safe_open
 from safetensors.torch import save_file
 from torch import Tensor
 
-from swimm3r.errors import InputError
+from swimm3r.errors import InputError, UsageError
 from swimm3r.io.atomic import atomic_path, write_text
 from swimm3r.sfm.adapter_file import trained_parameters
 from swimm3r.sfm.student import Student
@@ -57,8 +59,9 @@ def resume(student: Student, optimiser: torch.optim.Optimizer, path: Path, mark:
 class Rows:
     """Sums of the terms since the last row, and the file they go to."""
 
-    def __init__(self, path: Path) -> None:
+    def __init__(self, path: Path, tensorboard: Path | None = None) -> None:
         self._path = path
+        self._writer = None if tensorboard is None else _tensorboard(tensorboard)
         self._sums: dict[str, float] = {}
         self._count = 0
         self._epoch = 0.0
@@ -84,6 +87,32 @@ class Rows:
         """A row as given."""
         with self._path.open("a", encoding="utf-8") as file:
             file.write(json.dumps(row) + "\n")
+        if self._writer is not None:
+            step = row["step"]
+            for name, value in _flat(row):
+                self._writer.add_scalar(name, value, step)
+            self._writer.flush()
+
+
+def _flat(row: Mapping[str, object], under: str = "") -> Iterator[tuple[str, float]]:
+    """The numbers of a row, those of a nested one as `validation/loss`."""
+    for name, value in row.items():
+        if isinstance(value, Mapping):
+            yield from _flat(value, f"{under}{name}/")
+        elif isinstance(value, int | float) and name != "step":
+            yield under + name, float(value)
+
+
+def _tensorboard(folder: Path) -> Any:
+    try:
+        from torch.utils.tensorboard.writer import SummaryWriter
+    except ImportError as error:
+        raise UsageError(
+            "--tensorboard needs the package tensorboard",
+            cause="it is not installed; Swimm3R itself does without",
+            hint="pip install tensorboard, or leave --tensorboard out: metrics.jsonl has every number",
+        ) from error
+    return SummaryWriter(str(folder))
 
 
 def forget_rows_after(metrics: Path, done: int) -> None:
