@@ -2,12 +2,11 @@
 
 import copy
 import json
-import multiprocessing
 import os
 import signal
 import subprocess
 import sys
-from dataclasses import replace
+from dataclasses import astuple, replace
 from pathlib import Path
 from types import ModuleType
 
@@ -120,28 +119,43 @@ def test_the_teacher_is_left_as_it_was(network: Mast3r, eight: PairData, none: P
     again.adapters.detach()
 
 
-def killed_at(step: int):
-    def watch(what: str, done: int, total: int, /) -> None:
-        if done == step:
-            os.kill(os.getpid(), signal.SIGKILL)
+KILLED = """
+import os, signal, sys
+from pathlib import Path
+import torch
+torch.set_num_threads(1)
+from swimm3r.datasets import make_pairs, read_tree
+from swimm3r.sfm.adapter_file import Base
+from swimm3r.sfm.mast3r import checkpoint
+from swimm3r.sfm.training import train
+from swimm3r.sfm.training_data import split_data
+from swimm3r.datasets.settings import PairSettings
+from swimm3r.sfm.training_settings import TrainSettings
+from swimm3r.sfm.mast3r.settings import LoraSettings, ObjectiveSettings
 
-    return watch
+def watch(what, done, total, /):
+    if done == 3:
+        os.kill(os.getpid(), signal.SIGKILL)
+
+settings = eval(sys.argv[4])
+sequences = read_tree(Path(sys.argv[1])).sequences
+data, none = split_data(sequences, [make_pairs(s, settings.pairs) for s in sequences], settings.size, 0, 8)
+network, base = checkpoint.load(Path(sys.argv[2])), Base(*eval(sys.argv[5]))
+train(network, base, data, none, settings, Path(sys.argv[3]), lambda student, data: {}, progress=watch)
+"""
 
 
 @pytest.mark.skipif(sys.platform == "win32", reason="Windows has no kill -9")
 def test_killed_and_started_again_it_ends_with_the_same_bits(
-    network: Mast3r, eight: PairData, none: PairData, tmp_path: Path
+    network: Mast3r, dive: Path, eight: PairData, none: PairData, tmp_path: Path
 ):
     whole = train(network, BASE, eight, none, SETTINGS, tmp_path / "whole", nothing)
     settings = replace(SETTINGS, checkpoint_every=2)  # so that step 3 has to be done again
-    cut = tmp_path / "cut"
-    context = multiprocessing.get_context("fork")
-    child = context.Process(
-        target=train, args=(network, BASE, eight, none, settings, cut, nothing), kwargs={"progress": killed_at(3)}
-    )
-    child.start()
-    child.join(120)
-    assert child.exitcode == -signal.SIGKILL
+    cut, weights = tmp_path / "cut", tmp_path / "small.safetensors"
+    checkpoint.save(network, weights)
+    command = [sys.executable, "-c", KILLED, str(dive), str(weights), str(cut), repr(settings), repr(astuple(BASE))]
+    died = subprocess.run(command, capture_output=True, text=True, env={**os.environ, "OMP_NUM_THREADS": "1"})
+    assert died.returncode == -signal.SIGKILL, died.stderr[-2000:]
     assert [row["step"] for row in rows(cut)] == [1, 2, 3]
     resumed = train(network, BASE, eight, none, settings, cut, nothing)
     expected, found = learned(whole), learned(resumed)
