@@ -12,13 +12,14 @@ from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Literal
 
-from jaxtyping import Float
+import torch
+from jaxtyping import Bool, Float
 from torch import Tensor
 
 from swimm3r import weights
-from swimm3r.cameras import Cameras, distorted_grid, resized
+from swimm3r.cameras import Cameras, distorted_grid, project, resized
 from swimm3r.evaluate import NotComputed
-from swimm3r.evaluate.images import ViewScores, mean_view_scores, view_scores
+from swimm3r.evaluate.images import ViewScores, as_8_bit, blur4_psnr, mean_view_scores, psnr, view_scores
 from swimm3r.evaluate.lpips import Lpips, load_lpips
 from swimm3r.frames import Frames
 from swimm3r.geometry import DegenerateAlignmentError, align_poses, align_similarity
@@ -34,6 +35,7 @@ from swimm3r.splat.settings import PoseRefinementSettings
 from swimm3r.splat.views import pinhole_canvas, undistorted
 
 Source = Literal["reference", "2D-3D matches", "neighbours"]
+_GAP = 0.03  # of the picture's width: gaps in the cloud up to this size are closed where coverage is asked
 _WITNESSES = 6  # registered frames, the nearest in time, that a held-out frame is matched with
 
 
@@ -55,6 +57,16 @@ class HeldOutView:
     window: "Window"  # of the canvas that was rendered and scored
     source: Source
     scores: ViewScores
+    covered: "CoveredScores"
+
+
+@dataclass(frozen=True)
+class CoveredScores:
+    """The scores where some training frame saw what this frame shows; a map cannot know the rest."""
+
+    share: float  # of the pixels
+    psnr: float | NotComputed  # dB
+    blur4_psnr: float | NotComputed  # dB
 
 
 def first_poses(
@@ -111,7 +123,8 @@ def score_views(
         out = scene.render(cut(canvas, window))
         write_view(folder, name, out, span)
         scores = view_scores(out.rgb, target, perceptual, seen)
-        views.append(HeldOutView(name, lens, canvas, window, first.source, scores))
+        covered = covered_scores(out.rgb, target, seen, covered_by_training(rec, cut(canvas, window)))
+        views.append(HeldOutView(name, lens, canvas, window, first.source, scores, covered))
     progress("scoring test frames", len(poses), len(poses))
     return views
 
@@ -126,6 +139,55 @@ def protocol(views: Sequence[HeldOutView], settings: PoseRefinementSettings) -> 
 def mean_scores(views: Sequence[HeldOutView]) -> ViewScores:
     """The scores averaged over frames."""
     return mean_view_scores([view.scores for view in views])
+
+
+def covered_by_training(rec: Reconstruction, canvas: Cameras) -> Bool[Tensor, "h w"]:
+    """The pixels of a view into which points of the reconstruction fall, small gaps between them closed.
+
+    It asks the reconstruction, not the map: a map that leaves holes is not excused for them.
+    """
+    import cv2
+
+    xyz = rec.points.xyz if rec.cloud is None else rec.cloud.xyz
+    pixels, z = project(canvas, xyz[None].double())
+    inside = (z[0] > 0) & (pixels[0] > 0).all(-1) & (pixels[0] < torch.tensor([canvas.width, canvas.height])).all(-1)
+    column, row = pixels[0][inside].long().unbind(-1)
+    hit = torch.zeros(canvas.height, canvas.width, dtype=torch.uint8)
+    hit[row, column] = 1
+    reach = max(3, round(_GAP * canvas.width)) | 1
+    kernel = cv2.getStructuringElement(cv2.MORPH_ELLIPSE, (reach, reach))
+    border = reach  # closing must not eat into the picture's edge
+    padded = cv2.copyMakeBorder(hit.numpy(), border, border, border, border, cv2.BORDER_REFLECT)
+    closed = cv2.morphologyEx(padded, cv2.MORPH_CLOSE, kernel)[border:-border, border:-border]
+    return torch.from_numpy(closed.copy()) > 0
+
+
+def covered_scores(
+    render: Float[Tensor, "h w 3"],
+    target: Float[Tensor, "h w 3"],
+    seen: Bool[Tensor, "h w"],
+    covered: Bool[Tensor, "h w"],
+) -> CoveredScores:
+    """PSNR, and that of mere blurring, over the covered pixels; both pictures as their 8-bit files show them."""
+    counted = seen & covered
+    share = float(counted.sum() / seen.sum())
+    if not bool(counted.any()):
+        nothing = NotComputed("no training frame saw what the test frames show")
+        return CoveredScores(share, nothing, nothing)
+    render, target = as_8_bit(render), as_8_bit(target)
+    return CoveredScores(share, psnr(render[counted], target[counted]), blur4_psnr(target, counted))
+
+
+def mean_covered(views: Sequence[HeldOutView]) -> CoveredScores:
+    """Means over frames, those without a covered pixel left out of the PSNRs."""
+
+    def mean(values: list[float | NotComputed]) -> float | NotComputed:
+        numbers = [v for v in values if not isinstance(v, NotComputed)]
+        return sum(numbers) / len(numbers) if numbers else values[0]
+
+    scores = [view.covered for view in views]
+    share = sum(s.share for s in scores) / len(scores)
+    return CoveredScores(share, mean([s.psnr for s in scores]), mean([s.blur4_psnr for s in scores]))
 
 
 @dataclass(frozen=True)

@@ -17,7 +17,7 @@ from swimm3r.evaluate.underwater import clear_psnr, uciqe, uiqm, water_scores, w
 from swimm3r.frames import Frames
 from swimm3r.geometry import DegenerateAlignmentError, align_poses, align_similarity
 from swimm3r.ground_truth import GroundTruth
-from swimm3r.held_out import HeldOutView, cut, mean_scores, protocol
+from swimm3r.held_out import HeldOutView, cut, mean_covered, mean_scores, protocol
 from swimm3r.io import images
 from swimm3r.medium import Medium, MediumFit, remove_water, rescale
 from swimm3r.progress import Progress, silent
@@ -119,7 +119,13 @@ def splat_sections(scene: SplatMap, rec: Reconstruction, folder: Path) -> dict[s
 def test_section(views: Sequence[HeldOutView], settings: PoseRefinementSettings) -> dict[str, object]:
     """Mean scores of the frames that training did not see, and how they were placed."""
     scores = mean_scores(views)
-    return summary_entries({**vars(scores), "protocol": protocol(views, settings)})
+    covered = mean_covered(views)
+    of_covered = {
+        "covered": covered.share,
+        "psnr_covered": covered.psnr,
+        "blur4_psnr_covered": covered.blur4_psnr,
+    }
+    return summary_entries({**vars(scores), **of_covered, "protocol": protocol(views, settings)})
 
 
 def mean_medium(scene: SplatMap, rec: Reconstruction) -> Medium:

@@ -2,11 +2,14 @@
 
 from dataclasses import replace
 
+import pytest
 import torch
 
 from swimm3r.cameras import Cameras
+from swimm3r.evaluate import NotComputed
 from swimm3r.ground_truth import GroundTruth
-from swimm3r.held_out import cut, first_poses, visible_window
+from swimm3r.held_out import covered_by_training, covered_scores, cut, first_poses, visible_window
+from swimm3r.reconstruction import DenseCloud
 from swimm3r.renders import smooth_path
 from swimm3r.sfm.settings import FeatureSettings
 from swimm3r.splat.views import pinhole_canvas
@@ -62,3 +65,29 @@ def test_a_smooth_path_begins_and_ends_near_the_dive_and_holds_rotations():
     assert path[:, 1, 3].diff().abs().max() < 0.1 * poses[:, 1, 3].diff().abs().max()
     assert path[0, 0, 3] < 1.5
     assert path[-1, 0, 3] > 9.5
+
+
+def test_what_no_training_frame_saw_is_not_covered(tiny_dive):
+    x, y = torch.meshgrid(torch.linspace(-2.6, 2.6, 150), torch.linspace(-2.1, 2.1, 120), indexing="ij")
+    wall = torch.stack([x, y, torch.full_like(x, 3.0)], -1).reshape(-1, 3)
+    rec = replace(tiny_dive.rec, cloud=DenseCloud(wall, wall, wall))
+    camera = tiny_dive.cameras[4]
+    assert covered_by_training(rec, camera).all()
+    away = camera.cam2world.clone()
+    away[0, 0, 3] += 3.0  # the wall ends at x = 2.6
+    beyond = covered_by_training(rec, replace(camera, cam2world=away))
+    assert beyond[:, :10].all()
+    assert not beyond[:, 50:].any()
+
+
+def test_the_covered_score_looks_at_covered_pixels_alone():
+    render, target = torch.full((20, 20, 3), 0.5), torch.full((20, 20, 3), 0.5)
+    target[:, :10] = 0.6
+    target[:, 10:] = 0.9
+    left = torch.zeros(20, 20, dtype=torch.bool)
+    left[:, :10] = True
+    seen = torch.ones(20, 20, dtype=torch.bool)
+    scores = covered_scores(render, target, seen, left)
+    assert scores.share == 0.5
+    assert scores.psnr == pytest.approx(20.17, abs=0.01)  # 25 of 255
+    assert isinstance(covered_scores(render, target, seen, ~seen).psnr, NotComputed)
