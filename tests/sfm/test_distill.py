@@ -151,6 +151,22 @@ def test_far_away_the_inverse_divides_by_the_floor_and_stays_finite():
     assert torch.isfinite(gradient).all()
 
 
+def test_beyond_the_floor_under_t_d_the_inverse_loss_pulls_the_true_veil_down_and_leaves_beta_d_alone():
+    """A bias of Eq. stage1_loss_inv itself: where T_D < eps_inv the true water restores too dark a picture."""
+    J, z, medium = scene()
+    far = z + 30
+    I = add_water(J, far, medium)
+    everywhere = torch.ones_like(z, dtype=torch.bool)
+    assert torch.exp(-medium.beta_D * far[..., None]).max() < PAPER.min_transmittance
+    unknown = replace(medium, Binf=medium.Binf.clone().requires_grad_(), beta_D=medium.beta_D.clone().requires_grad_())
+    terms = physics_terms(I, J, far, everywhere, unknown, PAPER)
+    assert terms.forward.max() < 1e-6  # it is the true water
+    assert (terms.inverse > 0.1).all()
+    Binf, beta_D = torch.autograd.grad(terms.inverse.sum(), [unknown.Binf, unknown.beta_D])
+    assert (Binf.mean((1, 2)) > 0).all()  # descending lowers the veil
+    assert (beta_D == 0).all()
+
+
 def test_what_is_not_valid_is_never_read():
     J, z, medium = scene()
     I = add_water(J, z, medium)
