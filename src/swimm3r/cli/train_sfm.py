@@ -1,5 +1,6 @@
 """`swimm3r train-sfm`: distils the frozen network into a low-rank student that sees through water."""
 
+import os
 import sys
 from collections.abc import Callable
 from pathlib import Path
@@ -59,6 +60,7 @@ def command_for_recipe(name: str) -> Callable:
 
         with drawn_progress() as progress:
             adapter = run(data, out, settings, weights, base_licence, device, announce, progress)
-        print(f"Adapter: {adapter}")
+        if os.environ.get("RANK", "0") == "0":  # torchrun's other processes have the same to say
+            print(f"Adapter: {adapter}")
 
     return train_sfm
