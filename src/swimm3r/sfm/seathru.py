@@ -11,7 +11,7 @@ and one bounded least-squares problem finds Binf, beta_B and beta_D(z) = a exp(b
     dark        the darkest pixels of each range bin are B plus J' T_D with a small common J' (Sea-Thru's B(z))
     average     the average colour of a range bin decays as T_D from 1 / f (local space average colour, f = 2): decides
                 only what the tracks leave open
-    open water  pixels that look past every surface show Binf
+    open water  pixels that look past every surface show Binf; without any, Binf is not far from what is farthest
 
 `water_fit.py` holds the least squares. Depths enter in units of their median, so the fit commutes with any rescaling of
 the scene.

@@ -109,6 +109,8 @@ class SeathruSettings:
     slope_std: float = 0.1
     """Of b times the median depth in beta_D(z) = a exp(b z)."""
     open_water_std: float = 0.01
+    far_colour_std: float = 0.2
+    """How far Binf may be from the mean colour of the farthest tenth, where no open water is in view."""
     min_open_water: int = 200
     min_samples: int = 500
     min_tracks: int = 100

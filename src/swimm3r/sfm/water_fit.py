@@ -65,7 +65,7 @@ class _Evidence:
     """What is known besides the sightings."""
 
     bins: _RangeBins
-    open_water: tuple[float, float] | None  # median and its standard deviation
+    Binf: tuple[float, float]  # median of open water, or else the mean of what is far, and its standard deviation
     alone: bool  # no sightings
     lower: np.ndarray
     upper: np.ndarray
@@ -129,8 +129,10 @@ def _evidence(pixels: Pixels, gain_std: float, alone: bool, settings: SeathruSet
     water = _open_water_colour(pixels.open_water, gain_std, settings)
     lower, upper = LOWER.copy(), UPPER.copy()
     upper[BINF] = _largest_Binf(pixels.I, pixels.z)
-    if water is not None:
-        upper[BINF] = min(1.0, max(upper[BINF], water[0] + 3 * water[1]))
+    if water is None:
+        far = float(np.mean(pixels.I[pixels.z >= np.quantile(pixels.z, 0.9)]))
+        return _Evidence(_range_bins(pixels, settings), (far, settings.far_colour_std), alone, lower, upper)
+    upper[BINF] = min(1.0, max(upper[BINF], water[0] + 3 * water[1]))
     return _Evidence(_range_bins(pixels, settings), water, alone, lower, upper)
 
 
@@ -232,9 +234,8 @@ def _prior_residuals(x: np.ndarray, evidence: _Evidence, settings: SeathruSettin
         (x[LOG_MEAN] + np.log(settings.lsac_f)) / settings.mean_reflectance_std,
         (x[LOG_BETA_B] - x[LOG_BETA_D] + 0.7) / 1.0,  # r = beta_B / beta_D is U(0, 1) in the paper: log mean -1, std 1
         x[SLOPE] / settings.slope_std,
+        (x[BINF] - evidence.Binf[0]) / evidence.Binf[1],
     ]
-    if evidence.open_water is not None:
-        single.append((x[BINF] - evidence.open_water[0]) / evidence.open_water[1])
     return np.concatenate([dark, average / np.sqrt(len(average)), single])
 
 
@@ -292,9 +293,8 @@ def _best_start(
 
 
 def _starts(evidence: _Evidence) -> list[np.ndarray]:
-    Binf = evidence.open_water[0] if evidence.open_water is not None else 0.7 * evidence.upper[BINF]
     return [
-        np.array([Binf, np.log(beta_B), np.log(beta_D), 0.0, 0.02, np.log(0.4)])
+        np.array([evidence.Binf[0], np.log(beta_B), np.log(beta_D), 0.0, 0.02, np.log(0.4)])
         for beta_B in (0.1, 0.5, 2.0)
         for beta_D in (0.2, 0.7, 2.0)
     ]
