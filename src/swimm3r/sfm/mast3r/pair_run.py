@@ -7,9 +7,11 @@ import logging
 from collections.abc import Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass
+from functools import lru_cache
 from pathlib import Path
 
 import torch
+from torch import Tensor
 
 from swimm3r import weights
 from swimm3r.errors import DeviceError
@@ -92,12 +94,13 @@ def look_at_pairs(
         FrameStore(cache / "views", names, partners, half, alignment.subsample, 0.0 if alignment.parity else 0.5),
     )
     cached = EncodingCache(encodings.__getitem__, half)
+    mask_of = lru_cache(maxsize=64)(pictures.mask)  # of a distorted lens it is as dear as a picture
     todo = [pair for pair in pairs if not _is_done(said, *pair)]
     for done, (i, j) in enumerate(todo):
         progress("two-view network", done, len(todo))
         with torch.no_grad(), _memory_of_the_device():
             prediction = predict_pair(network, (i, cached[i]), (j, cached[j]))
-        _keep(prediction, pictures, said, settings)
+        _keep(prediction, [mask_of(f) for f in (i, j)], said, settings)
     progress("two-view network", len(todo), len(todo))
     said.frame_store.flush()
     return said
@@ -108,14 +111,13 @@ def _is_done(said: Said, i: int, j: int) -> bool:
     return added and said.pair_store.has(said.names[i], said.names[j])
 
 
-def _keep(p: PairPrediction, pictures: NetworkPictures, said: Said, settings: Mast3rSettings) -> None:
+def _keep(p: PairPrediction, masks: list[Tensor | None], said: Said, settings: Mast3rSettings) -> None:
     assert p.view_ii.points is not None
     assert p.view_jj.points is not None
     assert p.view_ii.confidence is not None
     assert p.view_jj.confidence is not None
     said.frame_store.add(p.i, p.j, p.view_ii.points, p.view_ii.confidence)
     said.frame_store.add(p.j, p.i, p.view_jj.points, p.view_jj.confidence)
-    masks = [pictures.mask(f) for f in (p.i, p.j)]
 
     def described(view: ViewPrediction, side: int) -> DescriptorMap:
         assert view.descriptors is not None

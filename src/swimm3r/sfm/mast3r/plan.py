@@ -16,8 +16,8 @@ from swimm3r.sfm.settings import Mast3rSettings
 
 _SEARCHES = 10  # nearest-neighbour searches over all seeds that the walks of one pair amount to
 _MATCHING_FLOPS = 2.4e10  # per second of one core: thin products, then a maximum
-_POINT_BYTES = 900  # of the alignment's graph, per matched pixel of a frame
-_POINT_SECONDS = 1.2e-7  # of one alignment step, per matched pixel of a frame
+_POINT_BYTES = 400  # of the alignment's graph, per matched pixel of a frame (benchmarks/mast3r_scale.py)
+_POINT_SECONDS = 4e-7  # of one alignment step, per matched pixel of a frame (benchmarks/mast3r_scale.py)
 _MATCHES_PER_SEED = 1.2  # what two exact views of 60 % overlap yield
 
 
