@@ -20,7 +20,7 @@ from swimm3r.cli.train_sfm import command_for_recipe
 from swimm3r.cli.weights import weights
 from swimm3r.errors import StorageError, Swimm3rError
 from swimm3r.presets import PRESETS
-from swimm3r.sfm.training_settings import RECIPES
+from swimm3r.sfm.training.settings import RECIPES
 
 _INTERRUPTED = 130
 _STORAGE_ERRORS = {errno.ENOSPC, errno.EDQUOT, errno.EROFS, errno.EACCES, errno.EPERM, errno.EFBIG}

@@ -9,7 +9,7 @@ from typing import Annotated, Literal
 from tyro.conf import Positional, arg
 
 from swimm3r.cli.console import drawn_progress
-from swimm3r.sfm.training_settings import RECIPES, TrainSettings
+from swimm3r.sfm.training.settings import RECIPES, TrainSettings
 
 Recipe = Literal[
     "swimm3r",
@@ -48,8 +48,8 @@ def command_for_recipe(name: str) -> Callable:
             device: where the network runs.
             settings: every number of the training.
         """
-        from swimm3r.sfm.train_sfm import train_sfm as run
-        from swimm3r.sfm.training import Estimate
+        from swimm3r.sfm.training.job import train_sfm as run
+        from swimm3r.sfm.training.loop import Estimate
 
         def announce(e: Estimate) -> None:
             print(

@@ -16,8 +16,8 @@ from swimm3r.geometry import relative_poses
 from swimm3r.io.images import write_rgb
 from swimm3r.medium import remove_water
 from swimm3r.sfm.matching import PixelMatches
-from swimm3r.sfm.training_data import PairData, TwoViews, nearest_known, split_data, trainable
-from swimm3r.sfm.training_scores import absolute_relative, pose_error, psnr
+from swimm3r.sfm.training.data import PairData, TwoViews, nearest_known, split_data, trainable
+from swimm3r.sfm.training.scores import absolute_relative, pose_error, psnr
 from swimm3r.synthetic import DiveSettings, write_dive
 
 WIDTH, HEIGHT = 80, 60  # the network's crop of it at 64 is 64 x 48

@@ -32,9 +32,9 @@ from swimm3r.sfm import adapter_file
 from swimm3r.sfm.adapter_file import Base, trained_parameters
 from swimm3r.sfm.mast3r.network import Mast3r
 from swimm3r.sfm.student import Student, new_student
-from swimm3r.sfm.training_data import PairData, PairItem
-from swimm3r.sfm.training_settings import TrainSettings
-from swimm3r.sfm.training_state import Rows, forget_rows_after, resume, write_state
+from swimm3r.sfm.training.data import PairData, PairItem
+from swimm3r.sfm.training.settings import TrainSettings
+from swimm3r.sfm.training.state import Rows, forget_rows_after, resume, write_state
 
 _ORDER, _WATER = 1, 2  # purposes of randomness
 _TERMS = ("encoder", "decoder", "descriptors", "forward", "inverse", "overshoot", "anchor", "clean")

@@ -26,7 +26,7 @@ from swimm3r.sfm.mast3r.settings import MatchingSettings
 from swimm3r.sfm.matching import DescriptorMap, PixelMatches, drop_border, match_pass
 from swimm3r.sfm.physics_head import ray_depth_of
 from swimm3r.sfm.student import Student
-from swimm3r.sfm.training_data import PairData, PairItem, TwoViews
+from swimm3r.sfm.training.data import PairData, PairItem, TwoViews
 
 _MIN_MATCHES = 8
 _LOST = 180.0  # degrees

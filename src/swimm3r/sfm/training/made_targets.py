@@ -25,7 +25,7 @@ from swimm3r.medium import MediumFit, linear_from_srgb, remove_water
 from swimm3r.progress import Progress, silent
 from swimm3r.sfm.seathru import fit_medium
 from swimm3r.sfm.settings import SeathruSettings
-from swimm3r.sfm.training_data import nearest_known
+from swimm3r.sfm.training.data import nearest_known
 from swimm3r.sfm.water_samples import WaterSamples
 
 _MARK = "made.json"
@@ -78,7 +78,7 @@ def _made(sequence: Sequence, folder: Path, progress: Progress) -> Sequence:
             return replace(sequence, notes=(*sequence.notes, f"not for training: {error.what}"))
         _make(sequence, water, folder, progress)
         medium = {name: value.tolist() for name, value in vars(water.medium).items()}
-        about = {"made_by": "swimm3r sfm/made_targets.py, after Sea-Thru", "pictures": names, "medium": medium}
+        about = {"made_by": "swimm3r sfm/training/made_targets.py, after Sea-Thru", "pictures": names, "medium": medium}
         write_text(mark, json.dumps(about, indent=2) + "\n")
 
     def with_clean(shot: Shot) -> Shot:

@@ -11,7 +11,7 @@ import torch
 from swimm3r.datasets import load, read_tree
 from swimm3r.io.images import write_rgb
 from swimm3r.medium import Medium, add_water, linear_from_srgb
-from swimm3r.sfm.made_targets import with_made_targets
+from swimm3r.sfm.training.made_targets import with_made_targets
 
 WATER = Medium(torch.tensor([0.08, 0.35, 0.4]), torch.tensor([0.5, 0.18, 0.14]), torch.tensor([0.4, 0.25, 0.2]))
 HEIGHT, WIDTH = 60, 80

@@ -1,4 +1,4 @@
-"""From a folder of data sets and a base checkpoint to a trained adapter: what surrounds the loop of `training.py`."""
+"""From a folder of data sets and a base checkpoint to a trained adapter: what surrounds the loop of `loop.py`."""
 
 import os
 from collections.abc import Callable
@@ -12,18 +12,18 @@ from swimm3r.datasets.pairs import Pair
 from swimm3r.datasets.sequences import Sequence
 from swimm3r.errors import DeviceError
 from swimm3r.progress import Progress, silent
-from swimm3r.sfm import training
 from swimm3r.sfm.adapter_file import Base, fingerprint
-from swimm3r.sfm.made_targets import with_made_targets
 from swimm3r.sfm.mast3r import checkpoint
 from swimm3r.sfm.mast3r.network import Mast3r
 from swimm3r.sfm.mast3r.preprocess import framing, to_network
 from swimm3r.sfm.mast3r.settings import Video
 from swimm3r.sfm.pairs import video_pairs
 from swimm3r.sfm.retrieval import cosine_similarity, global_descriptor
-from swimm3r.sfm.training_data import split_data
-from swimm3r.sfm.training_scores import score
-from swimm3r.sfm.training_settings import TrainSettings
+from swimm3r.sfm.training import loop
+from swimm3r.sfm.training.data import split_data
+from swimm3r.sfm.training.made_targets import with_made_targets
+from swimm3r.sfm.training.scores import score
+from swimm3r.sfm.training.settings import TrainSettings
 
 
 def train_sfm(
@@ -33,7 +33,7 @@ def train_sfm(
     weights: Path | None = None,
     base_licence: str | None = None,
     device: str = "auto",
-    announce: Callable[[training.Estimate], None] = lambda estimate: None,
+    announce: Callable[[loop.Estimate], None] = lambda estimate: None,
     progress: Progress = silent,
 ) -> Path:
     """Trains on every trainable pair below `data` and returns the adapter's path; Sea-Thru's targets are made first.
@@ -58,7 +58,7 @@ def train_sfm(
         ]
         pairs = [[*own, *more] for own, more in zip(pairs, found, strict=True)]
     train, validation = split_data(sequences, pairs, settings.size, settings.validation, settings.max_pairs, patch)
-    return training.train(network, base, train, validation, settings, folder, score, announce, progress)
+    return loop.train(network, base, train, validation, settings, folder, score, announce, progress)
 
 
 def retrieved_pairs(

@@ -25,12 +25,12 @@ from swimm3r.sfm.mast3r import checkpoint
 from swimm3r.sfm.mast3r.network import Architecture, Mast3r
 from swimm3r.sfm.mast3r.settings import ObjectiveSettings
 from swimm3r.sfm.student import Student, new_student
-from swimm3r.sfm.train_sfm import retrieved_pairs, train_sfm
-from swimm3r.sfm.training import Workers, batch_size, pairs_of_step, train
-from swimm3r.sfm.training_data import PairData, split_data
-from swimm3r.sfm.training_scores import score
-from swimm3r.sfm.training_settings import RECIPES, TrainSettings
-from swimm3r.sfm.training_state import Rows
+from swimm3r.sfm.training.data import PairData, split_data
+from swimm3r.sfm.training.job import retrieved_pairs, train_sfm
+from swimm3r.sfm.training.loop import Workers, batch_size, pairs_of_step, train
+from swimm3r.sfm.training.scores import score
+from swimm3r.sfm.training.settings import RECIPES, TrainSettings
+from swimm3r.sfm.training.state import Rows
 from swimm3r.synthetic import DiveSettings, write_dive
 
 BASE = Base("small.safetensors", "0" * 64, "made in a test")
@@ -127,10 +127,10 @@ torch.set_num_threads(1)
 from swimm3r.datasets import make_pairs, read_tree
 from swimm3r.sfm.adapter_file import Base
 from swimm3r.sfm.mast3r import checkpoint
-from swimm3r.sfm.training import train
-from swimm3r.sfm.training_data import split_data
+from swimm3r.sfm.training.loop import train
+from swimm3r.sfm.training.data import split_data
 from swimm3r.datasets.settings import PairSettings
-from swimm3r.sfm.training_settings import TrainSettings
+from swimm3r.sfm.training.settings import TrainSettings
 from swimm3r.sfm.mast3r.settings import LoraSettings, ObjectiveSettings
 
 def watch(what, done, total, /):
