@@ -130,9 +130,9 @@ class Reconstruction:
         return self.names.index(name)
 
 
-def save(rec: Reconstruction, folder: Path) -> None:
-    """Write a reconstruction into a folder; depth maps already live under it."""
-    sparse = colmap.ColmapModel(
+def colmap_model(rec: Reconstruction) -> colmap.ColmapModel:
+    """Cameras, points and tracks as io/colmap writes them."""
+    return colmap.ColmapModel(
         names=rec.names,
         model=rec.cameras.model,
         width=rec.cameras.width,
@@ -147,7 +147,11 @@ def save(rec: Reconstruction, folder: Path) -> None:
         track_frame=rec.tracks.frame.numpy(),
         track_xy=rec.tracks.xy.numpy(),
     )
-    colmap.write_model(folder / "sparse", sparse)
+
+
+def save(rec: Reconstruction, folder: Path) -> None:
+    """Write a reconstruction into a folder; depth maps already live under it."""
+    colmap.write_model(folder / "sparse", colmap_model(rec))
     cameras_json.write_cameras(
         folder / "cameras.json",
         cameras_json.CameraTable(

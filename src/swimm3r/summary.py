@@ -104,7 +104,7 @@ def splat_sections(scene: SplatMap, rec: Reconstruction, folder: Path) -> dict[s
         "iterations": scene.settings.iterations,
         "seconds_per_iteration": last["seconds_per_step"],
         "cpu_seconds_per_iteration": last["cpu_seconds_per_step"],
-        "device": "cpu",
+        "device": scene.primitives.xyz.device.type,
     }
     water = mean_medium(scene, rec)
     medium = {

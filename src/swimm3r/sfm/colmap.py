@@ -24,7 +24,7 @@ from swimm3r.frames import Frames
 from swimm3r.io.atomic import atomic_path
 from swimm3r.io.colmap import ColmapModel, from_pycolmap, to_pycolmap
 from swimm3r.progress import Progress, silent
-from swimm3r.reconstruction import Caution, DepthMaps, Matches, Points, Reconstruction, Tracks, cameras_of
+from swimm3r.reconstruction import Caution, DepthMaps, Matches, Points, Reconstruction, Tracks, cameras_of, colmap_model
 from swimm3r.sfm import mapping, vlad
 from swimm3r.sfm.feature_database import FeatureDatabase, fill_features, match_pairs, start_database
 from swimm3r.sfm.plausibility import implausible
@@ -126,7 +126,7 @@ def bundle_adjust(rec: Reconstruction, *, lens: bool = False) -> Reconstruction:
     options.print_summary = False
     options.ceres.loss_function_type = pycolmap.LossFunctionType.SOFT_L1
     options.ceres.solver_options.num_threads = 1  # as in mapping: the same sums in the same order
-    model = to_pycolmap(table_of(rec))
+    model = to_pycolmap(colmap_model(rec))
     pycolmap.bundle_adjustment(model, options)
     model.update_point_3d_errors()
     table = from_pycolmap(model)
@@ -135,25 +135,6 @@ def bundle_adjust(rec: Reconstruction, *, lens: bool = False) -> Reconstruction:
         cameras=cameras_of(table),
         points=replace(rec.points, xyz=torch.from_numpy(table.xyz), error=torch.from_numpy(table.error)),
         tracks=Tracks(*(torch.from_numpy(a) for a in (table.track_point, table.track_frame, table.track_xy))),
-    )
-
-
-def table_of(rec: Reconstruction) -> ColmapModel:
-    """Cameras, points and tracks as io/colmap writes them."""
-    return ColmapModel(
-        names=rec.names,
-        model=rec.cameras.model,
-        width=rec.cameras.width,
-        height=rec.cameras.height,
-        K=rec.cameras.K.numpy(),
-        distortion=rec.cameras.distortion.numpy(),
-        cam2world=rec.cameras.cam2world.numpy(),
-        xyz=rec.points.xyz.numpy(),
-        rgb=(rec.points.rgb.numpy() * 255).round().astype(np.uint8),
-        error=rec.points.error.numpy(),
-        track_point=rec.tracks.point.numpy(),
-        track_frame=rec.tracks.frame.numpy(),
-        track_xy=rec.tracks.xy.numpy(),
     )
 
 
