@@ -91,6 +91,47 @@ def test_a_capped_pair_keeps_its_colour_gradient_and_loses_its_shape_gradient(ba
 
 
 @backends
+def test_an_image_of_caps_and_stops_agrees_with_the_oracle(backend: Backend, scene: Scene):
+    """12 x 16 pixels, 14 primitives: one pair is capped, some pixels end before the last primitive."""
+    p, medium = scene(14, 12, 16)
+    p.opacity[0], p.beta[0] = 1.0, 0.8
+    p.opacity[1:6] = 0.99
+    p.mean2d[:6] = torch.tensor([8.5, 6.5]) + 0.3 * torch.arange(6)[:, None]
+    p.conic[:6] /= 4
+    expected, got = (step(b, p, medium, 0.0) for b in ("reference", backend))
+    alone = rasterize(Primitives2D(*(t[:1] for t in p)), medium, 12, 16, alpha_min=0.0, backend="reference")
+    assert (alone.alpha > 0.999 - 1e-12).sum() == 1
+    assert (expected.out.alpha > 0.9985).any()
+    assert_same_step(got, expected, 1e-4)
+    for result in (got, expected):
+        torch.testing.assert_close(result.sgg.geo + result.sgg.med, result.grads[0], rtol=1e-4, atol=1e-4)
+
+
+@pytest.mark.parametrize("backend", ["reference", *FAST])
+def test_depth_may_be_left_to_what_looks_at_depth(backend: Backend, scene: Scene):
+    """Without `medium_depth_grad` the water moves no primitive along its ray, and nothing else changes."""
+    p, medium = scene(60, 29, 37)
+    given = [t.to(torch.float32).requires_grad_() for t in (*p, *medium)]
+    weight = torch.rand(29, 37, generator=torch.Generator().manual_seed(4))
+    grads, branches = [], []
+    for full in (True, False):
+        sgg = SggBuffers.zeros(60)
+        out = rasterize(
+            Primitives2D(*given[:6]), MediumMaps(*given[6:]), 29, 37, sgg=sgg, medium_depth_grad=full, backend=backend
+        )
+        grads.append(torch.autograd.grad((out.z_depth * weight).sum() + out.rgb.square().sum(), given))
+        branches.append(sgg)
+    for name, a, b in zip(NAMES, *grads, strict=True):
+        if name == "depth":
+            assert (a - b).norm() > 0.01 * a.norm()
+            torch.testing.assert_close(b, branches[0].depth_iso[:, 2])
+        else:
+            torch.testing.assert_close(a, b)
+    for a, b in zip(*branches, strict=True):
+        torch.testing.assert_close(a, b)
+
+
+@backends
 def test_without_primitives_every_pixel_is_open_water(backend: Backend, scene: Scene):
     p, medium = scene(0, 20, 33)
     got = step(backend, p, medium)

@@ -116,3 +116,10 @@ def test_only_oversize_primitives_are_held_back(primitives):
     (gradient,) = torch.autograd.grad(value, p.scale)
     assert (gradient[[0, 2, 4, 5]] == 0).all()
     assert losses.oversize(p, radius, 1000.0) == 0
+
+
+def test_the_scale_regulariser_sees_the_spatial_scales_of_all_or_with_ubs_slip_all_scales_of_three(primitives):
+    p = primitives(10)
+    spread = torch.nn.functional.softplus(p.scale)
+    torch.testing.assert_close(losses.mean_scale(p), spread[:, :3].mean())
+    torch.testing.assert_close(losses.mean_scale(p, ubs_bug=True), spread[:3].mean())

@@ -62,13 +62,15 @@ def rasterize(
     alpha_min: float = ALPHA_MIN,
     sgg: SggBuffers | None = None,
     bins: Bins | None = None,
+    medium_depth_grad: bool = True,
     backend: Backend = "auto",
 ) -> RasterOutput:
     """Underwater image, clear image, z depth (not normalised) and alpha of one camera; differentiable in p and medium.
 
     `medium=None` is clear water: no veil, no attenuation. Pairs fainter than `alpha_min` are skipped. `sgg` is added to
-    in place when the gradient is taken. `auto` takes Numba on the CPU and Warp on CUDA, both in float32; `reference`
-    keeps the inputs' precision. Outputs and gradients have the inputs' dtype.
+    in place when the gradient is taken. Without `medium_depth_grad` only `z_depth` moves a primitive in depth, not the
+    light that the water takes and adds (uwbs.md 6.7). `auto` takes Numba on the CPU and Warp on CUDA, both in float32;
+    `reference` keeps the inputs' precision. Outputs and gradients have the inputs' dtype.
     Raises ValueError where shapes, or `bins` made for another image, do not fit.
     """
     _check(p, medium, height, width)
@@ -85,13 +87,13 @@ def rasterize(
         medium = MediumMaps(*p.mean2d.new_zeros(3, 3, height, width))
     dtype = p.mean2d.dtype
     if backend == "reference":
-        job = _Job(backend, height, width, alpha_min, sgg, None)
+        job = _Job(backend, height, width, alpha_min, sgg, None, medium_depth_grad)
         return RasterOutput(*_Rasterize.apply(job, *p, *medium))
     p = Primitives2D(*(t.float().contiguous() for t in p))
     medium = MediumMaps(*(t.float().contiguous() for t in medium))
     if bins is None:
         bins = _kernels(backend).bin_primitives(_detached(p), height, width, alpha_min)
-    job = _Job(backend, height, width, alpha_min, sgg, bins)
+    job = _Job(backend, height, width, alpha_min, sgg, bins, medium_depth_grad)
     return RasterOutput(*(image.to(dtype) for image in _Rasterize.apply(job, *p, *medium)))
 
 
@@ -105,6 +107,7 @@ class _Job:
     alpha_min: float
     sgg: SggBuffers | None
     bins: Bins | None
+    medium_depth_grad: bool
 
 
 class _Rasterize(torch.autograd.Function):
@@ -127,12 +130,18 @@ class _Rasterize(torch.autograd.Function):
         job, saved = ctx.job, ctx.saved_tensors
         p, medium, out = Primitives2D(*saved[:6]), MediumMaps(*saved[6:9]), RasterOutput(*saved[9:])
         cotangent = RasterOutput(*cotangents)
+        parts = job.sgg if job.medium_depth_grad else _zeros(p)
         if job.bins is None:
-            grads, medium_grads = reference.adjoint(p, medium, job.height, job.width, job.alpha_min, cotangent, job.sgg)
+            grads, medium_grads = reference.adjoint(p, medium, job.height, job.width, job.alpha_min, cotangent, parts)
         else:
             with_medium = any(ctx.needs_input_grad[7:])
             kernels = _kernels(job.backend)
-            grads, medium_grads = kernels.backward(job.bins, p, medium, out, cotangent, job.sgg, with_medium)
+            grads, medium_grads = kernels.backward(job.bins, p, medium, out, cotangent, parts, with_medium)
+        if not job.medium_depth_grad:
+            assert parts is not None
+            grads = grads._replace(depth=parts.depth_iso[:, 2])
+            for given, part in zip(job.sgg or (), parts, strict=False):
+                given += part
         return None, *grads, *(medium_grads or (None, None, None))
 
 
@@ -153,6 +162,11 @@ def _kernels(backend: Backend) -> ModuleType:
             hint="pip install 'swimm3r[cuda]', or move the tensors to the CPU.",
         ) from error
     return warp_gpu
+
+
+def _zeros(p: Primitives2D) -> SggBuffers:
+    """Empty buffers in the precision of the primitives."""
+    return SggBuffers(*(buffer.to(p.depth) for buffer in SggBuffers.zeros(len(p.depth), p.depth.device)))
 
 
 def _detached(p: Primitives2D) -> Primitives2D:

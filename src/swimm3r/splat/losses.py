@@ -76,9 +76,9 @@ def mean_opacity(p: BetaPrimitives) -> Float[Tensor, ""]:
     return torch.sigmoid(p.opacity).mean()
 
 
-def mean_scale(p: BetaPrimitives) -> Float[Tensor, ""]:
-    """L_scale (Eq. mcmc_reg), of the spatial scales of all primitives; UBS's code takes three primitives by a slip."""
-    return softplus(p.scale[:, :3]).mean()
+def mean_scale(p: BetaPrimitives, ubs_bug: bool = False) -> Float[Tensor, ""]:
+    """L_scale (Eq. mcmc_reg), of the spatial scales of all primitives; UBS's slip takes all of three primitives."""
+    return softplus(p.scale[:3] if ubs_bug else p.scale[:, :3]).mean()
 
 
 def oversize(p: BetaPrimitives, radius: Float[Tensor, " n"], limit: float) -> Float[Tensor, ""]:

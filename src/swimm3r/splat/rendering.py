@@ -62,7 +62,10 @@ def draw(p: BetaPrimitives, field: MediumField, view: Pinhole, settings: UwbsSet
     maps = medium_at_pixels(grid, view.height, view.width)
     if settings.render.depth == "ray":
         maps = per_z_depth(maps, view)
-    images = rasterize(projection.primitives, maps, view.height, view.width, alpha_min=settings.render.alpha_min)
+    images = rasterize(
+        projection.primitives, maps, view.height, view.width,
+        alpha_min=settings.render.alpha_min, medium_depth_grad=settings.render.medium_depth_grad == "full",
+    )  # fmt: skip
     return Drawing(images, projection, grid)
 
 

@@ -22,6 +22,8 @@ class RenderSettings:
     """The conditional covariance is not symmetric: its mean with its transpose, or its upper triangle as UBS has it."""
     rotation: Literal["first_order", "exponential"] = "first_order"
     """I + A as UBS has it, or the rotation exp(A)."""
+    medium_depth_grad: Literal["full", "detach"] = "full"
+    """Whether what the water takes and adds may move a primitive in depth; detach as WaterSplatting has it."""
 
 
 @dataclass(frozen=True)
@@ -82,6 +84,8 @@ class LossWeights:
     ssim: float = 0.2
     opacity: float = 0.01
     scale: float = 0.01
+    ubs_scale_reg_bug: bool = False
+    """Regularise all scales of the first three primitives, as UBS's code does, instead of the spatial ones of all."""
     depth: float = 0.1
     medium_smoothness: float = 1.0
     medium_prior: float = 0.01

@@ -168,7 +168,7 @@ def objective(
         total = total + w.medium_prior * off
         numbers |= {"medium_prior": off}
     if regularised:
-        opacity, scale = losses.mean_opacity(p), losses.mean_scale(p)
+        opacity, scale = losses.mean_opacity(p), losses.mean_scale(p, w.ubs_scale_reg_bug)
         total = total + w.opacity * opacity + w.scale * scale
         numbers |= {"opacity": opacity, "scale": scale}
     return total, {"loss": float(total.detach())} | {k: float(torch.as_tensor(v).detach()) for k, v in numbers.items()}
