@@ -148,7 +148,8 @@ def covered_by_training(rec: Reconstruction, canvas: Cameras) -> Bool[Tensor, "h
     """
     import cv2
 
-    xyz = rec.points.xyz if rec.cloud is None else rec.cloud.xyz
+    clouds = [cloud.xyz for cloud in (rec.cloud, rec.backdrop) if cloud is not None]
+    xyz = torch.cat(clouds or [rec.points.xyz])
     pixels, z = project(canvas, xyz[None].double())
     inside = (z[0] > 0) & (pixels[0] > 0).all(-1) & (pixels[0] < torch.tensor([canvas.width, canvas.height])).all(-1)
     column, row = pixels[0][inside].long().unbind(-1)

@@ -1,7 +1,8 @@
 """What structure from motion knows about a dive; the one record every back end fills and every later stage reads.
 
 On disk (`save`, `load`) it is a folder: sparse/ (COLMAP model), cameras.json, z_depth/NAME.npz, matches.npz,
-medium.json, points.ply (restored colours), points_raw.ply, reconstruction.json (back end, metric flag, cautions).
+medium.json, points.ply (restored colours), points_raw.ply, backdrop.ply (guessed ground, restored colours),
+backdrop_raw.ply, reconstruction.json (back end, metric flag, cautions).
 """
 
 import json
@@ -93,7 +94,7 @@ class DepthMaps:
 
 @dataclass(frozen=True)
 class DenseCloud:
-    """The fused dense points: colours in the water, and with the water removed, averaged over each point's track."""
+    """Dense points: their colours in the water, and with the water removed."""
 
     xyz: Float[Tensor, "n 3"]
     raw: Float[Tensor, "n 3"]  # 0..1
@@ -122,7 +123,8 @@ class Reconstruction:
     metric: bool = False
     medium: MediumFit | None = None  # on pixel values as stored, what the pipeline uses
     medium_linear: MediumFit | None = None  # in linear light, what the water table shows
-    cloud: DenseCloud | None = None
+    cloud: DenseCloud | None = None  # fused from the depth maps; colours averaged over each point's track
+    backdrop: DenseCloud | None = None  # ground filmed but not measured, at a guessed depth, for maps to start on
     cautions: tuple[Caution, ...] = ()
 
     def index(self, name: str) -> int:
@@ -169,9 +171,10 @@ def save(rec: Reconstruction, folder: Path) -> None:
         np.savez_compressed(draft, **{name: tensor.numpy() for name, tensor in vars(rec.matches).items()})
     fits = {"stored": rec.medium, "linear": rec.medium_linear}
     medium_json.write_fits(folder / "medium.json", {name: fit for name, fit in fits.items() if fit is not None})
-    if rec.cloud is not None:
-        ply.write_points(folder / "points.ply", rec.cloud.xyz.numpy(), rec.cloud.restored.numpy())
-        ply.write_points(folder / "points_raw.ply", rec.cloud.xyz.numpy(), rec.cloud.raw.numpy())
+    for stem, cloud in (("points", rec.cloud), ("backdrop", rec.backdrop)):
+        if cloud is not None:
+            ply.write_points(folder / f"{stem}.ply", cloud.xyz.numpy(), cloud.restored.numpy())
+            ply.write_points(folder / f"{stem}_raw.ply", cloud.xyz.numpy(), cloud.raw.numpy())
     about = {"backend": rec.backend, "metric": rec.metric, "cautions": [vars(caution) for caution in rec.cautions]}
     write_text(folder / "reconstruction.json", json.dumps(about, indent=2) + "\n")
 
@@ -183,11 +186,6 @@ def load(folder: Path) -> Reconstruction:
     with np.load(folder / "matches.npz") as stored:
         matches = Matches(**{name: torch.from_numpy(stored[name]) for name in stored.files})
     fits = medium_json.read_fits(folder / "medium.json")
-    cloud = None
-    if (folder / "points.ply").is_file():
-        xyz, restored = ply.read_points(folder / "points.ply")
-        _, raw = ply.read_points(folder / "points_raw.ply")
-        cloud = DenseCloud(torch.from_numpy(xyz), torch.from_numpy(raw), torch.from_numpy(restored))
     return Reconstruction(
         names=sparse.names,
         cameras=cameras_of(sparse),
@@ -203,9 +201,18 @@ def load(folder: Path) -> Reconstruction:
         metric=about["metric"],
         medium=fits.get("stored"),
         medium_linear=fits.get("linear"),
-        cloud=cloud,
+        cloud=_load_cloud(folder, "points"),
+        backdrop=_load_cloud(folder, "backdrop"),
         cautions=tuple(Caution(**caution) for caution in about["cautions"]),
     )
+
+
+def _load_cloud(folder: Path, stem: str) -> DenseCloud | None:
+    if not (folder / f"{stem}.ply").is_file():
+        return None
+    xyz, restored = ply.read_points(folder / f"{stem}.ply")
+    _, raw = ply.read_points(folder / f"{stem}_raw.ply")
+    return DenseCloud(torch.from_numpy(xyz), torch.from_numpy(raw), torch.from_numpy(restored))
 
 
 def cameras_of(table: colmap.ColmapModel | cameras_json.CameraTable) -> Cameras:

@@ -10,7 +10,7 @@ from swimm3r.errors import InputError
 from swimm3r.medium import AttenuationCurve, Medium
 from swimm3r.sfm.mast3r.pictures import NetworkPictures, network_pictures
 from swimm3r.sfm.physics_head import WaterMaps
-from swimm3r.sfm.predicted_water import PredictedWater, dive_fit, read, restore_predicted, write
+from swimm3r.sfm.predicted_water import PredictedWater, dive_fit, predicted_pictures, read, write
 from swimm3r.sfm.restore import restored_cloud
 from swimm3r.sfm.settings import Mast3rSettings, SeathruSettings
 from swimm3r.sfm.tracks import fuse_depth
@@ -72,12 +72,9 @@ def test_true_water_restores_the_cloud_to_its_clear_colours(dive, water: Predict
     )
 
 
-def test_restored_pictures_are_clear(dive, water: PredictedWater, tmp_path: Path):
-    from swimm3r.io.images import read_rgb
-
-    restore_predicted(dive.rec, dive.frames, water, tmp_path / "restored")
-    for i, name in enumerate(dive.rec.names):
-        J = torch.from_numpy(read_rgb(tmp_path / "restored" / f"{name}.png").astype("float32")) / 255
+def test_restored_pictures_are_clear(dive, water: PredictedWater):
+    for i, picture in predicted_pictures(dive.rec, dive.frames, water):
+        name, J = dive.rec.names[i], picture.clear
         known = dive.rec.depth[name].z_depth > 0
         raw = dive.frames.image(dive.frames.index(name))
         error = (J - dive.clear[i])[known].abs().mean()

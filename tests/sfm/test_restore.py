@@ -44,7 +44,9 @@ def horizon_picture(medium: Medium) -> tuple[torch.Tensor, DepthMap]:
 
 def test_a_picture_with_known_depth_gets_its_clear_colours_back(dive):
     name = dive.rec.names[2]
-    J = restore_picture(dive.frames.image(2), dive.rec.depth[name], rays_of(dive.rec.cameras[2]), exact(dive.medium))
+    J = restore_picture(
+        dive.frames.image(2), dive.rec.depth[name], rays_of(dive.rec.cameras[2]), exact(dive.medium)
+    ).shown
     assert psnr(J, dive.clear[2]) > 33
 
 
@@ -54,7 +56,7 @@ def test_gaps_in_the_depth_leave_no_holes_in_the_picture(dive):
     z[20:40, 30:60] = 0
     z[torch.rand(z.shape, generator=torch.Generator().manual_seed(0)) < 0.3] = 0
     patchy = DepthMap(z, (z > 0).float())
-    J = restore_picture(dive.frames.image(2), patchy, rays_of(dive.rec.cameras[2]), exact(dive.medium))
+    J = restore_picture(dive.frames.image(2), patchy, rays_of(dive.rec.cameras[2]), exact(dive.medium)).shown
     assert psnr(J, dive.clear[2]) > 28
 
 
@@ -67,7 +69,7 @@ def test_a_linear_fit_restores_light_that_was_lost_in_linear_light(dive):
     clear = dive.clear[2]
     ray_depth = ray_depth_from_z(z, image_directions(camera).float())
     raw = srgb_from_linear(add_water(linear_from_srgb(clear), ray_depth, dive.medium))
-    assert psnr(restore_picture(raw, DepthMap(z, near), rays_of(camera), linear), clear) > 30
+    assert psnr(restore_picture(raw, DepthMap(z, near), rays_of(camera), linear).shown, clear) > 30
 
 
 def test_filling_keeps_what_is_known_and_stays_in_its_range(dive):
@@ -95,7 +97,7 @@ def test_smooth_darkness_is_not_open_water(teal):
 def test_open_water_keeps_its_colour_instead_of_amplified_noise(teal, dive):
     image, depth = horizon_picture(teal)
     camera = replace(dive.rec.cameras[0], width=128, height=96)
-    J = restore_picture(image, depth, rays_of(camera), exact(teal))
+    J = restore_picture(image, depth, rays_of(camera), exact(teal)).shown
     assert (J[:36] - teal.Binf).abs().amax(-1).median() < 0.03
     assert J[:36].std((0, 1)).max() < 0.03
 
@@ -106,7 +108,7 @@ def test_noise_is_not_amplified_where_a_channel_no_longer_sees(dive):
     grey = torch.full((72, 96, 3), 0.4)
     noise = 0.01 * torch.randn(72, 96, 3, generator=torch.Generator().manual_seed(2))
     raw = (add_water(grey, z, dead) + noise).clamp(0, 1)
-    J = restore_picture(raw, DepthMap(z, torch.ones_like(z)), rays_of(dive.rec.cameras[0]), exact(dead))
+    J = restore_picture(raw, DepthMap(z, torch.ones_like(z)), rays_of(dive.rec.cameras[0]), exact(dead)).shown
     assert J[..., 0].std() < 0.1  # the plain inverse has 0.01 / exp(-6) = 4
     assert J[..., 1].std() < 0.02
 
@@ -140,7 +142,7 @@ def test_white_balance_makes_tinted_surfaces_grey():
 def test_display_gains_colour_surfaces_and_leave_open_water_as_it_was(teal, dive):
     image, depth = horizon_picture(teal)
     camera = replace(dive.rec.cameras[0], width=128, height=96)
-    plain = restore_picture(image, depth, rays_of(camera), exact(teal))
-    gained = restore_picture(image, depth, rays_of(camera), exact(teal), gains=torch.tensor([1.2, 0.9, 0.9]))
+    plain = restore_picture(image, depth, rays_of(camera), exact(teal)).shown
+    gained = restore_picture(image, depth, rays_of(camera), exact(teal), gains=torch.tensor([1.2, 0.9, 0.9])).shown
     torch.testing.assert_close(gained[:20], plain[:20])
     assert (gained[70:, :, 1] < 0.95 * plain[70:, :, 1]).float().mean() > 0.9

@@ -54,6 +54,20 @@ def test_without_a_dense_cloud_the_sparse_points_are_taken(tiny_dive):
     torch.testing.assert_close(p.xyz.double(), tiny_dive.rec.points.xyz, atol=1e-6, rtol=0)
 
 
+def test_a_bounded_share_of_the_primitives_starts_on_ground_of_guessed_depth(tiny_dive):
+    cloud = tiny_dive.rec.cloud
+    behind = replace(cloud, xyz=cloud.xyz + 10.0)
+    rec = replace(tiny_dive.rec, backdrop=behind)
+    settings = InitialSettings(primitives=len(cloud.xyz), backdrop=0.25)
+    p = initial_primitives(rec, settings, torch.Generator().manual_seed(0))
+    guessed = (p.xyz[:, None] - behind.xyz[None]).abs().amax(-1).amin(-1) < 1e-4
+    assert 0.15 * len(cloud.xyz) < guessed.sum() < 0.3 * len(cloud.xyz)
+    assert len(p.xyz) < 1.02 * settings.primitives
+    without = initial_primitives(rec, replace(settings, backdrop=0.0), torch.Generator().manual_seed(0))
+    assert len(without.xyz) == len(cloud.xyz)
+    assert (without.xyz < behind.xyz.amin(0)).any(-1).all()
+
+
 def test_softplus_undoes_its_inverse():
     s = torch.tensor([1e-6, 1e-3, 0.5, 4.0, 30.0])
     torch.testing.assert_close(torch.nn.functional.softplus(inverse_softplus(s)), s, rtol=1e-5, atol=1e-9)

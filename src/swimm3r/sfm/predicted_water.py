@@ -7,6 +7,7 @@ with it. The dive's fit is the median over frames; its curve is one exponential 
 they see. A coefficient counts as identifiable where the frames agree on it.
 """
 
+from collections.abc import Iterator
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -18,7 +19,6 @@ from torch.nn import functional as F
 
 from swimm3r.errors import InputError
 from swimm3r.frames import Frames
-from swimm3r.io import images
 from swimm3r.io.atomic import atomic_path
 from swimm3r.medium import AttenuationCurve, Medium, MediumFit, remove_water
 from swimm3r.progress import Progress, silent
@@ -26,6 +26,7 @@ from swimm3r.reconstruction import Reconstruction
 from swimm3r.sfm.depth_filling import fill_z_depth, sea_share
 from swimm3r.sfm.mast3r.pictures import NetworkPictures
 from swimm3r.sfm.physics_head import WaterMaps
+from swimm3r.sfm.restore import RestoredPicture
 from swimm3r.sfm.settings import SeathruSettings
 from swimm3r.sfm.tracks import ray_depth_map, shared_rays
 
@@ -130,10 +131,10 @@ def dive_fit(water: PredictedWater, rec: Reconstruction, settings: SeathruSettin
     return MediumFit(medium, curve, Medium(**spread), agreed, (low, high), "srgb")
 
 
-def restore_predicted(
-    rec: Reconstruction, frames: Frames, water: PredictedWater, folder: Path, progress: Progress = silent
-) -> None:
-    """folder/NAME.png of every frame with depth: the inverse of Eq. 3, clamped, by the frame's own water.
+def predicted_pictures(
+    rec: Reconstruction, frames: Frames, water: PredictedWater, progress: Progress = silent
+) -> Iterator[tuple[int, RestoredPicture]]:
+    """Every frame with depth, by its place in `rec`: the inverse of Eq. 3, clamped, by the frame's own water.
 
     Unknown depth is filled in along the edges; open water keeps the colour it has.
     """
@@ -146,9 +147,11 @@ def restore_predicted(
         image = frames.image(frames.index(name))
         own = water.frame(name)
         sea = sea_share(image, depth.z_depth, own.Binf)
-        z = ray_depth_map(fill_z_depth(image, depth, sea), rays[i]).flatten()
+        ray_depth = ray_depth_map(fill_z_depth(image, depth, sea), rays[i])
+        z = ray_depth.flatten()
         J = remove_water(image.reshape(-1, 3), z, own.at(z, water.place)).clamp(0, 1).reshape(image.shape)
-        images.write_rgb(folder / f"{name}.png", (J + sea[..., None] * (image - J)).numpy())
+        J = J + sea[..., None] * (image - J)
+        yield i, RestoredPicture(J, J, ray_depth, sea)
     progress("restoring pictures", len(rec.names), len(rec.names))
 
 

@@ -12,7 +12,8 @@ Where T_D is small the quotient is noise, so per channel with s = T_D:
 Near the camera all weights are 1 and J is the plain inverse. Nothing is stretched; `display_gains` serve the eye alone.
 """
 
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
+from dataclasses import dataclass
 
 import torch
 from jaxtyping import Bool, Float, Int
@@ -32,11 +33,37 @@ from swimm3r.progress import Progress, silent
 from swimm3r.reconstruction import DenseCloud, DepthMap, Reconstruction
 from swimm3r.sfm.depth_filling import LUMA, blur, fill_z_depth, local_linear, sea_share
 from swimm3r.sfm.settings import RestoreSettings
-from swimm3r.sfm.tracks import DenseTracks, cubes, ray_depth_map
+from swimm3r.sfm.tracks import DenseTracks, cubes, ray_depth_map, shared_rays
 
 MediumOfPixels = Callable[[str, Int[Tensor, " n"], Float[Tensor, " n"]], Medium]  # frame, pixels, ray depth
 
 _MAX_TINT = 1.0  # times the other channels, for blurred colours at a guessed distance
+
+
+@dataclass(frozen=True)
+class RestoredPicture:
+    """One whole picture without its water, as stored values in 0..1, and the distances that this assumed."""
+
+    clear: Float[Tensor, "h w 3"]
+    shown: Float[Tensor, "h w 3"]  # white-balanced for the eye where asked for
+    ray_depth: Float[Tensor, "h w"]  # filled in along the edges where the depth map has gaps
+    sea: Float[Tensor, "h w"]  # 0..1, how surely there is open water and no surface; it keeps the colour it has
+
+
+def restored_pictures(
+    rec: Reconstruction, frames: Frames, settings: RestoreSettings, progress: Progress = silent
+) -> Iterator[tuple[int, RestoredPicture]]:
+    """Every registered frame with some known depth, by its place in `rec`; needs the medium and the cloud."""
+    assert rec.medium is not None
+    assert rec.cloud is not None
+    gains = display_gains(rec.cloud.restored) if settings.white_balance else None
+    rays = shared_rays(rec.cameras)
+    for i, name in enumerate(rec.names):
+        progress("restoring pictures", i, len(rec.names))
+        depth = rec.depth[name]
+        if bool((depth.z_depth > 0).any()):
+            yield i, restore_picture(frames.image(frames.index(name)), depth, rays[i], rec.medium, settings, gains)
+    progress("restoring pictures", len(rec.names), len(rec.names))
 
 
 def restore_picture(
@@ -46,8 +73,8 @@ def restore_picture(
     fit: MediumFit,
     settings: RestoreSettings | None = None,
     gains: Float[Tensor, "3"] | None = None,
-) -> Float[Tensor, "h w 3"]:
-    """The whole picture without its water, as stored values in 0..1; unknown depth is filled in along the edges.
+) -> RestoredPicture:
+    """The whole picture without its water; unknown depth is filled in along the edges.
 
     `rays` are the directions of the pixels with z = 1 (`cameras.image_directions`). `gains` (`display_gains`) colour
     surfaces and not the open water behind them, which keeps the colour the diver saw.
@@ -64,7 +91,9 @@ def restore_picture(
     direct = I - backscatter(ray_depth, medium)
     J = _without_noise(direct, T_D, I @ LUMA, settings)
     stored = srgb_from_linear(J.clamp(min=0)) if fit.encoding == "linear" else J
-    return _horizon(stored if gains is None else stored * gains, T_D, image, sea, settings).clamp(0, 1)
+    clear = _horizon(stored, T_D, image, sea, settings).clamp(0, 1)
+    shown = clear if gains is None else _horizon(stored * gains, T_D, image, sea, settings).clamp(0, 1)
+    return RestoredPicture(clear, shown, ray_depth, sea)
 
 
 def restored_cloud(

@@ -15,7 +15,7 @@ from torch import Tensor
 from torch.nn.functional import softplus
 
 from swimm3r.cameras import Cameras, project
-from swimm3r.reconstruction import Reconstruction
+from swimm3r.reconstruction import DenseCloud, Reconstruction
 from swimm3r.splat.settings import InitialSettings
 
 
@@ -49,16 +49,14 @@ def rescaled(p: BetaPrimitives, factor: float) -> BetaPrimitives:
 
 
 def initial_primitives(rec: Reconstruction, settings: InitialSettings, rng: torch.Generator) -> BetaPrimitives:
-    """Primitives on the restored cloud, D = 6; on the sparse points, raw colours, where there is no cloud.
+    """Primitives on the restored cloud and its backdrop, D = 6; on the sparse points, raw colours, without a cloud.
 
     Raises ValueError for fewer than 4 points.
     """
-    points, colours = (rec.points.xyz, rec.points.rgb) if rec.cloud is None else (rec.cloud.xyz, rec.cloud.restored)
-    if len(points) < 4:
-        raise ValueError(f"a map starts from at least 4 points, got {len(points)}")
-    chosen = voxel_sample(points.double(), settings.primitives)
-    xyz, rgb = points[chosen].double(), colours[chosen].float()
+    xyz, rgb = _starting_points(rec, settings)
     n = len(xyz)
+    if n < 4:
+        raise ValueError(f"a map starts from at least 4 points, got {n}")
     distances, _ = KDTree(xyz.numpy()).query(xyz.numpy(), k=4)
     spacing = torch.from_numpy(distances[:, 1:]).square().mean(-1).sqrt()
     spacing = spacing.clamp(min=1e-3 * float(spacing.median()))  # doubled points would be points of no size
@@ -78,11 +76,27 @@ def initial_primitives(rec: Reconstruction, settings: InitialSettings, rng: torc
     )
 
 
+def _starting_points(
+    rec: Reconstruction, settings: InitialSettings
+) -> tuple[Float[Tensor, "n 3"], Float[Tensor, "n 3"]]:
+    """Positions, float64, and clear colours."""
+    if rec.cloud is None:
+        chosen = voxel_sample(rec.points.xyz.double(), settings.primitives)
+        return rec.points.xyz[chosen].double(), rec.points.rgb[chosen].float()
+    backdrop = DenseCloud(*(torch.zeros(0, 3),) * 3) if rec.backdrop is None else rec.backdrop
+    behind = voxel_sample(backdrop.xyz.double(), round(settings.backdrop * settings.primitives))
+    measured = voxel_sample(rec.cloud.xyz.double(), settings.primitives - len(behind))
+    xyz = torch.cat([rec.cloud.xyz[measured], backdrop.xyz[behind]]).double()
+    return xyz, torch.cat([rec.cloud.restored[measured], backdrop.restored[behind]]).float()
+
+
 def voxel_sample(points: Float[Tensor, "p 3"], target: int) -> Int[Tensor, " n"]:
     """One point per occupied voxel, the nearest to its voxel's mean; the edge is bisected until about `target` remain.
 
-    All points where there are no more than `target`; within 1 % of it where the points allow.
+    All points where there are no more than `target`, none for 0; within 1 % of it where the points allow.
     """
+    if target == 0:
+        return torch.zeros(0, dtype=torch.int64)
     if len(points) <= target:
         return torch.arange(len(points))
     origin = points.amin(0)

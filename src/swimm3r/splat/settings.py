@@ -31,7 +31,9 @@ class InitialSettings:
     """The primitives and the water that training starts from."""
 
     primitives: int = 400_000
-    """Points of the restored cloud that become primitives, one per voxel."""
+    """Points of the restored cloud and its backdrop that become primitives, one per voxel."""
+    backdrop: float = 0.2
+    """Largest share of them that lies on ground whose depth is a guess; 0 starts on measured points alone."""
     directions: Literal["mean", "uniform"] = "mean"
     """Mean of the conditioned direction: that of the frames which see the point, or drawn from a cube as UBS does,
     which hides 9 of 10 primitives in any one view."""

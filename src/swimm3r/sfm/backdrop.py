@@ -1,0 +1,78 @@
+"""Ground that pictures show and no two of them confirm: a guess at where it is, for a map to start on.
+
+Smooth sand, ground that passes once through a corner, far slopes: plane sweep gives them no depth, so the dense cloud
+has nothing there. Their depth is filled in from the surroundings (`depth_filling`), which is no measurement, so these
+points are kept apart from the cloud. Each piece of ground is taken from the first frame that shows it.
+"""
+
+import torch
+from jaxtyping import Bool
+from torch import Tensor
+
+from swimm3r.cameras import Cameras, directions, project
+from swimm3r.frames import Frames
+from swimm3r.reconstruction import DenseCloud, Reconstruction
+from swimm3r.sfm.restore import RestoredPicture
+
+_CELLS = 48  # cells along the long side of a picture in which ground is looked for
+_POINTS = 2  # along each side of a cell
+_WITNESSES = 200_000  # points of the cloud, at most, that are asked which cells it shows
+_SURFACE = 0.5  # share of open water from which there is no ground
+
+
+class Backdrop:
+    """Gathers the guessed ground of one picture after the other."""
+
+    def __init__(self, rec: Reconstruction, frames: Frames) -> None:
+        assert rec.cloud is not None
+        self.rec, self.frames = rec, frames
+        known = rec.cloud.xyz
+        self._shown = [known[:: max(1, len(known) // _WITNESSES)].double()]
+        self._pieces: list[DenseCloud] = []
+
+    def add(self, i: int, picture: RestoredPicture) -> None:
+        """The ground in frame i of the reconstruction that neither the cloud nor an earlier frame shows."""
+        camera, name = self.rec.cameras[i], self.rec.names[i]
+        f = self.frames.index(name)
+        guessed = (self.rec.depth[name].z_depth == 0) & (picture.sea < _SURFACE) & self.frames.mask(f)
+        edge = max(camera.width, camera.height) / _CELLS
+        row, column = _lattice(camera, edge / _POINTS)
+        take = guessed[row, column]
+        shown = _shown_cells(camera, torch.cat(self._shown), edge)
+        take &= ~shown[(row / edge).long(), (column / edge).long()]
+        row, column = row[take], column[take]
+        if not len(row):
+            return
+        pixel = torch.stack([column, row], -1).double() + 0.5
+        ray = torch.nn.functional.normalize(directions(camera, pixel[None])[0], dim=-1)
+        in_camera = ray * picture.ray_depth[row, column, None].double()
+        xyz = in_camera @ camera.cam2world[0, :3, :3].mT + camera.cam2world[0, :3, 3]
+        usable = xyz.isfinite().all(-1) & (in_camera[:, 2] > 0)
+        raw = self.frames.image(f)[row, column]
+        self._pieces.append(DenseCloud(xyz[usable].float(), raw[usable], picture.clear[row, column][usable]))
+        self._shown.append(xyz[usable])
+
+    def points(self) -> DenseCloud:
+        """All of it."""
+        none = torch.zeros(0, 3)
+        pieces = [vars(piece) for piece in self._pieces] or [{"xyz": none, "raw": none, "restored": none}]
+        return DenseCloud(*(torch.cat([piece[key] for piece in pieces]) for key in ("xyz", "raw", "restored")))
+
+
+def _lattice(camera: Cameras, step: float) -> tuple[Tensor, Tensor]:
+    """Rows and columns of pixels about `step` apart, row by row."""
+    rows = torch.arange(step / 2, camera.height, step).long()
+    columns = torch.arange(step / 2, camera.width, step).long()
+    row, column = torch.meshgrid(rows, columns, indexing="ij")
+    return row.flatten(), column.flatten()
+
+
+def _shown_cells(camera: Cameras, xyz: Tensor, edge: float) -> Bool[Tensor, "rows columns"]:
+    """Which square cells of a picture some point falls into."""
+    pixels, z = project(camera, xyz[None])
+    size = torch.tensor([camera.width, camera.height])
+    inside = (z[0] > 0) & (pixels[0] > 0).all(-1) & (pixels[0] < size).all(-1)
+    column, row = (pixels[0][inside] / edge).long().unbind(-1)
+    cells = torch.zeros(int(camera.height / edge) + 1, int(camera.width / edge) + 1, dtype=torch.bool)
+    cells[row, column] = True
+    return cells
