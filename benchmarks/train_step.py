@@ -93,7 +93,8 @@ def measure(size: Size, repeats: int) -> dict[str, float]:
     cotangent = [torch.randn(t.shape, generator=rng) / t.numel() for t in images]
     on_plane = [torch.randn(t.shape, generator=rng) for t in plane]
     on_maps = [torch.randn(t.shape, generator=rng) for t in maps]
-    drawing = Drawing(type(images)(*drawn), seen, grid_of(field, sight, settings.medium.stride))
+    grid = grid_of(field, sight, settings.medium.stride)
+    drawing = Drawing(type(images)(*drawn), seen, grid, MediumMaps(*maps), None)
 
     def raster() -> None:
         out = rasterize(type(seen.primitives)(*plane), MediumMaps(*maps), height, width)
@@ -108,7 +109,7 @@ def measure(size: Size, repeats: int) -> dict[str, float]:
         torch.autograd.grad(out, list(field.network.parameters()), on_maps)
 
     def losses() -> None:
-        loss, _ = uwbs.objective(leaves, drawing, view, settings, None, True)
+        loss = uwbs.objective(leaves, drawing, view, settings, None, True).total
         torch.autograd.grad(loss, [*drawn, leaves.opacity, leaves.scale], allow_unused=True)
 
     parameters = uwbs._parameters(BetaPrimitives(*(t.clone() for t in p)), field)

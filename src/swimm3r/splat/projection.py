@@ -121,9 +121,35 @@ def project(
     p: BetaPrimitives, view: Pinhole, settings: RenderSettings, time: Float[Tensor, ""] | None = None
 ) -> Projection:
     """Primitives conditioned on a camera and projected into it; differentiable in both."""
-    on_cpu = not p.xyz.is_cuda and p.xyz.dtype == torch.float32
-    if on_cpu and settings.rotation == "first_order":
+    if _has_fast_form(p, settings):
         from swimm3r.splat import projection_cpu
 
         return projection_cpu.project(p, view, settings, time)
     return project_plainly(p, view, settings, time)
+
+
+def centre_gradients(
+    p: BetaPrimitives,
+    view: Pinhole,
+    settings: RenderSettings,
+    on_plane: Float[Tensor, "n k 3"],
+    time: Float[Tensor, ""] | None = None,
+) -> Float[Tensor, "n k 3"]:
+    """Gradients of xyz for k gradients of (mean2d, depth): the projection's adjoint for these alone.
+
+    The direction that primitives are conditioned on follows xyz, as in `project`.
+    """
+    if _has_fast_form(p, settings):
+        from swimm3r.splat import projection_cpu
+
+        return projection_cpu.centre_gradients(p, view, settings, on_plane, time)
+    with torch.enable_grad():
+        xyz = p.xyz.detach().requires_grad_()
+        seen = project_plainly(p._replace(xyz=xyz), view, settings, time).primitives
+        centre = torch.cat([seen.mean2d, seen.depth[:, None]], -1)
+        parts = [torch.autograd.grad(centre, xyz, v, retain_graph=True)[0] for v in on_plane.unbind(1)]
+    return torch.stack(parts, 1)
+
+
+def _has_fast_form(p: BetaPrimitives, settings: RenderSettings) -> bool:
+    return not p.xyz.is_cuda and p.xyz.dtype == torch.float32 and settings.rotation == "first_order"

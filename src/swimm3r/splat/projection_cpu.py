@@ -26,15 +26,18 @@ from swimm3r.splat.conditioning_cpu import (
     D_L22,
     D_MEAN,
     D_S,
+    D_WX,
     D_X,
     DIRECTION,
     DISTANCE,
+    L11,
     MATRICES,
     MEAN,
     OC,
     SLOPE,
     B,
     O,
+    W,
     condition,
     conditioning_gradients,
     load,
@@ -139,6 +142,16 @@ def plane_gradients(g, ids, start, count, camera, three, two, d_mean2d, d_conic,
 
 
 @no_type_check
+@numba_math.inlined
+def along_view(g, q, three):
+    """The part of D_X along lane q's view direction, which a unit vector does not follow."""
+    along = ZERO
+    for k in range(three):
+        along += g[D_X, k, 0, q] * g[DIRECTION, k, 0, q]
+    return along
+
+
+@no_type_check
 @kernel
 def run_blocks(
     first, beyond, g, ids, back, xyz, query_mean, opacity, beta, scale, lower, camera, time,
@@ -181,10 +194,7 @@ def run_blocks(
             for q in range(count):
                 pose[9 + i] += g[D_AT, i, 0, q]
         for q in range(count):
-            i = ids[start + q]
-            along = ZERO
-            for k in range(three):
-                along += g[D_X, k, 0, q] * g[DIRECTION, k, 0, q]
+            i, along = ids[start + q], along_view(g, q, three)
             for k in range(three):
                 across = (g[D_X, k, 0, q] - along * g[DIRECTION, k, 0, q]) / g[DISTANCE, 0, 0, q]
                 d_xyz[i, k] = g[D_MEAN, k, 0, q] + across
@@ -207,15 +217,47 @@ def run_blocks(
                 entry += 3 + r
 
 
+@no_type_check
+@kernel
+def centre_blocks(
+    first, beyond, g, ids, on_plane, xyz, query_mean, opacity, beta, scale, lower, camera, time, d_xyz, sources=SOURCES
+):  # fmt: skip
+    """Blocks of `ids`: d_xyz [n, k, 3] of what on_plane [n, k, 3] says about centres and depths, k times over."""
+    three, c, two = xyz.shape[1], query_mean.shape[1], on_plane.shape[2] - 1
+    fx, fy = camera[FX], camera[FY]
+    for block in range(first, beyond):
+        start = block * LANES
+        count = min(LANES, len(ids) - start)
+        load(g, ids, start, count, xyz, query_mean, opacity, beta, scale, lower, camera, time)
+        condition(g, three, c)
+        onto_plane(g, camera, three, two)
+        for k in range(on_plane.shape[1]):
+            zero(g, D_AT, three, 1)
+            for q in range(count):
+                i = ids[start + q]
+                x, y, z = g[AT, 0, 0, q], g[AT, 1, 0, q], g[AT, 2, 0, q]
+                if z <= camera[NEAR]:
+                    continue
+                u, v = on_plane[i, k, 0], on_plane[i, k, 1]
+                g[D_AT, 0, 0, q], g[D_AT, 1, 0, q] = fx / z * u, fy / z * v
+                g[D_AT, 2, 0, q] = on_plane[i, k, 2] - (fx * x * u + fy * y * v) / (z * z)
+            product_at(g, D_MEAN, RV, D_AT, three, three, 1, ONE, SET)
+            product_at(g, D_WX, L11, D_MEAN, three, three, 1, ONE, SET)
+            product_at(g, D_X, W, D_WX, c, three, 1, ONE, SET)
+            for q in range(count):
+                i, along = ids[start + q], along_view(g, q, three)
+                for j in range(three):
+                    across = (g[D_X, j, 0, q] - along * g[DIRECTION, j, 0, q]) / g[DISTANCE, 0, 0, q]
+                    d_xyz[i, k, j] = g[D_MEAN, j, 0, q] + across
+
+
 class _Project(torch.autograd.Function):
     """Saves its inputs only; the block is computed again on the way back, which costs less than its memory."""
 
     @staticmethod
     def forward(ctx: Any, view: Pinhole, settings: RenderSettings, time: float, *tensors: Tensor) -> tuple[Tensor, ...]:
-        *stored, R, t, centre = (tensor.detach().contiguous() for tensor in tensors)
-        pose = np.concatenate([R.numpy().ravel(), t.numpy(), centre.numpy()])
-        rest = (view.fx, view.fy, view.cx, view.cy, *ray_limits(view), settings.near, settings.covariance == "upper")
-        camera = np.concatenate([pose, np.array(rest)]).astype(np.float32)
+        stored = [tensor.detach().contiguous() for tensor in tensors[:-3]]
+        camera = _camera(view, settings)
         n = len(stored[0])
         out = tuple(torch.empty(shape) for shape in ((n, 2), (n, 3), (n,), (n,), (n,), (n,)))
         nothing = [torch.empty(0, *values.shape[1:]) for values in stored]
@@ -237,6 +279,13 @@ class _Project(torch.autograd.Function):
         _run(ids, True, ctx.saved_tensors, ctx.camera, ctx.time, [*d, radius], [*results, d_pose])
         pose = d_pose.double().sum(0).float()
         return None, None, None, *results, pose[:9].reshape(3, 3), pose[9:12], pose[12:]
+
+
+def _camera(view: Pinhole, settings: RenderSettings) -> np.ndarray:
+    """The camera as the kernels read it."""
+    pose = np.concatenate([t.detach().numpy().ravel() for t in (view.R, view.t, view.centre)])
+    rest = (view.fx, view.fy, view.cx, view.cy, *ray_limits(view), settings.near, settings.covariance == "upper")
+    return np.concatenate([pose, np.array(rest)]).astype(np.float32)
 
 
 def _run(ids: np.ndarray, back: bool, stored: Any, camera: np.ndarray, time: float, plane: Any, gradients: Any) -> None:
@@ -261,3 +310,25 @@ def project(
     )
     mean2d, conic, opacity, exponent, depth = plane
     return Projection(Primitives2D(mean2d, conic, p.rgb, opacity, exponent, depth), radius)
+
+
+def centre_gradients(
+    p: BetaPrimitives,
+    view: Pinhole,
+    settings: RenderSettings,
+    on_plane: Float[Tensor, "n k 3"],
+    time: Float[Tensor, ""] | None = None,
+) -> Float[Tensor, "n k 3"]:
+    """`projection.centre_gradients` for float32 on the CPU."""
+    ids = on_plane.flatten(1).any(-1).nonzero()[:, 0].numpy()
+    d_xyz = torch.zeros(*on_plane.shape[:2], 3)
+    stored = (p.xyz, p.query_mean, p.opacity, p.beta, p.scale, p.lower)
+    arrays: Any = (ids, *(t.detach().contiguous().numpy() for t in (on_plane, *stored)), _camera(view, settings))
+    rest: Any = (np.float32(0.0 if time is None else float(time)), d_xyz.numpy())
+
+    def work(first: int, beyond: int) -> None:
+        workspace = np.zeros((OUTER + 1, 4, 4, LANES), np.float32)
+        centre_blocks(first, beyond, workspace, *arrays, *rest)
+
+    spread(work, -(-len(ids) // LANES), at_least=8)
+    return d_xyz

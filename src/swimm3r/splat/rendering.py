@@ -8,7 +8,7 @@ from torch import Tensor
 
 from swimm3r.cameras import Cameras
 from swimm3r.medium import Medium
-from swimm3r.raster import RasterOutput, rasterize
+from swimm3r.raster import MediumMaps, RasterOutput, SggBuffers, rasterize
 from swimm3r.splat.medium_field import FieldGrid, MediumField, grid_of, medium_at_pixels, per_z_depth
 from swimm3r.splat.primitives import BetaPrimitives
 from swimm3r.splat.projection import Pinhole, Projection, pinhole, project
@@ -53,20 +53,24 @@ class Drawing:
     images: RasterOutput
     projection: Projection
     grid: FieldGrid
+    maps: MediumMaps  # as the rasteriser reads them, per unit of z depth
+    sgg: SggBuffers | None  # filled when the gradient is taken
 
 
-def draw(p: BetaPrimitives, field: MediumField, view: Pinhole, settings: UwbsSettings) -> Drawing:
+def draw(p: BetaPrimitives, field: MediumField, view: Pinhole, settings: UwbsSettings, sgg: bool = False) -> Drawing:
     """Project, evaluate the water and rasterise; differentiable in everything, the pose included."""
     projection = project(p, view, settings.render)
     grid = grid_of(field, view, settings.medium.stride)
     maps = medium_at_pixels(grid, view.height, view.width)
     if settings.render.depth == "ray":
         maps = per_z_depth(maps, view)
+    buffers = SggBuffers.zeros(len(p.xyz), p.xyz.device) if sgg else None
     images = rasterize(
         projection.primitives, maps, view.height, view.width,
         alpha_min=settings.render.alpha_min, medium_depth_grad=settings.render.medium_depth_grad == "full",
+        sgg=buffers,
     )  # fmt: skip
-    return Drawing(images, projection, grid)
+    return Drawing(images, projection, grid, maps, buffers)
 
 
 def expected_z_depth(images: RasterOutput) -> Float[Tensor, "h w"]:

@@ -123,6 +123,25 @@ class DensifySettings:
 
 
 @dataclass(frozen=True)
+class SggSettings:
+    """Scattering-aware geometric gradients (Alg. 1); names the readings of what the paper leaves open."""
+
+    enabled: bool = True
+    end: float = 0.5  # tau_c, 10,000 of 20,000
+    residual: float = 0.15
+    """eta: share of the exact gradient that an uncertain centre keeps."""
+    split: Literal["clear", "direct"] = "clear"
+    """What counts as geometry: the light without water, or the light that arrives, attenuated ("direct")."""
+    depth: Literal["geometry", "apart"] = "geometry"
+    """Whether the depth loss's gradient is filtered with the geometry's, or added to it as it is."""
+    isolated: Literal["branch", "exact"] = "branch"
+    """The depth loss's own gradient: from the adjoint's depth branch, which takes alpha as given, or by a second
+    backward pass."""
+    largest_step: float = 2.0
+    """c_max: bound of the multiplier of Adam's step."""
+
+
+@dataclass(frozen=True)
 class UwbsSettings:
     """Underwater Beta Splatting, static."""
 
@@ -137,6 +156,7 @@ class UwbsSettings:
     rates: LearningRates = field(default_factory=LearningRates)
     weights: LossWeights = field(default_factory=LossWeights)
     densify: DensifySettings = field(default_factory=DensifySettings)
+    sgg: SggSettings = field(default_factory=SggSettings)
     seed: int = 0
     log_every: float = 0.005
     checkpoint_every: float = 0.1

@@ -13,6 +13,7 @@ from dataclasses import asdict, dataclass
 from pathlib import Path
 
 import torch
+from jaxtyping import Float, Int
 from torch import Tensor
 
 from swimm3r.frames import Frames
@@ -20,6 +21,7 @@ from swimm3r.medium import Medium
 from swimm3r.progress import Progress, silent
 from swimm3r.reconstruction import Reconstruction
 from swimm3r.splat import checkpoint, densify, losses, training
+from swimm3r.splat.gradients import differentiate
 from swimm3r.splat.medium_field import MediumField, WaterPrior, deviation, initial_field, smoothness, water_prior
 from swimm3r.splat.optimiser import Moments, adam_step, fresh, log_linear
 from swimm3r.splat.primitives import BetaPrimitives, initial_primitives, rescaled
@@ -36,6 +38,16 @@ class State:
     primitives: BetaPrimitives
     field: MediumField
     moments: dict[str, Moments]  # of "xyz" ... and of the field's parameters by "field.*"
+
+
+@dataclass(frozen=True)
+class _Round:
+    """A round of densification in the middle of a step."""
+
+    state: State
+    gradients: dict[str, Tensor]
+    stale: Int[Tensor, " m"]  # rows that are not what the gradient was taken of
+    counts: dict[str, float]
 
 
 @dataclass(frozen=True)
@@ -65,18 +77,35 @@ class Uwbs:
         settings, share = self.settings, step / self.settings.iterations
         parameters = _parameters(state.primitives, state.field)
         p = BetaPrimitives(*(values.detach().requires_grad_() for values in state.primitives))
-        drawing = draw(p, state.field, pinhole(view.camera), settings)
-        loss, numbers = objective(p, drawing, view, settings, self.prior, self._regularised(share))
+        sight, filtered = pinhole(view.camera), settings.sgg.enabled and share <= settings.sgg.end
+        drawing = draw(p, state.field, sight, settings, sgg=filtered)
+        loss = objective(p, drawing, view, settings, self.prior, self._regularised(share))
+        numbers = loss.numbers | {"primitives": float(len(p.xyz))}
         leaves = [*p, *state.field.network.parameters()]
-        gradients = dict(zip(parameters, torch.autograd.grad(loss, leaves, materialize_grads=True), strict=True))
-        numbers |= {"primitives": float(len(p.xyz))}
+        multiplier = None
+        if filtered:
+            sgg = differentiate(loss.total, loss.depth, leaves, p, drawing, sight, settings)
+            gradients = dict(zip(parameters, sgg.gradients, strict=True))
+            gradients["xyz"] = gradients["xyz"] + sgg.xyz
+            multiplier = sgg.multiplier
+            numbers |= {"medium_uncertainty": float(sgg.uncertainty[sgg.uncertainty > 0].mean().nan_to_num())}
+        else:
+            found = torch.autograd.grad(loss.total, leaves, materialize_grads=True)
+            gradients = dict(zip(parameters, found, strict=True))
         rates = self._rates(step)
         if self._densifies(step):
-            state, gradients, counts = self._densified(state, gradients, step, rates["xyz"])
-            numbers |= counts
+            round_ = self._densified(state, gradients, step, rates["xyz"])
+            state, gradients = round_.state, round_.gradients
+            numbers |= round_.counts
+            if multiplier is not None:
+                multiplier = _extended(multiplier, len(state.primitives.xyz) - len(multiplier))
+                multiplier[round_.stale] = 1
         _clip_field(gradients)
         with torch.no_grad():
+            before = state.primitives.xyz.clone()
             adam_step(_parameters(state.primitives, state.field), gradients, state.moments, rates)
+            if multiplier is not None:
+                state.primitives.xyz.sub_(before).mul_(multiplier[:, None]).add_(before)
         return state, numbers
 
     def stored(self, state: State) -> dict[str, Tensor]:
@@ -116,9 +145,7 @@ class Uwbs:
             medium = 0.0
         return rates | {name: medium for name in _FIELD_NAMES}
 
-    def _densified(
-        self, state: State, gradients: dict[str, Tensor], step: int, rate: float
-    ) -> tuple[State, dict[str, Tensor], dict[str, float]]:
+    def _densified(self, state: State, gradients: dict[str, Tensor], step: int, rate: float) -> _Round:
         """Relocation and growth, then noise; rows that start anew get no gradient of this step."""
         d = self.settings.densify
         n = len(state.primitives.xyz)
@@ -142,7 +169,16 @@ class Uwbs:
                 gradient[stale] = 0
                 moments[name], gradients[name] = Moments(first, second, m.steps), gradient
         counts = {"relocated": float(done.relocated), "added": float(done.added)}
-        return State(p, state.field, moments), gradients, counts
+        return _Round(State(p, state.field, moments), gradients, stale, counts)
+
+
+@dataclass(frozen=True)
+class Objective:
+    """Eq. uwbs_total for one view."""
+
+    total: Float[Tensor, ""]
+    depth: Float[Tensor, ""]  # the depth regulariser as it stands in the total
+    numbers: dict[str, float]  # the terms unweighted, for the record
 
 
 def objective(
@@ -152,16 +188,17 @@ def objective(
     settings: UwbsSettings,
     prior: WaterPrior | None,
     regularised: bool,
-) -> tuple[Tensor, dict[str, float]]:
-    """Eq. uwbs_total, and its terms unweighted. Opacity and scale count only while `regularised`."""
+) -> Objective:
+    """Eq. uwbs_total. Opacity and scale count only while `regularised`."""
     w = settings.weights
     photo = losses.photometric(drawing.images.rgb, view.rgb, view.seen, w.ssim)
-    depth = losses.depth_error(drawing.images, view.z_depth, view.depth_weight, w.depth_alpha)
+    depth_error = losses.depth_error(drawing.images, view.z_depth, view.depth_weight, w.depth_alpha)
     smooth = smoothness(drawing.grid)
     open_share = losses.uncovered(drawing.images, view.depth_weight)
     large = losses.oversize(p, drawing.projection.radius, w.max_radius * view.camera.width / 1280)
-    total = photo.loss + w.depth * depth + w.coverage * open_share + w.medium_smoothness * smooth + w.radius * large
-    numbers = {"l1": photo.l1, "ssim": photo.ssim, "depth": depth, "uncovered": open_share}
+    depth = w.depth * depth_error
+    total = photo.loss + depth + w.coverage * open_share + w.medium_smoothness * smooth + w.radius * large
+    numbers = {"l1": photo.l1, "ssim": photo.ssim, "depth": depth_error, "uncovered": open_share}
     numbers |= {"medium_smoothness": smooth, "radius": large}
     if prior is not None:
         off = deviation(drawing.grid, prior)
@@ -171,7 +208,8 @@ def objective(
         opacity, scale = losses.mean_opacity(p), losses.mean_scale(p, w.ubs_scale_reg_bug)
         total = total + w.opacity * opacity + w.scale * scale
         numbers |= {"opacity": opacity, "scale": scale}
-    return total, {"loss": float(total.detach())} | {k: float(torch.as_tensor(v).detach()) for k, v in numbers.items()}
+    numbers = {"loss": total} | numbers
+    return Objective(total, depth, {k: float(torch.as_tensor(v).detach()) for k, v in numbers.items()})
 
 
 def train(
