@@ -19,7 +19,7 @@ from swimm3r.errors import InputError, StorageError
 from swimm3r.evaluate.poses import absolute_pose_errors
 from swimm3r.io.video import Video
 from swimm3r.prepare import load_frames
-from swimm3r.presets import PRESETS
+from swimm3r.presets import MAST3R_PRESETS, PRESETS, RunSettings, from_yaml, to_yaml
 from swimm3r.renders import KINDS, render_run
 from swimm3r.run import evaluate_run, run_pipeline
 from swimm3r.sfm.settings import ColmapModelSettings
@@ -125,11 +125,28 @@ def test_a_finished_run_is_scored_and_rendered_again(finished: tuple[Path, dict]
     folder, summary = finished
     copy = tmp_path / "run"
     shutil.copytree(folder, copy)
-    again = evaluate_run(copy, TINY_MAP)
+    again = evaluate_run(copy)
     assert again["test"] == summary["test"]
     assert again["truth"]["splat"]["clear_psnr"] == pytest.approx(summary["truth"]["splat"]["clear_psnr"], abs=1e-3)
     pictures = render_run(copy, long_side=80)
     assert len(list(pictures.rglob("*_rgb.png"))) == summary["sfm"]["registered"]
+
+
+def test_settings_come_back_from_their_file(tmp_path: Path):
+    for settings in (
+        *PRESETS.values(),
+        RunSettings(sfm=MAST3R_PRESETS["fast"]),
+        RunSettings(sfm=ColmapModelSettings(tmp_path)),
+    ):
+        (tmp_path / "settings.yaml").write_text(to_yaml(settings))
+        assert from_yaml(tmp_path / "settings.yaml") == settings
+
+
+@pytest.mark.parametrize("text", ["", "frames: {fps: 5}\nwarp: 9\n", "sfm: {kind: Sonar}\n", "[1, 2"])
+def test_a_settings_file_of_another_version_is_named(tmp_path: Path, text: str):
+    (tmp_path / "settings.yaml").write_text(text)
+    with pytest.raises(InputError, match="does not hold the settings of a run"):
+        from_yaml(tmp_path / "settings.yaml")
 
 
 def test_a_map_is_trained_on_any_colmap_model(dive: Path, finished: tuple[Path, dict], tmp_path: Path):
@@ -140,6 +157,8 @@ def test_a_map_is_trained_on_any_colmap_model(dive: Path, finished: tuple[Path, 
     assert summary["sfm"]["epipolar_px"] < 1  # of the sightings of common points
     assert "from 2D-3D matches" in summary["test"]["protocol"]  # the model has no test frame
     assert summary["test"]["psnr"] > 20
+    scored_again = evaluate_run(tmp_path / "run")
+    assert scored_again["test"] == summary["test"]
 
 
 def test_a_number_that_was_not_computed_is_null_with_its_reason(finished: tuple[Path, dict]):

@@ -1,7 +1,11 @@
-"""The settings of a whole run, and the three starting points users choose from; torch-free."""
+"""The settings of a whole run, their file, and the three starting points users choose from; torch-free."""
 
 from dataclasses import dataclass, field
+from functools import cache
+from pathlib import Path
+from typing import TYPE_CHECKING
 
+from swimm3r.errors import InputError
 from swimm3r.frame_settings import FrameSettings
 from swimm3r.sfm.mast3r.settings import AlignmentSettings
 from swimm3r.sfm.settings import (
@@ -21,6 +25,9 @@ from swimm3r.splat.settings import (
     UwbsSettings,
 )
 
+if TYPE_CHECKING:
+    from cattrs import Converter
+
 LAPTOP = UwbsSettings(  # the paper's settings are made for a GPU
     iterations=5000,
     long_side=640,
@@ -37,6 +44,39 @@ class RunSettings:
     sfm: SfmSettings = field(default_factory=ColmapSettings)
     splat: SplatSettings = field(default=LAPTOP)
     test: PoseRefinementSettings = field(default_factory=PoseRefinementSettings)
+
+
+def to_yaml(settings: RunSettings) -> str:
+    """Every setting by name; the back end is named by `kind`."""
+    import yaml
+
+    return yaml.safe_dump(_converter().unstructure(settings), sort_keys=False)
+
+
+def from_yaml(path: Path) -> RunSettings:
+    """The settings that `to_yaml` wrote to a file. Raises InputError."""
+    import yaml
+
+    try:
+        return _converter().structure(yaml.safe_load(path.read_text(encoding="utf-8")), RunSettings)
+    except Exception as error:  # whatever a file of another version or another hand may cause, one by one unforeseeable
+        raise InputError(
+            f"{path} does not hold the settings of a run ({type(error).__name__})",
+            cause="it was edited, or written by another version of swimm3r",
+            hint="the same swimm3r run command again, which writes it anew",
+        ) from error
+
+
+@cache
+def _converter() -> "Converter":
+    from cattrs import Converter
+    from cattrs.strategies import configure_tagged_union
+
+    converter = Converter(forbid_extra_keys=True)
+    converter.register_unstructure_hook(Path, str)
+    converter.register_structure_hook(Path, lambda value, _: Path(value))
+    configure_tagged_union(SfmSettings, converter, tag_name="kind")
+    return converter
 
 
 PRESETS: dict[str, RunSettings] = {

@@ -10,12 +10,10 @@ import shutil
 import sys
 import time
 from collections.abc import Callable
-from dataclasses import asdict, dataclass
+from dataclasses import asdict, dataclass, replace
 from hashlib import sha256
 from importlib.metadata import version
 from pathlib import Path
-
-import yaml
 
 from swimm3r import held_out, reconstruction
 from swimm3r import summary as sections
@@ -26,7 +24,7 @@ from swimm3r.ground_truth import GroundTruth, read_ground_truth
 from swimm3r.io.atomic import write_text
 from swimm3r.io.foreign.model import read_foreign
 from swimm3r.prepare import check_source, load_frames, read_frames
-from swimm3r.presets import RunSettings
+from swimm3r.presets import RunSettings, from_yaml, to_yaml
 from swimm3r.progress import Progress, silent
 from swimm3r.reconstruction import Reconstruction
 from swimm3r.renders import write_flythrough
@@ -65,7 +63,7 @@ def run_pipeline(
     fingerprint = _fingerprint(source, folder)
     is_new = not folder.exists()
     record = _Record(folder, source, fingerprint)
-    write_text(folder / "settings.yaml", yaml.safe_dump(_plain(asdict(settings)), sort_keys=False))
+    write_text(folder / "settings.yaml", to_yaml(settings))
     write_text(folder / "versions.json", json.dumps(_versions(), indent=2) + "\n")
     truth = _truth(source, reference)
 
@@ -136,22 +134,24 @@ class _Run:
 
 def evaluate_run(
     folder: Path,
-    settings: RunSettings | None = None,
     *,
+    steps: int | None = None,
     reference: Path | None = None,
     progress: Progress = silent,
 ) -> dict:
     """Score a finished run again, its test frames' poses found anew, and return the summary.
 
-    Only `settings.test` and the features of `settings.sfm` are used. Raises InputError where the run has no map yet.
+    `steps` of pose refinement take the place of the run's own. Raises InputError where the run has no map yet.
     """
-    settings = settings or RunSettings()
     if not (folder / "splat" / "map.safetensors").is_file() or not (folder / "summary.json").is_file():
         raise InputError(
             f"{folder} holds no finished map",
             cause="it is another folder, or the run was interrupted, or stopped after structure from motion",
             hint="swimm3r run INPUT --out RUN, which goes on where it stopped",
         )
+    settings = from_yaml(folder / "settings.yaml")
+    if steps is not None:
+        settings = replace(settings, test=replace(settings.test, steps=steps))
     before = json.loads((folder / "summary.json").read_text(encoding="utf-8"))
     source = Path(before["input"]["path"])
     record = _Record(folder, source, before["input"]["fingerprint"])
@@ -315,21 +315,8 @@ def _fingerprint(source: Path, folder: Path) -> str:
 
 
 def _key(stage: str, before: str, settings: dict) -> str:
-    text = json.dumps([stage, before, _plain(settings)], sort_keys=True)
+    text = json.dumps([stage, before, settings], sort_keys=True, default=str)  # paths are all that JSON does not know
     return sha256(text.encode()).hexdigest()[:16]
-
-
-def _plain(value: object) -> object:
-    """Settings as JSON and YAML know them."""
-    match value:
-        case dict():
-            return {key: _plain(item) for key, item in value.items()}
-        case list() | tuple():
-            return [_plain(item) for item in value]
-        case Path():
-            return str(value)
-        case _:
-            return value
 
 
 def _versions() -> dict[str, str]:

@@ -5,25 +5,23 @@ from pathlib import Path
 from tyro.conf import Positional
 
 from swimm3r.cli.console import drawn_progress, print_summary
-from swimm3r.presets import RunSettings
-from swimm3r.splat.settings import PoseRefinementSettings
 
 
 def evaluate(
     run: Positional[Path],
     /,
     reference: Path | None = None,
-    test: PoseRefinementSettings = PoseRefinementSettings(),  # noqa: B008
+    steps: int | None = None,
 ) -> None:
     """Score a run's map on its test frames again, and write its report.
 
     Args:
         run: the run folder.
         reference: a cameras.json with poses to compare with.
-        test: how the test frames' poses are refined.
+        steps: of refinement for each test frame's pose; as in the run where not given.
     """
     from swimm3r.run import evaluate_run
 
     with drawn_progress() as progress:
-        summary = evaluate_run(run, RunSettings(test=test), reference=reference, progress=progress)
+        summary = evaluate_run(run, steps=steps, reference=reference, progress=progress)
     print_summary(summary, run)
