@@ -84,7 +84,7 @@ PRESETS: dict[str, RunSettings] = {
         frames=FrameSettings(long_side=960),
         sfm=ColmapSettings(depth=PlaneSweepSettings(long_side=480, sources=4)),
         splat=UwbsSettings(
-            iterations=1500,
+            iterations=2000,
             long_side=480,
             initial=InitialSettings(primitives=25_000),
             densify=DensifySettings(max_primitives=50_000),
