@@ -30,7 +30,7 @@ from swimm3r.reconstruction import Reconstruction
 from swimm3r.renders import write_flythrough
 from swimm3r.report import write_report
 from swimm3r.sfm import reconstruct
-from swimm3r.sfm.importers import model_cameras
+from swimm3r.sfm.model_frames import model_cameras
 from swimm3r.sfm.settings import ColmapModelSettings
 from swimm3r.splat import train
 from swimm3r.splat.checkpoint import load_map

@@ -4,11 +4,13 @@ from dataclasses import fields, replace
 from pathlib import Path
 
 import numpy as np
+import pycolmap
 import pytest
 
 from swimm3r.errors import InputError
 from swimm3r.io import colmap
 from swimm3r.io.colmap import ColmapModel
+from swimm3r.io.colmap_files import damaged_file
 
 
 def _model(lens: str = "OPENCV", cameras: int = 4, points: int = 30, seed: int = 0) -> ColmapModel:
@@ -94,12 +96,28 @@ def test_a_folder_without_a_model_is_an_input_error(tmp_path: Path) -> None:
         colmap.read_model(tmp_path)
 
 
-def test_a_truncated_model_is_an_input_error(tmp_path: Path) -> None:
+@pytest.mark.parametrize("name", ["cameras.bin", "images.bin", "points3D.bin", "rigs.bin", "frames.bin"])
+@pytest.mark.parametrize("left", [0, 1, 9, -1])
+def test_a_truncated_model_is_an_input_error(tmp_path: Path, name: str, left: int) -> None:
     colmap.write_model(tmp_path / "sparse", _model())
-    images = tmp_path / "sparse" / "images.bin"
-    images.write_bytes(images.read_bytes()[:100])
-    with pytest.raises(InputError, match="not a readable COLMAP model"):
+    file = tmp_path / "sparse" / name
+    file.write_bytes(file.read_bytes()[:left])
+    with pytest.raises(InputError, match=f"not a readable COLMAP model \\({name} is not whole") as caught:
         colmap.read_model(tmp_path / "sparse")
+    assert caught.value.exit_code == 3
+
+
+def test_a_model_with_a_rig_of_two_cameras_is_whole(tmp_path: Path) -> None:
+    rig, lens = pycolmap.Rig(rig_id=1), pycolmap.SensorType.CAMERA
+    rig.add_ref_sensor(pycolmap.sensor_t(lens, 1))
+    rig.add_sensor(pycolmap.sensor_t(lens, 2), pycolmap.Rigid3d())
+    model = pycolmap.Reconstruction()
+    for camera_id in (1, 2):
+        camera = pycolmap.Camera(model="PINHOLE", width=64, height=48, params=[50, 50, 32, 24], camera_id=camera_id)
+        model.add_camera(camera)
+    model.add_rig(rig)
+    model.write_binary(str(tmp_path))
+    assert damaged_file(tmp_path) is None
 
 
 def test_names_that_leave_the_folder_are_refused(tmp_path: Path) -> None:

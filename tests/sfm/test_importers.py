@@ -10,10 +10,16 @@ import torch
 from swimm3r import reconstruction
 from swimm3r.cameras import project
 from swimm3r.errors import InputError
+from swimm3r.frames import Frame, Frames
+from swimm3r.io import images
+from swimm3r.io.cameras_json import CameraTable, write_cameras
 from swimm3r.io.colmap import ColmapModel
-from swimm3r.io.foreign.model import ForeignDepth, ForeignModel
+from swimm3r.io.foreign.model import ForeignDepth, ForeignModel, read_foreign
 from swimm3r.reconstruction import Tracks
 from swimm3r.sfm import importers
+from swimm3r.sfm.settings import ColmapModelSettings, FeatureSettings
+from swimm3r.sfm.triangulation import triangulate
+from swimm3r.synthetic import Coefficients, DiveSettings, make_dive
 
 
 @pytest.fixture
@@ -93,7 +99,6 @@ def test_depth_that_comes_with_the_file_is_put_on_the_frames_grid(dive, model: C
     foreign = ForeignModel("VGGT", replace(model, track_point=model.track_point[:0], track_frame=model.track_frame[:0],
                                            track_xy=model.track_xy[:0]), depth=dense)  # fmt: skip
     rec = importers.from_foreign(dive.frames, foreign, tmp_path)
-    assert rec.cautions == ()
     importers.write_depth(rec, dive.frames, foreign)
     for k, name in enumerate(rec.names):
         found = rec.depth[name]
@@ -104,16 +109,59 @@ def test_depth_that_comes_with_the_file_is_put_on_the_frames_grid(dive, model: C
     assert not (rec.depth[rec.names[0]].z_depth[:, :16] > 0).any()
 
 
-def test_poses_alone_come_with_a_caution_and_their_cloud(dive, model: ColmapModel, tmp_path: Path):
-    bare = replace(
-        model, track_point=model.track_point[:0], track_frame=model.track_frame[:0], track_xy=model.track_xy[:0]
-    )
-    rec = importers.from_foreign(dive.frames, ForeignModel("nerfstudio", bare), tmp_path)
-    assert "no sightings of points" in rec.cautions[0].what
-    assert len(rec.points.xyz) == 30
-    assert len(rec.matches.i) == 0
-    reconstruction.save(rec, tmp_path)
-    assert len(reconstruction.load(tmp_path).points.xyz) == 30
+@pytest.fixture
+def posed_dive(tmp_path: Path) -> tuple[Frames, Path]:
+    """Five frames along a textured seafloor, and a cameras.json of them."""
+    whole = make_dive(DiveSettings(frames=24, width=240, height=160, coefficients=Coefficients(beta_B=(0.1, 0.1, 0.1))))
+    chosen = range(8, 13)
+    frames = []
+    for i in chosen:
+        path = tmp_path / "images" / whole.names[i]
+        images.write_rgb(path, whole.frame(i).raw.clamp(0, 1).numpy())
+        frames.append(Frame(path.name, path, float(i), 1.0, "train"))
+    cameras = whole.cameras[list(chosen)]
+    table = CameraTable(
+        tuple(f.name for f in frames), 240, 160, "PINHOLE", cameras.K.numpy(), cameras.distortion.numpy(),
+        cameras.cam2world.numpy(), "metres",
+    )  # fmt: skip
+    write_cameras(tmp_path / "cameras.json", table)
+    return Frames(tuple(frames), 240, 160, True), tmp_path / "cameras.json"
+
+
+def test_poses_alone_get_points_of_our_own_where_the_file_puts_the_cameras(posed_dive, tmp_path: Path):
+    frames, path = posed_dive
+    rec = importers.from_foreign(frames, read_foreign(path), tmp_path / "sfm")
+    assert rec.metric
+    assert len(rec.points.xyz) == 0
+    found = triangulate(rec, frames, FeatureSettings(), tmp_path / "sfm")
+    torch.testing.assert_close(found.cameras.cam2world, rec.cameras.cam2world)
+    assert len(found.points.xyz) > 100
+    assert len(found.matches.i) > 100
+    uv, z = project(found.cameras, found.points.xyz.expand(len(found.names), -1, -1))
+    off = (uv[found.tracks.frame, found.tracks.point] - found.tracks.xy).norm(dim=-1)
+    assert off.median() < 0.5
+    assert (z[found.tracks.frame, found.tracks.point] > 0).all()
+
+
+def test_a_cloud_without_sightings_stays_beside_the_triangulated_points(posed_dive, tmp_path: Path):
+    frames, path = posed_dive
+    foreign = read_foreign(path)
+    cloud = replace(foreign.model, xyz=np.ones((3, 3)), rgb=np.full((3, 3), 9, np.uint8), error=np.zeros(3))
+    rec = importers.from_foreign(frames, replace(foreign, model=cloud), tmp_path / "sfm")
+    found = triangulate(rec, frames, FeatureSettings(), tmp_path / "sfm")
+    assert found.points.xyz[:3].tolist() == np.ones((3, 3)).tolist()
+    assert found.tracks.point.min() == 3
+    reconstruction.save(found, tmp_path / "sfm")
+    assert len(reconstruction.load(tmp_path / "sfm").points.xyz) == len(found.points.xyz)
+
+
+def test_pictures_that_match_nowhere_come_with_a_caution(posed_dive, tmp_path: Path):
+    frames, path = posed_dive
+    for frame in frames:
+        images.write_rgb(frame.path, np.full((160, 240, 3), 0.4))
+    rec = importers.reconstruct(frames, ColmapModelSettings(path), tmp_path / "sfm")
+    assert "at its poses the pictures' own matches meet nowhere" in rec.cautions[0].what
+    assert len(rec.tracks.point) == len(rec.matches.i) == 0
 
 
 def test_a_model_of_other_pictures_is_an_input_error(dive, model: ColmapModel, tmp_path: Path):

@@ -16,6 +16,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from swimm3r.errors import InputError
+from swimm3r.io.colmap_files import damaged_file
 
 if TYPE_CHECKING:
     import pycolmap
@@ -51,14 +52,12 @@ def read_model(folder: Path) -> ColmapModel:
     import pycolmap
 
     found = find_model(folder)
+    if (damaged := damaged_file(found)) is not None:  # pycolmap would hang on some of them
+        raise _unreadable(found, f"{damaged} is not whole")
     try:
         model = pycolmap.Reconstruction(str(found))
     except (RuntimeError, ValueError, IndexError) as error:  # what pycolmap raises on damaged files
-        raise InputError(
-            f"{found} is not a readable COLMAP model ({str(error).splitlines()[-1][:200]})",
-            cause="a file is truncated or was written by an incompatible version",
-            hint="open it with COLMAP itself, or write it again with its model_converter",
-        ) from error
+        raise _unreadable(found, str(error).splitlines()[-1][:200]) from error
     return from_pycolmap(model)
 
 
@@ -188,6 +187,14 @@ def to_pycolmap(model: ColmapModel) -> "pycolmap.Reconstruction":
         point.xyz, point.color, point.error, point.track = xyz, rgb, error, track
         out.add_point3D_with_id(p + 1, point)
     return out
+
+
+def _unreadable(folder: Path, why: str) -> InputError:
+    return InputError(
+        f"{folder} is not a readable COLMAP model ({why})",
+        cause="a file is truncated or was written by an incompatible version",
+        hint="open it with COLMAP itself, or write it again with its model_converter",
+    )
 
 
 def _common_lens(models: set[str]) -> str:

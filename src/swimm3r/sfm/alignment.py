@@ -176,7 +176,7 @@ def _scene(parameters: _Parameters, problem: AlignmentProblem, settings: Alignme
     offset = _focal_point(plane, focal, principal, problem)
 
     quaternion, translation = parameters.quaternion, parameters.translation
-    if not settings.parity:  # the root is the gauge: it stays
+    if not settings.parity and problem.known_pose is None:  # the root is the gauge: it stays
         fixed = torch.arange(n) == problem.tree.root
         quaternion = torch.where(fixed[:, None], quaternion.detach(), quaternion)
         translation = torch.where(fixed[:, None], translation.detach(), translation)

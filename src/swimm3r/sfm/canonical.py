@@ -67,9 +67,9 @@ def add_pass(
     if h % subsample or w % subsample:
         raise ValueError(f"a pointmap of {h} x {w} pixels does not divide into blocks of {subsample}")
     if not (points.isfinite().all() and confidence.isfinite().all()):
-        share = (~points.isfinite().all(-1) | ~confidence.isfinite()).float().mean()
+        wrong = int((~points.isfinite().all(-1) | ~confidence.isfinite()).sum())
         raise WeightsError(
-            f"the network's pointmap is not finite at {share:.1%} of the pixels",
+            f"the network's pointmap is not finite at {wrong:,} of {h * w:,} pixels",
             cause="the weights are damaged, or half precision overflowed",
             hint="swimm3r weights verify mast3r, and run the network in float32",
         )

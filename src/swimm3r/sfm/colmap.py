@@ -34,6 +34,8 @@ from swimm3r.sfm.sift import unit_descriptors
 if TYPE_CHECKING:
     import pycolmap
 
+_NONE, _NOWHERE = np.zeros(0), np.zeros((0, 2))  # what is joined where no pair matches
+
 
 def reconstruct(frames: Frames, settings: ColmapSettings, folder: Path, progress: Progress = silent) -> Reconstruction:
     """Cameras, points, tracks and matches of the frames that can be placed; depth maps are for others to fill.
@@ -203,7 +205,7 @@ def _record(model: "pycolmap.Reconstruction", store: FeatureDatabase, frames: Fr
         cameras=cameras_of(table),
         points=Points(torch.from_numpy(table.xyz), _colours(table, frames, index), torch.from_numpy(table.error)),
         tracks=Tracks(*(torch.from_numpy(a) for a in (table.track_point, table.track_frame, table.track_xy))),
-        matches=_verified_matches(store, index),
+        matches=verified_matches(store, index),
         depth=DepthMaps(folder / "z_depth"),
         backend="colmap",
     )
@@ -220,7 +222,8 @@ def _colours(table: ColmapModel, frames: Frames, index: list[int]) -> Float[Tens
     return total / torch.bincount(point, minlength=len(total)).clamp(min=1)[:, None]
 
 
-def _verified_matches(store: FeatureDatabase, index: list[int]) -> Matches:
+def verified_matches(store: FeatureDatabase, index: list[int]) -> Matches:
+    """The verified matches among the database's frames of these numbers; `index[k]` is frame k of the result."""
     row_of = {i: row for row, i in enumerate(index)}
     i, j, xy_i, xy_j = [], [], [], []
     with store.open() as database:
@@ -233,12 +236,12 @@ def _verified_matches(store: FeatureDatabase, index: list[int]) -> Matches:
             j.append(np.full(len(rows), row_of[b]))
             xy_i.append(xy[a][rows[:, 0]])
             xy_j.append(xy[b][rows[:, 1]])
-    first, second = (torch.from_numpy(np.concatenate(side).astype(np.int64)) for side in (i, j))
+    first, second = (torch.from_numpy(np.concatenate([_NONE, *side]).astype(np.int64)) for side in (i, j))
     return Matches(
         i=first,
         j=second,
-        xy_i=torch.from_numpy(np.concatenate(xy_i)).float(),
-        xy_j=torch.from_numpy(np.concatenate(xy_j)).float(),
+        xy_i=torch.from_numpy(np.concatenate([_NOWHERE, *xy_i])).float(),
+        xy_j=torch.from_numpy(np.concatenate([_NOWHERE, *xy_j])).float(),
         confidence=torch.ones(len(first)),
     )
 

@@ -1,19 +1,20 @@
 """Poses and points that another program found, completed here: its files -> depth -> water -> restored cloud.
 
 Which files are read says `io.foreign.model.read_foreign`. Scale, intrinsics and points stay as they are; matches are
-the pairs of sightings of one point; depth that comes with the file is taken, else it is swept.
+the pairs of sightings of one point; where a file has neither sightings nor depth, points are triangulated at its poses
+(`triangulation`). Depth that comes with the file is taken, else it is swept.
 
-Frames that the model places but the split holds back take no part; their poses serve as reference (`model_cameras`).
+Frames that the model places but the split holds back take no part; their poses serve as reference (`model_frames`).
 """
 
 from dataclasses import replace
-from pathlib import Path, PurePosixPath
+from pathlib import Path
 
 import numpy as np
 import torch
 
 from swimm3r import reconstruction
-from swimm3r.cameras import Cameras, resized
+from swimm3r.cameras import Cameras
 from swimm3r.errors import InputError
 from swimm3r.frames import Frames
 from swimm3r.io.colmap import ColmapModel
@@ -30,12 +31,12 @@ from swimm3r.reconstruction import (
     cameras_of,
 )
 from swimm3r.sfm.match_tracks import MatchTracks, as_points
+from swimm3r.sfm.model_frames import at_frame_size, named_frames
 from swimm3r.sfm.plane_sweep import estimate_depth
 from swimm3r.sfm.settings import ColmapModelSettings
 from swimm3r.sfm.sweep_views import on_frame_grid
+from swimm3r.sfm.triangulation import triangulate
 from swimm3r.sfm.water import with_water
-
-_ASPECT = 0.01  # relative difference of aspect ratios beyond which pictures are not those of the model
 
 
 def reconstruct(
@@ -44,6 +45,8 @@ def reconstruct(
     """The reconstruction of the frames that the model names. Raises InputError where fewer than 2 of them are in it."""
     foreign = read_foreign(settings.model)
     rec = from_foreign(frames, foreign, folder)
+    if len(rec.tracks.point) == 0 and foreign.depth is None:
+        rec = _with_points(rec, frames, foreign, settings, folder, progress)
     reconstruction.save(rec, folder)
     if foreign.depth is None:
         estimate_depth(rec, frames, settings.depth, progress)
@@ -56,7 +59,7 @@ def reconstruct(
 
 def from_model(frames: Frames, model: ColmapModel, folder: Path) -> Reconstruction:
     """Cameras, points and tracks of the frames; depth maps are for others to fill."""
-    names, rows = _named(frames, model)
+    names, rows = named_frames(frames, model)
     if len(names) < 2:
         raise InputError(
             f"{len(names)} of {len(frames)} training frames are in the COLMAP model, at least 2 are needed",
@@ -68,7 +71,7 @@ def from_model(frames: Frames, model: ColmapModel, folder: Path) -> Reconstructi
     point, new_point = np.unique(model.track_point[kept], return_inverse=True)
     if len(model.track_point) == 0:  # a cloud that nobody says who saw
         point = np.arange(len(model.xyz))
-    cameras = _at_frame_size(cameras_of(model)[rows], frames)
+    cameras = at_frame_size(cameras_of(model)[rows], frames)
     scale = np.array([frames.width / model.width, frames.height / model.height])
     none = torch.zeros(0, dtype=torch.int64)
     return Reconstruction(
@@ -93,20 +96,11 @@ def from_model(frames: Frames, model: ColmapModel, folder: Path) -> Reconstructi
 def from_foreign(frames: Frames, foreign: ForeignModel, folder: Path) -> Reconstruction:
     """`from_model` with what the program knows besides: its name, whether lengths are metres, colours, matches."""
     rec = from_model(frames, foreign.model, folder)
-    cautions = ()
-    if len(rec.tracks.point) == 0 and foreign.depth is None:
-        caution = Caution(
-            f"{foreign.program}'s file has no sightings of points, so depth and water cannot be found from it.",
-            "Export a COLMAP model from the same program, or let swimm3r find the poses itself.",
-        )
-        cautions = (caution,)
     if not foreign.coloured:
         order = [frames.index(name) for name in rec.names]
         points, _ = as_points(_as_match_tracks(rec), rec.tracks.xy, rec.cameras, frames, order)
         rec = replace(rec, points=points)
-    return replace(
-        rec, backend=foreign.program, metric=foreign.metric, matches=matches_of(rec.tracks), cautions=cautions
-    )
+    return replace(rec, backend=foreign.program, metric=foreign.metric, matches=matches_of(rec.tracks))
 
 
 def matches_of(tracks: Tracks, reach: int = 3) -> Matches:
@@ -126,7 +120,7 @@ def write_depth(rec: Reconstruction, frames: Frames, foreign: ForeignModel, prog
     dense = foreign.depth
     assert dense is not None
     height, width = dense.z_depth.shape[1:]
-    names, rows = _named(frames, foreign.model)
+    names, rows = named_frames(frames, foreign.model)
     canvas = Cameras(
         torch.from_numpy(dense.K[rows]), torch.zeros(len(rows), 0).double(), rec.cameras.cam2world, width, height
     )
@@ -142,32 +136,24 @@ def write_depth(rec: Reconstruction, frames: Frames, foreign: ForeignModel, prog
     progress("depth", len(rows), len(rows))
 
 
-def model_cameras(frames: Frames, model: ColmapModel) -> tuple[tuple[str, ...], Cameras]:
-    """The frames that the model places, and their cameras at the size of the frames."""
-    names, rows = _named(frames, model)
-    return names, _at_frame_size(cameras_of(model)[rows], frames)
-
-
-def _named(frames: Frames, model: ColmapModel) -> tuple[tuple[str, ...], list[int]]:
-    """Frames that the model places and their rows in it; preparation may have changed a suffix."""
-    by_stem = {str(PurePosixPath(name).with_suffix("")): row for row, name in enumerate(model.names)}
-    by_name = {name: row for row, name in enumerate(model.names)}
-    rows = {name: by_name.get(name, by_stem.get(str(PurePosixPath(name).with_suffix("")))) for name in frames.names}
-    placed = {name: row for name, row in rows.items() if row is not None}
-    return tuple(placed), list(placed.values())
-
-
-def _at_frame_size(cameras: Cameras, frames: Frames) -> Cameras:
-    width, height = frames.width, frames.height
-    if abs(width * cameras.height / (height * cameras.width) - 1) > _ASPECT:
-        raise InputError(
-            f"the frames are {width}x{height}, the COLMAP model's pictures {cameras.width}x{cameras.height}",
-            cause="the pictures were cropped or turned after the model was made",
-            hint="give the pictures that the model was made of",
-        )
-    if (width, height) == (cameras.width, cameras.height):
-        return cameras
-    return resized(cameras, width, height)
+def _with_points(
+    rec: Reconstruction,
+    frames: Frames,
+    foreign: ForeignModel,
+    settings: ColmapModelSettings,
+    folder: Path,
+    progress: Progress,
+) -> Reconstruction:
+    """The same cameras with points of our own, for a file that says nobody saw anything."""
+    rec = triangulate(rec, frames, settings.features, folder, progress)
+    if len(rec.tracks.point):
+        return rec
+    caution = Caution(
+        f"{foreign.program}'s file has no sightings of points, and at its poses the pictures' own matches meet nowhere,"
+        " so depth and water cannot be found.",
+        "Check that the pictures are those of the file; or let swimm3r find the poses itself.",
+    )
+    return replace(rec, cautions=(*rec.cautions, caution))
 
 
 def _as_match_tracks(rec: Reconstruction) -> MatchTracks:

@@ -249,6 +249,9 @@ class Mast3rSettings:
     k4: float | None = None
     p1: float | None = None
     p2: float | None = None
+    known: Path | None = None
+    """Cameras that are known: a cameras.json, a COLMAP model or another program's file. Frames it names keep its poses
+    (and its unit), the others find theirs; its lens takes the place of the numbers above."""
     min_matches: int = 16
     """Pairs with fewer matches than this are taken for strangers: a few pixels agree by chance."""
     min_share: float = 0.9

@@ -8,6 +8,7 @@ import numpy as np
 
 from swimm3r.errors import InputError
 from swimm3r.io import colmap
+from swimm3r.io.cameras_json import read_cameras
 from swimm3r.io.colmap import ColmapModel
 
 
@@ -34,7 +35,7 @@ class ForeignModel:
 
 def read_foreign(path: Path) -> ForeignModel:
     """Read a COLMAP (GLOMAP, GLUEMAP, VGGT's demo_colmap) model, a nerfstudio or Spann3R transforms.json, a Metashape
-    cameras.xml, an OpenMVG sfm_data.json or a VGGT predictions.npz; or the folder that holds one of them.
+    cameras.xml, an OpenMVG sfm_data.json, a VGGT predictions.npz or a cameras.json; or the folder that holds one.
 
     Raises InputError for anything else and for a damaged file.
     """
@@ -53,14 +54,18 @@ def read_foreign(path: Path) -> ForeignModel:
                 document = json.loads(found.read_text(encoding="utf-8"))
                 if not isinstance(document, dict):
                     raise ValueError("a JSON object was expected")
-                reader = openmvg if "sfm_data_version" in document else nerfstudio
-                return reader.read(found, document)
+                if "sfm_data_version" in document:
+                    return openmvg.read(found, document)
+                if any("c2w" in frame for frame in document.get("frames", [])):
+                    return _own(found)
+                return nerfstudio.read(found, document)
     except (KeyError, ValueError, TypeError, IndexError, SyntaxError) as error:  # SyntaxError: XML's ParseError
         what = f"it has no {error}" if isinstance(error, KeyError) else str(error).splitlines()[0]
         raise InputError(
             f"{found} cannot be read as a reconstruction: {what[:200]}",
             cause="the file is damaged, or of another program or version",
-            hint="a COLMAP model, transforms.json, Metashape cameras.xml, OpenMVG sfm_data.json, VGGT predictions.npz",
+            hint="a COLMAP model, transforms.json, Metashape cameras.xml, OpenMVG sfm_data.json, VGGT predictions.npz,"
+            " cameras.json",
         ) from error
 
 
@@ -103,11 +108,19 @@ def one_size(sizes: set[tuple[int, int]]) -> tuple[int, int]:
     return next(iter(sizes))
 
 
+def _own(path: Path) -> ForeignModel:
+    """A cameras.json, as docs/conventions.md has it."""
+    table = read_cameras(path)
+    size = (table.width, table.height)
+    model = without_points(table.names, table.model, size, table.K, table.distortion, table.cam2world)
+    return ForeignModel("cameras.json", model, metric=table.units == "metres")
+
+
 def _file(path: Path) -> Path | None:
     """The file to read, None for a COLMAP model's folder."""
     if path.is_file():
         return path
-    for name in ("transforms.json", "sfm_data.json", "cameras.xml", "predictions.npz"):
+    for name in ("transforms.json", "sfm_data.json", "cameras.xml", "predictions.npz", "cameras.json"):
         if (path / name).is_file():
             return path / name
     return None

@@ -117,6 +117,7 @@ def _place(
         ),
         depth=DepthMaps(folder / "z_depth"),
         backend="mast3r" if settings.adapter is None else "swimm3r",
+        metric=_is_metric(pictures, kept),
         cautions=tuple(cautions),
     )
     if settings.bundle_adjustment:
@@ -127,6 +128,12 @@ def _place(
             before = said.frame_store.read(f).anchored.anchor_depth.clamp(min=1e-9)
             water.keep(f, rec.names[k], float((aligned.alignment.anchor_z_depth[k] / before).median().clamp(min=1e-9)))
     return rec
+
+
+def _is_metric(pictures: NetworkPictures, kept: list[int]) -> bool:
+    """Two known camera centres settle the unit; the network's own metres nobody measured."""
+    poses = pictures.poses
+    return poses is not None and poses.metric and int(poses.posed[kept].sum()) >= 2
 
 
 def _joined_frames(
@@ -225,6 +232,8 @@ def _align(
     if pictures.lens.model != "PINHOLE":  # its distortion belongs to its focal length
         alignment = replace(alignment, intrinsics="fixed")
     known = Known(K=None if pictures.K is None else pictures.K.repeat(len(kept), 1, 1))
+    if pictures.poses is not None:
+        known = replace(known, cam2world=pictures.poses.cam2world[kept], posed=pictures.poses.posed[kept])
     found = align(anchored, anchored_pairs, alignment, known, progress)
     matches = FrameMatches(
         torch.cat([torch.full_like(p.anchor_i, p.i) for p in anchored_pairs]),

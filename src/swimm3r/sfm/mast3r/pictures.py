@@ -6,6 +6,7 @@ prepared frame (its lens) -> undistorted, same K (pinhole) -> resized and croppe
 from dataclasses import dataclass, replace
 from functools import cached_property
 from hashlib import sha256
+from pathlib import Path
 
 import torch
 from jaxtyping import Bool, Float
@@ -14,6 +15,7 @@ from torch import Tensor
 from swimm3r.cameras import DISTORTION_PARAMETERS, Cameras, directions, project
 from swimm3r.errors import InputError, UsageError
 from swimm3r.frames import Frames
+from swimm3r.io.foreign.model import read_foreign
 from swimm3r.sfm.mast3r.preprocess import (
     Framing,
     K_to_network,
@@ -25,9 +27,20 @@ from swimm3r.sfm.mast3r.preprocess import (
     remove_distortion,
     to_network,
 )
+from swimm3r.sfm.model_frames import model_cameras
 from swimm3r.sfm.settings import Mast3rSettings
 
+_SAME_LENS = 0.01  # pixels, or of a distortion
 _ASSUMED = 0.75  # focal length over width of an unknown lens; only says how to write K, nothing is computed with it
+
+
+@dataclass(frozen=True)
+class KnownPoses:
+    """Where frames were, for those that the user's file names."""
+
+    cam2world: Float[Tensor, "n 4 4"]  # float64; anything for the others
+    posed: Bool[Tensor, " n"]
+    metric: bool  # whether they are in metres
 
 
 @dataclass(frozen=True)
@@ -38,6 +51,7 @@ class NetworkPictures:
     lens: Cameras  # one camera of the prepared frames
     known: bool  # whether the lens's K is
     framing: Framing
+    poses: "KnownPoses | None" = None
 
     def image(self, i: int) -> Float[Tensor, "3 H W"]:
         """Frame i in -1..1."""
@@ -106,8 +120,45 @@ def network_pictures(frames: Frames, settings: Mast3rSettings) -> NetworkPicture
             cause="panoramas and strips are no pictures of a camera",
             hint="pictures up to 16 times as wide as high",
         ) from error
+    if settings.known is not None:
+        lens, poses = _from_file(frames, settings, settings.known)
+        return NetworkPictures(frames, lens, True, frame, poses)
     lens = _lens(frames.width, frames.height, settings)
     return NetworkPictures(frames, lens, settings.focal is not None, frame)
+
+
+def _from_file(frames: Frames, settings: Mast3rSettings, path: Path) -> tuple[Cameras, KnownPoses]:
+    """Lens and poses of a file of known cameras."""
+    given = [name for name in ("focal", "k1", "k2", "k3", "k4", "p1", "p2") if getattr(settings, name) is not None]
+    if given or settings.bundle_adjustment:
+        other = given[0] if given else "bundle-adjustment"
+        raise UsageError(
+            f"--known and --{other} contradict each other",
+            cause="the file says where frames were and through which lens, and that is held",
+            hint=f"leave out one of the two{'' if given else ': bundle adjustment would move the poses'}",
+        )
+    foreign = read_foreign(path)
+    names, cameras = model_cameras(frames, foreign.model)
+    if not names:
+        raise InputError(
+            f"none of the {len(frames)} frames is in {path}",
+            cause=f"it is of other pictures; it names {', '.join(foreign.model.names[:3])}, ...",
+            hint="its names must be those of the prepared frames, with or without suffix",
+        )
+    intrinsics = torch.cat([cameras.K.flatten(1), cameras.distortion], dim=1)
+    if float((intrinsics - intrinsics[:1]).abs().max()) > _SAME_LENS:
+        raise InputError(
+            f"the frames in {path} have different intrinsics",
+            cause="they were calibrated one by one, or come from several cameras",
+            hint="one lens for all frames: calibrate them together",
+        )
+    cam2world = torch.eye(4, dtype=torch.float64).repeat(len(frames), 1, 1)
+    rows = [frames.index(name) for name in names]
+    cam2world[rows] = cameras.cam2world
+    posed = torch.zeros(len(frames), dtype=torch.bool)
+    posed[rows] = True
+    origin = torch.eye(4, dtype=torch.float64)[None]
+    return replace(cameras[0], cam2world=origin), KnownPoses(cam2world, posed, foreign.metric)
 
 
 def _lens(width: int, height: int, settings: Mast3rSettings) -> Cameras:
