@@ -42,11 +42,15 @@ class Student(nn.Module):
         raw: Float[Tensor, "b 2 3 h w"],
         ray_depth: Float[Tensor, "b 2 h w"],
         valid: Bool[Tensor, "b 2 h w"],
+        teacher: Features | None = None,
     ) -> dict[str, Float[Tensor, " b"]]:
-        """The fields of `LossTerms` of pairs of the network's pictures (-1..1); ray depth in m, read where valid."""
+        """The fields of `LossTerms` of pairs of the network's pictures (-1..1); ray depth in m, read where valid.
+
+        `teacher` is what it makes of the clear pictures, where that is known already.
+        """
         s = self.objective
-        with torch.no_grad(), self.adapters.off():
-            teacher, _ = self._features(clean)
+        if teacher is None:
+            teacher = self.teacher(clean)
         student, encoded = self._features(raw)
         terms = self._distances(teacher, student)
         zero = raw.new_zeros(len(raw), dtype=torch.float32)
@@ -62,6 +66,11 @@ class Student(nn.Module):
             physics = physics_terms(I, J, z, known, medium, s)
             terms |= {name: values.unflatten(0, (-1, 2)).mean(1) for name, values in vars(physics).items()}
         return terms
+
+    def teacher(self, clean: Float[Tensor, "b 2 3 h w"]) -> Features:
+        """What the network without its adapters makes of the clear pictures of pairs."""
+        with torch.no_grad(), self.adapters.off():
+            return self._features(clean)[0]
 
     def total(self, terms: dict[str, Float[Tensor, " b"]]) -> Float[Tensor, " b"]:
         """L_SfM of each pair."""

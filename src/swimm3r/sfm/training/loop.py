@@ -8,6 +8,7 @@ the gradients; the losses are means over pairs, so the curve is that of one proc
     FOLDER/state.safetensors     trained parameters and AdamW's moments, of the last finished stretch
     FOLDER/metrics.jsonl         every term of the objective each few steps, validation after each epoch
     FOLDER/adapter.safetensors   what is handed on (adapter_file.py), after each epoch
+    FOLDER/teacher/              what the teacher says of each pair (teacher_cache.py), where asked for
 """
 
 import hashlib
@@ -35,6 +36,7 @@ from swimm3r.sfm.student import Student, new_student
 from swimm3r.sfm.training.data import PairData, PairItem
 from swimm3r.sfm.training.settings import TrainSettings
 from swimm3r.sfm.training.state import Rows, forget_rows_after, resume, write_state
+from swimm3r.sfm.training.teacher_cache import TeacherCache
 
 _ORDER, _WATER = 1, 2  # purposes of randomness
 _TERMS = ("encoder", "decoder", "descriptors", "forward", "inverse", "overshoot", "anchor", "clean")
@@ -121,6 +123,9 @@ def _run(
         if done < total:
             announce(_estimate(student, data, settings, total, size, workers))
     model = _shared(student) if workers.count > 1 else student
+    cache = None
+    if settings.teacher_cache_mb:
+        cache = TeacherCache(folder / "teacher" / mark[:16] / str(workers.rank), settings.teacher_cache_mb << 20)
     rows = Rows(metrics, folder / "tensorboard" if settings.tensorboard and workers.first else None)
     with ThreadPoolExecutor(_LOADERS) as pool:
         coming = _load(pool, data, settings, size, done + 1, workers) if done < total else []
@@ -129,7 +134,7 @@ def _run(
                 progress("training the student", step - 1, total)
             items = [future.result() for future in coming]
             coming = _load(pool, data, settings, size, step + 1, workers) if step < total else []
-            terms = _step(model, student, optimiser, items, settings, size // workers.count)
+            terms = _step(model, student, optimiser, items, settings, size // workers.count, cache)
             rows.add(_mean_over_workers(terms, workers), step / per_epoch)
             ends_epoch = step % per_epoch == 0
             if workers.first and (step % settings.log_every == 0 or ends_epoch):
@@ -202,6 +207,7 @@ def _step(
     items: list[PairItem],
     settings: TrainSettings,
     share: int,
+    cache: TeacherCache | None,
 ) -> dict[str, Tensor]:
     """One step on this process's share of a batch; the sums of the terms over it."""
     sums: dict[str, Tensor] = {}
@@ -209,7 +215,9 @@ def _step(
     for number, part in enumerate(parts, start=1):
         last = number == len(parts)
         with nullcontext() if last or model is student else model.no_sync():  # type: ignore[operator]
-            terms = model(**_batch(part, student))
+            batch = _batch(part, student)
+            teacher = None if cache is None else cache.features(student, batch["clean"])
+            terms = model(**batch, teacher=teacher)
             (student.total(terms).sum() / share).backward()
         for name, values in {**terms, "loss": student.total(terms)}.items():
             sums[name] = sums.get(name, torch.zeros((), device=values.device)) + values.detach().sum()

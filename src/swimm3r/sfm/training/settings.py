@@ -38,13 +38,20 @@ class TrainSettings:
     """Steps between rows of metrics.jsonl, each the mean of its steps."""
     tensorboard: bool = False
     """Write the rows of metrics.jsonl for TensorBoard, too (pip install tensorboard)."""
+    teacher_cache_mb: int = 0
+    """Disk for the teacher's features, so that it looks at each pair once: 20 MB per pair at 512 x 320. 0 computes them
+    anew in each epoch."""
     checkpoint_every: int = 200
     """Steps between states that an interrupted training goes on from; the end of an epoch is always one."""
 
     def __post_init__(self) -> None:
         positive = ("learning_rate", "epochs", "batch", "log_every", "checkpoint_every")
         wrong = [name for name in positive if not getattr(self, name) > 0]
-        wrong += [n for n in ("weight_decay", "micro_batch", "validation", "max_pairs") if not getattr(self, n) >= 0]
+        wrong += [
+            n
+            for n in ("weight_decay", "micro_batch", "validation", "max_pairs", "teacher_cache_mb")
+            if not getattr(self, n) >= 0
+        ]
         if not 0 <= self.water_probability <= 1:
             wrong.append("water_probability")
         if self.size < 16:
