@@ -18,6 +18,8 @@ import numpy as np
 import pytest
 import torch
 
+from swimm3r.sfm.mast3r.network import Architecture, Mast3r
+
 torch.set_num_threads(1)  # two xdist workers share two cores
 
 SHARED = Path(os.environ.get("SWIMM3R_SHARED", Path(__file__).parents[2] / "shared"))
@@ -61,3 +63,15 @@ def write_video() -> Callable[..., Path]:
         return path
 
     return write
+
+
+@pytest.fixture(scope="session")
+def small_network() -> Mast3r:
+    """A network of MASt3R's published shape, thousands of times smaller, with random weights."""
+    small = Architecture(
+        encoder_dim=64, encoder_depth=2, encoder_heads=1, decoder_dim=64, decoder_depth=4, decoder_heads=1,
+        dpt_layer_dims=(4, 6, 8, 10), dpt_feature_dim=8, dpt_last_dims=(4, 4), local_hidden_dim=64, descriptor_dim=6,
+    )  # fmt: skip
+    with torch.random.fork_rng():
+        torch.manual_seed(0)
+        return Mast3r(small).eval().requires_grad_(False)

@@ -18,6 +18,9 @@ from swimm3r import reconstruction
 from swimm3r.errors import InputError, StorageError
 from swimm3r.evaluate.poses import absolute_pose_errors
 from swimm3r.io.video import Video
+from swimm3r.localization.batch import localize_run
+from swimm3r.localization.neighbours import pose_from_neighbours
+from swimm3r.localization.settings import LocalizationSettings
 from swimm3r.prepare import load_frames
 from swimm3r.presets import MAST3R_PRESETS, PRESETS, RunSettings, from_yaml, to_yaml
 from swimm3r.renders import KINDS, render_run
@@ -130,6 +133,20 @@ def test_a_finished_run_is_scored_and_rendered_again(finished: tuple[Path, dict]
     assert again["truth"]["splat"]["clear_psnr"] == pytest.approx(summary["truth"]["splat"]["clear_psnr"], abs=1e-3)
     pictures = render_run(copy, long_side=80)
     assert len(list(pictures.rglob("*_rgb.png"))) == summary["sfm"]["registered"]
+
+
+def test_the_test_frames_are_localised_in_the_map(finished: tuple[Path, dict], tmp_path: Path):
+    answers, out = localize_run(finished[0], out=tmp_path / "places", settings=LocalizationSettings(matcher="sift"))
+    frames, rec = load_frames(finished[0] / "prepare"), reconstruction.load(finished[0] / "sfm")
+    assert [a.name for a in answers] == list(frames.test.names)
+    record = json.loads((out / "poses.json").read_text())
+    assert record["located"] == len(answers)
+    assert len((out / "poses.tum").read_text().splitlines()) == len(answers)
+    for a in answers:
+        assert a.found is not None
+        between = pose_from_neighbours(rec, frames, a.name)
+        assert (a.found.cam2world[:3, 3] - between[:3, 3]).norm() < 0.3
+        assert (out / "matches" / f"{a.name}.png").is_file()
 
 
 def test_settings_come_back_from_their_file(tmp_path: Path):

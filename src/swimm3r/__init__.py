@@ -3,6 +3,7 @@
     frames = swimm3r.read_frames("dive.mp4", fps=5)
     rec = swimm3r.reconstruct(frames, swimm3r.ColmapSettings())
     scene = swimm3r.train(rec, frames, swimm3r.uwbs(iterations=20_000))
+    pose = swimm3r.localize(image, scene, rec, frames)
 
 Names load on first use, so that importing the package, and every --help, is instant.
 """
@@ -12,6 +13,8 @@ from typing import TYPE_CHECKING
 
 if TYPE_CHECKING:
     from swimm3r.frame_settings import FrameSettings
+    from swimm3r.localization import localize
+    from swimm3r.localization.settings import LocalizationSettings
     from swimm3r.medium import Medium, MediumFit, add_water, remove_water
     from swimm3r.prepare import read_frames
     from swimm3r.presets import PRESETS, RunSettings
@@ -27,6 +30,8 @@ if TYPE_CHECKING:
 
 _HOME = {
     "FrameSettings": "frame_settings",
+    "LocalizationSettings": "localization.settings",
+    "localize": "localization",
     "Medium": "medium",
     "MediumFit": "medium",
     "add_water": "medium",
@@ -53,6 +58,7 @@ __all__ = [
     "ColmapSettings",
     "DiveSettings",
     "FrameSettings",
+    "LocalizationSettings",
     "Mast3rSettings",
     "Medium",
     "MediumFit",
@@ -62,6 +68,7 @@ __all__ = [
     "UwbsSettings",
     "add_water",
     "load_map",
+    "localize",
     "read_frames",
     "reconstruct",
     "remove_water",

@@ -24,7 +24,8 @@ from swimm3r.evaluate.lpips import Lpips, load_lpips
 from swimm3r.frames import Frames
 from swimm3r.geometry import DegenerateAlignmentError, align_poses, align_similarity
 from swimm3r.ground_truth import GroundTruth
-from swimm3r.localization import landmarks_of, locate, neighbours, pose_from_neighbours
+from swimm3r.localization.landmarks import landmarks_of, locate
+from swimm3r.localization.neighbours import neighbours, pose_from_neighbours
 from swimm3r.progress import Progress, silent
 from swimm3r.reconstruction import Reconstruction
 from swimm3r.renders import depth_span, write_view

@@ -32,7 +32,7 @@ def test_half_a_colmap_model_is_exit_2(capsys: pytest.CaptureFixture[str], tmp_p
     assert "--images" in message
 
 
-@pytest.mark.parametrize("command", ["eval", "render"])
+@pytest.mark.parametrize("command", ["eval", "render", "localize"])
 def test_a_folder_without_a_map_is_exit_3(command: str, capsys: pytest.CaptureFixture[str], tmp_path: Path):
     code, message = outcome(capsys, command, str(tmp_path))
     assert code == 3

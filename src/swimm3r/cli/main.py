@@ -13,6 +13,7 @@ from swimm3r.cli.datasets import datasets
 from swimm3r.cli.demo import demo
 from swimm3r.cli.doctor import doctor
 from swimm3r.cli.evaluate import evaluate
+from swimm3r.cli.localize import localize
 from swimm3r.cli.render import render
 from swimm3r.cli.report import report
 from swimm3r.cli.run import commands_for_preset
@@ -42,6 +43,7 @@ def main(arguments: Sequence[str] | None = None) -> None:
         "doctor": doctor,
         "eval": evaluate,
         "render": render,
+        "localize": localize,
         "report": report,
         "datasets": datasets,
         "train-sfm": command_for_recipe(_named("--recipe", arguments, RECIPES, "swimm3r")),

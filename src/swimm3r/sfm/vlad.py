@@ -18,8 +18,8 @@ _ROUNDS = 10  # of k-means
 
 def similarity(descriptors: Sequence[Float[Tensor, "_ 128"]], generator: torch.Generator) -> Float[Tensor, "c c"]:
     """Cosine similarity of all frames, -1..1, given each frame's descriptors."""
-    words = _vocabulary(descriptors, generator)
-    v = torch.stack([_vlad(d, words) for d in descriptors])
+    words = vocabulary(descriptors, generator)
+    v = torch.stack([summed(d, words) for d in descriptors])
     return v @ v.mT
 
 
@@ -33,7 +33,8 @@ def alike_pairs(similarity: Float[Tensor, "c c"], count: int, apart: int = 0) ->
     return sorted({(min(i, j), max(i, j)) for i in range(n) for j in best[i].tolist() if far[i, j]})
 
 
-def _vocabulary(descriptors: Sequence[Float[Tensor, "_ 128"]], generator: torch.Generator) -> Float[Tensor, "k 128"]:
+def vocabulary(descriptors: Sequence[Float[Tensor, "_ 128"]], generator: torch.Generator) -> Float[Tensor, "k 128"]:
+    """Visual words: spherical k-means over a sample of all frames' descriptors."""
     share = max(1, _SAMPLES // len(descriptors))
     samples = torch.cat([d[torch.randperm(len(d), generator=generator)[:share]] for d in descriptors])
     words = samples[torch.randperm(len(samples), generator=generator)[:_WORDS]]
@@ -44,7 +45,8 @@ def _vocabulary(descriptors: Sequence[Float[Tensor, "_ 128"]], generator: torch.
     return words
 
 
-def _vlad(descriptors: Float[Tensor, "n 128"], words: Float[Tensor, "k 128"]) -> Float[Tensor, " d"]:
+def summed(descriptors: Float[Tensor, "n 128"], words: Float[Tensor, "k 128"]) -> Float[Tensor, " d"]:
+    """A frame's VLAD descriptor of unit length: per word the normalised sum of what its descriptors differ from it."""
     nearest = (descriptors @ words.mT).argmax(1)
     sums = torch.zeros_like(words).index_add_(0, nearest, descriptors - words[nearest])
     return normalize(normalize(sums, dim=1).flatten(), dim=0)

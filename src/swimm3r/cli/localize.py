@@ -1,0 +1,46 @@
+"""`swimm3r localize`: where pictures were taken, in a run's map."""
+
+from pathlib import Path
+
+from rich.console import Console
+from rich.table import Table
+from tyro.conf import Positional
+
+from swimm3r.cli.console import drawn_progress
+from swimm3r.localization.settings import LocalizationSettings
+
+
+def localize(
+    run: Positional[Path],
+    images: Positional[tuple[Path, ...]] = (),
+    /,
+    lens: Path | None = None,
+    out: Path | None = None,
+    settings: LocalizationSettings = LocalizationSettings(),  # noqa: B008
+) -> None:
+    """Find where pictures were taken in a run's map; without pictures, its test frames.
+
+    Args:
+        run: the run folder.
+        images: pictures of the same place.
+        lens: a cameras.json whose first camera is the pictures' own; otherwise they share the run's lens.
+        out: where poses.json, poses.tum and the match pictures go; RUN/localization otherwise.
+        settings: the protocol.
+    """
+    from swimm3r.localization.batch import localize_run
+
+    with drawn_progress() as progress:
+        answers, folder = localize_run(run, images, lens, out, settings, progress)
+    table = Table("picture", "place", "inliers", "median error, px", "seconds")
+    for a in answers:
+        if a.found is None:
+            table.add_row(a.name, "not found", "", "", "")
+            continue
+        inliers = (
+            f"{a.found.inliers} of {a.found.matches}" if a.found.stage == "refined" else str(a.found.coarse_inliers)
+        )
+        error = "" if a.found.reprojection_px is None else f"{a.found.reprojection_px:.2f}"
+        table.add_row(a.name, a.found.stage, inliers, error, f"{sum(a.found.seconds.values()):.1f}")
+    console = Console()
+    console.print(table)
+    console.print(folder)

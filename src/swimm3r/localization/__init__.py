@@ -1,0 +1,31 @@
+"""Where a picture was taken, in a map: `localize` for one picture, `Localizer` for many, by the paper's protocol."""
+
+from typing import TYPE_CHECKING
+
+if TYPE_CHECKING:
+    from jaxtyping import Float
+    from torch import Tensor
+
+    from swimm3r.cameras import Cameras
+    from swimm3r.frames import Frames
+    from swimm3r.localization.settings import LocalizationSettings
+    from swimm3r.reconstruction import Reconstruction
+    from swimm3r.splat.rendering import SplatMap
+
+
+def localize(
+    image: "Float[Tensor, 'h w 3']",
+    scene: "SplatMap",
+    rec: "Reconstruction",
+    frames: "Frames | None" = None,
+    lens: "Cameras | None" = None,
+    settings: "LocalizationSettings | None" = None,
+) -> "Float[Tensor, '4 4']":
+    """cam2world of one picture, in the axes and unit of `rec`. Raises RegistrationError where it cannot be placed.
+
+    The query is first matched with training pictures: `frames` has them; without, the map's renderings from the same
+    poses take their place. `lens` is the picture's camera (its pose unused), by default that of the reconstruction.
+    """
+    from swimm3r.localization.protocol import Localizer
+
+    return Localizer(scene, rec, frames, settings).locate(image, lens=lens).cam2world

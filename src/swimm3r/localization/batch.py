@@ -1,0 +1,162 @@
+"""Many pictures placed in the map of a finished run, and the record of it.
+
+OUT/poses.json       per picture: its pose and what speaks for it, or why it could not be placed
+OUT/poses.tum        timestamp tx ty tz qx qy qz qw, camera to world, of the pictures that were placed
+OUT/matches/NAME.png the query beside the rendering, a line per inlier
+"""
+
+import json
+from collections.abc import Sequence
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+import torch
+from jaxtyping import Bool, Float, UInt8
+from torch import Tensor
+
+from swimm3r import reconstruction
+from swimm3r.cameras import Cameras
+from swimm3r.errors import InputError, RegistrationError
+from swimm3r.geometry import quaternion_from_rotation
+from swimm3r.io import cameras_json, images
+from swimm3r.io.atomic import write_text
+from swimm3r.localization.protocol import STAGES, Evidence, Localization, Localizer
+from swimm3r.localization.settings import LocalizationSettings
+from swimm3r.prepare import load_frames
+from swimm3r.progress import Progress, silent
+from swimm3r.splat.checkpoint import load_map
+
+_LINES = 60  # inliers drawn, spread over all of them
+
+
+@dataclass(frozen=True)
+class Query:
+    """One picture that asks where it was taken."""
+
+    name: str
+    time: float  # seconds; the number of the picture where it has none
+    picture: Float[Tensor, "h w 3"]
+    mask: Bool[Tensor, "h w"] | None = None
+
+
+@dataclass(frozen=True)
+class Answer:
+    """What became of a query."""
+
+    name: str
+    time: float
+    found: Localization | None
+    reason: str = ""  # why nothing was found
+
+
+def localize_run(
+    folder: Path,
+    pictures: Sequence[Path] = (),
+    lens: Path | None = None,
+    out: Path | None = None,
+    settings: LocalizationSettings | None = None,
+    progress: Progress = silent,
+) -> tuple[list[Answer], Path]:
+    """Places pictures, by default the run's test frames, in the run's map; the record goes to `out`.
+
+    Raises InputError where the run has no map, RegistrationError where not one picture could be placed.
+    """
+    scene, rec = load_map(folder / "splat" / "map.safetensors"), reconstruction.load(folder / "sfm")
+    frames = load_frames(folder / "prepare")
+    localizer = Localizer(scene, rec, frames, settings)
+    camera = None if lens is None else reconstruction.cameras_of(cameras_json.read_cameras(lens))[0]
+    out = out or folder / "localization"
+    answers = []
+    names = [path.name for path in pictures] or list(frames.test.names)
+    if len(set(names)) < len(names):
+        raise InputError(
+            "two of the pictures have the same name",
+            cause="they lie in different folders",
+            hint="one folder at a time, each with its own --out",
+        )
+    for i, name in enumerate(names):
+        progress("localising", i, len(names))
+        if pictures:
+            query = Query(name, float(i), _picture(pictures[i]))
+        else:
+            f = frames.index(name)
+            query = Query(name, frames.frames[f].time, frames.image(f), frames.mask(f))
+        answers.append(answer(localizer, query, camera))
+        found = answers[-1].found
+        if found is not None and found.evidence is not None:
+            images.write_rgb(out / "matches" / f"{name}.png", match_picture(found.evidence))
+        _write(out, answers, localizer.matcher.name, rec.metric)
+    progress("localising", len(names), len(names))
+    if all(a.found is None for a in answers):
+        raise RegistrationError(
+            f"none of the {len(answers)} pictures could be placed in the map",
+            cause="they show other places than the map, or it was made in very different water",
+            hint="pictures from nearer to the dive's path",
+        )
+    return answers, out
+
+
+def answer(localizer: Localizer, query: Query, lens: Cameras | None = None) -> Answer:
+    """The query's place, or the reason why none was found."""
+    try:
+        return Answer(query.name, query.time, localizer.locate(query.picture, query.mask, lens))
+    except RegistrationError as failure:
+        return Answer(query.name, query.time, None, failure.what)
+
+
+def tum_line(time: float, cam2world: Float[Tensor, "4 4"]) -> str:
+    """One line of a TUM trajectory."""
+    w, x, y, z = quaternion_from_rotation(cam2world[:3, :3].double()).tolist()
+    return " ".join(f"{value:.9f}" for value in (time, *cam2world[:3, 3].tolist(), x, y, z, w))
+
+
+def match_picture(evidence: Evidence) -> UInt8[np.ndarray, "h w2 3"]:
+    """Query and rendering side by side, with inliers joined."""
+    import cv2
+
+    both = torch.cat([evidence.query, evidence.rendering], 1).clamp(0, 1)
+    canvas = np.ascontiguousarray((both * 255).round().to(torch.uint8).numpy())
+    width = evidence.query.shape[1]
+    inliers = evidence.inlier.nonzero()[:, 0]
+    for k in inliers[:: max(1, len(inliers) // _LINES)].tolist():
+        left = [round(float(v)) for v in evidence.xy_query[k]]
+        right = [round(float(v)) for v in evidence.xy_rendering[k]]
+        cv2.line(canvas, left, (right[0] + width, right[1]), (255, 220, 60), 1, cv2.LINE_AA)
+    return canvas
+
+
+def _picture(path: Path) -> Float[Tensor, "h w 3"]:
+    stored = images.read_rgb(path)
+    return torch.from_numpy(stored.astype(np.float32) / np.iinfo(stored.dtype).max)
+
+
+def _write(out: Path, answers: Sequence[Answer], matcher: str, metric: bool) -> None:
+    placed = [(a, a.found) for a in answers if a.found is not None]
+    document = {
+        "matcher": matcher,
+        "unit": "metres" if metric else "scene units",
+        "convention": "OpenCV camera axes, camera-to-world",
+        "located": len(placed),
+        "seconds": {stage: sum(found.seconds[stage] for _, found in placed) / max(1, len(placed)) for stage in STAGES},
+        "pictures": [_described(a) for a in answers],
+    }
+    write_text(out / "poses.json", json.dumps(document, indent=1) + "\n")
+    write_text(out / "poses.tum", "".join(tum_line(a.time, found.cam2world) + "\n" for a, found in placed))
+
+
+def _described(a: Answer) -> dict[str, object]:
+    if a.found is None:
+        return {"name": a.name, "time": a.time, "c2w": None, "reason": a.reason}
+    return {
+        "name": a.name,
+        "time": a.time,
+        "c2w": a.found.cam2world.tolist(),
+        "stage": a.found.stage,
+        "candidates": list(a.found.candidates),
+        "coarse_inliers": a.found.coarse_inliers,
+        "matches": a.found.matches,
+        "inliers": a.found.inliers,
+        "reprojection_px": a.found.reprojection_px,
+        "seconds": a.found.seconds,
+    }

@@ -1,0 +1,120 @@
+"""The paper's protocol on a map that is exactly known."""
+
+import pytest
+import torch
+
+import swimm3r
+from swimm3r.errors import InputError, RegistrationError
+from swimm3r.geometry import pose_from, rotation_angle, so3_exp
+from swimm3r.localization.batch import Query, answer, match_picture, tum_line
+from swimm3r.localization.matchers import Mast3rMatcher, SiftMatcher
+from swimm3r.localization.protocol import STAGES, Localizer
+from swimm3r.localization.settings import LocalizationSettings
+from swimm3r.sfm.settings import FeatureSettings
+
+SETTINGS = LocalizationSettings(matcher="sift", candidates=3, features=FeatureSettings(count=800))
+
+
+def off(found: torch.Tensor, truth: torch.Tensor) -> tuple[float, float]:
+    """Degrees and scene units between two poses."""
+    turn = rotation_angle(found[:3, :3].double().mT @ truth[:3, :3])
+    return float(torch.rad2deg(turn)), float((found[:3, 3] - truth[:3, 3]).norm())
+
+
+@pytest.fixture(scope="module")
+def localizer(place) -> Localizer:
+    return Localizer(place.scene, place.rec, place.frames, SETTINGS)
+
+
+@pytest.mark.parametrize("i", [2, 4])
+def test_a_held_out_frame_is_placed(place, localizer: Localizer, i: int):
+    found = localizer.locate(place.frames.image(i))
+    degrees, distance = off(found.cam2world, place.cameras.cam2world[i])
+    assert degrees < 0.1
+    assert distance < 0.005
+    assert found.stage == "refined"
+    assert found.inliers > 50
+    assert found.reprojection_px is not None
+    assert found.reprojection_px < 0.5
+    assert set(found.candidates) < set(place.rec.names)
+    assert set(found.seconds) == set(STAGES)
+
+
+def test_the_reference_farthest_away_is_the_least_like(place, localizer: Localizer):
+    assert "5.png" not in localizer.locate(place.frames.image(2)).candidates
+
+
+def test_the_map_alone_is_enough(place):
+    pose = swimm3r.localize(place.frames.image(2), place.scene, place.rec, settings=SETTINGS)
+    degrees, distance = off(pose, place.cameras.cam2world[2])
+    assert degrees < 0.1
+    assert distance < 0.005
+
+
+def test_a_smaller_copy_of_a_picture_is_placed_and_another_shape_needs_its_lens(place, localizer: Localizer):
+    picture = place.frames.image(2).permute(2, 0, 1)[None]
+    half = torch.nn.functional.interpolate(picture, (135, 180), mode="area")[0].permute(1, 2, 0).contiguous()
+    degrees, _ = off(localizer.locate(half).cam2world, place.cameras.cam2world[2])
+    assert degrees < 0.2
+    with pytest.raises(InputError, match="another lens"):
+        localizer.locate(place.frames.image(2)[:, :200])
+
+
+def test_a_picture_of_something_else_is_refused(localizer: Localizer):
+    noise = torch.rand(180, 240, 3, generator=torch.Generator().manual_seed(3))
+    with pytest.raises(RegistrationError, match="could not be placed"):
+        localizer.locate(noise)
+    failed = answer(localizer, Query("noise.png", 0.0, noise))
+    assert failed.found is None
+    assert "could not be placed" in failed.reason
+
+
+def test_without_a_good_rendering_the_coarse_pose_stands(place, localizer: Localizer):
+    hollow = Localizer(
+        place.scene, place.rec, place.frames, LocalizationSettings(min_alpha=1.1, matcher="sift", candidates=3)
+    )
+    found = hollow.locate(place.frames.image(2))
+    assert found.stage == "coarse"
+    assert found.reprojection_px is None
+    assert off(found.cam2world, place.cameras.cam2world[2])[0] < 1.0
+
+
+def test_masked_pixels_take_no_part(place):
+    matcher = SiftMatcher(SETTINGS)
+    left = torch.zeros(180, 240, dtype=torch.bool)
+    left[:, :120] = True
+    assert (matcher.describe(place.frames.image(2), left).xy[:, 0] < 120).all()
+
+
+def test_the_network_finds_the_picture_itself_and_matches_within_both_pictures(place, small_network):
+    matcher = Mast3rMatcher(small_network, SETTINGS)
+    everywhere = torch.ones(180, 240, dtype=torch.bool)
+    described = {
+        name: matcher.describe(place.frames.image(place.frames.index(name)), everywhere) for name in place.rec.names
+    }
+    likeness = matcher.index(place.rec.names, described.__getitem__)
+    for k, name in enumerate(place.rec.names):
+        assert int(likeness(described[name]).argmax()) == k
+    xy_a, xy_b = matcher.match(described["1.png"], described["3.png"])
+    assert len(xy_a) == len(xy_b) > 0
+    for xy in (xy_a, xy_b):
+        assert ((xy > 0) & (xy < torch.tensor([240.0, 180.0]))).all()
+
+
+def test_a_match_picture_shows_both_and_joins_inliers(localizer: Localizer, place):
+    evidence = localizer.locate(place.frames.image(2)).evidence
+    assert evidence is not None
+    picture = match_picture(evidence)
+    assert picture.shape == (180, 480, 3)
+    plain = (torch.cat([evidence.query, evidence.rendering], 1).clamp(0, 1) * 255).round().numpy()
+    assert (abs(picture - plain).max(-1) > 30).mean() > 0.01
+
+
+def test_a_tum_line_turns_back_into_the_pose():
+    pose = pose_from(so3_exp(torch.tensor([0.3, -0.2, 0.5]).double()), torch.tensor([1.0, 2.0, 3.0]).double())
+    time, *numbers = (float(value) for value in tum_line(0.25, pose).split())
+    assert (time, numbers[:3]) == (0.25, [1.0, 2.0, 3.0])
+    x, y, z, w = numbers[3:]
+    v = torch.tensor([x, y, z]).double()
+    angle = 2 * torch.atan2(v.norm(), torch.tensor(w))
+    torch.testing.assert_close(so3_exp(angle * v / v.norm()), pose[:3, :3], atol=1e-6, rtol=0)
