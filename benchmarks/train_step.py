@@ -75,7 +75,7 @@ def measure(size: Size, repeats: int) -> dict[str, float]:
     height, width = size.height, size.width
     recipe = uwbs.Uwbs(settings, None, 1.0, 1.0, None)  # the reconstruction is read at the start only
     p, field = lifted(size), initial_field(None, settings.medium, rng)
-    state = uwbs.State(p, field, {name: fresh(t) for name, t in uwbs._parameters(p, field).items()})
+    state = uwbs.State(p, field, None, {name: fresh(t) for name, t in uwbs._parameters(p, field).items()})
     prior = 1 + 9 * torch.rand(height, width, generator=rng)
     view = View(
         "benchmark", camera(size), torch.rand(3, height, width, generator=rng),

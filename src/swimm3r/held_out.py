@@ -22,7 +22,7 @@ from swimm3r.evaluate import NotComputed
 from swimm3r.evaluate.images import ViewScores, as_8_bit, blur4_psnr, mean_view_scores, psnr, view_scores
 from swimm3r.evaluate.lpips import Lpips, load_lpips
 from swimm3r.frames import Frames
-from swimm3r.geometry import DegenerateAlignmentError, align_poses, align_similarity
+from swimm3r.geometry import DegenerateAlignmentError, Similarity, align_poses, align_similarity
 from swimm3r.ground_truth import GroundTruth
 from swimm3r.localization.landmarks import landmarks_of, locate
 from swimm3r.localization.neighbours import neighbours, pose_from_neighbours
@@ -78,7 +78,7 @@ def first_poses(
     progress: Progress = silent,
 ) -> dict[str, FirstPose]:
     """A pose of every test frame in the axes and unit of the reconstruction."""
-    known = {} if reference is None else _from_reference(rec, reference)
+    known = {} if reference is None else reference_poses(rec, reference)
     landmarks = landmarks_of(rec, frames, features)
     poses = {}
     for done, frame in enumerate(frames.test):
@@ -95,6 +95,30 @@ def first_poses(
             poses[frame.name] = FirstPose(located.cam2world, "2D-3D matches")
     progress("placing test frames", len(frames.test), len(frames.test))
     return poses
+
+
+def reference_poses(rec: Reconstruction, reference: GroundTruth) -> dict[str, Float[Tensor, "4 4"]]:
+    """The reference's poses in the reconstruction's axes and unit; none where the frames they share do not align."""
+    place = {name: i for i, name in enumerate(reference.names)}
+    shared = [name for name in rec.names if name in place]
+    theirs = reference.cameras.cam2world[[place[name] for name in shared]].double()
+    ours = rec.cameras.cam2world[[rec.index(name) for name in shared]].double()
+    to_ours = best_similarity(theirs, ours)
+    if to_ours is None:
+        return {}
+    moved = to_ours.poses(reference.cameras.cam2world.double())
+    return {name: moved[i] for name, i in place.items()}
+
+
+def in_axes_of(scene: SplatMap, rec: Reconstruction, poses: dict[str, FirstPose]) -> dict[str, FirstPose]:
+    """The reconstruction's poses in the axes and unit of the map, whose training cameras may have moved together."""
+    if scene.poses is None:
+        return poses
+    before = rec.cameras.cam2world[[rec.index(name) for name in scene.poses.names]].double()
+    moved = best_similarity(before, scene.poses.cam2world)
+    if moved is None:
+        return poses
+    return {name: replace(pose, cam2world=moved.poses(pose.cam2world.double())) for name, pose in poses.items()}
 
 
 def score_views(
@@ -229,18 +253,12 @@ def published_lpips() -> Lpips | NotComputed:
     return load_lpips(weights.find("vgg16"), weights.find("lpips-vgg"))
 
 
-def _from_reference(rec: Reconstruction, reference: GroundTruth) -> dict[str, Float[Tensor, "4 4"]]:
-    """The reference's poses in the reconstruction's axes and unit; none where the frames they share do not align."""
-    place = {name: i for i, name in enumerate(reference.names)}
-    shared = [name for name in rec.names if name in place]
-    theirs = reference.cameras.cam2world[[place[name] for name in shared]].double()
-    ours = rec.cameras.cam2world[[rec.index(name) for name in shared]].double()
+def best_similarity(source: Float[Tensor, "n 4 4"], target: Float[Tensor, "n 4 4"]) -> Similarity | None:
+    """The similarity of the centres, of the poses where the centres lie on a line, None where neither is determined."""
     try:
-        to_ours = align_similarity(theirs[:, :3, 3], ours[:, :3, 3])
+        return align_similarity(source[:, :3, 3], target[:, :3, 3])
     except DegenerateAlignmentError:
         try:
-            to_ours = align_poses(theirs, ours)
+            return align_poses(source, target)
         except DegenerateAlignmentError:
-            return {}
-    moved = to_ours.poses(reference.cameras.cam2world.double())
-    return {name: moved[i] for name, i in place.items()}
+            return None

@@ -93,7 +93,8 @@ def render_run(
     Raises InputError where the run has no map, or a name in the file leads out of the folder.
     """
     scene, rec = load_map(folder / "splat" / "map.safetensors"), reconstruction.load(folder / "sfm")
-    table = cameras_json.read_cameras(cameras or folder / "sfm" / "cameras.json")
+    refined = folder / "splat" / "cameras.json"
+    table = cameras_json.read_cameras(cameras or (refined if refined.is_file() else folder / "sfm" / "cameras.json"))
     stations, out = reconstruction.cameras_of(table), out or folder / "renders" / "views"
     for name in table.names:
         if PurePosixPath(name).is_absolute() or ".." in PurePosixPath(name).parts:

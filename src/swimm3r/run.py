@@ -169,9 +169,11 @@ def evaluate_run(
 def _scores(run: _Run, settings: RunSettings, truth: GroundTruth | None, progress: Progress) -> dict[str, object]:
     folder, frames, rec, scene = run.folder, run.frames, run.rec, run.scene
     poses = held_out.first_poses(rec, frames, settings.sfm.features, _reference(settings, frames, truth), progress)
+    poses = held_out.in_axes_of(scene, rec, poses)
     views = held_out.score_views(scene, rec, frames, poses, folder / "renders" / "test", settings.test, progress)
     canvas = held_out.cut(views[0].canvas, views[0].window)
-    write_flythrough(folder / "renders" / "flythrough.mp4", scene, canvas, rec.cameras.cam2world, _FLIGHT, progress)
+    path = rec.cameras.cam2world if scene.poses is None else scene.poses.cam2world
+    write_flythrough(folder / "renders" / "flythrough.mp4", scene, canvas, path, _FLIGHT, progress)
     return {
         "test": sections.test_section(views, settings.test),
         "restored": {

@@ -23,6 +23,7 @@ from swimm3r.medium import Medium, MediumFit, remove_water, rescale
 from swimm3r.progress import Progress, silent
 from swimm3r.reconstruction import Reconstruction
 from swimm3r.splat.medium_field import grid_of
+from swimm3r.splat.pose_codes import RefinedPoses
 from swimm3r.splat.projection import pinhole
 from swimm3r.splat.rendering import SplatMap
 from swimm3r.splat.settings import PoseRefinementSettings
@@ -176,11 +177,27 @@ def truth_section(
         return summary_entries(section)
     section |= _depth_section(rec, truth, scale)
     entries = summary_entries(section)
+    if scene is not None and scene.poses is not None:
+        entries["refined_poses"] = _refined_section(scene.poses, truth)
     if truth.medium is not None and rec.medium is not None:
         entries["sfm"] = _water_section(rescale(rec.medium, scale), frames.test, truth, progress)
     if truth.medium is not None and scene is not None:
         entries["splat"] = _map_water_section(scene, rec, views, truth, scale)
     return entries
+
+
+def _refined_section(poses: RefinedPoses, truth: GroundTruth) -> dict[str, object]:
+    """The errors of the training frames' poses as the map's training left them."""
+    reference = {name: i for i, name in enumerate(truth.names)}
+    rows = [k for k, name in enumerate(poses.names) if name in reference]
+    if len(rows) < 2:
+        reason = NotComputed("fewer than 2 training frames are named in the reference")
+        return summary_entries(dict.fromkeys(("rotation_deg", "translation_deg", "ate"), reason))
+    true = truth.cameras.cam2world[[reference[poses.names[k]] for k in rows]]
+    scores = pose_scores(poses.cam2world[rows], true)
+    return summary_entries(
+        {"rotation_deg": scores.rotation_deg, "translation_deg": scores.translation_deg, "ate": scores.ate}
+    )
 
 
 def _medium_section(fit: MediumFit, metric: bool) -> dict[str, object]:

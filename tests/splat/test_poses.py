@@ -7,7 +7,8 @@ import torch
 
 from swimm3r.cameras import project
 from swimm3r.geometry import relative_poses, rotation_angle, so3_exp
-from swimm3r.splat.poses import edges, moved, refine_pose
+from swimm3r.splat.pose_codes import moved
+from swimm3r.splat.poses import edges, refine_pose
 from swimm3r.splat.settings import PoseRefinementSettings
 
 SEEN = torch.ones(48, 64, dtype=torch.bool)

@@ -1,7 +1,8 @@
 """Maps and training states on disk, as safetensors: tensors under their names, everything else in the header.
 
 map.safetensors (`schema` 1) holds the primitives as stored (before activation), the medium network, and in its header
-the recipe, its settings, the metric flag and the working unit. A checkpoint adds the optimiser's moments and the step.
+the recipe, its settings, the metric flag and the working unit; also the training frames' poses where they were
+refined. A checkpoint adds the optimiser's moments and the step.
 """
 
 import json
@@ -16,6 +17,7 @@ from torch import Tensor
 from swimm3r.errors import InputError
 from swimm3r.io.atomic import atomic_path
 from swimm3r.splat.medium_field import MediumField
+from swimm3r.splat.pose_codes import RefinedPoses
 from swimm3r.splat.primitives import BetaPrimitives
 from swimm3r.splat.rendering import SplatMap
 from swimm3r.splat.settings import UwbsSettings
@@ -42,6 +44,9 @@ def save_map(path: Path, scene: SplatMap) -> None:
         "metric": scene.metric,
         "length": scene.length,
     }
+    if scene.poses is not None:
+        tensors["poses.cam2world"] = scene.poses.cam2world
+        about["frames"] = scene.poses.names
     write(path, Stored(tensors, about))
 
 
@@ -60,7 +65,8 @@ def load_map(path: Path) -> SplatMap:
         primitives = BetaPrimitives(*(stored.tensors[f"primitives.{name}"] for name in BetaPrimitives._fields))
     except (KeyError, RuntimeError) as error:
         raise _foreign(path, str(error)) from error
-    return SplatMap(primitives, field.requires_grad_(False), settings, about["metric"], about["length"])
+    poses = RefinedPoses(tuple(about["frames"]), stored.tensors["poses.cam2world"]) if "frames" in about else None
+    return SplatMap(primitives, field.requires_grad_(False), settings, about["metric"], about["length"], poses)
 
 
 def write(path: Path, stored: Stored) -> None:

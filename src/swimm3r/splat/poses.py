@@ -14,15 +14,14 @@ from jaxtyping import Bool, Float
 from torch import Tensor
 
 from swimm3r.cameras import Cameras
-from swimm3r.geometry import pose_from, rotation_from_6d
 from swimm3r.progress import Progress, silent
+from swimm3r.splat.pose_codes import moved
 from swimm3r.splat.primitives import BetaPrimitives, select
 from swimm3r.splat.projection import pinhole, project
 from swimm3r.splat.rendering import SplatMap, draw, in_scene_units
 from swimm3r.splat.settings import PoseRefinementSettings
 from swimm3r.splat.views import pinhole_canvas, undistorted
 
-_IDENTITY = (1.0, 0.0, 0.0, 0.0, 1.0, 0.0)
 _DARK = 0.01  # sum of R, G, B below which a pixel is not looked at
 _MARGIN = 0.25  # of the picture, within which primitives outside it are kept: the pose moves
 
@@ -71,12 +70,6 @@ def refine_pose(
     start, end = losses[0], losses[-1]
     best = end if end[0] < start[0] else start
     return RefinedPose(replace(camera, cam2world=best[1][None]), start[0], best[0])
-
-
-def moved(cam2world: Float[Tensor, "4 4"], delta: Float[Tensor, "9"], length: float) -> Float[Tensor, "4 4"]:
-    """The pose after a small motion in its own camera's axes."""
-    rotation = rotation_from_6d(delta[3:] + torch.tensor(_IDENTITY))
-    return cam2world @ pose_from(rotation, delta[:3] * length).to(cam2world)
 
 
 def edges(

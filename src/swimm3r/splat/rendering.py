@@ -10,6 +10,7 @@ from swimm3r.cameras import Cameras
 from swimm3r.medium import Medium
 from swimm3r.raster import MediumMaps, RasterOutput, SggBuffers, rasterize
 from swimm3r.splat.medium_field import FieldGrid, MediumField, grid_of, medium_at_pixels, per_z_depth
+from swimm3r.splat.pose_codes import RefinedPoses
 from swimm3r.splat.primitives import BetaPrimitives
 from swimm3r.splat.projection import Pinhole, Projection, pinhole, project
 from swimm3r.splat.settings import UwbsSettings
@@ -39,6 +40,7 @@ class SplatMap:
     settings: UwbsSettings
     metric: bool
     length: float = 1.0  # scene units per working unit (`settings.py`)
+    poses: RefinedPoses | None = None  # of the training frames; None where they were held
 
     def render(self, camera: Cameras) -> RenderOutput:
         """The view of one pinhole camera, without gradient. Raises ValueError where the camera has distortion."""

@@ -142,6 +142,23 @@ class SggSettings:
 
 
 @dataclass(frozen=True)
+class TrainingPoseSettings:
+    """The training frames' poses, refined with the map (3R-GS's module and values)."""
+
+    enabled: bool = True
+    width: int = 64
+    """Of a camera's code and of the network's hidden layers."""
+    rate: float = 1.5e-4
+    """Of Adam, for codes and network."""
+    epipolar: float = 2.0
+    """Weight of the matches' epipolar error, pixels."""
+    epipolar_end: float = 0.15
+    """Share of the run after which the matches are left out."""
+    matches: int = 4096
+    """Matches per step, drawn anew each time; 3R-GS takes every twentieth of all."""
+
+
+@dataclass(frozen=True)
 class UwbsSettings:
     """Underwater Beta Splatting, static."""
 
@@ -157,6 +174,7 @@ class UwbsSettings:
     weights: LossWeights = field(default_factory=LossWeights)
     densify: DensifySettings = field(default_factory=DensifySettings)
     sgg: SggSettings = field(default_factory=SggSettings)
+    poses: TrainingPoseSettings = field(default_factory=TrainingPoseSettings)
     seed: int = 0
     log_every: float = 0.005
     checkpoint_every: float = 0.1

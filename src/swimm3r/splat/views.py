@@ -50,6 +50,14 @@ class TrainingViews:
     def __len__(self) -> int:
         return len(self.names)
 
+    @property
+    def cameras(self) -> Cameras:
+        """The views' pinhole cameras, working units."""
+        canvases = pinhole_canvas(
+            self.rec.cameras[[self.rec.index(name) for name in self.names]], self.settings.long_side
+        )
+        return _in_working_units(canvases, self.scale)
+
     def __getitem__(self, k: int) -> View:
         name = self.names[k]
         i = self.rec.index(name)
@@ -64,11 +72,9 @@ class TrainingViews:
             return stored, seen.numpy(), z_depth.half().numpy(), weight.half().numpy()
 
         rgb, seen, z_depth, weight = self._cache.get(name, make)
-        cam2world = canvas.cam2world.clone()
-        cam2world[:, :3, 3] *= self.scale
         return View(
             name,
-            replace(canvas, cam2world=cam2world),
+            _in_working_units(canvas, self.scale),
             torch.from_numpy(rgb.astype(np.float32)) / 255,
             torch.from_numpy(seen.copy()),
             torch.from_numpy(z_depth.astype(np.float32)),
@@ -87,6 +93,12 @@ class TrainingViews:
         z_depth, confidence = depth.z_depth[row, column], depth.confidence[row, column]
         known = seen & z_depth.isfinite() & (z_depth > 0) & (confidence >= self.settings.weights.depth_confidence)
         return torch.where(known, z_depth * self.scale, 0.0), torch.where(known, edge_weight(rgb), 0.0)
+
+
+def _in_working_units(cameras: Cameras, scale: float) -> Cameras:
+    cam2world = cameras.cam2world.clone()
+    cam2world[:, :3, 3] *= scale
+    return replace(cameras, cam2world=cam2world)
 
 
 def pinhole_canvas(lens: Cameras, long_side: int) -> Cameras:

@@ -9,7 +9,7 @@ known surfaces opaque (`coverage`).
 import hashlib
 import json
 import math
-from dataclasses import asdict, dataclass
+from dataclasses import asdict, dataclass, replace
 from pathlib import Path
 
 import torch
@@ -24,10 +24,11 @@ from swimm3r.splat import checkpoint, densify, losses, training
 from swimm3r.splat.gradients import differentiate
 from swimm3r.splat.medium_field import MediumField, WaterPrior, deviation, initial_field, smoothness, water_prior
 from swimm3r.splat.optimiser import Moments, adam_step, fresh, log_linear
+from swimm3r.splat.pose_codes import PoseCodes, Stations, training_stations, write_refined
 from swimm3r.splat.primitives import BetaPrimitives, initial_primitives, rescaled
 from swimm3r.splat.projection import pinhole
 from swimm3r.splat.rendering import Drawing, SplatMap, draw
-from swimm3r.splat.settings import UwbsSettings
+from swimm3r.splat.settings import TrainingPoseSettings, UwbsSettings
 from swimm3r.splat.views import TrainingViews, View, working_scale
 
 
@@ -37,7 +38,8 @@ class State:
 
     primitives: BetaPrimitives
     field: MediumField
-    moments: dict[str, Moments]  # of "xyz" ... and of the field's parameters by "field.*"
+    poses: PoseCodes | None  # None where poses are held
+    moments: dict[str, Moments]  # of "xyz" ..., of the field's parameters by "field.*", of the poses' by "poses.*"
 
 
 @dataclass(frozen=True)
@@ -59,6 +61,7 @@ class Uwbs:
     scale: float  # working units per scene unit
     radius: float  # of the cameras' path, working units
     prior: WaterPrior | None  # None where the reconstruction has no water
+    stations: Stations | None = None  # None where poses are held
 
     def start(self) -> State:
         """Primitives on the cloud, and the reconstruction's water in every direction."""
@@ -70,27 +73,38 @@ class Uwbs:
             fit = self.rec.medium.medium
             medium = Medium(fit.Binf, fit.beta_D / self.scale, fit.beta_B / self.scale)
         field = initial_field(medium, settings.medium, training.generator(settings.seed, 0, 3))
-        return State(p, field, {name: fresh(values) for name, values in _parameters(p, field).items()})
+        poses = None
+        if self.stations is not None:
+            poses = PoseCodes(len(self.stations), settings.poses, training.generator(settings.seed, 0, 6))
+        return State(p, field, poses, {name: fresh(values) for name, values in _parameters(p, field, poses).items()})
 
     def step(self, state: State, view: View, step: int) -> tuple[State, dict[str, float]]:
         """One view: forward, adjoint, densification on its cadence, Adam."""
         settings, share = self.settings, step / self.settings.iterations
-        parameters = _parameters(state.primitives, state.field)
+        parameters = _parameters(state.primitives, state.field, state.poses)
         p = BetaPrimitives(*(values.detach().requires_grad_() for values in state.primitives))
-        sight, filtered = pinhole(view.camera), settings.sgg.enabled and share <= settings.sgg.end
+        camera, filtered = view.camera, settings.sgg.enabled and share <= settings.sgg.end
+        if self.stations is not None and state.poses is not None:
+            camera = replace(camera, cam2world=self.stations.moved(state.poses, [view.name]))
+        sight = pinhole(camera)
         drawing = draw(p, state.field, sight, settings, sgg=filtered)
         loss = objective(p, drawing, view, settings, self.prior, self._regularised(share))
-        numbers = loss.numbers | {"primitives": float(len(p.xyz))}
-        leaves = [*p, *state.field.network.parameters()]
+        numbers, total = loss.numbers | {"primitives": float(len(p.xyz))}, loss.total
+        if self.stations is not None and state.poses is not None and share <= settings.poses.epipolar_end:
+            matches = self.stations.matches.some(settings.poses.matches, training.generator(settings.seed, step, 7))
+            off = self.stations.epipolar_error(state.poses, matches)
+            total = total + settings.poses.epipolar * off
+            numbers |= {"epipolar_px": float(off.detach())}
+        leaves = [*p, *state.field.network.parameters(), *(state.poses.parameters() if state.poses else ())]
         multiplier = None
         if filtered:
-            sgg = differentiate(loss.total, loss.depth, leaves, p, drawing, sight, settings)
+            sgg = differentiate(total, loss.depth, leaves, p, drawing, sight, settings)
             gradients = dict(zip(parameters, sgg.gradients, strict=True))
             gradients["xyz"] = gradients["xyz"] + sgg.xyz
             multiplier = sgg.multiplier
             numbers |= {"medium_uncertainty": float(sgg.uncertainty[sgg.uncertainty > 0].mean().nan_to_num())}
         else:
-            found = torch.autograd.grad(loss.total, leaves, materialize_grads=True)
+            found = torch.autograd.grad(total, leaves, materialize_grads=True)
             gradients = dict(zip(parameters, found, strict=True))
         rates = self._rates(step)
         if self._densifies(step):
@@ -102,15 +116,17 @@ class Uwbs:
                 multiplier[round_.stale] = 1
         _clip_field(gradients)
         with torch.no_grad():
-            before = state.primitives.xyz.clone()
-            adam_step(_parameters(state.primitives, state.field), gradients, state.moments, rates)
-            if multiplier is not None:
-                state.primitives.xyz.sub_(before).mul_(multiplier[:, None]).add_(before)
+            parameters = _parameters(state.primitives, state.field, state.poses)
+            before = None if multiplier is None else parameters["xyz"].clone()
+            adam_step(parameters, gradients, state.moments, rates)
+            if multiplier is not None and before is not None:
+                parameters["xyz"].sub_(before).mul_(multiplier[:, None]).add_(before)
         return state, numbers
 
     def stored(self, state: State) -> dict[str, Tensor]:
         """Parameters by name; their moments after .first, .second and .steps."""
-        tensors = {f"parameter.{name}": t for name, t in _parameters(state.primitives, state.field).items()}
+        parameters = _parameters(state.primitives, state.field, state.poses)
+        tensors = {f"parameter.{name}": t for name, t in parameters.items()}
         for name, m in state.moments.items():
             tensors |= {f"first.{name}": m.first, f"second.{name}": m.second, f"steps.{name}": m.steps}
         return tensors
@@ -118,13 +134,14 @@ class Uwbs:
     def restored(self, tensors: dict[str, Tensor]) -> State:
         """The inverse of `stored`."""
         field = MediumField(self.settings.medium.hidden)
-        names = [key.removeprefix("parameter.") for key in tensors if key.startswith("parameter.")]
-        with torch.no_grad():
-            for name, parameter in field.network.named_parameters():
-                parameter.copy_(tensors[f"parameter.field.{name}"])
+        poses = None if self.stations is None else PoseCodes(len(self.stations), self.settings.poses)
         p = BetaPrimitives(*(tensors[f"parameter.{name}"] for name in BetaPrimitives._fields))
-        moments = {k: Moments(tensors[f"first.{k}"], tensors[f"second.{k}"], tensors[f"steps.{k}"]) for k in names}
-        return State(p, field, {name: moments[name] for name in _parameters(p, field)})
+        parameters = _parameters(p, field, poses)
+        with torch.no_grad():
+            for name, parameter in parameters.items():
+                parameter.copy_(tensors[f"parameter.{name}"])
+        moments = {k: Moments(tensors[f"first.{k}"], tensors[f"second.{k}"], tensors[f"steps.{k}"]) for k in parameters}
+        return State(p, field, poses, moments)
 
     def _regularised(self, share: float) -> bool:
         return self.settings.densify.begin < share <= self.settings.densify.end
@@ -143,7 +160,8 @@ class Uwbs:
         medium = log_linear(r.medium, r.medium_end, share)
         if self.prior is not None and share <= self.settings.medium.begin:
             medium = 0.0
-        return rates | {name: medium for name in _FIELD_NAMES}
+        rates |= {name: medium for name in _FIELD_NAMES}
+        return rates | {name: self.settings.poses.rate for name in _POSE_NAMES}
 
     def _densified(self, state: State, gradients: dict[str, Tensor], step: int, rate: float) -> _Round:
         """Relocation and growth, then noise; rows that start anew get no gradient of this step."""
@@ -169,7 +187,7 @@ class Uwbs:
                 gradient[stale] = 0
                 moments[name], gradients[name] = Moments(first, second, m.steps), gradient
         counts = {"relocated": float(done.relocated), "added": float(done.added)}
-        return _Round(State(p, state.field, moments), gradients, stale, counts)
+        return _Round(State(p, state.field, state.poses, moments), gradients, stale, counts)
 
 
 @dataclass(frozen=True)
@@ -215,17 +233,25 @@ def objective(
 def train(
     rec: Reconstruction, frames: Frames, settings: UwbsSettings, folder: Path, progress: Progress = silent
 ) -> SplatMap:
-    """Train a map in `folder`: checkpoint/, metrics.jsonl, and at the end map.safetensors, in the scene's own unit."""
+    """Train a map in `folder`: checkpoint/, metrics.jsonl, and at the end map.safetensors and the refined cameras.json.
+
+    Both are in the scene's own unit; cameras.json is not written where poses are held.
+    """
     scale = working_scale(rec, settings)
     views = TrainingViews(rec, frames, settings, scale)
     prior = None if rec.medium is None else water_prior(rec.medium, 1 / scale, settings.medium)
-    recipe = Uwbs(settings, rec, scale, path_radius(rec, scale, settings.working_depth), prior)
+    stations = training_stations(rec, views.names, views.cameras, scale) if settings.poses.enabled else None
+    recipe = Uwbs(settings, rec, scale, path_radius(rec, scale, settings.working_depth), prior, stations)
     final = training.run(recipe, views, _schedule(settings, rec, views), folder, progress)
     field = MediumField(settings.medium.hidden)
     field.load_state_dict(final.field.state_dict())
     field.length.fill_(1 / scale)
     primitives = BetaPrimitives(*(values.detach().clone() for values in rescaled(final.primitives, 1 / scale)))
-    scene = SplatMap(primitives, field.requires_grad_(False), settings, rec.metric, 1 / scale)
+    poses = None
+    if stations is not None and final.poses is not None:
+        poses = stations.refined(final.poses)
+        write_refined(folder / "cameras.json", rec, poses)
+    scene = SplatMap(primitives, field.requires_grad_(False), settings, rec.metric, 1 / scale, poses)
     checkpoint.save_map(folder / "map.safetensors", scene)
     return scene
 
@@ -243,9 +269,13 @@ def path_radius(rec: Reconstruction, scale: float, working_depth: float) -> floa
 _FIELD_NAMES = tuple(f"field.{name}" for name, _ in MediumField(1).network.named_parameters())
 
 
-def _parameters(p: BetaPrimitives, field: MediumField) -> dict[str, Tensor]:
+_POSE_NAMES = tuple(f"poses.{name}" for name, _ in PoseCodes(1, TrainingPoseSettings(width=1)).named_parameters())
+
+
+def _parameters(p: BetaPrimitives, field: MediumField, poses: PoseCodes | None = None) -> dict[str, Tensor]:
     of_field: dict[str, Tensor] = {f"field.{name}": t for name, t in field.network.named_parameters()}
-    return {**p._asdict(), **of_field}
+    of_poses = {} if poses is None else {f"poses.{name}": t for name, t in poses.named_parameters()}
+    return {**p._asdict(), **of_field, **of_poses}
 
 
 def _extended(rows: Tensor, count: int) -> Tensor:
@@ -263,6 +293,8 @@ def _clip_field(gradients: dict[str, Tensor]) -> None:
 
 def _schedule(settings: UwbsSettings, rec: Reconstruction, views: TrainingViews) -> training.Schedule:
     everything = [asdict(settings), views.names, rec.cameras.cam2world.tolist(), rec.cameras.K.tolist()]
+    if settings.poses.enabled:
+        everything.append(float(rec.matches.xy_i.double().sum() + rec.matches.xy_j.double().sum()))
     digest = hashlib.sha256(json.dumps(everything, sort_keys=True).encode()).hexdigest()[:16]
     return training.Schedule(
         iterations=settings.iterations,
