@@ -5,8 +5,10 @@ from pathlib import Path
 import numpy as np
 import torch
 
+from swimm3r.splat.conditioning import rotation_block
 from swimm3r.splat.densify import noise, relocate_and_grow, shared_opacity
 from swimm3r.splat.primitives import BetaPrimitives
+from swimm3r.splat.settings import DensifySettings
 
 VECTORS = Path(__file__).parents[1] / "data/uwbs_vectors.npz"
 
@@ -74,7 +76,24 @@ def test_noise_moves_the_faint_along_their_own_shape_only(primitives):
     thin = p.scale.clone()
     thin[:, 2] = -9.0
     p = p._replace(scale=thin, lower=torch.zeros_like(p.lower))
-    moved = noise(p, 1.0, 0.005, rng())
+    moved = noise(p, 1.0, DensifySettings(), "first_order", rng())
     assert (moved[100:] == 0).all()
     assert (moved[:100, :2].abs() > 0).all()
     assert moved[:100, 2].abs().max() < 1e-5 * moved[:100, :2].abs().max()
+
+
+def test_the_gates_are_those_of_the_two_papers(primitives):
+    opacity = torch.tensor([0.001, 0.005, 0.02, 0.05])
+    p = with_opacity(primitives(4), opacity)
+    p = p._replace(scale=p.scale[:1].expand(4, -1), lower=p.lower[:1].expand(4, -1))
+    gates = {"sigmoid": 1 / (1 + torch.exp(100 * (opacity - 0.005))), "power": (1 - opacity) ** 100}
+    L = rotation_block(p.lower[:1, :3])[0] * torch.nn.functional.softplus(p.scale[0, :3])
+    eps = torch.randn(4, 3, 1, generator=rng())[..., 0]
+    for gate, expected in gates.items():
+        moved = noise(p, 2.0, DensifySettings(noise_gate=gate), "first_order", rng())
+        torch.testing.assert_close(moved, 2 * expected[:, None] * eps @ (L @ L.mT).mT, rtol=1e-4, atol=1e-7)
+
+
+def test_a_cap_below_the_number_there_is_removes_nobody(primitives):
+    p = with_opacity(primitives(30), torch.full((30,), 0.5))
+    assert len(relocate_and_grow(p, 10, 0.005, rng()).primitives.xyz) == 30

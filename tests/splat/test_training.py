@@ -10,9 +10,12 @@ import torch
 from swimm3r.evaluate.images import psnr
 from swimm3r.splat import train
 from swimm3r.splat.checkpoint import load_map
-from swimm3r.splat.rendering import SplatMap
-from swimm3r.splat.settings import DensifySettings, InitialSettings, MediumFieldSettings, UwbsSettings
+from swimm3r.splat.projection import pinhole
+from swimm3r.splat.recipes import uwbs
+from swimm3r.splat.rendering import SplatMap, draw
+from swimm3r.splat.settings import DensifySettings, InitialSettings, LossWeights, MediumFieldSettings, UwbsSettings
 from swimm3r.splat.training import view_of_step
+from swimm3r.splat.views import TrainingViews
 
 SETTINGS = UwbsSettings(
     iterations=40,
@@ -116,3 +119,30 @@ def test_an_epoch_visits_every_view_once_and_each_in_its_own_order():
 def test_the_number_of_primitives_never_exceeds_the_cap(tiny_dive, tmp_path):
     capped = replace(SETTINGS, densify=DensifySettings(max_primitives=510, min_every=4))
     assert len(train(tiny_dive.rec, tiny_dive.frames, capped, tmp_path).primitives.xyz) == 510
+
+
+def test_the_objective_is_the_papers_sum_with_the_papers_weights(tiny_dive):
+    paper = UwbsSettings(weights=LossWeights(coverage=0.0, max_radius=100.0))
+    view = TrainingViews(tiny_dive.rec, tiny_dive.frames, paper, 1.0)[3]
+    p = tiny_dive.truth.primitives
+    p = p._replace(xyz=p.xyz + 0.05, scale=p.scale.clone())
+    p.scale[0] = 3.0  # larger than 100 px of a 1280 px wide picture
+    drawing = draw(p, tiny_dive.truth.field, pinhole(view.camera), paper)
+    found = uwbs.objective(p, drawing, view, paper, None, regularised=True)
+    n = found.numbers
+    expected = 0.8 * n["l1"] + 0.2 * (1 - n["ssim"]) + 0.01 * n["opacity"] + 0.01 * n["scale"]
+    expected += 0.1 * n["depth"] + 1.0 * n["medium_smoothness"] + 0.1 * n["radius"]
+    assert float(found.total) == pytest.approx(expected, rel=1e-5)
+    assert min(n["depth"], n["radius"], n["l1"]) > 0
+    without = uwbs.objective(p, drawing, view, paper, None, regularised=False)
+    assert float(found.total - without.total) == pytest.approx(0.01 * (n["opacity"] + n["scale"]), rel=1e-3)
+
+
+def test_mcmc_noise_comes_with_every_step_where_asked(tiny_dive):
+    views = TrainingViews(tiny_dive.rec, tiny_dive.frames, SETTINGS, 1.0)
+    moved = {}
+    for cadence in ("round", "step"):
+        faint = replace(SETTINGS, iterations=1000, initial=InitialSettings(primitives=200, opacity=0.004))
+        recipe = uwbs.Uwbs(replace(faint, densify=DensifySettings(noise_cadence=cadence)), tiny_dive.rec, 1, 1, None)
+        moved[cadence] = recipe.step(recipe.start(), views[3], 1)[0].primitives.xyz
+    assert (moved["round"] != moved["step"]).any(-1).float().mean() > 0.9

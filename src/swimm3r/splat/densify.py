@@ -12,9 +12,10 @@ from torch import Tensor
 
 from swimm3r.splat.conditioning import rotation_block
 from swimm3r.splat.primitives import BetaPrimitives, select
+from swimm3r.splat.settings import DensifySettings
 
 _LARGEST = 1 - 2.0**-23
-_GATE = 100.0  # sharpness of the noise's gate around the dead opacity
+_GATE = 100.0  # sharpness of the noise's gates
 
 
 @dataclass(frozen=True)
@@ -63,17 +64,16 @@ def relocate_and_grow(p: BetaPrimitives, target: int, dead_opacity: float, rng: 
     return Densified(moved._replace(opacity=raw), source, touched, len(dead) if len(alive) else 0, added)
 
 
-def noise(p: BetaPrimitives, rate: float, dead_opacity: float, rng: torch.Generator) -> Float[Tensor, "n 3"]:
-    """Random displacement within each primitive's own shape, V11 eps, of those near death only (MCMC-GS's gate)."""
+def noise(
+    p: BetaPrimitives, rate: float, settings: DensifySettings, rotation: str, rng: torch.Generator
+) -> Float[Tensor, "n 3"]:
+    """Random displacement within each primitive's own shape, V11 eps, of those near death only."""
     opacity = torch.sigmoid(p.opacity)
-    at = (opacity < dead_opacity + 0.2).nonzero()[:, 0]  # the gate is below 1e-8 beyond
-    q = select(p, at)
-    L = rotation_block(q.lower[:, :3]) * torch.nn.functional.softplus(q.scale[:, None, :3])
-    eps = (
-        torch.randn(len(at), 3, 1, generator=rng)
-        * rate
-        * torch.sigmoid(-_GATE * (opacity[at] - dead_opacity))[:, None, None]
-    )
+    at = (opacity < settings.dead_opacity + 0.2).nonzero()[:, 0]  # both gates are below 1e-8 beyond
+    q, o = select(p, at), opacity[at]
+    L = rotation_block(q.lower[:, :3], rotation) * torch.nn.functional.softplus(q.scale[:, None, :3])
+    gate = (1 - o) ** _GATE if settings.noise_gate == "power" else torch.sigmoid(-_GATE * (o - settings.dead_opacity))
+    eps = torch.randn(len(at), 3, 1, generator=rng) * rate * gate[:, None, None]
     moved = torch.zeros_like(p.xyz)
     moved[at] = (L @ (L.mT @ eps))[..., 0]
     return moved

@@ -86,6 +86,9 @@ class LossWeights:
     ssim: float = 0.2
     opacity: float = 0.01
     scale: float = 0.01
+    mcmc_begin: float = 0.025
+    """Share of the run before which opacity and scale are not regularised: UBS's window, MCMC-GS has 0 to 1."""
+    mcmc_end: float = 0.5
     ubs_scale_reg_bug: bool = False
     """Regularise all scales of the first three primitives, as UBS's code does, instead of the spatial ones of all."""
     depth: float = 0.1
@@ -111,7 +114,7 @@ class DensifySettings:
 
     max_primitives: int = 800_000
     begin: float = 0.025  # 500 of 20,000
-    end: float = 0.5  # 10,000 of 20,000; opacity and scale are regularised in the same window
+    end: float = 0.5  # 10,000 of 20,000
     every: float = 0.005  # 100 of 20,000
     min_every: int = 20
     """Fewest steps between two rounds, whatever `every` says; growth is made up for."""
@@ -120,6 +123,10 @@ class DensifySettings:
     dead_opacity: float = 0.005
     noise: float = 1e6
     """UBS's rate for static scenes, times the positions' learning rate."""
+    noise_gate: Literal["sigmoid", "power"] = "sigmoid"
+    """How noise fades with opacity o: as 1 / (1 + exp(100 (o - dead_opacity))) (MCMC-GS), or as (1 - o)^100 (UBS)."""
+    noise_cadence: Literal["round", "step"] = "round"
+    """Noise with every round (UBS), or with every step from the first to the last (MCMC-GS, whose rate is 5e5)."""
 
 
 @dataclass(frozen=True)

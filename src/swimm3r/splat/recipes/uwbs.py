@@ -121,6 +121,9 @@ class Uwbs:
             adam_step(parameters, gradients, state.moments, rates)
             if multiplier is not None and before is not None:
                 parameters["xyz"].sub_(before).mul_(multiplier[:, None]).add_(before)
+            if settings.densify.noise_cadence == "step":
+                rng = training.generator(settings.seed, step, 8)
+                parameters["xyz"].add_(self._noise(state.primitives, rates["xyz"], rng))
         return state, numbers
 
     def stored(self, state: State) -> dict[str, Tensor]:
@@ -144,14 +147,15 @@ class Uwbs:
         return State(p, field, poses, moments)
 
     def _regularised(self, share: float) -> bool:
-        return self.settings.densify.begin < share <= self.settings.densify.end
+        return self.settings.weights.mcmc_begin < share <= self.settings.weights.mcmc_end
 
     def _every(self) -> int:
         d = self.settings.densify
         return max(d.min_every, round(d.every * self.settings.iterations))
 
     def _densifies(self, step: int) -> bool:
-        return step % self._every() == 0 and self._regularised(step / self.settings.iterations)
+        d, share = self.settings.densify, step / self.settings.iterations
+        return step % self._every() == 0 and d.begin < share <= d.end
 
     def _rates(self, step: int) -> dict[str, float]:
         r, share = self.settings.rates, step / self.settings.iterations
@@ -163,6 +167,10 @@ class Uwbs:
         rates |= {name: medium for name in _FIELD_NAMES}
         return rates | {name: self.settings.poses.rate for name in _POSE_NAMES}
 
+    def _noise(self, p: BetaPrimitives, rate: float, rng: torch.Generator) -> Float[Tensor, "n 3"]:
+        d = self.settings.densify
+        return densify.noise(p, d.noise * rate, d, self.settings.render.rotation, rng)
+
     def _densified(self, state: State, gradients: dict[str, Tensor], step: int, rate: float) -> _Round:
         """Relocation and growth, then noise; rows that start anew get no gradient of this step."""
         d = self.settings.densify
@@ -173,7 +181,8 @@ class Uwbs:
         with torch.no_grad():
             done = densify.relocate_and_grow(state.primitives, target, d.dead_opacity, rng)
             p = done.primitives
-            p = p._replace(xyz=p.xyz + densify.noise(p, d.noise * rate, d.dead_opacity, rng))
+            if d.noise_cadence == "round":
+                p = p._replace(xyz=p.xyz + self._noise(p, rate, rng))
             moments, gradients = dict(state.moments), dict(gradients)
             appended = len(p.xyz) - n
             stale = torch.cat(
