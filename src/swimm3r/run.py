@@ -123,6 +123,42 @@ def run_pipeline(
 
 
 @dataclass(frozen=True)
+class FinishedSfm:
+    """A run folder as its map's training finds it."""
+
+    frames: Frames
+    rec: Reconstruction
+    settings: RunSettings
+    truth: GroundTruth | None
+    key: str  # another one where anything before the map is another
+
+    def first_poses(self, progress: Progress = silent) -> dict[str, held_out.FirstPose]:
+        """Where the test frames' refinement starts, in the reconstruction's axes."""
+        reference = _reference(self.settings, self.frames, self.truth)
+        return held_out.first_poses(self.rec, self.frames, self.settings.sfm.features, reference, progress)
+
+
+def open_finished_sfm(folder: Path, reference: Path | None = None) -> FinishedSfm:
+    """Read a run folder up to its map. Raises InputError where structure from motion is not finished."""
+    path = folder / "summary.json"
+    summary = json.loads(path.read_text(encoding="utf-8")) if path.is_file() else {}
+    stage = summary.get("stages", {}).get("sfm", {})
+    if stage.get("status") != "done":
+        raise InputError(
+            f"{folder} holds no finished structure from motion",
+            cause="it is another folder, or the run was interrupted",
+            hint="swimm3r sfm INPUT --out RUN, or swimm3r run",
+        )
+    return FinishedSfm(
+        load_frames(folder / "prepare"),
+        reconstruction.load(folder / "sfm"),
+        from_yaml(folder / "settings.yaml"),
+        _truth(Path(summary["input"]["path"]), reference),
+        stage["key"],
+    )
+
+
+@dataclass(frozen=True)
 class _Run:
     """What a finished run holds."""
 
@@ -168,7 +204,7 @@ def evaluate_run(
 
 def _scores(run: _Run, settings: RunSettings, truth: GroundTruth | None, progress: Progress) -> dict[str, object]:
     folder, frames, rec, scene = run.folder, run.frames, run.rec, run.scene
-    poses = held_out.first_poses(rec, frames, settings.sfm.features, _reference(settings, frames, truth), progress)
+    poses = FinishedSfm(frames, rec, settings, truth, "").first_poses(progress)
     poses = held_out.in_axes_of(scene, rec, poses)
     views = held_out.score_views(scene, rec, frames, poses, folder / "renders" / "test", settings.test, progress)
     canvas = held_out.cut(views[0].canvas, views[0].window)

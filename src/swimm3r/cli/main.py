@@ -8,6 +8,7 @@ from collections.abc import Collection, Sequence
 
 import tyro
 
+from swimm3r.cli import bench
 from swimm3r.cli.console import MessagePrinter
 from swimm3r.cli.datasets import datasets
 from swimm3r.cli.demo import demo
@@ -39,6 +40,7 @@ def main(arguments: Sequence[str] | None = None) -> None:
             _named("--preset", arguments, PRESETS, "default"),
             _named("--backend", arguments, ("colmap", "mast3r", "swimm3r"), "colmap"),
         ),
+        "bench": bench.command_for_preset(_named("--preset", arguments, PRESETS, "fast")),
         "demo": demo,
         "doctor": doctor,
         "eval": evaluate,

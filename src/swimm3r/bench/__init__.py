@@ -1,0 +1,1 @@
+"""The paper's protocols as commands, over finished run folders."""
