@@ -101,7 +101,7 @@ REFINED = UwbsSettings(
     iterations=200,
     initial=InitialSettings(primitives=500, scale=2.0),
     densify=DensifySettings(max_primitives=600, min_every=20),
-    poses=TrainingPoseSettings(rate=2e-3, epipolar_end=0.75),
+    poses=TrainingPoseSettings(enabled=True, rate=2e-3, epipolar_end=0.75),
 )
 
 
