@@ -54,8 +54,13 @@ def test_ground_without_depth_gets_points_with_its_clear_colours(patchy, dive):
 
 
 def test_ground_that_an_earlier_frame_gave_is_not_taken_again(patchy, dive):
-    one, all_frames = gathered(patchy, dive, 1), gathered(patchy, dive, len(patchy.names))
-    assert len(one.xyz) < len(all_frames.xyz) < 0.5 * len(patchy.names) * len(one.xyz)
+    pictures = dict(restored_pictures(patchy, dive.frames, RestoreSettings(white_balance=False)))
+    alone, after = Backdrop(patchy, dive.frames), Backdrop(patchy, dive.frames)
+    alone.add(1, pictures[1])
+    for i in (0, 0, 1):
+        after.add(i, pictures[i])
+    first = len(gathered(patchy, dive, 1).xyz)
+    assert first < len(after.points().xyz) < first + 0.7 * len(alone.points().xyz)
 
 
 def test_known_depth_and_open_water_leave_nothing_to_guess(dive, patchy):
@@ -65,3 +70,12 @@ def test_known_depth_and_open_water_leave_nothing_to_guess(dive, patchy):
     _, picture = next(restored_pictures(patchy, dive.frames, RestoreSettings()))
     backdrop.add(0, replace(picture, sea=torch.ones_like(picture.sea)))
     assert len(backdrop.points().xyz) == 0
+
+
+def test_ground_too_white_for_its_guessed_distance_is_not_pulled_towards_the_camera(patchy, dive):
+    """Its colour is restored over a shorter path; a point there would hang before the lens."""
+    _, picture = next(restored_pictures(patchy, dive.frames, RestoreSettings()))
+    glaring = replace(dive.medium, beta_D=3 * dive.medium.beta_D)
+    _, white = next(restored_pictures(replace(patchy, medium=exact(glaring)), dive.frames, RestoreSettings()))
+    torch.testing.assert_close(white.ray_depth, picture.ray_depth)
+    assert (white.ray_depth[:, :32] > 0.8 * white.ray_depth[:, 32:].amin()).all()

@@ -35,8 +35,8 @@ def sea_share(
 def fill_z_depth(image: Float[Tensor, "h w 3"], depth: DepthMap, sea: Float[Tensor, "h w"]) -> Float[Tensor, "h w"]:
     """Depth for every pixel: known values stay, gaps follow their surroundings along similar colours.
 
-    Inverse depth is diffused on a coarse grid and fitted to the picture by local linear models, no farther than the
-    farthest known surface. `sea` (0..1) says where there is none; what is filled in there means nothing.
+    Inverse depth is diffused on a coarse grid and fitted to the picture by local linear models, between the nearest and
+    the farthest hundredth of what is known. `sea` (0..1) says where there is none; what is filled in there is no depth.
     """
     known = depth.z_depth > 0
     if not known.any():
@@ -47,8 +47,8 @@ def fill_z_depth(image: Float[Tensor, "h w 3"], depth: DepthMap, sea: Float[Tens
     coarse = _diffused(image, inverse, trust, sea)
     guide = image @ LUMA
     smooth = local_linear(guide, coarse[..., None], (1.001 - sea)[..., None], 0.01 * max(image.shape[:2]), 1e-3)[..., 0]
-    farthest = float(np.quantile(inverse[known].numpy(), 0.01))
-    filled = smooth.clamp(min=farthest, max=float(inverse[known].max()))
+    farthest, nearest = np.quantile(inverse[known].numpy(), [0.01, 0.99]).tolist()
+    filled = smooth.clamp(min=farthest, max=nearest)
     return middle / torch.where(known, inverse, filled)
 
 

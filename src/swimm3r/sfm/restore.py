@@ -42,11 +42,11 @@ _MAX_TINT = 1.0  # times the other channels, for blurred colours at a guessed di
 
 @dataclass(frozen=True)
 class RestoredPicture:
-    """One whole picture without its water, as stored values in 0..1, and the distances that this assumed."""
+    """One whole picture without its water, as stored values in 0..1."""
 
     clear: Float[Tensor, "h w 3"]
     shown: Float[Tensor, "h w 3"]  # white-balanced for the eye where asked for
-    ray_depth: Float[Tensor, "h w"]  # filled in along the edges where the depth map has gaps
+    ray_depth: Float[Tensor, "h w"]  # of the surface; filled in along the edges where the depth map has gaps
     sea: Float[Tensor, "h w"]  # 0..1, how surely there is open water and no surface; it keeps the colour it has
 
 
@@ -85,10 +85,10 @@ def restore_picture(
     z_depth = fill_z_depth(image, depth, sea)
     ray_depth = ray_depth_map(z_depth, rays)
     I = linear_from_srgb(image) if fit.encoding == "linear" else image
-    ray_depth = _not_beyond_white(I, ray_depth, depth.z_depth == 0, fit)
-    medium = fit.at(ray_depth)
-    T_D, _ = transmittances(ray_depth, medium)
-    direct = I - backscatter(ray_depth, medium)
+    path = _not_beyond_white(I, ray_depth, depth.z_depth == 0, fit)
+    medium = fit.at(path)
+    T_D, _ = transmittances(path, medium)
+    direct = I - backscatter(path, medium)
     J = _without_noise(direct, T_D, I @ LUMA, settings)
     stored = srgb_from_linear(J.clamp(min=0)) if fit.encoding == "linear" else J
     clear = _horizon(stored, T_D, image, sea, settings).clamp(0, 1)
