@@ -18,9 +18,9 @@ from torch import Tensor
 
 from swimm3r.sfm.mast3r.network import Descriptors, Pointmap
 
+MATCHING_WEIGHT = 0.075
 _ALPHA = 0.2  # of log C
 _MATCHING_ALPHA = 10.0  # of log Q
-_MATCHING_WEIGHT = 0.075
 _SKY_ERROR = 2.0
 _TEMPERATURE = 0.05
 _LEAST = 1e-8
@@ -121,4 +121,4 @@ def two_view_loss(
     metric: Bool[Tensor, " b"],
 ) -> Float[Tensor, ""]:
     """L of a batch of pairs in one direction."""
-    return pointmap_loss(points, truth, metric) + _MATCHING_WEIGHT * matching_loss(descriptors, matches)
+    return pointmap_loss(points, truth, metric) + MATCHING_WEIGHT * matching_loss(descriptors, matches)
