@@ -11,6 +11,7 @@ import torch
 from swimm3r.cameras import Cameras, project
 from swimm3r.errors import InputError
 from swimm3r.io import colmap, images, ply
+from swimm3r.io.cameras_json import CameraTable, write_cameras
 from swimm3r.io.colmap import ColmapModel
 from swimm3r.io.foreign.model import ForeignModel, read_foreign
 
@@ -93,6 +94,20 @@ def test_a_colmap_model(scene: Scene, tmp_path: Path):
     same_cameras(found, scene)
     same_pixels(found, scene, scene.sightings())
     np.testing.assert_allclose(found.model.xyz, scene.xyz)
+
+
+def test_our_own_cameras_json_is_read_by_name_and_never_hides_the_model_beside_it(scene: Scene, tmp_path: Path):
+    write_colmap(tmp_path / "sparse", scene)
+    table = CameraTable(
+        NAMES, WIDTH, HEIGHT, "OPENCV", np.tile(K, (N, 1, 1)), np.tile(OPENCV, (N, 1)), scene.cam2world, "metres"
+    )
+    write_cameras(tmp_path / "cameras.json", table)
+    found = read_foreign(tmp_path / "cameras.json")
+    assert found.metric
+    assert len(found.model.xyz) == 0
+    same_cameras(found, scene)
+    same_pixels(found, scene, scene.sightings())
+    assert len(read_foreign(tmp_path).model.xyz) == 20  # a run's folder holds both
 
 
 def transforms(scene: Scene, **changes: object) -> dict:

@@ -35,7 +35,8 @@ class ForeignModel:
 
 def read_foreign(path: Path) -> ForeignModel:
     """Read a COLMAP (GLOMAP, GLUEMAP, VGGT's demo_colmap) model, a nerfstudio or Spann3R transforms.json, a Metashape
-    cameras.xml, an OpenMVG sfm_data.json, a VGGT predictions.npz or a cameras.json; or the folder that holds one.
+    cameras.xml, an OpenMVG sfm_data.json or a VGGT predictions.npz; or the folder that holds one of them; or a
+    cameras.json of ours, which lies beside models that say more and so must be named itself.
 
     Raises InputError for anything else and for a damaged file.
     """
@@ -120,7 +121,7 @@ def _file(path: Path) -> Path | None:
     """The file to read, None for a COLMAP model's folder."""
     if path.is_file():
         return path
-    for name in ("transforms.json", "sfm_data.json", "cameras.xml", "predictions.npz", "cameras.json"):
+    for name in ("transforms.json", "sfm_data.json", "cameras.xml", "predictions.npz"):
         if (path / name).is_file():
             return path / name
     return None
