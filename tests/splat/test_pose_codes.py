@@ -52,8 +52,8 @@ def stations(dive, rec, settings: UwbsSettings):
 def test_zero_codes_leave_every_pose_where_it_is(tiny_dive):
     s = stations(tiny_dive, tiny_dive.rec, UwbsSettings())
     codes = PoseCodes(len(s), TrainingPoseSettings())
-    torch.testing.assert_close(s.moved(codes, s.names), s.cameras.cam2world)
-    total = s.moved(codes, s.names)[:, :3, 3].sum()
+    torch.testing.assert_close(s.moved(codes), s.cameras.cam2world)
+    total = s.moved(codes)[:, :3, 3].sum()
     learns = torch.autograd.grad(total, codes.network[4].weight)[0]
     assert (learns != 0).any()  # the last layer is zero, what it reads is not
 

@@ -11,7 +11,6 @@ d being the distances of a match's points from each other's epipolar lines in tr
 """
 
 import math
-from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -107,19 +106,19 @@ class Stations:
     def __len__(self) -> int:
         return len(self.names)
 
-    def moved(self, codes: PoseCodes, names: Sequence[str]) -> Float[Tensor, "k 4 4"]:
-        """The poses of some views as refined so far, working units."""
-        which = torch.tensor([self.names.index(name) for name in names])
+    def moved(self, codes: PoseCodes, which: Int[Tensor, " k"] | None = None) -> Float[Tensor, "k 4 4"]:
+        """The poses of some views, of all by default, as refined so far, working units."""
+        which = torch.arange(len(self)) if which is None else which
         return moved(self.cameras.cam2world[which], codes(which), self.spread)
 
     def epipolar_error(self, codes: PoseCodes, matches: EpipolarMatches) -> Float[Tensor, ""]:
         """L_epi of some matches under the refined poses, pixels."""
-        return epipolar_loss(matches, self.moved(codes, self.names), self.cameras.K, self.spread)
+        return epipolar_loss(matches, self.moved(codes), self.cameras.K, self.spread)
 
     def refined(self, codes: PoseCodes) -> RefinedPoses:
         """All poses, in scene units."""
         with torch.no_grad():
-            poses = self.moved(codes, self.names)
+            poses = self.moved(codes)
         return RefinedPoses(self.names, pose_from(poses[:, :3, :3], poses[:, :3, 3] / self.scale))
 
 

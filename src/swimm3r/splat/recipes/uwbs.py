@@ -85,7 +85,8 @@ class Uwbs:
         p = BetaPrimitives(*(values.detach().requires_grad_() for values in state.primitives))
         camera, filtered = view.camera, settings.sgg.enabled and share <= settings.sgg.end
         if self.stations is not None and state.poses is not None:
-            camera = replace(camera, cam2world=self.stations.moved(state.poses, [view.name]))
+            place = torch.tensor([self.stations.names.index(view.name)])
+            camera = replace(camera, cam2world=self.stations.moved(state.poses, place))
         sight = pinhole(camera)
         drawing = draw(p, state.field, sight, settings, sgg=filtered)
         loss = objective(p, drawing, view, settings, self.prior, self._regularised(share))
