@@ -24,7 +24,7 @@ from swimm3r.prepare import load_frames
 from swimm3r.presets import PRESETS
 from swimm3r.reconstruction import Reconstruction
 from swimm3r.splat import train
-from swimm3r.splat.pose_codes import spread_of
+from swimm3r.splat.pose_codes import as_mapped, spread_of
 from swimm3r.splat.settings import PoseRefinementSettings, UwbsSettings
 
 
@@ -82,9 +82,7 @@ def measure(rec: Reconstruction, frames: held_out.Frames, truth: GroundTruth, se
     with tempfile.TemporaryDirectory() as folder:
         scene = train(rec, frames, settings, Path(folder))
         # the test frames' poses are the truth's, brought into the map's axes by its own cameras
-        ours = (
-            rec if scene.poses is None else replace(rec, cameras=replace(rec.cameras, cam2world=scene.poses.cam2world))
-        )
+        ours = as_mapped(rec, scene.poses)
         known = held_out.reference_poses(ours, truth)
         starts = {frame.name: held_out.FirstPose(known[frame.name], "reference") for frame in frames.test}
         test = PoseRefinementSettings(steps=100, long_side=160)

@@ -34,6 +34,7 @@ from swimm3r.sfm.model_frames import model_cameras
 from swimm3r.sfm.settings import ColmapModelSettings
 from swimm3r.splat import train
 from swimm3r.splat.checkpoint import load_map
+from swimm3r.splat.pose_codes import as_mapped
 from swimm3r.splat.rendering import SplatMap
 
 SCHEMA = 1
@@ -208,7 +209,7 @@ def _scores(run: _Run, settings: RunSettings, truth: GroundTruth | None, progres
     poses = held_out.in_axes_of(scene, rec, poses)
     views = held_out.score_views(scene, rec, frames, poses, folder / "renders" / "test", settings.test, progress)
     canvas = held_out.cut(views[0].canvas, views[0].window)
-    path = rec.cameras.cam2world if scene.poses is None else scene.poses.cam2world
+    path = as_mapped(rec, scene.poses).cameras.cam2world
     write_flythrough(folder / "renders" / "flythrough.mp4", scene, canvas, path, _FLIGHT, progress)
     return {
         "test": sections.test_section(views, settings.test),

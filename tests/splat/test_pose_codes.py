@@ -118,6 +118,7 @@ def test_disturbed_poses_recover_while_the_map_is_trained(tiny_dive, tmp_path):
     assert torch.equal(stored.poses.cam2world, scene.poses.cam2world)
     table = read_cameras(tmp_path / "cameras.json")
     assert table.names == scene.poses.names == rec.names
+    assert torch.equal(pose_codes.as_mapped(rec, scene.poses).cameras.cam2world, scene.poses.cam2world)
     torch.testing.assert_close(torch.from_numpy(table.cam2world), scene.poses.cam2world)
 
 

@@ -28,6 +28,7 @@ from swimm3r.localization.references import FilmedReferences, Reference, Referen
 from swimm3r.localization.settings import LocalizationSettings
 from swimm3r.reconstruction import Reconstruction
 from swimm3r.sfm.colmap import absolute_pose
+from swimm3r.splat.pose_codes import as_mapped
 from swimm3r.splat.rendering import SplatMap
 from swimm3r.splat.views import pinhole_canvas, undistorted
 
@@ -72,6 +73,7 @@ class Localizer:
         settings: LocalizationSettings | None = None,
         matcher: Matcher | None = None,
     ) -> None:
+        rec = as_mapped(rec, scene.poses)
         self.scene, self.rec = scene, rec
         self.settings = settings or LocalizationSettings()
         self.matcher = matcher or matcher_for(self.settings)

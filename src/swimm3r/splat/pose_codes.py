@@ -11,7 +11,7 @@ d being the distances of a match's points from each other's epipolar lines in tr
 """
 
 import math
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 
 import torch
@@ -126,6 +126,15 @@ def training_stations(rec: Reconstruction, names: tuple[str, ...], cameras: Came
     """The stations of the views `names` with their pinhole `cameras`, working units."""
     matches = epipolar_matches(rec, names, cameras)
     return Stations(names, cameras, scale, spread_of(cameras.cam2world), matches)
+
+
+def as_mapped(rec: Reconstruction, poses: RefinedPoses | None) -> Reconstruction:
+    """The reconstruction with its cameras where the map's training left them; as it is where they were held."""
+    if poses is None:
+        return rec
+    cam2world = rec.cameras.cam2world.clone()
+    cam2world[[rec.index(name) for name in poses.names]] = poses.cam2world.to(cam2world)
+    return replace(rec, cameras=replace(rec.cameras, cam2world=cam2world))
 
 
 def write_refined(path: Path, rec: Reconstruction, poses: RefinedPoses) -> None:
