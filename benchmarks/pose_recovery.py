@@ -25,7 +25,7 @@ from swimm3r.presets import PRESETS
 from swimm3r.reconstruction import Reconstruction
 from swimm3r.splat import train
 from swimm3r.splat.pose_codes import as_mapped, spread_of
-from swimm3r.splat.settings import PoseRefinementSettings, UwbsSettings
+from swimm3r.splat.settings import PoseRefinementSettings, TrainingPoseSettings, UwbsSettings
 
 
 def disturbed(rec: Reconstruction, degrees: float, share: float) -> Reconstruction:
@@ -54,7 +54,7 @@ def main() -> None:
     parser.add_argument("--iterations", type=int, default=PRESETS["fast"].splat.iterations)
     parser.add_argument("--long-side", type=int, default=320)
     parser.add_argument("--primitives", type=int, default=12_000)
-    parser.add_argument("--rates", nargs="+", type=float, default=[PRESETS["fast"].splat.poses.rate])
+    parser.add_argument("--rates", nargs="+", type=float, default=[TrainingPoseSettings().rate])
     a = parser.parse_args()
     base = PRESETS["fast"].splat
     base = replace(

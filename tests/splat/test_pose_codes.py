@@ -14,6 +14,7 @@ from swimm3r.reconstruction import Matches
 from swimm3r.splat import pose_codes, train
 from swimm3r.splat.checkpoint import load_map
 from swimm3r.splat.pose_codes import PoseCodes, epipolar_loss, epipolar_matches, training_stations
+from swimm3r.splat.recipes.uwbs import pose_rate
 from swimm3r.splat.rendering import SplatMap
 from swimm3r.splat.settings import DensifySettings, InitialSettings, TrainingPoseSettings, UwbsSettings
 from swimm3r.splat.views import TrainingViews
@@ -101,7 +102,7 @@ REFINED = UwbsSettings(
     iterations=200,
     initial=InitialSettings(primitives=500, scale=2.0),
     densify=DensifySettings(max_primitives=600, min_every=20),
-    poses=TrainingPoseSettings(enabled=True, rate=2e-3, epipolar_end=0.75),
+    poses=TrainingPoseSettings(enabled=True, epipolar_end=0.75),
 )
 
 
@@ -120,6 +121,12 @@ def test_disturbed_poses_recover_while_the_map_is_trained(tiny_dive, tmp_path):
     assert table.names == scene.poses.names == rec.names
     assert torch.equal(pose_codes.as_mapped(rec, scene.poses).cameras.cam2world, scene.poses.cam2world)
     torch.testing.assert_close(torch.from_numpy(table.cam2world), scene.poses.cam2world)
+
+
+def test_short_runs_step_farther_and_the_papers_is_exact():
+    assert pose_rate(UwbsSettings()) == 1.5e-4
+    assert pose_rate(UwbsSettings(iterations=2_000)) == pytest.approx(1.5e-3)
+    assert pose_rate(UwbsSettings(iterations=10)) == 2e-3
 
 
 def test_poses_that_are_held_stay(tiny_dive, tmp_path):

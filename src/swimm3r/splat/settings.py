@@ -156,7 +156,8 @@ class TrainingPoseSettings:
     width: int = 64
     """Of a camera's code and of the network's hidden layers."""
     rate: float = 1.5e-4
-    """Of Adam, for codes and network."""
+    """Of Adam, for codes and network, in 20,000 steps; shorter runs step as much farther, up to `largest_rate`."""
+    largest_rate: float = 2e-3
     epipolar: float = 2.0
     """Weight of the matches' epipolar error, pixels."""
     epipolar_end: float = 0.15

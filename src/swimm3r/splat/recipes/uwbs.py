@@ -166,7 +166,7 @@ class Uwbs:
         if self.prior is not None and share <= self.settings.medium.begin:
             medium = 0.0
         rates |= {name: medium for name in _FIELD_NAMES}
-        return rates | {name: self.settings.poses.rate for name in _POSE_NAMES}
+        return rates | dict.fromkeys(_POSE_NAMES, pose_rate(self.settings))
 
     def _noise(self, p: BetaPrimitives, rate: float, rng: torch.Generator) -> Float[Tensor, "n 3"]:
         d = self.settings.densify
@@ -264,6 +264,11 @@ def train(
     scene = SplatMap(primitives, field.requires_grad_(False), settings, rec.metric, 1 / scale, poses)
     checkpoint.save_map(folder / "map.safetensors", scene)
     return scene
+
+
+def pose_rate(settings: UwbsSettings) -> float:
+    """Adam's rate for the poses: `rate` at the paper's 20,000 steps, in inverse proportion to others."""
+    return min(settings.poses.largest_rate, settings.poses.rate * 20_000 / settings.iterations)
 
 
 def path_radius(rec: Reconstruction, scale: float, working_depth: float) -> float:
