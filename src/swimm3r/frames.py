@@ -66,6 +66,12 @@ class Frames:
         """The frames held back for scoring."""
         return replace(self, frames=tuple(f for f in self.frames if f.split == "test"))
 
+    @property
+    def span(self) -> tuple[float, float]:
+        """When the first and the last frame were taken."""
+        times = [frame.time for frame in self.frames]
+        return min(times), max(times)
+
     def index(self, name: str) -> int:
         """The position of a frame by its name."""
         return self.names.index(name)

@@ -1,7 +1,7 @@
 """What is known for certain about a dive: reference poses, and for synthetic dives depth, clear colours and the water.
 
-On disk a folder beside the pictures: cameras.json; z_depth/NAME.npz (key z_depth), clear/NAME.png and medium.json where
-they exist. A cameras.json alone is a reference, too.
+On disk a folder beside the pictures: cameras.json; z_depth/NAME.npz (key z_depth), clear/NAME.png, masks/NAME.png (0
+where something moves) and medium.json where they exist. A cameras.json alone is a reference, too.
 """
 
 import json
@@ -10,7 +10,7 @@ from pathlib import Path
 
 import numpy as np
 import torch
-from jaxtyping import Float
+from jaxtyping import Bool, Float
 from torch import Tensor
 
 from swimm3r.cameras import Cameras
@@ -43,6 +43,11 @@ class GroundTruth:
         """The picture without water, 0..1; None where the reference has none."""
         path = self._path("clear", f"{name}.png")
         return None if path is None else torch.from_numpy(images.read_rgb(path).astype(np.float32)) / 255
+
+    def moving(self, name: str) -> Bool[Tensor, "h w"] | None:
+        """True where the picture shows something that moves; None where the reference does not say."""
+        path = self._path("masks", f"{name}.png")
+        return None if path is None else ~torch.from_numpy(images.read_mask(path).copy())
 
     def _path(self, kind: str, file: str) -> Path | None:
         path = None if self.folder is None else self.folder / kind / file

@@ -53,6 +53,7 @@ class HeldOutView:
     """One frame that training did not see, as the map shows it."""
 
     name: str
+    time: float  # seconds of the clip
     lens: Cameras  # the frame's own camera, its pose refined
     canvas: Cameras  # its pinhole at the training size
     window: "Window"  # of the canvas that was rendered and scored
@@ -139,17 +140,18 @@ def score_views(
         f = frames.index(name)
         lens = rec.cameras[rec.index(neighbours(rec, frames, name, 1)[0])]
         lens = replace(lens, cam2world=first.cam2world[None].to(lens.cam2world))
-        lens = refine_pose(scene, lens, frames.image(f), frames.mask(f), settings).camera
+        time = frames.frames[f].time
+        lens = refine_pose(scene, lens, frames.image(f), frames.mask(f), settings, time=time).camera
         canvas = pinhole_canvas(lens, scene.settings.long_side)
         window = visible_window(lens, canvas)
         target, seen = (
             part[window.rows, window.columns] for part in undistorted(frames.image(f), frames.mask(f), lens, canvas)
         )
-        out = scene.render(cut(canvas, window))
+        out = scene.render(cut(canvas, window), time)
         write_view(folder, name, out, span)
         scores = view_scores(out.rgb, target, perceptual, seen)
         covered = covered_scores(out.rgb, target, seen, covered_by_training(rec, cut(canvas, window)))
-        views.append(HeldOutView(name, lens, canvas, window, first.source, scores, covered))
+        views.append(HeldOutView(name, time, lens, canvas, window, first.source, scores, covered))
     progress("scoring test frames", len(poses), len(poses))
     return views
 

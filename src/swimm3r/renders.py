@@ -1,6 +1,6 @@
 """A map's views on disk: pictures of one camera, and a flight along the path of the dive."""
 
-from collections.abc import Iterable
+from collections.abc import Iterable, Sequence
 from dataclasses import replace
 from fractions import Fraction
 from pathlib import Path, PurePosixPath
@@ -14,9 +14,11 @@ from torch import Tensor
 from swimm3r import reconstruction
 from swimm3r.cameras import Cameras, project
 from swimm3r.errors import InputError
+from swimm3r.frames import Frames
 from swimm3r.geometry import pose_from, quaternion_from_rotation, rotation_from_quaternion
 from swimm3r.io import cameras_json, images
 from swimm3r.io.atomic import atomic_path
+from swimm3r.prepare import load_frames
 from swimm3r.progress import Progress, silent
 from swimm3r.reconstruction import Reconstruction
 from swimm3r.report.charts import depth_picture
@@ -63,15 +65,19 @@ def smooth_path(cam2world: Float[Tensor, "c 4 4"], count: int) -> Float[Tensor, 
 
 
 def write_flythrough(
-    path: Path, scene: SplatMap, canvas: Cameras, cam2world: Float[Tensor, "c 4 4"], count: int,
+    path: Path, scene: SplatMap, canvas: Cameras, cam2world: Float[Tensor, "c 4 4"], times: Sequence[float], count: int,
     progress: Progress = silent,
 ) -> None:  # fmt: skip
-    """An H.264 video of `count` views along the cameras' path: with the water, and beside it without."""
+    """An H.264 video of `count` views along the cameras' path: with the water, and beside it without.
+
+    `times` are the cameras' own, seconds of the clip; the flight takes as many of its own on the way.
+    """
+    clock = np.interp(np.linspace(0, len(times) - 1, count), np.arange(len(times)), times)
 
     def views() -> Iterable[UInt8[np.ndarray, "h w 3"]]:
         for i, pose in enumerate(smooth_path(cam2world, count)):
             progress("filming the flight", i, count)
-            out = scene.render(replace(canvas, cam2world=pose[None]))
+            out = scene.render(replace(canvas, cam2world=pose[None]), float(clock[i]))
             both = torch.cat([out.rgb, out.clear], 1)
             yield (both.clamp(0, 1) * 255).round().to(torch.uint8).numpy()
         progress("filming the flight", count, count)
@@ -86,11 +92,13 @@ def render_run(
     out: Path | None = None,
     long_side: int = 0,
     flight: int = 0,
+    time: float | None = None,
     progress: Progress = silent,
 ) -> Path:
     """Pictures of a finished run's map from the cameras of a cameras.json, by default those of training; into `out`.
 
-    Raises InputError where the run has no map, or a name in the file leads out of the folder.
+    A dynamic map shows `time` (seconds of the clip), by default the moment when the frame of a camera's name was taken.
+    Raises InputError where the run has no map, a name in the file leads out of the folder, or no moment is known.
     """
     scene, rec = load_map(folder / "splat" / "map.safetensors"), reconstruction.load(folder / "sfm")
     refined = folder / "splat" / "cameras.json"
@@ -103,15 +111,35 @@ def render_run(
                 cause="the file was made by another program, or was tampered with",
                 hint="names relative to the picture folder",
             )
+    times = moments_of(scene, table.names, load_frames(folder / "prepare"), time)
     span = depth_span(rec)
     for i, name in enumerate(table.names):
         progress("rendering", i, len(table.names))
-        write_view(out, name, scene.render(pinhole_canvas(stations[i], long_side)), span)
+        write_view(out, name, scene.render(pinhole_canvas(stations[i], long_side), times[i]), span)
     progress("rendering", len(table.names), len(table.names))
     if flight:
         canvas = pinhole_canvas(stations[0], long_side)
-        write_flythrough(out / "flythrough.mp4", scene, canvas, stations.cam2world, flight, progress)
+        write_flythrough(out / "flythrough.mp4", scene, canvas, stations.cam2world, times, flight, progress)
     return out
+
+
+def moments_of(scene: SplatMap, names: Sequence[str], frames: Frames, time: float | None) -> list[float]:
+    """When each picture shows the scene, seconds of the clip: `time`, or when the frame of that name was taken.
+
+    Raises InputError where a dynamic map is to be shown at a moment that is not known.
+    """
+    if time is not None or not scene.settings.dynamic:
+        return [time or 0.0] * len(names)
+    taken = {frame.name: frame.time for frame in frames}
+    strangers = [name for name in names if name not in taken]
+    if strangers:
+        start, end = scene.span
+        raise InputError(
+            f"{strangers[0]} is no frame of the dive, so it is not known when it would have been taken",
+            cause="the map changes with time, and the cameras are not those of its frames",
+            hint=f"--time SECONDS, {start:g} to {end:g}",
+        )
+    return [taken[name] for name in names]
 
 
 def _encode(path: Path, pictures: Iterable[UInt8[np.ndarray, "h w 3"]]) -> None:

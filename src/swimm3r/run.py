@@ -107,7 +107,7 @@ def run_pipeline(
         make=lambda: train(rec, frames, settings.splat, folder / "splat", progress),
         reuse=lambda: load_map(folder / "splat" / "map.safetensors"),
     )
-    record.add(sections.splat_sections(scene, rec, folder / "splat"))
+    record.add(sections.splat_sections(scene, rec, frames, folder / "splat"))
     if last_stage == "splat":
         return record.close()
 
@@ -209,8 +209,10 @@ def _scores(run: _Run, settings: RunSettings, truth: GroundTruth | None, progres
     poses = held_out.in_axes_of(scene, rec, poses)
     views = held_out.score_views(scene, rec, frames, poses, folder / "renders" / "test", settings.test, progress)
     canvas = held_out.cut(views[0].canvas, views[0].window)
-    path = as_mapped(rec, scene.poses).cameras.cam2world
-    write_flythrough(folder / "renders" / "flythrough.mp4", scene, canvas, path, _FLIGHT, progress)
+    path = as_mapped(rec, scene.poses)
+    times = [frames.frames[frames.index(name)].time for name in path.names]
+    flight = folder / "renders" / "flythrough.mp4"
+    write_flythrough(flight, scene, canvas, path.cameras.cam2world, times, _FLIGHT, progress)
     return {
         "test": sections.test_section(views, settings.test),
         "restored": {

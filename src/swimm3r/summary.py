@@ -11,6 +11,7 @@ from torch import Tensor
 from swimm3r.cameras import Cameras, directions, distorted_grid, image_directions, ray_depth_from_z
 from swimm3r.evaluate import NotComputed, summary_entries
 from swimm3r.evaluate.depth import depth_scores
+from swimm3r.evaluate.images import as_8_bit, psnr
 from swimm3r.evaluate.matches import epipolar_errors, match_scores
 from swimm3r.evaluate.poses import absolute_pose_errors, pose_scores
 from swimm3r.evaluate.underwater import clear_psnr, uciqe, uiqm, water_scores, water_scores_from_views
@@ -26,7 +27,7 @@ from swimm3r.splat.medium_field import grid_of
 from swimm3r.splat.pose_codes import RefinedPoses
 from swimm3r.splat.projection import pinhole
 from swimm3r.splat.rendering import SplatMap
-from swimm3r.splat.settings import PoseRefinementSettings
+from swimm3r.splat.settings import PoseRefinementSettings, recipe_of
 from swimm3r.splat.views import pinhole_canvas, undistorted
 
 _ASKED = 16  # training views that the map's mean water is taken over
@@ -95,19 +96,19 @@ def restored_section(folder: Path, names: Sequence[str], progress: Progress = si
     )
 
 
-def splat_sections(scene: SplatMap, rec: Reconstruction, folder: Path) -> dict[str, object]:
+def splat_sections(scene: SplatMap, rec: Reconstruction, frames: Frames, folder: Path) -> dict[str, object]:
     """ "splat" and the map's own water in "medium": the field's mean over the training views."""
     rows = (folder / "metrics.jsonl").read_text(encoding="utf-8").splitlines()
     last = json.loads(rows[-1])
     section = {
-        "recipe": "uwbs-static",
+        "recipe": recipe_of(scene.settings),
         "primitives": len(scene.primitives.xyz),
         "iterations": scene.settings.iterations,
         "seconds_per_iteration": last["seconds_per_step"],
         "cpu_seconds_per_iteration": last["cpu_seconds_per_step"],
         "device": scene.primitives.xyz.device.type,
     }
-    water = mean_medium(scene, rec)
+    water = mean_medium(scene, rec, frames)
     medium = {
         **{name: value.tolist() for name, value in vars(water).items()},
         "identifiable": {name: flags.tolist() for name, flags in _identifiable(rec).items()},
@@ -129,12 +130,15 @@ def test_section(views: Sequence[HeldOutView], settings: PoseRefinementSettings)
     return summary_entries({**vars(scores), **of_covered, "protocol": protocol(views, settings)})
 
 
-def mean_medium(scene: SplatMap, rec: Reconstruction) -> Medium:
-    """The map's water averaged over the directions that the training frames look in, per scene unit of ray depth."""
+def mean_medium(scene: SplatMap, rec: Reconstruction, frames: Frames) -> Medium:
+    """The map's water averaged over the directions and times of the training frames, per scene unit of ray depth."""
+    taken = {frame.name: frame.time for frame in frames}
     every = max(1, len(rec.names) // _ASKED)
     with torch.no_grad():
         values = [
-            grid_of(scene.field, pinhole(pinhole_canvas(rec.cameras[i], 64)), 8).values.flatten(1).mean(1)
+            grid_of(scene.field, pinhole(pinhole_canvas(rec.cameras[i], 64)), 8, scene.moment(taken[rec.names[i]]))
+            .values.flatten(1)
+            .mean(1)
             for i in range(0, len(rec.names), every)
         ]
     mean = torch.stack(values).mean(0)
@@ -182,7 +186,9 @@ def truth_section(
     if truth.medium is not None and rec.medium is not None:
         entries["sfm"] = _water_section(rescale(rec.medium, scale), frames.test, truth, progress)
     if truth.medium is not None and scene is not None:
-        entries["splat"] = _map_water_section(scene, rec, views, truth, scale)
+        entries["splat"] = _map_water_section(scene, rec, frames, views, truth, scale)
+        if truth.moving(views[0].name if views else "") is not None:
+            entries["splat"] |= summary_entries(_moving_section(scene, frames, views, truth))
     return entries
 
 
@@ -265,7 +271,7 @@ def _water_section(fit: MediumFit, held_out: Frames, truth: GroundTruth, progres
 
 
 def _map_water_section(
-    scene: SplatMap, rec: Reconstruction, views: Sequence[HeldOutView], truth: GroundTruth, scale: float
+    scene: SplatMap, rec: Reconstruction, frames: Frames, views: Sequence[HeldOutView], truth: GroundTruth, scale: float
 ) -> dict[str, object]:
     """The same of a map: its water field at true ray depth, and its own clear rendering, on the held-out views."""
     assert truth.medium is not None
@@ -282,17 +288,41 @@ def _map_water_section(
         y = pixels[..., 1].long().clamp(0, view.lens.height - 1)
         true_z = torch.where(shown, z_depth[y, x], 0.0)
         ray_depth = ray_depth_from_z(true_z, image_directions(view.canvas).float())[rows, columns]
-        out = scene.render(cut(view.canvas, view.window))
+        out = scene.render(cut(view.canvas, view.window), view.time)
         media.append((ray_depth, Medium(out.medium.Binf, out.medium.beta_D / scale, out.medium.beta_B / scale)))
         psnrs.append(clear_psnr(out.clear, true_clear[rows, columns], ray_depth, truth.medium))
     if not media:
         return summary_entries({"clear_psnr": NotComputed("the truth has no depth of a held-out frame")})
-    water = mean_medium(scene, rec)
+    water = mean_medium(scene, rec, frames)
     coefficients = Medium(water.Binf, water.beta_D / scale, water.beta_B / scale)
     known = [value for value in psnrs if not isinstance(value, NotComputed)]
     mean = sum(known) / len(known) if known else psnrs[0]
     scores = water_scores_from_views(media, coefficients, _identifiable(rec), truth.medium)
     return summary_entries({"clear_psnr": mean}) | scores.summary()
+
+
+def _moving_section(
+    scene: SplatMap, frames: Frames, views: Sequence[HeldOutView], truth: GroundTruth
+) -> dict[str, object]:
+    """PSNR of the held-out views where something moves and where nothing does, means over the views that show it."""
+    moved, still = [], []
+    for view in views:
+        f, moving = frames.index(view.name), truth.moving(view.name)
+        if moving is None:
+            continue
+        window = (view.window.rows, view.window.columns)
+        target, seen = undistorted(frames.image(f), frames.mask(f), view.lens, view.canvas)
+        _, quiet = undistorted(frames.image(f), frames.mask(f) & ~moving, view.lens, view.canvas)
+        render = as_8_bit(scene.render(cut(view.canvas, view.window), view.time).rgb)
+        target, seen, quiet = as_8_bit(target)[window], seen[window], quiet[window]
+        for where, found in ((seen & ~quiet, moved), (quiet, still)):
+            if bool(where.any()):
+                found.append(psnr(render[where], target[where]))
+
+    def mean(values: list[float]) -> float | NotComputed:
+        return sum(values) / len(values) if values else NotComputed("no held-out frame shows any of it")
+
+    return {"psnr_moving": mean(moved), "psnr_still": mean(still)}
 
 
 def _identifiable(rec: Reconstruction) -> dict[str, Bool[Tensor, "3"]]:

@@ -59,18 +59,20 @@ def test_the_multiplier_is_bounded_and_protects_depth_that_is_right():
     assert gradients.step_multiplier(u, torch.zeros(5, 3), 2.0).tolist() == [2.0, 2.0, 2.0, 1.0, 1.5]
 
 
-def test_centre_gradients_are_the_projections_own(primitives: Make, camera: Callable[..., Cameras]):
+@pytest.mark.parametrize("time", [None, torch.tensor(0.4)], ids=["static", "dynamic"])
+def test_centre_gradients_are_the_projections_own(time, primitives: Make, camera: Callable[..., Cameras]):
     """Fast against autograd of the plain form, several at once; both against the whole adjoint."""
-    p, view = primitives(500), projection.pinhole(camera(), torch.float64)
+    p, view = primitives(500, 3 if time is None else 4), projection.pinhole(camera(), torch.float64)
     rng = torch.Generator().manual_seed(1)
     pulls = torch.randn(500, 2, 3, generator=rng, dtype=torch.float64)
-    expected = projection.centre_gradients(p, view, RenderSettings(), pulls)
+    expected = projection.centre_gradients(p, view, RenderSettings(), pulls, time)
     single = BetaPrimitives(*(t.float() for t in p))
-    found = projection.centre_gradients(single, projection.pinhole(camera()), RenderSettings(), pulls.float())
+    found = projection.centre_gradients(single, projection.pinhole(camera()), RenderSettings(), pulls.float(), time)
     tame = (p.xyz @ view.R.mT + view.t)[:, 2] > 0.5
     torch.testing.assert_close(found[tame], expected[tame].float(), rtol=1e-3, atol=1e-3)
     xyz = single.xyz.clone().requires_grad_()
-    seen = projection.project(single._replace(xyz=xyz), projection.pinhole(camera()), RenderSettings()).primitives
+    sight = projection.pinhole(camera())
+    seen = projection.project(single._replace(xyz=xyz), sight, RenderSettings(), time).primitives
     (whole,) = torch.autograd.grad((seen.mean2d, seen.depth), xyz, (pulls[:, 0, :2].float(), pulls[:, 0, 2].float()))
     torch.testing.assert_close(found[:, 0], whole, rtol=1e-4, atol=1e-4)
 

@@ -10,6 +10,7 @@ from swimm3r.ground_truth import read_ground_truth
 from swimm3r.io import images
 from swimm3r.medium import add_water
 from swimm3r.synthetic import Coefficients, DiveSettings, make_dive, write_dive
+from swimm3r.synthetic.disturbances import swimming
 from swimm3r.synthetic.dive import water
 from swimm3r.synthetic.raycast import cast
 from swimm3r.synthetic.seafloor import height_at
@@ -101,7 +102,7 @@ def test_one_seed_is_one_dive_and_another_seed_another(frames):
 
 def test_nothing_but_the_masked_pixels_shows_the_fish(dive, fishy):
     shown = 0
-    for i in (1, 3, 5):
+    for i in (0, 11, 14):
         with_fish, without = fishy.frame(i), dive.frame(i)
         changed = (with_fish.raw - without.raw).abs().amax(-1) > 0
         assert not (changed & with_fish.usable).any()
@@ -112,6 +113,19 @@ def test_nothing_but_the_masked_pixels_shows_the_fish(dive, fishy):
         if hidden.any():
             assert changed[hidden].float().mean() > 0.95
     assert shown > 200
+
+
+def test_the_fish_swims_across_the_scene_steadily_and_above_ground(dive):
+    there = [swimming(dive.floor, share, QUIET.seed) for share in np.linspace(0, 1, 33)]
+    middle = torch.stack([fish.middle for fish in there])
+    steps = middle.diff(dim=0)
+    assert 0.9 < (middle[-1] - middle[0]).norm() < 1.5
+    assert steps.norm(dim=-1).max() < 0.08
+    assert steps.diff(dim=0).norm(dim=-1).max() < 0.01
+    assert (middle[:, 2].numpy() > height_at(dive.floor, *middle[:, :2].T.numpy()) + 0.2).all()
+    for fish, step in zip(there, steps, strict=False):
+        torch.testing.assert_close(fish.axes @ fish.axes.mT, torch.eye(3).double())
+        assert torch.nn.functional.cosine_similarity(fish.axes[0], step, dim=0) > 0.9
 
 
 def test_noise_has_the_strength_that_was_asked_for(dive, frames):

@@ -14,6 +14,7 @@ def render(
     out: Path | None = None,
     long_side: int = 0,
     flight: int = 0,
+    time: float | None = None,
 ) -> None:
     """Render a run's map: with its water, without it, the water alone, and depth.
 
@@ -24,8 +25,9 @@ def render(
         out: where the pictures go; RUN/renders/views otherwise.
         long_side: longer side of the pictures, pixels, at most the cameras' own; 0 is the cameras' own.
         flight: film a flight of this many pictures along the cameras, too: OUT/flythrough.mp4.
+        time: second of the clip that a dynamic map is shown at; each camera's own frame's where none is given.
     """
     from swimm3r.renders import render_run
 
     with drawn_progress() as progress:
-        print(render_run(run, cameras, out, long_side, flight, progress))
+        print(render_run(run, cameras, out, long_side, flight, time, progress))

@@ -1,8 +1,8 @@
 """Maps and training states on disk, as safetensors: tensors under their names, everything else in the header.
 
 map.safetensors (`schema` 1) holds the primitives as stored (before activation), the medium network, and in its header
-the recipe, its settings, the metric flag and the working unit; also the training frames' poses where they were
-refined. A checkpoint adds the optimiser's moments and the step.
+the recipe, its settings, the metric flag, the working unit and when the clip begins and ends; also the training
+frames' poses where they were refined. A checkpoint adds the optimiser's moments and the step.
 """
 
 import json
@@ -20,10 +20,9 @@ from swimm3r.splat.medium_field import MediumField
 from swimm3r.splat.pose_codes import RefinedPoses
 from swimm3r.splat.primitives import BetaPrimitives
 from swimm3r.splat.rendering import SplatMap
-from swimm3r.splat.settings import UwbsSettings
+from swimm3r.splat.settings import RECIPES, UwbsSettings, recipe_of
 
 SCHEMA = 1
-_RECIPES = {"uwbs-static": UwbsSettings}
 
 
 @dataclass(frozen=True)
@@ -39,10 +38,11 @@ def save_map(path: Path, scene: SplatMap) -> None:
     tensors = {f"primitives.{name}": values for name, values in scene.primitives._asdict().items()}
     tensors |= {f"field.{name}": values for name, values in scene.field.state_dict().items()}
     about = {
-        "recipe": "uwbs-static",
+        "recipe": recipe_of(scene.settings),
         "settings": asdict(scene.settings),
         "metric": scene.metric,
         "length": scene.length,
+        "span": scene.span,
     }
     if scene.poses is not None:
         tensors["poses.cam2world"] = scene.poses.cam2world
@@ -54,19 +54,21 @@ def load_map(path: Path) -> SplatMap:
     """Read what `save_map` wrote. Raises InputError for a file that is damaged or of another kind."""
     stored = read(path)
     about = stored.about
-    if about.get("recipe") not in _RECIPES:
+    if about.get("recipe") not in RECIPES:
         raise _foreign(path, f"its recipe is {about.get('recipe')!r}")
     settings = settings_from(UwbsSettings, about["settings"])
     try:
-        field = MediumField(settings.medium.hidden)
+        field = MediumField(settings.medium, settings.dynamic)
         field.load_state_dict(
             {k.removeprefix("field."): v for k, v in stored.tensors.items() if k.startswith("field.")}
         )
         primitives = BetaPrimitives(*(stored.tensors[f"primitives.{name}"] for name in BetaPrimitives._fields))
     except (KeyError, RuntimeError) as error:
         raise _foreign(path, str(error)) from error
+    start, end = about.get("span", (0.0, 1.0))  # static maps of earlier versions have none
     poses = RefinedPoses(tuple(about["frames"]), stored.tensors["poses.cam2world"]) if "frames" in about else None
-    return SplatMap(primitives, field.requires_grad_(False), settings, about["metric"], about["length"], poses)
+    field.requires_grad_(False)
+    return SplatMap(primitives, field, settings, about["metric"], about["length"], (start, end), poses)
 
 
 def write(path: Path, stored: Stored) -> None:

@@ -111,7 +111,7 @@ def differentiate(
         on_plane = on_plane + sgg.residual * medium_uncertainty(branches)[:, None] * alone[-1]
     by_depth = buffers.depth_iso if alone is None else torch.zeros_like(buffers.depth_iso)
     pulls = torch.stack([torch.nn.functional.pad(on_plane, (0, 1)), by_depth], 1)
-    xyz, isolated = centre_gradients(p, view, settings.render, pulls).unbind(1)
+    xyz, isolated = centre_gradients(p, view, settings.render, pulls, drawing.time).unbind(1)
     u = medium_uncertainty(branches)
     multiplier = step_multiplier(u, isolated if alone is None else alone[-2], sgg.largest_step)
     return Differentiated(gradients, xyz, multiplier, u)

@@ -1,10 +1,12 @@
 """The water as a field over ray directions: A_phi of Eq. ambient_medium.
 
-    (Binf, beta_B, beta_D)(u) = sigma_med[A_phi(SH(d(u)))]
+    (Binf, beta_B, beta_D)(u, t) = sigma_med[A_phi(SH(d(u)), gamma(t))]
 
-SH are the real spherical harmonics of degrees 0..3 of the pixel's unit ray in world axes, A_phi a 1x1 convolutional
-network with ReLU hidden layers, sigma_med a sigmoid for Binf and a softplus for the betas, which are per unit of ray
-depth. The field is smooth, so it is evaluated on a grid of pixels and interpolated in between (stride 1 is exact).
+SH are the real spherical harmonics of degrees 0..3 of the pixel's unit ray in world axes. gamma(t), in dynamic maps
+alone, is a learned linear map of sines and cosines of octaves of t, 0..1 over the clip: it is defined at times that no
+training frame has. A_phi is a 1x1 convolutional network with ReLU hidden layers, sigma_med a sigmoid for Binf and a
+softplus for the betas, which are per unit of ray depth. The field is smooth, so it is evaluated on a grid of pixels and
+interpolated in between (stride 1 is exact).
 """
 
 import math
@@ -29,20 +31,35 @@ class MediumField(nn.Module):
 
     length: Tensor  # scene units per working unit; betas are divided by it
 
-    def __init__(self, hidden: int) -> None:
+    def __init__(self, settings: MediumFieldSettings, dynamic: bool = False) -> None:
         super().__init__()
+        hidden, width = settings.hidden, settings.time_features if dynamic else 0
+        self.gamma = nn.Linear(2 * settings.frequencies, width) if dynamic else None
         self.network = nn.Sequential(
-            nn.Conv2d(HARMONICS, hidden, 1),
+            nn.Conv2d(HARMONICS + width, hidden, 1),
             nn.ReLU(),
             nn.Conv2d(hidden, hidden, 1),
             nn.ReLU(),
             nn.Conv2d(hidden, 9, 1),
         )
+        if settings.model == "none":
+            self.gamma, self.network = None, nn.Sequential()
         self.register_buffer("length", torch.ones(()))
 
-    def forward(self, directions: Float[Tensor, "h w 3"]) -> Float[Tensor, "9 h w"]:
-        """Binf, beta_B and beta_D, in this order, of unit directions in world axes."""
-        raw = self.network(spherical_harmonics(directions).permute(2, 0, 1)[None])[0]
+    def forward(
+        self, directions: Float[Tensor, "h w 3"], time: Float[Tensor, ""] | None = None
+    ) -> Float[Tensor, "9 h w"]:
+        """Binf, beta_B and beta_D, in this order, of unit directions in world axes, at a time in 0..1 of the clip."""
+        if not len(self.network):
+            return directions.new_zeros(9, *directions.shape[:2])
+        features = spherical_harmonics(directions)
+        if self.gamma is not None:
+            assert time is not None
+            octaves = math.pi * 2.0 ** torch.arange(self.gamma.in_features // 2).to(features)
+            angles = octaves * time.to(features)
+            now = self.gamma(torch.cat([angles.sin(), angles.cos()]))
+            features = torch.cat([features, now.expand(*features.shape[:2], -1)], -1)
+        raw = self.network(features.permute(2, 0, 1)[None])[0]
         return torch.cat([sigmoid(raw[:3]), softplus(raw[3:]) / self.length])
 
 
@@ -54,13 +71,17 @@ class FieldGrid:
     step: tuple[float, float]  # pixels between neighbours, down and right
 
 
-def initial_field(medium: Medium | None, settings: MediumFieldSettings, rng: torch.Generator) -> MediumField:
-    """A field that is `medium` (coefficients per working unit) in every direction; without one, grey and thin water."""
-    field = MediumField(settings.hidden)
+def initial_field(
+    medium: Medium | None, settings: MediumFieldSettings, rng: torch.Generator, dynamic: bool = False
+) -> MediumField:
+    """A field that is `medium` (coefficients per working unit) everywhere; without one, grey and thin water."""
+    field = MediumField(settings, dynamic)
+    if settings.model == "none":
+        return field
     with torch.no_grad():
-        for layer in field.network:
-            if isinstance(layer, nn.Conv2d):
-                bound = 1 / math.sqrt(layer.in_channels)  # torch's own default, but from our generator
+        for layer in field.modules():
+            if isinstance(layer, nn.Conv2d | nn.Linear):
+                bound = 1 / math.sqrt(layer.weight.shape[1])  # torch's own default, but from our generator
                 layer.weight.uniform_(-bound, bound, generator=rng)
                 assert layer.bias is not None
                 layer.bias.uniform_(-bound, bound, generator=rng)
@@ -75,8 +96,8 @@ def initial_field(medium: Medium | None, settings: MediumFieldSettings, rng: tor
     return field
 
 
-def grid_of(field: MediumField, view: Pinhole, stride: int) -> FieldGrid:
-    """The field on about every stride-th pixel of a view; its pose may carry a gradient."""
+def grid_of(field: MediumField, view: Pinhole, stride: int, time: Float[Tensor, ""] | None = None) -> FieldGrid:
+    """The field on about every stride-th pixel of a view, at a time in 0..1; the pose may carry a gradient."""
     rows, columns = (max(2, math.ceil((size - 1) / stride) + 1) for size in (view.height, view.width))
     y = torch.linspace(0.5, view.height - 0.5, rows, device=view.R.device)
     x = torch.linspace(0.5, view.width - 0.5, columns, device=view.R.device)
@@ -90,7 +111,7 @@ def grid_of(field: MediumField, view: Pinhole, stride: int) -> FieldGrid:
     )
     directions = torch.nn.functional.normalize(rays @ view.R, dim=-1)  # R^T to the world
     step = ((view.height - 1) / (rows - 1), (view.width - 1) / (columns - 1))
-    return FieldGrid(field(directions.to(field.length)), step)
+    return FieldGrid(field(directions.to(field.length), time), step)
 
 
 def medium_at_pixels(grid: FieldGrid, height: int, width: int) -> MediumMaps:

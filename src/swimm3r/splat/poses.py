@@ -42,24 +42,26 @@ def refine_pose(
     mask: Bool[Tensor, "h w"],
     settings: PoseRefinementSettings | None = None,
     progress: Progress = silent,
+    time: float | None = None,
 ) -> RefinedPose:
     """The pose near `camera`'s from which the map looks most like the picture; the given one where none looks better.
 
-    `picture` and `mask` are the frame as prepared, distortion included.
+    `picture` and `mask` are the frame as prepared, distortion included; `time` is when it was taken, seconds.
     """
     settings = settings or PoseRefinementSettings()
     canvas = pinhole_canvas(camera, settings.long_side)
     target, seen = undistorted(picture, mask, camera, canvas)
     wanted = edges(target, seen, settings)
     units = in_scene_units(scene.settings, scene.length)
-    primitives = in_sight(scene, canvas)
+    now = scene.moment(time)
+    primitives = in_sight(scene, canvas, now)
     delta = torch.zeros(9, requires_grad=True)
     adam = torch.optim.Adam([delta], lr=settings.rate)
     losses: list[tuple[float, Tensor]] = []
     for step in range(settings.steps + 1):
         progress("refining a pose", step, settings.steps)
         pose = moved(canvas.cam2world[0], delta, scene.length)
-        images = draw(primitives, scene.field, pinhole(replace(canvas, cam2world=pose[None])), units).images
+        images = draw(primitives, scene.field, pinhole(replace(canvas, cam2world=pose[None])), units, now).images
         loss = ((images.rgb.permute(1, 2, 0) - target).abs().mean(-1) * wanted).sum() / wanted.sum()
         losses.append((float(loss.detach()), pose.detach()))
         if step == settings.steps:
@@ -85,10 +87,10 @@ def edges(
     return strong if int(strong.sum()) >= settings.min_edges * strong.numel() else usable
 
 
-def in_sight(scene: SplatMap, canvas: Cameras) -> BetaPrimitives:
+def in_sight(scene: SplatMap, canvas: Cameras, now: Float[Tensor, ""] | None = None) -> BetaPrimitives:
     """The primitives that a camera sees, or would after a small motion."""
     with torch.no_grad():
-        seen = project(scene.primitives, pinhole(canvas), in_scene_units(scene.settings, scene.length).render)
+        seen = project(scene.primitives, pinhole(canvas), in_scene_units(scene.settings, scene.length).render, now)
     size = torch.tensor([canvas.width, canvas.height])
     reach = seen.radius[:, None] + _MARGIN * size
     at = seen.primitives.mean2d

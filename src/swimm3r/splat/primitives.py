@@ -76,6 +76,18 @@ def initial_primitives(rec: Reconstruction, settings: InitialSettings, rng: torc
     )
 
 
+def with_time(p: BetaPrimitives, settings: InitialSettings, rng: torch.Generator) -> BetaPrimitives:
+    """D = 7 of D = 6: each primitive around a moment of its own, as UBS begins; nothing moves or turns yet."""
+    n = len(p.xyz)
+    spread = inverse_softplus(torch.full((n, 1), settings.time_scale))
+    return p._replace(
+        query_mean=torch.cat([p.query_mean, torch.rand(n, 1, generator=rng)], -1),
+        beta=torch.cat([p.beta, torch.full((n, 1), settings.time_exponent)], -1),
+        scale=torch.cat([p.scale, spread], -1),
+        lower=torch.cat([p.lower, 1e-5 * torch.randn(n, 6, generator=rng)], -1),
+    )
+
+
 def _starting_points(
     rec: Reconstruction, settings: InitialSettings
 ) -> tuple[Float[Tensor, "n 3"], Float[Tensor, "n 3"]]:

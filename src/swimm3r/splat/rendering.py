@@ -14,6 +14,7 @@ from swimm3r.splat.pose_codes import RefinedPoses
 from swimm3r.splat.primitives import BetaPrimitives
 from swimm3r.splat.projection import Pinhole, Projection, pinhole, project
 from swimm3r.splat.settings import UwbsSettings
+from swimm3r.splat.views import moment
 
 _SEEN = 1e-3  # alpha below which a pixel has no depth
 _COVERED = 0.5  # alpha from which on a pixel's clear colour is that of a surface
@@ -40,12 +41,25 @@ class SplatMap:
     settings: UwbsSettings
     metric: bool
     length: float = 1.0  # scene units per working unit (`settings.py`)
+    span: tuple[float, float] = (0.0, 1.0)  # of the clip it was trained on, seconds
     poses: RefinedPoses | None = None  # of the training frames; None where they were held
 
-    def render(self, camera: Cameras) -> RenderOutput:
-        """The view of one pinhole camera, without gradient. Raises ValueError where the camera has distortion."""
+    def render(self, camera: Cameras, time: float | None = None) -> RenderOutput:
+        """The view of one pinhole camera at a time of the clip (seconds; static maps need none), without gradient.
+
+        Raises ValueError where the camera has distortion, or where a dynamic map is given no time.
+        """
         with torch.no_grad():
-            return render(self, camera)
+            return render(self, camera, time)
+
+    def moment(self, time: float | None) -> Float[Tensor, ""] | None:
+        """A time of the clip as the map's own parts take it: None in static maps, 0..1 in dynamic ones."""
+        if not self.settings.dynamic:
+            return None
+        if time is None:
+            start, end = self.span
+            raise ValueError(f"a dynamic map is rendered at a time of its clip, {start:g} to {end:g} s; got none")
+        return moment(self.span, time)
 
 
 @dataclass(frozen=True)
@@ -57,12 +71,21 @@ class Drawing:
     grid: FieldGrid
     maps: MediumMaps  # as the rasteriser reads them, per unit of z depth
     sgg: SggBuffers | None  # filled when the gradient is taken
+    time: Float[Tensor, ""] | None = None  # that primitives were conditioned on
 
 
-def draw(p: BetaPrimitives, field: MediumField, view: Pinhole, settings: UwbsSettings, sgg: bool = False) -> Drawing:
-    """Project, evaluate the water and rasterise; differentiable in everything, the pose included."""
-    projection = project(p, view, settings.render)
-    grid = grid_of(field, view, settings.medium.stride)
+def draw(
+    p: BetaPrimitives,
+    field: MediumField,
+    view: Pinhole,
+    settings: UwbsSettings,
+    time: Float[Tensor, ""] | None = None,
+    sgg: bool = False,
+) -> Drawing:
+    """Project, evaluate the water and rasterise; differentiable in everything but time, the pose included."""
+    time = time if settings.dynamic else None
+    projection = project(p, view, settings.render, time)
+    grid = grid_of(field, view, settings.medium.stride, time)
     maps = medium_at_pixels(grid, view.height, view.width)
     if settings.render.depth == "ray":
         maps = per_z_depth(maps, view)
@@ -72,7 +95,7 @@ def draw(p: BetaPrimitives, field: MediumField, view: Pinhole, settings: UwbsSet
         alpha_min=settings.render.alpha_min, medium_depth_grad=settings.render.medium_depth_grad == "full",
         sgg=buffers,
     )  # fmt: skip
-    return Drawing(images, projection, grid, maps, buffers)
+    return Drawing(images, projection, grid, maps, buffers, time)
 
 
 def expected_z_depth(images: RasterOutput) -> Float[Tensor, "h w"]:
@@ -93,12 +116,12 @@ def in_scene_units(settings: UwbsSettings, length: float) -> UwbsSettings:
     return replace(settings, render=replace(settings.render, near=settings.render.near * length))
 
 
-def render(scene: SplatMap, camera: Cameras) -> RenderOutput:
-    """One view of a map. Raises ValueError where the camera has distortion or is more than one."""
+def render(scene: SplatMap, camera: Cameras, time: float | None = None) -> RenderOutput:
+    """One view of a map at a time of its clip. Raises ValueError as `SplatMap.render` does."""
     settings = in_scene_units(scene.settings, scene.length)
-    view = pinhole(camera)
-    projected = project(scene.primitives, view, settings.render).primitives
-    medium = medium_at_pixels(grid_of(scene.field, view, settings.medium.stride), view.height, view.width)
+    view, now = pinhole(camera), scene.moment(time)
+    projected = project(scene.primitives, view, settings.render, now).primitives
+    medium = medium_at_pixels(grid_of(scene.field, view, settings.medium.stride, now), view.height, view.width)
     maps = per_z_depth(medium, view) if settings.render.depth == "ray" else medium
     height, width, alpha_min = view.height, view.width, settings.render.alpha_min
     images = rasterize(projected, maps, height, width, alpha_min=alpha_min)

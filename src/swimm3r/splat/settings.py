@@ -39,6 +39,10 @@ class InitialSettings:
     which hides 9 of 10 primitives in any one view."""
     view_exponent: float = 0.0
     """Stored exponent of the conditioned directions: how fast a primitive fades seen from elsewhere, as 4 exp of it."""
+    time_exponent: float = 0.0
+    """The same of time, in dynamic maps."""
+    time_scale: float = 1.0
+    """Scale of a primitive in time, in lengths of the clip; its mean time is drawn from all of the clip (UBS)."""
     scale: float = 1.0
     """Spatial scale, in root mean square distances to the 3 nearest neighbours."""
     opacity: float = 0.5
@@ -50,7 +54,13 @@ class InitialSettings:
 class MediumFieldSettings:
     """The ambient field A_phi of Eq. ambient_medium."""
 
+    model: Literal["network", "none"] = "network"
+    """none is clear water before black: Beta splatting without the underwater part (UBS)."""
     hidden: int = 128  # two hidden layers of WaterSplatting's width
+    frequencies: int = 8
+    """Octaves of the clip's time that gamma(t) begins with, in dynamic maps."""
+    time_features: int = 16
+    """Width of gamma(t)."""
     stride: int = 8
     """Pixels between the directions at which the field is evaluated; between them its maps are interpolated."""
     prior: float = 0.3
@@ -123,6 +133,8 @@ class DensifySettings:
     dead_opacity: float = 0.005
     noise: float = 1e6
     """UBS's rate for static scenes, times the positions' learning rate."""
+    noise_dynamic: float = 1.0
+    """UBS's rate for dynamic ones."""
     noise_gate: Literal["sigmoid", "power"] = "sigmoid"
     """How noise fades with opacity o: as 1 / (1 + exp(100 (o - dead_opacity))) (MCMC-GS), or as (1 - o)^100 (UBS)."""
     noise_cadence: Literal["round", "step"] = "round"
@@ -168,8 +180,10 @@ class TrainingPoseSettings:
 
 @dataclass(frozen=True)
 class UwbsSettings:
-    """Underwater Beta Splatting, static."""
+    """Underwater Beta Splatting; static, or with primitives and water that depend on the time, too."""
 
+    dynamic: bool = False
+    """Condition primitives on time besides direction (D = 7), and let the water change with it."""
     iterations: int = 20_000
     long_side: int = 1600
     """Longer side of the training pictures, pixels; they are never enlarged."""
@@ -204,4 +218,14 @@ class PoseRefinementSettings:
 
 
 SplatSettings = UwbsSettings
+RECIPES = ("uwbs-static", "uwbs-dynamic", "ubs")
+
+
+def recipe_of(settings: UwbsSettings) -> str:
+    """Which of RECIPES the settings are of."""
+    if settings.medium.model == "none":
+        return "ubs"
+    return "uwbs-dynamic" if settings.dynamic else "uwbs-static"
+
+
 uwbs = UwbsSettings  # as the Python API calls it: swimm3r.train(rec, frames, swimm3r.uwbs(iterations=20_000))

@@ -1,7 +1,8 @@
 """What a map is trained on: undistorted pictures of one size, their masks and depth, in working units.
 
 Every frame becomes a pinhole picture with its own K at the training size. Depth along the optical axis is the same
-number on both grids. What the frame does not show, or its mask excludes, is not `seen` and takes no part in any loss.
+number on both grids. Time runs from 0 at the clip's first frame to 1 at its last, test frames included. What the frame
+does not show, or its mask excludes, is not `seen` and takes no part in any loss.
 """
 
 from dataclasses import dataclass, replace
@@ -30,6 +31,7 @@ class View:
     seen: Bool[Tensor, "h w"]
     z_depth: Float[Tensor, "h w"]  # working units, 0 = unknown
     depth_weight: Float[Tensor, "h w"]  # edge-aware, 0 where the depth is unknown or doubtful
+    time: Float[Tensor, ""] | None = None  # of the clip, 0..1; static maps do not ask
 
 
 class TrainingViews:
@@ -37,6 +39,7 @@ class TrainingViews:
 
     def __init__(self, rec: Reconstruction, frames: Frames, settings: UwbsSettings, scale: float) -> None:
         self.rec, self.frames, self.settings, self.scale = rec, frames, settings, scale
+        self._times = {frame.name: moment(frames.span, frame.time) for frame in frames}
         train = {frame.name for frame in frames.train}
         self.names = tuple(name for name in rec.names if name in train)
         if not self.names:
@@ -46,6 +49,11 @@ class TrainingViews:
                 hint="the folder of pictures the reconstruction was made of",
             )
         self._cache = ArrayCache(max_bytes=768 << 20)
+
+    @property
+    def times(self) -> list[float]:
+        """When the views were taken, 0..1 of the clip."""
+        return [float(self._times[name]) for name in self.names]
 
     def __len__(self) -> int:
         return len(self.names)
@@ -79,6 +87,7 @@ class TrainingViews:
             torch.from_numpy(seen.copy()),
             torch.from_numpy(z_depth.astype(np.float32)),
             torch.from_numpy(weight.astype(np.float32)),
+            self._times[name],
         )
 
     def _depth(
@@ -99,6 +108,12 @@ def _in_working_units(cameras: Cameras, scale: float) -> Cameras:
     cam2world = cameras.cam2world.clone()
     cam2world[:, :3, 3] *= scale
     return replace(cameras, cam2world=cam2world)
+
+
+def moment(span: tuple[float, float], time: float) -> Float[Tensor, ""]:
+    """A time in seconds of a clip that lasts from span[0] to span[1], as maps take it: 0..1."""
+    start, end = span
+    return torch.tensor((time - start) / (end - start) if end > start else 0.0)
 
 
 def pinhole_canvas(lens: Cameras, long_side: int) -> Cameras:

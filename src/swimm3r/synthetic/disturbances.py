@@ -9,11 +9,14 @@ from torch import Tensor
 
 from swimm3r.cameras import Cameras, ray_depth_from_z
 from swimm3r.medium import Medium, add_water
+from swimm3r.synthetic.seafloor import Seafloor, height_at
 
 _BODY = (0.19, 0.072, 0.04)  # m, half axes: along, up, across
 _TAIL = (0.045, 0.075, 0.008)
 _TAIL_AT = -0.205  # m behind the middle
-_PERIOD = 9.0  # frames to cross the view and come back
+_CROSSING = 1.0  # m swum during the dive
+_AHEAD = 2.5  # m before the world's origin: in view from all of the path
+_ABOVE = 0.3  # m between the fish's way and the highest ground under it
 
 
 @dataclass(frozen=True)
@@ -25,30 +28,50 @@ class Fish:
     ray_depth: Float[Tensor, "h w"]  # 0 where it is not
 
 
-def fish(
-    sample_rays: Float[Tensor, "h2 w2 3"], floor_z_depth: Float[Tensor, "h w"], number: float, phase: float
-) -> Fish:
-    """The fish in frame `number`: it swims to and fro before the camera and is hidden by what is nearer.
+@dataclass(frozen=True)
+class Swimmer:
+    """Where the fish is and how it is turned."""
+
+    middle: Float[Tensor, "3"]
+    axes: Float[Tensor, "3 3"]  # rows: along, up, across
+
+    def seen_from(self, cam2world: Float[Tensor, "4 4"]) -> "Swimmer":
+        """The same in a camera's axes."""
+        R = cam2world[:3, :3]
+        return Swimmer((self.middle - cam2world[:3, 3]) @ R, self.axes @ R)
+
+
+def swimming(floor: Seafloor, share: float, seed: int) -> Swimmer:
+    """The fish in the world when `share` of the dive has passed: it swims across, once, in a gentle curve."""
+    rng = np.random.default_rng([seed, 3])
+    side, sway, bob = rng.choice([-1.0, 1.0]), rng.uniform(0, 2 * np.pi), rng.uniform(0, 2 * np.pi)
+
+    def way(at: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        return side * _CROSSING * (at - 0.5), _AHEAD + 0.15 * np.sin(2 * np.pi * at + sway)
+
+    x, y = way(np.linspace(0, 1, 64))
+    ground = max(height_at(floor, x, y + aside).max() for aside in (-0.1, 0.0, 0.1))
+    x, y = way(np.array([share - 1e-3, share, share + 1e-3]))
+    height = ground + _ABOVE + 0.06 * np.sin(2 * np.pi * share + bob)
+    along = np.array([x[2] - x[0], y[2] - y[0], 0.0])
+    along /= np.linalg.norm(along)
+    up = np.array([0.0, 0.0, 1.0])
+    axes = np.stack([along, up, np.cross(along, up)])
+    return Swimmer(torch.tensor([x[1], y[1], height]), torch.from_numpy(axes))
+
+
+def fish(sample_rays: Float[Tensor, "h2 w2 3"], floor_z_depth: Float[Tensor, "h w"], there: Swimmer) -> Fish:
+    """The fish in a picture, hidden by what is nearer; `there` is in the camera's axes.
 
     `sample_rays` are the rays (z = 1) of twice the picture's resolution; `floor_z_depth` is 0 in open water.
     """
-    turn = 2 * np.pi * (number / _PERIOD + phase)
-    middle = torch.tensor(
-        [0.85 * np.sin(turn), -0.02 + 0.12 * np.sin(0.7 * turn), 1.25 + 0.15 * np.cos(0.6 * turn)], dtype=torch.float32
-    )
-    heading = 1.0 if np.cos(turn) >= 0 else -1.0
-    lean = 0.35 * np.sin(0.9 * turn)
-    # rows: along, up, across
-    axes = torch.tensor(
-        [[heading * np.cos(lean), 0.0, np.sin(lean)], [0.0, -1.0, 0.0], [-np.sin(lean), 0.0, heading * np.cos(lean)]],
-        dtype=torch.float32,
-    )
+    middle, axes = there.middle.float(), there.axes.float()
     z = torch.full(sample_rays.shape[:2], torch.inf)
     colour = torch.zeros(*sample_rays.shape[:2], 3)
     for half_axes, offset in ((_BODY, 0.0), (_TAIL, _TAIL_AT)):
         size = torch.tensor(half_axes)
         start = -(axes @ middle) - torch.tensor([offset, 0.0, 0.0])
-        o, d = start / size, (sample_rays.float() @ axes.mT.float()) / size
+        o, d = start / size, (sample_rays.float() @ axes.mT) / size
         a, b, c = (d * d).sum(-1), (d * o).sum(-1), (o * o).sum(-1) - 1
         root = b * b - a * c
         t = torch.where(root > 0, (-b - root.clamp(min=0).sqrt()) / a, torch.inf)

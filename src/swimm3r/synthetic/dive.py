@@ -78,8 +78,8 @@ class Dive:
         usable = torch.ones_like(z_depth, dtype=torch.bool)
         rng = np.random.default_rng([settings.seed, 2, i])
         if settings.moving_object:
-            phase = np.random.default_rng([settings.seed, 3]).random()
-            seen = disturbances.fish(sample_rays, z_depth, float(i), phase)
+            there = disturbances.swimming(self.floor, i / max(len(self) - 1, 1), settings.seed)
+            seen = disturbances.fish(sample_rays, z_depth, there.seen_from(camera.cam2world[0]))
             raw, usable = disturbances.with_fish(raw, seen, self.medium), disturbances.untouched(seen)
         if settings.marine_snow:
             raw = disturbances.marine_snow(raw, camera, settings.marine_snow, self.medium, rng)

@@ -51,7 +51,7 @@ class DiveSettings:
     vignetting: float = 0.0
     """light lost in the corners, 0..1"""
     moving_object: bool = False
-    """a fish crosses the view"""
+    """a fish swims across, once during the dive"""
     give_masks: bool = False
     """put the moving object's masks beside images/ for the pipeline to use, not only under truth/"""
 

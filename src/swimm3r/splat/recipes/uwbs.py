@@ -1,4 +1,4 @@
-"""Underwater Beta Splatting, static: the objective of Eq. uwbs_total, its schedule, and one step of it.
+"""Underwater Beta Splatting: the objective of Eq. uwbs_total, its schedule, and one step of it.
 
 L = L_3DGS + lambda_opa L_opa + lambda_scale L_scale + lambda_depth L_depth + lambda_smooth L_smooth + lambda_rad L_rad
 
@@ -9,6 +9,7 @@ known surfaces opaque (`coverage`).
 import hashlib
 import json
 import math
+from collections.abc import Collection
 from dataclasses import asdict, dataclass, replace
 from pathlib import Path
 
@@ -25,10 +26,10 @@ from swimm3r.splat.gradients import differentiate
 from swimm3r.splat.medium_field import MediumField, WaterPrior, deviation, initial_field, smoothness, water_prior
 from swimm3r.splat.optimiser import Moments, adam_step, fresh, log_linear
 from swimm3r.splat.pose_codes import PoseCodes, Stations, training_stations, write_refined
-from swimm3r.splat.primitives import BetaPrimitives, initial_primitives, rescaled
+from swimm3r.splat.primitives import BetaPrimitives, initial_primitives, rescaled, with_time
 from swimm3r.splat.projection import pinhole
 from swimm3r.splat.rendering import Drawing, SplatMap, draw
-from swimm3r.splat.settings import TrainingPoseSettings, UwbsSettings
+from swimm3r.splat.settings import UwbsSettings
 from swimm3r.splat.views import TrainingViews, View, working_scale
 
 
@@ -67,12 +68,14 @@ class Uwbs:
         """Primitives on the cloud, and the reconstruction's water in every direction."""
         settings = self.settings
         p = initial_primitives(self.rec, settings.initial, training.generator(settings.seed, 0, 2))
+        if settings.dynamic:
+            p = with_time(p, settings.initial, training.generator(settings.seed, 0, 5))
         p = BetaPrimitives(*(values.contiguous() for values in rescaled(p, self.scale)))
         medium = None
         if self.rec.medium is not None:
             fit = self.rec.medium.medium
             medium = Medium(fit.Binf, fit.beta_D / self.scale, fit.beta_B / self.scale)
-        field = initial_field(medium, settings.medium, training.generator(settings.seed, 0, 3))
+        field = initial_field(medium, settings.medium, training.generator(settings.seed, 0, 3), settings.dynamic)
         poses = None
         if self.stations is not None:
             poses = PoseCodes(len(self.stations), settings.poses, training.generator(settings.seed, 0, 6))
@@ -88,7 +91,7 @@ class Uwbs:
             place = torch.tensor([self.stations.names.index(view.name)])
             camera = replace(camera, cam2world=self.stations.moved(state.poses, place))
         sight = pinhole(camera)
-        drawing = draw(p, state.field, sight, settings, sgg=filtered)
+        drawing = draw(p, state.field, sight, settings, view.time, sgg=filtered)
         loss = objective(p, drawing, view, settings, self.prior, self._regularised(share))
         numbers, total = loss.numbers | {"primitives": float(len(p.xyz))}, loss.total
         if self.stations is not None and state.poses is not None and share <= settings.poses.epipolar_end:
@@ -96,7 +99,7 @@ class Uwbs:
             off = self.stations.epipolar_error(state.poses, matches)
             total = total + settings.poses.epipolar * off
             numbers |= {"epipolar_px": float(off.detach())}
-        leaves = [*p, *state.field.network.parameters(), *(state.poses.parameters() if state.poses else ())]
+        leaves = [*p, *state.field.parameters(), *(state.poses.parameters() if state.poses else ())]
         multiplier = None
         if filtered:
             sgg = differentiate(total, loss.depth, leaves, p, drawing, sight, settings)
@@ -107,7 +110,7 @@ class Uwbs:
         else:
             found = torch.autograd.grad(total, leaves, materialize_grads=True)
             gradients = dict(zip(parameters, found, strict=True))
-        rates = self._rates(step)
+        rates = self._rates(step, parameters)
         if self._densifies(step):
             round_ = self._densified(state, gradients, step, rates["xyz"])
             state, gradients = round_.state, round_.gradients
@@ -137,7 +140,7 @@ class Uwbs:
 
     def restored(self, tensors: dict[str, Tensor]) -> State:
         """The inverse of `stored`."""
-        field = MediumField(self.settings.medium.hidden)
+        field = MediumField(self.settings.medium, self.settings.dynamic)
         poses = None if self.stations is None else PoseCodes(len(self.stations), self.settings.poses)
         p = BetaPrimitives(*(tensors[f"parameter.{name}"] for name in BetaPrimitives._fields))
         parameters = _parameters(p, field, poses)
@@ -158,19 +161,20 @@ class Uwbs:
         d, share = self.settings.densify, step / self.settings.iterations
         return step % self._every() == 0 and d.begin < share <= d.end
 
-    def _rates(self, step: int) -> dict[str, float]:
+    def _rates(self, step: int, names: Collection[str]) -> dict[str, float]:
         r, share = self.settings.rates, step / self.settings.iterations
         rates = {name: getattr(r, name) for name in BetaPrimitives._fields}
         rates["xyz"] = self.radius * log_linear(r.xyz, r.xyz_end, share)
         medium = log_linear(r.medium, r.medium_end, share)
         if self.prior is not None and share <= self.settings.medium.begin:
             medium = 0.0
-        rates |= {name: medium for name in _FIELD_NAMES}
-        return rates | dict.fromkeys(_POSE_NAMES, pose_rate(self.settings))
+        rates |= {name: medium for name in names if name.startswith(_FIELD)}
+        return rates | {name: pose_rate(self.settings) for name in names if name.startswith(_POSES)}
 
     def _noise(self, p: BetaPrimitives, rate: float, rng: torch.Generator) -> Float[Tensor, "n 3"]:
         d = self.settings.densify
-        return densify.noise(p, d.noise * rate, d, self.settings.render.rotation, rng)
+        strength = d.noise_dynamic if self.settings.dynamic else d.noise
+        return densify.noise(p, strength * rate, d, self.settings.render.rotation, rng)
 
     def _densified(self, state: State, gradients: dict[str, Tensor], step: int, rate: float) -> _Round:
         """Relocation and growth, then noise; rows that start anew get no gradient of this step."""
@@ -249,11 +253,12 @@ def train(
     """
     scale = working_scale(rec, settings)
     views = TrainingViews(rec, frames, settings, scale)
-    prior = None if rec.medium is None else water_prior(rec.medium, 1 / scale, settings.medium)
+    known = None if settings.medium.model == "none" else rec.medium
+    prior = None if known is None else water_prior(known, 1 / scale, settings.medium)
     stations = training_stations(rec, views.names, views.cameras, scale) if settings.poses.enabled else None
     recipe = Uwbs(settings, rec, scale, path_radius(rec, scale, settings.working_depth), prior, stations)
     final = training.run(recipe, views, _schedule(settings, rec, views), folder, progress)
-    field = MediumField(settings.medium.hidden)
+    field = MediumField(settings.medium, settings.dynamic)
     field.load_state_dict(final.field.state_dict())
     field.length.fill_(1 / scale)
     primitives = BetaPrimitives(*(values.detach().clone() for values in rescaled(final.primitives, 1 / scale)))
@@ -261,7 +266,8 @@ def train(
     if stations is not None and final.poses is not None:
         poses = stations.refined(final.poses)
         write_refined(folder / "cameras.json", rec, poses)
-    scene = SplatMap(primitives, field.requires_grad_(False), settings, rec.metric, 1 / scale, poses)
+    field.requires_grad_(False)
+    scene = SplatMap(primitives, field, settings, rec.metric, 1 / scale, frames.span, poses)
     checkpoint.save_map(folder / "map.safetensors", scene)
     return scene
 
@@ -281,15 +287,12 @@ def path_radius(rec: Reconstruction, scale: float, working_depth: float) -> floa
     return max(1.1 * spread * scale, working_depth / 3)
 
 
-_FIELD_NAMES = tuple(f"field.{name}" for name, _ in MediumField(1).network.named_parameters())
-
-
-_POSE_NAMES = tuple(f"poses.{name}" for name, _ in PoseCodes(1, TrainingPoseSettings(width=1)).named_parameters())
+_FIELD, _POSES = "field.", "poses."
 
 
 def _parameters(p: BetaPrimitives, field: MediumField, poses: PoseCodes | None = None) -> dict[str, Tensor]:
-    of_field: dict[str, Tensor] = {f"field.{name}": t for name, t in field.network.named_parameters()}
-    of_poses = {} if poses is None else {f"poses.{name}": t for name, t in poses.named_parameters()}
+    of_field: dict[str, Tensor] = {f"{_FIELD}{name}": t for name, t in field.named_parameters()}
+    of_poses = {} if poses is None else {f"{_POSES}{name}": t for name, t in poses.named_parameters()}
     return {**p._asdict(), **of_field, **of_poses}
 
 
@@ -299,15 +302,15 @@ def _extended(rows: Tensor, count: int) -> Tensor:
 
 def _clip_field(gradients: dict[str, Tensor]) -> None:
     """The field's gradient is held to a norm of 1e-3 (WaterSplatting)."""
-    of_field = [gradients[name] for name in _FIELD_NAMES]
-    norm = float(torch.stack([g.norm() for g in of_field]).norm())
+    of_field = [gradient for name, gradient in gradients.items() if name.startswith(_FIELD)]
+    norm = math.hypot(*(float(g.norm()) for g in of_field))
     if norm > 1e-3:
         for g in of_field:
             g.mul_(1e-3 / norm)
 
 
 def _schedule(settings: UwbsSettings, rec: Reconstruction, views: TrainingViews) -> training.Schedule:
-    everything = [asdict(settings), views.names, rec.cameras.cam2world.tolist(), rec.cameras.K.tolist()]
+    everything = [asdict(settings), views.names, views.times, rec.cameras.cam2world.tolist(), rec.cameras.K.tolist()]
     if settings.poses.enabled:
         everything.append(float(rec.matches.xy_i.double().sum() + rec.matches.xy_j.double().sum()))
     digest = hashlib.sha256(json.dumps(everything, sort_keys=True).encode()).hexdigest()[:16]
