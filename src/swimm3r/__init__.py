@@ -25,7 +25,7 @@ if TYPE_CHECKING:
     from swimm3r.splat import train
     from swimm3r.splat.checkpoint import load_map
     from swimm3r.splat.rendering import SplatMap
-    from swimm3r.splat.settings import UwbsSettings, uwbs
+    from swimm3r.splat.settings import UwbsSettings, ubs, uwbs
     from swimm3r.synthetic import DiveSettings, write_dive
 
 _HOME = {
@@ -48,6 +48,7 @@ _HOME = {
     "UwbsSettings": "splat.settings",
     "load_map": "splat.checkpoint",
     "train": "splat",
+    "ubs": "splat.settings",
     "uwbs": "splat.settings",
     "DiveSettings": "synthetic",
     "write_dive": "synthetic",
@@ -74,6 +75,7 @@ __all__ = [
     "remove_water",
     "run_pipeline",
     "train",
+    "ubs",
     "uwbs",
     "write_dive",
 ]

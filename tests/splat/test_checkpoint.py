@@ -1,5 +1,6 @@
 """Files that are not maps are refused in plain words."""
 
+import json
 from dataclasses import asdict
 
 import pytest
@@ -33,7 +34,33 @@ def test_a_damaged_file_and_a_strangers_file_are_refused(tmp_path, wall):
     save_file({"x": torch.zeros(2)}, path)
     with pytest.raises(InputError, match="header"):
         load_map(path)
+    write(path, Stored({"x": torch.zeros(2)}, {"recipe": "splatfacto"}))
+    with pytest.raises(InputError, match="splatfacto"):
+        load_map(path)
     save_map(path, wall(10))
     path.write_bytes(path.read_bytes()[:-100])
     with pytest.raises(InputError):
+        load_map(path)
+
+
+def test_a_map_of_a_newer_version_says_so(tmp_path, wall):
+    path = tmp_path / "map.safetensors"
+    save_map(path, wall(10))
+    stored = read(path)
+    header = {"swimm3r": json.dumps({**stored.about, "schema": 2})}
+    save_file(stored.tensors, path, header)
+    with pytest.raises(InputError, match="newer Swimm3R: its schema is 2, this version reads 1"):
+        load_map(path)
+
+
+def test_a_map_without_its_water_or_with_settings_nobody_knows_is_refused(tmp_path, wall):
+    path = tmp_path / "map.safetensors"
+    save_map(path, wall(10))
+    stored = read(path)
+    dry = {name: values for name, values in stored.tensors.items() if not name.startswith("field.network.0")}
+    write(path, Stored(dry, stored.about))
+    with pytest.raises(InputError, match="not a map"):
+        load_map(path)
+    write(path, Stored(stored.tensors, {**stored.about, "settings": {"iterations": 3, "salinity": 35}}))
+    with pytest.raises(InputError, match="salinity"):
         load_map(path)

@@ -8,17 +8,23 @@ from tyro.conf import arg
 
 from swimm3r.cli.console import drawn_progress, print_summary
 from swimm3r.presets import PRESETS
+from swimm3r.splat.settings import Recipe, with_recipe
 from swimm3r.synthetic.settings import DiveSettings
 
 
-def demo(out: Path = Path("runs/demo"), dive: Annotated[DiveSettings, arg(name="")] = DiveSettings()) -> None:  # noqa: B008
+def demo(
+    out: Path = Path("runs/demo"),
+    recipe: Recipe = "uwbs-static",
+    dive: Annotated[DiveSettings, arg(name="")] = DiveSettings(),  # noqa: B008
+) -> None:
     """Make a synthetic dive and run the pipeline on it; needs no download and no GPU.
 
     Args:
         out: the run folder; the dive itself goes to OUT-dive beside it.
+        recipe: uwbs-static; uwbs-dynamic, whose map changes with time; ubs, Beta splatting without the water.
         dive: what the synthetic dive looks like.
     """
-    settings = replace(PRESETS["default"], splat=PRESETS["fast"].splat)
+    settings = replace(PRESETS["default"], splat=with_recipe(PRESETS["fast"].splat, recipe))
     from swimm3r.run import run_pipeline
     from swimm3r.synthetic import write_dive
 

@@ -5,6 +5,7 @@ import logging
 import os
 import sys
 from collections.abc import Collection, Sequence
+from typing import TypeVar
 
 import tyro
 
@@ -22,8 +23,10 @@ from swimm3r.cli.train_sfm import command_for_recipe
 from swimm3r.cli.weights import weights
 from swimm3r.errors import StorageError, Swimm3rError
 from swimm3r.presets import PRESETS
-from swimm3r.sfm.training.settings import RECIPES
+from swimm3r.sfm.training.settings import RECIPES as SFM_RECIPES
+from swimm3r.splat.settings import RECIPES as MAP_RECIPES
 
+Name = TypeVar("Name", bound=str)
 _INTERRUPTED = 130
 _STORAGE_ERRORS = {errno.ENOSPC, errno.EDQUOT, errno.EROFS, errno.EACCES, errno.EPERM, errno.EFBIG}
 
@@ -39,6 +42,7 @@ def main(arguments: Sequence[str] | None = None) -> None:
         **commands_for_preset(
             _named("--preset", arguments, PRESETS, "default"),
             _named("--backend", arguments, ("colmap", "mast3r", "swimm3r"), "colmap"),
+            _named("--recipe", arguments, MAP_RECIPES, "uwbs-static"),
         ),
         "bench": bench.command_for_preset(_named("--preset", arguments, PRESETS, "fast")),
         "demo": demo,
@@ -48,7 +52,7 @@ def main(arguments: Sequence[str] | None = None) -> None:
         "localize": localize,
         "report": report,
         "datasets": datasets,
-        "train-sfm": command_for_recipe(_named("--recipe", arguments, RECIPES, "swimm3r")),
+        "train-sfm": command_for_recipe(_named("--recipe", arguments, SFM_RECIPES, "swimm3r")),
         "weights": weights,
     }
     try:
@@ -80,10 +84,12 @@ def _fail(error: Swimm3rError) -> None:
     raise SystemExit(error.exit_code)
 
 
-def _named(option: str, arguments: Sequence[str], known: Collection[str], default: str) -> str:
+def _named(option: str, arguments: Sequence[str], known: Collection[Name], default: Name) -> Name:
     """What decides the defaults that --help shows is found before tyro parses; tyro checks the name."""
     for here, after in zip(arguments, [*arguments[1:], ""], strict=True):
         name = after if here == option else here.removeprefix(f"{option}=")
-        if name != here and name in known:
-            return name
+        if name != here:
+            for one in known:
+                if one == name:
+                    return one
     return default

@@ -1,6 +1,7 @@
 """`swimm3r run`, `prepare`, `sfm` and `splat`: the pipeline, whole or up to a stage."""
 
 from collections.abc import Callable
+from dataclasses import replace
 from pathlib import Path
 from typing import Annotated, Literal
 
@@ -12,16 +13,17 @@ from swimm3r.errors import UsageError
 from swimm3r.frame_settings import FrameSettings
 from swimm3r.presets import MAST3R_PRESETS, PRESETS, RunSettings
 from swimm3r.sfm.settings import ColmapModelSettings, ColmapSettings, Mast3rSettings, SfmSettings
-from swimm3r.splat.settings import PoseRefinementSettings, UwbsSettings
+from swimm3r.splat.settings import PoseRefinementSettings, Recipe, UwbsSettings, with_recipe
 
 Preset = Literal["fast", "default", "best"]
 Backend = Literal["colmap", "mast3r", "swimm3r"]
 _FLAT = arg(name="")  # --fps, not --frames.fps; what lies deeper keeps its prefix: --depth.planes
 
 
-def commands_for_preset(name: str, backend: str = "colmap") -> dict[str, Callable]:
-    """The commands that share the pipeline's settings, with the defaults of a preset and the options of a back end."""
+def commands_for_preset(name: str, backend: str = "colmap", recipe: Recipe = "uwbs-static") -> dict[str, Callable]:
+    """The commands that share the pipeline's settings, with the defaults of a preset, a back end and a recipe."""
     defaults = PRESETS[name]
+    defaults = replace(defaults, splat=with_recipe(defaults.splat, recipe))
     assert isinstance(defaults.sfm, ColmapSettings)
     sfm_defaults = MAST3R_PRESETS[name] if backend != "colmap" else defaults.sfm
     sfm_settings = Annotated[type(sfm_defaults), _FLAT]
@@ -74,8 +76,10 @@ def commands_for_preset(name: str, backend: str = "colmap") -> dict[str, Callabl
         *,
         out: Path,
         colmap: Path | None = None,
+        transforms: Path | None = None,
         images: Path | None = None,
         preset: Preset = "default",
+        recipe: Recipe = "uwbs-static",
         reference: Path | None = None,
         frames: Annotated[FrameSettings, _FLAT] = defaults.frames,
         sfm: Annotated[ColmapSettings, _FLAT] = defaults.sfm,
@@ -85,32 +89,37 @@ def commands_for_preset(name: str, backend: str = "colmap") -> dict[str, Callabl
         """A map of a dive, or of any COLMAP model: swimm3r splat --colmap sparse/0 --images pictures/ --out RUN.
 
         Args:
-            source: a video, or a folder of pictures; or give --colmap and --images.
+            source: a video, or a folder of pictures; or give --colmap and --images, or --transforms.
             out: the run folder.
-            colmap: a COLMAP model (or transforms.json, cameras.xml, sfm_data.json, predictions.npz) taken as it is.
-            images: the pictures it was made of; its names are relative to this folder.
+            colmap: a COLMAP model (or cameras.xml, sfm_data.json, predictions.npz) taken as it is.
+            transforms: nerfstudio's transforms.json, taken as it is.
+            images: the pictures it was made of; its names are relative to this folder. Those that a transforms.json
+                names are found without.
             preset: what the other defaults aim at.
+            recipe: uwbs-static; uwbs-dynamic, whose map changes with time; ubs, Beta splatting without the water.
             reference: a cameras.json with poses to compare with.
             frames: which frames to take.
             sfm: how poses, depth and water are found; with --colmap, depth and water alone.
             splat: how the map is trained.
             test: how the test frames' poses are refined.
         """
-        if (colmap is None) != (images is None) or (source is None) == (images is None):
+        if transforms is not None and images is None:
+            from swimm3r.io.foreign.nerfstudio import pictures_folder
+
+            images = pictures_folder(transforms)
+        models = [model for model in (colmap, transforms) if model is not None]
+        given = source or images
+        if given is None or len(models) > 1 or (source is None) != (len(models) == 1) or (source and images):
             raise UsageError(
-                "a map is trained on a source, or on --colmap with --images",
-                cause="both were given, or one half of the pair is missing",
+                "a map is trained on a source, on --colmap with --images, or on --transforms",
+                cause="several of them were given, or one half of the pair is missing",
                 hint="swimm3r splat dive.mp4 --out RUN, or swimm3r splat --colmap DIR --images DIR --out RUN",
             )
-        poses = (
-            sfm
-            if colmap is None
-            else ColmapModelSettings(
-                colmap.resolve(), features=sfm.features, depth=sfm.depth, water=sfm.water, restore=sfm.restore
+        poses = sfm
+        if models:
+            poses = ColmapModelSettings(
+                models[0].resolve(), features=sfm.features, depth=sfm.depth, water=sfm.water, restore=sfm.restore
             )
-        )
-        given = source or images
-        assert given is not None
         _pipeline(given, out, RunSettings(frames, poses, splat, test), reference, "eval")
 
     def run(
@@ -119,6 +128,7 @@ def commands_for_preset(name: str, backend: str = "colmap") -> dict[str, Callabl
         out: Path,
         preset: Preset = "default",
         backend: Backend = "colmap",
+        recipe: Recipe = "uwbs-static",
         reference: Path | None = None,
         frames: Annotated[FrameSettings, _FLAT] = defaults.frames,
         sfm: sfm_settings = sfm_defaults,
@@ -133,6 +143,7 @@ def commands_for_preset(name: str, backend: str = "colmap") -> dict[str, Callabl
             preset: what the other defaults aim at.
             backend: how poses and depth are found; mast3r needs weights, swimm3r an adapter, too. `--backend mast3r
                 --help` shows its options.
+            recipe: uwbs-static; uwbs-dynamic, whose map changes with time; ubs, Beta splatting without the water.
             reference: a cameras.json with poses to compare with.
             frames: which frames to take.
             sfm: how poses, depth and water are found.

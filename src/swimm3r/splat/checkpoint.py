@@ -55,16 +55,18 @@ def load_map(path: Path) -> SplatMap:
     stored = read(path)
     about = stored.about
     if about.get("recipe") not in RECIPES:
-        raise _foreign(path, f"its recipe is {about.get('recipe')!r}")
-    settings = settings_from(UwbsSettings, about["settings"])
+        raise _foreign(path, f"its recipe is {about.get('recipe')!r}, and known are {', '.join(RECIPES)}")
     try:
+        settings = settings_from(UwbsSettings, about["settings"])
         field = MediumField(settings.medium, settings.dynamic)
         field.load_state_dict(
             {k.removeprefix("field."): v for k, v in stored.tensors.items() if k.startswith("field.")}
         )
         primitives = BetaPrimitives(*(stored.tensors[f"primitives.{name}"] for name in BetaPrimitives._fields))
-    except (KeyError, RuntimeError) as error:
-        raise _foreign(path, str(error)) from error
+        if {len(values) for values in primitives} != {len(primitives.xyz)}:
+            raise ValueError("its primitives' parts are of different lengths")
+    except (KeyError, TypeError, ValueError, RuntimeError) as error:
+        raise _foreign(path, str(error).splitlines()[0]) from error
     start, end = about.get("span", (0.0, 1.0))  # static maps of earlier versions have none
     poses = RefinedPoses(tuple(about["frames"]), stored.tensors["poses.cam2world"]) if "frames" in about else None
     field.requires_grad_(False)
@@ -86,8 +88,15 @@ def read(path: Path) -> Stored:
             if "swimm3r" not in header:
                 raise _foreign(path, "it has no Swimm3R header")
             about = json.loads(header["swimm3r"])
-            if about.get("schema") != SCHEMA:
-                raise _foreign(path, f"its schema is {about.get('schema')}, this version reads {SCHEMA}")
+            schema = about.get("schema")
+            if isinstance(schema, int) and schema > SCHEMA:
+                raise InputError(
+                    f"{path} was written by a newer Swimm3R: its schema is {schema}, this version reads {SCHEMA}.",
+                    cause="the map was trained elsewhere, with a later version",
+                    hint="update Swimm3R here, or train the map again",
+                )
+            if schema != SCHEMA:
+                raise _foreign(path, f"its schema is {schema}, this version reads {SCHEMA}")
             return Stored({name: file.get_tensor(name) for name in file.keys()}, about)  # noqa: SIM118
     except (OSError, SafetensorError, ValueError) as error:
         raise _foreign(path, str(error)) from error

@@ -91,7 +91,7 @@ def with_time(p: BetaPrimitives, settings: InitialSettings, rng: torch.Generator
 def _starting_points(
     rec: Reconstruction, settings: InitialSettings
 ) -> tuple[Float[Tensor, "n 3"], Float[Tensor, "n 3"]]:
-    """Positions, float64, and clear colours."""
+    """Positions, float64, and colours."""
     if rec.cloud is None:
         chosen = voxel_sample(rec.points.xyz.double(), settings.primitives)
         return rec.points.xyz[chosen].double(), rec.points.rgb[chosen].float()
@@ -99,7 +99,8 @@ def _starting_points(
     behind = voxel_sample(backdrop.xyz.double(), round(settings.backdrop * settings.primitives))
     measured = voxel_sample(rec.cloud.xyz.double(), settings.primitives - len(behind))
     xyz = torch.cat([rec.cloud.xyz[measured], backdrop.xyz[behind]]).double()
-    return xyz, torch.cat([rec.cloud.restored[measured], backdrop.restored[behind]]).float()
+    colours = (getattr(cloud, settings.colours)[rows] for cloud, rows in ((rec.cloud, measured), (backdrop, behind)))
+    return xyz, torch.cat([*colours]).float()
 
 
 def voxel_sample(points: Float[Tensor, "p 3"], target: int) -> Int[Tensor, " n"]:

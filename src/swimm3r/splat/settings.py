@@ -4,8 +4,8 @@ Windows and cadences are fractions of `iterations`, exact at the paper's 20,000.
 or, where the reconstruction has no scale, a third of its median depth (`working_depth`).
 """
 
-from dataclasses import dataclass, field
-from typing import Literal
+from dataclasses import dataclass, field, replace
+from typing import Any, Literal, get_args
 
 
 @dataclass(frozen=True)
@@ -46,6 +46,8 @@ class InitialSettings:
     scale: float = 1.0
     """Spatial scale, in root mean square distances to the 3 nearest neighbours."""
     opacity: float = 0.5
+    colours: Literal["restored", "raw"] = "restored"
+    """Without the water, or as filmed for maps that have none."""
     max_views: int = 64
     """Frames asked whether they see a point."""
 
@@ -218,14 +220,38 @@ class PoseRefinementSettings:
 
 
 SplatSettings = UwbsSettings
-RECIPES = ("uwbs-static", "uwbs-dynamic", "ubs")
+uwbs = UwbsSettings  # as the Python API calls it: swimm3r.train(rec, frames, swimm3r.uwbs(iterations=20_000))
+
+Recipe = Literal["uwbs-static", "uwbs-dynamic", "ubs"]
+RECIPES: tuple[Recipe, ...] = get_args(Recipe)
 
 
-def recipe_of(settings: UwbsSettings) -> str:
-    """Which of RECIPES the settings are of."""
+def with_recipe(settings: UwbsSettings, recipe: Recipe) -> UwbsSettings:
+    """Settings of another method at the same size and length."""
+    match recipe:
+        case "uwbs-static":
+            return replace(settings, dynamic=False)
+        case "uwbs-dynamic":
+            return replace(settings, dynamic=True)
+        case "ubs":  # Universal Beta Splatting as published, on the given cloud: no water, no depth, nothing skipped
+            none = dict.fromkeys(("depth", "medium_smoothness", "medium_prior", "radius", "coverage"), 0.0)
+            return replace(
+                settings,
+                initial=replace(settings.initial, directions="uniform", colours="raw"),
+                render=replace(settings.render, alpha_min=0.0, covariance="upper"),
+                medium=replace(settings.medium, model="none"),
+                weights=replace(settings.weights, **none),
+                sgg=replace(settings.sgg, enabled=False),
+            )
+
+
+def ubs(**changes: Any) -> UwbsSettings:
+    """Beta splatting without the underwater part, as the Python API calls it."""
+    return with_recipe(UwbsSettings(**changes), "ubs")
+
+
+def recipe_of(settings: UwbsSettings) -> Recipe:
+    """What the settings train."""
     if settings.medium.model == "none":
         return "ubs"
     return "uwbs-dynamic" if settings.dynamic else "uwbs-static"
-
-
-uwbs = UwbsSettings  # as the Python API calls it: swimm3r.train(rec, frames, swimm3r.uwbs(iterations=20_000))

@@ -5,13 +5,14 @@ Poses are camera to world with OpenGL's camera axes (x right, y up, z backwards)
 back. The cloud of `ply_file_path` is in the file's world; it has no sightings.
 """
 
+import json
 import math
 from pathlib import Path, PurePosixPath
 from typing import Any
 
 import numpy as np
 
-from swimm3r.io.foreign.model import ForeignModel, one_size, without_points
+from swimm3r.io.foreign.model import ForeignModel, one_size, read_foreign, without_points
 from swimm3r.io.ply import read_points
 
 _FLIP = np.diag([1.0, -1.0, -1.0, 1.0])
@@ -53,6 +54,15 @@ def read(path: Path, document: dict[str, Any]) -> ForeignModel:
         colours = (rgb * 255).round().astype(np.uint8)
         model = type(model)(**{**vars(model), "xyz": xyz, "rgb": colours, "error": np.zeros(len(xyz))})
     return ForeignModel("nerfstudio", model)
+
+
+def pictures_folder(path: Path) -> Path:
+    """Where the pictures of a transforms.json lie. Raises InputError for a file that is not one."""
+    names = read_foreign(path).model.names
+    file = path / "transforms.json" if path.is_dir() else path
+    first = PurePosixPath(json.loads(file.read_text(encoding="utf-8"))["frames"][0]["file_path"].replace("\\", "/"))
+    # names with folders of their own are relative to the file, others to the one folder that all lie in
+    return file.parent if any("/" in name for name in names) else file.parent / first.parent
 
 
 def _kind(frame: dict[str, Any]) -> str:
