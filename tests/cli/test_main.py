@@ -1,10 +1,13 @@
 """Exit codes and messages, as a user meets them."""
 
+import json
 from pathlib import Path
 
+import numpy as np
 import pytest
 
 from swimm3r.cli.main import main
+from swimm3r.splat.settings import recipe_of
 
 
 def outcome(capsys: pytest.CaptureFixture[str], *arguments: str) -> tuple[int, str]:
@@ -32,7 +35,7 @@ def test_half_a_colmap_model_is_exit_2(capsys: pytest.CaptureFixture[str], tmp_p
     assert "--images" in message
 
 
-@pytest.mark.parametrize("command", ["eval", "render", "localize"])
+@pytest.mark.parametrize("command", ["eval", "render", "export", "localize"])
 def test_a_folder_without_a_map_is_exit_3(command: str, capsys: pytest.CaptureFixture[str], tmp_path: Path):
     code, message = outcome(capsys, command, str(tmp_path))
     assert code == 3
@@ -66,3 +69,25 @@ def test_the_preset_sets_the_defaults(capsys: pytest.CaptureFixture[str]):
             main(["run", "--preset", preset, "--help"])
         shown[preset] = capsys.readouterr().out
     assert shown["fast"] != shown["best"]
+
+
+def test_a_recipe_and_a_transforms_json_reach_the_pipeline(tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
+    document = {
+        "w": 64, "h": 48, "fl_x": 60,
+        "frames": [{"file_path": f"images/{k}.png", "transform_matrix": np.eye(4).tolist()} for k in range(3)],
+    }  # fmt: skip
+    (tmp_path / "transforms.json").write_text(json.dumps(document))
+    asked = []
+    monkeypatch.setattr("swimm3r.run.run_pipeline", lambda *given, **_: asked.append(given) or {})
+    monkeypatch.setattr("swimm3r.cli.run.print_summary", lambda *_: None)
+    for recipe in ("uwbs-static", "uwbs-dynamic", "ubs"):
+        main(["splat", "--transforms", str(tmp_path / "transforms.json"), "--recipe", recipe, "--out", "run"])
+        source, _, settings = asked[-1]
+        assert source == tmp_path / "images"
+        assert settings.sfm.model == tmp_path / "transforms.json"
+        assert recipe_of(settings.splat) == recipe
+
+
+def test_two_models_at_once_are_exit_2(capsys: pytest.CaptureFixture[str], tmp_path: Path):
+    models = ("--colmap", str(tmp_path), "--transforms", str(tmp_path / "t.json"), "--images", str(tmp_path))
+    assert outcome(capsys, "splat", *models, "--out", str(tmp_path / "run"))[0] == 2

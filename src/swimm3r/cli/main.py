@@ -15,6 +15,7 @@ from swimm3r.cli.datasets import datasets
 from swimm3r.cli.demo import demo
 from swimm3r.cli.doctor import doctor
 from swimm3r.cli.evaluate import evaluate
+from swimm3r.cli.export import export
 from swimm3r.cli.localize import localize
 from swimm3r.cli.render import render
 from swimm3r.cli.report import report
@@ -48,6 +49,7 @@ def main(arguments: Sequence[str] | None = None) -> None:
         "demo": demo,
         "doctor": doctor,
         "eval": evaluate,
+        "export": export,
         "render": render,
         "localize": localize,
         "report": report,

@@ -1,4 +1,4 @@
-"""Coloured point clouds as PLY (Turk 1994), binary little-endian: float x y z, uchar red green blue."""
+"""Vertices as PLY (Turk 1994), binary little-endian; of clouds float x y z, uchar red green blue."""
 
 from pathlib import Path
 
@@ -28,12 +28,18 @@ def write_points(path: Path, xyz: Float[np.ndarray, "n 3"], rgb: Float[np.ndarra
         points[name] = xyz[:, axis]
     for channel, name in enumerate(("red", "green", "blue")):
         points[name] = np.clip(rgb[:, channel], 0, 1) * 255 + 0.5
-    kinds = ["float"] * 3 + ["uchar"] * 3
-    properties = "".join(f"property {kind} {name}\n" for kind, name in zip(kinds, _RECORD.names or (), strict=True))
-    header = f"ply\nformat binary_little_endian 1.0\nelement vertex {len(xyz)}\n{properties}end_header\n"
+    write_vertices(path, points)
+
+
+def write_vertices(path: Path, vertices: np.ndarray) -> None:
+    """Write a structured array of float32 and uint8 fields, one property each, whole or not at all."""
+    kinds = {np.dtype("<f4"): "float", np.dtype("u1"): "uchar"}
+    fields = [(name, vertices.dtype[name]) for name in vertices.dtype.names or ()]
+    properties = "".join(f"property {kinds[kind]} {name}\n" for name, kind in fields)
+    header = f"ply\nformat binary_little_endian 1.0\nelement vertex {len(vertices)}\n{properties}end_header\n"
     with atomic_path(path) as draft, draft.open("wb") as file:
         file.write(header.encode("ascii"))
-        file.write(points.tobytes())
+        file.write(vertices.tobytes())
 
 
 def read_points(path: Path) -> tuple[Float32[np.ndarray, "n 3"], Float32[np.ndarray, "n 3"]]:

@@ -1,0 +1,161 @@
+"""A Beta map as Gaussians that 3DGS viewers show: without its water, from one side, at one moment, with equal moments.
+
+A Beta splat of exponent B on the ellipse of covariance S has on the image plane the mass and the second moments of a
+Gaussian with (uwbs.md 1.4)
+
+    covariance S / (2 (B + 2)),   peak o (B + 2) / (B + 1), at most 0.999
+
+A viewer's Gaussian knows neither direction nor time, so S is that seen from the mean direction of the cameras that have
+the primitive in their picture, and o their mean. How much is lost is measured: `clear_difference`.
+"""
+
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+import torch
+from jaxtyping import Float
+from torch import Tensor
+from torch.nn.functional import normalize
+
+from swimm3r.cameras import Cameras
+from swimm3r.evaluate.images import psnr_from_errors
+from swimm3r.geometry import quaternion_from_rotation
+from swimm3r.io import cameras_json
+from swimm3r.io.ply import write_vertices
+from swimm3r.raster import ALPHA_MAX, ALPHA_MIN, RasterOutput, rasterize
+from swimm3r.reconstruction import cameras_of
+from swimm3r.splat.checkpoint import load_map
+from swimm3r.splat.conditioning import Conditioned, condition, queries, symmetric
+from swimm3r.splat.primitives import select
+from swimm3r.splat.projection import pinhole, project, project_conditioned
+from swimm3r.splat.rendering import SplatMap, in_scene_units
+from swimm3r.splat.views import pinhole_canvas
+
+_SH0 = 0.28209479177387814  # the constant spherical harmonic: colour = 0.5 + _SH0 f_dc
+_EXPONENT = 200.0  # of the Beta kernel that stands for a Gaussian: off by at most 0.2 % of the peak
+_ASKED = 64  # cameras, spread over the dive, that say which way a primitive is looked at
+_COMPARED = 8  # of them
+_FLATTEST = 1e-6  # a scale of this share of the largest, at least: viewers divide by it
+
+
+@dataclass(frozen=True)
+class Gaussians:
+    """Clear splats in the axes and unit of the reconstruction."""
+
+    xyz: Float[Tensor, "n 3"]
+    rgb: Float[Tensor, "n 3"]  # without the water, not bounded
+    opacity: Float[Tensor, " n"]  # peak, 0..1
+    covariance: Float[Tensor, "n 3 3"]
+
+
+@dataclass(frozen=True)
+class ClearDifference:
+    """How the Gaussians' clear pictures differ from the map's own, over some cameras."""
+
+    psnr: float  # dB, of colours blended over black
+    alpha: float  # mean difference of opacity, Gaussians minus map
+
+
+def moment_matched(scene: SplatMap, cameras: Cameras, time: float | None = None) -> Gaussians:
+    """The map's primitives as `cameras` see them on average, those too faint to see left out.
+
+    Raises ValueError where a dynamic map is given no time.
+    """
+    now, settings = scene.moment(time), in_scene_units(scene.settings, scene.length).render
+    p = scene.primitives
+    direction, share, seen = (torch.zeros(len(p.xyz), k) for k in (3, 1, 1))
+    with torch.no_grad():
+        for i in range(len(cameras)):
+            view = pinhole(cameras[i])
+            drawn = project(p, view, settings, now)
+            at, reach = drawn.primitives.mean2d, drawn.radius[:, None]
+            size = torch.tensor([view.width, view.height])
+            inside = ((at > -reach) & (at < size + reach)).all(-1, keepdim=True) & (drawn.radius[:, None] > 0)
+            direction += inside * queries(p.xyz, view.centre)
+            share += inside * drawn.primitives.opacity[:, None]
+            seen += inside
+        found = seen[:, 0] > 0
+        p = select(p, found)
+        query = normalize(direction[found], dim=-1)
+        if now is not None:
+            query = torch.cat([query, now.expand(len(query), 1)], -1)
+        state = condition(p, query, settings.rotation)
+        B = 4 * torch.exp(p.beta[:, 0])
+        peak = ((share / seen.clamp(min=1))[found, 0] * (B + 2) / (B + 1)).clamp(max=ALPHA_MAX)
+        covariance = symmetric(state.covariance, settings.covariance) / (2 * (B + 2))[:, None, None]
+        visible = peak >= ALPHA_MIN
+    return Gaussians(state.mean[visible], p.rgb[visible], peak[visible], covariance[visible])
+
+
+def write_ply(path: Path, g: Gaussians) -> None:
+    """The Gaussians as 3DGS stores them, spherical harmonics of degree 0: logits, log scales, quaternions wxyz."""
+    variance, axes = torch.linalg.eigh(g.covariance.double())
+    scale = variance.clamp(min=0).sqrt()
+    scale = scale.clamp(min=_FLATTEST * scale.amax(-1, keepdim=True)).clamp(min=1e-12)
+    axes = axes * torch.linalg.det(axes).sign()[:, None, None]  # a rotation, not a reflection
+    quaternion = quaternion_from_rotation(axes)
+    columns = {
+        **{name: g.xyz[:, k] for k, name in enumerate("xyz")},
+        **{f"n{name}": torch.zeros(len(g.xyz)) for name in "xyz"},
+        **{f"f_dc_{k}": (g.rgb[:, k] - 0.5) / _SH0 for k in range(3)},
+        "opacity": g.opacity.double().logit(),
+        **{f"scale_{k}": scale[:, k].log() for k in range(3)},
+        **{f"rot_{k}": quaternion[:, k] for k in range(4)},
+    }
+    vertices = np.empty(len(g.xyz), [(name, "<f4") for name in columns])
+    for name, values in columns.items():
+        vertices[name] = values.numpy()
+    write_vertices(path, vertices)
+
+
+def draw_gaussians(g: Gaussians, camera: Cameras, near: float) -> RasterOutput:
+    """What a 3DGS viewer shows of them: exp(-r2 / 2) under the image plane's covariance with its 0.3 px^2 of blur.
+
+    The kernel is (1 - r2 / 2B)^B with a large B.
+    """
+    view = pinhole(camera)
+    exponent = torch.full_like(g.opacity, _EXPONENT)
+    p = project_conditioned(Conditioned(g.xyz, g.covariance, g.opacity), exponent, g.rgb, view, near).primitives
+    return rasterize(p._replace(conic=p.conic / (2 * _EXPONENT)), None, view.height, view.width)
+
+
+def clear_difference(scene: SplatMap, g: Gaussians, cameras: Cameras, time: float | None = None) -> ClearDifference:
+    """The Gaussians against the map they were made of, both without water and before black, seen by `cameras`."""
+    settings, now = in_scene_units(scene.settings, scene.length).render, scene.moment(time)
+    colours, alphas = [], []
+    with torch.no_grad():
+        for i in range(len(cameras)):
+            view = pinhole(cameras[i])
+            own = rasterize(project(scene.primitives, view, settings, now).primitives, None, view.height, view.width)
+            theirs = draw_gaussians(g, cameras[i], settings.near)
+            colours.append(theirs.clear - own.clear)
+            alphas.append(float((theirs.alpha - own.alpha).mean()))
+    return ClearDifference(psnr_from_errors(torch.stack(colours)), float(np.mean(alphas)))
+
+
+@dataclass(frozen=True)
+class Exported:
+    """What was written."""
+
+    path: Path
+    gaussians: int
+    primitives: int
+    difference: ClearDifference
+
+
+def export_run(folder: Path, path: Path, time: float | None = None) -> Exported:
+    """The Gaussians of a finished run's map, and how far they are from it in views along the dive.
+
+    A dynamic map is exported at `time`, seconds of the clip; half way by default. Raises InputError without a map.
+    """
+    scene = load_map(folder / "splat" / "map.safetensors")
+    cameras = cameras_of(cameras_json.read_cameras(folder / "sfm" / "cameras.json"))
+    time = sum(scene.span) / 2 if time is None else time
+    station = torch.linspace(0, len(cameras) - 1, min(_ASKED, len(cameras))).round().long()
+    canvas = pinhole_canvas(cameras[station], scene.settings.long_side)
+    g = moment_matched(scene, canvas, time)
+    write_ply(path, g)
+    looked_at = canvas[torch.linspace(0, len(canvas) - 1, min(_COMPARED, len(canvas))).round().long()]
+    difference = clear_difference(scene, g, looked_at, time)
+    return Exported(path, len(g.xyz), len(scene.primitives.xyz), difference)
