@@ -150,7 +150,9 @@ def export_run(folder: Path, path: Path, time: float | None = None) -> Exported:
     A dynamic map is exported at `time`, seconds of the clip; half way by default. Raises InputError without a map.
     """
     scene = load_map(folder / "splat" / "map.safetensors")
-    cameras = cameras_of(cameras_json.read_cameras(folder / "sfm" / "cameras.json"))
+    stations = folder / "splat" / "cameras.json"  # where training moved them
+    stations = stations if stations.is_file() else folder / "sfm" / "cameras.json"
+    cameras = cameras_of(cameras_json.read_cameras(stations))
     time = sum(scene.span) / 2 if time is None else time
     station = torch.linspace(0, len(cameras) - 1, min(_ASKED, len(cameras))).round().long()
     canvas = pinhole_canvas(cameras[station], scene.settings.long_side)
