@@ -21,6 +21,7 @@ from swimm3r.splat.settings import (
     InitialSettings,
     LearningRates,
     PoseRefinementSettings,
+    SggSettings,
     SplatSettings,
     UwbsSettings,
 )
@@ -28,11 +29,13 @@ from swimm3r.splat.settings import (
 if TYPE_CHECKING:
     from cattrs import Converter
 
+WITHOUT_SGG = SggSettings(enabled=False)  # short runs are 0.1 dB better without, and faster (benchmarks/README.md)
 LAPTOP = UwbsSettings(  # the paper's settings are made for a GPU
     iterations=5000,
     long_side=640,
     initial=InitialSettings(primitives=50_000),
     densify=DensifySettings(max_primitives=100_000),
+    sgg=WITHOUT_SGG,
 )
 
 
@@ -90,6 +93,7 @@ PRESETS: dict[str, RunSettings] = {
             densify=DensifySettings(max_primitives=50_000),
             # UBS's rates are made for 20 times as many steps; on ruie_green_rock these are worth 0.4 dB at equal cost
             rates=LearningRates(xyz=5e-4, query_mean=3e-3, rgb=5e-3, beta=4e-3, lower=4e-3),
+            sgg=WITHOUT_SGG,
         ),
     ),
     "default": RunSettings(),

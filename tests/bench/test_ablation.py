@@ -95,6 +95,8 @@ def test_each_variant_lacks_exactly_its_parts():
     assert (sgg.sgg.enabled, sgg.weights.depth) == (True, 0)
     assert (depth.sgg.enabled, depth.weights.depth) == (False, TINY.weights.depth)
     assert replace(full, seed=TINY.seed) == TINY
+    without = replace(TINY, sgg=replace(TINY.sgg, enabled=False))
+    assert VARIANTS[3].settings(without, 0) == TINY
     assert baseline.seed == full.seed != VARIANTS[0].settings(TINY, 0).seed
 
 

@@ -102,7 +102,7 @@ REFINED = UwbsSettings(
     iterations=200,
     initial=InitialSettings(primitives=500, scale=2.0),
     densify=DensifySettings(max_primitives=600, min_every=20),
-    poses=TrainingPoseSettings(enabled=True, epipolar_end=0.75),
+    poses=TrainingPoseSettings(epipolar_end=0.75),
 )
 
 

@@ -38,9 +38,9 @@ class Variant:
     depth: bool
 
     def settings(self, full: UwbsSettings, seed: int) -> UwbsSettings:
-        """`full` with this variant's parts switched off."""
+        """`full` with this variant's parts on and the others off; a preset may have had SGG off."""
         weights = full.weights if self.depth else replace(full.weights, depth=0.0)
-        sgg = full.sgg if self.sgg else replace(full.sgg, enabled=False)
+        sgg = replace(full.sgg, enabled=self.sgg)
         return replace(full, weights=weights, sgg=sgg, seed=full.seed + _SEEDS_APART * seed)
 
 

@@ -166,7 +166,7 @@ class SggSettings:
 class TrainingPoseSettings:
     """The training frames' poses, refined with the map (3R-GS's module and values)."""
 
-    enabled: bool = False
+    enabled: bool = True
     width: int = 64
     """Of a camera's code and of the network's hidden layers."""
     rate: float = 1.5e-4
