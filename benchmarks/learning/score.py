@@ -52,7 +52,11 @@ from swimm3r.sfm.training.scores import absolute_relative
 _GRID = 4  # pixels between the seeds of the recall
 _TOLERANCE = 1 / 32  # of the picture's width
 _LOST = 180.0
+_PARTS = {False: "all", True: "near"}
 _ALONE = 8  # every so manieth frame is given to Sea-Thru alone
+
+
+WaterRows = dict[str, np.ndarray]  # what was looked at -> errors of T_D and B
 
 
 @dataclass(frozen=True)
@@ -172,28 +176,32 @@ def water_errors(views: list[tuple[Tensor, Medium]], true: Medium) -> tuple[floa
     return float(np.mean(found.T_D_abs)), float(np.mean(found.B_abs))
 
 
-def water_rows(
-    network: Mast3r, head: PhysicsHead, dives: list[Shots], truth: list[Medium], with_sea_thru: bool
-) -> dict[str, dict[str, float]]:
-    """Errors of T_D and B by the head and by Sea-Thru, on whole pictures and on their lower halves."""
+def head_rows(network: Mast3r, head: PhysicsHead, dives: list[Shots], truth: list[Medium]) -> WaterRows:
+    """Errors of the head, which sees one picture, whole or its lower half."""
+    rows = {}
+    for near, where in _PARTS.items():
+        errors = []
+        for shots, true in zip(dives, truth, strict=True):
+            assert shots.raw is not None
+            errors.append(water_errors(head_water(network, head, shots.raw, shots.ray_depth, near), true))
+        rows[where] = np.mean(errors, 0)
+    return rows
+
+
+def sea_thru_rows(dives: list[Shots], truth: list[Medium]) -> WaterRows:
+    """Errors of Sea-Thru, from whole dives and from single pictures."""
     rows: dict[str, list[tuple[float, float]]] = {}
     for shots, true in zip(dives, truth, strict=True):
-        assert shots.raw is not None
-        for near in (False, True):
-            where = "near" if near else "all"
-            views = head_water(network, head, shots.raw, shots.ray_depth, near)
-            rows.setdefault(f"head, {where}", []).append(water_errors(views, true))
-            count = len(shots.raw)
-            given = (
-                {"dive": [range(count)], "one picture": [[k] for k in range(0, count, _ALONE)]} if with_sea_thru else {}
-            )
+        count = len(shots.z_depth)
+        given = {"dive": [range(count)], "one picture": [[k] for k in range(0, count, _ALONE)]}
+        for near, where in _PARTS.items():
             for what, choices in given.items():
                 for chosen in choices:
                     with tempfile.TemporaryDirectory() as folder:
                         fit, depths = sea_thru(shots, Path(folder), near, chosen)
                     errors = water_errors([(z, fit.at(z)) for z in depths], true)
-                    rows.setdefault(f"Sea-Thru ({what}), {where}", []).append(errors)
-    return {name: dict(zip(("T_D", "B"), np.mean(values, 0).tolist(), strict=True)) for name, values in rows.items()}
+                    rows.setdefault(f"{what}, {where}", []).append(errors)
+    return {name: np.mean(errors, 0) for name, errors in rows.items()}
 
 
 def real_row(network: Mast3r, clip: Path, size: int, step: int = 3) -> dict[str, float]:
@@ -261,18 +269,22 @@ def main() -> None:
         if args.flsea:
             show(f"{row}, {args.flsea.name}", flsea_row(network, args.flsea, args.size))
 
+    def show_water(row: str, found: WaterRows) -> None:
+        for name, (T_D, B) in found.items():
+            show(f"{row}, {name}", {"T_D": T_D, "B": B})
+
     show("teacher, clear", geometry_row(teacher, dives, lambda s: s.clean, args.pairs))
     show("teacher, raw", geometry_row(teacher, dives, _raw, args.pairs))
     beyond_dives("teacher", teacher)
-    for number, adapter in enumerate(args.adapters):
+    for adapter in args.adapters:
         network = checkpoint.load(args.teacher)
         student = adapter_file.load(adapter, network)
         show(f"{adapter.parent.name}, raw", geometry_row(network, dives, _raw, args.pairs))
         beyond_dives(adapter.parent.name, network)
         if student.head is not None:
-            found = water_rows(network, student.head, dives, truth, args.sea_thru and number == 0)
-            for name, values in found.items():
-                show(f"{adapter.parent.name}, {name}", values)
+            show_water(f"{adapter.parent.name}, head", head_rows(network, student.head, dives, truth))
+    if args.sea_thru:
+        show_water("Sea-Thru", sea_thru_rows(dives, truth))
 
 
 def _raw(shots: Shots) -> Tensor:
