@@ -25,6 +25,8 @@ def test_settings_know_their_recipe(recipe):
 def test_ubs_as_the_python_api_has_it():
     assert recipe_of(ubs(iterations=7)) == "ubs"
     assert ubs(iterations=7).iterations == 7
+    assert not ubs().poses.enabled
+    assert not ubs().sgg.enabled
 
 
 def test_ubs_paints_the_water_onto_the_scene(tiny_dive, tmp_path):

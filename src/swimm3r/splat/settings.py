@@ -233,7 +233,7 @@ def with_recipe(settings: UwbsSettings, recipe: Recipe) -> UwbsSettings:
             return replace(settings, dynamic=False)
         case "uwbs-dynamic":
             return replace(settings, dynamic=True)
-        case "ubs":  # Universal Beta Splatting as published, on the given cloud: no water, no depth, nothing skipped
+        case "ubs":  # Universal Beta Splatting as published, on the given cloud: no water or depth, poses held
             none = dict.fromkeys(("depth", "medium_smoothness", "medium_prior", "radius", "coverage"), 0.0)
             return replace(
                 settings,
@@ -242,6 +242,7 @@ def with_recipe(settings: UwbsSettings, recipe: Recipe) -> UwbsSettings:
                 medium=replace(settings.medium, model="none"),
                 weights=replace(settings.weights, **none),
                 sgg=replace(settings.sgg, enabled=False),
+                poses=replace(settings.poses, enabled=False),
             )
 
 
