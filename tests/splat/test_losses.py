@@ -53,7 +53,7 @@ def test_pixels_that_are_not_seen_have_no_gradient_and_no_say():
     assert (gradient[:, ~seen] == 0).all()
     assert (gradient[:, seen] != 0).any()
     painted = torch.where(seen, b, 0.9)
-    assert float(losses.photometric(a, painted, seen, 0.2).loss) == float(loss)
+    assert float(losses.photometric(a, painted, seen, 0.2).loss) == float(loss.detach())
 
 
 def depth_images(z: torch.Tensor, alpha: torch.Tensor) -> RasterOutput:
