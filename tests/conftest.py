@@ -66,12 +66,23 @@ def write_video() -> Callable[..., Path]:
 
 
 @pytest.fixture(scope="session")
-def small_network() -> Mast3r:
-    """A network of MASt3R's published shape, thousands of times smaller, with random weights."""
-    small = Architecture(
-        encoder_dim=64, encoder_depth=2, encoder_heads=1, decoder_dim=64, decoder_depth=4, decoder_heads=1,
-        dpt_layer_dims=(4, 6, 8, 10), dpt_feature_dim=8, dpt_last_dims=(4, 4), local_hidden_dim=64, descriptor_dim=6,
-    )  # fmt: skip
-    with torch.random.fork_rng():
-        torch.manual_seed(0)
-        return Mast3r(small).eval().requires_grad_(False)
+def make_small_network() -> Callable[[], Mast3r]:
+    """Networks of MASt3R's published shape, thousands of times smaller, always with the same random weights."""
+
+    def make() -> Mast3r:
+        small = Architecture(
+            encoder_dim=64, encoder_depth=2, encoder_heads=1, decoder_dim=64, decoder_depth=4, decoder_heads=1,
+            dpt_layer_dims=(4, 6, 8, 10), dpt_feature_dim=8, dpt_last_dims=(4, 4), local_hidden_dim=64,
+            descriptor_dim=6,
+        )  # fmt: skip
+        with torch.random.fork_rng():
+            torch.manual_seed(0)
+            return Mast3r(small).eval().requires_grad_(False)
+
+    return make
+
+
+@pytest.fixture(scope="session")
+def small_network(make_small_network: Callable[[], Mast3r]) -> Mast3r:
+    """One of them, for tests that leave it as it is."""
+    return make_small_network()

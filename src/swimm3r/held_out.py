@@ -169,7 +169,7 @@ def mean_scores(views: Sequence[HeldOutView]) -> ViewScores:
 
 
 def covered_by_training(rec: Reconstruction, canvas: Cameras) -> Bool[Tensor, "h w"]:
-    """The pixels of a view into which points of the reconstruction fall, small gaps between them closed.
+    """The pixels of a view into which measured or guessed ground of the reconstruction falls, small gaps closed.
 
     It asks the reconstruction, not the map: a map that leaves holes is not excused for them.
     """

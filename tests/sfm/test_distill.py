@@ -1,5 +1,6 @@
 """The objective term by term, against numbers worked out by hand and against its limits."""
 
+from collections.abc import Callable
 from dataclasses import replace
 
 import pytest
@@ -17,7 +18,7 @@ from swimm3r.sfm.distill import (
     physics_terms,
     squared_distance,
 )
-from swimm3r.sfm.mast3r.network import Architecture, Mast3r
+from swimm3r.sfm.mast3r.network import Mast3r
 from swimm3r.sfm.mast3r.settings import ObjectiveSettings
 
 PAPER = ObjectiveSettings()
@@ -210,14 +211,8 @@ def test_a_batch_is_the_mean_of_its_frames():
 
 
 @pytest.fixture(scope="module")
-def network() -> Mast3r:
-    with torch.random.fork_rng():
-        torch.manual_seed(0)
-        small = Architecture(
-            64, 2, 1, 64, 4, 1, dpt_layer_dims=(4, 6, 8, 10), dpt_feature_dim=8, dpt_last_dims=(4, 4),
-            local_hidden_dim=64, descriptor_dim=6,
-        )  # fmt: skip
-        return Mast3r(small).eval().requires_grad_(False)
+def network(make_small_network: Callable[[], Mast3r]) -> Mast3r:
+    return make_small_network()
 
 
 def test_features_are_the_levels_the_objective_names(network: Mast3r):

@@ -6,6 +6,7 @@ import os
 import signal
 import subprocess
 import sys
+from collections.abc import Callable
 from dataclasses import astuple, replace
 from pathlib import Path
 from types import ModuleType
@@ -22,7 +23,7 @@ from swimm3r.io.images import write_rgb
 from swimm3r.sfm import adapter_file
 from swimm3r.sfm.adapter_file import Base, fingerprint
 from swimm3r.sfm.mast3r import checkpoint
-from swimm3r.sfm.mast3r.network import Architecture, Mast3r
+from swimm3r.sfm.mast3r.network import Mast3r
 from swimm3r.sfm.mast3r.settings import ObjectiveSettings
 from swimm3r.sfm.student import Student, new_student
 from swimm3r.sfm.training.data import PairData, split_data
@@ -42,14 +43,8 @@ SETTINGS = TrainSettings(
 
 
 @pytest.fixture(scope="module")
-def network() -> Mast3r:
-    with torch.random.fork_rng():
-        torch.manual_seed(0)
-        small = Architecture(
-            64, 2, 1, 64, 4, 1, dpt_layer_dims=(4, 6, 8, 10), dpt_feature_dim=8, dpt_last_dims=(4, 4),
-            local_hidden_dim=64, descriptor_dim=6,
-        )  # fmt: skip
-        return Mast3r(small).eval().requires_grad_(False)
+def network(make_small_network: Callable[[], Mast3r]) -> Mast3r:
+    return make_small_network()
 
 
 @pytest.fixture(scope="module")
