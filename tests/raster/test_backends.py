@@ -8,12 +8,23 @@ import numpy as np
 import pytest
 import torch
 
-from swimm3r.raster import Backend, MediumMaps, Primitives2D, RasterOutput, SggBuffers, bin_primitives, rasterize
+from swimm3r.raster import (
+    Backend,
+    Kernel,
+    MediumMaps,
+    Primitives2D,
+    RasterOutput,
+    SggBuffers,
+    bin_primitives,
+    rasterize,
+)
 
 Scene = Callable[..., tuple[Primitives2D, MediumMaps]]
 VECTORS = np.load(Path(__file__).parents[1] / "data" / "uwbs_vectors.npz")
 FAST: list[Backend] = ["numba", "warp"]
 backends = pytest.mark.parametrize("backend", FAST)
+KERNELS: list[Kernel] = ["beta", "gaussian"]
+kernels = pytest.mark.parametrize("kernel", KERNELS)
 
 
 class Step(NamedTuple):
@@ -24,7 +35,9 @@ class Step(NamedTuple):
     sgg: SggBuffers
 
 
-def step(backend: Backend, p: Primitives2D, medium: MediumMaps, alpha_min: float = 1 / 255) -> Step:
+def step(
+    backend: Backend, p: Primitives2D, medium: MediumMaps, alpha_min: float = 1 / 255, kernel: Kernel = "beta"
+) -> Step:
     """A pass with a fixed random cotangent for each of the four images; float32 except in the reference."""
     dtype = torch.float64 if backend == "reference" else torch.float32
     leaves = [t.to(dtype).requires_grad_() for t in (*p, *medium)]
@@ -32,7 +45,7 @@ def step(backend: Backend, p: Primitives2D, medium: MediumMaps, alpha_min: float
     sgg = SggBuffers(*(b.to(dtype) for b in SggBuffers.zeros(len(p.depth))))
     out = rasterize(
         Primitives2D(*leaves[:6]), MediumMaps(*leaves[6:]), height, width,
-        alpha_min=alpha_min, sgg=sgg, backend=backend,
+        alpha_min=alpha_min, kernel=kernel, sgg=sgg, backend=backend,
     )  # fmt: skip
     rng = torch.Generator().manual_seed(9)
     cotangent = [torch.randn(image.shape, generator=rng).to(dtype) for image in out]
@@ -55,33 +68,37 @@ def assert_same_step(got: Step, expected: Step, tolerance: float = 3e-6) -> None
 
 
 @backends
-@pytest.mark.parametrize("alpha_min", [1 / 255, 0.0])
+@pytest.mark.parametrize(("kernel", "alpha_min"), [("beta", 1 / 255), ("beta", 0.0), ("gaussian", 1 / 255)])
 @pytest.mark.parametrize(("n", "height", "width"), [(60, 29, 37), (1, 5, 3), (200, 48, 64)])
 def test_a_pass_agrees_with_the_oracle(
-    backend: Backend, n: int, height: int, width: int, alpha_min: float, scene: Scene
+    backend: Backend, n: int, height: int, width: int, alpha_min: float, kernel: Kernel, scene: Scene
 ):
     p, medium = scene(n, height, width)
-    assert_same_step(step(backend, p, medium, alpha_min), step("reference", p, medium, alpha_min))
+    got, expected = (step(b, p, medium, alpha_min, kernel) for b in (backend, "reference"))
+    assert_same_step(got, expected, 3e-6 if kernel == "beta" else 3e-5)  # Gaussians pile up: R / (1 - alpha) cancels
 
 
 @backends
-def test_an_opaque_stack_ends_the_pixel_where_the_oracle_ends_it(backend: Backend, scene: Scene):
+@kernels
+def test_an_opaque_stack_ends_the_pixel_where_the_oracle_ends_it(backend: Backend, kernel: Kernel, scene: Scene):
     p, medium = scene(80, 20, 20)
     p = p._replace(opacity=torch.full_like(p.opacity, 0.98), conic=p.conic / 30)
-    expected = step("reference", p, medium)
+    expected = step("reference", p, medium, kernel=kernel)
     assert (expected.out.alpha > 0.999).any()
     assert (expected.out.alpha < 1 - 1e-4).all()
-    assert_same_step(step(backend, p, medium), expected, 2e-5)  # R / (1 - alpha) magnifies float32's rounding 50 times
+    got = step(backend, p, medium, kernel=kernel)
+    assert_same_step(got, expected, 2e-5)  # R / (1 - alpha) magnifies float32's rounding 50 times
 
 
 @backends
-def test_a_capped_pair_keeps_its_colour_gradient_and_loses_its_shape_gradient(backend: Backend):
+@kernels
+def test_a_capped_pair_keeps_its_colour_gradient_and_loses_its_shape_gradient(backend: Backend, kernel: Kernel):
     p = Primitives2D(
         torch.tensor([[0.5, 0.5]]), torch.tensor([[0.01, 0.0, 0.01]]), torch.rand(1, 3), torch.tensor([1.0]),
         torch.tensor([2.0]), torch.tensor([1.5]),
     )  # fmt: skip
     medium = MediumMaps(*torch.rand(3, 3, 1, 1, generator=torch.Generator().manual_seed(0)))
-    got, expected = step(backend, p, medium), step("reference", p, medium)
+    got, expected = step(backend, p, medium, kernel=kernel), step("reference", p, medium, kernel=kernel)
     assert_same_step(got, expected)
     grads = dict(zip(NAMES, got.grads, strict=True))
     assert got.out.alpha.item() == pytest.approx(0.999)
@@ -206,15 +223,17 @@ def test_a_one_pixel_image_reproduces_the_published_pixel(backend: Backend, case
 
 
 @backends
-def test_bins_made_once_serve_many_calls(backend: Backend, scene: Scene):
+@kernels
+def test_bins_made_once_serve_many_calls(backend: Backend, kernel: Kernel, scene: Scene):
     p, medium = scene(60, 29, 37)
     p, medium = Primitives2D(*(t.float() for t in p)), MediumMaps(*(t.float() for t in medium))
-    bins = bin_primitives(p, 29, 37)
+    bins = bin_primitives(p, 29, 37, kernel=kernel)
     torch.testing.assert_close(
-        rasterize(p, medium, 29, 37, bins=bins, backend=backend), rasterize(p, medium, 29, 37, backend=backend)
+        rasterize(p, medium, 29, 37, kernel=kernel, bins=bins, backend=backend),
+        rasterize(p, medium, 29, 37, kernel=kernel, backend=backend),
     )
-    with pytest.raises(ValueError, match="bins are for 29 x 37"):
-        rasterize(p, medium, 29, 37, bins=bins, alpha_min=0.0, backend=backend)
+    with pytest.raises(ValueError, match=f"bins are for 29 x 37 pixels, alpha_min 0.00392157 and the {kernel} kernel"):
+        rasterize(p, medium, 29, 37, kernel=kernel, bins=bins, alpha_min=0.1, backend=backend)
 
 
 @backends
@@ -244,3 +263,40 @@ def test_maps_of_another_size_are_refused(scene: Scene):
     p, medium = scene(5, 8, 8)
     with pytest.raises(ValueError, match=r"binf must have shape \(3, 8, 9\)"):
         rasterize(p, medium, 8, 9)
+
+
+@pytest.mark.parametrize("backend", ["reference", *FAST])
+def test_a_gaussian_fades_as_the_exponential_of_half_its_squared_distance(backend: Backend):
+    conic = torch.tensor([[0.05, 0.01, 0.03]])
+    one = Primitives2D(
+        torch.tensor([[8.0, 6.0]]), conic, torch.ones(1, 3), torch.tensor([0.7]), torch.tensor([0.5]), torch.ones(1)
+    )
+    alpha = rasterize(one, None, 12, 16, kernel="gaussian", backend=backend).alpha
+    y, x = torch.meshgrid(torch.arange(12) + 0.5 - 6, torch.arange(16) + 0.5 - 8, indexing="ij")
+    expected = 0.7 * torch.exp(-0.5 * (0.05 * x * x + 2 * 0.01 * x * y + 0.03 * y * y))
+    torch.testing.assert_close(alpha, torch.where(expected >= 1 / 255, expected, 0.0), rtol=1e-5, atol=1e-6)
+
+
+@pytest.mark.parametrize("backend", ["reference", *FAST])
+def test_a_gaussian_is_the_limit_of_wide_and_steep_beta_kernels(backend: Backend, scene: Scene):
+    """(1 - r2 / 2b)^b -> e^(-r2 / 2)."""
+    p, medium = scene(60, 29, 37)
+    p = Primitives2D(*(t.float() for t in p))
+    medium = MediumMaps(*(t.float() for t in medium))
+    b = 2000.0
+    steep = p._replace(conic=p.conic / (2 * b), beta=torch.full_like(p.beta, b))
+    half = p._replace(beta=torch.full_like(p.beta, 0.5))
+    torch.testing.assert_close(
+        rasterize(half, medium, 29, 37, kernel="gaussian", alpha_min=1e-4, backend=backend),
+        rasterize(steep, medium, 29, 37, alpha_min=1e-4, backend=backend),
+        rtol=0,
+        atol=2e-3,
+    )
+
+
+def test_a_gaussian_needs_a_least_alpha(scene: Scene):
+    p, medium = scene(5, 8, 8)
+    for made in (lambda: rasterize(p, medium, 8, 8, kernel="gaussian", alpha_min=0.0),
+                 lambda: bin_primitives(p, 8, 8, kernel="gaussian", alpha_min=0.0)):  # fmt: skip
+        with pytest.raises(ValueError, match="must be above 0"):
+            made()

@@ -1,5 +1,6 @@
 """What only the CPU back end promises: threads do not change a bit, the inner loops are SIMD, tiles are exact."""
 
+import inspect
 import platform
 import re
 from collections.abc import Callable
@@ -11,6 +12,7 @@ import torch
 
 from swimm3r.raster import (
     ALPHA_MIN,
+    Kernel,
     MediumMaps,
     Primitives2D,
     SggBuffers,
@@ -28,12 +30,12 @@ def float32(scene: tuple[Primitives2D, MediumMaps]) -> tuple[Primitives2D, Mediu
     return Primitives2D(*(t.float() for t in p)), MediumMaps(*(t.float() for t in medium))
 
 
-def full_pass(p: Primitives2D, medium: MediumMaps) -> list[torch.Tensor]:
+def full_pass(p: Primitives2D, medium: MediumMaps, kernel: Kernel = "beta") -> list[torch.Tensor]:
     """Everything a training step reads from the rasteriser."""
     leaves = [t.detach().requires_grad_() for t in (*p, *medium)]
     sgg = SggBuffers.zeros(len(p.depth))
     height, width = medium.binf.shape[1:]
-    out = rasterize(Primitives2D(*leaves[:6]), MediumMaps(*leaves[6:]), height, width, sgg=sgg)
+    out = rasterize(Primitives2D(*leaves[:6]), MediumMaps(*leaves[6:]), height, width, kernel=kernel, sgg=sgg)
     rng = torch.Generator().manual_seed(1)
     grads = torch.autograd.grad(out, leaves, [torch.randn(image.shape, generator=rng) for image in out])
     return [*out, *grads, *sgg]
@@ -69,14 +71,24 @@ def packed_operations(assembly: str) -> list[int]:
     return sorted(counts, reverse=True)
 
 
-@pytest.mark.parametrize(("kernel", "expected"), [("forward_tiles", [50, 25]), ("adjoint_tiles", [90, 30, 25])])
-def test_the_loops_over_pixels_are_simd(kernel: str, expected: list[int], scene: Scene):
-    full_pass(*float32(scene(10, 20, 20)))
-    cached = getattr(numba_kernels, kernel)
-    options = {name: cached.targetoptions[name] for name in ("nogil", "error_model", "fastmath")}
+@pytest.mark.parametrize(
+    ("name", "kernel", "expected"),
+    [
+        ("forward_tiles", "beta", [50, 25]),
+        ("forward_tiles", "gaussian", [50, 18]),  # no logarithm
+        ("adjoint_tiles", "beta", [90, 30, 25]),
+        ("adjoint_tiles", "gaussian", [90, 30, 18]),
+    ],
+)
+def test_the_loops_over_pixels_are_simd(name: str, kernel: Kernel, expected: list[int], scene: Scene):
+    full_pass(*float32(scene(10, 20, 20)), kernel)
+    cached = getattr(numba_kernels, name)
+    options = {key: cached.targetoptions[key] for key in ("nogil", "error_model", "fastmath")}
     fresh = numba.njit(**options)(cached.py_func)  # code from Numba's cache cannot be looked into
+    argument = list(inspect.signature(cached.py_func).parameters).index("gaussian")
     for signature in cached.signatures:
-        fresh.compile(signature)
+        if isinstance(signature[argument], numba.types.Boolean) == (kernel == "gaussian"):
+            fresh.compile(signature)
     assemblies = fresh.inspect_asm()
     assert assemblies
     for assembly in assemblies.values():
@@ -100,13 +112,15 @@ def test_the_guard_sees_a_loop_that_is_not_simd():
     assert max(packed_operations(assembly), default=0) < 3
 
 
-def test_every_covered_pixel_is_in_a_tile_list_and_every_listed_tile_is_touched(scene: Scene):
+@pytest.mark.parametrize("kernel", ["beta", "gaussian"])
+def test_every_covered_pixel_is_in_a_tile_list_and_every_listed_tile_is_touched(kernel: Kernel, scene: Scene):
     p, _ = float32(scene(200, 70, 90))
-    bins = bin_primitives(p, 70, 90)
+    bins = bin_primitives(p, 70, 90, kernel=kernel)
     listed = {(t, int(i)) for t in range(30) for i in bins.ids[bins.tile_start[t] : bins.tile_start[t + 1]]}
     y, x = np.mgrid[0:70, 0:90] + 0.5
     covered, near = set(), set()
-    r2_max = 1 - (ALPHA_MIN / p.opacity.double()) ** (1 / p.beta.double())
+    fainter = p.opacity.double() / ALPHA_MIN
+    r2_max = 1 - fainter ** (-1 / p.beta.double()) if kernel == "beta" else fainter.log() / p.beta.double()
     for i in range(200):
         dx, dy = x - p.mean2d[i, 0].item(), y - p.mean2d[i, 1].item()
         a, b, c = p.conic[i].tolist()

@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 import torch
 
-from swimm3r.raster import MediumMaps, Primitives2D, RasterOutput, SggBuffers, rasterize
+from swimm3r.raster import Kernel, MediumMaps, Primitives2D, RasterOutput, SggBuffers, rasterize
 from swimm3r.raster.reference import beta_kernel, blend, split_alpha_adjoint
 
 Scene = Callable[..., tuple[Primitives2D, MediumMaps]]
@@ -85,21 +85,24 @@ def test_the_veil_is_one_minus_the_blended_backscatter_transmittance():
     torch.testing.assert_close(out.V, identity, rtol=1e-13, atol=1e-13)
 
 
-def test_gradients_of_the_image_agree_with_finite_differences(scene: Scene):
+@pytest.mark.parametrize("kernel", ["beta", "gaussian"])
+def test_gradients_of_the_image_agree_with_finite_differences(kernel: Kernel, scene: Scene):
     p, medium = scene(3, 3, 4)
     leaves = [t.requires_grad_() for t in (*p, *medium)]
 
     def images(*t: torch.Tensor) -> tuple[torch.Tensor, ...]:
-        return rasterize(Primitives2D(*t[:6]), MediumMaps(*t[6:]), 3, 4, alpha_min=0.0, backend="reference")
+        p, medium = Primitives2D(*t[:6]), MediumMaps(*t[6:])
+        return rasterize(p, medium, 3, 4, alpha_min=1e-9, kernel=kernel, backend="reference")
 
     assert torch.autograd.gradcheck(images, leaves, fast_mode=True)
 
 
-def test_geometry_and_medium_branches_add_up_to_the_plain_centre_gradient(scene: Scene):
+@pytest.mark.parametrize("kernel", ["beta", "gaussian"])
+def test_geometry_and_medium_branches_add_up_to_the_plain_centre_gradient(kernel: Kernel, scene: Scene):
     p, medium = scene(30, 13, 18)
     p.mean2d.requires_grad_()
     buffers = SggBuffers(*(b.double() for b in SggBuffers.zeros(30)))
-    out = rasterize(p, medium, 13, 18, alpha_min=0.0, sgg=buffers, backend="reference")
+    out = rasterize(p, medium, 13, 18, alpha_min=1e-9, kernel=kernel, sgg=buffers, backend="reference")
     rng = torch.Generator().manual_seed(1)
     sum((t * torch.rand(t.shape, generator=rng).double()).sum() for t in out).backward()
     torch.testing.assert_close(buffers.geo + buffers.med, p.mean2d.grad, rtol=1e-11, atol=1e-12)

@@ -33,7 +33,6 @@ from swimm3r.splat.rendering import SplatMap, in_scene_units
 from swimm3r.splat.views import pinhole_canvas
 
 _SH0 = 0.28209479177387814  # the constant spherical harmonic: colour = 0.5 + _SH0 f_dc
-_EXPONENT = 200.0  # of the Beta kernel that stands for a Gaussian: off by at most 0.2 % of the peak
 _ASKED = 64  # cameras, spread over the dive, that say which way a primitive is looked at
 _COMPARED = 8  # of them
 _FLATTEST = 1e-6  # a scale of this share of the largest, at least: viewers divide by it
@@ -110,14 +109,11 @@ def write_ply(path: Path, g: Gaussians) -> None:
 
 
 def draw_gaussians(g: Gaussians, camera: Cameras, near: float) -> RasterOutput:
-    """What a 3DGS viewer shows of them: exp(-r2 / 2) under the image plane's covariance with its 0.3 px^2 of blur.
-
-    The kernel is (1 - r2 / 2B)^B with a large B.
-    """
+    """What a 3DGS viewer shows of them: exp(-r2 / 2) under the image plane's covariance with its 0.3 px^2 of blur."""
     view = pinhole(camera)
-    exponent = torch.full_like(g.opacity, _EXPONENT)
-    p = project_conditioned(Conditioned(g.xyz, g.covariance, g.opacity), exponent, g.rgb, view, near).primitives
-    return rasterize(p._replace(conic=p.conic / (2 * _EXPONENT)), None, view.height, view.width)
+    half = torch.full_like(g.opacity, 0.5)
+    p = project_conditioned(Conditioned(g.xyz, g.covariance, g.opacity), half, g.rgb, view, near).primitives
+    return rasterize(p, None, view.height, view.width, kernel="gaussian")
 
 
 def clear_difference(scene: SplatMap, g: Gaussians, cameras: Cameras, time: float | None = None) -> ClearDifference:

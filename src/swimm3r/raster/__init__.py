@@ -1,4 +1,4 @@
-"""The differentiable underwater Beta-splat rasteriser: one function, three back ends.
+"""The differentiable underwater splat rasteriser: one function, two kernels, three back ends.
 
     I = B_inf + sum_i w_i (c_i e^{-beta_D z_i} - B_inf e^{-beta_B z_i}),   w_i = T_i alpha_i
 
@@ -21,6 +21,7 @@ from swimm3r.raster.records import (
     T_MIN,
     TILE,
     Bins,
+    Kernel,
     MediumMaps,
     Primitives2D,
     RasterOutput,
@@ -34,6 +35,7 @@ __all__ = [
     "T_MIN",
     "Backend",
     "Bins",
+    "Kernel",
     "MediumMaps",
     "Primitives2D",
     "RasterOutput",
@@ -45,12 +47,16 @@ __all__ = [
 Backend = Literal["auto", "numba", "warp", "reference"]
 
 
-def bin_primitives(p: Primitives2D, height: int, width: int, *, alpha_min: float = ALPHA_MIN) -> Bins:
+def bin_primitives(
+    p: Primitives2D, height: int, width: int, *, alpha_min: float = ALPHA_MIN, kernel: Kernel = "beta"
+) -> Bins:
     """Sort primitives into 16 x 16 tiles, front to back, on their device; without gradient, and exact.
 
     Worth calling only to rasterise the same primitives twice: `rasterize` bins by itself.
     """
-    return _kernels("warp" if p.mean2d.is_cuda else "numba").bin_primitives(_detached(p), height, width, alpha_min)
+    _check_cut(alpha_min, kernel)
+    kernels = _kernels("warp" if p.mean2d.is_cuda else "numba")
+    return kernels.bin_primitives(_detached(p), height, width, alpha_min, kernel)
 
 
 def rasterize(
@@ -60,6 +66,7 @@ def rasterize(
     width: int,
     *,
     alpha_min: float = ALPHA_MIN,
+    kernel: Kernel = "beta",
     sgg: SggBuffers | None = None,
     bins: Bins | None = None,
     medium_depth_grad: bool = True,
@@ -67,17 +74,20 @@ def rasterize(
 ) -> RasterOutput:
     """Underwater image, clear image, z depth (not normalised) and alpha of one camera; differentiable in p and medium.
 
-    `medium=None` is clear water: no veil, no attenuation. Pairs fainter than `alpha_min` are skipped. `sgg` is added to
-    in place when the gradient is taken. Without `medium_depth_grad` only `z_depth` moves a primitive in depth, not the
-    light that the water takes and adds (uwbs.md 6.7). `auto` takes Numba on the CPU and Warp on CUDA, both in float32;
-    `reference` keeps the inputs' precision. Outputs and gradients have the inputs' dtype.
+    `medium=None` is clear water: no veil, no attenuation. Pairs fainter than `alpha_min` are skipped; a Gaussian has no
+    other end, so it needs one. `sgg` is added to in place when the gradient is taken. Without `medium_depth_grad` only
+    `z_depth` moves a primitive in depth, not the light that the water takes and adds (uwbs.md 6.7). `auto` takes Numba
+    on the CPU and Warp on CUDA, both in float32; `reference` keeps the inputs' precision. Outputs and gradients have
+    the inputs' dtype.
     Raises ValueError where shapes, or `bins` made for another image, do not fit.
     """
     _check(p, medium, height, width)
-    if bins is not None and (bins.height, bins.width, bins.alpha_min) != (height, width, alpha_min):
+    _check_cut(alpha_min, kernel)
+    wanted = (height, width, alpha_min, kernel)
+    if bins is not None and (bins.height, bins.width, bins.alpha_min, bins.kernel) != wanted:
         raise ValueError(
-            f"bins are for {bins.height} x {bins.width} pixels and alpha_min {bins.alpha_min:g}, "
-            f"the image is {height} x {width} with alpha_min {alpha_min:g}"
+            f"bins are for {bins.height} x {bins.width} pixels, alpha_min {bins.alpha_min:g} and the {bins.kernel} "
+            f"kernel, the image is {height} x {width} with alpha_min {alpha_min:g} and the {kernel} kernel"
         )
     if bins is not None and len(bins.packed) != len(p.mean2d):
         raise ValueError(f"bins hold {len(bins.packed)} primitives, got {len(p.mean2d)}")
@@ -87,13 +97,13 @@ def rasterize(
         medium = MediumMaps(*p.mean2d.new_zeros(3, 3, height, width))
     dtype = p.mean2d.dtype
     if backend == "reference":
-        job = _Job(backend, height, width, alpha_min, sgg, None, medium_depth_grad)
+        job = _Job(backend, height, width, alpha_min, kernel, sgg, None, medium_depth_grad)
         return RasterOutput(*_Rasterize.apply(job, *p, *medium))
     p = Primitives2D(*(t.float().contiguous() for t in p))
     medium = MediumMaps(*(t.float().contiguous() for t in medium))
     if bins is None:
-        bins = _kernels(backend).bin_primitives(_detached(p), height, width, alpha_min)
-    job = _Job(backend, height, width, alpha_min, sgg, bins, medium_depth_grad)
+        bins = _kernels(backend).bin_primitives(_detached(p), height, width, alpha_min, kernel)
+    job = _Job(backend, height, width, alpha_min, kernel, sgg, bins, medium_depth_grad)
     return RasterOutput(*(image.to(dtype) for image in _Rasterize.apply(job, *p, *medium)))
 
 
@@ -105,6 +115,7 @@ class _Job:
     height: int
     width: int
     alpha_min: float
+    kernel: Kernel
     sgg: SggBuffers | None
     bins: Bins | None
     medium_depth_grad: bool
@@ -117,7 +128,7 @@ class _Rasterize(torch.autograd.Function):
     def forward(ctx: Any, job: _Job, *tensors: Tensor) -> tuple[Tensor, ...]:
         p, medium = Primitives2D(*tensors[:6]), MediumMaps(*tensors[6:])
         if job.bins is None:
-            out = reference.render(p, medium, job.height, job.width, job.alpha_min)
+            out = reference.render(p, medium, job.height, job.width, job.alpha_min, job.kernel)
         else:
             out = _kernels(job.backend).forward(job.bins, p, medium)
         ctx.job = job
@@ -132,7 +143,9 @@ class _Rasterize(torch.autograd.Function):
         cotangent = RasterOutput(*cotangents)
         parts = job.sgg if job.medium_depth_grad else _zeros(p)
         if job.bins is None:
-            grads, medium_grads = reference.adjoint(p, medium, job.height, job.width, job.alpha_min, cotangent, parts)
+            grads, medium_grads = reference.adjoint(
+                p, medium, job.height, job.width, job.alpha_min, job.kernel, cotangent, parts
+            )
         else:
             with_medium = any(ctx.needs_input_grad[7:])
             kernels = _kernels(job.backend)
@@ -171,6 +184,13 @@ def _zeros(p: Primitives2D) -> SggBuffers:
 
 def _detached(p: Primitives2D) -> Primitives2D:
     return Primitives2D(*(t.detach().float().contiguous() for t in p))
+
+
+def _check_cut(alpha_min: float, kernel: Kernel) -> None:
+    if kernel == "gaussian" and alpha_min <= 0:
+        raise ValueError(
+            f"a Gaussian ends where it is fainter than alpha_min, which must be above 0, got {alpha_min:g}"
+        )
 
 
 def _check(p: Primitives2D, medium: MediumMaps | None, height: int, width: int) -> None:

@@ -2,7 +2,8 @@
 
 Primitives are ordered by depth once (radix sort of the float bits) and scattered stably into their tiles. Which
 4 x 4 blocks of which tiles an ellipse may touch is decided exactly: in a strip of rows it covers one interval of x.
-Culling never changes the image: alpha >= alpha_min inside the support means r2 < 1 - (alpha_min / o)^(1/b).
+Culling never changes the image: alpha >= alpha_min means r2 < 1 - (alpha_min / o)^(1/b) under the Beta kernel, and
+r2 < ln(o / alpha_min) / b under the Gaussian.
 
 A packed primitive is one cache line: mean (2), conic (3), log2 opacity, exponent, r2_max, depth, colour (3), and what
 `span` needs: half width, half height, y of the rightmost point from the centre, determinant of the conic.
@@ -16,7 +17,7 @@ import torch
 from numba import njit
 
 from swimm3r.raster.numba_math import bits, inlined, prefetch
-from swimm3r.raster.records import TILE, Bins, CpuBins, Primitives2D
+from swimm3r.raster.records import TILE, Bins, CpuBins, Kernel, Primitives2D
 
 MEAN_X, MEAN_Y, CONIC_A, CONIC_B, CONIC_C, LOG2_O, EXPONENT, R2_MAX, DEPTH, COLOR = range(10)
 HALF_WIDTH, HALF_HEIGHT, RIGHTMOST_Y, DETERMINANT = range(12, 16)
@@ -59,7 +60,7 @@ def last_pixel(x, size):
 
 @no_type_check
 @njit(nogil=True, cache=True, error_model="numpy")
-def pack(alpha_min, height, width, packed, keys, mean2d, conic, color, opacity, beta, depth):
+def pack(alpha_min, gaussian, height, width, packed, keys, mean2d, conic, color, opacity, beta, depth):
     """Packed records and depth keys; what cannot be seen gets the last key.
 
     Returns how many primitives can be seen, and more tiles than they can meet.
@@ -74,7 +75,8 @@ def pack(alpha_min, height, width, packed, keys, mean2d, conic, color, opacity, 
             continue
         if not (o > 0 and o >= alpha_min and abs(x) < np.inf and abs(y) < np.inf):
             continue
-        r2_max = 1 - (alpha_min / o) ** (1 / float(beta[i]))
+        power = 1 / float(beta[i])
+        r2_max = math.log(o / alpha_min) * power if gaussian else 1 - (alpha_min / o) ** power
         half_width, half_height = math.sqrt(r2_max * c / determinant), math.sqrt(r2_max * a / determinant)
         packed[i, MEAN_X], packed[i, MEAN_Y] = x, y
         packed[i, CONIC_A], packed[i, CONIC_B], packed[i, CONIC_C] = a, b, c
@@ -160,13 +162,13 @@ def scatter(packed, order, bound, height, width):
     return tile_start, ids, blocks, slot, first_slot
 
 
-def bin_primitives(p: Primitives2D, height: int, width: int, alpha_min: float) -> Bins:
+def bin_primitives(p: Primitives2D, height: int, width: int, alpha_min: float, kernel: Kernel) -> Bins:
     """Tile lists of float32 primitives on the CPU."""
     n = len(p.depth)
     packed, keys = np.empty((n, 16), np.float32), np.empty(n, np.uint32)
     fields = [t.numpy() for t in p]
-    drawn, bound = pack(alpha_min, height, width, packed, keys, *fields)
+    drawn, bound = pack(alpha_min, kernel == "gaussian", height, width, packed, keys, *fields)
     order = argsort_keys(keys)[:drawn]
     lists = (torch.from_numpy(a) for a in (packed, order, *scatter(packed, order, bound, height, width)))
     records, by_depth, tile_start, ids, blocks, slot, first_slot = lists
-    return Bins(height, width, alpha_min, records, tile_start, ids, CpuBins(by_depth, blocks, slot, first_slot))
+    return Bins(height, width, alpha_min, kernel, records, tile_start, ids, CpuBins(by_depth, blocks, slot, first_slot))

@@ -26,8 +26,9 @@ def forward(bins: Bins, p: Primitives2D, medium: MediumMaps) -> RasterOutput:
     height, width = bins.height, bins.width
     shapes = ((3, height, width), (3, height, width), (height, width), (height, width))
     out = RasterOutput(*(torch.empty(shape) for shape in shapes))
-    arrays = _arrays((bins.packed, bins.tile_start, bins.ids, _lists(bins).blocks, *medium, *out))
-    _spread(lambda first, beyond: forward_tiles(first, beyond, *arrays), bins.tile_start.numpy())
+    lists = (bins.packed, bins.tile_start, bins.ids, _lists(bins).blocks)
+    arguments: tuple[Any, ...] = (*_arrays((*lists, *medium, *out)), _gaussian(bins))
+    _spread(lambda first, beyond: forward_tiles(first, beyond, *arguments), bins.tile_start.numpy())
     return out
 
 
@@ -48,7 +49,8 @@ def backward(
     lists = (bins.packed, bins.tile_start, bins.ids, own.blocks, own.slot)
     images = (*medium, *(g.contiguous() for g in cotangent), *out)
     d_medium = (None,) * 3 if medium_grads is None else _arrays(medium_grads)
-    arguments: tuple[Any, ...] = (*_arrays((*lists, *images)), slots, *d_medium, None if sgg is None else True)
+    with_sgg = None if sgg is None else True
+    arguments: tuple[Any, ...] = (*_arrays((*lists, *images)), slots, *d_medium, with_sgg, _gaussian(bins))
     _spread(lambda first, beyond: adjoint_tiles(first, beyond, *arguments), bins.tile_start.numpy())
     buffers = (None,) * 5 if sgg is None else _arrays(sgg)
     totals: tuple[Any, ...] = (*_arrays((bins.packed, own.order, own.first_slot)), slots, *_arrays(grads), *buffers)
@@ -60,6 +62,11 @@ def _lists(bins: Bins) -> CpuBins:
     if bins.cpu is None:
         raise ValueError("these bins were made for the Warp back end; make them with bin_primitives on CPU tensors")
     return bins.cpu
+
+
+def _gaussian(bins: Bins) -> bool | None:
+    """The kernel as the compiled code is told: by type."""
+    return True if bins.kernel == "gaussian" else None
 
 
 @lru_cache(maxsize=4)

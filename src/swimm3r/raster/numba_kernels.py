@@ -20,7 +20,9 @@ from swimm3r.raster.numba_math import maximum, minimum, prefetch, select, vec3
 from swimm3r.raster.records import TILE
 
 _pair = pairmath.make(numba_math.inlined, numba_math.exp2, numba_math.log2, minimum, maximum, select, vec3, np.float32)
-half_slope, coverage, advance, transmittance = _pair.half_slope, _pair.coverage, _pair.advance, _pair.transmittance
+half_slope, squared_distance, coverage = _pair.half_slope, _pair.squared_distance, _pair.coverage
+beta_falloff, gaussian_falloff = _pair.beta_falloff, _pair.gaussian_falloff
+advance, transmittance = _pair.advance, _pair.transmittance
 seen_colour, colour_slope, payloads = _pair.seen_colour, _pair.colour_slope, _pair.payloads
 shape_slopes, depth_slope = _pair.shape_slopes, _pair.depth_slope
 
@@ -45,9 +47,9 @@ I0, I1, I2, J0, J1, J2, Z = (np.uintp(STRIDE * k) for k in range(13, 20))
 FORWARD_ROWS = 20
 # adjoint: dL/d rgb, clear, z depth, alpha; what lies behind, of the full, geometry and depth payloads;
 G0, G1, G2, C0, C1, C2, GZ, GA, RF, RG, RD = (np.uintp(STRIDE * k) for k in range(13, 24))
-# sums of w E_B, w z E_B, w z c E_D; per pair: u and log2 u, the two shape slopes, dL/dr2 of each payload
+# sums of w E_B, w z E_B, w z c E_D; per pair: u and l, the two shape slopes, dL/dr2 of each payload
 VB0, VB1, VB2, ZB0, ZB1, ZB2, ZD0, ZD1, ZD2 = (np.uintp(STRIDE * k) for k in range(24, 33))
-U, LOG_U, P, Q, TF, TG, TD = (np.uintp(STRIDE * k) for k in range(33, 40))
+U, LOG_F, P, Q, TF, TG, TD = (np.uintp(STRIDE * k) for k in range(33, 40))
 ADJOINT_ROWS = 40
 
 # Columns of a slot
@@ -58,6 +60,15 @@ PLAIN, WITH_SGG = 12, 20
 
 kernel = njit(nogil=True, cache=True, error_model="numpy", fastmath=numba_math.FLAGS)
 adjoint_kernel = njit(nogil=True, cache=True, error_model="numpy", fastmath=numba_math.FLAGS | {"reassoc"})
+
+
+@no_type_check
+@numba_math.inlined
+def falloff(r2, gaussian):
+    """(u, l) of a kernel; None for `gaussian` is the Beta kernel, and leaves the other out of what is compiled."""
+    if gaussian is None:
+        return beta_falloff(r2)
+    return gaussian_falloff(r2)
 
 
 @no_type_check
@@ -141,6 +152,7 @@ def forward_tiles(
     clear,
     z_depth,
     alpha_out,
+    gaussian,
     sources=SOURCES,
 ):
     """Images of the tiles first..beyond-1."""
@@ -164,7 +176,9 @@ def forward_tiles(
                 hit = (mask >> (4 * block_row)) & 15
                 q0, q1 = np.uintp(64 * block_row) + FIRST[hit], np.uintp(64 * block_row) + BEYOND[hit]
                 for q in range(q0, q1):
-                    alpha, _, _, _ = coverage(ws[X + q] - mean_x, ws[Y + q] - mean_y, conic, log2_o, exponent, r2_max)
+                    r2 = squared_distance(ws[X + q] - mean_x, ws[Y + q] - mean_y, conic)
+                    _, log_f = falloff(r2, gaussian)
+                    alpha, _ = coverage(r2, log_f, log2_o, exponent, r2_max)
                     ws[W + q], ws[T + q] = advance(ws[T + q], alpha)
                 for q in range(q0, q1):
                     w = ws[W + q]
@@ -237,7 +251,7 @@ def end_adjoint(ws, tile_y, tile_x, d_binf, d_beta_b, d_beta_d):
 @adjoint_kernel
 def adjoint_tiles(
     first, beyond, packed, tile_start, ids, blocks, slot, binf, beta_b, beta_d, g_rgb, g_clear, g_z, g_alpha,
-    rgb, clear, z_depth, alpha_out, slots, d_binf, d_beta_b, d_beta_d, with_sgg, sources=SOURCES,
+    rgb, clear, z_depth, alpha_out, slots, d_binf, d_beta_b, d_beta_d, with_sgg, gaussian, sources=SOURCES,
 ):  # fmt: skip
     """Slots and water gradients of the tiles first..beyond-1; None for `with_sgg` or `d_binf` leaves that part out."""
     height, width = z_depth.shape
@@ -268,9 +282,10 @@ def adjoint_tiles(
                 q0, q1 = np.uintp(64 * block_row) + FIRST[hit], np.uintp(64 * block_row) + BEYOND[hit]
                 for q in range(q0, q1):
                     before = ws[T + q]
-                    alpha, shaped, ws[U + q], ws[LOG_U + q] = coverage(
-                        ws[X + q] - mean_x, ws[Y + q] - mean_y, conic, log2_o, exponent, r2_max
-                    )
+                    r2 = squared_distance(ws[X + q] - mean_x, ws[Y + q] - mean_y, conic)
+                    ws[U + q], log_f = falloff(r2, gaussian)
+                    ws[LOG_F + q] = log_f
+                    alpha, shaped = coverage(r2, log_f, log2_o, exponent, r2_max)
                     w, ws[T + q] = advance(before, alpha)
                     ws[W + q] = w
                     ws[P + q], ws[Q + q] = shape_slopes(w, before, alpha, shaped, ws[U + q])
@@ -316,7 +331,7 @@ def adjoint_tiles(
                     yy += t * dy * dy
                     tu = t * ws[U + q]
                     opacity += tu
-                    beta += tu * ws[LOG_U + q]
+                    beta += tu * ws[LOG_F + q]
                     if with_sgg is not None:
                         abs_x += abs(t * half_x)
                         abs_y += abs(t * half_y)

@@ -1,7 +1,10 @@
 """What one primitive does to one pixel, forward and adjoint, written once for every back end.
 
-    alpha = min(0.999, o u^b),  u = 1 - r2                              F = c e^{-beta_D z} - B_inf e^{-beta_B z}
+    alpha = min(0.999, o f(r2)),  f = (1 - r2)^b or e^{-b r2}           F = c e^{-beta_D z} - B_inf e^{-beta_B z}
     w = T alpha,  T <- T (1 - alpha)                                    I = B_inf + sum w F,  J = sum w c,  D = sum w z
+
+Both kernels are f = 2^(b l), l = log2(1 - r2) or -r2 log2 e, and fall by b f / u per r2, u = 1 - r2 or 1: the pair
+(u, l) is all that tells them apart, and b = 1/2 makes the Gaussian of 3DGS.
 
 The adjoint walks front to back again. With a payload e_i = dL/dw_i per branch of Alg. 1 and R_i = sum_{j > i} w_j e_j,
 which is the total known from the forward images minus the running sum,
@@ -31,7 +34,7 @@ def make(jit: Any, exp2: Any, log2: Any, minimum: Any, maximum: Any, select: Any
     precision (a bare 2.0 would promote Numba's lanes to float64).
     """
     zero, one = K(0.0), K(1.0)
-    u_min, alpha_max, t_min = K(U_MIN), K(ALPHA_MAX), K(T_MIN)
+    u_min, alpha_max, t_min, neg_log2_e = K(U_MIN), K(ALPHA_MAX), K(T_MIN), K(-LOG2_E)
 
     @jit
     def half_slope(dx, dy, conic):
@@ -39,16 +42,28 @@ def make(jit: Any, exp2: Any, log2: Any, minimum: Any, maximum: Any, select: Any
         return conic[0] * dx + conic[1] * dy, conic[1] * dx + conic[2] * dy
 
     @jit
-    def coverage(dx, dy, conic, log2_opacity, exponent, r2_max):
-        """Alpha, the part of it that follows the shape (0 where capped), u, and log2 u."""
+    def squared_distance(dx, dy, conic):
+        """r2."""
         half_x, half_y = half_slope(dx, dy, conic)
-        r2 = dx * half_x + dy * half_y
+        return dx * half_x + dy * half_y
+
+    @jit
+    def beta_falloff(r2):
+        """(u, l) of the Beta kernel."""
         u = maximum(one - r2, u_min)
-        log_u = log2(u)
-        raw = exp2(log2_opacity + exponent * log_u)
+        return u, log2(u)
+
+    @jit
+    def gaussian_falloff(r2):
+        """(u, l) of the Gaussian."""
+        return one, neg_log2_e * r2
+
+    @jit
+    def coverage(r2, log_f, log2_opacity, exponent, r2_max):
+        """Alpha, and the part of it that follows the shape (0 where capped)."""
+        raw = exp2(log2_opacity + exponent * log_f)
         alpha = select(r2 < r2_max, minimum(raw, alpha_max), zero)
-        shaped = select(raw < alpha_max, alpha, zero)
-        return alpha, shaped, u, log_u
+        return alpha, select(raw < alpha_max, alpha, zero)
 
     @jit
     def advance(T, alpha):
@@ -105,6 +120,9 @@ def make(jit: Any, exp2: Any, log2: Any, minimum: Any, maximum: Any, select: Any
 
     return SimpleNamespace(
         half_slope=half_slope,
+        squared_distance=squared_distance,
+        beta_falloff=beta_falloff,
+        gaussian_falloff=gaussian_falloff,
         coverage=coverage,
         advance=advance,
         transmittance=transmittance,

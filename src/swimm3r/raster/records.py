@@ -4,7 +4,7 @@ Pixel (x, y) has its centre at (x + 0.5, y + 0.5). Images are [3, H, W]; depths 
 """
 
 from dataclasses import dataclass
-from typing import NamedTuple
+from typing import Literal, NamedTuple
 
 import torch
 from jaxtyping import Float, Int
@@ -16,6 +16,8 @@ ALPHA_MIN = 1 / 255
 """Pairs fainter than this are skipped by default; the paper and the vectors cut nothing (alpha_min=0)."""
 ALPHA_MAX = 0.999
 """Opacity of one pair is capped here; a capped pair has no gradient towards its shape (uwbs.md 1.4)."""
+Kernel = Literal["beta", "gaussian"]
+"""How a primitive fades from its centre: (1 - r2)^b within r2 < 1, or e^{-b r2}, which only `alpha_min` ends."""
 T_MIN = 1e-4
 """A pixel ends *before* the primitive that would bring its transmittance to this or below (uwbs.md 1.5)."""
 
@@ -24,10 +26,10 @@ class Primitives2D(NamedTuple):
     """Primitives as one camera sees them, in any order."""
 
     mean2d: Float[Tensor, "n 2"]  # px
-    conic: Float[Tensor, "n 3"]  # (A, B, C) of r2 = A dx^2 + 2 B dx dy + C dy^2, 1/px^2; the support is r2 < 1
+    conic: Float[Tensor, "n 3"]  # (A, B, C) of r2 = A dx^2 + 2 B dx dy + C dy^2, 1/px^2
     color: Float[Tensor, "n 3"]  # clear (water-free) colour
     opacity: Float[Tensor, " n"]  # 0..1, already conditioned on the view
-    beta: Float[Tensor, " n"]  # exponent of the kernel (1 - r2)^beta, > 0; 4 exp(b) of the raw parameter b
+    beta: Float[Tensor, " n"]  # b of the kernel, > 0: 4 exp of a Beta primitive's raw parameter, 1/2 of a Gaussian
     depth: Float[Tensor, " n"]  # camera z of the centre; <= 0 or not finite: not drawn
 
 
@@ -84,6 +86,7 @@ class Bins:
     height: int
     width: int
     alpha_min: float
+    kernel: Kernel
     packed: Float[Tensor, "n 16"]  # what a kernel reads of each primitive, one cache line (see bins.py)
     tile_start: Int[Tensor, " tile_bounds"]  # tile t holds the pairs tile_start[t] : tile_start[t + 1]
     ids: Int[Tensor, " pairs"]  # index of the primitive

@@ -12,7 +12,7 @@ import torch
 from jaxtyping import Bool, Float
 from torch import Tensor
 
-from swimm3r.raster.records import ALPHA_MAX, T_MIN, MediumMaps, Primitives2D, RasterOutput, SggBuffers
+from swimm3r.raster.records import ALPHA_MAX, T_MIN, Kernel, MediumMaps, Primitives2D, RasterOutput, SggBuffers
 
 
 @dataclass(frozen=True)
@@ -55,6 +55,11 @@ def beta_kernel(r2: Float[Tensor, "*x"], exponent: Float[Tensor, "*x"]) -> Float
     inside = (r2 >= 0) & (r2 < 1)
     u = torch.where(inside, 1 - r2, torch.ones_like(r2))  # 1 outside, where the power and its gradient are not used
     return torch.where(inside, u**exponent, torch.zeros_like(r2))
+
+
+def gaussian_kernel(r2: Float[Tensor, "*x"], exponent: Float[Tensor, "*x"]) -> Float[Tensor, "*x"]:
+    """e^(-exponent r2); an exponent of 1/2 is the Gaussian of 3DGS."""
+    return torch.exp(-exponent * r2)
 
 
 def transmittance(alpha: Float[Tensor, "*pixels k"]) -> Float[Tensor, "*pixels k+1"]:
@@ -141,7 +146,7 @@ class _Pairs:
     capped: Tensor
 
 
-def _pairs(p: Primitives2D, height: int, width: int, alpha_min: float) -> _Pairs:
+def _pairs(p: Primitives2D, height: int, width: int, alpha_min: float, kernel: Kernel) -> _Pairs:
     """Alpha of every pair, with the cut-offs of uwbs.md 1.4 and 1.5."""
     A, B, C = p.conic.unbind(-1)
     drawn = (p.depth > 0) & p.depth.isfinite() & (A * C - B * B > 0) & (A > 0)
@@ -154,7 +159,8 @@ def _pairs(p: Primitives2D, height: int, width: int, alpha_min: float) -> _Pairs
     dx = mean[:, 0] - x.reshape(-1, 1).to(mean)
     dy = mean[:, 1] - y.reshape(-1, 1).to(mean)
     r2 = A * dx * dx + 2 * B * dx * dy + C * dy * dy
-    raw = p.opacity[order] * beta_kernel(r2, p.beta[order].expand_as(r2))
+    fade = gaussian_kernel if kernel == "gaussian" else beta_kernel
+    raw = p.opacity[order] * fade(r2, p.beta[order].expand_as(r2))
     alpha = raw.clamp(max=ALPHA_MAX)
     alpha = torch.where(alpha.detach() >= alpha_min, alpha, torch.zeros_like(alpha))
     alpha = torch.where(_accepted(alpha.detach()), alpha, torch.zeros_like(alpha))
@@ -165,9 +171,11 @@ def _per_pixel(maps: Float[Tensor, "c h w"]) -> Float[Tensor, "p c"]:
     return maps.reshape(maps.shape[0], -1).T
 
 
-def render(p: Primitives2D, medium: MediumMaps, height: int, width: int, alpha_min: float) -> RasterOutput:
+def render(
+    p: Primitives2D, medium: MediumMaps, height: int, width: int, alpha_min: float, kernel: Kernel
+) -> RasterOutput:
     """The four images in the inputs' precision; differentiable."""
-    pairs = _pairs(p, height, width, alpha_min)
+    pairs = _pairs(p, height, width, alpha_min, kernel)
     water = MediumMaps(*(_per_pixel(m) for m in medium))
     out = blend(pairs.alpha, p.color[pairs.order], p.depth[pairs.order], water)
     return RasterOutput(
@@ -179,10 +187,16 @@ def render(p: Primitives2D, medium: MediumMaps, height: int, width: int, alpha_m
 
 
 def sgg(
-    p: Primitives2D, medium: MediumMaps, height: int, width: int, alpha_min: float, cotangent: RasterOutput
+    p: Primitives2D,
+    medium: MediumMaps,
+    height: int,
+    width: int,
+    alpha_min: float,
+    kernel: Kernel,
+    cotangent: RasterOutput,
 ) -> SggBuffers:
     """The buffers of Alg. 1 from the closed forms; p and medium carry no gradient."""
-    pairs = _pairs(p, height, width, alpha_min)
+    pairs = _pairs(p, height, width, alpha_min, kernel)
     order = pairs.order
     water = MediumMaps(*(_per_pixel(m) for m in medium))
     g = RasterOutput(
@@ -192,10 +206,10 @@ def sgg(
         cotangent.alpha.reshape(-1),
     )
     branch = split_alpha_adjoint(pairs.alpha, p.color[order], p.depth[order], water, g)
-    # dalpha/dmean2d = -2 o beta u^(beta - 1) (conic delta), nothing where alpha is capped or the pair skipped
+    # dalpha/dmean2d = -2 b alpha / u (conic delta), nothing where alpha is capped or the pair skipped
     shaped = (pairs.alpha > 0) & ~pairs.capped
-    u = torch.where(shaped, 1 - pairs.r2, torch.ones_like(pairs.r2))
-    slope = torch.where(shaped, -2 * p.opacity[order] * p.beta[order] * u ** (p.beta[order] - 1), torch.zeros_like(u))
+    u = torch.where(shaped & (kernel == "beta"), 1 - pairs.r2, torch.ones_like(pairs.r2))
+    slope = torch.where(shaped, -2 * p.beta[order] * pairs.alpha / u, torch.zeros_like(u))
     A, B, C = p.conic[order].unbind(-1)
     dalpha = slope[..., None] * torch.stack([A * pairs.dx + B * pairs.dy, B * pairs.dx + C * pairs.dy], -1)
     geo, med, dep = (a[..., None] * dalpha for a in (branch.geo, branch.med, branch.depth))
@@ -218,15 +232,16 @@ def adjoint(
     height: int,
     width: int,
     alpha_min: float,
+    kernel: Kernel,
     cotangent: RasterOutput,
     buffers: SggBuffers | None,
 ) -> tuple[Primitives2D, MediumMaps]:
     """Gradients by autograd, rendering again; adds the closed forms of Alg. 1 to `buffers`."""
     if buffers is not None:
-        for buffer, part in zip(buffers, sgg(p, medium, height, width, alpha_min, cotangent), strict=True):
+        for buffer, part in zip(buffers, sgg(p, medium, height, width, alpha_min, kernel, cotangent), strict=True):
             buffer += part
     leaves = [t.detach().requires_grad_() for t in (*p, *medium)]
     with torch.enable_grad():
-        again = render(Primitives2D(*leaves[:6]), MediumMaps(*leaves[6:]), height, width, alpha_min)
+        again = render(Primitives2D(*leaves[:6]), MediumMaps(*leaves[6:]), height, width, alpha_min, kernel)
     grads = torch.autograd.grad(again, leaves, cotangent, materialize_grads=True)
     return Primitives2D(*grads[:6]), MediumMaps(*grads[6:])

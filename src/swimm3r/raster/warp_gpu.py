@@ -12,6 +12,7 @@ Warp's own adjoint of a loop that carries T is wrong (raster.md 3.6): ours is wr
 import inspect
 from collections.abc import Callable
 from contextlib import AbstractContextManager, nullcontext
+from dataclasses import dataclass
 from typing import Any, no_type_check
 
 import torch
@@ -19,7 +20,7 @@ import warp as wp
 from torch import Tensor
 
 from swimm3r.raster import pairmath
-from swimm3r.raster.records import TILE, Bins, MediumMaps, Primitives2D, RasterOutput, SggBuffers
+from swimm3r.raster.records import TILE, Bins, Kernel, MediumMaps, Primitives2D, RasterOutput, SggBuffers
 
 # No banner, no "module loaded" lines: they would land in the middle of the command line's progress. The first name is
 # Warp's before 1.19, the second since.
@@ -108,7 +109,8 @@ def _native_helpers() -> Any:
 
 exp2, warp_any, add_over_warp = _native_helpers()
 _pair = pairmath.make(_function, exp2, wp.log2, wp.min, wp.max, wp.where, wp.vec3, float)
-half_slope, coverage, advance, transmittance = _pair.half_slope, _pair.coverage, _pair.advance, _pair.transmittance
+half_slope, squared_distance, coverage = _pair.half_slope, _pair.squared_distance, _pair.coverage
+advance, transmittance = _pair.advance, _pair.transmittance
 seen_colour, colour_slope, payloads = _pair.seen_colour, _pair.colour_slope, _pair.payloads
 shape_slopes, depth_slope = _pair.shape_slopes, _pair.depth_slope
 
@@ -137,130 +139,154 @@ def store(image: wp.array3d(dtype=float), y: int, x: int, v: wp.vec3):
     image[2, y, x] = v[2]
 
 
-@no_type_check
-@wp.kernel(enable_backward=False)
-def forward_kernel(
-    packed: wp.array2d(dtype=float), tile_start: wp.array(dtype=int), ids: wp.array(dtype=int),
-    binf: wp.array3d(dtype=float), beta_b: wp.array3d(dtype=float), beta_d: wp.array3d(dtype=float),
-    rgb: wp.array3d(dtype=float), clear: wp.array3d(dtype=float), z_depth: wp.array2d(dtype=float),
-    alpha_out: wp.array2d(dtype=float),
-):  # fmt: skip
-    """Images, one thread per pixel."""
-    tile, thread = wp.tid()
-    height, width = z_depth.shape[0], z_depth.shape[1]
-    pixel_x, pixel_y = pixel_of(tile, thread, (width + 15) // 16)
-    inside = pixel_x < width and pixel_y < height
-    x, y = wp.min(pixel_x, width - 1), wp.min(pixel_y, height - 1)
-    centre_x, centre_y = float(x) + 0.5, float(y) + 0.5
-    B, k_b, k_d = channels(binf, y, x), -LOG2_E * channels(beta_b, y, x), -LOG2_E * channels(beta_d, y, x)
-    T = wp.where(inside, 1.0, -1.0)
-    image = wp.vec3(0.0, 0.0, 0.0)
-    J = wp.vec3(0.0, 0.0, 0.0)
-    D = wp.float32(0.0)
-    entry = tile_start[tile]
-    end = tile_start[tile + 1]
-    while entry < end:
-        i = ids[entry]
-        entry += 1
-        conic = wp.vec3(packed[i, 2], packed[i, 3], packed[i, 4])
-        alpha, _shaped, _u, _log_u = coverage(
-            centre_x - packed[i, 0], centre_y - packed[i, 1], conic, packed[i, 5], packed[i, 6], packed[i, 7]
-        )
-        if warp_any(wp.where(alpha > 0.0 and T > 0.0, 1, 0)) != 0:
-            z = packed[i, 8]
-            color = wp.vec3(packed[i, 9], packed[i, 10], packed[i, 11])
-            w, behind = advance(T, alpha)
-            T = behind
-            image += w * seen_colour(color, B, transmittance(k_b, z), transmittance(k_d, z))
-            J += w * color
-            D += w * z
-            if warp_any(wp.where(T > 0.0, 1, 0)) == 0:
-                entry = end
-    if inside:
-        store(rgb, y, x, image + B)
-        store(clear, y, x, J)
-        z_depth[y, x] = D
-        alpha_out[y, x] = 1.0 - wp.abs(T)
+@dataclass(frozen=True)
+class PixelKernels:
+    """The two passes for one falloff."""
+
+    forward: Any
+    adjoint: Any
 
 
 @no_type_check
-@wp.kernel(enable_backward=False)
-def adjoint_kernel(
-    packed: wp.array2d(dtype=float), tile_start: wp.array(dtype=int), ids: wp.array(dtype=int),
-    binf: wp.array3d(dtype=float), beta_b: wp.array3d(dtype=float), beta_d: wp.array3d(dtype=float),
-    g_rgb: wp.array3d(dtype=float), g_clear: wp.array3d(dtype=float), g_z: wp.array2d(dtype=float),
-    g_alpha: wp.array2d(dtype=float),
-    rgb: wp.array3d(dtype=float), clear: wp.array3d(dtype=float), z_depth: wp.array2d(dtype=float),
-    alpha_out: wp.array2d(dtype=float),
-    sums: wp.array(dtype=float), d_binf: wp.array3d(dtype=float), d_beta_b: wp.array3d(dtype=float),
-    d_beta_d: wp.array3d(dtype=float),
-):  # fmt: skip
-    """Sums of every primitive and gradients of the water, front to back again (pairmath.py)."""
-    tile, thread = wp.tid()
-    height, width = z_depth.shape[0], z_depth.shape[1]
-    pixel_x, pixel_y = pixel_of(tile, thread, (width + 15) // 16)
-    inside = pixel_x < width and pixel_y < height
-    x, y = wp.min(pixel_x, width - 1), wp.min(pixel_y, height - 1)
-    centre_x, centre_y = float(x) + 0.5, float(y) + 0.5
-    B, k_b, k_d = channels(binf, y, x), -LOG2_E * channels(beta_b, y, x), -LOG2_E * channels(beta_d, y, x)
-    g, gc = channels(g_rgb, y, x), channels(g_clear, y, x)
-    gz, ga = g_z[y, x], g_alpha[y, x]
-    g_veil = wp.cw_mul(g, B)
-    J = channels(clear, y, x)
-    rest_depth = gz * z_depth[y, x]
-    both = rest_depth + ga * alpha_out[y, x] + wp.dot(gc, J)
-    rest = wp.dot(g, channels(rgb, y, x) - B) + both
-    rest_geo = wp.dot(g, J) + both
-    T = wp.where(inside, 1.0, -1.0)
-    veil = wp.vec3(0.0, 0.0, 0.0)
-    z_veil = wp.vec3(0.0, 0.0, 0.0)
-    z_direct = wp.vec3(0.0, 0.0, 0.0)
-    entry = tile_start[tile]
-    end = tile_start[tile + 1]
-    while entry < end:
-        i = ids[entry]
-        entry += 1
-        dx, dy = centre_x - packed[i, 0], centre_y - packed[i, 1]
-        conic = wp.vec3(packed[i, 2], packed[i, 3], packed[i, 4])
-        alpha, shaped, u, log_u = coverage(dx, dy, conic, packed[i, 5], packed[i, 6], packed[i, 7])
-        if warp_any(wp.where(alpha > 0.0 and T > 0.0, 1, 0)) != 0:
-            z = packed[i, 8]
-            color = wp.vec3(packed[i, 9], packed[i, 10], packed[i, 11])
-            w, behind = advance(T, alpha)
-            p, q = shape_slopes(w, T, alpha, shaped, u)
-            T = behind
-            E_B, E_D = transmittance(k_b, z), transmittance(k_d, z)
-            slope = colour_slope(g, gc, E_D)
-            full, geo, depth = payloads(color, z, E_B, slope, g, g_veil, gc, gz, ga)
-            rest -= w * full
-            rest_geo -= w * geo
-            rest_depth -= w * depth
-            veil += w * E_B
-            z_veil += w * z * E_B
-            z_direct += w * z * wp.cw_mul(color, E_D)
-            t, t_geo, t_depth = p * full - q * rest, p * geo - q * rest_geo, p * depth - q * rest_depth
-            half_x, half_y = half_slope(dx, dy, conic)
-            add_over_warp(
-                sums, i, t * half_x, t * half_y, t * dx * dx, 2.0 * t * dx * dy, t * dy * dy,
-                w * slope[0], w * slope[1], w * slope[2], t * u, t * u * log_u,
-                w * depth_slope(color, E_B, E_D, g, g_veil, k_b, k_d), w * gz,
-                t_geo * half_x, t_geo * half_y, wp.abs(t_geo * half_x), wp.abs(t_geo * half_y),
-                wp.abs(t * half_x), wp.abs(t * half_y), t_depth * half_x, t_depth * half_y,
-            )  # fmt: skip
-            if warp_any(wp.where(T > 0.0, 1, 0)) == 0:
-                entry = end
-    if inside:
-        store(d_binf, y, x, wp.cw_mul(g, wp.vec3(1.0, 1.0, 1.0) - veil))
-        store(d_beta_b, y, x, wp.cw_mul(g_veil, z_veil))
-        store(d_beta_d, y, x, -wp.cw_mul(g, z_direct))
+def _pixel_kernels(falloff: Any) -> PixelKernels:
+    """The passes as compiled for one of the pair's falloffs."""
+
+    @no_type_check
+    @wp.kernel(enable_backward=False)
+    def forward_kernel(
+        packed: wp.array2d(dtype=float), tile_start: wp.array(dtype=int), ids: wp.array(dtype=int),
+        binf: wp.array3d(dtype=float), beta_b: wp.array3d(dtype=float), beta_d: wp.array3d(dtype=float),
+        rgb: wp.array3d(dtype=float), clear: wp.array3d(dtype=float), z_depth: wp.array2d(dtype=float),
+        alpha_out: wp.array2d(dtype=float),
+    ):  # fmt: skip
+        """Images, one thread per pixel."""
+        tile, thread = wp.tid()
+        height, width = z_depth.shape[0], z_depth.shape[1]
+        pixel_x, pixel_y = pixel_of(tile, thread, (width + 15) // 16)
+        inside = pixel_x < width and pixel_y < height
+        x, y = wp.min(pixel_x, width - 1), wp.min(pixel_y, height - 1)
+        centre_x, centre_y = float(x) + 0.5, float(y) + 0.5
+        B, k_b, k_d = channels(binf, y, x), -LOG2_E * channels(beta_b, y, x), -LOG2_E * channels(beta_d, y, x)
+        T = wp.where(inside, 1.0, -1.0)
+        image = wp.vec3(0.0, 0.0, 0.0)
+        J = wp.vec3(0.0, 0.0, 0.0)
+        D = wp.float32(0.0)
+        entry = tile_start[tile]
+        end = tile_start[tile + 1]
+        while entry < end:
+            i = ids[entry]
+            entry += 1
+            conic = wp.vec3(packed[i, 2], packed[i, 3], packed[i, 4])
+            r2 = squared_distance(centre_x - packed[i, 0], centre_y - packed[i, 1], conic)
+            _u, log_f = falloff(r2)
+            alpha, _shaped = coverage(r2, log_f, packed[i, 5], packed[i, 6], packed[i, 7])
+            if warp_any(wp.where(alpha > 0.0 and T > 0.0, 1, 0)) != 0:
+                z = packed[i, 8]
+                color = wp.vec3(packed[i, 9], packed[i, 10], packed[i, 11])
+                w, behind = advance(T, alpha)
+                T = behind
+                image += w * seen_colour(color, B, transmittance(k_b, z), transmittance(k_d, z))
+                J += w * color
+                D += w * z
+                if warp_any(wp.where(T > 0.0, 1, 0)) == 0:
+                    entry = end
+        if inside:
+            store(rgb, y, x, image + B)
+            store(clear, y, x, J)
+            z_depth[y, x] = D
+            alpha_out[y, x] = 1.0 - wp.abs(T)
+
+    @no_type_check
+    @wp.kernel(enable_backward=False)
+    def adjoint_kernel(
+        packed: wp.array2d(dtype=float), tile_start: wp.array(dtype=int), ids: wp.array(dtype=int),
+        binf: wp.array3d(dtype=float), beta_b: wp.array3d(dtype=float), beta_d: wp.array3d(dtype=float),
+        g_rgb: wp.array3d(dtype=float), g_clear: wp.array3d(dtype=float), g_z: wp.array2d(dtype=float),
+        g_alpha: wp.array2d(dtype=float),
+        rgb: wp.array3d(dtype=float), clear: wp.array3d(dtype=float), z_depth: wp.array2d(dtype=float),
+        alpha_out: wp.array2d(dtype=float),
+        sums: wp.array(dtype=float), d_binf: wp.array3d(dtype=float), d_beta_b: wp.array3d(dtype=float),
+        d_beta_d: wp.array3d(dtype=float),
+    ):  # fmt: skip
+        """Sums of every primitive and gradients of the water, front to back again (pairmath.py)."""
+        tile, thread = wp.tid()
+        height, width = z_depth.shape[0], z_depth.shape[1]
+        pixel_x, pixel_y = pixel_of(tile, thread, (width + 15) // 16)
+        inside = pixel_x < width and pixel_y < height
+        x, y = wp.min(pixel_x, width - 1), wp.min(pixel_y, height - 1)
+        centre_x, centre_y = float(x) + 0.5, float(y) + 0.5
+        B, k_b, k_d = channels(binf, y, x), -LOG2_E * channels(beta_b, y, x), -LOG2_E * channels(beta_d, y, x)
+        g, gc = channels(g_rgb, y, x), channels(g_clear, y, x)
+        gz, ga = g_z[y, x], g_alpha[y, x]
+        g_veil = wp.cw_mul(g, B)
+        J = channels(clear, y, x)
+        rest_depth = gz * z_depth[y, x]
+        both = rest_depth + ga * alpha_out[y, x] + wp.dot(gc, J)
+        rest = wp.dot(g, channels(rgb, y, x) - B) + both
+        rest_geo = wp.dot(g, J) + both
+        T = wp.where(inside, 1.0, -1.0)
+        veil = wp.vec3(0.0, 0.0, 0.0)
+        z_veil = wp.vec3(0.0, 0.0, 0.0)
+        z_direct = wp.vec3(0.0, 0.0, 0.0)
+        entry = tile_start[tile]
+        end = tile_start[tile + 1]
+        while entry < end:
+            i = ids[entry]
+            entry += 1
+            dx, dy = centre_x - packed[i, 0], centre_y - packed[i, 1]
+            conic = wp.vec3(packed[i, 2], packed[i, 3], packed[i, 4])
+            r2 = squared_distance(dx, dy, conic)
+            u, log_f = falloff(r2)
+            alpha, shaped = coverage(r2, log_f, packed[i, 5], packed[i, 6], packed[i, 7])
+            if warp_any(wp.where(alpha > 0.0 and T > 0.0, 1, 0)) != 0:
+                z = packed[i, 8]
+                color = wp.vec3(packed[i, 9], packed[i, 10], packed[i, 11])
+                w, behind = advance(T, alpha)
+                p, q = shape_slopes(w, T, alpha, shaped, u)
+                T = behind
+                E_B, E_D = transmittance(k_b, z), transmittance(k_d, z)
+                slope = colour_slope(g, gc, E_D)
+                full, geo, depth = payloads(color, z, E_B, slope, g, g_veil, gc, gz, ga)
+                rest -= w * full
+                rest_geo -= w * geo
+                rest_depth -= w * depth
+                veil += w * E_B
+                z_veil += w * z * E_B
+                z_direct += w * z * wp.cw_mul(color, E_D)
+                t, t_geo, t_depth = p * full - q * rest, p * geo - q * rest_geo, p * depth - q * rest_depth
+                half_x, half_y = half_slope(dx, dy, conic)
+                add_over_warp(
+                    sums, i, t * half_x, t * half_y, t * dx * dx, 2.0 * t * dx * dy, t * dy * dy,
+                    w * slope[0], w * slope[1], w * slope[2], t * u, t * u * log_f,
+                    w * depth_slope(color, E_B, E_D, g, g_veil, k_b, k_d), w * gz,
+                    t_geo * half_x, t_geo * half_y, wp.abs(t_geo * half_x), wp.abs(t_geo * half_y),
+                    wp.abs(t * half_x), wp.abs(t * half_y), t_depth * half_x, t_depth * half_y,
+                )  # fmt: skip
+                if warp_any(wp.where(T > 0.0, 1, 0)) == 0:
+                    entry = end
+        if inside:
+            store(d_binf, y, x, wp.cw_mul(g, wp.vec3(1.0, 1.0, 1.0) - veil))
+            store(d_beta_b, y, x, wp.cw_mul(g_veil, z_veil))
+            store(d_beta_d, y, x, -wp.cw_mul(g, z_direct))
+
+    return PixelKernels(forward_kernel, adjoint_kernel)
 
 
-def bin_primitives(p: Primitives2D, height: int, width: int, alpha_min: float) -> Bins:
+_PASSES: dict[Kernel, PixelKernels] = {
+    "beta": _pixel_kernels(_pair.beta_falloff),
+    "gaussian": _pixel_kernels(_pair.gaussian_falloff),
+}
+
+
+def bin_primitives(p: Primitives2D, height: int, width: int, alpha_min: float, kernel: Kernel) -> Bins:
     """Tile lists on the primitives' device, exact as on the CPU; the number of pairs is the one trip to the host."""
     n, device = len(p.depth), p.depth.device
     A, B, C = p.conic.double().unbind(-1)
     determinant = A * C - B * B
-    r2_max = 1 - (alpha_min / p.opacity.double()) ** (1 / p.beta.double())
+    if kernel == "gaussian":
+        r2_max = (p.opacity.double() / alpha_min).log() / p.beta.double()
+    else:
+        r2_max = 1 - (alpha_min / p.opacity.double()) ** (1 / p.beta.double())
     seen = (p.depth > 0) & p.depth.isfinite() & p.mean2d.isfinite().all(-1) & (A > 0) & (determinant > 0)
     seen &= A.isfinite() & determinant.isfinite() & (p.beta > 0) & (p.opacity > 0) & (p.opacity >= alpha_min)
     safe = torch.where(seen, determinant, 1.0)
@@ -297,7 +323,7 @@ def bin_primitives(p: Primitives2D, height: int, width: int, alpha_min: float) -
     record = torch.zeros(n, 16, device=device)
     record[:, :2], record[:, 2:5], record[:, 5] = p.mean2d, p.conic, p.opacity.log2()
     record[:, 6], record[:, 7], record[:, 8], record[:, 9:12] = p.beta, r2_max, p.depth, p.color
-    return Bins(height, width, alpha_min, record, tile_start, ids[order].int())
+    return Bins(height, width, alpha_min, kernel, record, tile_start, ids[order].int())
 
 
 def forward(bins: Bins, p: Primitives2D, medium: MediumMaps) -> RasterOutput:
@@ -305,7 +331,7 @@ def forward(bins: Bins, p: Primitives2D, medium: MediumMaps) -> RasterOutput:
     like, height, width = medium.binf, bins.height, bins.width
     shapes = ((3, height, width), (3, height, width), (height, width), (height, width))
     out = RasterOutput(*(like.new_empty(shape) for shape in shapes))
-    _launch(forward_kernel, bins, [bins.packed, bins.tile_start, bins.ids, *medium, *out])
+    _launch(_PASSES[bins.kernel].forward, bins, [bins.packed, bins.tile_start, bins.ids, *medium, *out])
     return out
 
 
@@ -322,7 +348,7 @@ def backward(
     sums = bins.packed.new_zeros(len(p.depth) * VALUES)
     d_medium = MediumMaps(*(torch.empty_like(t) for t in medium))
     images = (*medium, *(g.contiguous() for g in cotangent), *out)
-    _launch(adjoint_kernel, bins, [bins.packed, bins.tile_start, bins.ids, *images, sums, *d_medium])
+    _launch(_PASSES[bins.kernel].adjoint, bins, [bins.packed, bins.tile_start, bins.ids, *images, sums, *d_medium])
     s = sums.view(-1, VALUES)
     exponent = torch.where(s.any(-1), p.beta, 1.0)[:, None]  # what was not seen may hold anything
     opacity = torch.where(s.any(-1), p.opacity, 1.0)
