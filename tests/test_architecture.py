@@ -95,7 +95,7 @@ def test_importing_the_package_loads_nothing_heavy():
 
 def test_help_loads_no_torch():
     commands = ["run", "demo", "sfm", "splat", "render", "export", "eval", "prepare", "doctor", "datasets"]
-    commands += ["train-sfm", "bench"]
+    commands += ["train-sfm", "bench", *(f"bench {name}" for name in ("render", "ablation-uwbs", "localisation"))]
     for command in ("", "weights get", *commands):
         snippet = (
             "from swimm3r.cli.main import main\n"

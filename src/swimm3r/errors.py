@@ -4,6 +4,8 @@ Exit codes: 0 done, 2 usage, 3 input data, 4 weights, 5 device, 6 too few regist
 Everything else is our own mistake and keeps its traceback.
 """
 
+from functools import partial
+
 
 class Swimm3rError(Exception):
     """Something the user can act on."""
@@ -15,6 +17,9 @@ class Swimm3rError(Exception):
         self.what = what
         self.cause = cause
         self.hint = hint
+
+    def __reduce__(self) -> tuple:
+        return partial(type(self), cause=self.cause, hint=self.hint), (self.what,)  # between processes
 
     def __str__(self) -> str:
         return f"{self.what}\n  Likely cause: {self.cause}\n  Try: {self.hint}"

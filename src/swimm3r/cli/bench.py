@@ -1,47 +1,141 @@
-"""`swimm3r bench`: the paper's protocols over finished runs."""
+"""`swimm3r bench PROTOCOL`: the paper's tables on your own dives, one sub-command each."""
 
 from collections.abc import Callable
+from dataclasses import replace
 from pathlib import Path
-from typing import Literal
+from typing import TYPE_CHECKING, Annotated, Literal
 
-from tyro.conf import Positional
+from tyro.conf import Positional, arg, subcommand
 
+from swimm3r.bench.settings import JobSettings
 from swimm3r.cli.console import drawn_progress
-from swimm3r.presets import PRESETS
-from swimm3r.splat.settings import PoseRefinementSettings, UwbsSettings
+from swimm3r.frame_settings import FrameSettings
+from swimm3r.localization.settings import LocalizationSettings
+from swimm3r.presets import PRESETS, RunSettings
+from swimm3r.progress import Progress
+from swimm3r.sfm.settings import ColmapSettings
+from swimm3r.splat.settings import RECIPES, PoseRefinementSettings, Recipe, UwbsSettings
+
+if TYPE_CHECKING:
+    from swimm3r.bench.tables import Table
+
+Preset = Literal["fast", "default", "best"]
+_FLAT = arg(name="")
+_Jobs = Annotated[JobSettings, _FLAT]
+_ONE_BY_ONE = JobSettings()
 
 
 def command_for_preset(name: str) -> Callable:
     """The command, with the map settings of a preset as defaults."""
     defaults = PRESETS[name]
+    assert isinstance(defaults.sfm, ColmapSettings)
+    found_poses, picked_evenly = defaults.sfm, replace(defaults.frames, pick="uniform")
 
-    def bench(
-        protocol: Positional[Literal["ablation-uwbs"]],
+    def ablation_uwbs(
         runs: Positional[tuple[Path, ...]],
         /,
         out: Path,
         seeds: int = 3,
-        preset: Literal["fast", "default", "best"] = "fast",
+        preset: Preset = "fast",
         splat: UwbsSettings = defaults.splat,
         test: PoseRefinementSettings = defaults.test,
+        jobs: _Jobs = _ONE_BY_ONE,
     ) -> None:
-        """Train variants of the map on finished runs, several seeds each, and compare. The same command goes on.
+        """Train the map without its parts, several seeds each: baseline, + SGG, + depth, full.
 
         Args:
-            protocol: ablation-uwbs trains baseline, + SGG, + depth and full.
             runs: run folders with finished structure from motion; they are only read.
-            out: where maps, scores and the tables go: ablation.md, .csv and .json.
+            out: where maps, scores and the tables go: ablation.md, .csv, .json and .tex.
             seeds: trainings of each variant on each run.
             preset: what the other defaults aim at.
             splat: how the full variant is trained; the others are it without a part.
             test: how the test frames' poses are refined.
+            jobs: scenes in parallel.
         """
-        from swimm3r.bench import statistics
-        from swimm3r.bench.ablation import ablate
+        from swimm3r.bench.ablation_uwbs import ablate
 
-        with drawn_progress() as progress:
-            cells = ablate(runs, out, splat, seeds, test, progress)
-        statistics.write_tables(out, cells)
-        print(statistics.table(cells))
+        _show(out, lambda progress: ablate(runs, out, splat, seeds, test, jobs, progress))
+
+    def render(
+        inputs: Positional[tuple[Path, ...]],
+        /,
+        out: Path,
+        recipes: tuple[Recipe, ...] = RECIPES,
+        seeds: int = 1,
+        poses: bool = False,
+        against: Recipe | None = None,
+        preset: Preset = "fast",
+        frames: FrameSettings = picked_evenly,
+        sfm: ColmapSettings = found_poses,
+        splat: UwbsSettings = defaults.splat,
+        test: PoseRefinementSettings = defaults.test,
+        jobs: _Jobs = _ONE_BY_ONE,
+    ) -> None:
+        """Train every recipe on every clip's structure from motion and compare how they show the test frames.
+
+        Args:
+            inputs: run folders with finished structure from motion, which are only read; or clips, of which runs are
+                made in OUT/runs. Runs of one clip whose poses were found in different ways are rows of one table.
+            out: where maps, scores, pictures side by side and the tables go: render.md, .csv, .json and .tex.
+            recipes: the renderers.
+            seeds: trainings of each recipe on each run.
+            poses: add all recipes again with the training frames' poses refined along with the map.
+            against: the recipe that differences are taken from; the first where none is named.
+            preset: what the other defaults aim at.
+            frames: which frames to take of clips; the paper's are evenly spaced.
+            sfm: how poses, depth and water of clips are found.
+            splat: size and length of the maps; a recipe changes what makes it another method.
+            test: how the test frames' poses are refined.
+            jobs: scenes in parallel.
+        """
+        from swimm3r.bench.render import compare_renderers
+        from swimm3r.bench.runs import made_runs
+
+        def run(progress: Progress) -> "Table":
+            runs = made_runs(inputs, out, RunSettings(frames, sfm, splat, test), progress)
+            return compare_renderers(runs, out, recipes, splat, seeds, poses, test, against, jobs, progress)
+
+        _show(out, run)
+
+    protocols = {"render": render, "localisation": localisation, "ablation-uwbs": ablation_uwbs}
+    action = None
+    for protocol, command in protocols.items():
+        one = Annotated[None, subcommand(protocol, constructor=command)]
+        action = one if action is None else action | one
+
+    def bench(action: Annotated[action, arg(name="")]) -> None:  # pyright: ignore[reportInvalidTypeForm]
+        """The paper's tables on your own dives. Results stay in --out; the same command goes on where it stopped."""
 
     return bench
+
+
+def localisation(
+    runs: Positional[tuple[Path, ...]],
+    /,
+    out: Path,
+    maps: Path | None = None,
+    settings: LocalizationSettings = LocalizationSettings(),  # noqa: B008
+    jobs: _Jobs = _ONE_BY_ONE,
+) -> None:
+    """Place every test frame of finished runs in their maps, judged by structure from motion of all frames.
+
+    Several runs of one clip, their poses found in different ways, are rows of one table.
+
+    Args:
+        runs: run folders; they are only read.
+        out: where match pictures, references and the tables go: localisation.md, .csv, .json and .tex.
+        maps: a folder of swimm3r bench render; its maps of these runs take the place of the runs' own.
+        settings: the protocol; SIFT where no MASt3R weights are here.
+        jobs: scenes in parallel.
+    """
+    from swimm3r.bench.localisation import localise
+
+    _show(out, lambda progress: localise(runs, out, settings, maps, jobs, progress))
+
+
+def _show(out: Path, protocol: "Callable[[Progress], Table]") -> None:
+    from swimm3r.bench import tables
+
+    with drawn_progress() as progress:
+        table = protocol(progress)
+    print(tables.write(out, table))

@@ -1,0 +1,147 @@
+"""One cell of a table: the scores of one method on one scene under one seed.
+
+A cell's folder OUT/SCENE/METHOD/SEED keeps what the method made (a map, pictures) and scores.json with the key of
+everything the scores depend on: a cell that is there is not computed again, one that was cut short goes on from what
+its folder holds. Torch-free: worker processes learn their share of the cores before torch starts its threads.
+"""
+
+import json
+import os
+import re
+from collections.abc import Callable, Mapping, Sequence
+from concurrent.futures import ProcessPoolExecutor
+from dataclasses import dataclass, field
+from functools import partial
+from hashlib import sha256
+from multiprocessing import get_context
+from pathlib import Path
+from typing import Any
+
+from swimm3r.bench.settings import JobSettings
+from swimm3r.errors import DeviceError, Swimm3rError, UsageError, WeightsError
+from swimm3r.evaluate import NotComputed, summary_entries
+from swimm3r.io.atomic import write_text
+from swimm3r.progress import Progress, silent
+
+Scores = Mapping[str, float | NotComputed]
+
+
+@dataclass(frozen=True)
+class Cell:
+    """One method on one scene. A method that could not be run says why, and has no scores."""
+
+    scene: str
+    method: str
+    seed: int
+    scores: dict[str, float | NotComputed] = field(default_factory=dict)
+    not_run: str = ""
+
+
+@dataclass(frozen=True)
+class Place:
+    """Where in the table a cell stands, and so where its folder lies."""
+
+    scene: str
+    method: str  # parts that are varied separately stand apart: "colmap / uwbs-static"
+    seed: int = 0
+
+    def folder(self, out: Path) -> Path:
+        """OUT/SCENE/METHOD/SEED, a folder per part of the method's name."""
+        return scene_folder(out, self.scene).joinpath(*map(_plain, self.method.split(" / ")), f"{self.seed}")
+
+
+def scene_folder(out: Path, scene: str) -> Path:
+    """Where the cells of a scene lie."""
+    return out / _plain(scene)
+
+
+SceneWork = Callable[..., list[Cell]]
+"""`work(scene, progress=...)`; a `partial` of a module's function, for it is sent to other processes."""
+
+
+def kept_cell(out: Path, place: Place, depends_on: object, make: Callable[[Path], Scores]) -> Cell:
+    """The cell of that place, from its folder where it was computed from the same; else `make(folder)` computes it.
+
+    `depends_on` is anything JSON can hold (paths by their names). Where weights or a device are missing the cell says
+    so and is not kept: the next call tries again.
+    """
+    folder = place.folder(out)
+    path = folder / "scores.json"
+    key = sha256(json.dumps(depends_on, sort_keys=True, default=str).encode()).hexdigest()
+    if path.is_file():
+        stored = json.loads(path.read_text(encoding="utf-8"))
+        if stored.get("key") == key:
+            return Cell(place.scene, place.method, place.seed, _scores(stored["scores"]))
+    try:
+        scores = dict(make(folder))
+    except (WeightsError, DeviceError) as missing:
+        return Cell(place.scene, place.method, place.seed, not_run=missing.what)
+    document = {"key": key, "scene": place.scene, "method": place.method, "seed": place.seed}
+    write_text(path, json.dumps({**document, "scores": summary_entries(scores)}, indent=2) + "\n")
+    return Cell(place.scene, place.method, place.seed, _scores(summary_entries(scores)))
+
+
+def over_scenes(
+    scenes: Sequence[object], work: SceneWork, out: Path, how: JobSettings, progress: Progress = silent
+) -> list[Cell]:
+    """The cells of all scenes in the scenes' order. One scene's error is raised when the others are done."""
+    if not scenes:
+        raise UsageError(
+            "there is nothing to measure on", cause="no run folder or clip was named", hint="name at least one"
+        )
+    if how.slurm:
+        return _joined([job.result for job in _submitted(scenes, work, out, how)], progress)
+    if how.jobs == 1 or len(scenes) < 2:
+        return _joined([partial(work, scene, progress=progress) for scene in scenes], progress)
+    threads = max(1, (os.cpu_count() or 1) // how.jobs)
+    with ProcessPoolExecutor(how.jobs, get_context("spawn"), _share_cores, (threads,)) as pool:
+        return _joined([pool.submit(work, scene, progress=silent).result for scene in scenes], progress)
+
+
+def _submitted(scenes: Sequence[object], work: SceneWork, out: Path, how: JobSettings) -> list:
+    try:
+        import submitit  # pyright: ignore[reportMissingImports]
+    except ImportError as error:
+        raise UsageError(
+            "scenes are sent to Slurm by submitit, which is not installed",
+            cause="it is not among Swimm3R's own requirements",
+            hint="pip install submitit, or --jobs N for processes on this computer",
+        ) from error
+    executor = submitit.AutoExecutor(folder=out / "slurm")
+    options = {"timeout_min": how.minutes, "cpus_per_task": how.cpus, "gpus_per_node": how.gpus}
+    executor.update_parameters(**options, **({"slurm_partition": how.partition} if how.partition else {}))
+    with executor.batch():
+        return [executor.submit(work, scene, progress=silent) for scene in scenes]
+
+
+def _joined(results: Sequence[Callable[[], list[Cell]]], progress: Progress) -> list[Cell]:
+    cells: list[Cell] = []
+    failed: list[Swimm3rError] = []
+    for done, result in enumerate(results):
+        progress("scenes", done, len(results))
+        try:
+            cells += result()
+        except Swimm3rError as error:
+            failed.append(error)
+    progress("scenes", len(results), len(results))
+    if failed:
+        raise failed[0]
+    return cells
+
+
+def _share_cores(threads: int) -> None:
+    for name in ("OMP_NUM_THREADS", "NUMBA_NUM_THREADS", "MKL_NUM_THREADS"):
+        os.environ[name] = str(threads)
+
+
+def _scores(entries: Mapping[str, Any]) -> dict[str, float | NotComputed]:
+    return {
+        name: NotComputed(str(entries.get(f"{name}_reason", "no reason was kept"))) if value is None else float(value)
+        for name, value in entries.items()
+        if not name.endswith("_reason")
+    }
+
+
+def _plain(name: str) -> str:
+    """A folder's name: `+ SGG` is plus-SGG."""
+    return re.sub(r"[^\w.+-]+", "-", name.replace("+ ", "plus-")).strip("-.") or "unnamed"

@@ -1,0 +1,229 @@
+"""How well maps place the frames they never saw (the paper's Tab. visloc_base), by map and by structure from motion.
+
+Every test frame of a run is a query. Its pose is judged against the structure from motion of all frames, training and
+test, by relative poses: of test frame and training frame, where the map's training frames anchor the answer, and of two
+test frames, of which short clips have few. Maps are the runs' own, and those that `bench render` left.
+"""
+
+import json
+from collections.abc import Sequence
+from dataclasses import asdict, dataclass
+from functools import partial
+from pathlib import Path
+
+import torch
+from jaxtyping import Bool, Float
+from torch import Tensor
+
+from swimm3r.bench import reference
+from swimm3r.bench.cells import Cell, Place, Scores, kept_cell, over_scenes, scene_folder
+from swimm3r.bench.memory import with_peak_mb
+from swimm3r.bench.runs import POSES_REFINED, Clip, SfmRun, clips_of
+from swimm3r.bench.scores import columns
+from swimm3r.bench.settings import JobSettings
+from swimm3r.bench.tables import Table
+from swimm3r.errors import InputError
+from swimm3r.evaluate import NotComputed
+from swimm3r.evaluate.poses import RelativePoseErrors, relative_pose_errors, rra, rta
+from swimm3r.geometry import rotation_angle
+from swimm3r.ground_truth import GroundTruth
+from swimm3r.held_out import best_similarity
+from swimm3r.io import images
+from swimm3r.localization.batch import Answer, Query, answer, match_picture
+from swimm3r.localization.protocol import STAGES, Localizer
+from swimm3r.localization.settings import LocalizationSettings
+from swimm3r.progress import Progress, silent
+from swimm3r.reconstruction import Reconstruction
+from swimm3r.run import FinishedSfm
+from swimm3r.splat.checkpoint import load_map
+from swimm3r.splat.settings import recipe_of
+
+_PAIRS = [f"{score}_{pairs}" for pairs in ("map", "queries") for score in ("rra2", "rta5", "rra15", "rta15")]
+COLUMNS = columns(
+    "located_pct", "inlier_5px_pct", "reprojection_px", *_PAIRS, "rotation_median_deg", "position_median_pct",
+    *(f"fps_{stage}" for stage in STAGES), "fps_localise", "peak_mb", "peak_vram_mb",
+)  # fmt: skip
+
+
+@dataclass(frozen=True)
+class FoundMap:
+    """A map of a run, and under which name and seed it stands in the table."""
+
+    path: Path
+    method: str
+    seed: int
+
+
+def localise(
+    runs: Sequence[Path],
+    out: Path,
+    settings: LocalizationSettings | None = None,
+    maps: Path | None = None,
+    how: JobSettings | None = None,
+    progress: Progress = silent,
+) -> Table:
+    """Every test frame of every run in each of its maps; `maps` is a folder that `bench render` filled.
+
+    Raises InputError where a run has no map, or holds no finished structure from motion.
+    """
+    clips = clips_of(runs)
+    for clip in clips:
+        for run in clip.runs:
+            maps_of(run, maps)
+    work = partial(_cells_of_clip, out=out, settings=settings or LocalizationSettings(), maps=maps)
+    cells = over_scenes(clips, work, out, how or JobSettings(), progress)
+    return Table("localisation", "Test frames placed in maps", cells, COLUMNS)
+
+
+def maps_of(run: SfmRun, maps: Path | None) -> list[FoundMap]:
+    """The run's own map and those of the same structure from motion below `maps`."""
+    found = []
+    own = run.folder / "splat" / "map.safetensors"
+    if own.is_file() and maps is None:
+        found.append(FoundMap(own, f"{run.sfm} / {recipe_of(load_map(own).settings)}", 0))
+    if maps is not None:
+        for path in sorted(scene_folder(maps, run.scene).glob("*/*/*/map.safetensors")):
+            record = path.parent / "scores.json"
+            if not record.is_file():  # still in training
+                continue
+            method = json.loads(record.read_text(encoding="utf-8"))["method"]
+            if method.split(" / ")[0].removesuffix(POSES_REFINED) == run.sfm:
+                found.append(FoundMap(path, method, int(path.parent.name)))
+    if not found:
+        raise InputError(
+            f"there is no map of {run.folder}" + (f" below {maps}" if maps else ""),
+            cause="the run stopped after structure from motion, or the maps are of other runs",
+            hint="swimm3r run INPUT --out RUN; or swimm3r bench render RUN --out DIR, then --maps DIR",
+        )
+    return found
+
+
+def _cells_of_clip(
+    clip: Clip, /, *, out: Path, settings: LocalizationSettings, maps: Path | None, progress: Progress
+) -> list[Cell]:
+    first = clip.runs[0].open()
+    truth = reference.whole_clip(first.frames, reference.settings_of(first), out / "references" / clip.name, progress)
+    cells = []
+    for run in clip.runs:
+        sfm = run.open()
+        for found in maps_of(run, maps):
+            stat = found.path.stat()
+            depends_on = [
+                sfm.key,
+                str(found.path),
+                stat.st_size,
+                stat.st_mtime_ns,
+                asdict(settings),
+                reference.digest(truth),
+            ]
+            make = partial(_scores, sfm=sfm, path=found.path, truth=truth, settings=settings, progress=progress)
+            place = Place(clip.name, found.method, found.seed)
+            cells.append(kept_cell(out, place, [*depends_on, [c.score for c in COLUMNS]], make))
+    return cells
+
+
+def _scores(
+    folder: Path,
+    *,
+    sfm: FinishedSfm,
+    path: Path,
+    truth: GroundTruth | NotComputed,
+    settings: LocalizationSettings,
+    progress: Progress,
+) -> Scores:
+    scene = load_map(path)
+
+    def work() -> tuple[Localizer, list[Answer]]:
+        localizer = Localizer(scene, sfm.rec, sfm.frames, settings)
+        return localizer, _answers(localizer, sfm, folder, progress)
+
+    (localizer, answers), peaks = with_peak_mb(work)
+    return {**localisation_scores(answers), **pose_scores(localizer.rec, answers, truth), **peaks}
+
+
+def _answers(localizer: Localizer, sfm: FinishedSfm, folder: Path, progress: Progress) -> list[Answer]:
+    """Every test frame placed; folder/matches/NAME.png shows what with."""
+    found = []
+    for done, frame in enumerate(sfm.frames.test):
+        progress("localising", done, len(sfm.frames.test))
+        f = sfm.frames.index(frame.name)
+        query = Query(frame.name, frame.time, sfm.frames.image(f), sfm.frames.mask(f))
+        found.append(answer(localizer, query))
+        place = found[-1].found
+        if place is not None and place.evidence is not None:
+            images.write_rgb(folder / "matches" / f"{frame.name}.png", match_picture(place.evidence))
+    return found
+
+
+def localisation_scores(answers: Sequence[Answer]) -> dict[str, float | NotComputed]:
+    """What needs no reference: how many were placed, on what evidence, how fast."""
+    found = [a.found for a in answers if a.found is not None]
+    nothing = NotComputed("no test frame was located")
+    refined = [f.reprojection_px for f in found if f.reprojection_px is not None]
+    scores: dict[str, float | NotComputed] = {
+        "located_pct": 100 * len(found) / len(answers),
+        "inlier_5px_pct": 100 * sum(f.inliers / max(1, f.matches) for f in found) / len(answers),
+        "reprojection_px": float(torch.tensor(refined).quantile(0.5)) if refined else nothing,
+    }
+    for stage in STAGES:
+        seconds = sum(f.seconds[stage] for f in found)
+        scores[f"fps_{stage}"] = len(found) / seconds if seconds > 0 else nothing
+    total = sum(sum(f.seconds.values()) for f in found)
+    scores["fps_localise"] = len(found) / total if total > 0 else nothing
+    return scores
+
+
+def pose_scores(
+    rec: Reconstruction, answers: Sequence[Answer], truth: GroundTruth | NotComputed
+) -> dict[str, float | NotComputed]:
+    """RRA and RTA of pairs, and the errors after alignment by the training frames, whose poses are `rec`'s."""
+    names = [*_PAIRS, "rotation_median_deg", "position_median_pct"]
+    if isinstance(truth, NotComputed):
+        return dict.fromkeys(names, truth)
+    rows = {name: row for row, name in enumerate(truth.names)}
+    queries = [a for a in answers if a.name in rows]
+    trained = [name for name in rec.names if name in rows]
+    if not queries:
+        return dict.fromkeys(names, NotComputed("the reference has no test frame"))
+    identity = torch.eye(4, dtype=torch.float64)
+    placed = [identity if a.found is None else a.found.cam2world.double() for a in queries]
+    ours = rec.cameras.cam2world[[rec.index(name) for name in trained]].double()
+    theirs = truth.cameras.cam2world[[rows[name] for name in (*(a.name for a in queries), *trained)]].double()
+    found = torch.tensor([a.found is not None for a in queries] + [True] * len(trained))
+    errors = relative_pose_errors(torch.cat([torch.stack(placed), ours]), theirs, found)
+    is_query = torch.arange(len(found)) < len(queries)
+    both = is_query[errors.pairs].sum(-1)
+    scores: dict[str, float | NotComputed] = {}
+    for kind, count in (("map", 1), ("queries", 2)):
+        chosen = _selected(errors, both == count)
+        few = NotComputed("there is no such pair of frames in the reference")
+        for threshold in (2, 15):
+            scores[f"rra{threshold}_{kind}"] = rra(chosen, threshold) if len(chosen.pairs) else few
+        for threshold in (5, 15):
+            scores[f"rta{threshold}_{kind}"] = rta(chosen, threshold) if len(chosen.pairs) else few
+    return scores | _aligned_errors(torch.stack(placed)[found[: len(queries)]], ours, theirs, found, len(queries))
+
+
+def _aligned_errors(
+    placed: Float[Tensor, "q 4 4"],
+    ours: Float[Tensor, "t 4 4"],
+    theirs: Float[Tensor, "n 4 4"],
+    found: Bool[Tensor, " n"],
+    queries: int,
+) -> dict[str, float | NotComputed]:
+    """Median errors of the located frames, once the reference lies on the map by the training frames of both."""
+    names = ("rotation_median_deg", "position_median_pct")
+    to_ours = best_similarity(theirs[queries:], ours) if len(ours) else None
+    if to_ours is None or not len(placed):
+        why = "no test frame was located" if to_ours is not None else "the training frames do not align"
+        return dict.fromkeys(names, NotComputed(why))
+    true = to_ours.poses(theirs[:queries][found[:queries]])
+    turned = torch.rad2deg(rotation_angle(true[:, :3, :3].mT @ placed[:, :3, :3]))
+    moved = (true[:, :3, 3] - placed[:, :3, 3]).norm(dim=-1)
+    centres = ours[:, :3, 3]
+    spread = (centres - centres.mean(0)).norm(dim=-1).square().mean().sqrt()
+    return {names[0]: turned.quantile(0.5).item(), names[1]: 100 * (moved.quantile(0.5) / spread).item()}
+
+
+def _selected(errors: RelativePoseErrors, rows: Bool[Tensor, " pairs"]) -> RelativePoseErrors:
+    return RelativePoseErrors(**{name: values[rows] for name, values in vars(errors).items()})

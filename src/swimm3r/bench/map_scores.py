@@ -1,0 +1,76 @@
+"""The scores of a trained map on held-out frames, as the rendering tables print them."""
+
+import json
+from pathlib import Path
+
+from swimm3r import held_out
+from swimm3r.bench.cells import Scores
+from swimm3r.evaluate import NotComputed
+from swimm3r.io import images
+from swimm3r.progress import Progress, silent
+from swimm3r.run import FinishedSfm
+from swimm3r.splat import train
+from swimm3r.splat.checkpoint import load_map
+from swimm3r.splat.rendering import SplatMap
+from swimm3r.splat.settings import PoseRefinementSettings, SplatSettings
+from swimm3r.splat.views import undistorted
+from swimm3r.summary import truth_section
+
+
+def trained(sfm: FinishedSfm, settings: SplatSettings, folder: Path, progress: Progress = silent) -> SplatMap:
+    """The map in `folder`, trained there where it is not finished yet."""
+    path = folder / "map.safetensors"
+    if path.is_file():
+        scene = load_map(path)
+        if scene.settings == settings:
+            return scene
+    return train(sfm.rec, sfm.frames, settings, folder, progress)
+
+
+def map_scores(
+    sfm: FinishedSfm,
+    scene: SplatMap,
+    poses: dict[str, held_out.FirstPose],
+    folder: Path,
+    test: PoseRefinementSettings,
+    progress: Progress = silent,
+) -> Scores:
+    """Refines each test frame's pose on the frozen map, renders it into folder/test beside NAME_target.png, scores it.
+
+    `poses` are where refinement starts, in the reconstruction's axes. A synthetic dive adds the errors of the clear
+    colours and of the water.
+    """
+    there = held_out.in_axes_of(scene, sfm.rec, poses)
+    views = held_out.score_views(scene, sfm.rec, sfm.frames, there, folder / "test", test, progress)
+    for view in views:
+        f, window = sfm.frames.index(view.name), (view.window.rows, view.window.columns)
+        target, _ = undistorted(sfm.frames.image(f), sfm.frames.mask(f), view.lens, view.canvas)
+        images.write_rgb(folder / "test" / f"{view.name}_target.png", target[window].numpy())
+    mean = held_out.mean_scores(views)
+    scores: dict[str, float | NotComputed] = {
+        "psnr": mean.psnr,
+        "ssim_3dgs": mean.ssim,
+        "lpips_vgg": mean.lpips,
+        "sharpness": mean.sharpness,
+        "blur4_psnr": mean.blur4_psnr,
+        "from_reference_pct": 100 * sum(view.source == "reference" for view in views) / len(views),
+        "train_cpu_seconds": _training_seconds(folder, scene.settings),
+    }
+    if sfm.truth is not None and sfm.truth.medium is not None:
+        of_map = truth_section(sfm.rec, sfm.frames, sfm.truth, scene, views, progress).get("splat")
+        of_map = of_map if isinstance(of_map, dict) else {}
+        for name in ("clear_psnr", "T_D_abs", "B_abs"):
+            value = of_map.get(name)
+            if value is None:
+                value = NotComputed(of_map.get(f"{name}_reason") or "the poses do not align with the truth")
+            scores[name] = sum(value) / len(value) if isinstance(value, list) else value
+    return scores
+
+
+def _training_seconds(folder: Path, settings: SplatSettings) -> float | NotComputed:
+    """By the record of the training, so that a map scored again keeps what it took."""
+    path = folder / "metrics.jsonl"
+    if not path.is_file():
+        return NotComputed("the map came without the record of its training")
+    last = json.loads(path.read_text(encoding="utf-8").splitlines()[-1])
+    return last["cpu_seconds_per_step"] * settings.iterations

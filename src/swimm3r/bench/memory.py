@@ -1,0 +1,38 @@
+"""The most memory a piece of work held."""
+
+import sys
+from collections.abc import Callable
+from pathlib import Path
+from typing import TypeVar
+
+import torch
+
+from swimm3r.evaluate import NotComputed
+
+Result = TypeVar("Result")
+_STATUS, _RESET = Path("/proc/self/status"), Path("/proc/self/clear_refs")
+
+
+def with_peak_mb(work: Callable[[], Result]) -> tuple[Result, dict[str, float | NotComputed]]:
+    """The result, and the peaks while it was made: `peak_mb` of the process, `peak_vram_mb` where CUDA was used.
+
+    The process's peak is what Linux counts from a reset on, so what lay in memory before is in it.
+    """
+    before: NotComputed | None = None
+    try:
+        _RESET.write_text("5")  # VmHWM starts anew from what is resident now
+    except OSError:
+        before = NotComputed(f"{sys.platform} does not let a process reset its peak of memory")
+    cuda = torch.cuda.is_available() and torch.cuda.is_initialized()
+    if cuda:
+        torch.cuda.reset_peak_memory_stats()
+    result = work()
+    peaks: dict[str, float | NotComputed] = {"peak_mb": before if before is not None else _resident_peak_mb()}
+    if torch.cuda.is_available() and torch.cuda.is_initialized():
+        peaks["peak_vram_mb"] = torch.cuda.max_memory_allocated() / 1024**2
+    return result, peaks
+
+
+def _resident_peak_mb() -> float:
+    line = next(line for line in _STATUS.read_text().splitlines() if line.startswith("VmHWM:"))
+    return int(line.split()[1]) / 1024

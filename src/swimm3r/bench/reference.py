@@ -1,0 +1,68 @@
+"""Reference poses where nobody knows the truth: structure from motion of all frames, test frames included.
+
+The paper places test frames by poses of the full sequence, which no method's own training frames could give. They are
+made once per clip, without dense depth and water, and kept in a folder with the key of what they were made of.
+"""
+
+import json
+import shutil
+from dataclasses import asdict, replace
+from hashlib import sha256
+from pathlib import Path
+
+from swimm3r.errors import RegistrationError
+from swimm3r.evaluate import NotComputed
+from swimm3r.frames import Frames
+from swimm3r.ground_truth import GroundTruth, read_ground_truth
+from swimm3r.io import cameras_json
+from swimm3r.io.atomic import write_text
+from swimm3r.progress import Progress, silent
+from swimm3r.run import FinishedSfm
+from swimm3r.sfm import colmap
+from swimm3r.sfm.settings import ColmapSettings
+
+
+def settings_of(sfm: FinishedSfm) -> ColmapSettings:
+    """The run's own where COLMAP found its poses, for they may know the lens; else the defaults."""
+    return sfm.settings.sfm if isinstance(sfm.settings.sfm, ColmapSettings) else ColmapSettings()
+
+
+def whole_clip(
+    frames: Frames, settings: ColmapSettings, folder: Path, progress: Progress = silent
+) -> GroundTruth | NotComputed:
+    """Poses of all frames together, made in `folder` or found there; NotComputed where they cannot be placed."""
+    listing = [(f.name, f.path.stat().st_size) for f in frames]
+    poses_only = {k: v for k, v in asdict(settings).items() if k not in ("depth", "water", "restore", "threads")}
+    key = sha256(json.dumps([listing, poses_only], sort_keys=True, default=str).encode()).hexdigest()
+    record, cameras = folder / "reference.json", folder / "cameras.json"
+    stored = json.loads(record.read_text(encoding="utf-8")) if record.is_file() else {}
+    if stored.get("key") == key:
+        return NotComputed(stored["failed"]) if stored["failed"] else read_ground_truth(cameras)
+    shutil.rmtree(folder, ignore_errors=True)
+    everything = replace(frames, frames=tuple(replace(frame, split="train") for frame in frames))
+    failed = ""
+    try:
+        rec = colmap.reconstruct(everything, settings, folder / "work", progress)
+        table = cameras_json.CameraTable(
+            names=rec.names,
+            width=rec.cameras.width,
+            height=rec.cameras.height,
+            model=rec.cameras.model,
+            K=rec.cameras.K.numpy(),
+            distortion=rec.cameras.distortion.numpy(),
+            cam2world=rec.cameras.cam2world.numpy(),
+            units="scene units",
+        )
+        cameras_json.write_cameras(cameras, table)
+    except RegistrationError as error:
+        failed = f"no reference: {error.what}"
+    shutil.rmtree(folder / "work", ignore_errors=True)
+    write_text(record, json.dumps({"key": key, "failed": failed, "frames": len(frames)}, indent=2) + "\n")
+    return NotComputed(failed) if failed else read_ground_truth(cameras)
+
+
+def digest(reference: GroundTruth | NotComputed) -> str:
+    """Another one for other poses."""
+    if isinstance(reference, NotComputed):
+        return reference.reason
+    return sha256(json.dumps([reference.names, reference.cameras.cam2world.tolist()]).encode()).hexdigest()

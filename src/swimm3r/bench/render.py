@@ -1,0 +1,132 @@
+"""How maps show the frames they never saw: structure from motion x renderer (the paper's Tab. quantitative_comparison).
+
+Every recipe is trained on the same reconstruction and frames. A test frame's pose comes from the structure from motion
+of all frames, brought into the reconstruction's axes by the similarity of the training cameras (Umeyama), and is then
+refined on each frozen map from the same start: the paper's route, after 3R-GS.
+"""
+
+from collections.abc import Sequence
+from dataclasses import asdict, replace
+from functools import partial
+from pathlib import Path
+
+from swimm3r import held_out
+from swimm3r.bench import reference
+from swimm3r.bench.cells import Cell, Place, Scores, kept_cell, over_scenes
+from swimm3r.bench.map_scores import map_scores, trained
+from swimm3r.bench.pictures import stored, write_grid
+from swimm3r.bench.runs import POSES_REFINED, Clip, clips_of
+from swimm3r.bench.scores import columns
+from swimm3r.bench.settings import JobSettings
+from swimm3r.bench.tables import Table
+from swimm3r.evaluate import NotComputed
+from swimm3r.ground_truth import GroundTruth
+from swimm3r.progress import Progress, silent
+from swimm3r.run import FinishedSfm
+from swimm3r.splat.settings import PoseRefinementSettings, Recipe, SplatSettings, UwbsSettings, with_recipe
+
+COLUMNS = columns(
+    "psnr", "ssim_3dgs", "lpips_vgg", "sharpness", "blur4_psnr", "clear_psnr", "T_D_abs", "B_abs",
+    "from_reference_pct", "train_cpu_seconds",
+)  # fmt: skip
+_SEEDS_APART = 1_000
+
+
+def compare_renderers(
+    runs: Sequence[Path],
+    out: Path,
+    recipes: Sequence[Recipe],
+    base: UwbsSettings,
+    seeds: int = 1,
+    poses: bool = False,
+    test: PoseRefinementSettings | None = None,
+    against: str | None = None,
+    how: JobSettings | None = None,
+    progress: Progress = silent,
+) -> Table:
+    """Every recipe at the size and length of `base` on every run; `poses` adds them all with training poses refined.
+
+    Differences are from `against`, by default the first recipe, within the same structure from motion.
+    """
+    clips = clips_of(runs)
+    work = partial(
+        _cells_of_clip,
+        out=out,
+        recipes=tuple(recipes),
+        base=base,
+        seeds=seeds,
+        blocks=(False, True) if poses else (False,),
+        test=test or PoseRefinementSettings(),
+    )
+    cells = over_scenes(clips, work, out, how or JobSettings(), progress)
+    title = "Test frames rendered, by structure from motion and renderer"
+    return Table("render", title, cells, COLUMNS, against or recipes[0])
+
+
+def _cells_of_clip(
+    clip: Clip,
+    /,
+    *,
+    out: Path,
+    recipes: Sequence[Recipe],
+    base: UwbsSettings,
+    seeds: int,
+    blocks: Sequence[bool],
+    test: PoseRefinementSettings,
+    progress: Progress,
+) -> list[Cell]:
+    first = clip.runs[0].open()
+    truth = reference.whole_clip(first.frames, reference.settings_of(first), out / "references" / clip.name, progress)
+    cells = []
+    for run in clip.runs:
+        sfm = run.open()
+        start: dict[str, held_out.FirstPose] = {}
+        for seed in range(seeds):
+            for refined in blocks:
+                for recipe in recipes:
+                    settings = settings_for(base, recipe, refined, seed)
+                    method = f"{run.sfm}{POSES_REFINED if refined else ''} / {recipe}"
+                    depends_on = [sfm.key, recipe, asdict(settings), asdict(test), reference.digest(truth)]
+                    make = partial(_scores, sfm=sfm, settings=settings, test=test, truth=truth, start=start)
+                    place = Place(clip.name, method, seed)
+                    depends_on.append([c.score for c in COLUMNS])
+                    cells.append(kept_cell(out, place, depends_on, partial(make, progress=progress)))
+    for frame in first.frames.test:
+        _side_by_side(out, clip.name, frame.name, cells)
+    return cells
+
+
+def settings_for(base: UwbsSettings, recipe: Recipe, refined: bool, seed: int) -> SplatSettings:
+    """A recipe at the size and length of `base`, its training poses refined where asked."""
+    settings = with_recipe(base, recipe)
+    settings = replace(settings, seed=settings.seed + _SEEDS_APART * seed)
+    return replace(settings, poses=replace(settings.poses, enabled=True)) if refined else settings
+
+
+def _scores(
+    folder: Path,
+    *,
+    sfm: FinishedSfm,
+    settings: SplatSettings,
+    test: PoseRefinementSettings,
+    truth: GroundTruth | NotComputed,
+    start: dict[str, held_out.FirstPose],
+    progress: Progress,
+) -> Scores:
+    if not start:  # the same for every renderer
+        known = None if isinstance(truth, NotComputed) else truth
+        features = sfm.settings.sfm.features
+        start.update(held_out.first_poses(sfm.rec, sfm.frames, features, known, progress))
+    scene = trained(sfm, settings, folder, progress)
+    return map_scores(sfm, scene, start, folder, test, progress)
+
+
+def _side_by_side(out: Path, scene: str, frame: str, cells: Sequence[Cell]) -> None:
+    """OUT/pictures/SCENE/FRAME.png, a row per structure from motion: the frame, then colours and depth of each map."""
+    rows: dict[str, list] = {}
+    for cell in (c for c in cells if c.seed == 0):
+        sfm, recipe = cell.method.split(" / ")
+        shown = Place(scene, cell.method).folder(out) / "test"
+        row = rows.setdefault(sfm, [stored(sfm, shown / f"{frame}_target.png")])
+        row += [stored(recipe, shown / f"{frame}_rgb.png"), stored("depth", shown / f"{frame}_z_depth.png")]
+    write_grid(out / "pictures" / scene / f"{Path(frame).stem}.png", list(rows.values()))

@@ -1,0 +1,103 @@
+"""Run folders as scenes and methods of a table: one scene per clip, one method per way its poses were found."""
+
+import json
+from collections.abc import Sequence
+from dataclasses import dataclass
+from pathlib import Path
+
+from swimm3r.errors import InputError
+from swimm3r.presets import RunSettings
+from swimm3r.progress import Progress, silent
+from swimm3r.run import FinishedSfm, open_finished_sfm, run_pipeline
+from swimm3r.sfm.settings import ColmapModelSettings, ColmapSettings
+
+POSES_REFINED = " + poses"
+"""Ends the name of how poses were found where maps refined them, whatever their recipe says."""
+
+
+@dataclass(frozen=True)
+class SfmRun:
+    """A run folder with finished structure from motion."""
+
+    folder: Path
+    scene: str  # the clip's name
+    sfm: str  # how its poses were found
+    frames: str  # the same for runs that took the same frames in the same way
+
+    def open(self) -> FinishedSfm:
+        """What its map's training finds."""
+        return open_finished_sfm(self.folder)
+
+
+@dataclass(frozen=True)
+class Clip:
+    """One scene with every run of it, the first of which lends its frames and its knowledge of the lens."""
+
+    name: str
+    runs: tuple[SfmRun, ...]
+
+
+def clips_of(folders: Sequence[Path]) -> list[Clip]:
+    """The runs by clip. Two runs of a clip whose poses were found in the same way are told apart by their folders.
+
+    Raises InputError where a folder holds no finished structure from motion, runs of one clip took other frames, or
+    two clips have one name.
+    """
+    found: dict[str, list[SfmRun]] = {}
+    prints: dict[str, str] = {}
+    for folder in folders:
+        settings = open_finished_sfm(folder).settings
+        summary = json.loads((folder / "summary.json").read_text(encoding="utf-8"))
+        source = Path(summary["input"]["path"])
+        name = source.stem if source.suffix and not source.is_dir() else source.name
+        if prints.setdefault(name, summary["input"]["fingerprint"]) != summary["input"]["fingerprint"]:
+            raise InputError(
+                f"two clips have the name {name}",
+                cause="results are kept by the clips' names",
+                hint="another name for one of them, and a run of it under that name",
+            )
+        label = sfm_label(settings, json.loads((folder / "sfm" / "reconstruction.json").read_text())["backend"])
+        frames = summary["stages"]["prepare"]["key"]
+        found.setdefault(name, []).append(SfmRun(folder, name, label, frames))
+    return [Clip(name, _told_apart(runs)) for name, runs in found.items()]
+
+
+def made_runs(
+    inputs: Sequence[Path], out: Path, settings: RunSettings, progress: Progress = silent
+) -> tuple[Path, ...]:
+    """Run folders as they are; of clips, new ones up to their structure from motion in OUT/runs."""
+    runs = []
+    for given in inputs:
+        if not (given / "summary.json").is_file():
+            folder = out / "runs" / given.stem
+            run_pipeline(given, folder, settings, last_stage="sfm", progress=progress)
+            given = folder
+        runs.append(given)
+    return tuple(runs)
+
+
+def sfm_label(settings: RunSettings, backend: str) -> str:
+    """How poses were found, in a word."""
+    match settings.sfm:
+        case ColmapSettings(mapping=mapping) if mapping.method != "auto":
+            return f"{backend}-{mapping.method}"
+        case ColmapModelSettings(model=model):
+            return f"{backend} ({model.name})" if backend == "COLMAP model" else backend
+        case _:
+            return backend
+
+
+def _told_apart(runs: list[SfmRun]) -> tuple[SfmRun, ...]:
+    if len({run.frames for run in runs}) > 1:
+        raise InputError(
+            f"the runs of {runs[0].scene} took different frames",
+            cause="they were made with other --fps, --pick or --long-side, and their scores would not compare",
+            hint="runs of one clip with the same frames, as --preset and the options for frames decide",
+        )
+    labels = [run.sfm for run in runs]
+    return tuple(
+        run
+        if labels.count(run.sfm) == 1
+        else SfmRun(run.folder, run.scene, f"{run.sfm} ({run.folder.resolve().name})", run.frames)
+        for run in runs
+    )

@@ -1,0 +1,64 @@
+"""The columns of the paper's tables. A score's name tells its metric's variant, its note says it in words."""
+
+from dataclasses import dataclass
+from typing import Literal
+
+
+@dataclass(frozen=True)
+class Column:
+    """One score as tables print it."""
+
+    score: str  # its name in cells, CSV and JSON
+    label: str
+    digits: int
+    best: Literal["high", "low", "neither"]
+    note: str = ""  # the variant in words
+
+
+_PAIRS = "pairs i < j, W_i W_j^-1, baselines as lines, an unplaced frame fails its pairs"
+_MAP_PAIRS = f"a test frame with each training frame; {_PAIRS}"
+_QUERY_PAIRS = f"two test frames; {_PAIRS}"
+_EPIPOLAR = "mean of both distances, pixels of the frames, under each method's own poses"
+_DEPTH = "z depth, each frame scaled by its median, mean over frames"
+_AFTER = "over located frames, after the similarity of the training frames"
+_FIRST_POSES = "test frames whose refinement began at the reference's pose; else at one from 2D-3D matches"
+_WATER = "mean over held-out pixels at true ray depth and over channels"
+
+COLUMNS = (
+    Column("psnr", "PSNR", 2, "high", "dB, test frames as 8-bit pictures, their poses refined on the frozen map"),
+    Column("ssim_3dgs", "SSIM", 4, "high", "11 x 11 Gaussian of sigma 1.5, zero padding, as 3DGS"),
+    Column("lpips_vgg", "LPIPS", 4, "low", "v0.1, VGG-16, inputs 0..1 as 3DGS feeds them"),
+    Column("sharpness", "Sharpness", 3, "neither", "mean gradient magnitude, rendering : test frame; 1 is as sharp"),
+    Column("blur4_psnr", "Blurred by 4 px", 2, "neither", "dB of the test frame against itself blurred, sigma 4 px"),
+    Column("clear_psnr", "Clear PSNR", 2, "high", "dB of the picture without water where true T_D > 0.05"),
+    Column("T_D_abs", "T_D error", 4, "low", f"absolute error of the direct transmittance, {_WATER}"),
+    Column("B_abs", "B error", 4, "low", f"absolute error of the backscatter, {_WATER}"),
+    Column("from_reference_pct", "By reference, %", 0, "neither", _FIRST_POSES),
+    Column("train_cpu_seconds", "Training, CPU s", 0, "low", "processor seconds per step times steps"),
+    Column("located_pct", "Located, %", 1, "high", "test frames that were given a pose"),
+    Column("inlier_5px_pct", "Inlier@5px, %", 1, "high", "of query-to-render matches; 0 where not located"),
+    Column("reprojection_px", "Reproj., px", 2, "low", "median over located frames of the median over inliers"),
+    Column("rra2_map", "RRA@2", 1, "high", _MAP_PAIRS),
+    Column("rta5_map", "RTA@5", 1, "high", _MAP_PAIRS),
+    Column("rra15_map", "RRA@15", 1, "high", _MAP_PAIRS),
+    Column("rta15_map", "RTA@15", 1, "high", _MAP_PAIRS),
+    Column("rra2_queries", "RRA@2 (queries)", 1, "high", _QUERY_PAIRS),
+    Column("rta5_queries", "RTA@5 (queries)", 1, "high", _QUERY_PAIRS),
+    Column("rra15_queries", "RRA@15 (queries)", 1, "high", _QUERY_PAIRS),
+    Column("rta15_queries", "RTA@15 (queries)", 1, "high", _QUERY_PAIRS),
+    Column("rotation_median_deg", "Rotation, deg", 3, "low", f"median, {_AFTER}"),
+    Column("position_median_pct", "Position, %", 2, "low", f"median, of the path's spread, {_AFTER}"),
+    *(
+        Column(f"fps_{stage}", f"{stage}, FPS", 2, "high", "frames per second of wall time; other work slows it")
+        for stage in ("retrieve", "coarse", "render", "match", "refine")
+    ),
+    Column("fps_localise", "Loc. FPS", 3, "high", "all stages together"),
+    Column("peak_mb", "Peak, MB", 0, "low", "resident memory of the process while it localised"),
+    Column("peak_vram_mb", "Peak VRAM, MB", 0, "low", "allocated by torch on the GPU while it localised"),
+)
+
+
+def columns(*names: str) -> tuple[Column, ...]:
+    """The columns of these scores."""
+    by_name = {column.score: column for column in COLUMNS}
+    return tuple(by_name[name] for name in names)

@@ -1,0 +1,69 @@
+"""Cells are kept, found again by what they depend on, and say why they are empty; scenes run side by side."""
+
+from functools import partial
+from pathlib import Path
+
+import pytest
+
+from swimm3r.bench.cells import Cell, Place, Scores, kept_cell, over_scenes
+from swimm3r.bench.settings import JobSettings
+from swimm3r.errors import InputError, UsageError, WeightsError
+from swimm3r.evaluate import NotComputed
+from swimm3r.progress import Progress
+
+PLACE = Place("reef", "colmap / + SGG", 2)
+
+
+def test_a_cell_is_computed_once_for_what_it_depends_on(tmp_path: Path):
+    made = []
+
+    def make(folder: Path) -> Scores:
+        made.append(folder)
+        return {"psnr": 20.0 + len(made), "lpips_vgg": NotComputed("no weights"), "fps": float("inf")}
+
+    first = kept_cell(tmp_path, PLACE, ["a", Path("b")], make)
+    assert first.scores["psnr"] == 21.0
+    assert first.scores["lpips_vgg"] == NotComputed("no weights")
+    assert isinstance(first.scores["fps"], NotComputed)
+    assert kept_cell(tmp_path, PLACE, ["a", Path("b")], make) == first
+    assert kept_cell(tmp_path, PLACE, ["a", Path("c")], make).scores["psnr"] == 22.0
+    assert made == [tmp_path / "reef" / "colmap" / "plus-SGG" / "2"] * 2
+
+
+def test_a_method_without_its_weights_is_not_run_and_tried_again(tmp_path: Path):
+    def refuse(folder: Path) -> Scores:
+        raise WeightsError("the weights 'mast3r' are not on this computer", cause="", hint="")
+
+    cell = kept_cell(tmp_path, PLACE, 1, refuse)
+    assert cell == Cell("reef", PLACE.method, 2, {}, "the weights 'mast3r' are not on this computer")
+    assert kept_cell(tmp_path, PLACE, 1, lambda _: {"psnr": 1.0}).scores == {"psnr": 1.0}
+
+
+def names_lead_out(scene: str, /, *, out: Path, progress: Progress) -> list[Cell]:
+    (out / scene).touch()
+    if scene == "b":
+        raise InputError("b is damaged", cause="why", hint="try")
+    return [Cell(scene, "m", 0, {"x": float(ord(scene))})]
+
+
+@pytest.mark.parametrize("jobs", [1, 2])
+def test_scenes_keep_their_order_and_one_error_waits_for_the_others(tmp_path: Path, jobs: int):
+    work = partial(names_lead_out, out=tmp_path)
+    cells = over_scenes(["c", "a"], work, tmp_path, JobSettings(jobs))
+    assert [c.scene for c in cells] == ["c", "a"]
+    with pytest.raises(InputError, match="b is damaged") as raised:
+        over_scenes(["b", "d"], work, tmp_path, JobSettings(jobs))
+    assert (raised.value.cause, raised.value.hint) == ("why", "try")
+    assert (tmp_path / "d").exists()
+
+
+def test_no_scenes_and_no_submitit_are_said_plainly(tmp_path: Path):
+    with pytest.raises(UsageError, match="nothing to measure"):
+        over_scenes([], names_lead_out, tmp_path, JobSettings())
+    with pytest.raises(UsageError, match="submitit"):
+        over_scenes(["a"], partial(names_lead_out, out=tmp_path), tmp_path, JobSettings(slurm=True))
+
+
+def test_names_of_scenes_stay_below_the_folder(tmp_path: Path):
+    assert Place("../../etc", "a/b").folder(tmp_path).is_relative_to(tmp_path)
+    assert ".." not in Place("../../etc", "..").folder(tmp_path).parts

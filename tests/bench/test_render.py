@@ -1,0 +1,81 @@
+"""Recipes on one reconstruction: one start for all, the block with refined poses, pictures side by side."""
+
+import json
+from dataclasses import replace
+from pathlib import Path
+
+import pytest
+
+from swimm3r import held_out
+from swimm3r.bench import reference, tables
+from swimm3r.bench.localisation import maps_of
+from swimm3r.bench.render import compare_renderers, settings_for
+from swimm3r.bench.runs import clips_of, made_runs
+from swimm3r.evaluate import NotComputed
+from swimm3r.io.images import read_rgb
+from swimm3r.presets import RunSettings
+from swimm3r.run import open_finished_sfm
+from swimm3r.splat.settings import PoseRefinementSettings, UwbsSettings
+
+
+def test_every_recipe_starts_from_the_same_poses_of_the_whole_clip(
+    run: Path, tmp_path: Path, tiny: UwbsSettings, quick: PoseRefinementSettings, monkeypatch: pytest.MonkeyPatch
+):
+    truth = open_finished_sfm(run).truth
+    monkeypatch.setattr(reference, "whole_clip", lambda *_: truth)
+    starts, score_views = [], held_out.score_views
+
+    def watched(scene, rec, frames, poses, *rest):
+        starts.append(poses)
+        return score_views(scene, rec, frames, poses, *rest)
+
+    monkeypatch.setattr(held_out, "score_views", watched)
+    held = replace(tiny, poses=replace(tiny.poses, enabled=False))
+    table = compare_renderers([run], tmp_path, ("uwbs-static", "ubs"), held, 1, True, quick)
+    assert [c.method for c in table.cells] == [
+        "truth / uwbs-static", "truth / ubs", "truth + poses / uwbs-static", "truth + poses / ubs",
+    ]  # fmt: skip
+    first, second = starts[:2]
+    assert {name: pose.source for name, pose in first.items()} == dict.fromkeys(first, "reference")
+    assert all((first[name].cam2world == second[name].cam2world).all() for name in first)
+    for cell in table.cells:
+        assert isinstance(cell.scores["psnr"], float)
+        assert cell.scores["from_reference_pct"] == 100
+        assert all(isinstance(cell.scores[name], float) for name in ("clear_psnr", "T_D_abs", "B_abs"))
+    text = tables.write(tmp_path, table)
+    assert "| psnr | truth + poses / ubs | truth + poses / uwbs-static |" in text
+    pictures = sorted((tmp_path / "pictures" / "dive").glob("*.png"))
+    assert len(pictures) == 2
+    assert read_rgb(pictures[0]).shape[0] == 2 * (240 + 22 + 4)
+    found = maps_of(clips_of([run])[0].runs[0], tmp_path)
+    assert {m.method for m in found} == {c.method for c in table.cells}
+
+
+def test_the_block_with_poses_refines_them_in_every_recipe(tiny: UwbsSettings):
+    held = replace(tiny, poses=replace(tiny.poses, enabled=False))
+    assert not settings_for(held, "ubs", False, 0).poses.enabled
+    assert settings_for(held, "ubs", True, 0).poses.enabled
+    assert settings_for(held, "uwbs-dynamic", True, 1).seed != held.seed
+
+
+def test_clips_are_reconstructed_once_and_runs_are_taken_as_they_are(
+    run: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+):
+    made = []
+
+    def run_pipeline(source, folder, settings, *, last_stage, progress):
+        made.append((source, folder, last_stage))
+
+    monkeypatch.setattr("swimm3r.bench.runs.run_pipeline", run_pipeline)
+    clip = tmp_path / "dive.mp4"
+    assert made_runs([run, clip], tmp_path, RunSettings()) == (run, tmp_path / "runs" / "dive")
+    assert made == [(clip, tmp_path / "runs" / "dive", "sfm")]
+
+
+def test_a_clip_that_cannot_be_placed_as_a_whole_is_remembered(run: Path, tmp_path: Path):
+    sfm = open_finished_sfm(run)
+    flat = replace(sfm.frames, frames=sfm.frames.frames[:2])
+    found = reference.whole_clip(flat, reference.settings_of(sfm), tmp_path)
+    assert isinstance(found, NotComputed)
+    assert json.loads((tmp_path / "reference.json").read_text())["failed"] == found.reason
+    assert reference.whole_clip(flat, reference.settings_of(sfm), tmp_path) == found
