@@ -13,7 +13,7 @@ import pytest
 
 from swimm3r import weights
 from swimm3r.errors import StorageError, UsageError, WeightsError
-from swimm3r.weights import Weights
+from swimm3r.weights import Weights, download
 
 BODY = bytes(range(256)) * 4096  # 1 MiB
 
@@ -158,7 +158,7 @@ def test_server_without_ranges_starts_over(server: Server, home: Path):
 
 def test_part_that_was_already_whole_is_taken(server: Server, home: Path, monkeypatch: pytest.MonkeyPatch):
     whole = manifest(server.url)
-    monkeypatch.setattr(weights, "_verify", lambda *a: (_ for _ in ()).throw(KeyboardInterrupt))
+    monkeypatch.setattr(download, "compare", lambda *a: (_ for _ in ()).throw(KeyboardInterrupt))
     with pytest.raises(KeyboardInterrupt):
         weights.fetch("net", manifest=whole)
     monkeypatch.undo()
@@ -200,7 +200,7 @@ def test_offline_failure_is_quick_and_says_what_to_bring(home: Path):
 def test_silent_server_is_given_up_within_five_seconds_even_when_resuming(
     server: Server, home: Path, monkeypatch: pytest.MonkeyPatch
 ):
-    monkeypatch.setattr(weights, "_ANSWER_SECONDS", 0.5)
+    monkeypatch.setattr(download, "_ANSWER_SECONDS", 0.5)
     server.silent_seconds = 3.0
     home.mkdir(parents=True)
     (home / "net.bin.part").write_bytes(BODY[:1000])
@@ -304,7 +304,7 @@ def test_unknown_name_is_a_usage_error():
 
 def test_full_disk_is_a_storage_error(server: Server, home: Path, monkeypatch: pytest.MonkeyPatch):
     usage = type("Usage", (), {"free": 1000})()
-    monkeypatch.setattr(weights.shutil, "disk_usage", lambda folder: usage)
+    monkeypatch.setattr(download.shutil, "disk_usage", lambda folder: usage)
     with pytest.raises(StorageError, match="has room for 0 MB"):
         weights.fetch("net", manifest=manifest(server.url))
 
