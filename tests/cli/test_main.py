@@ -1,6 +1,8 @@
 """Exit codes and messages, as a user meets them."""
 
 import json
+import subprocess
+import sys
 from pathlib import Path
 
 import numpy as np
@@ -52,6 +54,15 @@ def test_ctrl_c_is_exit_130_and_says_that_nothing_is_lost(
     code, message = outcome(capsys, "run", str(tmp_path), "--out", str(tmp_path / "run"))
     assert code == 130
     assert "goes on from here" in message
+
+
+def test_output_that_nobody_reads_on_is_no_fault():
+    """As of `swimm3r run --help | head`."""
+    command = [sys.executable, "-m", "swimm3r", "run", "--help"]
+    with subprocess.Popen(command, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True) as process:
+        process.stdout.close()
+        assert process.stderr.read() == ""
+    assert process.returncode == 141
 
 
 def test_a_folder_that_cannot_be_written_is_exit_7(capsys: pytest.CaptureFixture[str], tmp_path: Path):

@@ -28,7 +28,7 @@ from swimm3r.sfm.training.settings import RECIPES as SFM_RECIPES
 from swimm3r.splat.settings import RECIPES as MAP_RECIPES
 
 Name = TypeVar("Name", bound=str)
-_INTERRUPTED = 130
+_INTERRUPTED, _UNREAD = 130, 141  # 128 + SIGINT, SIGPIPE
 _STORAGE_ERRORS = {errno.ENOSPC, errno.EDQUOT, errno.EROFS, errno.EACCES, errno.EPERM, errno.EFBIG}
 
 
@@ -69,6 +69,9 @@ def main(arguments: Sequence[str] | None = None) -> None:
     except KeyboardInterrupt:
         print("\nInterrupted. What is finished is kept: the same command goes on from here.", file=sys.stderr)
         raise SystemExit(_INTERRUPTED) from None
+    except BrokenPipeError:  # of `swimm3r ... | head`: nobody reads on
+        os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
+        raise SystemExit(_UNREAD) from None
     except OSError as error:
         if error.errno not in _STORAGE_ERRORS:
             raise
