@@ -1,5 +1,7 @@
 """The paper's protocol on a map that is exactly known."""
 
+from dataclasses import replace
+
 import pytest
 import torch
 
@@ -9,8 +11,12 @@ from swimm3r.geometry import pose_from, rotation_angle, so3_exp
 from swimm3r.localization.batch import Query, answer, match_picture, tum_line
 from swimm3r.localization.matchers import Mast3rMatcher, SiftMatcher
 from swimm3r.localization.protocol import STAGES, Localizer
+from swimm3r.localization.references import rendered
 from swimm3r.localization.settings import LocalizationSettings
 from swimm3r.sfm.settings import FeatureSettings
+from swimm3r.splat.medium_field import initial_field
+from swimm3r.splat.primitives import with_time
+from swimm3r.splat.settings import InitialSettings
 
 SETTINGS = LocalizationSettings(matcher="sift", candidates=3, features=FeatureSettings(count=800))
 
@@ -49,6 +55,18 @@ def test_the_map_alone_is_enough(place):
     degrees, distance = off(pose, place.cameras.cam2world[2])
     assert degrees < 0.1
     assert distance < 0.005
+
+
+def test_a_dynamic_map_is_shown_at_the_pictures_time_and_half_way_through_the_clip_where_nobody_knows(place):
+    p = with_time(place.scene.primitives, InitialSettings(time_scale=0.4), torch.Generator().manual_seed(0))
+    field = initial_field(None, place.scene.settings.medium, torch.Generator().manual_seed(0), dynamic=True)
+    scene = replace(
+        place.scene, primitives=p, field=field, settings=replace(place.scene.settings, dynamic=True), span=(0.0, 1.0)
+    )
+    lens = place.cameras[2]
+    shown = {time: rendered(scene, lens, 0, 0.5, time).rgb for time in (0.0, 0.5, None)}
+    assert torch.equal(shown[None], shown[0.5])
+    assert (shown[0.0] - shown[0.5]).abs().max() > 0.05
 
 
 def test_a_smaller_copy_of_a_picture_is_placed_and_another_shape_needs_its_lens(place, localizer: Localizer):

@@ -20,12 +20,14 @@ def localize(
     frames: "Frames | None" = None,
     lens: "Cameras | None" = None,
     settings: "LocalizationSettings | None" = None,
+    time: float | None = None,
 ) -> "Float[Tensor, '4 4']":
     """cam2world of one picture, in the axes and unit of `rec`. Raises RegistrationError where it cannot be placed.
 
     The query is first matched with training pictures: `frames` has them; without, the map's renderings from the same
-    poses take their place. `lens` is the picture's camera (its pose unused), by default that of the reconstruction.
+    poses take their place. `lens` is the picture's camera (its pose unused), by default that of the reconstruction;
+    `time`, seconds of the clip, is the moment at which a dynamic map is shown.
     """
     from swimm3r.localization.protocol import Localizer
 
-    return Localizer(scene, rec, frames, settings).locate(image, lens=lens).cam2world
+    return Localizer(scene, rec, frames, settings).locate(image, lens=lens, time=time).cam2world

@@ -38,6 +38,7 @@ class Query:
     time: float  # seconds; the number of the picture where it has none
     picture: Float[Tensor, "h w 3"]
     mask: Bool[Tensor, "h w"] | None = None
+    moment: float | None = None  # seconds of the map's clip, where the picture is part of it
 
 
 @dataclass(frozen=True)
@@ -81,7 +82,8 @@ def localize_run(
             query = Query(name, float(i), _picture(pictures[i]))
         else:
             f = frames.index(name)
-            query = Query(name, frames.frames[f].time, frames.image(f), frames.mask(f))
+            time = frames.frames[f].time
+            query = Query(name, time, frames.image(f), frames.mask(f), time)
         answers.append(answer(localizer, query, camera))
         found = answers[-1].found
         if found is not None and found.evidence is not None:
@@ -100,7 +102,8 @@ def localize_run(
 def answer(localizer: Localizer, query: Query, lens: Cameras | None = None) -> Answer:
     """The query's place, or the reason why none was found."""
     try:
-        return Answer(query.name, query.time, localizer.locate(query.picture, query.mask, lens))
+        found = localizer.locate(query.picture, query.mask, lens, query.moment)
+        return Answer(query.name, query.time, found)
     except RegistrationError as failure:
         return Answer(query.name, query.time, None, failure.what)
 

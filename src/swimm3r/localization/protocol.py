@@ -9,11 +9,11 @@
 The renderer is whatever map there is; where the last step finds too few inliers, the coarse pose stands.
 """
 
-import time
 from collections.abc import Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass, field, replace
 from functools import lru_cache
+from time import perf_counter
 from typing import Any, Literal
 
 import torch
@@ -91,8 +91,11 @@ class Localizer:
         picture: Float[Tensor, "h w 3"],
         mask: Bool[Tensor, "h w"] | None = None,
         lens: Cameras | None = None,
+        time: float | None = None,
     ) -> Localization:
         """The pose of one picture (0..1), taken through `lens` (its pose unused), by default the reconstruction's.
+
+        `time`, seconds of the clip, matters to dynamic maps: it is the moment they are shown at, where it is known.
 
         Raises RegistrationError where too few matches agree on any pose, InputError where the picture's shape is not
         that of the reconstruction's frames and no lens is given.
@@ -117,7 +120,7 @@ class Localizer:
         pose, coarse_inliers = found
         best = Localization(pose, "coarse", candidates, coarse_inliers, 0, 0, None, None, seconds)
         for _ in range(s.rounds):
-            refined = self._refined(picture, mask, replace(lens, cam2world=best.cam2world[None]), seconds)
+            refined = self._refined(picture, mask, replace(lens, cam2world=best.cam2world[None]), time, seconds)
             best = replace(best, matches=refined.matches, evidence=refined.evidence)
             if refined.inliers < s.min_inliers:
                 break
@@ -152,12 +155,17 @@ class Localizer:
         return self._pose(torch.cat(pixels), torch.cat(points), lens, self.settings.max_error)[0]
 
     def _refined(
-        self, picture: Float[Tensor, "h w 3"], mask: Bool[Tensor, "h w"], lens: Cameras, seconds: dict[str, float]
+        self,
+        picture: Float[Tensor, "h w 3"],
+        mask: Bool[Tensor, "h w"],
+        lens: Cameras,
+        time: float | None,
+        seconds: dict[str, float],
     ) -> Localization:
         """One round of rendering, matching and PnP from the pose of `lens`."""
         s = self.settings
         with _timed(seconds, "render"):
-            reference = rendered(self.scene, lens, self.long_side, s.min_alpha)
+            reference = rendered(self.scene, lens, self.long_side, s.min_alpha, time)
         with _timed(seconds, "match"):
             canvas = pinhole_canvas(lens, self.long_side)
             shown, usable = undistorted(picture, mask, lens, canvas)
@@ -195,8 +203,8 @@ class Localizer:
 @contextmanager
 def _timed(seconds: dict[str, float], stage: str) -> Iterator[None]:
     """Adds the time its block takes."""
-    started = time.perf_counter()
+    started = perf_counter()
     try:
         yield
     finally:
-        seconds[stage] += time.perf_counter() - started
+        seconds[stage] += perf_counter() - started

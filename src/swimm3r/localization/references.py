@@ -68,10 +68,13 @@ class RenderedReferences:
         return rendered(self.scene, self.rec.cameras[self.rec.index(name)], self.long_side, self.min_alpha)
 
 
-def rendered(scene: SplatMap, lens: Cameras, long_side: int, min_alpha: float) -> Reference:
-    """The map from a camera's pose on its pinhole canvas; depth where the map covers at least `min_alpha`."""
+def rendered(scene: SplatMap, lens: Cameras, long_side: int, min_alpha: float, time: float | None = None) -> Reference:
+    """The map from a camera's pose on its pinhole canvas; depth where the map covers at least `min_alpha`.
+
+    A dynamic map is shown at `time`, seconds of its clip, or half way through where nobody knows it.
+    """
     canvas = pinhole_canvas(lens, long_side)
-    out = scene.render(canvas, sum(scene.span) / 2)  # nobody knows when in the clip a stranger's picture was taken
+    out = scene.render(canvas, sum(scene.span) / 2 if time is None else time)
     covered = out.alpha > min_alpha
     camera = replace(canvas, cam2world=canvas.cam2world.double())
     return Reference(camera, out.rgb.clamp(0, 1), torch.ones_like(covered), torch.where(covered, out.z_depth, 0.0))
