@@ -26,6 +26,7 @@ from swimm3r.splat.projection import pinhole, project
 from swimm3r.splat.recipes import uwbs
 from swimm3r.splat.rendering import Drawing
 from swimm3r.splat.settings import UwbsSettings
+from swimm3r.splat.state import first_state, parameters_of
 from swimm3r.splat.views import View
 
 
@@ -76,7 +77,7 @@ def measure(size: Size, repeats: int) -> dict[str, float]:
     height, width = size.height, size.width
     recipe = uwbs.Uwbs(settings, None, 1.0, 1.0, None)  # the reconstruction is read at the start only
     p, field = lifted(size), initial_field(None, settings.medium, rng)
-    state = uwbs.State(p, field, None, {name: fresh(t) for name, t in uwbs._parameters(p, field).items()})
+    state = first_state(p, field, None)
     prior = 1 + 9 * torch.rand(height, width, generator=rng)
     view = View(
         "benchmark", camera(size), torch.rand(3, height, width, generator=rng),
@@ -113,7 +114,7 @@ def measure(size: Size, repeats: int) -> dict[str, float]:
         loss = uwbs.objective(leaves, drawing, view, settings, None, True).total
         torch.autograd.grad(loss, [*drawn, leaves.opacity, leaves.scale], allow_unused=True)
 
-    parameters = uwbs._parameters(BetaPrimitives(*(t.clone() for t in p)), field)
+    parameters = parameters_of(BetaPrimitives(*(t.clone() for t in p)), field)
     moments = {name: fresh(t) for name, t in parameters.items()}
     gradients = {name: torch.randn(t.shape, generator=rng) for name, t in parameters.items()}
     rates = recipe._rates(1)

@@ -25,7 +25,7 @@ if TYPE_CHECKING:
     from swimm3r.splat import train
     from swimm3r.splat.checkpoint import load_map
     from swimm3r.splat.rendering import SplatMap
-    from swimm3r.splat.settings import UwbsSettings, ubs, uwbs
+    from swimm3r.splat.settings import McmcGsSettings, UwbsSettings, mcmc_gs, threers_gs, ubs, uwbs
     from swimm3r.synthetic import DiveSettings, write_dive
 
 _HOME = {
@@ -45,7 +45,10 @@ _HOME = {
     "ColmapSettings": "sfm.settings",
     "Mast3rSettings": "sfm.settings",
     "SplatMap": "splat.rendering",
+    "McmcGsSettings": "splat.settings",
     "UwbsSettings": "splat.settings",
+    "mcmc_gs": "splat.settings",
+    "threers_gs": "splat.settings",
     "load_map": "splat.checkpoint",
     "train": "splat",
     "ubs": "splat.settings",
@@ -61,6 +64,7 @@ __all__ = [
     "FrameSettings",
     "LocalizationSettings",
     "Mast3rSettings",
+    "McmcGsSettings",
     "Medium",
     "MediumFit",
     "Reconstruction",
@@ -70,10 +74,12 @@ __all__ = [
     "add_water",
     "load_map",
     "localize",
+    "mcmc_gs",
     "read_frames",
     "reconstruct",
     "remove_water",
     "run_pipeline",
+    "threers_gs",
     "train",
     "ubs",
     "uwbs",

@@ -54,7 +54,7 @@ class RunSettings:
 
 
 def to_yaml(settings: RunSettings) -> str:
-    """Every setting by name; the back end is named by `kind`."""
+    """Every setting by name; the back end and the kind of map are named by `kind`."""
     import yaml
 
     return yaml.safe_dump(_converter().unstructure(settings), sort_keys=False)
@@ -83,6 +83,7 @@ def _converter() -> "Converter":
     converter.register_unstructure_hook(Path, str)
     converter.register_structure_hook(Path, lambda value, _: Path(value))
     configure_tagged_union(SfmSettings, converter, tag_name="kind")
+    configure_tagged_union(SplatSettings, converter, tag_name="kind", default=UwbsSettings)  # the only kind there was
     return converter
 
 

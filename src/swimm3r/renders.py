@@ -128,7 +128,7 @@ def moments_of(scene: SplatMap, names: Sequence[str], frames: Frames, time: floa
 
     Raises InputError where a dynamic map is to be shown at a moment that is not known.
     """
-    if time is not None or not scene.settings.dynamic:
+    if time is not None or not scene.primitives.dynamic:
         return [time or 0.0] * len(names)
     taken = {frame.name: frame.time for frame in frames}
     strangers = [name for name in names if name not in taken]

@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 
 from swimm3r.cli.main import main
-from swimm3r.splat.settings import recipe_of
+from swimm3r.splat.settings import RECIPES, recipe_of
 
 
 def outcome(capsys: pytest.CaptureFixture[str], *arguments: str) -> tuple[int, str]:
@@ -91,7 +91,7 @@ def test_a_recipe_and_a_transforms_json_reach_the_pipeline(tmp_path: Path, monke
     asked = []
     monkeypatch.setattr("swimm3r.run.run_pipeline", lambda *given, **_: asked.append(given) or {})
     monkeypatch.setattr("swimm3r.cli.run.print_summary", lambda *_: None)
-    for recipe in ("uwbs-static", "uwbs-dynamic", "ubs"):
+    for recipe in RECIPES:
         main(["splat", "--transforms", str(tmp_path / "transforms.json"), "--recipe", recipe, "--out", "run"])
         source, _, settings = asked[-1]
         assert source == tmp_path / "images"

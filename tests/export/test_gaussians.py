@@ -7,12 +7,20 @@ import pytest
 import torch
 
 from swimm3r.cameras import Cameras
-from swimm3r.export.gaussians import Gaussians, clear_difference, draw_gaussians, moment_matched, write_ply
+from swimm3r.export.gaussians import (
+    Gaussians,
+    clear_difference,
+    clear_gaussians,
+    draw_gaussians,
+    moment_matched,
+    write_ply,
+)
 from swimm3r.raster import Primitives2D, rasterize
+from swimm3r.splat.gaussians import GaussianPrimitives, seen_colour
 from swimm3r.splat.medium_field import initial_field
 from swimm3r.splat.primitives import BetaPrimitives, inverse_softplus
 from swimm3r.splat.rendering import SplatMap
-from swimm3r.splat.settings import MediumFieldSettings, UwbsSettings
+from swimm3r.splat.settings import MediumFieldSettings, UwbsSettings, mcmc_gs
 
 PARTS = {"f_dc": 3, "opacity": 0, "scale": 3, "rot": 4}
 FIELDS = ["x", "y", "z", "nx", "ny", "nz"]
@@ -43,7 +51,9 @@ def gaussians(n: int = 5) -> Gaussians:
     rng = torch.Generator().manual_seed(0)
     A = 0.2 * torch.randn(n, 3, 3, generator=rng)
     xyz = torch.randn(n, 3, generator=rng) * 0.3 + torch.tensor([0.0, 0.0, 4.0])
-    return Gaussians(xyz, torch.rand(n, 3, generator=rng), torch.rand(n, generator=rng) * 0.9, A @ A.mT)
+    return Gaussians(
+        xyz, torch.rand(n, 3, generator=rng), torch.rand(n, generator=rng) * 0.9, A @ A.mT, torch.zeros(n, 0, 3)
+    )
 
 
 def test_on_the_image_plane_mass_and_second_moments_are_those_of_the_beta_kernel():
@@ -114,3 +124,45 @@ def test_the_wall_looks_like_itself_as_gaussians():
     faint = clear_difference(scene, replace(g, opacity=0.3 * g.opacity), camera())
     assert faint.psnr < lost.psnr
     assert faint.alpha < -0.02
+
+
+def gaussian_wall() -> SplatMap:
+    """The wall in Gaussians whose colours change with the direction."""
+    rng = torch.Generator().manual_seed(1)
+    of, n = wall(600), 600
+    assert isinstance(of.primitives, BetaPrimitives)
+    p = GaussianPrimitives(
+        of.primitives.xyz, torch.randn(n, 4, generator=rng), torch.full((n, 3), -2.5), of.primitives.opacity,
+        torch.randn(n, 3, generator=rng), 0.2 * torch.randn(n, 15, 3, generator=rng),
+    )  # fmt: skip
+    field = initial_field(None, MediumFieldSettings(model="none"), rng)
+    return SplatMap(p, field, mcmc_gs(), True)
+
+
+def test_gaussians_leave_as_they_are():
+    scene = gaussian_wall()
+    g = clear_gaussians(scene, camera())
+    difference = clear_difference(scene, g, camera())
+    assert difference.psnr > 60
+    assert abs(difference.alpha) < 1e-4
+
+
+def test_viewers_see_the_harmonics_with_their_own_signs(tmp_path):
+    """3DGS's degree 1 is C1 (-y, z, -x), its coefficients stand channel by channel."""
+    scene = gaussian_wall()
+    p = scene.primitives._replace(harmonics=scene.primitives.harmonics.clone())
+    p.harmonics[:, 3:] = 0
+    g = clear_gaussians(replace(scene, primitives=p), camera())
+    write_ply(tmp_path / "g.ply", g)
+    head, _, body = (tmp_path / "g.ply").read_bytes().partition(b"end_header\n")
+    names = [line.split()[-1] for line in head.decode().split("\n") if line.startswith("property")]
+    assert [name for name in names if name.startswith("f_rest")] == [f"f_rest_{k}" for k in range(45)]
+    v = np.frombuffer(body, [(name, "<f4") for name in names])
+    eye = torch.tensor([0.4, -0.3, 0.1])
+    x, y, z = torch.nn.functional.normalize(g.xyz - eye, dim=-1).numpy().T
+    expected = seen_colour(p, eye).numpy()
+    for c in range(3):
+        k = [v[f"f_rest_{15 * c + i}"] for i in range(3)]
+        along = 0.4886025119029199 * (-y * k[0] + z * k[1] - x * k[2])
+        seen = np.maximum(0.5 + 0.28209479177387814 * v[f"f_dc_{c}"] + along, 0)
+        np.testing.assert_allclose(seen, expected[:, c], atol=1e-5)

@@ -13,8 +13,7 @@ from swimm3r.io.cameras_json import read_cameras
 from swimm3r.reconstruction import Matches
 from swimm3r.splat import pose_codes, train
 from swimm3r.splat.checkpoint import load_map
-from swimm3r.splat.pose_codes import PoseCodes, epipolar_loss, epipolar_matches, training_stations
-from swimm3r.splat.recipes.uwbs import pose_rate
+from swimm3r.splat.pose_codes import PoseCodes, epipolar_loss, epipolar_matches, pose_rate, training_stations
 from swimm3r.splat.rendering import SplatMap
 from swimm3r.splat.settings import DensifySettings, InitialSettings, TrainingPoseSettings, UwbsSettings
 from swimm3r.splat.views import TrainingViews
@@ -124,9 +123,9 @@ def test_disturbed_poses_recover_while_the_map_is_trained(tiny_dive, tmp_path):
 
 
 def test_short_runs_step_farther_and_the_papers_is_exact():
-    assert pose_rate(UwbsSettings()) == 1.5e-4
-    assert pose_rate(UwbsSettings(iterations=2_000)) == pytest.approx(1.5e-3)
-    assert pose_rate(UwbsSettings(iterations=10)) == 2e-3
+    assert pose_rate(TrainingPoseSettings(), 20_000) == 1.5e-4
+    assert pose_rate(TrainingPoseSettings(), 2_000) == pytest.approx(1.5e-3)
+    assert pose_rate(TrainingPoseSettings(), 10) == 2e-3
 
 
 def test_poses_that_are_held_stay(tiny_dive, tmp_path):

@@ -8,7 +8,7 @@ from tyro.conf import arg
 
 from swimm3r.cli.console import drawn_progress, print_summary
 from swimm3r.presets import PRESETS
-from swimm3r.splat.settings import Recipe, with_recipe
+from swimm3r.splat.settings import Recipe, UwbsSettings, with_recipe
 from swimm3r.synthetic.settings import DiveSettings
 
 
@@ -21,10 +21,12 @@ def demo(
 
     Args:
         out: the run folder; the dive itself goes to OUT-dive beside it.
-        recipe: uwbs-static; uwbs-dynamic, whose map changes with time; ubs, Beta splatting without the water.
+        recipe: uwbs-static; uwbs-dynamic, whose map changes with time; or another method on the same start.
         dive: what the synthetic dive looks like.
     """
-    settings = replace(PRESETS["default"], splat=with_recipe(PRESETS["fast"].splat, recipe))
+    size = PRESETS["fast"].splat
+    assert isinstance(size, UwbsSettings)
+    settings = replace(PRESETS["default"], splat=with_recipe(size, recipe))
     from swimm3r.run import run_pipeline
     from swimm3r.synthetic import write_dive
 

@@ -23,10 +23,12 @@ _FLAT = arg(name="")  # --fps, not --frames.fps; what lies deeper keeps its pref
 def commands_for_preset(name: str, backend: str = "colmap", recipe: Recipe = "uwbs-static") -> dict[str, Callable]:
     """The commands that share the pipeline's settings, with the defaults of a preset, a back end and a recipe."""
     defaults = PRESETS[name]
+    assert isinstance(defaults.splat, UwbsSettings)
     defaults = replace(defaults, splat=with_recipe(defaults.splat, recipe))
     assert isinstance(defaults.sfm, ColmapSettings)
     sfm_defaults = MAST3R_PRESETS[name] if backend != "colmap" else defaults.sfm
     sfm_settings = Annotated[type(sfm_defaults), _FLAT]
+    map_settings = type(defaults.splat)
 
     def prepare(
         source: Positional[Path],
@@ -83,7 +85,7 @@ def commands_for_preset(name: str, backend: str = "colmap", recipe: Recipe = "uw
         reference: Path | None = None,
         frames: Annotated[FrameSettings, _FLAT] = defaults.frames,
         sfm: Annotated[ColmapSettings, _FLAT] = defaults.sfm,
-        splat: UwbsSettings = defaults.splat,
+        splat: map_settings = defaults.splat,
         test: PoseRefinementSettings = defaults.test,
     ) -> None:
         """A map of a dive, or of any COLMAP model: swimm3r splat --colmap sparse/0 --images pictures/ --out RUN.
@@ -96,7 +98,8 @@ def commands_for_preset(name: str, backend: str = "colmap", recipe: Recipe = "uw
             images: the pictures it was made of; its names are relative to this folder. Those that a transforms.json
                 names are found without.
             preset: what the other defaults aim at.
-            recipe: uwbs-static; uwbs-dynamic, whose map changes with time; ubs, Beta splatting without the water.
+            recipe: uwbs-static; uwbs-dynamic, whose map changes with time; or another method on the same start.
+                `--recipe NAME --help` shows its options.
             reference: a cameras.json with poses to compare with.
             frames: which frames to take.
             sfm: how poses, depth and water are found; with --colmap, depth and water alone.
@@ -132,7 +135,7 @@ def commands_for_preset(name: str, backend: str = "colmap", recipe: Recipe = "uw
         reference: Path | None = None,
         frames: Annotated[FrameSettings, _FLAT] = defaults.frames,
         sfm: sfm_settings = sfm_defaults,
-        splat: UwbsSettings = defaults.splat,
+        splat: map_settings = defaults.splat,
         test: PoseRefinementSettings = defaults.test,
     ) -> None:
         """Everything, from a clip to the report page. The same command again goes on where it was interrupted.
@@ -143,7 +146,8 @@ def commands_for_preset(name: str, backend: str = "colmap", recipe: Recipe = "uw
             preset: what the other defaults aim at.
             backend: how poses and depth are found; mast3r needs weights, swimm3r an adapter, too. `--backend mast3r
                 --help` shows its options.
-            recipe: uwbs-static; uwbs-dynamic, whose map changes with time; ubs, Beta splatting without the water.
+            recipe: uwbs-static; uwbs-dynamic, whose map changes with time; or another method on the same start.
+                `--recipe NAME --help` shows its options.
             reference: a cameras.json with poses to compare with.
             frames: which frames to take.
             sfm: how poses, depth and water are found.

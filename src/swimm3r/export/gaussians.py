@@ -1,12 +1,12 @@
-"""A Beta map as Gaussians that 3DGS viewers show: without its water, from one side, at one moment, with equal moments.
+"""A map as Gaussians that 3DGS viewers show, without its water.
 
-A Beta splat of exponent B on the ellipse of covariance S has on the image plane the mass and the second moments of a
-Gaussian with (uwbs.md 1.4)
+Gaussians leave as they are, their harmonics with the Condon-Shortley sign that viewers expect. A Beta splat of exponent
+B on the ellipse of covariance S has on the image plane the mass and the second moments of a Gaussian with (uwbs.md 1.4)
 
     covariance S / (2 (B + 2)),   peak o (B + 2) / (B + 1), at most 0.999
 
-A viewer's Gaussian knows neither direction nor time, so S is that seen from the mean direction of the cameras that have
-the primitive in their picture, and o their mean. How much is lost is measured: `clear_difference`.
+A viewer's Gaussian knows neither conditioned direction nor time, so S is that seen from the mean direction of the
+cameras that have the primitive in their picture, and o their mean. How much is lost is measured: `clear_difference`.
 """
 
 from dataclasses import dataclass
@@ -27,12 +27,15 @@ from swimm3r.raster import ALPHA_MAX, ALPHA_MIN, RasterOutput, rasterize
 from swimm3r.reconstruction import cameras_of
 from swimm3r.splat.checkpoint import load_map
 from swimm3r.splat.conditioning import Conditioned, condition, queries, symmetric
-from swimm3r.splat.primitives import select
+from swimm3r.splat.gaussians import coloured, covariance
+from swimm3r.splat.primitives import BetaPrimitives, select
 from swimm3r.splat.projection import pinhole, project, project_conditioned
 from swimm3r.splat.rendering import SplatMap, in_scene_units
+from swimm3r.splat.settings import RenderSettings
+from swimm3r.splat.spherical import Y_00
 from swimm3r.splat.views import pinhole_canvas
 
-_SH0 = 0.28209479177387814  # the constant spherical harmonic: colour = 0.5 + _SH0 f_dc
+_CONDON_SHORTLEY = [(-1.0) ** m for degree in (1, 2, 3) for m in range(-degree, degree + 1)]
 _ASKED = 64  # cameras, spread over the dive, that say which way a primitive is looked at
 _COMPARED = 8  # of them
 _FLATTEST = 1e-6  # a scale of this share of the largest, at least: viewers divide by it
@@ -43,9 +46,10 @@ class Gaussians:
     """Clear splats in the axes and unit of the reconstruction."""
 
     xyz: Float[Tensor, "n 3"]
-    rgb: Float[Tensor, "n 3"]  # without the water, not bounded
+    rgb: Float[Tensor, "n 3"]  # without the water, not bounded; the mean over all directions
     opacity: Float[Tensor, " n"]  # peak, 0..1
     covariance: Float[Tensor, "n 3 3"]
+    harmonics: Float[Tensor, "n h 3"]  # of the colour from degree 1 on (splat.spherical); none of Beta maps
 
 
 @dataclass(frozen=True)
@@ -56,13 +60,28 @@ class ClearDifference:
     alpha: float  # mean difference of opacity, Gaussians minus map
 
 
+def clear_gaussians(scene: SplatMap, cameras: Cameras, time: float | None = None) -> Gaussians:
+    """The map's primitives as Gaussians, Beta ones as `cameras` see them on average; what is too faint is left out.
+
+    Raises ValueError where a dynamic map is given no time.
+    """
+    p = scene.primitives
+    if isinstance(p, BetaPrimitives):
+        return moment_matched(scene, cameras, time)
+    p = select(p, torch.sigmoid(p.opacity) >= ALPHA_MIN)
+    peak = torch.sigmoid(p.opacity).clamp(max=ALPHA_MAX)
+    return Gaussians(p.xyz, 0.5 + Y_00 * p.colour, peak, covariance(p), p.harmonics)
+
+
 def moment_matched(scene: SplatMap, cameras: Cameras, time: float | None = None) -> Gaussians:
-    """The map's primitives as `cameras` see them on average, those too faint to see left out.
+    """A Beta map's primitives as `cameras` see them on average, those too faint to see left out.
 
     Raises ValueError where a dynamic map is given no time.
     """
     now, settings = scene.moment(time), in_scene_units(scene.settings, scene.length).render
     p = scene.primitives
+    assert isinstance(p, BetaPrimitives)
+    assert isinstance(settings, RenderSettings)
     direction, share, seen = (torch.zeros(len(p.xyz), k) for k in (3, 1, 1))
     with torch.no_grad():
         for i in range(len(cameras)):
@@ -82,22 +101,25 @@ def moment_matched(scene: SplatMap, cameras: Cameras, time: float | None = None)
         state = condition(p, query, settings.rotation)
         B = 4 * torch.exp(p.beta[:, 0])
         peak = ((share / seen.clamp(min=1))[found, 0] * (B + 2) / (B + 1)).clamp(max=ALPHA_MAX)
-        covariance = symmetric(state.covariance, settings.covariance) / (2 * (B + 2))[:, None, None]
+        shape = symmetric(state.covariance, settings.covariance) / (2 * (B + 2))[:, None, None]
         visible = peak >= ALPHA_MIN
-    return Gaussians(state.mean[visible], p.rgb[visible], peak[visible], covariance[visible])
+    none = torch.zeros(int(visible.sum()), 0, 3)
+    return Gaussians(state.mean[visible], p.rgb[visible], peak[visible], shape[visible], none)
 
 
 def write_ply(path: Path, g: Gaussians) -> None:
-    """The Gaussians as 3DGS stores them, spherical harmonics of degree 0: logits, log scales, quaternions wxyz."""
+    """The Gaussians as 3DGS stores them: logits, log scales, quaternions wxyz, harmonics channel by channel."""
     variance, axes = torch.linalg.eigh(g.covariance.double())
     scale = variance.clamp(min=0).sqrt()
     scale = scale.clamp(min=_FLATTEST * scale.amax(-1, keepdim=True)).clamp(min=1e-12)
     axes = axes * torch.linalg.det(axes).sign()[:, None, None]  # a rotation, not a reflection
     quaternion = quaternion_from_rotation(axes)
+    signed = g.harmonics * torch.tensor(_CONDON_SHORTLEY[: g.harmonics.shape[1]])[:, None]
     columns = {
         **{name: g.xyz[:, k] for k, name in enumerate("xyz")},
         **{f"n{name}": torch.zeros(len(g.xyz)) for name in "xyz"},
-        **{f"f_dc_{k}": (g.rgb[:, k] - 0.5) / _SH0 for k in range(3)},
+        **{f"f_dc_{k}": (g.rgb[:, k] - 0.5) / Y_00 for k in range(3)},
+        **{f"f_rest_{k}": values for k, values in enumerate(signed.permute(2, 1, 0).flatten(0, 1))},
         "opacity": g.opacity.double().logit(),
         **{f"scale_{k}": scale[:, k].log() for k in range(3)},
         **{f"rot_{k}": quaternion[:, k] for k in range(4)},
@@ -112,7 +134,8 @@ def draw_gaussians(g: Gaussians, camera: Cameras, near: float) -> RasterOutput:
     """What a 3DGS viewer shows of them: exp(-r2 / 2) under the image plane's covariance with its 0.3 px^2 of blur."""
     view = pinhole(camera)
     half = torch.full_like(g.opacity, 0.5)
-    p = project_conditioned(Conditioned(g.xyz, g.covariance, g.opacity), half, g.rgb, view, near).primitives
+    rgb = coloured(g.rgb, g.harmonics, g.xyz - view.centre)
+    p = project_conditioned(Conditioned(g.xyz, g.covariance, g.opacity), half, rgb, view, near).primitives
     return rasterize(p, None, view.height, view.width, kernel="gaussian")
 
 
@@ -123,7 +146,8 @@ def clear_difference(scene: SplatMap, g: Gaussians, cameras: Cameras, time: floa
     with torch.no_grad():
         for i in range(len(cameras)):
             view = pinhole(cameras[i])
-            own = rasterize(project(scene.primitives, view, settings, now).primitives, None, view.height, view.width)
+            seen = project(scene.primitives, view, settings, now)
+            own = rasterize(seen.primitives, None, view.height, view.width, kernel=seen.kernel)
             theirs = draw_gaussians(g, cameras[i], settings.near)
             colours.append(theirs.clear - own.clear)
             alphas.append(float((theirs.alpha - own.alpha).mean()))
@@ -152,7 +176,7 @@ def export_run(folder: Path, path: Path, time: float | None = None) -> Exported:
     time = sum(scene.span) / 2 if time is None else time
     station = torch.linspace(0, len(cameras) - 1, min(_ASKED, len(cameras))).round().long()
     canvas = pinhole_canvas(cameras[station], scene.settings.long_side)
-    g = moment_matched(scene, canvas, time)
+    g = clear_gaussians(scene, canvas, time)
     write_ply(path, g)
     looked_at = canvas[torch.linspace(0, len(canvas) - 1, min(_COMPARED, len(canvas))).round().long()]
     difference = clear_difference(scene, g, looked_at, time)

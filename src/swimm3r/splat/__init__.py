@@ -27,10 +27,7 @@ def train(
     Works in `folder` (a new temporary one by default) and goes on exactly from what an interrupted call left there.
     Raises InputError where no training frame is registered.
     """
-    settings = settings or UwbsSettings()
-    folder = folder or Path(mkdtemp(prefix="swimm3r-splat-"))
-    match settings:
-        case UwbsSettings():
-            from swimm3r.splat.recipes import uwbs
+    from swimm3r.splat import fitting
 
-            return uwbs.train(reconstruction, frames, settings, folder, progress)
+    folder = folder or Path(mkdtemp(prefix="swimm3r-splat-"))
+    return fitting.train(reconstruction, frames, settings or UwbsSettings(), folder, progress)

@@ -1,6 +1,6 @@
 """Maps and training states on disk, as safetensors: tensors under their names, everything else in the header.
 
-map.safetensors (`schema` 1) holds the primitives as stored (before activation), the medium network, and in its header
+map.safetensors (`schema` 1) holds the primitives as stored (before activation), the water, and in its header
 the recipe, its settings, the metric flag, the working unit and when the clip begins and ends; also the training
 frames' poses where they were refined. A checkpoint adds the optimiser's moments and the step.
 """
@@ -16,11 +16,10 @@ from torch import Tensor
 
 from swimm3r.errors import InputError
 from swimm3r.io.atomic import atomic_path
-from swimm3r.splat.medium_field import MediumField
 from swimm3r.splat.pose_codes import RefinedPoses
-from swimm3r.splat.primitives import BetaPrimitives
 from swimm3r.splat.rendering import SplatMap
-from swimm3r.splat.settings import RECIPES, UwbsSettings, recipe_of
+from swimm3r.splat.settings import RECIPES, recipe_of, settings_of
+from swimm3r.splat.state import parts_of
 
 SCHEMA = 1
 
@@ -57,12 +56,13 @@ def load_map(path: Path) -> SplatMap:
     if about.get("recipe") not in RECIPES:
         raise _foreign(path, f"its recipe is {about.get('recipe')!r}, and known are {', '.join(RECIPES)}")
     try:
-        settings = settings_from(UwbsSettings, about["settings"])
-        field = MediumField(settings.medium, settings.dynamic)
+        settings = settings_from(settings_of(about["recipe"]), about["settings"])
+        parts = parts_of(settings)
+        field, kind = parts.field, parts.primitives
         field.load_state_dict(
             {k.removeprefix("field."): v for k, v in stored.tensors.items() if k.startswith("field.")}
         )
-        primitives = BetaPrimitives(*(stored.tensors[f"primitives.{name}"] for name in BetaPrimitives._fields))
+        primitives = kind(*(stored.tensors[f"primitives.{name}"] for name in kind._fields))
         if {len(values) for values in primitives} != {len(primitives.xyz)}:
             raise ValueError("its primitives' parts are of different lengths")
     except (KeyError, TypeError, ValueError, RuntimeError) as error:

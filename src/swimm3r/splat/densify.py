@@ -43,14 +43,14 @@ def relocate_and_grow(p: BetaPrimitives, target: int, dead_opacity: float, rng: 
     alive = (opacity > dead_opacity).nonzero()[:, 0]
     restarted = [torch.zeros(0, dtype=torch.int64)]
     if len(dead) and len(alive):
-        drawn = alive[_draw(opacity[alive], len(dead), rng)]
+        drawn = alive[draw_rows(opacity[alive], len(dead), rng)]
         opacity = _shared(opacity, drawn, dead_opacity)
         source[dead] = drawn
         opacity[dead] = opacity[drawn]
         restarted.append(drawn)
     added = max(0, target - n) if len(alive) else 0
     if added:
-        drawn = _draw(opacity, added, rng)
+        drawn = draw_rows(opacity, added, rng)
         opacity = _shared(opacity, drawn, dead_opacity)
         source = torch.cat([source, source[drawn]])
         opacity = torch.cat([opacity, opacity[drawn]])
@@ -79,7 +79,7 @@ def noise(
     return moved
 
 
-def _draw(weights: Float[Tensor, " n"], count: int, rng: torch.Generator) -> Int[Tensor, " count"]:
+def draw_rows(weights: Float[Tensor, " n"], count: int, rng: torch.Generator) -> Int[Tensor, " count"]:
     """Rows drawn with replacement; by the cumulative sum, as torch.multinomial stops at 2^24 categories."""
     edges = weights.double().cumsum(0)
     return torch.searchsorted(edges, torch.rand(count, generator=rng, dtype=torch.float64) * edges[-1]).clamp(

@@ -21,27 +21,26 @@ from swimm3r.medium import Medium, MediumFit
 from swimm3r.raster import MediumMaps
 from swimm3r.splat.primitives import inverse_softplus
 from swimm3r.splat.projection import Pinhole
-from swimm3r.splat.settings import MediumFieldSettings
-
-HARMONICS = 16
+from swimm3r.splat.scene_settings import MediumFieldSettings
+from swimm3r.splat.spherical import HARMONICS, spherical_harmonics
 
 
 class MediumField(nn.Module):
-    """The network and the unit it answers in."""
+    """The network, the unit it answers in, and the pixels between the directions it is asked for."""
 
     length: Tensor  # scene units per working unit; betas are divided by it
 
     def __init__(self, settings: MediumFieldSettings, dynamic: bool = False) -> None:
         super().__init__()
-        hidden, width = settings.hidden, settings.time_features if dynamic else 0
+        self.stride = settings.stride
+        width = settings.time_features if dynamic else 0
         self.gamma = nn.Linear(2 * settings.frequencies, width) if dynamic else None
-        self.network = nn.Sequential(
-            nn.Conv2d(HARMONICS + width, hidden, 1),
-            nn.ReLU(),
-            nn.Conv2d(hidden, hidden, 1),
-            nn.ReLU(),
-            nn.Conv2d(hidden, 9, 1),
-        )
+        activation = nn.ReLU if settings.activation == "relu" else nn.Sigmoid
+        layers, inputs = [], HARMONICS + width
+        for _ in range(settings.layers):
+            layers += [nn.Conv2d(inputs, settings.hidden, 1, bias=settings.biases), activation()]
+            inputs = settings.hidden
+        self.network = nn.Sequential(*layers, nn.Conv2d(inputs, 9, 1, bias=settings.biases))
         if settings.model == "none":
             self.gamma, self.network = None, nn.Sequential()
         self.register_buffer("length", torch.ones(()))
@@ -74,7 +73,10 @@ class FieldGrid:
 def initial_field(
     medium: Medium | None, settings: MediumFieldSettings, rng: torch.Generator, dynamic: bool = False
 ) -> MediumField:
-    """A field that is `medium` (coefficients per working unit) everywhere; without one, grey and thin water."""
+    """A field that is `medium` (coefficients per working unit) everywhere; without one, grey and thin water.
+
+    Without biases it cannot be, and begins at random.
+    """
     field = MediumField(settings, dynamic)
     if settings.model == "none":
         return field
@@ -83,8 +85,10 @@ def initial_field(
             if isinstance(layer, nn.Conv2d | nn.Linear):
                 bound = 1 / math.sqrt(layer.weight.shape[1])  # torch's own default, but from our generator
                 layer.weight.uniform_(-bound, bound, generator=rng)
-                assert layer.bias is not None
-                layer.bias.uniform_(-bound, bound, generator=rng)
+                if layer.bias is not None:
+                    layer.bias.uniform_(-bound, bound, generator=rng)
+        if not settings.biases:
+            return field
         grey = torch.full((3,), 0.5)
         start = medium or Medium(grey, torch.full((3,), settings.prior), torch.full((3,), settings.prior))
         last = field.network[-1]
@@ -168,31 +172,3 @@ def smoothness(grid: FieldGrid) -> Float[Tensor, ""]:
     """
     down, right = grid.values.diff(dim=1), grid.values.diff(dim=2)
     return down.abs().mean() / grid.step[0] + right.abs().mean() / grid.step[1]
-
-
-def spherical_harmonics(d: Float[Tensor, "*n 3"]) -> Float[Tensor, "*n 16"]:
-    """Real orthonormal spherical harmonics of degrees 0..3 of unit vectors."""
-    x, y, z = d.unbind(-1)
-    xx, yy, zz = x * x, y * y, z * z
-    pi = math.pi
-    return torch.stack(
-        [
-            torch.full_like(x, 0.5 / math.sqrt(pi)),
-            math.sqrt(3 / (4 * pi)) * y,
-            math.sqrt(3 / (4 * pi)) * z,
-            math.sqrt(3 / (4 * pi)) * x,
-            0.5 * math.sqrt(15 / pi) * x * y,
-            0.5 * math.sqrt(15 / pi) * y * z,
-            0.25 * math.sqrt(5 / pi) * (3 * zz - 1),
-            0.5 * math.sqrt(15 / pi) * x * z,
-            0.25 * math.sqrt(15 / pi) * (xx - yy),
-            0.25 * math.sqrt(35 / (2 * pi)) * y * (3 * xx - yy),
-            0.5 * math.sqrt(105 / pi) * x * y * z,
-            0.25 * math.sqrt(21 / (2 * pi)) * y * (5 * zz - 1),
-            0.25 * math.sqrt(7 / pi) * z * (5 * zz - 3),
-            0.25 * math.sqrt(21 / (2 * pi)) * x * (5 * zz - 1),
-            0.25 * math.sqrt(105 / pi) * z * (xx - yy),
-            0.25 * math.sqrt(35 / (2 * pi)) * x * (xx - 3 * yy),
-        ],
-        -1,
-    )

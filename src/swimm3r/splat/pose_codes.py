@@ -22,7 +22,7 @@ from swimm3r.cameras import Cameras, directions
 from swimm3r.geometry import fundamental_from_poses, pose_from, rotation_from_6d, symmetric_epipolar_error
 from swimm3r.io import cameras_json
 from swimm3r.reconstruction import Reconstruction
-from swimm3r.splat.settings import TrainingPoseSettings
+from swimm3r.splat.scene_settings import TrainingPoseSettings
 
 IDENTITY = (1.0, 0.0, 0.0, 0.0, 1.0, 0.0)  # in the 6D form
 _NO_BASELINE = 1e-6  # of the spread: cameras nearer than this have no epipolar lines
@@ -65,6 +65,11 @@ def spread_of(cam2world: Float[Tensor, "c 4 4"]) -> float:
     """Root mean square distance of the cameras from their middle."""
     centres = cam2world[:, :3, 3]
     return float((centres - centres.mean(0)).square().sum(-1).mean().sqrt())
+
+
+def pose_rate(settings: TrainingPoseSettings, iterations: int) -> float:
+    """Adam's rate for the poses: `rate` in 20,000 steps, in inverse proportion to others."""
+    return min(settings.largest_rate, settings.rate * 20_000 / iterations)
 
 
 @dataclass(frozen=True)

@@ -16,8 +16,8 @@ from torch import Tensor
 from swimm3r.cameras import Cameras
 from swimm3r.progress import Progress, silent
 from swimm3r.splat.pose_codes import moved
-from swimm3r.splat.primitives import BetaPrimitives, select
-from swimm3r.splat.projection import pinhole, project
+from swimm3r.splat.primitives import select
+from swimm3r.splat.projection import Primitives, pinhole, project
 from swimm3r.splat.rendering import SplatMap, draw, in_scene_units
 from swimm3r.splat.settings import PoseRefinementSettings
 from swimm3r.splat.views import pinhole_canvas, undistorted
@@ -87,7 +87,7 @@ def edges(
     return strong if int(strong.sum()) >= settings.min_edges * strong.numel() else usable
 
 
-def in_sight(scene: SplatMap, canvas: Cameras, now: Float[Tensor, ""] | None = None) -> BetaPrimitives:
+def in_sight(scene: SplatMap, canvas: Cameras, now: Float[Tensor, ""] | None = None) -> Primitives:
     """The primitives that a camera sees, or would after a small motion."""
     with torch.no_grad():
         seen = project(scene.primitives, pinhole(canvas), in_scene_units(scene.settings, scene.length).render, now)

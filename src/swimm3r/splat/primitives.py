@@ -6,7 +6,9 @@ is a primitive's covariance over position and query q, the view direction (D = 6
 values are before activation: opacity = sigmoid, exponent B = 4 exp, scales s = softplus, which is also L22's diagonal.
 """
 
-from typing import NamedTuple
+from collections.abc import Iterable, Iterator
+from dataclasses import dataclass
+from typing import Any, NamedTuple, Protocol, TypeVar, runtime_checkable
 
 import torch
 from jaxtyping import Bool, Float, Int
@@ -16,6 +18,7 @@ from torch.nn.functional import softplus
 
 from swimm3r.cameras import Cameras, project
 from swimm3r.reconstruction import DenseCloud, Reconstruction
+from swimm3r.splat.gaussian_settings import GaussianInitialSettings
 from swimm3r.splat.settings import InitialSettings
 
 
@@ -30,10 +33,28 @@ class BetaPrimitives(NamedTuple):
     scale: Float[Tensor, "n d"]  # 3 + c
     lower: Float[Tensor, "n l"]  # strict lower triangle: a01 a02 a12, then the rows from 3 on, left to right
 
+    @property
+    def dynamic(self) -> bool:
+        """Whether they change with time."""
+        return self.query_mean.shape[1] > 3
 
-def select(p: BetaPrimitives, which: Int[Tensor, " m"] | Bool[Tensor, " n"]) -> BetaPrimitives:
+
+@runtime_checkable  # so that the suite can check calls against it
+class Rows(Protocol):
+    """Primitives of any kind: tensors with a row for each."""
+
+    def __iter__(self) -> Iterator[Tensor]: ...
+
+    @classmethod
+    def _make(cls, iterable: Iterable[Tensor]) -> Any: ...
+
+
+OfKind = TypeVar("OfKind", bound=Rows)
+
+
+def select(p: OfKind, which: Int[Tensor, " m"] | Bool[Tensor, " n"]) -> OfKind:
     """Some of the primitives."""
-    return BetaPrimitives(*(values[which] for values in p))
+    return p._make(values[which] for values in p)
 
 
 def inverse_softplus(y: Float[Tensor, "*n"]) -> Float[Tensor, "*n"]:
@@ -53,22 +74,17 @@ def initial_primitives(rec: Reconstruction, settings: InitialSettings, rng: torc
 
     Raises ValueError for fewer than 4 points.
     """
-    xyz, rgb = _starting_points(rec, settings)
-    n = len(xyz)
-    if n < 4:
-        raise ValueError(f"a map starts from at least 4 points, got {n}")
-    distances, _ = KDTree(xyz.numpy()).query(xyz.numpy(), k=4)
-    spacing = torch.from_numpy(distances[:, 1:]).square().mean(-1).sqrt()
-    spacing = spacing.clamp(min=1e-3 * float(spacing.median()))  # doubled points would be points of no size
+    start = starting_points(rec, settings)
+    xyz, n = start.xyz, len(start.xyz)
     if settings.directions == "mean":
         directions = mean_directions(xyz, rec, settings.max_views).float()
     else:
         directions = 2 * torch.rand(n, 3, generator=rng) - 1
-    scale = torch.cat([settings.scale * spacing[:, None].expand(-1, 3).float(), torch.ones(n, 3)], -1)
+    scale = torch.cat([settings.scale * start.spacing[:, None].expand(-1, 3).float(), torch.ones(n, 3)], -1)
     return BetaPrimitives(
         xyz=xyz.float(),
         query_mean=directions,
-        rgb=rgb,
+        rgb=start.rgb,
         opacity=torch.full((n,), settings.opacity).logit(),
         beta=torch.tensor([0.0, *[settings.view_exponent] * 3]).repeat(n, 1),
         scale=inverse_softplus(scale),
@@ -88,8 +104,28 @@ def with_time(p: BetaPrimitives, settings: InitialSettings, rng: torch.Generator
     )
 
 
-def _starting_points(
-    rec: Reconstruction, settings: InitialSettings
+@dataclass(frozen=True)
+class StartingPoints:
+    """Where primitives start, whatever their kind."""
+
+    xyz: Float[Tensor, "n 3"]  # float64
+    rgb: Float[Tensor, "n 3"]
+    spacing: Float[Tensor, " n"]  # root mean square distance to the 3 nearest neighbours, float64
+
+
+def starting_points(rec: Reconstruction, settings: InitialSettings | GaussianInitialSettings) -> StartingPoints:
+    """The cloud and its backdrop, one point per voxel. Raises ValueError for fewer than 4 points."""
+    xyz, rgb = _sampled(rec, settings)
+    if len(xyz) < 4:
+        raise ValueError(f"a map starts from at least 4 points, got {len(xyz)}")
+    distances, _ = KDTree(xyz.numpy()).query(xyz.numpy(), k=4)
+    spacing = torch.from_numpy(distances[:, 1:]).square().mean(-1).sqrt()
+    # doubled points would be points of no size
+    return StartingPoints(xyz, rgb, spacing.clamp(min=1e-3 * float(spacing.median())))
+
+
+def _sampled(
+    rec: Reconstruction, settings: InitialSettings | GaussianInitialSettings
 ) -> tuple[Float[Tensor, "n 3"], Float[Tensor, "n 3"]]:
     """Positions, float64, and colours."""
     if rec.cloud is None:

@@ -1,11 +1,13 @@
-"""Conditioned primitives on the image plane of a real pinhole camera (uwbs.md 2.1, 1.4).
+"""Primitives on the image plane of a real pinhole camera (uwbs.md 2.1, 1.4).
 
     mu = (fx x / z + cx, fy y / z + cy),   Sigma2 = J R S R^T J^T + 0.3 I,   conic = Sigma2^-1
 
-J is taken at the ray clamped to 0.3 field tangents beyond the picture. A primitive covers the pixels with r2 < 1 under
-its conic; its uncapped radius is the square root of Sigma2's larger eigenvalue.
+J is taken at the ray clamped to 0.3 field tangents beyond the picture. A Beta primitive covers the pixels with r2 < 1
+under its conic; its uncapped radius is the square root of Sigma2's larger eigenvalue, 3.33 times that for a Gaussian,
+where an opaque one falls below 1/255.
 """
 
+import math
 from dataclasses import dataclass
 
 import torch
@@ -13,13 +15,19 @@ from jaxtyping import Float
 from torch import Tensor
 
 from swimm3r.cameras import Cameras
-from swimm3r.raster import Primitives2D
+from swimm3r.raster import Kernel, Primitives2D
 from swimm3r.splat.conditioning import Conditioned, conditioned_in_view
+from swimm3r.splat.gaussian_settings import GaussianRenderSettings
+from swimm3r.splat.gaussians import GaussianPrimitives, covariance, seen_colour
 from swimm3r.splat.primitives import BetaPrimitives
 from swimm3r.splat.settings import RenderSettings
 
+Primitives = BetaPrimitives | GaussianPrimitives
+"""What can be projected."""
+
 BLUR = 0.3
 """px^2, added to every covariance on the image plane."""
+_GAUSSIAN_REACH = math.sqrt(2 * math.log(255))
 _MARGIN = 0.3  # field tangents beyond the picture at which J is held
 
 
@@ -44,6 +52,7 @@ class Projection:
 
     primitives: Primitives2D
     radius: Float[Tensor, " n"]
+    kernel: Kernel = "beta"
 
 
 def pinhole(camera: Cameras, dtype: torch.dtype = torch.float32) -> Pinhole:
@@ -117,10 +126,24 @@ def project_plainly(
     return project_conditioned(seen, 4 * torch.exp(p.beta[:, 0]), p.rgb, view, settings.near)
 
 
+def project_gaussians(p: GaussianPrimitives, view: Pinhole, near: float) -> Projection:
+    """Gaussians in one camera."""
+    seen = Conditioned(p.xyz, covariance(p), torch.sigmoid(p.opacity))
+    half = torch.full_like(seen.opacity, 0.5)
+    drawn = project_conditioned(seen, half, seen_colour(p, view.centre), view, near)
+    return Projection(drawn.primitives, _GAUSSIAN_REACH * drawn.radius, "gaussian")
+
+
 def project(
-    p: BetaPrimitives, view: Pinhole, settings: RenderSettings, time: Float[Tensor, ""] | None = None
+    p: Primitives,
+    view: Pinhole,
+    settings: RenderSettings | GaussianRenderSettings,
+    time: Float[Tensor, ""] | None = None,
 ) -> Projection:
-    """Primitives conditioned on a camera and projected into it; differentiable in both."""
+    """Primitives projected into a camera, Beta ones conditioned on it; differentiable in both."""
+    if isinstance(p, GaussianPrimitives):
+        return project_gaussians(p, view, settings.near)
+    assert isinstance(settings, RenderSettings)
     if _has_fast_form(p, settings):
         from swimm3r.splat import projection_cpu
 

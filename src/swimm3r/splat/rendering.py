@@ -1,6 +1,7 @@
 """A trained map and its pictures: with the water, without it, the water alone, and depth."""
 
 from dataclasses import dataclass, replace
+from typing import TypeVar
 
 import torch
 from jaxtyping import Float
@@ -9,11 +10,11 @@ from torch import Tensor
 from swimm3r.cameras import Cameras
 from swimm3r.medium import Medium
 from swimm3r.raster import MediumMaps, RasterOutput, SggBuffers, rasterize
+from swimm3r.splat.gaussian_settings import GaussianSettings
 from swimm3r.splat.medium_field import FieldGrid, MediumField, grid_of, medium_at_pixels, per_z_depth
 from swimm3r.splat.pose_codes import RefinedPoses
-from swimm3r.splat.primitives import BetaPrimitives
-from swimm3r.splat.projection import Pinhole, Projection, pinhole, project
-from swimm3r.splat.settings import UwbsSettings
+from swimm3r.splat.projection import Pinhole, Primitives, Projection, pinhole, project
+from swimm3r.splat.settings import SplatSettings, UwbsSettings
 from swimm3r.splat.views import moment
 
 _SEEN = 1e-3  # alpha below which a pixel has no depth
@@ -36,9 +37,9 @@ class RenderOutput:
 class SplatMap:
     """Primitives and water of one scene, in the unit and axes of its reconstruction."""
 
-    primitives: BetaPrimitives
+    primitives: Primitives
     field: MediumField
-    settings: UwbsSettings
+    settings: SplatSettings
     metric: bool
     length: float = 1.0  # scene units per working unit (`settings.py`)
     span: tuple[float, float] = (0.0, 1.0)  # of the clip it was trained on, seconds
@@ -54,7 +55,7 @@ class SplatMap:
 
     def moment(self, time: float | None) -> Float[Tensor, ""] | None:
         """A time of the clip as the map's own parts take it: None in static maps, 0..1 in dynamic ones."""
-        if not self.settings.dynamic:
+        if not self.primitives.dynamic:
             return None
         if time is None:
             start, end = self.span
@@ -75,25 +76,25 @@ class Drawing:
 
 
 def draw(
-    p: BetaPrimitives,
+    p: Primitives,
     field: MediumField,
     view: Pinhole,
-    settings: UwbsSettings,
+    settings: UwbsSettings | GaussianSettings,
     time: Float[Tensor, ""] | None = None,
     sgg: bool = False,
 ) -> Drawing:
     """Project, evaluate the water and rasterise; differentiable in everything but time, the pose included."""
-    time = time if settings.dynamic else None
+    time = time if p.dynamic else None
     projection = project(p, view, settings.render, time)
-    grid = grid_of(field, view, settings.medium.stride, time)
+    grid = grid_of(field, view, field.stride, time)
     maps = medium_at_pixels(grid, view.height, view.width)
     if settings.render.depth == "ray":
         maps = per_z_depth(maps, view)
     buffers = SggBuffers.zeros(len(p.xyz), p.xyz.device) if sgg else None
     images = rasterize(
         projection.primitives, maps, view.height, view.width,
-        alpha_min=settings.render.alpha_min, medium_depth_grad=settings.render.medium_depth_grad == "full",
-        sgg=buffers,
+        alpha_min=settings.render.alpha_min, kernel=projection.kernel,
+        medium_depth_grad=settings.render.medium_depth_grad == "full", sgg=buffers,
     )  # fmt: skip
     return Drawing(images, projection, grid, maps, buffers, time)
 
@@ -111,7 +112,10 @@ def surface_colour(images: RasterOutput) -> Float[Tensor, "3 h w"]:
     return images.clear / images.alpha.clamp(min=_COVERED)
 
 
-def in_scene_units(settings: UwbsSettings, length: float) -> UwbsSettings:
+Settings = TypeVar("Settings", bound=SplatSettings)
+
+
+def in_scene_units(settings: Settings, length: float) -> Settings:
     """Settings whose lengths are scene units instead of working units."""
     return replace(settings, render=replace(settings.render, near=settings.render.near * length))
 
@@ -120,13 +124,14 @@ def render(scene: SplatMap, camera: Cameras, time: float | None = None) -> Rende
     """One view of a map at a time of its clip. Raises ValueError as `SplatMap.render` does."""
     settings = in_scene_units(scene.settings, scene.length)
     view, now = pinhole(camera), scene.moment(time)
-    projected = project(scene.primitives, view, settings.render, now).primitives
-    medium = medium_at_pixels(grid_of(scene.field, view, settings.medium.stride, now), view.height, view.width)
+    projection = project(scene.primitives, view, settings.render, now)
+    projected, kernel = projection.primitives, projection.kernel
+    medium = medium_at_pixels(grid_of(scene.field, view, scene.field.stride, now), view.height, view.width)
     maps = per_z_depth(medium, view) if settings.render.depth == "ray" else medium
     height, width, alpha_min = view.height, view.width, settings.render.alpha_min
-    images = rasterize(projected, maps, height, width, alpha_min=alpha_min)
+    images = rasterize(projected, maps, height, width, alpha_min=alpha_min, kernel=kernel)
     black = projected._replace(color=torch.zeros_like(projected.color))
-    veil = rasterize(black, maps, height, width, alpha_min=alpha_min).rgb
+    veil = rasterize(black, maps, height, width, alpha_min=alpha_min, kernel=kernel).rgb
     return RenderOutput(
         rgb=images.rgb.permute(1, 2, 0),
         clear=surface_colour(images).permute(1, 2, 0),

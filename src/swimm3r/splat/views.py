@@ -18,7 +18,7 @@ from swimm3r.errors import InputError
 from swimm3r.frames import Frames
 from swimm3r.io.cache import ArrayCache
 from swimm3r.reconstruction import Reconstruction
-from swimm3r.splat.settings import UwbsSettings
+from swimm3r.splat.settings import SplatSettings
 
 
 @dataclass(frozen=True)
@@ -37,7 +37,7 @@ class View:
 class TrainingViews:
     """The registered training frames as views; pictures are made when asked for and kept in a bounded cache."""
 
-    def __init__(self, rec: Reconstruction, frames: Frames, settings: UwbsSettings, scale: float) -> None:
+    def __init__(self, rec: Reconstruction, frames: Frames, settings: SplatSettings, scale: float) -> None:
         self.rec, self.frames, self.settings, self.scale = rec, frames, settings, scale
         self._times = {frame.name: moment(frames.span, frame.time) for frame in frames}
         train = {frame.name for frame in frames.train}
@@ -93,14 +93,15 @@ class TrainingViews:
     def _depth(
         self, name: str, lens: Cameras, canvas: Cameras, rgb: Float[Tensor, "h w 3"], seen: Bool[Tensor, "h w"]
     ) -> tuple[Float[Tensor, "h w"], Float[Tensor, "h w"]]:
-        if name not in self.rec.depth:
+        least = self.settings.depth_confidence
+        if least is None or name not in self.rec.depth:
             return torch.zeros(canvas.height, canvas.width), torch.zeros(canvas.height, canvas.width)
         depth = self.rec.depth[name]
         column, row, _ = _grid(_key(lens), _key(canvas))
         row = np.clip(row.round().astype(np.int64), 0, lens.height - 1)
         column = np.clip(column.round().astype(np.int64), 0, lens.width - 1)
         z_depth, confidence = depth.z_depth[row, column], depth.confidence[row, column]
-        known = seen & z_depth.isfinite() & (z_depth > 0) & (confidence >= self.settings.weights.depth_confidence)
+        known = seen & z_depth.isfinite() & (z_depth > 0) & (confidence >= least)
         return torch.where(known, z_depth * self.scale, 0.0), torch.where(known, edge_weight(rgb), 0.0)
 
 
@@ -149,7 +150,7 @@ def edge_weight(rgb: Float[Tensor, "h w 3"]) -> Float[Tensor, "h w"]:
     return torch.exp(-right) + torch.exp(-down)
 
 
-def working_scale(rec: Reconstruction, settings: UwbsSettings) -> float:
+def working_scale(rec: Reconstruction, settings: SplatSettings) -> float:
     """Working units per scene unit: 1 for a metric reconstruction, else what gives the scene its `working_depth`."""
     return 1.0 if rec.metric else settings.working_depth / median_z_depth(rec)
 

@@ -6,41 +6,26 @@ and, beyond the paper, terms that hold the water to what structure from motion m
 known surfaces opaque (`coverage`).
 """
 
-import hashlib
-import json
-import math
 from collections.abc import Collection
-from dataclasses import asdict, dataclass, replace
-from pathlib import Path
+from dataclasses import dataclass, replace
 
 import torch
 from jaxtyping import Float, Int
 from torch import Tensor
 
-from swimm3r.frames import Frames
 from swimm3r.medium import Medium
-from swimm3r.progress import Progress, silent
 from swimm3r.reconstruction import Reconstruction
-from swimm3r.splat import checkpoint, densify, losses, training
+from swimm3r.splat import densify, losses, training
 from swimm3r.splat.gradients import differentiate
 from swimm3r.splat.medium_field import MediumField, WaterPrior, deviation, initial_field, smoothness, water_prior
-from swimm3r.splat.optimiser import Moments, adam_step, fresh, log_linear
-from swimm3r.splat.pose_codes import PoseCodes, Stations, training_stations, write_refined
+from swimm3r.splat.optimiser import Moments, adam_step, log_linear
+from swimm3r.splat.pose_codes import PoseCodes, Stations, pose_rate
 from swimm3r.splat.primitives import BetaPrimitives, initial_primitives, rescaled, with_time
 from swimm3r.splat.projection import pinhole
-from swimm3r.splat.rendering import Drawing, SplatMap, draw
+from swimm3r.splat.rendering import Drawing, draw
 from swimm3r.splat.settings import UwbsSettings
-from swimm3r.splat.views import TrainingViews, View, working_scale
-
-
-@dataclass(frozen=True)
-class State:
-    """Primitives, water, and the optimiser's memory of both."""
-
-    primitives: BetaPrimitives
-    field: MediumField
-    poses: PoseCodes | None  # None where poses are held
-    moments: dict[str, Moments]  # of "xyz" ..., of the field's parameters by "field.*", of the poses' by "poses.*"
+from swimm3r.splat.state import FIELD, POSES, State, clip_field, first_state, parameters_of, restored, stored
+from swimm3r.splat.views import View
 
 
 @dataclass(frozen=True)
@@ -70,7 +55,7 @@ class Uwbs:
         p = initial_primitives(self.rec, settings.initial, training.generator(settings.seed, 0, 2))
         if settings.dynamic:
             p = with_time(p, settings.initial, training.generator(settings.seed, 0, 5))
-        p = BetaPrimitives(*(values.contiguous() for values in rescaled(p, self.scale)))
+        p = rescaled(p, self.scale)
         medium = None
         if self.rec.medium is not None:
             fit = self.rec.medium.medium
@@ -79,12 +64,12 @@ class Uwbs:
         poses = None
         if self.stations is not None:
             poses = PoseCodes(len(self.stations), settings.poses, training.generator(settings.seed, 0, 6))
-        return State(p, field, poses, {name: fresh(values) for name, values in _parameters(p, field, poses).items()})
+        return first_state(p, field, poses)
 
     def step(self, state: State, view: View, step: int) -> tuple[State, dict[str, float]]:
         """One view: forward, adjoint, densification on its cadence, Adam."""
         settings, share = self.settings, step / self.settings.iterations
-        parameters = _parameters(state.primitives, state.field, state.poses)
+        parameters = parameters_of(state.primitives, state.field, state.poses)
         p = BetaPrimitives(*(values.detach().requires_grad_() for values in state.primitives))
         camera, filtered = view.camera, settings.sgg.enabled and share <= settings.sgg.end
         if self.stations is not None and state.poses is not None:
@@ -118,9 +103,9 @@ class Uwbs:
             if multiplier is not None:
                 multiplier = _extended(multiplier, len(state.primitives.xyz) - len(multiplier))
                 multiplier[round_.stale] = 1
-        _clip_field(gradients)
+        clip_field(gradients)
         with torch.no_grad():
-            parameters = _parameters(state.primitives, state.field, state.poses)
+            parameters = parameters_of(state.primitives, state.field, state.poses)
             before = None if multiplier is None else parameters["xyz"].clone()
             adam_step(parameters, gradients, state.moments, rates)
             if multiplier is not None and before is not None:
@@ -131,24 +116,20 @@ class Uwbs:
         return state, numbers
 
     def stored(self, state: State) -> dict[str, Tensor]:
-        """Parameters by name; their moments after .first, .second and .steps."""
-        parameters = _parameters(state.primitives, state.field, state.poses)
-        tensors = {f"parameter.{name}": t for name, t in parameters.items()}
-        for name, m in state.moments.items():
-            tensors |= {f"first.{name}": m.first, f"second.{name}": m.second, f"steps.{name}": m.steps}
-        return tensors
+        """Everything in a state, by name."""
+        return stored(state)
 
     def restored(self, tensors: dict[str, Tensor]) -> State:
         """The inverse of `stored`."""
+        return restored(tensors, self.settings, 0 if self.stations is None else len(self.stations))
+
+    def rescaled(self, state: State, factor: float) -> tuple[BetaPrimitives, MediumField]:
+        """Primitives and water after every length was multiplied by `factor`, without gradient."""
         field = MediumField(self.settings.medium, self.settings.dynamic)
-        poses = None if self.stations is None else PoseCodes(len(self.stations), self.settings.poses)
-        p = BetaPrimitives(*(tensors[f"parameter.{name}"] for name in BetaPrimitives._fields))
-        parameters = _parameters(p, field, poses)
-        with torch.no_grad():
-            for name, parameter in parameters.items():
-                parameter.copy_(tensors[f"parameter.{name}"])
-        moments = {k: Moments(tensors[f"first.{k}"], tensors[f"second.{k}"], tensors[f"steps.{k}"]) for k in parameters}
-        return State(p, field, poses, moments)
+        field.load_state_dict(state.field.state_dict())
+        field.length.fill_(factor)
+        p = BetaPrimitives(*(values.detach().clone() for values in rescaled(state.primitives, factor)))
+        return p, field.requires_grad_(False)
 
     def _regularised(self, share: float) -> bool:
         return self.settings.weights.mcmc_begin < share <= self.settings.weights.mcmc_end
@@ -168,8 +149,10 @@ class Uwbs:
         medium = log_linear(r.medium, r.medium_end, share)
         if self.prior is not None and share <= self.settings.medium.begin:
             medium = 0.0
-        rates |= {name: medium for name in names if name.startswith(_FIELD)}
-        return rates | {name: pose_rate(self.settings) for name in names if name.startswith(_POSES)}
+        rates |= {name: medium for name in names if name.startswith(FIELD)}
+        return rates | {
+            name: pose_rate(self.settings.poses, self.settings.iterations) for name in names if name.startswith(POSES)
+        }
 
     def _noise(self, p: BetaPrimitives, rate: float, rng: torch.Generator) -> Float[Tensor, "n 3"]:
         d = self.settings.densify
@@ -244,80 +227,12 @@ def objective(
     return Objective(total, depth, {k: float(torch.as_tensor(v).detach()) for k, v in numbers.items()})
 
 
-def train(
-    rec: Reconstruction, frames: Frames, settings: UwbsSettings, folder: Path, progress: Progress = silent
-) -> SplatMap:
-    """Train a map in `folder`: checkpoint/, metrics.jsonl, and at the end map.safetensors and the refined cameras.json.
-
-    Both are in the scene's own unit; cameras.json is not written where poses are held.
-    """
-    scale = working_scale(rec, settings)
-    views = TrainingViews(rec, frames, settings, scale)
-    known = None if settings.medium.model == "none" else rec.medium
-    prior = None if known is None else water_prior(known, 1 / scale, settings.medium)
-    stations = training_stations(rec, views.names, views.cameras, scale) if settings.poses.enabled else None
-    recipe = Uwbs(settings, rec, scale, path_radius(rec, scale, settings.working_depth), prior, stations)
-    final = training.run(recipe, views, _schedule(settings, rec, views), folder, progress)
-    field = MediumField(settings.medium, settings.dynamic)
-    field.load_state_dict(final.field.state_dict())
-    field.length.fill_(1 / scale)
-    primitives = BetaPrimitives(*(values.detach().clone() for values in rescaled(final.primitives, 1 / scale)))
-    poses = None
-    if stations is not None and final.poses is not None:
-        poses = stations.refined(final.poses)
-        write_refined(folder / "cameras.json", rec, poses)
-    field.requires_grad_(False)
-    scene = SplatMap(primitives, field, settings, rec.metric, 1 / scale, frames.span, poses)
-    checkpoint.save_map(folder / "map.safetensors", scene)
-    return scene
-
-
-def pose_rate(settings: UwbsSettings) -> float:
-    """Adam's rate for the poses: `rate` at the paper's 20,000 steps, in inverse proportion to others."""
-    return min(settings.poses.largest_rate, settings.poses.rate * 20_000 / settings.iterations)
-
-
-def path_radius(rec: Reconstruction, scale: float, working_depth: float) -> float:
-    """1.1 times the largest distance of a camera from their mean, working units (UBS); a third of the depth at least.
-
-    The floor keeps a camera that hardly moves from freezing its scene.
-    """
-    centres = rec.cameras.centres
-    spread = float(torch.linalg.vector_norm(centres - centres.mean(0), dim=-1).max())
-    return max(1.1 * spread * scale, working_depth / 3)
-
-
-_FIELD, _POSES = "field.", "poses."
-
-
-def _parameters(p: BetaPrimitives, field: MediumField, poses: PoseCodes | None = None) -> dict[str, Tensor]:
-    of_field: dict[str, Tensor] = {f"{_FIELD}{name}": t for name, t in field.named_parameters()}
-    of_poses = {} if poses is None else {f"{_POSES}{name}": t for name, t in poses.named_parameters()}
-    return {**p._asdict(), **of_field, **of_poses}
+def known_water(rec: Reconstruction, scale: float, settings: UwbsSettings) -> WaterPrior | None:
+    """What structure from motion says about the water, per working unit; None for maps without water."""
+    if settings.medium.model == "none" or rec.medium is None:
+        return None
+    return water_prior(rec.medium, 1 / scale, settings.medium)
 
 
 def _extended(rows: Tensor, count: int) -> Tensor:
     return torch.cat([rows, rows.new_zeros(count, *rows.shape[1:])])
-
-
-def _clip_field(gradients: dict[str, Tensor]) -> None:
-    """The field's gradient is held to a norm of 1e-3 (WaterSplatting)."""
-    of_field = [gradient for name, gradient in gradients.items() if name.startswith(_FIELD)]
-    norm = math.hypot(*(float(g.norm()) for g in of_field))
-    if norm > 1e-3:
-        for g in of_field:
-            g.mul_(1e-3 / norm)
-
-
-def _schedule(settings: UwbsSettings, rec: Reconstruction, views: TrainingViews) -> training.Schedule:
-    everything = [asdict(settings), views.names, views.times, rec.cameras.cam2world.tolist(), rec.cameras.K.tolist()]
-    if settings.poses.enabled:
-        everything.append(float(rec.matches.xy_i.double().sum() + rec.matches.xy_j.double().sum()))
-    digest = hashlib.sha256(json.dumps(everything, sort_keys=True).encode()).hexdigest()[:16]
-    return training.Schedule(
-        iterations=settings.iterations,
-        log_every=max(1, math.ceil(settings.log_every * settings.iterations)),
-        checkpoint_every=max(1, math.ceil(settings.checkpoint_every * settings.iterations)),
-        seed=settings.seed,
-        fingerprint=digest,
-    )

@@ -1,0 +1,65 @@
+"""From a reconstruction to a map: the recipe of the settings, its run, and the map in the scene's own unit."""
+
+import hashlib
+import json
+import math
+from dataclasses import asdict
+from pathlib import Path
+
+from swimm3r.frames import Frames
+from swimm3r.progress import Progress, silent
+from swimm3r.reconstruction import Reconstruction
+from swimm3r.splat import checkpoint, training
+from swimm3r.splat.pose_codes import training_stations, write_refined
+from swimm3r.splat.recipes.mcmc_gs import McmcGs
+from swimm3r.splat.recipes.uwbs import Uwbs, known_water
+from swimm3r.splat.rendering import SplatMap
+from swimm3r.splat.settings import McmcGsSettings, SplatSettings, UwbsSettings
+from swimm3r.splat.site import Site, path_radius
+from swimm3r.splat.views import TrainingViews, working_scale
+
+
+def train(
+    rec: Reconstruction, frames: Frames, settings: SplatSettings, folder: Path, progress: Progress = silent
+) -> SplatMap:
+    """Train a map in `folder`: checkpoint/, metrics.jsonl, and at the end map.safetensors and the refined cameras.json.
+
+    Both are in the scene's own unit; cameras.json is not written where poses are held.
+    """
+    scale = working_scale(rec, settings)
+    views = TrainingViews(rec, frames, settings, scale)
+    stations = training_stations(rec, views.names, views.cameras, scale) if settings.poses.enabled else None
+    site = Site(rec, scale, path_radius(rec, scale, settings.working_depth), stations)
+    recipe = _recipe(settings, site)
+    final = training.run(recipe, views, _schedule(settings, rec, views), folder, progress)
+    primitives, field = recipe.rescaled(final, 1 / scale)
+    poses = None
+    if stations is not None and final.poses is not None:
+        poses = stations.refined(final.poses)
+        write_refined(folder / "cameras.json", rec, poses)
+    scene = SplatMap(primitives, field, settings, rec.metric, 1 / scale, frames.span, poses)
+    checkpoint.save_map(folder / "map.safetensors", scene)
+    return scene
+
+
+def _recipe(settings: SplatSettings, site: Site) -> Uwbs | McmcGs:
+    match settings:
+        case UwbsSettings():
+            prior = known_water(site.rec, site.scale, settings)
+            return Uwbs(settings, site.rec, site.scale, site.radius, prior, site.stations)
+        case McmcGsSettings():
+            return McmcGs(settings, site)
+
+
+def _schedule(settings: SplatSettings, rec: Reconstruction, views: TrainingViews) -> training.Schedule:
+    everything = [asdict(settings), views.names, views.times, rec.cameras.cam2world.tolist(), rec.cameras.K.tolist()]
+    if settings.poses.enabled:
+        everything.append(float(rec.matches.xy_i.double().sum() + rec.matches.xy_j.double().sum()))
+    digest = hashlib.sha256(json.dumps(everything, sort_keys=True).encode()).hexdigest()[:16]
+    return training.Schedule(
+        iterations=settings.iterations,
+        log_every=max(1, math.ceil(settings.log_every * settings.iterations)),
+        checkpoint_every=max(1, math.ceil(settings.checkpoint_every * settings.iterations)),
+        seed=settings.seed,
+        fingerprint=digest,
+    )

@@ -1,0 +1,122 @@
+"""The numbers of the peers, which splat Gaussians; torch-free.
+
+Windows and cadences are fractions of `iterations`, exact at the length each was published with. Lengths are in working
+units (`settings.py`). Every peer starts from the cloud, and from as many primitives, as UWBS does.
+"""
+
+from dataclasses import dataclass, field
+from typing import Literal
+
+from swimm3r.splat.scene_settings import TrainingPoseSettings
+
+
+@dataclass(frozen=True)
+class GaussianInitialSettings:
+    """The Gaussians that training starts from."""
+
+    primitives: int = 400_000
+    """Points of the cloud and its backdrop that become primitives, one per voxel."""
+    backdrop: float = 0.2
+    """Largest share of them that lies on ground whose depth is a guess."""
+    colours: Literal["restored", "raw"] = "raw"
+    """As filmed, or without the water for maps that have one."""
+    harmonics: int = 3
+    """Degree of the colours' spherical harmonics."""
+    scale: float = 1.0
+    """In root mean square distances to the 3 nearest neighbours."""
+    opacity: float = 0.1
+
+
+@dataclass(frozen=True)
+class GaussianRenderSettings:
+    """How a Gaussian meets a camera."""
+
+    depth: Literal["ray", "z"] = "z"
+    """The depth that attenuates: along the ray, or along the optical axis as the peers have it."""
+    alpha_min: float = 1 / 255
+    """Pairs fainter than this are skipped."""
+    near: float = 0.01
+    """Primitives nearer than this z depth are not drawn."""
+    medium_depth_grad: Literal["full", "detach"] = "full"
+    """Whether what the water takes and adds may move a primitive in depth."""
+
+
+@dataclass(frozen=True)
+class GaussianRates:
+    """Of Adam (eps 1e-15); positions decay log-linearly over the run."""
+
+    xyz: float = 1.6e-4
+    """Times the scene's radius, as is its end."""
+    xyz_end: float = 1.6e-6
+    quaternion: float = 1e-3
+    scale: float = 5e-3
+    opacity: float = 5e-2
+    colour: float = 2.5e-3
+    harmonics: float = 1.25e-4
+    haste: float = 0.5
+    """In runs shorter than the published one the rates of positions, rotations and colours grow with its length over
+    theirs to this power, at most fourfold; 0 keeps them. UWBS's `fast` preset has rates raised by as much, and 400
+    steps of Gaussian MCMC on ruie_green_rock gain 1.2 dB by it on frames held back."""
+
+
+@dataclass(frozen=True)
+class GaussianSettings:
+    """What all peers have."""
+
+    iterations: int = 30_000
+    long_side: int = 1600
+    """Longer side of the training pictures, pixels; they are never enlarged."""
+    working_depth: float = 3.0
+    """Median depth, working units, that a scene without metric scale is given while it is trained."""
+    max_primitives: int = 800_000
+    initial: GaussianInitialSettings = field(default_factory=GaussianInitialSettings)
+    render: GaussianRenderSettings = field(default_factory=GaussianRenderSettings)
+    rates: GaussianRates = field(default_factory=GaussianRates)
+    degree_every: float = 1 / 30
+    """Share of the run between two degrees of the colours' harmonics."""
+    poses: TrainingPoseSettings = field(default_factory=TrainingPoseSettings)
+    seed: int = 0
+    log_every: float = 0.005
+    checkpoint_every: float = 0.1
+
+    @property
+    def depth_confidence(self) -> float | None:
+        """No peer reads depth."""
+        return None
+
+
+@dataclass(frozen=True)
+class McmcSettings:
+    """Relocation, growth and noise (3DGS-MCMC), with its regularisers."""
+
+    begin: float = 1 / 60  # 500 of 30,000
+    end: float = 5 / 6  # 25,000 of 30,000
+    every: float = 1 / 300  # 100 of 30,000
+    min_every: int = 20
+    """Fewest steps between two rounds, whatever `every` says; growth is made up for."""
+    growth: float = 1.05
+    """Per round at `every`."""
+    dead_opacity: float = 0.005
+    noise: float = 5e5
+    """Times the positions' learning rate, with every step."""
+
+
+@dataclass(frozen=True)
+class McmcWeights:
+    """Of the losses, all the run."""
+
+    ssim: float = 0.2
+    opacity: float = 0.01
+    scale: float = 0.01
+
+
+@dataclass(frozen=True)
+class McmcGsSettings(GaussianSettings):
+    """Gaussian MCMC without water: 3R-GS with the poses refined, 3DGS-MCMC without."""
+
+    initial: GaussianInitialSettings = field(default_factory=lambda: GaussianInitialSettings(scale=0.1, opacity=0.5))
+    weights: McmcWeights = field(default_factory=McmcWeights)
+    densify: McmcSettings = field(default_factory=McmcSettings)
+    poses: TrainingPoseSettings = field(
+        default_factory=lambda: TrainingPoseSettings(rate=2.25e-4, epipolar_end=0.1)  # 1.5e-4 and 3,000 in 30,000
+    )

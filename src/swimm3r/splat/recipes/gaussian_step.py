@@ -1,0 +1,99 @@
+"""What a step of every recipe with Gaussians begins and ends with: one view drawn, rates, rows that come and go."""
+
+from collections.abc import Collection
+from dataclasses import dataclass
+
+import torch
+from jaxtyping import Float, Int
+from torch import Tensor
+
+from swimm3r.splat import training
+from swimm3r.splat.gaussian_settings import GaussianSettings
+from swimm3r.splat.gaussians import GaussianPrimitives, initial_gaussians, rescaled, to_degree
+from swimm3r.splat.optimiser import Moments, log_linear
+from swimm3r.splat.pose_codes import pose_rate
+from swimm3r.splat.projection import Pinhole, pinhole
+from swimm3r.splat.rendering import Drawing, draw
+from swimm3r.splat.site import Site
+from swimm3r.splat.state import POSES, State, parameters_of
+from swimm3r.splat.views import View
+
+# purposes of randomness (training.generator): 2 primitives, 3 water, 4 densification, 6 poses, 7 matches, 8 noise
+_MOST_HASTE = 4.0
+
+
+@dataclass(frozen=True)
+class Look:
+    """One view as drawn for training, and what its loss may be differentiated by."""
+
+    p: GaussianPrimitives  # leaves
+    drawing: Drawing
+    sight: Pinhole
+    parameters: dict[str, Tensor]  # the leaves by name, water and poses too
+
+    def gradients(self, loss: Float[Tensor, ""]) -> dict[str, Tensor]:
+        """The loss's gradient by name; "mean2d" is that of the projected centres, px."""
+        plane = self.drawing.projection.primitives.mean2d
+        found = torch.autograd.grad(loss, [*self.parameters.values(), plane], materialize_grads=True)
+        return dict(zip([*self.parameters, "mean2d"], found, strict=True))
+
+
+def first_gaussians(site: Site, settings: GaussianSettings) -> GaussianPrimitives:
+    """The Gaussians before step 1, in working units."""
+    p = initial_gaussians(site.rec, settings.initial, training.generator(settings.seed, 0, 2))
+    return rescaled(p, site.scale)
+
+
+def look(
+    site: Site, state: State[GaussianPrimitives], view: View, settings: GaussianSettings, step: int, sgg: bool = False
+) -> Look:
+    """Draw a view with the harmonics that this step has come to; `sgg` asks for the gradients' parts."""
+    p = GaussianPrimitives(*(values.detach().requires_grad_() for values in state.primitives))
+    degree = int((step - 1) / (settings.degree_every * settings.iterations))
+    sight = pinhole(site.camera(view, state.poses))
+    drawing = draw(to_degree(p, min(degree, settings.initial.harmonics)), state.field, sight, settings, sgg=sgg)
+    return Look(p, drawing, sight, parameters_of(p, state.field, state.poses))
+
+
+def with_matches(
+    site: Site, state: State, loss: Float[Tensor, ""], settings: GaussianSettings, step: int
+) -> tuple[Float[Tensor, ""], dict[str, float]]:
+    """The loss, with the epipolar error of the training poses while it takes part, and that for the record."""
+    rng = training.generator(settings.seed, step, 7)
+    off = site.epipolar_error(state.poses, settings.poses, step / settings.iterations, rng)
+    if off is None:
+        return loss, {}
+    return loss + settings.poses.epipolar * off, {"epipolar_px": float(off.detach())}
+
+
+def haste(settings: GaussianSettings) -> float:
+    """How much larger some rates are than published, in a run this short."""
+    published = type(settings).iterations
+    return min(_MOST_HASTE, max(1.0, published / settings.iterations) ** settings.rates.haste)
+
+
+def rates_of(site: Site, settings: GaussianSettings, step: int, names: Collection[str]) -> dict[str, float]:
+    """Adam's rates of Gaussians and poses in a step; the water's are the recipe's own."""
+    r, faster = settings.rates, haste(settings)
+    position = site.radius * log_linear(r.xyz, r.xyz_end, step / settings.iterations)
+    hasty = {"xyz": position, "quaternion": r.quaternion, "colour": r.colour, "harmonics": r.harmonics}
+    poses = pose_rate(settings.poses, settings.iterations)
+    return {
+        **{name: faster * rate for name, rate in hasty.items()},
+        "scale": r.scale,
+        "opacity": r.opacity,
+        **{name: poses for name in names if name.startswith(POSES)},
+    }
+
+
+def with_rows(
+    moments: dict[str, Moments], source: Int[Tensor, " n"], restarted: Int[Tensor, " m"]
+) -> dict[str, Moments]:
+    """The optimiser's memory after row i of the Gaussians became what row source[i] was; zero in `restarted`."""
+    kept = dict(moments)
+    for name in GaussianPrimitives._fields:
+        m = moments[name]
+        first, second = m.first[source], m.second[source]
+        first[restarted], second[restarted] = 0, 0
+        kept[name] = Moments(first, second, m.steps)
+    return kept

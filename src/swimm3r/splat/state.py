@@ -1,0 +1,95 @@
+"""What training changes, whatever the recipe, and what a map consists of."""
+
+import dataclasses
+import math
+from dataclasses import dataclass
+from typing import Any, Generic, TypeVar
+
+import torch
+from torch import Tensor
+
+from swimm3r.splat.gaussians import GaussianPrimitives
+from swimm3r.splat.medium_field import MediumField
+from swimm3r.splat.optimiser import Moments, fresh
+from swimm3r.splat.pose_codes import PoseCodes
+from swimm3r.splat.primitives import BetaPrimitives
+from swimm3r.splat.projection import Primitives
+from swimm3r.splat.scene_settings import MediumFieldSettings
+from swimm3r.splat.settings import McmcGsSettings, SplatSettings, UwbsSettings
+
+FIELD, POSES = "field.", "poses."
+P = TypeVar("P", BetaPrimitives, GaussianPrimitives)
+
+
+@dataclass(frozen=True)
+class Parts:
+    """The kind of primitives, and a water whose values are still to come."""
+
+    primitives: type[Primitives]
+    field: MediumField
+
+
+def parts_of(settings: SplatSettings) -> Parts:
+    """What the maps of a recipe consist of."""
+    match settings:
+        case UwbsSettings():
+            return Parts(BetaPrimitives, MediumField(settings.medium, settings.dynamic))
+        case McmcGsSettings():
+            return Parts(GaussianPrimitives, MediumField(MediumFieldSettings(model="none")))
+
+
+@dataclass(frozen=True)
+class State(Generic[P]):
+    """Primitives, water and poses, the optimiser's memory of them, and what else a recipe remembers."""
+
+    primitives: P
+    field: MediumField
+    poses: PoseCodes | None  # None where poses are held
+    moments: dict[str, Moments]  # of "xyz" ..., of the field's parameters by "field.*", of the poses' by "poses.*"
+    memory: dict[str, Tensor] = dataclasses.field(default_factory=dict)
+
+
+def parameters_of(p: Primitives, field: MediumField, poses: PoseCodes | None = None) -> dict[str, Tensor]:
+    """Everything that is trained, by the names of `State.moments`."""
+    of_field: dict[str, Tensor] = {f"{FIELD}{name}": t for name, t in field.named_parameters()}
+    of_poses = {} if poses is None else {f"{POSES}{name}": t for name, t in poses.named_parameters()}
+    return {**p._asdict(), **of_field, **of_poses}
+
+
+def first_state(p: P, field: MediumField, poses: PoseCodes | None, memory: dict[str, Tensor] | None = None) -> State[P]:
+    """The state before step 1."""
+    p = type(p)(*(values.contiguous() for values in p))
+    moments = {name: fresh(values) for name, values in parameters_of(p, field, poses).items()}
+    return State(p, field, poses, moments, memory or {})
+
+
+def stored(state: State) -> dict[str, Tensor]:
+    """Parameters by name; their moments after .first, .second and .steps; what else is remembered after .memory."""
+    parameters = parameters_of(state.primitives, state.field, state.poses)
+    tensors = {f"parameter.{name}": t for name, t in parameters.items()}
+    for name, m in state.moments.items():
+        tensors |= {f"first.{name}": m.first, f"second.{name}": m.second, f"steps.{name}": m.steps}
+    return tensors | {f"memory.{name}": t for name, t in state.memory.items()}
+
+
+def restored(tensors: dict[str, Tensor], settings: SplatSettings, cameras: int) -> State[Any]:
+    """The inverse of `stored`; `cameras` are those whose poses are refined, 0 where they are held."""
+    parts = parts_of(settings)
+    poses = PoseCodes(cameras, settings.poses) if cameras else None
+    p: Any = parts.primitives(*(tensors[f"parameter.{name}"] for name in parts.primitives._fields))
+    parameters = parameters_of(p, parts.field, poses)
+    with torch.no_grad():
+        for name, parameter in parameters.items():
+            parameter.copy_(tensors[f"parameter.{name}"])
+    moments = {k: Moments(tensors[f"first.{k}"], tensors[f"second.{k}"], tensors[f"steps.{k}"]) for k in parameters}
+    memory = {k.removeprefix("memory."): t for k, t in tensors.items() if k.startswith("memory.")}
+    return State(p, parts.field, poses, moments, memory)
+
+
+def clip_field(gradients: dict[str, Tensor]) -> None:
+    """Hold the gradient of the water's network to a norm of 1e-3, in place (WaterSplatting)."""
+    of_field = [gradient for name, gradient in gradients.items() if name.startswith(FIELD)]
+    norm = math.hypot(*(float(g.norm()) for g in of_field))
+    if norm > 1e-3:
+        for g in of_field:
+            g.mul_(1e-3 / norm)
