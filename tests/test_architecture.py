@@ -95,7 +95,11 @@ def test_importing_the_package_loads_nothing_heavy():
 
 def test_help_loads_no_torch():
     commands = ["run", "demo", "sfm", "splat", "render", "export", "eval", "prepare", "doctor", "datasets"]
-    commands += ["train-sfm", "bench", *(f"bench {name}" for name in ("render", "ablation-uwbs", "localisation"))]
+    commands += [
+        "train-sfm",
+        "bench",
+        *(f"bench {name}" for name in ("sfm", "restoration", "render", "localisation", "ablation-uwbs")),
+    ]
     for command in ("", "weights get", *commands):
         snippet = (
             "from swimm3r.cli.main import main\n"

@@ -61,12 +61,12 @@ def run_pipeline(
     """
     settings = settings or RunSettings()
     check_source(source)
-    fingerprint = _fingerprint(source, folder)
+    fingerprint = fingerprint_of(source, folder)
     is_new = not folder.exists()
     record = _Record(folder, source, fingerprint)
     write_text(folder / "settings.yaml", to_yaml(settings))
     write_text(folder / "versions.json", json.dumps(_versions(), indent=2) + "\n")
-    truth = _truth(source, reference)
+    truth = truth_of(source, reference)
 
     key = _key("prepare", fingerprint, asdict(settings.frames))
     try:
@@ -154,7 +154,7 @@ def open_finished_sfm(folder: Path, reference: Path | None = None) -> FinishedSf
         load_frames(folder / "prepare"),
         reconstruction.load(folder / "sfm"),
         from_yaml(folder / "settings.yaml"),
-        _truth(Path(summary["input"]["path"]), reference),
+        truth_of(Path(summary["input"]["path"]), reference),
         stage["key"],
     )
 
@@ -195,7 +195,7 @@ def evaluate_run(
     record.summary |= {name: section for name, section in before.items() if name not in _SCORES}
     frames, rec = load_frames(folder / "prepare"), reconstruction.load(folder / "sfm")
     run = _Run(folder, frames, rec, load_map(folder / "splat" / "map.safetensors"))
-    truth = _truth(source, reference)
+    truth = truth_of(source, reference)
     key = _key("eval", before["stages"]["splat"]["key"], {"reference": str(reference), "test": asdict(settings.test)})
     record.stage("eval", key, make=lambda: record.add(_scores(run, settings, truth, progress)))
     summary = record.close()
@@ -333,14 +333,15 @@ class _Record:
             log.write(line + "\n")
 
 
-def _truth(source: Path, reference: Path | None) -> GroundTruth | None:
+def truth_of(source: Path, reference: Path | None) -> GroundTruth | None:
+    """What is known for certain of a clip: the reference where one is given, else what a synthetic dive brings."""
     if reference is not None:
         return read_ground_truth(reference)
     beside = source / TRUTH_FOLDER
     return read_ground_truth(beside) if beside.is_dir() else None
 
 
-def _fingerprint(source: Path, folder: Path) -> str:
+def fingerprint_of(source: Path, folder: Path) -> str:
     """What tells one input from another: names, sizes and times of its files, not where it lies.
 
     A run folder inside the input is no part of it.

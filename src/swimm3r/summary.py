@@ -14,7 +14,7 @@ from swimm3r.evaluate.depth import depth_scores
 from swimm3r.evaluate.images import as_8_bit, psnr
 from swimm3r.evaluate.matches import epipolar_errors, match_scores
 from swimm3r.evaluate.poses import absolute_pose_errors, pose_scores
-from swimm3r.evaluate.underwater import clear_psnr, uciqe, uiqm, water_scores, water_scores_from_views
+from swimm3r.evaluate.underwater import URANKER, clear_psnr, uciqe, uiqm, water_scores, water_scores_from_views
 from swimm3r.frames import Frames
 from swimm3r.geometry import DegenerateAlignmentError, align_poses, align_similarity
 from swimm3r.ground_truth import GroundTruth
@@ -31,21 +31,11 @@ from swimm3r.splat.settings import PoseRefinementSettings, recipe_of
 from swimm3r.splat.views import pinhole_canvas, undistorted
 
 _ASKED = 16  # training views that the map's mean water is taken over
-_NO_WEIGHTS = NotComputed("needs the URanker weights, which this version does not load")
 
 
 def sfm_sections(rec: Reconstruction, frames: Frames) -> dict[str, object]:
     """ "sfm", "medium" and "cautions": what structure from motion found."""
-    cameras = rec.cameras
-    errors = epipolar_errors(
-        rec.matches.i,
-        rec.matches.j,
-        _undistorted(cameras, rec.matches.i, rec.matches.xy_i),
-        _undistorted(cameras, rec.matches.j, rec.matches.xy_j),
-        cameras.K,
-        cameras.cam2world,
-    )
-    epipolar = match_scores(errors)
+    epipolar = match_scores(retained_match_errors(rec))
     observations = torch.bincount(rec.tracks.point, minlength=len(rec.points.xyz)).double()
     sfm = {
         "backend": rec.backend,
@@ -73,6 +63,18 @@ def sfm_sections(rec: Reconstruction, frames: Frames) -> dict[str, object]:
     return sections
 
 
+def retained_match_errors(rec: Reconstruction) -> Float[Tensor, " m"]:
+    """Symmetric epipolar error of every match the reconstruction keeps, under its own cameras; pixels of the frames."""
+    return epipolar_errors(
+        rec.matches.i,
+        rec.matches.j,
+        _undistorted(rec.cameras, rec.matches.i, rec.matches.xy_i),
+        _undistorted(rec.cameras, rec.matches.j, rec.matches.xy_j),
+        rec.cameras.K,
+        rec.cameras.cam2world,
+    )
+
+
 def restored_section(folder: Path, names: Sequence[str], progress: Progress = silent) -> dict[str, object]:
     """Reference-free scores of the restored pictures, native size, averaged over frames."""
     scores = []
@@ -91,7 +93,7 @@ def restored_section(folder: Path, names: Sequence[str], progress: Progress = si
             "uiqm_variant": "FUnIE-GAN, native size",
             "uciqe": mean[1],
             "uciqe_variant": "CIELAB, own units",
-            "urank": _NO_WEIGHTS,
+            "urank": URANKER,
         }
     )
 

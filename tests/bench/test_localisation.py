@@ -88,7 +88,8 @@ def test_runs_of_one_clip_are_rows_and_their_reference_is_made_once(
         train(sfm.rec, sfm.frames, tiny, folder / "splat")
     made = []
 
-    def all_frames(frames, settings, folder, progress):
+    def all_frames(frames, settings, folder, progress, lens):
+        assert (lens.K == sfm.rec.cameras[0].K).all()
         made.append((frames.names, {f.split for f in frames}))
         order = [truth.names.index(name) for name in frames.names]
         return replace(sfm.rec, names=frames.names, cameras=truth.cameras[order])

@@ -22,7 +22,7 @@ def test_every_recipe_starts_from_the_same_poses_of_the_whole_clip(
     run: Path, tmp_path: Path, tiny: UwbsSettings, quick: PoseRefinementSettings, monkeypatch: pytest.MonkeyPatch
 ):
     truth = open_finished_sfm(run).truth
-    monkeypatch.setattr(reference, "whole_clip", lambda *_: truth)
+    monkeypatch.setattr(reference, "of_clip", lambda *_: truth)
     starts, score_views = [], held_out.score_views
 
     def watched(scene, rec, frames, poses, *rest):
@@ -74,8 +74,8 @@ def test_clips_are_reconstructed_once_and_runs_are_taken_as_they_are(
 
 def test_a_clip_that_cannot_be_placed_as_a_whole_is_remembered(run: Path, tmp_path: Path):
     sfm = open_finished_sfm(run)
-    flat = replace(sfm.frames, frames=sfm.frames.frames[:2])
-    found = reference.whole_clip(flat, reference.settings_of(sfm), tmp_path)
+    few = replace(sfm.frames, frames=sfm.frames.frames[:8:7])
+    found = reference.of_clip(replace(sfm, frames=few), tmp_path)
     assert isinstance(found, NotComputed)
     assert json.loads((tmp_path / "reference.json").read_text())["failed"] == found.reason
-    assert reference.whole_clip(flat, reference.settings_of(sfm), tmp_path) == found
+    assert reference.of_clip(replace(sfm, frames=few), tmp_path) == found

@@ -1,5 +1,6 @@
 """Poses without weights: from pictures of two textured planes whose poses are known, and from a murky real clip."""
 
+import shutil
 from dataclasses import replace
 from pathlib import Path
 
@@ -190,6 +191,18 @@ def test_fixed_intrinsics_stay_as_given_but_for_a_flat_port_which_is_confessed(f
     assert found.cameras.K[0, 0, 0].item() == pytest.approx(FOCAL)
     assert found.cameras.distortion[0].tolist() == [0.01]
     assert any("flat port" in caution.what for caution in found.cautions)
+
+
+def test_a_lens_that_is_given_is_held(frames: Frames, folder: Path, tmp_path: Path) -> None:
+    shutil.copytree(folder, tmp_path, dirs_exist_ok=True)
+    given = _cameras()[0]
+    K = given.K * torch.tensor([1.02, 0.99, 1.0], dtype=torch.float64)[:, None]
+    lens = replace(given, K=K, distortion=torch.tensor([[0.01, 0.0, 0.0, 0.001]]).double(), model="OPENCV")
+    rec = colmap.reconstruct(frames, SETTINGS, tmp_path, lens=lens)
+    assert len(rec.names) == COUNT
+    assert rec.cameras.model == "OPENCV"
+    torch.testing.assert_close(rec.cameras.K, K.expand(COUNT, 3, 3))
+    torch.testing.assert_close(rec.cameras.distortion, lens.distortion.expand(COUNT, 4))
 
 
 def test_frames_of_another_place_are_left_out_and_said(frames: Frames, tmp_path: Path) -> None:

@@ -2,7 +2,8 @@
 
 Every test frame of a run is a query. Its pose is judged against the structure from motion of all frames, training and
 test, by relative poses: of test frame and training frame, where the map's training frames anchor the answer, and of two
-test frames, of which short clips have few. Maps are the runs' own, and those that `bench render` left.
+test frames, of which short clips have few. The pairs of two training frames say how far the map's own poses agree with
+the reference: nothing placed in the map can agree better. Maps are the runs' own, and those that `bench render` left.
 """
 
 import json
@@ -39,6 +40,7 @@ from swimm3r.splat.checkpoint import load_map
 from swimm3r.splat.settings import recipe_of
 
 _PAIRS = [f"{score}_{pairs}" for pairs in ("map", "queries") for score in ("rra2", "rta5", "rra15", "rta15")]
+_PAIRS += ["rra2_training", "rta5_training"]
 COLUMNS = columns(
     "located_pct", "inlier_5px_pct", "reprojection_px", *_PAIRS, "rotation_median_deg", "position_median_pct",
     *(f"fps_{stage}" for stage in STAGES), "fps_localise", "peak_mb", "peak_vram_mb",
@@ -102,7 +104,7 @@ def _cells_of_clip(
     clip: Clip, /, *, out: Path, settings: LocalizationSettings, maps: Path | None, progress: Progress
 ) -> list[Cell]:
     first = clip.runs[0].open()
-    truth = reference.whole_clip(first.frames, reference.settings_of(first), out / "references" / clip.name, progress)
+    truth = reference.of_clip(first, scene_folder(out / "references", clip.name), progress)
     cells = []
     for run in clip.runs:
         sfm = run.open()
@@ -147,7 +149,7 @@ def _answers(localizer: Localizer, sfm: FinishedSfm, folder: Path, progress: Pro
     for done, frame in enumerate(sfm.frames.test):
         progress("localising", done, len(sfm.frames.test))
         f = sfm.frames.index(frame.name)
-        query = Query(frame.name, frame.time, sfm.frames.image(f), sfm.frames.mask(f))
+        query = Query(frame.name, frame.time, sfm.frames.image(f), sfm.frames.mask(f), frame.time)
         found.append(answer(localizer, query))
         place = found[-1].found
         if place is not None and place.evidence is not None:
@@ -194,13 +196,14 @@ def pose_scores(
     is_query = torch.arange(len(found)) < len(queries)
     both = is_query[errors.pairs].sum(-1)
     scores: dict[str, float | NotComputed] = {}
-    for kind, count in (("map", 1), ("queries", 2)):
+    for kind, count in (("training", 0), ("map", 1), ("queries", 2)):
         chosen = _selected(errors, both == count)
         few = NotComputed("there is no such pair of frames in the reference")
         for threshold in (2, 15):
             scores[f"rra{threshold}_{kind}"] = rra(chosen, threshold) if len(chosen.pairs) else few
         for threshold in (5, 15):
             scores[f"rta{threshold}_{kind}"] = rta(chosen, threshold) if len(chosen.pairs) else few
+    scores = {name: scores[name] for name in _PAIRS}
     return scores | _aligned_errors(torch.stack(placed)[found[: len(queries)]], ours, theirs, found, len(queries))
 
 

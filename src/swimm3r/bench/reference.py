@@ -1,7 +1,9 @@
 """Reference poses where nobody knows the truth: structure from motion of all frames, test frames included.
 
 The paper places test frames by poses of the full sequence, which no method's own training frames could give. They are
-made once per clip, without dense depth and water, and kept in a folder with the key of what they were made of.
+made once per clip, without dense depth and water, and kept in a folder with the key of what they were made of. The lens
+is held at what the clip's first run found: calibrated anew, it would come out different on other frames (on small hazy
+pictures by a quarter), and poses under two lenses differ by more than a good localisation errs.
 """
 
 import json
@@ -10,6 +12,7 @@ from dataclasses import asdict, replace
 from hashlib import sha256
 from pathlib import Path
 
+from swimm3r.cameras import Cameras
 from swimm3r.errors import RegistrationError
 from swimm3r.evaluate import NotComputed
 from swimm3r.frames import Frames
@@ -22,18 +25,21 @@ from swimm3r.sfm import colmap
 from swimm3r.sfm.settings import ColmapSettings
 
 
-def settings_of(sfm: FinishedSfm) -> ColmapSettings:
-    """The run's own where COLMAP found its poses, for they may know the lens; else the defaults."""
-    return sfm.settings.sfm if isinstance(sfm.settings.sfm, ColmapSettings) else ColmapSettings()
+def of_clip(sfm: FinishedSfm, folder: Path, progress: Progress = silent) -> GroundTruth | NotComputed:
+    """The reference of a run's clip, by the run's own settings where COLMAP found its poses, else by the defaults."""
+    settings = sfm.settings.sfm if isinstance(sfm.settings.sfm, ColmapSettings) else ColmapSettings()
+    return whole_clip(sfm.frames, sfm.rec.cameras[0], settings, folder, progress)
 
 
 def whole_clip(
-    frames: Frames, settings: ColmapSettings, folder: Path, progress: Progress = silent
+    frames: Frames, lens: Cameras, settings: ColmapSettings, folder: Path, progress: Progress = silent
 ) -> GroundTruth | NotComputed:
     """Poses of all frames together, made in `folder` or found there; NotComputed where they cannot be placed."""
     listing = [(f.name, f.path.stat().st_size) for f in frames]
-    poses_only = {k: v for k, v in asdict(settings).items() if k not in ("depth", "water", "restore", "threads")}
-    key = sha256(json.dumps([listing, poses_only], sort_keys=True, default=str).encode()).hexdigest()
+    through = [lens.model, lens.K.tolist(), lens.distortion.tolist()]
+    used = {k: v for k, v in asdict(settings).items() if k in ("pairs", "exhaustive_to", "overlap", "loops")}
+    used |= {"features": asdict(settings.features), "mapping": asdict(settings.mapping)}
+    key = sha256(json.dumps([listing, through, used], sort_keys=True).encode()).hexdigest()
     record, cameras = folder / "reference.json", folder / "cameras.json"
     stored = json.loads(record.read_text(encoding="utf-8")) if record.is_file() else {}
     if stored.get("key") == key:
@@ -42,7 +48,7 @@ def whole_clip(
     everything = replace(frames, frames=tuple(replace(frame, split="train") for frame in frames))
     failed = ""
     try:
-        rec = colmap.reconstruct(everything, settings, folder / "work", progress)
+        rec = colmap.reconstruct(everything, settings, folder / "work", progress, lens)
         table = cameras_json.CameraTable(
             names=rec.names,
             width=rec.cameras.width,

@@ -12,7 +12,7 @@ from pathlib import Path
 
 from swimm3r import held_out
 from swimm3r.bench import reference
-from swimm3r.bench.cells import Cell, Place, Scores, kept_cell, over_scenes
+from swimm3r.bench.cells import Cell, Place, Scores, kept_cell, over_scenes, scene_folder
 from swimm3r.bench.map_scores import map_scores, trained
 from swimm3r.bench.pictures import stored, write_grid
 from swimm3r.bench.runs import POSES_REFINED, Clip, clips_of
@@ -76,7 +76,7 @@ def _cells_of_clip(
     progress: Progress,
 ) -> list[Cell]:
     first = clip.runs[0].open()
-    truth = reference.whole_clip(first.frames, reference.settings_of(first), out / "references" / clip.name, progress)
+    truth = reference.of_clip(first, scene_folder(out / "references", clip.name), progress)
     cells = []
     for run in clip.runs:
         sfm = run.open()

@@ -5,11 +5,17 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
+from swimm3r.bench.settings import IMPORTED
 from swimm3r.errors import InputError
+from swimm3r.frames import Frames
+from swimm3r.io.images import image_size
+from swimm3r.io.video import Video
+from swimm3r.prepare.stills import pictures_of
 from swimm3r.presets import RunSettings
 from swimm3r.progress import Progress, silent
 from swimm3r.run import FinishedSfm, open_finished_sfm, run_pipeline
-from swimm3r.sfm.settings import ColmapModelSettings, ColmapSettings
+from swimm3r.sfm.settings import ColmapModelSettings, ColmapSettings, Mast3rSettings
+from swimm3r.sfm.training.settings import RECIPES
 
 POSES_REFINED = " + poses"
 """Ends the name of how poses were found where maps refined them, whatever their recipe says."""
@@ -76,13 +82,23 @@ def made_runs(
     return tuple(runs)
 
 
+def original_pixels(source: Path, frames: Frames) -> float:
+    """Pixels of the clip's own pictures per pixel of the frames made of them."""
+    width = image_size(pictures_of(source)[1][0])[0] if source.is_dir() else Video(source).width
+    return width / frames.width
+
+
 def sfm_label(settings: RunSettings, backend: str) -> str:
     """How poses were found, in a word."""
     match settings.sfm:
         case ColmapSettings(mapping=mapping) if mapping.method != "auto":
             return f"{backend}-{mapping.method}"
-        case ColmapModelSettings(model=model):
-            return f"{backend} ({model.name})" if backend == "COLMAP model" else backend
+        case ColmapModelSettings(model=model) if model.parent.name in IMPORTED:
+            return model.parent.name
+        case ColmapModelSettings(model=model) if backend == "COLMAP model":
+            return f"{backend} ({model.name})"
+        case Mast3rSettings(adapter=Path() as adapter) if adapter.parent.name in RECIPES:
+            return adapter.parent.name
         case _:
             return backend
 

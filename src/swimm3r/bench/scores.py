@@ -17,8 +17,12 @@ class Column:
 
 _PAIRS = "pairs i < j, W_i W_j^-1, baselines as lines, an unplaced frame fails its pairs"
 _MAP_PAIRS = f"a test frame with each training frame; {_PAIRS}"
+_TRAINING_PAIRS = "two training frames, the map's own poses against the reference: what localisation can reach"
 _QUERY_PAIRS = f"two test frames; {_PAIRS}"
-_EPIPOLAR = "mean of both distances, pixels of the frames, under each method's own poses"
+_EPIPOLAR = (
+    "mean of both distances, original pixels, under each method's own poses, over the matches it keeps: COLMAP's"
+    " verified two-view ones, MASt3R's that agree with its map; of imported models sightings of one point"
+)
 _DEPTH = "z depth, each frame scaled by its median, mean over frames"
 _AFTER = "over located frames, after the similarity of the training frames"
 _FIRST_POSES = "test frames whose refinement began at the reference's pose; else at one from 2D-3D matches"
@@ -35,6 +39,23 @@ COLUMNS = (
     Column("B_abs", "B error", 4, "low", f"absolute error of the backscatter, {_WATER}"),
     Column("from_reference_pct", "By reference, %", 0, "neither", _FIRST_POSES),
     Column("train_cpu_seconds", "Training, CPU s", 0, "low", "processor seconds per step times steps"),
+    Column("registered_pct", "Reg., %", 1, "high", "training frames placed, in the largest model; mean over scenes"),
+    Column("epipolar_mean_px", "EpiErr, px", 3, "low", _EPIPOLAR),
+    Column("inlier_1px_pct", "Inlier@1px, %", 1, "high", f"share with that error below 1; {_EPIPOLAR}"),
+    Column("points", "#Points", 0, "neither", "sparse points of the map, seen by several frames"),
+    Column("dense_points", "#Dense points", 0, "neither", "of the restored cloud"),
+    Column("sfm_cpu_seconds", "SfM, CPU s", 0, "low", "poses, dense depth, water and cloud"),
+    Column("absrel_median", "AbsRel", 4, "low", _DEPTH),
+    Column("delta125_median", "δ<1.25", 2, "high", f"%, {_DEPTH}"),
+    Column("rmselog_median", "RMSE log", 4, "low", f"natural logarithm, {_DEPTH}"),
+    Column("depth_coverage_pct", "Depth, %", 1, "neither", "of the truly known pixels those that are scored"),
+    Column("rra15", "RRA@15", 2, "high", _PAIRS),
+    Column("rta15", "RTA@15", 2, "high", _PAIRS),
+    Column("maa30", "mAA(30)", 2, "high", f"whole-degree bins of the larger error; {_PAIRS}"),
+    Column("reference_pct", "In reference, %", 1, "neither", "frames that the reference knows; others do not count"),
+    Column("uiqm_funie", "UIQM", 3, "high", "FUnIE-GAN variant, native size"),
+    Column("uciqe_cielab", "UCIQE", 2, "high", "CIELAB's own units"),
+    Column("uranker", "URank", 3, "high", "URanker"),
     Column("located_pct", "Located, %", 1, "high", "test frames that were given a pose"),
     Column("inlier_5px_pct", "Inlier@5px, %", 1, "high", "of query-to-render matches; 0 where not located"),
     Column("reprojection_px", "Reproj., px", 2, "low", "median over located frames of the median over inliers"),
@@ -46,6 +67,8 @@ COLUMNS = (
     Column("rta5_queries", "RTA@5 (queries)", 1, "high", _QUERY_PAIRS),
     Column("rra15_queries", "RRA@15 (queries)", 1, "high", _QUERY_PAIRS),
     Column("rta15_queries", "RTA@15 (queries)", 1, "high", _QUERY_PAIRS),
+    Column("rra2_training", "RRA@2 (training)", 1, "neither", _TRAINING_PAIRS),
+    Column("rta5_training", "RTA@5 (training)", 1, "neither", _TRAINING_PAIRS),
     Column("rotation_median_deg", "Rotation, deg", 3, "low", f"median, {_AFTER}"),
     Column("position_median_pct", "Position, %", 2, "low", f"median, of the path's spread, {_AFTER}"),
     *(

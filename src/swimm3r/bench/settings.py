@@ -1,6 +1,8 @@
-"""How a benchmark's scenes are spread over processes; torch-free, so that --help is instant."""
+"""What the protocols are told besides the settings of their parts; torch-free, so that --help is instant."""
 
 from dataclasses import dataclass
+from pathlib import Path
+from typing import Literal
 
 from swimm3r.errors import UsageError
 
@@ -30,3 +32,45 @@ class JobSettings:
                     cause="a slip in the command",
                     hint="leave it out for the default",
                 )
+
+
+SfmMethod = Literal[
+    "colmap-incremental",
+    "colmap-global",
+    "gluemap",
+    "spann3r",
+    "vggt",
+    "mast3r",
+    "dark3r",
+    "distillation-only",
+    "without-forward",
+    "without-inverse",
+    "without-saturation",
+    "without-augmentation",
+    "swimm3r",
+]
+IMPORTED: tuple[SfmMethod, ...] = ("gluemap", "spann3r", "vggt")
+PEERS: tuple[SfmMethod, ...] = (
+    *("colmap-incremental", "colmap-global"),
+    *IMPORTED,
+    *("mast3r", "dark3r", "distillation-only", "swimm3r"),
+)
+ABLATION: tuple[SfmMethod, ...] = (
+    "swimm3r",
+    "without-forward",
+    "without-inverse",
+    "without-saturation",
+    "without-augmentation",
+    "distillation-only",
+)
+
+
+@dataclass(frozen=True)
+class SfmMethods:
+    """Which ways of structure from motion are compared. One that lacks its files is reported as not run."""
+
+    methods: tuple[SfmMethod, ...] = PEERS
+    adapters: Path | None = None
+    """Trainings of swimm3r train-sfm by the names of their recipes: ADAPTERS/dark3r/adapter.safetensors ..."""
+    imports: Path | None = None
+    """What other programs made of the same pictures: IMPORTS/vggt/SCENE or SCENE.npz, IMPORTS/gluemap/SCENE, ..."""

@@ -7,13 +7,13 @@ from typing import TYPE_CHECKING, Annotated, Literal
 
 from tyro.conf import Positional, arg, subcommand
 
-from swimm3r.bench.settings import JobSettings
+from swimm3r.bench.settings import JobSettings, SfmMethods
 from swimm3r.cli.console import drawn_progress
 from swimm3r.frame_settings import FrameSettings
 from swimm3r.localization.settings import LocalizationSettings
-from swimm3r.presets import PRESETS, RunSettings
+from swimm3r.presets import MAST3R_PRESETS, PRESETS, RunSettings
 from swimm3r.progress import Progress
-from swimm3r.sfm.settings import ColmapSettings
+from swimm3r.sfm.settings import ColmapSettings, Mast3rSettings
 from swimm3r.splat.settings import RECIPES, PoseRefinementSettings, Recipe, UwbsSettings
 
 if TYPE_CHECKING:
@@ -22,7 +22,8 @@ if TYPE_CHECKING:
 Preset = Literal["fast", "default", "best"]
 _FLAT = arg(name="")
 _Jobs = Annotated[JobSettings, _FLAT]
-_ONE_BY_ONE = JobSettings()
+_Methods = Annotated[SfmMethods, _FLAT]
+_ONE_BY_ONE, _ALL_METHODS = JobSettings(), SfmMethods()
 
 
 def command_for_preset(name: str) -> Callable:
@@ -30,6 +31,7 @@ def command_for_preset(name: str) -> Callable:
     defaults = PRESETS[name]
     assert isinstance(defaults.sfm, ColmapSettings)
     found_poses, picked_evenly = defaults.sfm, replace(defaults.frames, pick="uniform")
+    as_filmed = replace(picked_evenly, long_side=0)
 
     def ablation_uwbs(
         runs: Positional[tuple[Path, ...]],
@@ -97,7 +99,46 @@ def command_for_preset(name: str) -> Callable:
 
         _show(out, run)
 
-    protocols = {"render": render, "localisation": localisation, "ablation-uwbs": ablation_uwbs}
+    def sfm(
+        clips: Positional[tuple[Path, ...]],
+        /,
+        out: Path,
+        given: _Methods = _ALL_METHODS,
+        references: Path | None = None,
+        preset: Preset = "fast",
+        frames: FrameSettings = as_filmed,
+        colmap: ColmapSettings = found_poses,
+        mast3r: Mast3rSettings = MAST3R_PRESETS[name],
+        jobs: _Jobs = _ONE_BY_ONE,
+    ) -> None:
+        """Structure from motion of clips by every method: registration, epipolar error, inliers, points, clouds.
+
+        Methods whose weights, adapters or models are not here are reported as not run.
+
+        Args:
+            clips: videos or folders of stills.
+            out: where the methods' run folders, pictures of the clouds and the tables go: sfm.md, .csv, .json and .tex.
+            given: the methods and their files.
+            references: a folder with NAME.json (a cameras.json) of clips whose poses are known; synthetic dives bring
+                their own.
+            preset: what the other defaults aim at.
+            frames: which frames to take; the paper's are evenly spaced and of their own size.
+            colmap: how COLMAP works, and depth, water and cloud of all methods without a network.
+            mast3r: how the network's methods work.
+            jobs: clips in parallel.
+        """
+        from swimm3r.bench.sfm import compare_sfm
+
+        settings = RunSettings(frames, colmap, defaults.splat, defaults.test)
+        _show(out, lambda progress: compare_sfm(clips, out, given, settings, mast3r, references, jobs, progress))
+
+    protocols = {
+        "sfm": sfm,
+        "restoration": restoration,
+        "render": render,
+        "localisation": localisation,
+        "ablation-uwbs": ablation_uwbs,
+    }
     action = None
     for protocol, command in protocols.items():
         one = Annotated[None, subcommand(protocol, constructor=command)]
@@ -107,6 +148,24 @@ def command_for_preset(name: str) -> Callable:
         """The paper's tables on your own dives. Results stay in --out; the same command goes on where it stopped."""
 
     return bench
+
+
+def restoration(
+    runs: Positional[tuple[Path, ...]],
+    /,
+    out: Path,
+    jobs: _Jobs = _ONE_BY_ONE,
+) -> None:
+    """Score the restored frames of runs without reference: UIQM, UCIQE, and URanker or why it is not there.
+
+    Args:
+        runs: run folders with finished structure from motion, such as bench sfm leaves; they are only read.
+        out: where pictures side by side and the tables go: restoration.md, .csv, .json and .tex.
+        jobs: scenes in parallel.
+    """
+    from swimm3r.bench.restoration import score_restoration
+
+    _show(out, lambda progress: score_restoration(runs, out, jobs, progress))
 
 
 def localisation(

@@ -22,6 +22,15 @@ from swimm3r.evaluate import NotComputed
 from swimm3r.evaluate.images import as_8_bit, psnr_from_errors
 from swimm3r.medium import Encoding, Medium, MediumFit, backscatter, linear_from_srgb, transmittances
 
+URANKER = NotComputed("URanker's network is not published in enough detail to be rebuilt")
+"""Why there is no UnderwaterRanker score (Guo et al. 2023).
+
+Known are a CoaT-like transformer (patches 4, 2, 2, 2; widths 152, 320, 320, 320; serial depths 2, 2, 2, 2; 6 parallel
+blocks; 8 heads; position windows 3, 5, 7 for 2, 3, 3 heads), a 64-bin histogram of each channel as a further token, and
+the mean of three linear heads on the class tokens of scales 2 to 4. Not known: where that token enters attention and
+position encodings, how the parallel blocks exchange scales, the normalisations, and the names in the weights' file,
+without which a wrong guess would load in part and score silently. The authors' code is non-commercial and stays unread.
+"""
 _BLOCK = 10  # pixels; only whole blocks count
 
 

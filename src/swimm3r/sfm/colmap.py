@@ -37,10 +37,17 @@ if TYPE_CHECKING:
 _NONE, _NOWHERE = np.zeros(0), np.zeros((0, 2))  # what is joined where no pair matches
 
 
-def reconstruct(frames: Frames, settings: ColmapSettings, folder: Path, progress: Progress = silent) -> Reconstruction:
+def reconstruct(
+    frames: Frames,
+    settings: ColmapSettings,
+    folder: Path,
+    progress: Progress = silent,
+    lens: Cameras | None = None,
+) -> Reconstruction:
     """Cameras, points, tracks and matches of the frames that can be placed; depth maps are for others to fill.
 
-    Raises InputError for fewer than 2 frames and RegistrationError where too few can be placed.
+    `lens` (one camera, its pose unused) is held where it is given; else the settings say what is known of it. Raises
+    InputError for fewer than 2 frames and RegistrationError where too few can be placed.
     """
     import pycolmap
 
@@ -52,7 +59,11 @@ def reconstruct(frames: Frames, settings: ColmapSettings, folder: Path, progress
         )
     pycolmap.logging.minloglevel = pycolmap.logging.Level.ERROR.value  # its log is not for divers
     threads = settings.threads or os.cpu_count() or 1
-    camera = mapping.first_camera(frames.width, frames.height, settings)
+    if lens is None:
+        camera = mapping.first_camera(frames.width, frames.height, settings)
+    else:
+        camera, settings = _lens(lens), replace(settings, intrinsics="fixed")
+        camera.camera_id, camera.has_prior_focal_length = 1, True
     with _full_disk_said_plainly(folder):
         store = start_database(folder, frames, camera, settings.features)
         fill_features(store, frames, settings.features, threads, progress)

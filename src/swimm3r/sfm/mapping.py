@@ -99,7 +99,7 @@ def _climb(
     with store.open() as database:
         camera = database.read_camera(1)
     best: list[pycolmap.Reconstruction] = []
-    rungs = _ladder(camera.width, camera.height, settings)
+    rungs = [camera] if settings.intrinsics == "fixed" else _ladder(camera.width, camera.height, settings)
     for k, rung in enumerate(rungs):
         set_camera(store, rung)
         what = "placing frames" if k == 0 else f"placing frames, lens {k + 1} of {len(rungs)}"

@@ -104,7 +104,7 @@ MANIFEST = (
     ),
     Weights(
         name="uranker",
-        purpose="the URanker score of underwater pictures",
+        purpose="the URanker score of underwater pictures; nothing here loads them yet",
         filename="URanker_ckpt-450eb36d.pth",
         urls=("https://huggingface.co/chaofengc/IQA-PyTorch-Weights/resolve/main/URanker_ckpt-450eb36d.pth",),
         size=None,

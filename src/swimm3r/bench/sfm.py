@@ -1,0 +1,149 @@
+"""Structure from motion by every method on the same frames (the paper's Tab. sfm_metrics), and the clouds side by side.
+
+Each method leaves a run folder OUT/SCENE/METHOD/0/run, which `bench render`, `localisation` and `restoration` take.
+"""
+
+import json
+from collections.abc import Sequence
+from dataclasses import asdict, replace
+from functools import partial
+from pathlib import Path
+
+from swimm3r import reconstruction
+from swimm3r.bench import reference
+from swimm3r.bench.cells import Cell, Place, Scores, kept_cell, over_scenes
+from swimm3r.bench.pictures import Panel, write_grid
+from swimm3r.bench.runs import original_pixels
+from swimm3r.bench.scores import columns
+from swimm3r.bench.settings import JobSettings, SfmMethods
+from swimm3r.bench.sfm_methods import model_scores, reference_scores, settings_for
+from swimm3r.bench.tables import Table
+from swimm3r.errors import InputError, RegistrationError
+from swimm3r.evaluate import NotComputed
+from swimm3r.geometry import Similarity
+from swimm3r.ground_truth import GroundTruth
+from swimm3r.held_out import best_similarity
+from swimm3r.prepare import check_source, load_frames
+from swimm3r.presets import RunSettings
+from swimm3r.progress import Progress, silent
+from swimm3r.reconstruction import Reconstruction
+from swimm3r.report.charts import plan_view
+from swimm3r.run import fingerprint_of, run_pipeline, truth_of
+from swimm3r.sfm.settings import ColmapSettings, Mast3rSettings
+
+COLUMNS = columns(
+    "registered_pct", "epipolar_mean_px", "inlier_1px_pct", "points", "dense_points", "rra15", "rta15", "maa30",
+    "reference_pct", "sfm_cpu_seconds",
+)  # fmt: skip
+
+
+def compare_sfm(
+    clips: Sequence[Path],
+    out: Path,
+    given: SfmMethods,
+    settings: RunSettings,
+    mast3r: Mast3rSettings,
+    references: Path | None = None,
+    how: JobSettings | None = None,
+    progress: Progress = silent,
+) -> Table:
+    """Every method on every clip; `settings` say how frames are taken and how COLMAP works.
+
+    Poses are judged where a reference is known: a synthetic dive brings its own, `references` holds NAME.json (a
+    cameras.json) of others. Raises InputError where a clip cannot be read or two have one name.
+    """
+    names = [clip.stem for clip in clips]
+    if len(set(names)) < len(names):
+        raise InputError(
+            f"two of the clips have one name: {', '.join(sorted(names))}",
+            cause="results are kept by the clips' names",
+            hint="another name for one of them",
+        )
+    for clip in clips:
+        check_source(clip)
+    work = partial(_cells_of_clip, out=out, given=given, settings=settings, mast3r=mast3r, references=references)
+    cells = over_scenes(clips, work, out, how or JobSettings(), progress)
+    return Table("sfm", "Structure from motion by every method", cells, COLUMNS)
+
+
+def _cells_of_clip(
+    clip: Path,
+    /,
+    *,
+    out: Path,
+    given: SfmMethods,
+    settings: RunSettings,
+    mast3r: Mast3rSettings,
+    references: Path | None,
+    progress: Progress,
+) -> list[Cell]:
+    scene = clip.stem
+    named = None if references is None else references / f"{scene}.json"
+    truth = truth_of(clip, named if named is not None and named.is_file() else None)
+    assert isinstance(settings.sfm, ColmapSettings)
+    cells = []
+    for method in given.methods:
+        chosen = settings_for(method, scene, given, settings.sfm, mast3r)
+        if isinstance(chosen, NotComputed):
+            cells.append(Cell(scene, method, 0, not_run=chosen.reason))
+            continue
+        depends_on = [fingerprint_of(clip, out), asdict(settings.frames), type(chosen).__name__, asdict(chosen)]
+        depends_on += [None if truth is None else reference.digest(truth), [c.score for c in COLUMNS]]
+        make = partial(_scores, clip=clip, settings=replace(settings, sfm=chosen), truth=truth, progress=progress)
+        cells.append(kept_cell(out, Place(scene, method), depends_on, make))
+    _cloud_grid(out, scene, [cell.method for cell in cells if not cell.not_run])
+    return cells
+
+
+def _scores(
+    folder: Path, *, clip: Path, settings: RunSettings, truth: GroundTruth | None, progress: Progress
+) -> Scores:
+    run, rec, seconds = folder / "run", None, NotComputed("too few frames could be placed")
+    try:
+        run_pipeline(clip, run, settings, last_stage="sfm", progress=progress)
+        rec = reconstruction.load(run / "sfm")
+        seconds = json.loads((run / "summary.json").read_text(encoding="utf-8"))["stages"]["sfm"]["cpu_seconds"]
+    except RegistrationError:  # its row says that nothing was registered
+        pass
+    frames = load_frames(run / "prepare")
+    scores = model_scores(rec, len(frames.train), original_pixels(clip, frames))
+    if truth is not None:
+        scores |= reference_scores(rec, frames.train.names, truth)
+    return {**scores, "sfm_cpu_seconds": seconds}
+
+
+def _cloud_grid(out: Path, scene: str, methods: Sequence[str]) -> None:
+    """OUT/pictures/SCENE.png: each method's cloud from above, as filmed and without the water, in one method's axes."""
+    filmed, restored, first = [], [], None
+    for method in methods:
+        folder = Place(scene, method).folder(out) / "run" / "sfm"
+        if not (folder / "reconstruction.json").is_file():
+            filmed.append(Panel(method, None))
+            restored.append(Panel("without the water", None))
+            continue
+        rec = reconstruction.load(folder)
+        first = first or rec
+        raw, clear = _from_above(rec, first)
+        filmed.append(Panel(method, raw))
+        restored.append(Panel("without the water", clear))
+    if first is not None:
+        write_grid(out / "pictures" / f"{scene}.png", [filmed, restored])
+
+
+def _from_above(rec: Reconstruction, first: Reconstruction) -> tuple:
+    xyz, raw = rec.points.xyz, rec.points.rgb
+    restored = raw
+    if rec.cloud is not None:
+        xyz, raw, restored = rec.cloud.xyz, rec.cloud.raw, rec.cloud.restored
+    to_first = _between(rec, first)
+    poses = rec.cameras.cam2world.double()
+    if to_first is not None:
+        xyz, poses = to_first.points(xyz.double()), to_first.poses(poses)
+    view = plan_view(xyz.numpy(), raw.numpy(), restored.numpy(), poses.numpy())
+    return view.raw, None if rec.cloud is None else view.restored
+
+
+def _between(rec: Reconstruction, first: Reconstruction) -> Similarity | None:
+    shared = [name for name in rec.names if name in first.names]
+    ours, theirs = (r.cameras.cam2world[[r.index(name) for name in shared]].double() for r in (rec, first))
+    return best_similarity(ours, theirs) if shared else None
