@@ -5,7 +5,7 @@ of all frames, brought into the reconstruction's axes by the similarity of the t
 refined on each frozen map from the same start: the paper's route, after 3R-GS.
 """
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import asdict, replace
 from functools import partial
 from pathlib import Path
@@ -14,7 +14,7 @@ from swimm3r import held_out
 from swimm3r.bench import reference
 from swimm3r.bench.cells import Cell, Place, Scores, kept_cell, over_scenes, scene_folder
 from swimm3r.bench.map_scores import map_scores, trained
-from swimm3r.bench.pictures import stored, write_grid
+from swimm3r.bench.pictures import Panel, stored, write_grid
 from swimm3r.bench.runs import POSES_REFINED, Clip, clips_of
 from swimm3r.bench.scores import columns
 from swimm3r.bench.settings import JobSettings
@@ -77,22 +77,31 @@ def _cells_of_clip(
 ) -> list[Cell]:
     first = clip.runs[0].open()
     truth = reference.of_clip(first, scene_folder(out / "references", clip.name), progress)
-    cells = []
+    cells: list[Cell] = []
+    shown: dict[str, Path] = {}
     for run in clip.runs:
         sfm = run.open()
         start: dict[str, held_out.FirstPose] = {}
         for seed in range(seeds):
+            as_it_comes: dict[SplatSettings, tuple[Cell, Path]] = {}
             for refined in blocks:
                 for recipe in recipes:
                     settings = settings_for(base, recipe, refined, seed)
-                    method = f"{run.sfm}{POSES_REFINED if refined else ''} / {recipe}"
-                    depends_on = [sfm.key, recipe, asdict(settings), asdict(test), reference.digest(truth)]
-                    make = partial(_scores, sfm=sfm, settings=settings, test=test, truth=truth, start=start)
-                    place = Place(clip.name, method, seed)
-                    depends_on.append([c.score for c in COLUMNS])
-                    cells.append(kept_cell(out, place, depends_on, partial(make, progress=progress)))
+                    place = Place(clip.name, f"{run.sfm}{POSES_REFINED if refined else ''} / {recipe}", seed)
+                    if refined and settings in as_it_comes:  # it refines poses of its own accord
+                        cell, folder = as_it_comes[settings]
+                        cell = replace(cell, method=place.method)
+                    else:
+                        depends_on = [sfm.key, recipe, asdict(settings), asdict(test), reference.digest(truth)]
+                        depends_on.append([c.score for c in COLUMNS])
+                        make = partial(_scores, sfm=sfm, settings=settings, test=test, truth=truth, start=start)
+                        cell = kept_cell(out, place, depends_on, partial(make, progress=progress))
+                        folder = place.folder(out)
+                        as_it_comes[settings] = cell, folder
+                    cells.append(cell)
+                    shown.setdefault(place.method, folder / "test")
     for frame in first.frames.test:
-        _side_by_side(out, clip.name, frame.name, cells)
+        _side_by_side(out / "pictures" / clip.name, frame.name, shown)
     return cells
 
 
@@ -121,12 +130,11 @@ def _scores(
     return map_scores(sfm, scene, start, folder, test, progress)
 
 
-def _side_by_side(out: Path, scene: str, frame: str, cells: Sequence[Cell]) -> None:
-    """OUT/pictures/SCENE/FRAME.png, a row per structure from motion: the frame, then colours and depth of each map."""
-    rows: dict[str, list] = {}
-    for cell in (c for c in cells if c.seed == 0):
-        sfm, recipe = cell.method.split(" / ")
-        shown = Place(scene, cell.method).folder(out) / "test"
-        row = rows.setdefault(sfm, [stored(sfm, shown / f"{frame}_target.png")])
-        row += [stored(recipe, shown / f"{frame}_rgb.png"), stored("depth", shown / f"{frame}_z_depth.png")]
-    write_grid(out / "pictures" / scene / f"{Path(frame).stem}.png", list(rows.values()))
+def _side_by_side(out: Path, frame: str, shown: Mapping[str, Path]) -> None:
+    """OUT/FRAME.png, a row per structure from motion: the frame, then colours and depth of each map."""
+    rows: dict[str, list[Panel]] = {}
+    for method, pictures in shown.items():
+        sfm, recipe = method.split(" / ")
+        row = rows.setdefault(sfm, [stored(sfm, pictures / f"{frame}_target.png")])
+        row += [stored(recipe, pictures / f"{frame}_rgb.png"), stored("depth", pictures / f"{frame}_z_depth.png")]
+    write_grid(out / f"{Path(frame).stem}.png", list(rows.values()))

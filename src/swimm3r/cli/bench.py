@@ -30,6 +30,8 @@ def command_for_preset(name: str) -> Callable:
     """The command, with the map settings of a preset as defaults."""
     defaults = PRESETS[name]
     assert isinstance(defaults.sfm, ColmapSettings)
+    assert isinstance(defaults.splat, UwbsSettings)
+    full = defaults.splat
     found_poses, picked_evenly = defaults.sfm, replace(defaults.frames, pick="uniform")
     as_filmed = replace(picked_evenly, long_side=0)
 
@@ -39,7 +41,7 @@ def command_for_preset(name: str) -> Callable:
         out: Path,
         seeds: int = 3,
         preset: Preset = "fast",
-        splat: UwbsSettings = defaults.splat,
+        splat: UwbsSettings = full,
         test: PoseRefinementSettings = defaults.test,
         jobs: _Jobs = _ONE_BY_ONE,
     ) -> None:
@@ -69,7 +71,7 @@ def command_for_preset(name: str) -> Callable:
         preset: Preset = "fast",
         frames: FrameSettings = picked_evenly,
         sfm: ColmapSettings = found_poses,
-        splat: UwbsSettings = defaults.splat,
+        splat: UwbsSettings = full,
         test: PoseRefinementSettings = defaults.test,
         jobs: _Jobs = _ONE_BY_ONE,
     ) -> None:
