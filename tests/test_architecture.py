@@ -98,7 +98,10 @@ def test_help_loads_no_torch():
     commands += [
         "train-sfm",
         "bench",
-        *(f"bench {name}" for name in ("sfm", "restoration", "render", "localisation", "ablation-uwbs")),
+        *(
+            f"bench {name}"
+            for name in ("flsea", "sfm", "restoration", "render", "localisation", "ablation-sfm", "ablation-uwbs")
+        ),
     ]
     for command in ("", "weights get", *commands):
         snippet = (

@@ -23,7 +23,7 @@ from swimm3r.splat.settings import (
 from swimm3r.synthetic import write_dive
 from swimm3r.synthetic.settings import DiveSettings
 
-_WIDTH, _HEIGHT = 240, 160
+_WIDTH, _HEIGHT = 192, 128
 
 
 @pytest.fixture(scope="session")

@@ -137,7 +137,7 @@ def test_two_clips_of_one_name_are_refused(run: Path, tmp_path: Path):
 def test_original_pixels_are_those_of_the_clip(run: Path):
     frames = load_frames(run / "prepare")
     assert original_pixels(run.parent / "dive", frames) == 1
-    assert original_pixels(run.parent / "dive", replace(frames, width=120)) == 2
+    assert original_pixels(run.parent / "dive", replace(frames, width=96)) == 2
 
 
 def test_restored_frames_are_scored_beside_those_as_filmed(run: Path, tmp_path: Path):

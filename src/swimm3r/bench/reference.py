@@ -32,19 +32,20 @@ def of_clip(sfm: FinishedSfm, folder: Path, progress: Progress = silent) -> Grou
 
 
 def whole_clip(
-    frames: Frames, lens: Cameras, settings: ColmapSettings, folder: Path, progress: Progress = silent
+    frames: Frames, lens: Cameras | None, settings: ColmapSettings, folder: Path, progress: Progress = silent
 ) -> GroundTruth | NotComputed:
-    """Poses of all frames together, made in `folder` or found there; NotComputed where they cannot be placed."""
+    """Poses of all frames together, made in `folder` or found there; NotComputed where they cannot be placed.
+
+    `lens` is held; without one it is calibrated as the settings say.
+    """
     listing = [(f.name, f.path.stat().st_size) for f in frames]
-    through = [lens.model, lens.K.tolist(), lens.distortion.tolist()]
-    used = {k: v for k, v in asdict(settings).items() if k in ("pairs", "exhaustive_to", "overlap", "loops")}
-    used |= {"features": asdict(settings.features), "mapping": asdict(settings.mapping)}
+    through = None if lens is None else [lens.model, lens.K.tolist(), lens.distortion.tolist()]
+    used = {k: v for k, v in asdict(settings).items() if k not in ("depth", "water", "restore", "threads")}
     key = sha256(json.dumps([listing, through, used], sort_keys=True).encode()).hexdigest()
     record, cameras = folder / "reference.json", folder / "cameras.json"
     stored = json.loads(record.read_text(encoding="utf-8")) if record.is_file() else {}
     if stored.get("key") == key:
         return NotComputed(stored["failed"]) if stored["failed"] else read_ground_truth(cameras)
-    shutil.rmtree(folder, ignore_errors=True)
     everything = replace(frames, frames=tuple(replace(frame, split="train") for frame in frames))
     failed = ""
     try:

@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING, Annotated, Literal
 
 from tyro.conf import Positional, arg, subcommand
 
-from swimm3r.bench.settings import JobSettings, SfmMethods
+from swimm3r.bench.settings import ABLATION, JobSettings, SfmMethods
 from swimm3r.cli.console import drawn_progress
 from swimm3r.frame_settings import FrameSettings
 from swimm3r.localization.settings import LocalizationSettings
@@ -134,11 +134,84 @@ def command_for_preset(name: str) -> Callable:
         settings = RunSettings(frames, colmap, defaults.splat, defaults.test)
         _show(out, lambda progress: compare_sfm(clips, out, given, settings, mast3r, references, jobs, progress))
 
+    def flsea(
+        root: Positional[Path],
+        /,
+        out: Path,
+        given: _Methods = _ALL_METHODS,
+        stride: int = 1,
+        sequences: tuple[str, ...] = (),
+        preset: Preset = "fast",
+        colmap: ColmapSettings = found_poses,
+        mast3r: Mast3rSettings = MAST3R_PRESETS[name],
+        jobs: _Jobs = _ONE_BY_ONE,
+    ) -> None:
+        """Depth and poses of every method on FLSea's test sequences.
+
+        Judged against the set's own depth, and COLMAP on its restored pictures.
+
+        Args:
+            root: FLSea-VI as unpacked.
+            out: where frames, references, the methods' results and the tables go: flsea.md, .csv, .json and .tex.
+            given: the methods and their files.
+            stride: take every so-manieth frame, the same for all methods and for the reference.
+            sequences: by the names of their folders; the paper's test split where none is named.
+            preset: what the other defaults aim at.
+            colmap: how COLMAP works, for the reference, too.
+            mast3r: how the network's methods work.
+            jobs: sequences in parallel.
+        """
+        from swimm3r.bench.flsea import compare_on_flsea
+
+        _show(
+            out,
+            lambda progress: compare_on_flsea(root, out, given, colmap, mast3r, stride, sequences, jobs, progress),
+        )
+
+    def ablation_sfm(
+        root: Positional[Path],
+        /,
+        out: Path,
+        adapters: Path | None = None,
+        stride: int = 1,
+        sequences: tuple[str, ...] = (),
+        preset: Preset = "fast",
+        colmap: ColmapSettings = found_poses,
+        mast3r: Mast3rSettings = MAST3R_PRESETS[name],
+        jobs: _Jobs = _ONE_BY_ONE,
+    ) -> None:
+        """The same of the trainings that leave out a part of medium-aware distillation.
+
+        Their restored pictures: bench sfm --methods swimm3r without-forward ..., then bench restoration.
+
+        Args:
+            root: FLSea-VI as unpacked.
+            out: where frames, references, results and the tables go: ablation-sfm.md, .csv, .json and .tex.
+            adapters: trainings of swimm3r train-sfm by their recipes: DIR/without-forward/adapter.safetensors ...
+            stride: take every so-manieth frame.
+            sequences: by the names of their folders; the paper's test split where none is named.
+            preset: what the other defaults aim at.
+            colmap: how the reference is made.
+            mast3r: how the network's methods work.
+            jobs: sequences in parallel.
+        """
+        from swimm3r.bench.flsea import compare_on_flsea
+
+        given = SfmMethods(ABLATION, adapters)
+        _show(
+            out,
+            lambda progress: compare_on_flsea(
+                root, out, given, colmap, mast3r, stride, sequences, jobs, progress, "ablation-sfm"
+            ),
+        )
+
     protocols = {
+        "flsea": flsea,
         "sfm": sfm,
         "restoration": restoration,
         "render": render,
         "localisation": localisation,
+        "ablation-sfm": ablation_sfm,
         "ablation-uwbs": ablation_uwbs,
     }
     action = None
