@@ -28,7 +28,7 @@ from swimm3r.sfm.mast3r.settings import ObjectiveSettings
 from swimm3r.sfm.student import Student, new_student
 from swimm3r.sfm.training.data import PairData, split_data
 from swimm3r.sfm.training.job import retrieved_pairs, train_sfm
-from swimm3r.sfm.training.loop import Workers, batch_size, pairs_of_step, train
+from swimm3r.sfm.training.loop import Workers, batch_size, learning_rate, pairs_of_step, train
 from swimm3r.sfm.training.scores import score
 from swimm3r.sfm.training.settings import RECIPES, TrainSettings
 from swimm3r.sfm.training.state import Rows
@@ -272,6 +272,14 @@ def test_a_batch_that_does_not_divide_among_the_processes_is_refused():
         batch_size(TrainSettings(batch=4), 100, Workers(0, 3))
     with pytest.raises(InputError, match="too few"):
         batch_size(TrainSettings(batch=4), 1, Workers(0, 2))
+
+
+def test_the_rate_stays_and_then_falls_along_a_line():
+    """Of 9 steps the last 4 cool down; a tenth would have rate 0."""
+    settings = TrainSettings(learning_rate=1.0, cool_down=0.5)
+    rates = [learning_rate(settings, step, 9) for step in range(1, 10)]
+    assert rates == pytest.approx([1, 1, 1, 1, 1, 0.8, 0.6, 0.4, 0.2])
+    assert {learning_rate(TrainSettings(), step, 9) for step in range(1, 10)} == {5e-4}
 
 
 def test_an_epoch_takes_every_pair_once_and_the_next_in_another_order():

@@ -134,6 +134,8 @@ def _run(
                 progress("training the student", step - 1, total)
             items = [future.result() for future in coming]
             coming = _load(pool, data, settings, size, step + 1, workers) if step < total else []
+            for group in optimiser.param_groups:
+                group["lr"] = learning_rate(settings, step, total)
             terms = _step(model, student, optimiser, items, settings, size // workers.count, cache)
             rows.add(_mean_over_workers(terms, workers), step / per_epoch)
             ends_epoch = step % per_epoch == 0
@@ -180,6 +182,12 @@ def batch_size(settings: TrainSettings, pairs: int, workers: Workers = Workers()
             hint="fewer processes; swimm3r datasets ROOT shows what was found",
         )
     return size
+
+
+def learning_rate(settings: TrainSettings, step: int, total: int) -> float:
+    """Adam's rate in a step (from 1); in the cool-down it falls along a line that would reach 0 after the last step."""
+    left = (total + 1 - step) / (total + 1)
+    return settings.learning_rate * min(1.0, left / settings.cool_down if settings.cool_down else 1.0)
 
 
 def pairs_of_step(step: int, pairs: int, size: int, seed: int) -> list[int]:

@@ -18,6 +18,9 @@ class TrainSettings:
     water_probability: float = 0.5
     """p of the paper's parametric water-type augmentation."""
     learning_rate: float = 5e-4
+    cool_down: float = 0.0
+    """Share of the steps, at the end, in which the learning rate falls to 0 along a line; the paper names no
+    schedule. Short trainings gain from it."""
     weight_decay: float = 1e-4
     epochs: int = 20
     batch: int = 4
@@ -52,8 +55,7 @@ class TrainSettings:
             for n in ("weight_decay", "micro_batch", "validation", "max_pairs", "teacher_cache_mb")
             if not getattr(self, n) >= 0
         ]
-        if not 0 <= self.water_probability <= 1:
-            wrong.append("water_probability")
+        wrong += [name for name in ("water_probability", "cool_down") if not 0 <= getattr(self, name) <= 1]
         if self.size < 16:
             wrong.append("size")
         if wrong:
