@@ -25,7 +25,16 @@ if TYPE_CHECKING:
     from swimm3r.splat import train
     from swimm3r.splat.checkpoint import load_map
     from swimm3r.splat.rendering import SplatMap
-    from swimm3r.splat.settings import McmcGsSettings, UwbsSettings, mcmc_gs, threers_gs, ubs, uwbs
+    from swimm3r.splat.settings import (
+        McmcGsSettings,
+        UwbsSettings,
+        WaterSplattingSettings,
+        mcmc_gs,
+        threers_gs,
+        ubs,
+        uwbs,
+        watersplatting,
+    )
     from swimm3r.synthetic import DiveSettings, write_dive
 
 _HOME = {
@@ -47,6 +56,8 @@ _HOME = {
     "SplatMap": "splat.rendering",
     "McmcGsSettings": "splat.settings",
     "UwbsSettings": "splat.settings",
+    "WaterSplattingSettings": "splat.settings",
+    "watersplatting": "splat.settings",
     "mcmc_gs": "splat.settings",
     "threers_gs": "splat.settings",
     "load_map": "splat.checkpoint",
@@ -71,6 +82,7 @@ __all__ = [
     "RunSettings",
     "SplatMap",
     "UwbsSettings",
+    "WaterSplattingSettings",
     "add_water",
     "load_map",
     "localize",
@@ -83,6 +95,7 @@ __all__ = [
     "train",
     "ubs",
     "uwbs",
+    "watersplatting",
     "write_dive",
 ]
 

@@ -12,7 +12,7 @@ from torch.nn.functional import normalize
 from swimm3r.cameras import Cameras
 from swimm3r.geometry import rotation_from_quaternion
 from swimm3r.raster import rasterize
-from swimm3r.splat import gaussian_mcmc
+from swimm3r.splat import gaussian_mcmc, gradient_densify
 from swimm3r.splat.gaussian_settings import GaussianInitialSettings, GaussianRenderSettings
 from swimm3r.splat.gaussians import (
     GaussianPrimitives,
@@ -23,6 +23,7 @@ from swimm3r.splat.gaussians import (
     seen_colour,
     to_degree,
 )
+from swimm3r.splat.optimiser import Moments
 from swimm3r.splat.projection import Pinhole, pinhole, project
 from swimm3r.splat.spherical import Y_00, spherical_harmonics
 
@@ -189,3 +190,87 @@ def test_fewer_points_than_a_neighbourhood_are_refused(tiny_dive):
     few = replace(tiny_dive.rec, cloud=type(cloud)(*(values[:3] for values in vars(cloud).values())))
     with pytest.raises(ValueError, match="at least 4 points"):
         initial_gaussians(few, GaussianInitialSettings(), torch.Generator())
+
+
+def pulled(n: int, hard: list[int]) -> dict[str, torch.Tensor]:
+    """A memory in which some rows were pulled, by their place in the list the harder."""
+    memory = gradient_densify.nothing_seen(n)
+    memory["times"] += 2
+    for place, row in enumerate(hard):
+        memory["pull"][row] = 2.0 * (place + 1)
+    return memory
+
+
+def small_and_large(n: int = 40) -> GaussianPrimitives:
+    p = GaussianPrimitives(*(t.float() for t in gaussians(n)))
+    p.scale[:20], p.scale[20:] = -5.0, -1.0
+    return p
+
+
+def test_pulled_gaussians_double_where_small_and_split_where_large():
+    p, rng = small_and_large(), torch.Generator().manual_seed(0)
+    done = gradient_densify.multiply(p, pulled(40, [3, 25]), 0.5, 0.1, 100, rng)
+    q = done.primitives
+    assert done.source.tolist() == [*range(40), 3, 25]
+    assert all(torch.equal(a[40], b[3]) and torch.equal(a[3], b[3]) for a, b in zip(q, p, strict=True))
+    assert sorted(done.restarted.tolist()) == [25, 40, 41]
+    for half in (25, 41):
+        torch.testing.assert_close(q.scale[half].exp() * 1.6, p.scale[25].exp())
+        assert (q.xyz[half] != p.xyz[25]).all()
+    still = [i for i in range(40) if i != 25]
+    assert all(torch.equal(a[still], b[still]) for a, b in zip(q, p, strict=True))
+
+
+def test_halves_lie_within_the_shape_they_came_from():
+    p = small_and_large()
+    p = GaussianPrimitives(*(t[25:26].repeat(2000, *[1] * (t.ndim - 1)) for t in p))
+    done = gradient_densify.multiply(p, pulled(2000, list(range(2000))), 0.5, 0.1, 4000, torch.Generator())
+    off = (done.primitives.xyz - p.xyz[0]).double()
+    expected = covariance(GaussianPrimitives(*(t[:1].double() for t in p)))[0]
+    torch.testing.assert_close(off.T @ off / len(off), expected, rtol=0.15, atol=0.005)
+
+
+def test_the_hardest_pulled_multiply_first_where_room_is_short():
+    p = small_and_large()
+    done = gradient_densify.multiply(p, pulled(40, [3, 7, 5]), 0.5, 0.1, 42, torch.Generator())
+    assert done.source[40:].tolist() == [5, 7]
+    full = gradient_densify.multiply(p, pulled(40, [3, 7, 5]), 0.5, 0.1, 40, torch.Generator())
+    assert len(full.primitives.xyz) == 40
+
+
+def test_culled_rows_leave_and_the_others_keep_their_place():
+    done = gradient_densify.multiply(small_and_large(), pulled(40, [3, 25]), 0.5, 0.1, 100, torch.Generator())
+    kept = torch.ones(42, dtype=torch.bool)
+    kept[[0, 25]] = False
+    left = gradient_densify.only(done, kept)
+    assert len(left.primitives.xyz) == 40
+    assert left.source.tolist() == [*range(1, 25), *range(26, 40), 3, 25]
+    assert torch.equal(left.primitives.xyz, done.primitives.xyz[kept])
+    assert sorted(left.restarted.tolist()) == [38, 39]
+
+
+def test_pulls_are_counted_while_a_gaussian_is_in_the_picture(camera: Callable[..., Cameras]):
+    view = pinhole(camera())
+    p = GaussianPrimitives(*(t.float() for t in to_degree(gaussians(30), 0)))
+    p.xyz[10:20, 2] = -3.0
+    seen = project(p, view, GaussianRenderSettings())
+    gradient = torch.ones(30, 2)
+    memory = gradient_densify.remembered(gradient_densify.nothing_seen(30), gradient, seen, view)
+    memory = gradient_densify.remembered(memory, gradient, seen, view)
+    assert not memory["times"][10:20].any()
+    shown = memory["times"] == 2
+    assert shown.sum() >= 10
+    torch.testing.assert_close(memory["pull"][shown] / 2, torch.full((int(shown.sum()),), float(np.hypot(40, 28))))
+
+
+def test_dimming_bounds_opacities_and_forgets_their_moments_alone():
+    p = small_and_large()
+    moments = {
+        name: Moments(torch.ones_like(t), torch.ones_like(t), torch.tensor(3.0)) for name, t in p._asdict().items()
+    }
+    q, after = gradient_densify.dimmed(p, moments, 0.5)
+    assert float(torch.sigmoid(q.opacity).max()) <= 0.5 + 1e-6
+    faint = torch.sigmoid(p.opacity) < 0.5
+    assert torch.equal(q.opacity[faint], p.opacity[faint])
+    assert not after["opacity"].first.any()
+    assert after["xyz"].first.all()

@@ -13,8 +13,9 @@ from swimm3r.splat import checkpoint, training
 from swimm3r.splat.pose_codes import training_stations, write_refined
 from swimm3r.splat.recipes.mcmc_gs import McmcGs
 from swimm3r.splat.recipes.uwbs import Uwbs, known_water
+from swimm3r.splat.recipes.watersplatting import WaterSplatting
 from swimm3r.splat.rendering import SplatMap
-from swimm3r.splat.settings import McmcGsSettings, SplatSettings, UwbsSettings
+from swimm3r.splat.settings import McmcGsSettings, SplatSettings, UwbsSettings, WaterSplattingSettings
 from swimm3r.splat.site import Site, path_radius
 from swimm3r.splat.views import TrainingViews, working_scale
 
@@ -29,7 +30,7 @@ def train(
     scale = working_scale(rec, settings)
     views = TrainingViews(rec, frames, settings, scale)
     stations = training_stations(rec, views.names, views.cameras, scale) if settings.poses.enabled else None
-    site = Site(rec, scale, path_radius(rec, scale, settings.working_depth), stations)
+    site = Site(rec, scale, path_radius(rec, scale, settings.working_depth), len(views), stations)
     recipe = _recipe(settings, site)
     final = training.run(recipe, views, _schedule(settings, rec, views), folder, progress)
     primitives, field = recipe.rescaled(final, 1 / scale)
@@ -42,13 +43,15 @@ def train(
     return scene
 
 
-def _recipe(settings: SplatSettings, site: Site) -> Uwbs | McmcGs:
+def _recipe(settings: SplatSettings, site: Site) -> Uwbs | McmcGs | WaterSplatting:
     match settings:
         case UwbsSettings():
             prior = known_water(site.rec, site.scale, settings)
             return Uwbs(settings, site.rec, site.scale, site.radius, prior, site.stations)
         case McmcGsSettings():
             return McmcGs(settings, site)
+        case WaterSplattingSettings():
+            return WaterSplatting(settings, site)
 
 
 def _schedule(settings: SplatSettings, rec: Reconstruction, views: TrainingViews) -> training.Schedule:

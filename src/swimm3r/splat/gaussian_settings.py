@@ -7,7 +7,7 @@ units (`settings.py`). Every peer starts from the cloud, and from as many primit
 from dataclasses import dataclass, field
 from typing import Literal
 
-from swimm3r.splat.scene_settings import TrainingPoseSettings
+from swimm3r.splat.scene_settings import MediumFieldSettings, TrainingPoseSettings
 
 
 @dataclass(frozen=True)
@@ -120,3 +120,58 @@ class McmcGsSettings(GaussianSettings):
     poses: TrainingPoseSettings = field(
         default_factory=lambda: TrainingPoseSettings(rate=2.25e-4, epipolar_end=0.1)  # 1.5e-4 and 3,000 in 30,000
     )
+
+
+@dataclass(frozen=True)
+class AbsGradSettings:
+    """Multiplication by absolute gradients, culls, and cuts of the opacities (WaterSplatting)."""
+
+    begin: float = 1 / 30  # 500 of 15,000
+    end: float = 2 / 3  # 10,000 of 15,000
+    every: float = 1 / 150  # 100 of 15,000
+    min_every: int = 40
+    """Fewest steps between two rounds, whatever `every` says: a round needs its views."""
+    pull: float = 8e-4
+    """Least mean gradient of a projected centre, in half pictures."""
+    large: float = 1e-3
+    """Scale from which on a Gaussian is split instead of doubled, in radii of the cameras' path."""
+    least_opacity: float = 0.5
+    """Fainter Gaussians are culled by a round,"""
+    least_opacity_late: float = 0.1
+    """and these after the last."""
+    largest: float = 10.0
+    """Scale above which they are culled, in radii of the cameras' path."""
+    reset_every: float = 1 / 30  # 500 of 15,000
+    """Share of the run between two cuts of the opacities; 0 for none."""
+    reset_opacity: float = 0.5
+    """What they are cut to."""
+
+
+@dataclass(frozen=True)
+class RelativeWeights:
+    """Of reg-L1 and reg-SSIM."""
+
+    ssim: float = 0.2
+    floor: float = 1e-3
+    """Added to the rendered value that errors are divided by."""
+
+
+@dataclass(frozen=True)
+class WaterSplattingSettings(GaussianSettings):
+    """Gaussians in water that a network knows for every direction."""
+
+    iterations: int = 15_000
+    initial: GaussianInitialSettings = field(default_factory=lambda: GaussianInitialSettings(colours="restored"))
+    medium: MediumFieldSettings = field(
+        default_factory=lambda: MediumFieldSettings(layers=1, activation="sigmoid", biases=False, begin=0.0)
+    )
+    medium_rate: float = 1e-3
+    medium_rate_end: float = 1.5e-4
+    rates: GaussianRates = field(default_factory=lambda: GaussianRates(xyz_end=5e-5))
+    weights: RelativeWeights = field(default_factory=RelativeWeights)
+    densify: AbsGradSettings = field(default_factory=AbsGradSettings)
+    degree_every: float = 1 / 15
+    first_divisor: int = 4
+    """By how much the training pictures are smaller at first,"""
+    double_every: float = 0.2  # 3,000 of 15,000
+    """and the share of the run after which they double."""

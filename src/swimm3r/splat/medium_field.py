@@ -100,6 +100,12 @@ def initial_field(
     return field
 
 
+def in_unit(field: MediumField, length: float) -> MediumField:
+    """The trained field in the scene's own unit, `length` of which are a working unit, without gradient."""
+    field.length.fill_(length)
+    return field.requires_grad_(False)
+
+
 def grid_of(field: MediumField, view: Pinhole, stride: int, time: Float[Tensor, ""] | None = None) -> FieldGrid:
     """The field on about every stride-th pixel of a view, at a time in 0..1; the pose may carry a gradient."""
     rows, columns = (max(2, math.ceil((size - 1) / stride) + 1) for size in (view.height, view.width))

@@ -20,6 +20,7 @@ class Site:
     rec: Reconstruction
     scale: float  # working units per scene unit
     radius: float  # of the cameras' path, working units
+    views: int  # how many there are
     stations: Stations | None = None  # None where poses are held
 
     @property

@@ -15,7 +15,7 @@ from swimm3r.splat.pose_codes import PoseCodes
 from swimm3r.splat.primitives import BetaPrimitives
 from swimm3r.splat.projection import Primitives
 from swimm3r.splat.scene_settings import MediumFieldSettings
-from swimm3r.splat.settings import McmcGsSettings, SplatSettings, UwbsSettings
+from swimm3r.splat.settings import McmcGsSettings, SplatSettings, UwbsSettings, WaterSplattingSettings
 
 FIELD, POSES = "field.", "poses."
 P = TypeVar("P", BetaPrimitives, GaussianPrimitives)
@@ -36,6 +36,8 @@ def parts_of(settings: SplatSettings) -> Parts:
             return Parts(BetaPrimitives, MediumField(settings.medium, settings.dynamic))
         case McmcGsSettings():
             return Parts(GaussianPrimitives, MediumField(MediumFieldSettings(model="none")))
+        case WaterSplattingSettings():
+            return Parts(GaussianPrimitives, MediumField(settings.medium))
 
 
 @dataclass(frozen=True)

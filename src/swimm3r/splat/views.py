@@ -12,6 +12,7 @@ import numpy as np
 import torch
 from jaxtyping import Bool, Float
 from torch import Tensor
+from torch.nn.functional import interpolate
 
 from swimm3r.cameras import Cameras, distorted_grid, project, resized
 from swimm3r.errors import InputError
@@ -103,6 +104,17 @@ class TrainingViews:
         z_depth, confidence = depth.z_depth[row, column], depth.confidence[row, column]
         known = seen & z_depth.isfinite() & (z_depth > 0) & (confidence >= least)
         return torch.where(known, z_depth * self.scale, 0.0), torch.where(known, edge_weight(rgb), 0.0)
+
+
+def smaller(view: View, divisor: int) -> View:
+    """A view of fewer pixels, each the mean of those it covers; without depth."""
+    if divisor == 1:
+        return view
+    height, width = (max(2, size // divisor) for size in view.seen.shape)
+    rgb = interpolate(view.rgb[None], (height, width), mode="area")[0]
+    seen = interpolate(view.seen[None, None].float(), (height, width), mode="area")[0, 0] > 0.999
+    nothing = torch.zeros(height, width)
+    return View(view.name, resized(view.camera, width, height), rgb, seen, nothing, nothing, view.time)
 
 
 def _in_working_units(cameras: Cameras, scale: float) -> Cameras:

@@ -17,7 +17,15 @@ from swimm3r.medium import Medium
 from swimm3r.reconstruction import Reconstruction
 from swimm3r.splat import densify, losses, training
 from swimm3r.splat.gradients import differentiate
-from swimm3r.splat.medium_field import MediumField, WaterPrior, deviation, initial_field, smoothness, water_prior
+from swimm3r.splat.medium_field import (
+    MediumField,
+    WaterPrior,
+    deviation,
+    in_unit,
+    initial_field,
+    smoothness,
+    water_prior,
+)
 from swimm3r.splat.optimiser import Moments, adam_step, log_linear
 from swimm3r.splat.pose_codes import PoseCodes, Stations, pose_rate
 from swimm3r.splat.primitives import BetaPrimitives, initial_primitives, rescaled, with_time
@@ -125,11 +133,7 @@ class Uwbs:
 
     def rescaled(self, state: State, factor: float) -> tuple[BetaPrimitives, MediumField]:
         """Primitives and water after every length was multiplied by `factor`, without gradient."""
-        field = MediumField(self.settings.medium, self.settings.dynamic)
-        field.load_state_dict(state.field.state_dict())
-        field.length.fill_(factor)
-        p = BetaPrimitives(*(values.detach().clone() for values in rescaled(state.primitives, factor)))
-        return p, field.requires_grad_(False)
+        return rescaled(state.primitives, factor), in_unit(state.field, factor)
 
     def _regularised(self, share: float) -> bool:
         return self.settings.weights.mcmc_begin < share <= self.settings.weights.mcmc_end

@@ -1,0 +1,132 @@
+"""WaterSplatting (Li et al. 2025): Gaussians in water that a small network knows for every direction.
+
+    I = sum_i w_i c_i e^{-beta_D z_i} + Binf V,   L = 0.8 mean |(I - gt) / (sg(I) + eps)| + 0.2 (1 - SSIM)
+
+with both pictures of SSIM divided by sg(I) + eps, too (uwbs.md 3). The picture is formed as UWBS forms it.
+Gaussians multiply by absolute gradients and are culled by opacity; opacities are cut back now and then.
+
+Where we depart from the publication: exact harmonics of the pixel's ray where its encoding sees 2 d - 1; pixel centres
+at +0.5; exact gradients where its backward pass leaves out depth and mistakes the cap on alpha; SSIM pads with zeros;
+the water's network is asked on a grid of pixels and interpolated, and keeps its optimiser's memory when Gaussians are
+culled; the number of Gaussians has the bound that all recipes have. Its schedule densifies only beyond n_train + 100 of
+every 500 steps, which long clips never reach: here never more than half of them are waited for. In short runs rounds
+are `min_every` steps apart at least, rates grow (`haste`), opacities are not cut, and culls are as after the last round
+(`with_recipe`): there is no time to grow back.
+"""
+
+from dataclasses import dataclass
+
+import torch
+from jaxtyping import Float
+from torch import Tensor
+
+from swimm3r.splat import gradient_densify, losses, training
+from swimm3r.splat.gaussian_settings import WaterSplattingSettings
+from swimm3r.splat.gaussians import GaussianPrimitives, rescaled
+from swimm3r.splat.medium_field import MediumField, in_unit, initial_field
+from swimm3r.splat.optimiser import adam_step, log_linear
+from swimm3r.splat.recipes.gaussian_step import first_gaussians, look, rates_of, with_matches, with_rows
+from swimm3r.splat.site import Site
+from swimm3r.splat.state import FIELD, State, clip_field, first_state, parameters_of, restored, stored
+from swimm3r.splat.views import View, smaller
+
+
+@dataclass(frozen=True)
+class WaterSplatting:
+    """The recipe for one scene (`training.Recipe`)."""
+
+    settings: WaterSplattingSettings
+    site: Site
+
+    def start(self) -> State[GaussianPrimitives]:
+        """Faint Gaussians on the cloud, and a network at random."""
+        seed = self.settings.seed
+        p = first_gaussians(self.site, self.settings)
+        field = initial_field(None, self.settings.medium, training.generator(seed, 0, 3))
+        codes = self.site.codes(self.settings.poses, training.generator(seed, 0, 6))
+        return first_state(p, field, codes, gradient_densify.nothing_seen(len(p.xyz)))
+
+    def step(
+        self, state: State[GaussianPrimitives], view: View, step: int
+    ) -> tuple[State[GaussianPrimitives], dict[str, float]]:
+        """One view at the resolution this step has come to: forward, adjoint, Adam, densification on its cadence."""
+        settings = self.settings
+        view = smaller(view, self._divisor(step))
+        seen = look(self.site, state, view, settings, step, sgg=True)
+        photo = relative_photometric(seen.drawing.images.rgb, view, settings.weights.floor, settings.weights.ssim)
+        total, numbers = with_matches(self.site, state, photo.loss, settings, step)
+        l1 = (seen.drawing.images.rgb.detach() - view.rgb)[:, view.seen].abs().mean()
+        numbers |= {"loss": float(total.detach()), "l1": float(l1), "relative_l1": photo.l1, "ssim": photo.ssim}
+        numbers |= {"primitives": float(len(seen.p.xyz))}
+        gradients = seen.gradients(total)
+        clip_field(gradients)
+        assert seen.drawing.sgg is not None
+        with torch.no_grad():
+            parameters = parameters_of(state.primitives, state.field, state.poses)
+            water = log_linear(settings.medium_rate, settings.medium_rate_end, step / settings.iterations)
+            rates = dict.fromkeys((name for name in parameters if name.startswith(FIELD)), water)
+            adam_step(parameters, gradients, state.moments, rates | rates_of(self.site, settings, step, parameters))
+            memory = gradient_densify.remembered(
+                state.memory, seen.drawing.sgg.full_abs, seen.drawing.projection, seen.sight
+            )
+            state = State(state.primitives, state.field, state.poses, state.moments, memory)
+            if step % self._every() == 0 and step > settings.densify.begin * settings.iterations:
+                state = self._round(state, step)
+        return state, numbers
+
+    def stored(self, state: State) -> dict[str, Tensor]:
+        """Everything in a state, by name."""
+        return stored(state)
+
+    def restored(self, tensors: dict[str, Tensor]) -> State:
+        """The inverse of `stored`."""
+        return restored(tensors, self.settings, self.site.refined_cameras)
+
+    def rescaled(self, state: State[GaussianPrimitives], factor: float) -> tuple[GaussianPrimitives, MediumField]:
+        """Gaussians and water after every length was multiplied by `factor`, without gradient."""
+        return rescaled(state.primitives, factor), in_unit(state.field, factor)
+
+    def _divisor(self, step: int) -> int:
+        """By how much the training picture is smaller."""
+        doublings = int((step - 1) / (self.settings.double_every * self.settings.iterations))
+        return max(1, self.settings.first_divisor >> doublings)
+
+    def _every(self) -> int:
+        d = self.settings.densify
+        return max(d.min_every, round(d.every * self.settings.iterations))
+
+    def _period(self) -> int:
+        """Steps from one cut of the opacities to the next; all of the run where there is none."""
+        d = self.settings.densify
+        return self._every() * round(d.reset_every / d.every) if d.reset_every else self.settings.iterations
+
+    def _round(self, state: State[GaussianPrimitives], step: int) -> State[GaussianPrimitives]:
+        """Multiply and cull; cut opacities back on their cadence."""
+        d, p, moments, memory = self.settings.densify, state.primitives, state.moments, state.memory
+        since = step % self._period()
+        growing = step < d.end * self.settings.iterations
+        waits = min(self.site.views + self._every(), self._period() // 2) if d.reset_every else 0
+        if not growing or since > waits:
+            done = gradient_densify.unchanged(p)
+            if growing:
+                rng = training.generator(self.settings.seed, step, 4)
+                large = d.large * self.site.radius
+                done = gradient_densify.multiply(p, memory, d.pull, large, self.settings.max_primitives, rng)
+            q = done.primitives
+            fit = torch.sigmoid(q.opacity) >= (d.least_opacity if growing else d.least_opacity_late)
+            fit &= q.scale.amax(-1).exp() <= d.largest * self.site.radius
+            if int(fit.sum()) >= 4:
+                done = gradient_densify.only(done, fit)
+            p, moments = done.primitives, with_rows(moments, done.source, done.restarted)
+            memory = gradient_densify.nothing_seen(len(p.xyz))
+        if growing and d.reset_every and since == self._every():
+            p, moments = gradient_densify.dimmed(p, moments, d.reset_opacity)
+        return State(p, state.field, state.poses, moments, memory)
+
+
+def relative_photometric(
+    render: Float[Tensor, "3 h w"], view: View, floor: float, ssim_weight: float
+) -> losses.Photometric:
+    """reg-L1 and reg-SSIM: both pictures in units of the rendered value, so that dark water counts as much."""
+    unit = render.detach() + floor
+    return losses.photometric(render / unit, view.rgb / unit, view.seen, ssim_weight)
