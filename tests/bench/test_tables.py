@@ -47,7 +47,8 @@ def test_what_is_missing_is_told_with_its_reason():
     assert "| mast3r | not run |" in text
     assert "- a, mast3r: not run: its weights are not here" in text
     assert "- lpips_vgg of a, peer and 7 more: no weights" in text
-    assert "LPIPS ↓" not in text
+    assert "LPIPS ↓" in text
+    assert "SSIM" not in text
     assert "(`psnr`): dB" in text
 
 
@@ -60,8 +61,8 @@ def test_a_mean_over_fewer_cells_says_so():
 
 def test_latex_prints_the_best_of_each_column_in_bold():
     text = latex(Table("t", "T", cells_with_a_gain(0.1), columns("psnr", "lpips_vgg")))
-    assert r"ours & \textbf{25.60} \\" in text
-    assert r"peer & 25.50 \\" in text
+    assert r"ours & \textbf{25.60} & -- \\" in text
+    assert r"peer & 25.50 & -- \\" in text
     assert r"PSNR$\uparrow$" in text
 
 

@@ -29,13 +29,13 @@ class Table:
     name: str  # of the files
     title: str
     cells: Sequence[Cell]
-    columns: Sequence[Column]  # those of them that some cell has are shown
+    columns: Sequence[Column]  # those that no cell speaks of are not shown
     against: str | None = None  # the method that differences are taken from; the first where none is named
 
     @property
     def shown(self) -> list[Column]:
-        """The columns that some cell computed."""
-        return [c for c in self.columns if any(number(cell, c.score) is not None for cell in self.cells)]
+        """The columns that some cell has, or gives a reason for not having."""
+        return [c for c in self.columns if any(c.score in cell.scores for cell in self.cells)]
 
 
 def write(folder: Path, table: Table) -> str:
@@ -57,7 +57,7 @@ def markdown(table: Table) -> str:
     if scenes > 1:
         parts.append(_by_scene(table))
     parts.append(_differences(table, found))
-    parts += [_missing(table), "\n".join(f"- {c.label} (`{c.score}`): {c.note}" for c in table.shown if c.note)]
+    parts += [_missing(table), _notes(table)]
     return "\n\n".join(part for part in parts if part) + "\n"
 
 
@@ -107,7 +107,7 @@ def _by_scene(table: Table) -> str:
 
 
 def _differences(table: Table, found: Sequence[Row]) -> str:
-    digits = {c.score: c.digits + 2 for c in table.shown}
+    digits = {c.score: c.digits + 2 for c in table.shown if c.best != "neither"}
     compared = [r for r in found if r.method != r.against and r.pairs and r.score in digits]
     if not compared:
         return ""
@@ -131,6 +131,15 @@ def _missing(table: Table) -> str:
         more = f" and {len(where) - 1} more" if len(where) > 1 else ""
         lines.append(f"- {score} of {where[0]}{more}: {reason}")
     return "\n".join(["## Not computed", "", *lines]) if lines else ""
+
+
+def _notes(table: Table) -> str:
+    """What the columns mean, those that mean the same but for a threshold together."""
+    notes: dict[str, list[str]] = {}
+    for c in table.shown:
+        notes.setdefault(c.note, []).append(f"{c.label} (`{c.score}`)")
+    lines = [f"- {', '.join(names)}: {note}" for note, names in notes.items() if note]
+    return "\n".join(["## Columns", "", *lines])
 
 
 def _csv(table: Table) -> str:
