@@ -1,7 +1,10 @@
 """Cells are kept, found again by what they depend on, and say why they are empty; scenes run side by side."""
 
+import sys
+from contextlib import nullcontext
 from functools import partial
 from pathlib import Path
+from types import SimpleNamespace
 
 import pytest
 
@@ -57,11 +60,41 @@ def test_scenes_keep_their_order_and_one_error_waits_for_the_others(tmp_path: Pa
     assert (tmp_path / "d").exists()
 
 
-def test_no_scenes_and_no_submitit_are_said_plainly(tmp_path: Path):
+def test_no_scenes_and_no_submitit_are_said_plainly(tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
     with pytest.raises(UsageError, match="nothing to measure"):
         over_scenes([], names_lead_out, tmp_path, JobSettings())
+    monkeypatch.setitem(sys.modules, "submitit", None)
     with pytest.raises(UsageError, match="submitit"):
         over_scenes(["a"], partial(names_lead_out, out=tmp_path), tmp_path, JobSettings(slurm=True))
+
+
+def test_a_cluster_gets_a_job_per_scene(tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
+    told = {}
+
+    class AutoExecutor:  # what of submitit is used
+        def __init__(self, folder):
+            told["folder"] = folder
+
+        def update_parameters(self, **options):
+            told.update(options)
+
+        def batch(self):
+            return nullcontext()
+
+        def submit(self, work, scene, **options):
+            return SimpleNamespace(result=partial(work, scene, **options))
+
+    monkeypatch.setitem(sys.modules, "submitit", SimpleNamespace(AutoExecutor=AutoExecutor))
+    how = JobSettings(slurm=True, partition="sea", minutes=5, cpus=3)
+    cells = over_scenes(["a", "c"], partial(names_lead_out, out=tmp_path), tmp_path, how)
+    assert [c.scene for c in cells] == ["a", "c"]
+    assert told == {
+        "folder": tmp_path / "slurm",
+        "timeout_min": 5,
+        "cpus_per_task": 3,
+        "gpus_per_node": 0,
+        "slurm_partition": "sea",
+    }
 
 
 def test_names_of_scenes_stay_below_the_folder(tmp_path: Path):

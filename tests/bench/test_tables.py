@@ -64,6 +64,9 @@ def test_latex_prints_the_best_of_each_column_in_bold():
     assert r"ours & \textbf{25.60} & -- \\" in text
     assert r"peer & 25.50 & -- \\" in text
     assert r"PSNR$\uparrow$" in text
+    by_scene = text.split(r"\end{tabular}")[1]
+    assert r" & \multicolumn{2}{c}{a} & \multicolumn{2}{c}{b} & \multicolumn{2}{c}{Average} \\" in by_scene
+    assert r"peer & 20.50 & -- & 30.50 & -- & 25.50 & -- \\" in by_scene
 
 
 def test_csv_and_json_hold_every_cell(tmp_path: Path):

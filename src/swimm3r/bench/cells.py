@@ -105,7 +105,7 @@ def _submitted(scenes: Sequence[object], work: SceneWork, out: Path, how: JobSet
         raise UsageError(
             "scenes are sent to Slurm by submitit, which is not installed",
             cause="it is not among Swimm3R's own requirements",
-            hint="pip install submitit, or --jobs N for processes on this computer",
+            hint="pip install 'swimm3r[slurm]', or --jobs N for processes on this computer",
         ) from error
     executor = submitit.AutoExecutor(folder=out / "slurm")
     options = {"timeout_min": how.minutes, "cpus_per_task": how.cpus, "gpus_per_node": how.gpus}

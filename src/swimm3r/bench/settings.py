@@ -14,7 +14,7 @@ class JobSettings:
     jobs: int = 1
     """Scenes computed at once, each in a process with its share of the cores."""
     slurm: bool = False
-    """Each scene as a job through submitit (pip install submitit); all need the same disk."""
+    """Each scene as a job through submitit (pip install 'swimm3r[slurm]'); all need the same disk."""
     partition: str = ""
     """Slurm's; its default where empty."""
     minutes: int = 24 * 60

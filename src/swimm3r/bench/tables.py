@@ -19,6 +19,7 @@ from swimm3r.evaluate import NotComputed, summary_entries
 from swimm3r.io.atomic import write_text
 
 _ARROW = {"high": " ↑", "low": " ↓", "neither": ""}
+_BY_SCENE = 3  # columns of the table by scene
 _LATEX_ARROW = {"high": r"$\uparrow$", "low": r"$\downarrow$", "neither": ""}
 
 
@@ -62,17 +63,35 @@ def markdown(table: Table) -> str:
 
 
 def latex(table: Table) -> str:
-    """A tabular of the means with the best of each column in bold."""
-    found, shown = {(r.method, r.score): r for r in rows(table.cells, table.against)}, table.shown
-    best = {c.score: _best([r for r in found.values() if r.score == c.score], c) for c in shown}
-    head = " & ".join(["Method", *(_escaped(c.label) + _LATEX_ARROW[c.best] for c in shown)])
-    lines = [rf"% {table.title}", r"\begin{tabular}{l|" + "c" * len(shown) + "}", head + r" \\", r"\hline"]
+    """A tabular of the means, and where there are several scenes another of the first columns by scene, as the paper's.
+
+    The best of each column is bold.
+    """
+    shown = table.shown
+    found = rows(table.cells, table.against)
+    head = " & ".join(["Method", *(_latex_label(c) for c in shown)]) + r" \\"
+    text = _tabular(table, [head], [(found, c) for c in shown])
+    scenes = list(dict.fromkeys(c.scene for c in table.cells))
+    if len(scenes) < 2:
+        return text
+    few = shown[:_BY_SCENE]
+    parts = [rows([c for c in table.cells if c.scene == scene]) for scene in scenes]
+    groups = [rf"\multicolumn{{{len(few)}}}{{c}}{{{_escaped(name)}}}" for name in (*scenes, "Average")]
+    names = [_latex_label(c) for c in few] * (len(scenes) + 1)
+    heads = [" & ".join(["", *groups]) + r" \\", " & ".join(["Method", *names]) + r" \\"]
+    return text + "\n" + _tabular(table, heads, [(part, c) for part in (*parts, found) for c in few])
+
+
+def _tabular(table: Table, heads: Sequence[str], columns: Sequence[tuple[Sequence[Row], Column]]) -> str:
+    """One line per method, one column per rows and score."""
+    lines = [rf"% {table.title}", r"\begin{tabular}{l|" + "c" * len(columns) + "}", *heads, r"\hline"]
+    best = [_best([r for r in found if r.score == c.score], c) for found, c in columns]
     for method in _methods(table.cells):
         values = []
-        for c in shown:
-            row = found.get((method, c.score))
+        for (found, c), winner in zip(columns, best, strict=True):
+            row = next((r for r in found if r.method == method and r.score == c.score), None)
             value = "--" if row is None else f"{row.mean:.{c.digits}f}"
-            values.append(rf"\textbf{{{value}}}" if row is not None and value == best[c.score] else value)
+            values.append(rf"\textbf{{{value}}}" if row is not None and value == winner else value)
         lines.append(" & ".join([_escaped(method), *values]) + r" \\")
     return "\n".join([*lines, r"\hline", r"\end{tabular}"]) + "\n"
 
@@ -197,7 +216,11 @@ def _counted(count: int, singular: str) -> str:
     return f"{count} {singular}{'s' * (count != 1)}"
 
 
+def _latex_label(column: Column) -> str:
+    return _escaped(column.label) + _LATEX_ARROW[column.best]
+
+
 def _escaped(text: str) -> str:
     for sign in "&%_#":
         text = text.replace(sign, f"\\{sign}")
-    return text
+    return text.replace("δ<", r"$\delta<$")
