@@ -90,13 +90,13 @@ def test_runs_of_one_clip_are_rows_and_their_reference_is_made_once(
 
     def all_frames(frames, settings, folder, progress, lens):
         assert (lens.K == sfm.rec.cameras[0].K).all()
-        made.append((frames.names, {f.split for f in frames}))
+        made.append((settings.mapping.method, frames.names, {f.split for f in frames}))
         order = [truth.names.index(name) for name in frames.names]
         return replace(sfm.rec, names=frames.names, cameras=truth.cameras[order])
 
     monkeypatch.setattr(colmap, "reconstruct", all_frames)
     table = localise(runs, tmp_path / "out", LocalizationSettings(matcher="sift"))
-    assert made == [(sfm.frames.names, {"train"})]
+    assert made == [(method, sfm.frames.names, {"train"}) for method in ("incremental", "global")]
     assert [(c.scene, c.method) for c in table.cells] == [
         ("dive", "truth (first) / uwbs-static"),
         ("dive", "truth (second) / uwbs-static"),
@@ -106,7 +106,7 @@ def test_runs_of_one_clip_are_rows_and_their_reference_is_made_once(
         assert isinstance(cell.scores["peak_mb"], float | NotComputed)
         assert isinstance(cell.scores["rra2_map"], float)
     assert localise(runs, tmp_path / "out", LocalizationSettings(matcher="sift")).cells == table.cells
-    assert len(made) == 1
+    assert len(made) == 2
 
 
 def test_runs_with_other_frames_do_not_compare(run: Path, tmp_path: Path):
