@@ -10,7 +10,8 @@ On held-back dives everything is compared with the truth; a row is one network o
     rotation, translation    degrees, medians: the second camera from its pointmap (PnP) against the true pose
     T_D, B     mean absolute errors over pixels and channels at true ray depth; `near`: of the lower half of each
                picture, all that either method then sees, where the depth range is short. The head reads one picture
-               at a time; Sea-Thru is given the whole dive at true poses, or one picture, too
+               at a time, and `dive` is its median over all of them; Sea-Thru is given one picture, or the whole dive
+               at true poses
 
 On real clips with a COLMAP model, poses are compared with the model's; on FLSea's samples, depth with theirs.
 """
@@ -53,6 +54,7 @@ _GRID = 4  # pixels between the seeds of the recall
 _TOLERANCE = 1 / 32  # of the picture's width
 _LOST = 180.0
 _PARTS = {False: "all", True: "near"}
+_COEFFICIENTS = ("Binf", "beta_D", "beta_B")
 _ALONE = 8  # every so manieth frame is given to Sea-Thru alone
 
 
@@ -135,9 +137,7 @@ def head_water(
     half = raw.shape[2] // 32 * 16 if near else 0
     raw, ray_depth = raw[:, :, half:], ray_depth[:, half:]
     medium = head(network.encode(raw)).at(ray_depth)
-    return [
-        (z, Medium(*(getattr(medium, n)[k] for n in ("Binf", "beta_D", "beta_B")))) for k, z in enumerate(ray_depth)
-    ]
+    return [(z, Medium(*(getattr(medium, n)[k] for n in _COEFFICIENTS))) for k, z in enumerate(ray_depth)]
 
 
 def sea_thru(shots: Shots, folder: Path, near: bool, chosen: Sequence[int]) -> tuple[MediumFit, Tensor]:
@@ -171,21 +171,27 @@ def sea_thru(shots: Shots, folder: Path, near: bool, chosen: Sequence[int]) -> t
 
 def water_errors(views: list[tuple[Tensor, Medium]], true: Medium) -> tuple[float, float]:
     """Mean absolute errors of T_D and B over pixels and channels."""
-    identifiable = {name: torch.zeros(3, dtype=torch.bool) for name in ("Binf", "beta_D", "beta_B")}
+    identifiable = {name: torch.zeros(3, dtype=torch.bool) for name in _COEFFICIENTS}
     found = water_scores_from_views(views, true, identifiable, true)
     return float(np.mean(found.T_D_abs)), float(np.mean(found.B_abs))
 
 
+def of_dive(views: list[tuple[Tensor, Medium]]) -> list[tuple[Tensor, Medium]]:
+    """The same views with one water: the median over their pixels."""
+    medians = {n: torch.cat([getattr(m, n).reshape(-1, 3) for _, m in views]).median(0).values for n in _COEFFICIENTS}
+    return [(z, Medium(**{n: v.expand(*z.shape, 3) for n, v in medians.items()})) for z, _ in views]
+
+
 def head_rows(network: Mast3r, head: PhysicsHead, dives: list[Shots], truth: list[Medium]) -> WaterRows:
-    """Errors of the head, which sees one picture, whole or its lower half."""
-    rows = {}
+    """Errors of the head, which sees one picture, whole or its lower half, and of its median over each dive."""
+    rows: dict[str, list[tuple[float, float]]] = {}
     for near, where in _PARTS.items():
-        errors = []
         for shots, true in zip(dives, truth, strict=True):
             assert shots.raw is not None
-            errors.append(water_errors(head_water(network, head, shots.raw, shots.ray_depth, near), true))
-        rows[where] = np.mean(errors, 0)
-    return rows
+            views = head_water(network, head, shots.raw, shots.ray_depth, near)
+            rows.setdefault(f"one picture, {where}", []).append(water_errors(views, true))
+            rows.setdefault(f"dive, {where}", []).append(water_errors(of_dive(views), true))
+    return {name: np.mean(errors, 0) for name, errors in rows.items()}
 
 
 def sea_thru_rows(dives: list[Shots], truth: list[Medium]) -> WaterRows:
@@ -242,7 +248,7 @@ def flsea_row(network: Mast3r, folder: Path, size: int) -> dict[str, float]:
 def read_truth(folder: Path, dives: list[Shots]) -> list[Medium]:
     """The true water of each dive."""
     stored = [json.loads((folder / shots.name / "truth" / "medium.json").read_text()) for shots in dives]
-    return [Medium(*(torch.tensor(s[name]) for name in ("Binf", "beta_D", "beta_B"))) for s in stored]
+    return [Medium(*(torch.tensor(s[name]) for name in _COEFFICIENTS)) for s in stored]
 
 
 def main() -> None:
