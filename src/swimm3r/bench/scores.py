@@ -72,10 +72,10 @@ COLUMNS = (
     Column("rotation_median_deg", "Rotation, deg", 3, "low", f"median, {_AFTER}"),
     Column("position_median_pct", "Position, %", 2, "low", f"median, of the path's spread, {_AFTER}"),
     *(
-        Column(f"fps_{stage}", f"{stage}, FPS", 2, "high", "frames per second of wall time; other work slows it")
+        Column(f"fps_{stage}", f"{stage}, FPS", 2, "high", "located frames per second of wall time")
         for stage in ("retrieve", "coarse", "render", "match", "refine")
     ),
-    Column("fps_localise", "Loc. FPS", 3, "high", "all stages together"),
+    Column("fps_localise", "Loc. FPS", 3, "high", "all stages together, without what is done once per map"),
     Column("peak_mb", "Peak, MB", 0, "low", "resident memory of the process while it localised"),
     Column("peak_vram_mb", "Peak VRAM, MB", 0, "low", "allocated by torch on the GPU while it localised"),
 )

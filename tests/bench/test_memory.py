@@ -1,0 +1,19 @@
+"""The peak of memory belongs to the work it is measured over."""
+
+import numpy as np
+
+from swimm3r.bench.memory import with_peak_mb
+from swimm3r.evaluate import NotComputed
+
+
+def test_the_peak_is_of_the_work_alone():
+    def work(megabytes: int) -> int:
+        return len(np.ones(megabytes << 17))  # float64: 8 bytes each
+
+    (first, much), (_, little) = with_peak_mb(lambda: work(400)), with_peak_mb(lambda: work(1))
+    assert first == 400 << 17
+    if isinstance(much["peak_mb"], NotComputed):  # a system that keeps no such count
+        assert isinstance(little["peak_mb"], NotComputed)
+        return
+    assert isinstance(little["peak_mb"], float)
+    assert much["peak_mb"] - little["peak_mb"] > 300
