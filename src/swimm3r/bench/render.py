@@ -135,6 +135,6 @@ def _side_by_side(out: Path, frame: str, shown: Mapping[str, Path]) -> None:
     rows: dict[str, list[Panel]] = {}
     for method, pictures in shown.items():
         sfm, recipe = method.split(" / ")
-        row = rows.setdefault(sfm, [stored(sfm, pictures / f"{frame}_target.png")])
+        row = rows.setdefault(sfm, [stored(f"{sfm}: test frame", pictures / f"{frame}_target.png")])
         row += [stored(recipe, pictures / f"{frame}_rgb.png"), stored("depth", pictures / f"{frame}_z_depth.png")]
     write_grid(out / f"{Path(frame).stem}.png", list(rows.values()))
