@@ -123,6 +123,7 @@ def test_every_method_is_a_row_and_none_is_skipped_in_silence(
     assert placed.scores["sfm_cpu_seconds"] == 3.5
     assert (lost.scores["registered_pct"], lost.scores["rra15"], lost.scores["points"]) == (0, 0, 0)
     assert all(c.not_run and not c.scores for c in others)
+    assert [path.parent.parent.name for path in tmp_path.glob("dive/*/0/run")] == ["colmap-incremental"]
     assert "vggt: not run" in tables.markdown(table)
     assert read_rgb(tmp_path / "pictures" / "dive.png").shape[1] > 400
     assert compare_sfm([clip], tmp_path, SfmMethods(), PRESETS["fast"], Mast3rSettings()).cells == table.cells

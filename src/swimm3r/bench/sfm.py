@@ -1,9 +1,10 @@
 """Structure from motion by every method on the same frames (the paper's Tab. sfm_metrics), and the clouds side by side.
 
-Each method leaves a run folder OUT/SCENE/METHOD/0/run, which `bench render`, `localisation` and `restoration` take.
+A method that succeeds leaves a run folder OUT/SCENE/METHOD/0/run for `bench render`, `localisation` and `restoration`.
 """
 
 import json
+import shutil
 from collections.abc import Sequence
 from dataclasses import asdict, replace
 from functools import partial
@@ -109,6 +110,9 @@ def _scores(
     scores = model_scores(rec, len(frames.train), original_pixels(clip, frames))
     if truth is not None:
         scores |= reference_scores(rec, frames.train.names, truth)
+    if rec is None:  # METHOD/0/run is for others to take
+        shutil.rmtree(folder / "failed", ignore_errors=True)
+        run.rename(folder / "failed")
     return {**scores, "sfm_cpu_seconds": seconds}
 
 
