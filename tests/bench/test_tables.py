@@ -52,6 +52,12 @@ def test_what_is_missing_is_told_with_its_reason():
     assert "(`psnr`): dB" in text
 
 
+def test_a_table_of_methods_that_were_not_run_still_has_its_columns():
+    text = markdown(Table("t", "T", [Cell("a", "mast3r", 0, {}, "no weights")], columns("psnr")))
+    assert "| method | cells | PSNR ↑ |" in text
+    assert "| mast3r | not run | - |" in text
+
+
 def test_a_mean_over_fewer_cells_says_so():
     cells = [*cells_with_a_gain(0.1), Cell("c", "ours", 0, {"psnr": MISSING})]
     assert "(4)" in next(

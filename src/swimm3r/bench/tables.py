@@ -30,13 +30,14 @@ class Table:
     name: str  # of the files
     title: str
     cells: Sequence[Cell]
-    columns: Sequence[Column]  # those that no cell speaks of are not shown
+    columns: Sequence[Column]
     against: str | None = None  # the method that differences are taken from; the first where none is named
 
     @property
     def shown(self) -> list[Column]:
-        """The columns that some cell has, or gives a reason for not having."""
-        return [c for c in self.columns if any(c.score in cell.scores for cell in self.cells)]
+        """The columns that some cell has, or gives a reason for not having; all where no method was run."""
+        found = [c for c in self.columns if any(c.score in cell.scores for cell in self.cells)]
+        return found or list(self.columns)
 
 
 def write(folder: Path, table: Table) -> str:
