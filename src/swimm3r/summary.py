@@ -23,9 +23,7 @@ from swimm3r.io import images
 from swimm3r.medium import Medium, MediumFit, remove_water, rescale
 from swimm3r.progress import Progress, silent
 from swimm3r.reconstruction import Reconstruction
-from swimm3r.splat.medium_field import grid_of
 from swimm3r.splat.pose_codes import RefinedPoses
-from swimm3r.splat.projection import pinhole
 from swimm3r.splat.rendering import SplatMap
 from swimm3r.splat.settings import PoseRefinementSettings, recipe_of
 from swimm3r.splat.views import pinhole_canvas, undistorted
@@ -137,14 +135,11 @@ def mean_medium(scene: SplatMap, rec: Reconstruction, frames: Frames) -> Medium:
     taken = {frame.name: frame.time for frame in frames}
     every = max(1, len(rec.names) // _ASKED)
     with torch.no_grad():
-        values = [
-            grid_of(scene.field, pinhole(pinhole_canvas(rec.cameras[i], 64)), 8, scene.moment(taken[rec.names[i]]))
-            .values.flatten(1)
-            .mean(1)
+        views = [
+            mean_water(scene, pinhole_canvas(rec.cameras[i], 64), taken[rec.names[i]])
             for i in range(0, len(rec.names), every)
         ]
-    mean = torch.stack(values).mean(0)
-    return Medium(mean[:3], beta_B=mean[3:6], beta_D=mean[6:])
+    return Medium(**{name: torch.stack([getattr(view, name) for view in views]).mean(0) for name in vars(views[0])})
 
 
 def truth_section(

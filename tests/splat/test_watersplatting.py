@@ -20,7 +20,9 @@ SETTINGS = watersplatting(iterations=1500)
 
 
 def recipe(dive, settings=SETTINGS, views: int = 7) -> WaterSplatting:
-    return WaterSplatting(settings, Site(dive.rec, 1.0, 1.0, views))
+    of = TrainingViews(dive.rec, dive.frames, settings, 1.0)
+    of.names = (of.names * views)[:views]  # only their number matters
+    return WaterSplatting(settings, Site(dive.rec, 1.0, 1.0, of))
 
 
 def view_of(dive, k: int = 3):

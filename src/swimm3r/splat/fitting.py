@@ -5,6 +5,7 @@ import json
 import math
 from dataclasses import asdict
 from pathlib import Path
+from typing import Any
 
 from swimm3r.frames import Frames
 from swimm3r.progress import Progress, silent
@@ -12,10 +13,11 @@ from swimm3r.reconstruction import Reconstruction
 from swimm3r.splat import checkpoint, training
 from swimm3r.splat.pose_codes import training_stations, write_refined
 from swimm3r.splat.recipes.mcmc_gs import McmcGs
+from swimm3r.splat.recipes.seasplat import SeaSplat
 from swimm3r.splat.recipes.uwbs import Uwbs, known_water
 from swimm3r.splat.recipes.watersplatting import WaterSplatting
 from swimm3r.splat.rendering import SplatMap
-from swimm3r.splat.settings import McmcGsSettings, SplatSettings, UwbsSettings, WaterSplattingSettings
+from swimm3r.splat.settings import McmcGsSettings, SeaSplatSettings, SplatSettings, UwbsSettings, WaterSplattingSettings
 from swimm3r.splat.site import Site, path_radius
 from swimm3r.splat.views import TrainingViews, working_scale
 
@@ -30,7 +32,7 @@ def train(
     scale = working_scale(rec, settings)
     views = TrainingViews(rec, frames, settings, scale)
     stations = training_stations(rec, views.names, views.cameras, scale) if settings.poses.enabled else None
-    site = Site(rec, scale, path_radius(rec, scale, settings.working_depth), len(views), stations)
+    site = Site(rec, scale, path_radius(rec, scale, settings.working_depth), views, stations)
     recipe = _recipe(settings, site)
     final = training.run(recipe, views, _schedule(settings, rec, views), folder, progress)
     primitives, field = recipe.rescaled(final, 1 / scale)
@@ -43,7 +45,7 @@ def train(
     return scene
 
 
-def _recipe(settings: SplatSettings, site: Site) -> Uwbs | McmcGs | WaterSplatting:
+def _recipe(settings: SplatSettings, site: Site) -> training.Recipe[Any]:
     match settings:
         case UwbsSettings():
             prior = known_water(site.rec, site.scale, settings)
@@ -52,6 +54,8 @@ def _recipe(settings: SplatSettings, site: Site) -> Uwbs | McmcGs | WaterSplatti
             return McmcGs(settings, site)
         case WaterSplattingSettings():
             return WaterSplatting(settings, site)
+        case SeaSplatSettings():
+            return SeaSplat(settings, site)
 
 
 def _schedule(settings: SplatSettings, rec: Reconstruction, views: TrainingViews) -> training.Schedule:

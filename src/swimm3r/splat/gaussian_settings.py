@@ -175,3 +175,78 @@ class WaterSplattingSettings(GaussianSettings):
     """By how much the training pictures are smaller at first,"""
     double_every: float = 0.2  # 3,000 of 15,000
     """and the share of the run after which they double."""
+
+
+@dataclass(frozen=True)
+class GradientSettings:
+    """Multiplication by gradients, culls, and cuts of the opacities (3DGS)."""
+
+    begin: float = 1 / 60  # 500 of 30,000
+    end: float = 0.5  # 15,000 of 30,000
+    every: float = 1 / 300  # 100 of 30,000
+    min_every: int = 40
+    """Fewest steps between two rounds, whatever `every` says: a round needs its views."""
+    pull: float = 2e-4
+    """Least mean gradient of a projected centre, in half pictures."""
+    large: float = 0.01
+    """Scale from which on a Gaussian is split instead of doubled, in radii of the cameras' path."""
+    least_opacity: float = 0.005
+    """Fainter Gaussians are culled,"""
+    largest: float = 0.1
+    """and, after the first cut, those of larger scales, in radii of the cameras' path,"""
+    largest_radius: float = 20.0
+    """or of larger radius in a training picture, pixels."""
+    reset_every: float = 0.1  # 3,000 of 30,000
+    """Share of the run between two cuts of the opacities; 0 for none."""
+    reset_opacity: float = 0.01
+    """What they are cut to."""
+
+
+@dataclass(frozen=True)
+class SeaSplatWeights:
+    """Of the losses; those on J, and the dark channel's, begin with the water."""
+
+    ssim: float = 0.2
+    far: float = 1.0
+    """Of the error in proportion to depth."""
+    background: float = 0.01
+    """Of what covers pixels that have the colour of the open water."""
+    background_distance: float = 0.2 * 3**0.5
+    """Largest distance in RGB of a colour that counts as such."""
+    smooth_depth: float = 2.0
+    grey: float = 0.1
+    saturation: float = 2.0
+    saturated: float = 0.7
+    """Clear colours are to be darker than this."""
+    dark: float = 1.0
+    """Of the light left when the backscatter is taken away,"""
+    negative: float = 1000.0
+    """and of backscatter beyond the picture, in units of the former."""
+
+
+@dataclass(frozen=True)
+class SceneWaterSettings:
+    """When the water comes, and how often it learns."""
+
+    begin: float = 1 / 3  # 10,000 of 30,000
+    """Share of the run before which there is a background instead."""
+    rate: float = 1e-2
+    """Of Adam, for water and background."""
+    first_burst: float = 1 / 30
+    """Steps of the water alone when it comes, 1,000, as a share of the run, which does not count them;"""
+    colour_burst: float = 1 / 15
+    """then of the colours alone, 2,000."""
+    every: float = 1 / 300
+    """Share of the run between two more bursts of the water, 100 steps,"""
+    burst: float = 0.5
+    """and how long they are, 50 steps, as a share of that."""
+
+
+@dataclass(frozen=True)
+class SeaSplatSettings(GaussianSettings):
+    """Gaussians, and one set of water coefficients for the scene."""
+
+    initial: GaussianInitialSettings = field(default_factory=lambda: GaussianInitialSettings(harmonics=0))
+    weights: SeaSplatWeights = field(default_factory=SeaSplatWeights)
+    densify: GradientSettings = field(default_factory=GradientSettings)
+    water: SceneWaterSettings = field(default_factory=SceneWaterSettings)

@@ -62,6 +62,10 @@ class MediumField(nn.Module):
         return torch.cat([sigmoid(raw[:3]), softplus(raw[3:]) / self.length])
 
 
+NO_WATER = MediumField(MediumFieldSettings(model="none"))
+"""Clear water before black."""
+
+
 @dataclass(frozen=True)
 class FieldGrid:
     """The field on a grid of one camera's pixels, corners included."""
@@ -133,11 +137,16 @@ def medium_at_pixels(grid: FieldGrid, height: int, width: int) -> MediumMaps:
     return MediumMaps(maps[:3], maps[3:6], maps[6:])
 
 
+def ray_lengths(view: Pinhole) -> Float[Tensor, "h w"]:
+    """Lengths of the pixels' rays at z = 1."""
+    x = (torch.arange(view.width, device=view.R.device) + 0.5 - view.cx) / view.fx
+    y = (torch.arange(view.height, device=view.R.device) + 0.5 - view.cy) / view.fy
+    return (1 + x * x + (y * y)[:, None]).sqrt()
+
+
 def per_z_depth(maps: MediumMaps, view: Pinhole) -> MediumMaps:
     """Betas for a rasteriser that blends z depth: times the length of the pixel's ray at z = 1, which is exact."""
-    x = (torch.arange(view.width, device=maps.binf.device) + 0.5 - view.cx) / view.fx
-    y = (torch.arange(view.height, device=maps.binf.device) + 0.5 - view.cy) / view.fy
-    length = (1 + x * x + (y * y)[:, None]).sqrt().to(maps.binf)
+    length = ray_lengths(view).to(maps.binf)
     return MediumMaps(maps.binf, maps.beta_b * length, maps.beta_d * length)
 
 

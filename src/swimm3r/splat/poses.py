@@ -18,7 +18,7 @@ from swimm3r.progress import Progress, silent
 from swimm3r.splat.pose_codes import moved
 from swimm3r.splat.primitives import select
 from swimm3r.splat.projection import Primitives, pinhole, project
-from swimm3r.splat.rendering import SplatMap, draw, in_scene_units
+from swimm3r.splat.rendering import SplatMap, in_scene_units, pictures
 from swimm3r.splat.settings import PoseRefinementSettings
 from swimm3r.splat.views import pinhole_canvas, undistorted
 
@@ -61,7 +61,7 @@ def refine_pose(
     for step in range(settings.steps + 1):
         progress("refining a pose", step, settings.steps)
         pose = moved(canvas.cam2world[0], delta, scene.length)
-        images = draw(primitives, scene.field, pinhole(replace(canvas, cam2world=pose[None])), units, now).images
+        images = pictures(primitives, scene.field, pinhole(replace(canvas, cam2world=pose[None])), units, now)
         loss = ((images.rgb.permute(1, 2, 0) - target).abs().mean(-1) * wanted).sum() / wanted.sum()
         losses.append((float(loss.detach()), pose.detach()))
         if step == settings.steps:

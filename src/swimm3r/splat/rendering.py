@@ -6,19 +6,33 @@ from typing import TypeVar
 import torch
 from jaxtyping import Float
 from torch import Tensor
+from torch.nn.functional import relu
 
 from swimm3r.cameras import Cameras
 from swimm3r.medium import Medium
 from swimm3r.raster import MediumMaps, RasterOutput, SggBuffers, rasterize
 from swimm3r.splat.gaussian_settings import GaussianSettings
-from swimm3r.splat.medium_field import FieldGrid, MediumField, grid_of, medium_at_pixels, per_z_depth
+from swimm3r.splat.medium_field import (
+    NO_WATER,
+    FieldGrid,
+    MediumField,
+    grid_of,
+    medium_at_pixels,
+    per_z_depth,
+    ray_lengths,
+)
 from swimm3r.splat.pose_codes import RefinedPoses
 from swimm3r.splat.projection import Pinhole, Primitives, Projection, pinhole, project
+from swimm3r.splat.scene_water import SceneWater, WaterLayer, layer, relative_depth, seen_through
 from swimm3r.splat.settings import SplatSettings, UwbsSettings
 from swimm3r.splat.views import moment
 
 _SEEN = 1e-3  # alpha below which a pixel has no depth
 _COVERED = 0.5  # alpha from which on a pixel's clear colour is that of a surface
+
+
+Water = MediumField | SceneWater
+"""Either is in every primitive's way to a pixel, or over the finished picture."""
 
 
 @dataclass(frozen=True)
@@ -38,7 +52,7 @@ class SplatMap:
     """Primitives and water of one scene, in the unit and axes of its reconstruction."""
 
     primitives: Primitives
-    field: MediumField
+    field: Water
     settings: SplatSettings
     metric: bool
     length: float = 1.0  # scene units per working unit (`settings.py`)
@@ -99,6 +113,18 @@ def draw(
     return Drawing(images, projection, grid, maps, buffers, time)
 
 
+def pictures(
+    p: Primitives, field: Water, view: Pinhole, settings: SplatSettings, time: Float[Tensor, ""] | None = None
+) -> RasterOutput:
+    """The images of any map; differentiable as `draw` is."""
+    match field:
+        case MediumField():
+            return draw(p, field, view, settings, time).images
+        case SceneWater():
+            images = draw(p, NO_WATER, view, settings, time).images
+            return images._replace(rgb=seen_through(images.clear, layer(field, relative_depth(images))))
+
+
 def expected_z_depth(images: RasterOutput) -> Float[Tensor, "h w"]:
     """Mean z depth of what a pixel shows; 0 where it shows nothing but water."""
     return torch.where(images.alpha > _SEEN, images.z_depth / images.alpha.clamp(min=_SEEN), 0.0)
@@ -124,14 +150,21 @@ def render(scene: SplatMap, camera: Cameras, time: float | None = None) -> Rende
     """One view of a map at a time of its clip. Raises ValueError as `SplatMap.render` does."""
     settings = in_scene_units(scene.settings, scene.length)
     view, now = pinhole(camera), scene.moment(time)
-    projection = project(scene.primitives, view, settings.render, now)
-    projected, kernel = projection.primitives, projection.kernel
-    medium = medium_at_pixels(grid_of(scene.field, view, scene.field.stride, now), view.height, view.width)
-    maps = per_z_depth(medium, view) if settings.render.depth == "ray" else medium
-    height, width, alpha_min = view.height, view.width, settings.render.alpha_min
-    images = rasterize(projected, maps, height, width, alpha_min=alpha_min, kernel=kernel)
-    black = projected._replace(color=torch.zeros_like(projected.color))
-    veil = rasterize(black, maps, height, width, alpha_min=alpha_min, kernel=kernel).rgb
+    match scene.field:
+        case MediumField():
+            drawing = draw(scene.primitives, scene.field, view, settings, now)
+            images, medium = drawing.images, medium_at_pixels(drawing.grid, view.height, view.width)
+            seen = drawing.projection.primitives
+            black = seen._replace(color=torch.zeros_like(seen.color))
+            veil = rasterize(
+                black, drawing.maps, view.height, view.width,
+                alpha_min=settings.render.alpha_min, kernel=drawing.projection.kernel,
+            ).rgb  # fmt: skip
+        case SceneWater():
+            images = draw(scene.primitives, NO_WATER, view, settings, now).images
+            over = layer(scene.field, relative_depth(images))
+            medium, veil = _as_coefficients(scene.field, over, images, view), over.backscatter
+            images = images._replace(rgb=seen_through(images.clear, over))
     return RenderOutput(
         rgb=images.rgb.permute(1, 2, 0),
         clear=surface_colour(images).permute(1, 2, 0),
@@ -144,3 +177,25 @@ def render(scene: SplatMap, camera: Cameras, time: float | None = None) -> Rende
             beta_B=medium.beta_b.permute(1, 2, 0),
         ),
     )
+
+
+def mean_water(scene: SplatMap, camera: Cameras, time: float | None = None) -> Medium:
+    """The map's water averaged over one view, per scene unit of ray depth."""
+    match scene.field:
+        case MediumField():
+            mean = (
+                grid_of(scene.field, pinhole(camera), scene.field.stride, scene.moment(time)).values.flatten(1).mean(1)
+            )
+            return Medium(mean[:3], beta_B=mean[3:6], beta_D=mean[6:])
+        case SceneWater():
+            medium = scene.render(camera, time).medium
+            return Medium(**{name: values.flatten(0, 1).mean(0) for name, values in vars(medium).items()})
+
+
+def _as_coefficients(water: SceneWater, over: WaterLayer, images: RasterOutput, view: Pinhole) -> MediumMaps:
+    """Betas per unit of ray depth that take, over each pixel's own, the light that the scene's coefficients take."""
+    z = expected_z_depth(images)
+    ray = (torch.where(z > 0, z, z.max()) * ray_lengths(view)).clamp(min=1e-6)
+    shares = over.depth / ray
+    a, b, Binf = (v[:, None, None] for v in (relu(water.attenuation), relu(water.backscatter), water.Binf))
+    return MediumMaps(Binf.expand(3, *shares.shape), b * shares, a * shares)

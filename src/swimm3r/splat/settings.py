@@ -7,7 +7,12 @@ or, where the reconstruction has no scale, a third of its median depth (`working
 from dataclasses import dataclass, field, replace
 from typing import Any, Literal, TypeVar, get_args
 
-from swimm3r.splat.gaussian_settings import GaussianSettings, McmcGsSettings, WaterSplattingSettings
+from swimm3r.splat.gaussian_settings import (
+    GaussianSettings,
+    McmcGsSettings,
+    SeaSplatSettings,
+    WaterSplattingSettings,
+)
 from swimm3r.splat.scene_settings import MediumFieldSettings, TrainingPoseSettings
 
 
@@ -187,10 +192,10 @@ class PoseRefinementSettings:
     """Share of the picture below which every pixel counts instead."""
 
 
-SplatSettings = UwbsSettings | McmcGsSettings | WaterSplattingSettings
+SplatSettings = UwbsSettings | WaterSplattingSettings | SeaSplatSettings | McmcGsSettings
 uwbs = UwbsSettings  # as the Python API calls it: swimm3r.train(rec, frames, swimm3r.uwbs(iterations=20_000))
 
-Recipe = Literal["uwbs-static", "uwbs-dynamic", "ubs", "watersplatting", "threers_gs", "mcmc_gs"]
+Recipe = Literal["uwbs-static", "uwbs-dynamic", "ubs", "watersplatting", "seasplat", "threers_gs", "mcmc_gs"]
 RECIPES: tuple[Recipe, ...] = get_args(Recipe)
 
 
@@ -216,8 +221,14 @@ def with_recipe(settings: UwbsSettings, recipe: Recipe) -> SplatSettings:
             water = _of_the_same_size(settings, watersplatting())
             if water.iterations < _SHORT:
                 gentle = replace(water.densify, reset_every=0.0, least_opacity=water.densify.least_opacity_late)
-                water = replace(water, densify=gentle)
+                water = replace(water, densify=gentle, initial=replace(water.initial, opacity=_SHORT_OPACITY))
             return water
+        case "seasplat":
+            sea = _of_the_same_size(settings, seasplat())
+            if sea.iterations < _SHORT:
+                uncut = replace(sea.densify, reset_every=0.0)
+                sea = replace(sea, densify=uncut, initial=replace(sea.initial, opacity=_SHORT_OPACITY))
+            return sea
         case "threers_gs" | "mcmc_gs":
             peer = _of_the_same_size(settings, threers_gs() if recipe == "threers_gs" else mcmc_gs())
             if peer.iterations < _SHORT:
@@ -228,7 +239,10 @@ def with_recipe(settings: UwbsSettings, recipe: Recipe) -> SplatSettings:
 _SHORT = 10_000
 """Runs shorter than this give the peers what they would else lack the time for. WaterSplatting's Gaussians start at an
 opacity of 0.1 and are culled below 0.5: of 4,000 on ruie_green_rock (160 px) 724 were left after 400 steps, at 23.6 dB
-on frames held back; culled below 0.1, and their opacities not cut, they are 7,400 at 30.2 dB."""
+on frames held back; culled below 0.1, and their opacities not cut, they are 7,400 at 30.2 dB. SeaSplat gains 10 dB by
+opacities that are not cut."""
+_SHORT_OPACITY = 0.5
+"""Of WaterSplatting's and SeaSplat's Gaussians in short runs, as UWBS begins; SeaSplat gains 0.5 dB by it."""
 _SHORT_SCALE = 0.5
 """Of MCMC's Gaussians in short runs, in their spacing: from a tenth of it, as published, they would take 460 steps to
 cover it. The same 400 steps gain 2.3 dB by it."""
@@ -257,6 +271,12 @@ def watersplatting(**changes: Any) -> WaterSplattingSettings:
     return WaterSplattingSettings(**changes)
 
 
+def seasplat(**changes: Any) -> SeaSplatSettings:
+    """SeaSplat, as the Python API calls it: on poses as they are."""
+    changes.setdefault("poses", TrainingPoseSettings(enabled=False))
+    return SeaSplatSettings(**changes)
+
+
 def threers_gs(**changes: Any) -> McmcGsSettings:
     """3R-GS, as the Python API calls it: Gaussian MCMC with the training poses refined."""
     return McmcGsSettings(**changes)
@@ -275,6 +295,8 @@ def settings_of(recipe: Recipe) -> type[SplatSettings]:
             return UwbsSettings
         case "watersplatting":
             return WaterSplattingSettings
+        case "seasplat":
+            return SeaSplatSettings
         case "threers_gs" | "mcmc_gs":
             return McmcGsSettings
 
@@ -284,6 +306,8 @@ def recipe_of(settings: SplatSettings) -> Recipe:
     match settings:
         case WaterSplattingSettings():
             return "watersplatting"
+        case SeaSplatSettings():
+            return "seasplat"
         case McmcGsSettings():
             return "threers_gs" if settings.poses.enabled else "mcmc_gs"
         case UwbsSettings():

@@ -10,7 +10,7 @@ from swimm3r.cameras import Cameras
 from swimm3r.reconstruction import Reconstruction
 from swimm3r.splat.pose_codes import PoseCodes, Stations
 from swimm3r.splat.scene_settings import TrainingPoseSettings
-from swimm3r.splat.views import View
+from swimm3r.splat.views import TrainingViews, View
 
 
 @dataclass(frozen=True)
@@ -20,7 +20,7 @@ class Site:
     rec: Reconstruction
     scale: float  # working units per scene unit
     radius: float  # of the cameras' path, working units
-    views: int  # how many there are
+    views: TrainingViews
     stations: Stations | None = None  # None where poses are held
 
     @property

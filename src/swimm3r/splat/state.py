@@ -14,11 +14,14 @@ from swimm3r.splat.optimiser import Moments, fresh
 from swimm3r.splat.pose_codes import PoseCodes
 from swimm3r.splat.primitives import BetaPrimitives
 from swimm3r.splat.projection import Primitives
+from swimm3r.splat.rendering import Water
 from swimm3r.splat.scene_settings import MediumFieldSettings
-from swimm3r.splat.settings import McmcGsSettings, SplatSettings, UwbsSettings, WaterSplattingSettings
+from swimm3r.splat.scene_water import SceneWater
+from swimm3r.splat.settings import McmcGsSettings, SeaSplatSettings, SplatSettings, UwbsSettings, WaterSplattingSettings
 
 FIELD, POSES = "field.", "poses."
 P = TypeVar("P", BetaPrimitives, GaussianPrimitives)
+W = TypeVar("W", MediumField, SceneWater)
 
 
 @dataclass(frozen=True)
@@ -26,7 +29,7 @@ class Parts:
     """The kind of primitives, and a water whose values are still to come."""
 
     primitives: type[Primitives]
-    field: MediumField
+    field: Water
 
 
 def parts_of(settings: SplatSettings) -> Parts:
@@ -38,27 +41,29 @@ def parts_of(settings: SplatSettings) -> Parts:
             return Parts(GaussianPrimitives, MediumField(MediumFieldSettings(model="none")))
         case WaterSplattingSettings():
             return Parts(GaussianPrimitives, MediumField(settings.medium))
+        case SeaSplatSettings():
+            return Parts(GaussianPrimitives, SceneWater())
 
 
 @dataclass(frozen=True)
-class State(Generic[P]):
+class State(Generic[P, W]):
     """Primitives, water and poses, the optimiser's memory of them, and what else a recipe remembers."""
 
     primitives: P
-    field: MediumField
+    field: W
     poses: PoseCodes | None  # None where poses are held
     moments: dict[str, Moments]  # of "xyz" ..., of the field's parameters by "field.*", of the poses' by "poses.*"
     memory: dict[str, Tensor] = dataclasses.field(default_factory=dict)
 
 
-def parameters_of(p: Primitives, field: MediumField, poses: PoseCodes | None = None) -> dict[str, Tensor]:
+def parameters_of(p: Primitives, field: Water, poses: PoseCodes | None = None) -> dict[str, Tensor]:
     """Everything that is trained, by the names of `State.moments`."""
     of_field: dict[str, Tensor] = {f"{FIELD}{name}": t for name, t in field.named_parameters()}
     of_poses = {} if poses is None else {f"{POSES}{name}": t for name, t in poses.named_parameters()}
     return {**p._asdict(), **of_field, **of_poses}
 
 
-def first_state(p: P, field: MediumField, poses: PoseCodes | None, memory: dict[str, Tensor] | None = None) -> State[P]:
+def first_state(p: P, field: W, poses: PoseCodes | None, memory: dict[str, Tensor] | None = None) -> State[P, W]:
     """The state before step 1."""
     p = type(p)(*(values.contiguous() for values in p))
     moments = {name: fresh(values) for name, values in parameters_of(p, field, poses).items()}
@@ -74,7 +79,7 @@ def stored(state: State) -> dict[str, Tensor]:
     return tensors | {f"memory.{name}": t for name, t in state.memory.items()}
 
 
-def restored(tensors: dict[str, Tensor], settings: SplatSettings, cameras: int) -> State[Any]:
+def restored(tensors: dict[str, Tensor], settings: SplatSettings, cameras: int) -> State[Any, Any]:
     """The inverse of `stored`; `cameras` are those whose poses are refined, 0 where they are held."""
     parts = parts_of(settings)
     poses = PoseCodes(cameras, settings.poses) if cameras else None
@@ -85,7 +90,8 @@ def restored(tensors: dict[str, Tensor], settings: SplatSettings, cameras: int) 
             parameter.copy_(tensors[f"parameter.{name}"])
     moments = {k: Moments(tensors[f"first.{k}"], tensors[f"second.{k}"], tensors[f"steps.{k}"]) for k in parameters}
     memory = {k.removeprefix("memory."): t for k, t in tensors.items() if k.startswith("memory.")}
-    return State(p, parts.field, poses, moments, memory)
+    field: Any = parts.field
+    return State(p, field, poses, moments, memory)
 
 
 def clip_field(gradients: dict[str, Tensor]) -> None:

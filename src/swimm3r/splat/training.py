@@ -16,6 +16,8 @@ import torch
 from swimm3r.io.atomic import write_text
 from swimm3r.progress import Progress
 from swimm3r.splat import checkpoint
+from swimm3r.splat.projection import Primitives
+from swimm3r.splat.rendering import Water
 from swimm3r.splat.views import TrainingViews, View
 
 log = logging.getLogger(__name__)
@@ -41,6 +43,10 @@ class Recipe(Protocol[State]):
 
     def restored(self, tensors: dict[str, torch.Tensor]) -> State:
         """The state that `stored` was made of."""
+        ...
+
+    def rescaled(self, state: State, factor: float) -> tuple[Primitives, Water]:
+        """What the map keeps of a finished state, after every length was multiplied by `factor`; without gradient."""
         ...
 
 

@@ -10,6 +10,7 @@ from torch import Tensor
 from swimm3r.splat import training
 from swimm3r.splat.gaussian_settings import GaussianSettings
 from swimm3r.splat.gaussians import GaussianPrimitives, initial_gaussians, rescaled, to_degree
+from swimm3r.splat.medium_field import NO_WATER, MediumField
 from swimm3r.splat.optimiser import Moments, log_linear
 from swimm3r.splat.pose_codes import pose_rate
 from swimm3r.splat.projection import Pinhole, pinhole
@@ -20,6 +21,9 @@ from swimm3r.splat.views import View
 
 # purposes of randomness (training.generator): 2 primitives, 3 water, 4 densification, 6 poses, 7 matches, 8 noise
 _MOST_HASTE = 4.0
+
+
+InField = State[GaussianPrimitives, MediumField]
 
 
 @dataclass(frozen=True)
@@ -44,14 +48,16 @@ def first_gaussians(site: Site, settings: GaussianSettings) -> GaussianPrimitive
     return rescaled(p, site.scale)
 
 
-def look(
-    site: Site, state: State[GaussianPrimitives], view: View, settings: GaussianSettings, step: int, sgg: bool = False
-) -> Look:
-    """Draw a view with the harmonics that this step has come to; `sgg` asks for the gradients' parts."""
+def look(site: Site, state: State, view: View, settings: GaussianSettings, step: int, sgg: bool = False) -> Look:
+    """Draw a view with the harmonics that this step has come to; `sgg` asks for the gradients' parts.
+
+    Water that lies over finished pictures is not in this one.
+    """
     p = GaussianPrimitives(*(values.detach().requires_grad_() for values in state.primitives))
     degree = int((step - 1) / (settings.degree_every * settings.iterations))
     sight = pinhole(site.camera(view, state.poses))
-    drawing = draw(to_degree(p, min(degree, settings.initial.harmonics)), state.field, sight, settings, sgg=sgg)
+    field = state.field if isinstance(state.field, MediumField) else NO_WATER
+    drawing = draw(to_degree(p, min(degree, settings.initial.harmonics)), field, sight, settings, sgg=sgg)
     return Look(p, drawing, sight, parameters_of(p, state.field, state.poses))
 
 

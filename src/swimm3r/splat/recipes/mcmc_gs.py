@@ -17,11 +17,11 @@ from torch import Tensor
 from swimm3r.splat import gaussian_mcmc, losses, training
 from swimm3r.splat.gaussian_settings import McmcGsSettings
 from swimm3r.splat.gaussians import GaussianPrimitives, rescaled
-from swimm3r.splat.medium_field import MediumField
+from swimm3r.splat.medium_field import NO_WATER, MediumField
 from swimm3r.splat.optimiser import adam_step
-from swimm3r.splat.recipes.gaussian_step import first_gaussians, look, rates_of, with_matches, with_rows
+from swimm3r.splat.recipes.gaussian_step import InField, first_gaussians, look, rates_of, with_matches, with_rows
 from swimm3r.splat.site import Site
-from swimm3r.splat.state import State, first_state, parameters_of, parts_of, restored, stored
+from swimm3r.splat.state import State, first_state, parameters_of, restored, stored
 from swimm3r.splat.views import View
 
 
@@ -32,14 +32,12 @@ class McmcGs:
     settings: McmcGsSettings
     site: Site
 
-    def start(self) -> State[GaussianPrimitives]:
+    def start(self) -> InField:
         """Small Gaussians on the cloud, coloured as filmed."""
         codes = self.site.codes(self.settings.poses, training.generator(self.settings.seed, 0, 6))
-        return first_state(first_gaussians(self.site, self.settings), parts_of(self.settings).field, codes)
+        return first_state(first_gaussians(self.site, self.settings), NO_WATER, codes)
 
-    def step(
-        self, state: State[GaussianPrimitives], view: View, step: int
-    ) -> tuple[State[GaussianPrimitives], dict[str, float]]:
+    def step(self, state: InField, view: View, step: int) -> tuple[InField, dict[str, float]]:
         """One view: forward, adjoint, Adam, relocation and growth on their cadence, noise."""
         settings, w = self.settings, self.settings.weights
         seen = look(self.site, state, view, settings, step)
@@ -71,7 +69,7 @@ class McmcGs:
         """The inverse of `stored`."""
         return restored(tensors, self.settings, self.site.refined_cameras)
 
-    def rescaled(self, state: State[GaussianPrimitives], factor: float) -> tuple[GaussianPrimitives, MediumField]:
+    def rescaled(self, state: InField, factor: float) -> tuple[GaussianPrimitives, MediumField]:
         """Gaussians, and no water, after every length was multiplied by `factor`, without gradient."""
         return rescaled(state.primitives, factor), state.field.requires_grad_(False)
 
@@ -83,9 +81,7 @@ class McmcGs:
         d, share = self.settings.densify, step / self.settings.iterations
         return step % self._every() == 0 and d.begin < share <= d.end
 
-    def _densified(
-        self, state: State[GaussianPrimitives], step: int
-    ) -> tuple[State[GaussianPrimitives], dict[str, float]]:
+    def _densified(self, state: InField, step: int) -> tuple[InField, dict[str, float]]:
         d, n = self.settings.densify, len(state.primitives.xyz)
         growth = d.growth ** (self._every() / (d.every * self.settings.iterations))
         target = max(n, min(self.settings.max_primitives, int(growth * n)))

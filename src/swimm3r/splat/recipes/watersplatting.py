@@ -25,7 +25,7 @@ from swimm3r.splat.gaussian_settings import WaterSplattingSettings
 from swimm3r.splat.gaussians import GaussianPrimitives, rescaled
 from swimm3r.splat.medium_field import MediumField, in_unit, initial_field
 from swimm3r.splat.optimiser import adam_step, log_linear
-from swimm3r.splat.recipes.gaussian_step import first_gaussians, look, rates_of, with_matches, with_rows
+from swimm3r.splat.recipes.gaussian_step import InField, first_gaussians, look, rates_of, with_matches, with_rows
 from swimm3r.splat.site import Site
 from swimm3r.splat.state import FIELD, State, clip_field, first_state, parameters_of, restored, stored
 from swimm3r.splat.views import View, smaller
@@ -38,7 +38,7 @@ class WaterSplatting:
     settings: WaterSplattingSettings
     site: Site
 
-    def start(self) -> State[GaussianPrimitives]:
+    def start(self) -> InField:
         """Faint Gaussians on the cloud, and a network at random."""
         seed = self.settings.seed
         p = first_gaussians(self.site, self.settings)
@@ -46,9 +46,7 @@ class WaterSplatting:
         codes = self.site.codes(self.settings.poses, training.generator(seed, 0, 6))
         return first_state(p, field, codes, gradient_densify.nothing_seen(len(p.xyz)))
 
-    def step(
-        self, state: State[GaussianPrimitives], view: View, step: int
-    ) -> tuple[State[GaussianPrimitives], dict[str, float]]:
+    def step(self, state: InField, view: View, step: int) -> tuple[InField, dict[str, float]]:
         """One view at the resolution this step has come to: forward, adjoint, Adam, densification on its cadence."""
         settings = self.settings
         view = smaller(view, self._divisor(step))
@@ -82,7 +80,7 @@ class WaterSplatting:
         """The inverse of `stored`."""
         return restored(tensors, self.settings, self.site.refined_cameras)
 
-    def rescaled(self, state: State[GaussianPrimitives], factor: float) -> tuple[GaussianPrimitives, MediumField]:
+    def rescaled(self, state: InField, factor: float) -> tuple[GaussianPrimitives, MediumField]:
         """Gaussians and water after every length was multiplied by `factor`, without gradient."""
         return rescaled(state.primitives, factor), in_unit(state.field, factor)
 
@@ -100,12 +98,12 @@ class WaterSplatting:
         d = self.settings.densify
         return self._every() * round(d.reset_every / d.every) if d.reset_every else self.settings.iterations
 
-    def _round(self, state: State[GaussianPrimitives], step: int) -> State[GaussianPrimitives]:
+    def _round(self, state: InField, step: int) -> InField:
         """Multiply and cull; cut opacities back on their cadence."""
         d, p, moments, memory = self.settings.densify, state.primitives, state.moments, state.memory
         since = step % self._period()
         growing = step < d.end * self.settings.iterations
-        waits = min(self.site.views + self._every(), self._period() // 2) if d.reset_every else 0
+        waits = min(len(self.site.views) + self._every(), self._period() // 2) if d.reset_every else 0
         if not growing or since > waits:
             done = gradient_densify.unchanged(p)
             if growing:

@@ -1,0 +1,216 @@
+"""SeaSplat (Yang et al. 2024): Gaussians first, then one set of water coefficients over their pictures.
+
+For a third of the run I = J + b (1 - alpha) before a learned background b; then the water of `scene_water`, whose Binf
+begins as b. It learns in bursts that the run does not count: 1,000 steps of its own when it comes, followed by 2,000 of
+the colours alone, and 50 more every 100 steps; in between it stands still. Losses (uwbs.md 4.1), with d detached where
+it weighs:
+
+    0.8 L1 + 0.2 (1 - SSIM)                     mean |d (I - gt)|                0.01 mean alpha where I looks like Binf
+    2 mean |grad d| e^{-grad gt}                and with water: 0.1 mean_c (mean J_c - 0.5)^2
+    2 mean (relu(-J) + relu(J - 0.7))^2         mean relu(gt - B) + 1000 smooth-L1(relu(B - gt))
+
+Gaussians multiply, are culled and cut as in 3DGS. Where we depart from the publication: SSIM pads with zeros; the
+number of Gaussians has the bound that all recipes have; `clear` pictures are divided by alpha as everybody's are. In
+short runs rounds are `min_every` steps apart at least, rates grow (`haste`), and opacities are not cut (`with_recipe`).
+"""
+
+from dataclasses import dataclass
+
+import torch
+from jaxtyping import Bool, Float
+from torch import Tensor
+from torch.nn.functional import relu, smooth_l1_loss
+
+from swimm3r.raster import RasterOutput
+from swimm3r.splat import gradient_densify, losses, training
+from swimm3r.splat.gaussian_settings import SeaSplatSettings, SeaSplatWeights
+from swimm3r.splat.gaussians import GaussianPrimitives, rescaled
+from swimm3r.splat.optimiser import Moments, adam_step, fresh
+from swimm3r.splat.recipes.gaussian_step import first_gaussians, look, rates_of, with_matches, with_rows
+from swimm3r.splat.scene_water import SceneWater, initial_scene_water, layer, relative_depth, seen_through
+from swimm3r.splat.site import Site
+from swimm3r.splat.state import FIELD, State, first_state, parameters_of, restored, stored
+from swimm3r.splat.views import View
+
+UnderWater = State[GaussianPrimitives, SceneWater]
+_SMOOTH = 0.2  # of smooth-L1
+
+
+@dataclass(frozen=True)
+class SeaSplat:
+    """The recipe for one scene (`training.Recipe`)."""
+
+    settings: SeaSplatSettings
+    site: Site
+
+    def start(self) -> UnderWater:
+        """Faint Gaussians on the cloud, coloured as filmed."""
+        seed = self.settings.seed
+        p = first_gaussians(self.site, self.settings)
+        water = initial_scene_water(training.generator(seed, 0, 3))
+        codes = self.site.codes(self.settings.poses, training.generator(seed, 0, 6))
+        return first_state(p, water, codes, gradient_densify.nothing_seen(len(p.xyz)))
+
+    def step(self, state: UnderWater, view: View, step: int) -> tuple[UnderWater, dict[str, float]]:
+        """Bursts where they are due, then one view: forward, adjoint, Adam, densification on its cadence."""
+        settings, w, wet = self.settings, self.settings.weights, step > self._dry_steps()
+        if step == self._dry_steps() + 1:
+            state = self._filled(state, step)
+        elif wet and step % self._share(settings.water.every) == 0:
+            self._water_burst(state, step, settings.water.burst * settings.water.every * settings.iterations)
+        seen = look(self.site, state, view, settings, step)
+        found = objective(seen.drawing.images, state.field, view, w, wet)
+        total, numbers = with_matches(self.site, state, found.total, settings, step)
+        numbers |= found.numbers | {"loss": float(total.detach()), "primitives": float(len(seen.p.xyz))}
+        gradients = seen.gradients(total)
+        with torch.no_grad():
+            still = () if wet else (f"{FIELD}veil",)
+            parameters = parameters_of(state.primitives, state.field, state.poses)
+            moving = {name: t for name, t in parameters.items() if not name.startswith(FIELD) or name in still}
+            rates = rates_of(self.site, settings, step, parameters) | dict.fromkeys(still, settings.water.rate)
+            adam_step(moving, gradients, state.moments, rates)
+            memory = gradient_densify.remembered(state.memory, gradients["mean2d"], seen.drawing.projection, seen.sight)
+            state = State(state.primitives, state.field, state.poses, state.moments, memory)
+            d, share = settings.densify, step / settings.iterations
+            if d.begin < share <= d.end:
+                state = self._round(state, step)
+        return state, numbers
+
+    def stored(self, state: State) -> dict[str, Tensor]:
+        """Everything in a state, by name."""
+        return stored(state)
+
+    def restored(self, tensors: dict[str, Tensor]) -> State:
+        """The inverse of `stored`."""
+        return restored(tensors, self.settings, self.site.refined_cameras)
+
+    def rescaled(self, state: UnderWater, factor: float) -> tuple[GaussianPrimitives, SceneWater]:
+        """Gaussians after every length was multiplied by `factor`, and the water, which has no length."""
+        return rescaled(state.primitives, factor), state.field.requires_grad_(False)
+
+    def _share(self, of: float) -> int:
+        return max(1, round(of * self.settings.iterations))
+
+    def _dry_steps(self) -> int:
+        return int(self.settings.water.begin * self.settings.iterations)
+
+    def _filled(self, state: UnderWater, step: int) -> UnderWater:
+        """The state when the water has come, with an optimiser of its own; then the colours without it."""
+        names = [name for name in state.moments if name.startswith(FIELD)]
+        moments: dict[str, Moments] = state.moments | {name: fresh(state.moments[name].first) for name in names}
+        state = State(state.primitives, state.field, state.poses, moments, state.memory)
+        water = self.settings.water
+        self._water_burst(state, step, water.first_burst * self.settings.iterations)
+        for view in self._views(step, 11, water.colour_burst * self.settings.iterations):
+            seen = look(self.site, state, view, self.settings, step)
+            gradients = seen.gradients(
+                objective(seen.drawing.images, state.field, view, self.settings.weights, True).total
+            )
+            rates = rates_of(self.site, self.settings, step, state.moments)
+            colours = {name: getattr(state.primitives, name) for name in ("colour", "harmonics")}
+            with torch.no_grad():
+                adam_step(colours, gradients, state.moments, rates)
+        return state
+
+    def _water_burst(self, state: UnderWater, step: int, count: float) -> None:
+        """Steps of the water alone."""
+        parameters: dict[str, Tensor] = {f"{FIELD}{name}": t for name, t in state.field.named_parameters()}
+        rates = dict.fromkeys(parameters, self.settings.water.rate)
+        for view in self._views(step, 10, count):
+            with torch.no_grad():
+                images = look(self.site, state, view, self.settings, step).drawing.images
+            loss = objective(images, state.field, view, self.settings.weights, True).total
+            found = torch.autograd.grad(loss, list(parameters.values()), materialize_grads=True)
+            with torch.no_grad():
+                adam_step(parameters, dict(zip(parameters, found, strict=True)), state.moments, rates)
+
+    def _views(self, step: int, purpose: int, count: float) -> list[View]:
+        """Some views, drawn anew each time."""
+        rng = training.generator(self.settings.seed, step, purpose)
+        drawn = torch.randint(len(self.site.views), (max(1, round(count)),), generator=rng)
+        return [self.site.views[k] for k in drawn.tolist()]
+
+    def _round(self, state: UnderWater, step: int) -> UnderWater:
+        """Multiply and cull, and cut opacities back, each on its cadence."""
+        d, p, moments, memory = self.settings.densify, state.primitives, state.moments, state.memory
+        cut_every = self._share(d.reset_every) if d.reset_every else self.settings.iterations
+        if step % max(d.min_every, self._share(d.every)) == 0:
+            rng = training.generator(self.settings.seed, step, 4)
+            large, most = d.large * self.site.radius, self.settings.max_primitives
+            done = gradient_densify.multiply(p, memory, d.pull, large, most, rng)
+            q = done.primitives
+            fit = torch.sigmoid(q.opacity) >= d.least_opacity
+            if step > cut_every:
+                fit &= q.scale.amax(-1).exp() <= d.largest * self.site.radius
+                fit &= memory["radius"][done.source] <= d.largest_radius
+            if int(fit.sum()) >= 4:
+                done = gradient_densify.only(done, fit)
+            p, moments = done.primitives, with_rows(moments, done.source, done.restarted)
+            memory = gradient_densify.nothing_seen(len(p.xyz))
+        if d.reset_every and step % cut_every == 0:
+            p, moments = gradient_densify.dimmed(p, moments, d.reset_opacity)
+        return State(p, state.field, state.poses, moments, memory)
+
+
+@dataclass(frozen=True)
+class Objective:
+    """The losses of one view."""
+
+    total: Float[Tensor, ""]
+    numbers: dict[str, float]  # unweighted, for the record
+
+
+def objective(images: RasterOutput, water: SceneWater, view: View, w: SeaSplatWeights, wet: bool) -> Objective:
+    """The sum of the losses of a clear view, with the water over it once it is `wet`."""
+    J, depth = images.clear, relative_depth(images)
+    shown = seen_through(J, layer(water, depth)) if wet else J + water.Binf[:, None, None] * (1 - images.alpha)
+    photo = losses.photometric(shown, view.rgb, view.seen, w.ssim)
+    terms = {
+        "far": (w.far, mean_seen(depth.detach() * (shown - view.rgb).abs(), view.seen)),
+        "background": (w.background, covered_background(shown if wet else J, images.alpha, water, view, w)),
+        "smooth_depth": (w.smooth_depth, depth_steps(depth, view)),
+    }
+    if wet:
+        terms |= {
+            "grey": (w.grey, (torch.stack([mean_seen(channel, view.seen) for channel in J]) - 0.5).square().mean()),
+            "saturation": (w.saturation, mean_seen((relu(-J) + relu(J - w.saturated)).square(), view.seen)),
+            "dark": (w.dark, dark_channel(layer(water, depth.detach()).backscatter, view, w.negative)),
+        }
+    total = photo.loss
+    for weight, term in terms.values():
+        total = total + weight * term
+    numbers = {"l1": photo.l1, "ssim": photo.ssim} | {name: float(term.detach()) for name, (_, term) in terms.items()}
+    return Objective(total, numbers)
+
+
+def mean_seen(values: Float[Tensor, "*c h w"], seen: Bool[Tensor, "h w"]) -> Float[Tensor, ""]:
+    """Mean over the pixels that count."""
+    return torch.where(seen, values, 0.0).mean() / seen.float().mean().clamp(min=1e-6)
+
+
+def covered_background(
+    shown: Float[Tensor, "3 h w"], alpha: Float[Tensor, "h w"], water: SceneWater, view: View, w: SeaSplatWeights
+) -> Float[Tensor, ""]:
+    """Mean alpha of the pixels that have the colour of the open water: nothing should stand there. 0 without any."""
+    off = torch.linalg.vector_norm(shown.detach() - water.Binf.detach()[:, None, None], dim=0)
+    open_water = (off < w.background_distance) & view.seen
+    return torch.where(open_water, alpha, 0.0).sum() / open_water.sum().clamp(min=1)
+
+
+def depth_steps(depth: Float[Tensor, "h w"], view: View) -> Float[Tensor, ""]:
+    """Mean difference of neighbouring depths, the less the brighter the picture becomes (signed, as published)."""
+    total = depth.new_zeros(())
+    for axis in (0, 1):
+        brighter = view.rgb.diff(dim=1 + axis).mean(0)
+        both = view.seen.narrow(axis, 1, view.seen.shape[axis] - 1) & view.seen.narrow(
+            axis, 0, view.seen.shape[axis] - 1
+        )
+        total = total + mean_seen((depth.diff(dim=axis) * torch.exp(-brighter)).abs(), both)
+    return total
+
+
+def dark_channel(backscatter: Float[Tensor, "3 h w"], view: View, negative: float) -> Float[Tensor, ""]:
+    """Light left of the picture without its backscatter, which is to be small, and much more what is below 0."""
+    direct = torch.where(view.seen, view.rgb - backscatter, 0.0)
+    beyond = smooth_l1_loss(relu(-direct), torch.zeros_like(direct), beta=_SMOOTH)
+    return (relu(direct).mean() + negative * beyond) / view.seen.float().mean().clamp(min=1e-6)
