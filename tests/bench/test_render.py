@@ -1,6 +1,7 @@
 """Recipes on one reconstruction: one start for all, the block with refined poses, pictures side by side."""
 
 import json
+import shutil
 from dataclasses import replace
 from pathlib import Path
 
@@ -13,6 +14,7 @@ from swimm3r.bench.localisation import maps_of
 from swimm3r.bench.render import compare_renderers, settings_for
 from swimm3r.bench.runs import clips_of, made_runs
 from swimm3r.cameras import project
+from swimm3r.errors import InputError
 from swimm3r.evaluate import NotComputed
 from swimm3r.ground_truth import GroundTruth
 from swimm3r.io.images import read_rgb
@@ -20,6 +22,7 @@ from swimm3r.presets import RunSettings
 from swimm3r.reconstruction import Matches
 from swimm3r.run import open_finished_sfm
 from swimm3r.sfm import colmap
+from swimm3r.sfm.settings import ColmapSettings, PlaneSweepSettings
 from swimm3r.splat.settings import PoseRefinementSettings, UwbsSettings
 
 
@@ -76,6 +79,22 @@ def test_clips_are_reconstructed_once_and_runs_are_taken_as_they_are(
     clip = tmp_path / "dive.mp4"
     assert made_runs([run, clip], tmp_path, RunSettings()) == (run, tmp_path / "runs" / "dive")
     assert made == [(clip, tmp_path / "runs" / "dive", "sfm")]
+
+
+def test_a_scene_with_a_model_lends_its_poses_where_asked(run: Path, tmp_path: Path):
+    scene = tmp_path / "Curasao"
+    shutil.copytree(run.parent / "dive" / "images", scene / "Images_wb")
+    shutil.copytree(run / "sfm" / "sparse", scene / "sparse" / "0")
+    quick_depth = PlaneSweepSettings(long_side=64, sources=1, rounds=1)
+    settings = RunSettings(sfm=ColmapSettings(depth=quick_depth))
+    (made,) = made_runs([scene], tmp_path / "out", settings, given_poses=True)
+    (clip,) = clips_of([made])
+    assert (clip.name, clip.runs[0].sfm) == ("Curasao", "COLMAP model (sparse)")
+    sfm, known = clip.runs[0].open(), open_finished_sfm(run).rec
+    assert sfm.rec.names == known.names
+    torch.testing.assert_close(sfm.rec.cameras.cam2world, known.cameras.cam2world)
+    with pytest.raises(InputError, match="no folder of pictures with their COLMAP model"):
+        made_runs([run.parent / "dive"], tmp_path / "out", settings, given_poses=True)
 
 
 def test_a_clip_that_cannot_be_placed_as_a_whole_is_remembered(run: Path, tmp_path: Path):

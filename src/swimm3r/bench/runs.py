@@ -2,10 +2,12 @@
 
 import json
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 
 from swimm3r.bench.settings import IMPORTED
+from swimm3r.bench.sfm_methods import on_model
+from swimm3r.datasets import layouts
 from swimm3r.errors import InputError
 from swimm3r.frames import Frames
 from swimm3r.io.images import image_size
@@ -17,6 +19,7 @@ from swimm3r.run import FinishedSfm, open_finished_sfm, run_pipeline
 from swimm3r.sfm.settings import ColmapModelSettings, ColmapSettings, Mast3rSettings
 from swimm3r.sfm.training.settings import RECIPES
 
+PICTURES = ("images_wb", "images")  # folders named so lend their clip no name
 POSES_REFINED = " + poses"
 """Ends the name of how poses were found where maps refined them, whatever their recipe says."""
 
@@ -55,7 +58,8 @@ def clips_of(folders: Sequence[Path]) -> list[Clip]:
         settings = open_finished_sfm(folder).settings
         summary = json.loads((folder / "summary.json").read_text(encoding="utf-8"))
         source = Path(summary["input"]["path"])
-        name = source.stem if source.suffix and not source.is_dir() else source.name
+        named = source.parent if source.name.lower() in PICTURES else source
+        name = named.stem if named.suffix and not named.is_dir() else named.name
         if prints.setdefault(name, summary["input"]["fingerprint"]) != summary["input"]["fingerprint"]:
             raise InputError(
                 f"two clips have the name {name}",
@@ -69,17 +73,40 @@ def clips_of(folders: Sequence[Path]) -> list[Clip]:
 
 
 def made_runs(
-    inputs: Sequence[Path], out: Path, settings: RunSettings, progress: Progress = silent
+    inputs: Sequence[Path],
+    out: Path,
+    settings: RunSettings,
+    given_poses: bool = False,
+    progress: Progress = silent,
 ) -> tuple[Path, ...]:
-    """Run folders as they are; of clips, new ones up to their structure from motion in OUT/runs."""
+    """Run folders as they are; of clips, new ones up to their structure from motion in OUT/runs.
+
+    With `given_poses` a clip is a folder of pictures with their COLMAP model, whose poses are taken. Raises InputError
+    where it has none.
+    """
     runs = []
     for given in inputs:
-        if not (given / "summary.json").is_file():
-            folder = out / "runs" / given.stem
-            run_pipeline(given, folder, settings, last_stage="sfm", progress=progress)
-            given = folder
-        runs.append(given)
+        if (given / "summary.json").is_file():
+            runs.append(given)
+            continue
+        runs.append(out / "runs" / given.stem)
+        source, chosen = _with_given_poses(given, settings) if given_poses else (given, settings)
+        run_pipeline(source, runs[-1], chosen, last_stage="sfm", progress=progress)
     return tuple(runs)
+
+
+def _with_given_poses(scene: Path, settings: RunSettings) -> tuple[Path, RunSettings]:
+    """The pictures of a scene as SeaThru-NeRF and its kin lay it out, and settings that take its model's poses."""
+    here = layouts.folder(scene, scene) if scene.is_dir() else None
+    pictures, model = (None, None) if here is None else (here.child(*PICTURES), here.child("sparse", "colmap"))
+    if pictures is None or model is None:
+        raise InputError(
+            f"{scene} is no folder of pictures with their COLMAP model",
+            cause=f"given poses are looked for in sparse/ or colmap/ beside {' or '.join(PICTURES)}",
+            hint="without --given-poses they are found anew",
+        )
+    assert isinstance(settings.sfm, ColmapSettings)
+    return pictures, replace(settings, sfm=on_model(model, settings.sfm))
 
 
 def original_pixels(source: Path, frames: Frames) -> float:

@@ -2,6 +2,7 @@
 
 from collections.abc import Sequence
 from dataclasses import replace
+from pathlib import Path
 
 import torch
 
@@ -88,6 +89,10 @@ def _imported(
     found = [folder / scene] if (folder / scene).exists() else sorted(folder.glob(f"{scene}.*"))
     if not found:
         return NotComputed(f"there is no {folder / scene}")
-    return ColmapModelSettings(
-        found[0].resolve(), features=colmap.features, depth=colmap.depth, water=colmap.water, restore=colmap.restore
-    )
+    return on_model(found[0], colmap)
+
+
+def on_model(model: Path, colmap: ColmapSettings) -> ColmapModelSettings:
+    """A model's poses, with depth, water and cloud found as COLMAP's settings say."""
+    parts = {name: getattr(colmap, name) for name in ("features", "depth", "water", "restore")}
+    return ColmapModelSettings(model.resolve(), **parts)

@@ -67,6 +67,7 @@ def command_for_preset(name: str) -> Callable:
         recipes: tuple[Recipe, ...] = RECIPES,
         seeds: int = 1,
         poses: bool = False,
+        given_poses: bool = False,
         against: Recipe | None = None,
         preset: Preset = "fast",
         frames: FrameSettings = picked_evenly,
@@ -84,6 +85,7 @@ def command_for_preset(name: str) -> Callable:
             recipes: the renderers.
             seeds: trainings of each recipe on each run.
             poses: add all recipes again with the training frames' poses refined along with the map.
+            given_poses: clips are folders of pictures with a COLMAP model (SeaThru-NeRF and its kin); take its poses.
             against: the recipe that differences are taken from; the first where none is named.
             preset: what the other defaults aim at.
             frames: which frames to take of clips; the paper's are evenly spaced.
@@ -96,7 +98,7 @@ def command_for_preset(name: str) -> Callable:
         from swimm3r.bench.runs import made_runs
 
         def run(progress: Progress) -> "Table":
-            runs = made_runs(inputs, out, RunSettings(frames, sfm, splat, test), progress)
+            runs = made_runs(inputs, out, RunSettings(frames, sfm, splat, test), given_poses, progress)
             return compare_renderers(runs, out, recipes, splat, seeds, poses, test, against, jobs, progress)
 
         _show(out, run)
