@@ -24,7 +24,7 @@ from swimm3r.medium import Medium, MediumFit, remove_water, rescale
 from swimm3r.progress import Progress, silent
 from swimm3r.reconstruction import Reconstruction
 from swimm3r.splat.pose_codes import RefinedPoses
-from swimm3r.splat.rendering import SplatMap
+from swimm3r.splat.rendering import SplatMap, mean_water
 from swimm3r.splat.settings import PoseRefinementSettings, recipe_of
 from swimm3r.splat.views import pinhole_canvas, undistorted
 

@@ -23,7 +23,7 @@ from swimm3r.reconstruction import Matches
 from swimm3r.run import open_finished_sfm
 from swimm3r.sfm import colmap
 from swimm3r.sfm.settings import ColmapSettings, PlaneSweepSettings
-from swimm3r.splat.settings import PoseRefinementSettings, UwbsSettings
+from swimm3r.splat.settings import RECIPES, PoseRefinementSettings, UwbsSettings
 
 
 def test_every_recipe_starts_from_the_same_poses_of_the_whole_clip(
@@ -63,7 +63,10 @@ def test_every_recipe_starts_from_the_same_poses_of_the_whole_clip(
 def test_the_block_with_poses_refines_them_in_every_recipe(tiny: UwbsSettings):
     held = replace(tiny, poses=replace(tiny.poses, enabled=False))
     assert not settings_for(held, "ubs", False, 0).poses.enabled
-    assert settings_for(held, "ubs", True, 0).poses.enabled
+    for recipe in RECIPES:
+        refined = settings_for(held, recipe, True, 0)
+        assert refined.poses.enabled
+        hash(refined)  # by which a recipe that refines poses of its own accord is known
     assert settings_for(held, "uwbs-dynamic", True, 1).seed != held.seed
 
 
