@@ -104,7 +104,7 @@ def _cells_of_clip(
     clip: Clip, /, *, out: Path, settings: LocalizationSettings, maps: Path | None, progress: Progress
 ) -> list[Cell]:
     first = clip.runs[0].open()
-    truth = reference.of_clip(first, scene_folder(out / "references", clip.name), progress)
+    truth = reference.of_clip(first, scene_folder((maps or out) / "references", clip.name), progress)
     cells = []
     for run in clip.runs:
         sfm = run.open()
