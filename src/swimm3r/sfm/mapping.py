@@ -20,6 +20,7 @@ from swimm3r.cameras import DISTORTION_PARAMETERS, distort
 from swimm3r.errors import UsageError
 from swimm3r.progress import Progress
 from swimm3r.sfm.feature_database import MIN_INLIERS, FeatureDatabase
+from swimm3r.sfm.pair_agreement import contradicting_frames
 from swimm3r.sfm.resection import misplaced_frames
 from swimm3r.sfm.settings import ColmapSettings
 
@@ -131,20 +132,24 @@ def place_leftovers(
 def replace_misplaced(
     store: FeatureDatabase, model: "pycolmap.Reconstruction", settings: ColmapSettings, progress: Progress
 ) -> "pycolmap.Reconstruction":
-    """The model with frames that stood in the wrong place taken out and placed again, where that explains more."""
+    """The model with frames that stood in the wrong place taken out and placed again, where that explains more.
+
+    First those that contradict their pairs, which may be a whole part of the clip; then single ones, by resection.
+    """
     import pycolmap
 
-    for _ in range(_ROUNDS):
-        misplaced = misplaced_frames(store, model)
-        if not misplaced:
-            break
-        rest = pycolmap.Reconstruction(model)
-        for image_id in misplaced:
-            rest.deregister_frame(rest.images[image_id].frame_id)
-        again = place_leftovers(store, rest, settings, progress)
-        if _merit([again]) <= _merit([model]):
-            break
-        model = again
+    for ask in (contradicting_frames, misplaced_frames):
+        for _ in range(_ROUNDS):
+            misplaced = ask(store, model)
+            if not misplaced:
+                break
+            rest = pycolmap.Reconstruction(model)
+            for image_id in misplaced:
+                rest.deregister_frame(rest.images[image_id].frame_id)
+            again = place_leftovers(store, rest, settings, progress)
+            if _merit([again]) <= _merit([model]):
+                break
+            model = again
     return model
 
 
