@@ -239,8 +239,8 @@ def with_recipe(settings: UwbsSettings, recipe: Recipe) -> SplatSettings:
 _SHORT = 10_000
 """Runs shorter than this give the peers what they would else lack the time for. WaterSplatting's Gaussians start at an
 opacity of 0.1 and are culled below 0.5: of 4,000 on ruie_green_rock (160 px) 724 were left after 400 steps, at 23.6 dB
-on frames held back; culled below 0.1, and their opacities not cut, they are 7,400 at 30.2 dB. SeaSplat gains 10 dB by
-opacities that are not cut."""
+on frames held back; begun at 0.5, culled below 0.1 and not cut they are 7,500 at 30.3 dB. SeaSplat's gain 10 dB by not
+being cut (benchmarks/short_runs.py)."""
 _SHORT_OPACITY = 0.5
 """Of WaterSplatting's and SeaSplat's Gaussians in short runs, as UWBS begins; SeaSplat gains 0.5 dB by it."""
 _SHORT_SCALE = 0.5

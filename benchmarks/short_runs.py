@@ -1,0 +1,113 @@
+"""What the peers' published schedules do to them in a short run, and what `with_recipe` does about it.
+
+    python benchmarks/short_runs.py RUN [--iterations 400] [--long-side 160] [--primitives 4000] [--only NAME ...]
+
+Each variant is trained on the frames of a finished run, every fifth registered one held back; its PSNR is the mean over
+those, at the poses structure from motion gave them. One seed: it finds what breaks a method, not which is best.
+"""
+
+import argparse
+import tempfile
+import time
+from dataclasses import replace
+from pathlib import Path
+
+import torch
+
+from swimm3r.evaluate.images import psnr
+from swimm3r.presets import PRESETS
+from swimm3r.run import FinishedSfm, open_finished_sfm
+from swimm3r.splat import train
+from swimm3r.splat.settings import (
+    McmcGsSettings,
+    SeaSplatSettings,
+    SplatSettings,
+    UwbsSettings,
+    WaterSplattingSettings,
+    mcmc_gs,
+    seasplat,
+    watersplatting,
+    with_recipe,
+)
+from swimm3r.splat.views import pinhole_canvas, undistorted
+
+
+def variants(size: UwbsSettings) -> dict[str, SplatSettings]:
+    """The recipes as they are trained, and each without one of the changes made for short runs."""
+    mcmc, water, sea = (with_recipe(size, name) for name in ("mcmc_gs", "watersplatting", "seasplat"))
+    assert isinstance(mcmc, McmcGsSettings)
+    assert isinstance(water, WaterSplattingSettings)
+    assert isinstance(sea, SeaSplatSettings)
+    slow = {
+        f"{name}, rates as published": replace(of, rates=replace(of.rates, haste=0.0))
+        for name, of in (("mcmc_gs", mcmc), ("watersplatting", water), ("seasplat", sea))
+    }
+    mcmc_first = replace(mcmc.initial, scale=mcmc_gs().initial.scale)
+    faint = {
+        of: replace(of.initial, opacity=published.initial.opacity)
+        for of, published in ((water, watersplatting()), (sea, seasplat()))
+    }
+    return {
+        "uwbs-static": with_recipe(size, "uwbs-static"),
+        "mcmc_gs": mcmc,
+        "mcmc_gs, first scale as published": replace(mcmc, initial=mcmc_first),
+        "watersplatting": water,
+        "watersplatting, first opacity, culls and cuts as published": replace(
+            water, initial=faint[water], densify=watersplatting().densify
+        ),
+        "seasplat": sea,
+        "seasplat, first opacity and cuts as published": replace(sea, initial=faint[sea], densify=seasplat().densify),
+        "seasplat, first opacity as published": replace(sea, initial=faint[sea]),
+        **slow,
+    }
+
+
+def score(sfm: FinishedSfm, settings: SplatSettings) -> tuple[float, int]:
+    """PSNR on the frames held back, and the primitives of the map."""
+    registered = [frame.name for frame in sfm.frames.train if frame.name in set(sfm.rec.names)]
+    held = registered[2::5]
+    split = (replace(f, split="test") if f.name in held else f for f in sfm.frames.frames)
+    frames = replace(sfm.frames, frames=tuple(split))
+    with tempfile.TemporaryDirectory() as folder:
+        scene = train(sfm.rec, frames, settings, Path(folder))
+    found = []
+    for name in held:
+        lens, f = sfm.rec.cameras[sfm.rec.index(name)], frames.index(name)
+        canvas = pinhole_canvas(lens, settings.long_side)
+        target, seen = undistorted(frames.image(f), frames.mask(f), lens, canvas)
+        render = scene.render(canvas, frames.frames[f].time).rgb.clamp(0, 1)
+        found.append(psnr(render[seen], target[seen]))
+    return sum(found) / len(found), len(scene.primitives.xyz)
+
+
+def main() -> None:
+    """Print a line per variant."""
+    parser = argparse.ArgumentParser(description=(__doc__ or "").split("\n")[0])
+    parser.add_argument("run", type=Path)
+    parser.add_argument("--iterations", type=int, default=400)
+    parser.add_argument("--long-side", type=int, default=160)
+    parser.add_argument("--primitives", type=int, default=4000)
+    parser.add_argument("--only", nargs="*")
+    given = parser.parse_args()
+    torch.set_num_threads(1)
+    sfm, preset = open_finished_sfm(given.run), PRESETS["fast"].splat
+    assert isinstance(preset, UwbsSettings)
+    size = replace(
+        preset,
+        iterations=given.iterations,
+        long_side=given.long_side,
+        initial=replace(preset.initial, primitives=given.primitives),
+        densify=replace(preset.densify, max_primitives=2 * given.primitives),
+    )
+    for name, settings in variants(size).items():
+        if given.only and name not in given.only:
+            continue
+        started = time.process_time()
+        found, count = score(sfm, settings)
+        print(
+            f"{name:60s} {found:6.2f} dB  {count:6d} primitives  {time.process_time() - started:4.0f} CPU-s", flush=True
+        )
+
+
+if __name__ == "__main__":
+    main()
