@@ -26,6 +26,7 @@ from swimm3r.splat.projection import pinhole, project
 from swimm3r.splat.recipes import uwbs
 from swimm3r.splat.rendering import Drawing
 from swimm3r.splat.settings import UwbsSettings
+from swimm3r.splat.site import Site
 from swimm3r.splat.state import first_state, parameters_of
 from swimm3r.splat.views import View
 
@@ -75,7 +76,7 @@ def measure(size: Size, repeats: int) -> dict[str, float]:
     settings = UwbsSettings(iterations=20_000)
     rng = torch.Generator().manual_seed(1)
     height, width = size.height, size.width
-    recipe = uwbs.Uwbs(settings, None, 1.0, 1.0, None)  # the reconstruction is read at the start only
+    recipe = uwbs.Uwbs(settings, Site(None, 1.0, 1.0, None))  # reconstruction and views are read at the start only
     p, field = lifted(size), initial_field(None, settings.medium, rng)
     state = first_state(p, field, None)
     prior = 1 + 9 * torch.rand(height, width, generator=rng)

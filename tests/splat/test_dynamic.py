@@ -70,7 +70,7 @@ def test_primitives_begin_around_moments_of_their_own(tiny_dive):
     assert p.query_mean.shape[1] == 4
     assert 0.4 < p.query_mean[:, 3].mean() < 0.6
     assert p.lower.shape[1] == 21
-    torch.testing.assert_close(torch.nn.functional.softplus(p.scale[:, 6]), torch.full((len(p.xyz),), 1.0))
+    torch.testing.assert_close(torch.nn.functional.softplus(p.scale[:, 6]), torch.full((len(p.xyz),), 4.0))
 
 
 def test_a_dynamic_map_shows_different_moments_differently_and_wants_to_know_which(tiny_dive, trained):

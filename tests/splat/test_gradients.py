@@ -15,6 +15,7 @@ from swimm3r.splat.primitives import BetaPrimitives
 from swimm3r.splat.recipes import uwbs
 from swimm3r.splat.rendering import draw
 from swimm3r.splat.settings import InitialSettings, RenderSettings, SggSettings, UwbsSettings
+from swimm3r.splat.site import Site
 from swimm3r.splat.views import TrainingViews, View
 
 Make = Callable[..., BetaPrimitives]
@@ -199,7 +200,7 @@ def test_filter_and_multiplier_end_at_the_cut_off(tiny_dive):
     moved = {}
     for enabled in (True, False):
         sgg = replace(settings.sgg, enabled=enabled)
-        recipe = uwbs.Uwbs(replace(settings, sgg=sgg), tiny_dive.rec, 1.0, 1.0, None)
+        recipe = uwbs.Uwbs(replace(settings, sgg=sgg), Site(tiny_dive.rec, 1.0, 1.0, views))
         for step in (10, 11):
             moved[enabled, step] = recipe.step(recipe.start(), views[3], step)[0].primitives
     assert not torch.equal(moved[True, 10].xyz, moved[False, 10].xyz)

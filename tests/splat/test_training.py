@@ -14,6 +14,7 @@ from swimm3r.splat.projection import pinhole
 from swimm3r.splat.recipes import uwbs
 from swimm3r.splat.rendering import SplatMap, draw
 from swimm3r.splat.settings import DensifySettings, InitialSettings, LossWeights, MediumFieldSettings, UwbsSettings
+from swimm3r.splat.site import Site
 from swimm3r.splat.training import view_of_step
 from swimm3r.splat.views import TrainingViews
 
@@ -143,6 +144,7 @@ def test_mcmc_noise_comes_with_every_step_where_asked(tiny_dive):
     moved = {}
     for cadence in ("round", "step"):
         faint = replace(SETTINGS, iterations=1000, initial=InitialSettings(primitives=200, opacity=0.004))
-        recipe = uwbs.Uwbs(replace(faint, densify=DensifySettings(noise_cadence=cadence)), tiny_dive.rec, 1, 1, None)
+        settings = replace(faint, densify=DensifySettings(noise_cadence=cadence))
+        recipe = uwbs.Uwbs(settings, Site(tiny_dive.rec, 1.0, 1.0, views))
         moved[cadence] = recipe.step(recipe.start(), views[3], 1)[0].primitives.xyz
     assert (moved["round"] != moved["step"]).any(-1).float().mean() > 0.9

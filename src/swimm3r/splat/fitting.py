@@ -48,8 +48,7 @@ def train(
 def _recipe(settings: SplatSettings, site: Site) -> training.Recipe[Any]:
     match settings:
         case UwbsSettings():
-            prior = known_water(site.rec, site.scale, settings)
-            return Uwbs(settings, site.rec, site.scale, site.radius, prior, site.stations)
+            return Uwbs(settings, site, known_water(site.rec, site.scale, settings))
         case McmcGsSettings():
             return McmcGs(settings, site)
         case WaterSplattingSettings():

@@ -7,7 +7,7 @@ known surfaces opaque (`coverage`).
 """
 
 from collections.abc import Collection
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 
 import torch
 from jaxtyping import Float, Int
@@ -15,7 +15,7 @@ from torch import Tensor
 
 from swimm3r.medium import Medium
 from swimm3r.reconstruction import Reconstruction
-from swimm3r.splat import densify, losses, training
+from swimm3r.splat import densify, losses, movers, training
 from swimm3r.splat.gradients import differentiate
 from swimm3r.splat.medium_field import (
     MediumField,
@@ -27,11 +27,12 @@ from swimm3r.splat.medium_field import (
     water_prior,
 )
 from swimm3r.splat.optimiser import Moments, adam_step, log_linear
-from swimm3r.splat.pose_codes import PoseCodes, Stations, pose_rate
+from swimm3r.splat.pose_codes import pose_rate
 from swimm3r.splat.primitives import BetaPrimitives, initial_primitives, rescaled, with_time
 from swimm3r.splat.projection import pinhole
 from swimm3r.splat.rendering import Drawing, draw
 from swimm3r.splat.settings import UwbsSettings
+from swimm3r.splat.site import Site
 from swimm3r.splat.state import FIELD, POSES, State, clip_field, first_state, parameters_of, restored, stored
 from swimm3r.splat.views import View
 
@@ -51,45 +52,38 @@ class Uwbs:
     """The recipe for one scene (`training.Recipe`)."""
 
     settings: UwbsSettings
-    rec: Reconstruction
-    scale: float  # working units per scene unit
-    radius: float  # of the cameras' path, working units
-    prior: WaterPrior | None  # None where the reconstruction has no water
-    stations: Stations | None = None  # None where poses are held
+    site: Site
+    prior: WaterPrior | None = None  # None where the reconstruction has no water
 
     def start(self) -> State:
         """Primitives on the cloud, and the reconstruction's water in every direction."""
-        settings = self.settings
-        p = initial_primitives(self.rec, settings.initial, training.generator(settings.seed, 0, 2))
+        settings, rec, scale = self.settings, self.site.rec, self.site.scale
+        p = initial_primitives(rec, settings.initial, training.generator(settings.seed, 0, 2))
         if settings.dynamic:
             p = with_time(p, settings.initial, training.generator(settings.seed, 0, 5))
-        p = rescaled(p, self.scale)
+        p = rescaled(p, scale)
         medium = None
-        if self.rec.medium is not None:
-            fit = self.rec.medium.medium
-            medium = Medium(fit.Binf, fit.beta_D / self.scale, fit.beta_B / self.scale)
+        if rec.medium is not None:
+            fit = rec.medium.medium
+            medium = Medium(fit.Binf, fit.beta_D / scale, fit.beta_B / scale)
         field = initial_field(medium, settings.medium, training.generator(settings.seed, 0, 3), settings.dynamic)
-        poses = None
-        if self.stations is not None:
-            poses = PoseCodes(len(self.stations), settings.poses, training.generator(settings.seed, 0, 6))
-        return first_state(p, field, poses)
+        return first_state(p, field, self.site.codes(settings.poses, training.generator(settings.seed, 0, 6)))
 
     def step(self, state: State, view: View, step: int) -> tuple[State, dict[str, float]]:
         """One view: forward, adjoint, densification on its cadence, Adam."""
         settings, share = self.settings, step / self.settings.iterations
+        if self._looks_for_movers(step):
+            state = self._with_movers(state, step)
         parameters = parameters_of(state.primitives, state.field, state.poses)
         p = BetaPrimitives(*(values.detach().requires_grad_() for values in state.primitives))
-        camera, filtered = view.camera, settings.sgg.enabled and share <= settings.sgg.end
-        if self.stations is not None and state.poses is not None:
-            place = torch.tensor([self.stations.names.index(view.name)])
-            camera = replace(camera, cam2world=self.stations.moved(state.poses, place))
-        sight = pinhole(camera)
+        filtered = settings.sgg.enabled and share <= settings.sgg.end
+        sight = pinhole(self.site.camera(view, state.poses))
         drawing = draw(p, state.field, sight, settings, view.time, sgg=filtered)
         loss = objective(p, drawing, view, settings, self.prior, self._regularised(share))
         numbers, total = loss.numbers | {"primitives": float(len(p.xyz))}, loss.total
-        if self.stations is not None and state.poses is not None and share <= settings.poses.epipolar_end:
-            matches = self.stations.matches.some(settings.poses.matches, training.generator(settings.seed, step, 7))
-            off = self.stations.epipolar_error(state.poses, matches)
+        rng = training.generator(settings.seed, step, 7)
+        off = self.site.epipolar_error(state.poses, settings.poses, share, rng)
+        if off is not None:
             total = total + settings.poses.epipolar * off
             numbers |= {"epipolar_px": float(off.detach())}
         leaves = [*p, *state.field.parameters(), *(state.poses.parameters() if state.poses else ())]
@@ -129,7 +123,7 @@ class Uwbs:
 
     def restored(self, tensors: dict[str, Tensor]) -> State:
         """The inverse of `stored`."""
-        return restored(tensors, self.settings, 0 if self.stations is None else len(self.stations))
+        return restored(tensors, self.settings, self.site.refined_cameras)
 
     def rescaled(self, state: State, factor: float) -> tuple[BetaPrimitives, MediumField]:
         """Primitives and water after every length was multiplied by `factor`, without gradient."""
@@ -146,10 +140,28 @@ class Uwbs:
         d, share = self.settings.densify, step / self.settings.iterations
         return step % self._every() == 0 and d.begin < share <= d.end
 
+    def _looks_for_movers(self, step: int) -> bool:
+        return self.settings.dynamic and step == round(self.settings.movers.at * self.settings.iterations)
+
+    def _has_movers(self, step: int) -> bool:
+        """Whether no room need be kept for what moves, any more or at all."""
+        return not self.settings.dynamic or step >= self.settings.movers.at * self.settings.iterations
+
+    def _with_movers(self, state: State, step: int) -> State:
+        """Primitives for what moves, behind the others; their optimiser starts anew."""
+        rng = training.generator(self.settings.seed, step, 9)
+        fresh_ones = movers.born(state.primitives, state.field, self.site.views, self.settings, rng)
+        moments = dict(state.moments)
+        for name in BetaPrimitives._fields:
+            m, count = moments[name], len(fresh_ones.xyz)
+            moments[name] = Moments(_extended(m.first, count), _extended(m.second, count), m.steps)
+        p = BetaPrimitives(*(torch.cat(pair) for pair in zip(state.primitives, fresh_ones, strict=True)))
+        return State(p, state.field, state.poses, moments)
+
     def _rates(self, step: int, names: Collection[str]) -> dict[str, float]:
         r, share = self.settings.rates, step / self.settings.iterations
         rates = {name: getattr(r, name) for name in BetaPrimitives._fields}
-        rates["xyz"] = self.radius * log_linear(r.xyz, r.xyz_end, share)
+        rates["xyz"] = self.site.radius * log_linear(r.xyz, r.xyz_end, share)
         medium = log_linear(r.medium, r.medium_end, share)
         if self.prior is not None and share <= self.settings.medium.begin:
             medium = 0.0
@@ -168,7 +180,8 @@ class Uwbs:
         d = self.settings.densify
         n = len(state.primitives.xyz)
         growth = d.growth ** (self._every() / (d.every * self.settings.iterations))
-        target = max(n, min(d.max_primitives, int(growth * n)))
+        kept_free = 0.0 if self._has_movers(step) else self.settings.movers.share
+        target = max(n, min(round((1 - kept_free) * d.max_primitives), int(growth * n)))
         rng = training.generator(self.settings.seed, step, 4)
         with torch.no_grad():
             done = densify.relocate_and_grow(state.primitives, target, d.dead_opacity, rng)
