@@ -118,7 +118,7 @@ def measure(size: Size, repeats: int) -> dict[str, float]:
     parameters = parameters_of(BetaPrimitives(*(t.clone() for t in p)), field)
     moments = {name: fresh(t) for name, t in parameters.items()}
     gradients = {name: torch.randn(t.shape, generator=rng) for name, t in parameters.items()}
-    rates = recipe._rates(1)
+    rates = recipe._rates(1, parameters)
 
     def adam() -> None:
         with torch.no_grad():
