@@ -70,7 +70,7 @@ def depth_scores(
     return DepthScores(absrel, 100 * delta, rmse_log, coverage, len(pairs), align)
 
 
-def _frame_scores(p: Float[Tensor, "n"], g: Float[Tensor, "n"]) -> tuple[float, float, float]:
+def _frame_scores(p: Float[Tensor, " n"], g: Float[Tensor, " n"]) -> tuple[float, float, float]:
     absrel = ((p - g).abs() / g).mean()
     delta = (torch.maximum(p / g, g / p) < 1.25).double().mean()
     rmse_log = ((p.log() - g.log()) ** 2).mean().sqrt()
@@ -81,7 +81,7 @@ def _known(depth: Float[Tensor, "h w"]) -> Bool[Tensor, "h w"]:
     return torch.isfinite(depth) & (depth > 0)
 
 
-def _median(values: Float[Tensor, "n"]) -> float:
+def _median(values: Float[Tensor, " n"]) -> float:
     # torch.median takes the lower of the two middle values, torch.quantile refuses more than 16 million
     ordered, n = values.sort().values, len(values)
     return ((ordered[(n - 1) // 2] + ordered[n // 2]) / 2).item()

@@ -69,7 +69,7 @@ class Lpips:
     backbone: Backbone
     inputs: Inputs
     trunk: dict[str, Tensor]
-    heads: tuple[Float[Tensor, "_"], ...]
+    heads: tuple[Float[Tensor, " _"], ...]
 
     @property
     def variant(self) -> str:

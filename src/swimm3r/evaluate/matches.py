@@ -28,14 +28,14 @@ class MatchScores:
 
 
 def epipolar_errors(
-    i: Int[Tensor, "m"],
-    j: Int[Tensor, "m"],
+    i: Int[Tensor, " m"],
+    j: Int[Tensor, " m"],
     xy_i: Float[Tensor, "m 2"],
     xy_j: Float[Tensor, "m 2"],
     K: Float[Tensor, "n 3 3"],
     cam2world: Float[Tensor, "n 4 4"],
     form: SymmetricForm = "mean",
-) -> Float[Tensor, "m"]:
+) -> Float[Tensor, " m"]:
     """Symmetric epipolar error of each match, px; `i` and `j` index the frames. NaN where both share one centre."""
     errors = [xy_i.new_zeros(0, dtype=torch.float64)]
     K, cam2world = K.double(), cam2world.double()
@@ -45,7 +45,7 @@ def epipolar_errors(
     return torch.cat(errors)
 
 
-def match_scores(errors: Float[Tensor, "m"], pixel_scale: float = 1.0, form: SymmetricForm = "mean") -> MatchScores:
+def match_scores(errors: Float[Tensor, " m"], pixel_scale: float = 1.0, form: SymmetricForm = "mean") -> MatchScores:
     """Mean and inlier share of `epipolar_errors` of that form; `pixel_scale` is original pixels per pixel of theirs.
 
     NaN errors (two frames with one centre) have no epipolar geometry and are left out.
@@ -59,7 +59,7 @@ def match_scores(errors: Float[Tensor, "m"], pixel_scale: float = 1.0, form: Sym
     return MatchScores(errors.mean().item(), inliers, len(errors), variant)
 
 
-def registration_rate(registered: Bool[Tensor, "n"]) -> float:
+def registration_rate(registered: Bool[Tensor, " n"]) -> float:
     """Share of the frames handed to the method that it placed in its (largest) model, 0..1."""
     if not len(registered):
         raise ValueError("the registration rate of no frames is undefined")

@@ -32,13 +32,13 @@ class RelativePoseErrors:
     """Errors of the relative poses of all pairs i < j, degrees; 180 where a frame is not registered."""
 
     pairs: Int[Tensor, "pairs 2"]
-    rotation: Float[Tensor, "pairs"]
-    translation: Float[Tensor, "pairs"]  # between the baselines' directions, 0..180
-    baseline: Float[Tensor, "pairs"]  # length of the reference's, in its unit
-    registered: Bool[Tensor, "pairs"]
+    rotation: Float[Tensor, " pairs"]
+    translation: Float[Tensor, " pairs"]  # between the baselines' directions, 0..180
+    baseline: Float[Tensor, " pairs"]  # length of the reference's, in its unit
+    registered: Bool[Tensor, " pairs"]
 
     @property
-    def sign_blind_translation(self) -> Float[Tensor, "pairs"]:
+    def sign_blind_translation(self) -> Float[Tensor, " pairs"]:
         """Angle between the baselines as lines, 0..90, as RTA counts it; 180 where a frame is not registered."""
         folded = torch.minimum(self.translation, 180 - self.translation)
         return torch.where(self.registered, folded, self.translation)
@@ -72,7 +72,7 @@ class PoseScores:
 def relative_pose_errors(
     cam2world: Float[Tensor, "n 4 4"],
     reference: Float[Tensor, "n 4 4"],
-    registered: Bool[Tensor, "n"] | None = None,
+    registered: Bool[Tensor, " n"] | None = None,
     seen_from: SeenFrom = "i",
 ) -> RelativePoseErrors:
     """Rotation and baseline errors of every pair; poses of unregistered frames are not looked at.
@@ -165,7 +165,7 @@ def absolute_pose_errors(cam2world: Float[Tensor, "n 4 4"], reference: Float[Ten
 def pose_scores(
     cam2world: Float[Tensor, "n 4 4"],
     reference: Float[Tensor, "n 4 4"],
-    registered: Bool[Tensor, "n"] | None = None,
+    registered: Bool[Tensor, " n"] | None = None,
 ) -> PoseScores:
     """Every pose score of one sequence of at least 2 frames; rows of `cam2world` count where `registered`."""
     registered = _all_if_none(registered, cam2world)
@@ -203,7 +203,7 @@ def mean_translation_error(errors: RelativePoseErrors) -> float | NotComputed:
     return errors.translation[counted].mean().item()
 
 
-def _angle_between(a: Float[Tensor, "n 3"], b: Float[Tensor, "n 3"]) -> Float[Tensor, "n"]:
+def _angle_between(a: Float[Tensor, "n 3"], b: Float[Tensor, "n 3"]) -> Float[Tensor, " n"]:
     # atan2 of sine and cosine: acos loses half the digits near 0
     angle = torch.rad2deg(torch.atan2(torch.linalg.cross(a, b).norm(dim=-1), (a * b).sum(-1)))
     directed = (a.norm(dim=-1) > 0) & (b.norm(dim=-1) > 0)
@@ -216,7 +216,7 @@ def _percentage(hits: Bool[Tensor, "..."]) -> float:
     return 100 * hits.double().mean().item()
 
 
-def _all_if_none(registered: Bool[Tensor, "n"] | None, poses: Float[Tensor, "n 4 4"]) -> Bool[Tensor, "n"]:
+def _all_if_none(registered: Bool[Tensor, " n"] | None, poses: Float[Tensor, "n 4 4"]) -> Bool[Tensor, " n"]:
     return torch.ones(len(poses), dtype=torch.bool) if registered is None else registered
 
 

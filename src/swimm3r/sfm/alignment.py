@@ -41,10 +41,10 @@ class Alignment:
 
     K: Float[Tensor, "n 3 3"]  # float64, pixels of the network's image, centres at +0.5
     cam2world: Float[Tensor, "n 4 4"]  # float64
-    anchor_z_depth: tuple[Float[Tensor, "_"], ...]  # per frame
-    focal_before: Float[Tensor, "n"]  # the pointmaps' own: `dense_z_depth` needs it
+    anchor_z_depth: tuple[Float[Tensor, " _"], ...]  # per frame
+    focal_before: Float[Tensor, " n"]  # the pointmaps' own: `dense_z_depth` needs it
     points: Float[Tensor, "m 3"]  # of all matches in the order of the pairs, the middle between both frames' opinions
-    losses: tuple[Float[Tensor, "coarse"], Float[Tensor, "fine"]]
+    losses: tuple[Float[Tensor, " coarse"], Float[Tensor, " fine"]]
 
 
 def align(
@@ -77,7 +77,7 @@ def align(
 
 
 def dense_z_depth(
-    anchor_z_depth: Float[Tensor, "a"],
+    anchor_z_depth: Float[Tensor, " a"],
     relative_depth: Float[Tensor, "h w"],
     focal_before: float,
     focal: float,

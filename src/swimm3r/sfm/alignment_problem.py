@@ -25,7 +25,7 @@ class Predicted:
     """Where one frame's anchors are in another frame's camera, as the network says: for pairs that match nowhere."""
 
     points: Float[Tensor, "a 3"]
-    confidence: Float[Tensor, "a"]
+    confidence: Float[Tensor, " a"]
 
 
 @dataclass(frozen=True)
@@ -36,11 +36,11 @@ class AnchoredPair:
     j: int
     xy_i: Int64[Tensor, "m 2"]
     xy_j: Int64[Tensor, "m 2"]
-    anchor_i: Int64[Tensor, "m"]
-    anchor_j: Int64[Tensor, "m"]
-    relative_i: Float[Tensor, "m"]
-    relative_j: Float[Tensor, "m"]
-    confidence: Float[Tensor, "m"]
+    anchor_i: Int64[Tensor, " m"]
+    anchor_j: Int64[Tensor, " m"]
+    relative_i: Float[Tensor, " m"]
+    relative_j: Float[Tensor, " m"]
+    confidence: Float[Tensor, " m"]
     i_in_j: Predicted | None = None  # needed only where no match exceeds the confidence threshold
     j_in_i: Predicted | None = None
 
@@ -60,7 +60,7 @@ class Known:
 
     K: Float[Tensor, "n 3 3"] | None = None
     cam2world: Float[Tensor, "n 4 4"] | None = None
-    posed: Bool[Tensor, "n"] | None = None  # for which frames; None: for all
+    posed: Bool[Tensor, " n"] | None = None  # for which frames; None: for all
 
 
 @dataclass(frozen=True)
@@ -68,25 +68,25 @@ class AlignmentProblem:
     """Everything that stays constant during an alignment."""
 
     size: Float[Tensor, "n 2"]  # width, height
-    focal: Float[Tensor, "n"]
-    median: Float[Tensor, "n"]
-    confidence: Float[Tensor, "n"]
-    anchor_ratio: Float[Tensor, "a"]  # depth / median
-    anchor_frame: Int64[Tensor, "a"]
-    point_frame: Int64[Tensor, "p"]
+    focal: Float[Tensor, " n"]
+    median: Float[Tensor, " n"]
+    confidence: Float[Tensor, " n"]
+    anchor_ratio: Float[Tensor, " a"]  # depth / median
+    anchor_frame: Int64[Tensor, " a"]
+    point_frame: Int64[Tensor, " p"]
     point_xy: Float[Tensor, "p 2"]
-    point_anchor: Int64[Tensor, "p"]
-    point_relative: Float[Tensor, "p"]
-    match_confidence: Float[Tensor, "m"]  # 0 where the pair failed
-    failed_point: Int64[Tensor, "f"]
-    failed_frame: Int64[Tensor, "f"]
+    point_anchor: Int64[Tensor, " p"]
+    point_relative: Float[Tensor, " p"]
+    match_confidence: Float[Tensor, " m"]  # 0 where the pair failed
+    failed_point: Int64[Tensor, " f"]
+    failed_frame: Int64[Tensor, " f"]
     failed_target: Float[Tensor, "f 3"]
-    failed_confidence: Float[Tensor, "f"]
+    failed_confidence: Float[Tensor, " f"]
     tree: KinematicTree
     pixel_centre: float
     known_K: Float[Tensor, "n 3 3"] | None
     known_pose: Float[Tensor, "n 4 4"] | None
-    posed: Bool[Tensor, "n"]
+    posed: Bool[Tensor, " n"]
 
     @staticmethod
     def of(
@@ -138,7 +138,7 @@ class AlignmentProblem:
         )
 
     @property
-    def aspect(self) -> Float[Tensor, "n"]:
+    def aspect(self) -> Float[Tensor, " n"]:
         """fy / fx of every frame, which is never optimised."""
         if self.known_K is None:
             return torch.ones(len(self.focal))

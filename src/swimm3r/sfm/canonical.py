@@ -52,7 +52,7 @@ class AnchoredFrame:
     height: int
     width: int
     focal: float  # pixels, as the pointmap implies
-    anchor_depth: Float[Tensor, "a"]  # z at the anchors, row-major over blocks
+    anchor_depth: Float[Tensor, " a"]  # z at the anchors, row-major over blocks
     confidence: float  # mean of the canonical one
 
 
@@ -122,7 +122,7 @@ def implied_focal(points: Float[Tensor, "h w 3"], pixel_centre: float = 0.5) -> 
 
 def anchors_of(
     view: CanonicalView, xy: Int64[Tensor, "m 2"], subsample: int = 8
-) -> tuple[Int64[Tensor, "m"], Float[Tensor, "m"]]:
+) -> tuple[Int64[Tensor, " m"], Float[Tensor, " m"]]:
     """For pixels of a frame, the number of their block's anchor and their depth relative to it."""
     x, y = xy.T
     blocks = view.confidence.shape[1] // subsample

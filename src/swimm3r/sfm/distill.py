@@ -78,7 +78,7 @@ def features(network: Mast3r, view1: Encoded, view2: Encoded, settings: Objectiv
 
 
 def squared_distance(
-    teacher: tuple[Float[Tensor, "b *_"], ...], student: tuple[Float[Tensor, "b *_"], ...], reduction: str
+    teacher: tuple[Float[Tensor, " b *_"], ...], student: tuple[Float[Tensor, " b *_"], ...], reduction: str
 ) -> Float[Tensor, " b"]:
     """|F - F~|^2 of one level, averaged over its views and blocks; nothing flows back into the teacher."""
     if not student:

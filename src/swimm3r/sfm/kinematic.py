@@ -25,7 +25,7 @@ class KinematicTree:
     """Each frame's parent; the root is its own."""
 
     root: int
-    parent: Int64[Tensor, "n"]
+    parent: Int64[Tensor, " n"]
     order: tuple[int, ...]  # breadth first from the root
 
 

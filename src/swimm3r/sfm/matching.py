@@ -29,16 +29,16 @@ class PixelMatches:
 
     xy1: Int64[Tensor, "m 2"]
     xy2: Int64[Tensor, "m 2"]
-    confidence: Float[Tensor, "m"]
+    confidence: Float[Tensor, " m"]
 
 
 @dataclass(frozen=True)
 class ReciprocalPairs:
     """Where the walks of one search ended, as flat pixel numbers y * w + x, sorted by the first."""
 
-    index1: Int64[Tensor, "m"]
-    index2: Int64[Tensor, "m"]
-    basins: Int64[Tensor, "pixels"]  # of view 1: where the walk went next from here; -1 where none passed
+    index1: Int64[Tensor, " m"]
+    index2: Int64[Tensor, " m"]
+    basins: Int64[Tensor, " pixels"]  # of view 1: where the walk went next from here; -1 where none passed
 
 
 def match_views(
@@ -83,7 +83,7 @@ def reciprocal_pairs(
     view1: DescriptorMap,
     view2: DescriptorMap,
     subsample: int = 8,
-    seeds: Int64[Tensor, "s"] | None = None,
+    seeds: Int64[Tensor, " s"] | None = None,
     pixel_tolerance: float | int = 0,
 ) -> ReciprocalPairs:
     """Walks from seeds in view 1 (a grid, or flat pixel numbers) and keeps those that come to stand still.
@@ -124,8 +124,8 @@ def reciprocal_pairs(
 
 
 def unique_pairs(
-    index1: Int64[Tensor, "m"], index2: Int64[Tensor, "m"]
-) -> tuple[Int64[Tensor, "k"], Int64[Tensor, "k"], Int64[Tensor, "k"]]:
+    index1: Int64[Tensor, " m"], index2: Int64[Tensor, " m"]
+) -> tuple[Int64[Tensor, " k"], Int64[Tensor, " k"], Int64[Tensor, " k"]]:
     """Each pair once, sorted by the first index, then the second; and where it first stood in the input."""
     pairs, inverse = torch.unique(torch.stack([index1, index2], dim=1), dim=0, return_inverse=True)
     order = torch.arange(len(index1), device=index1.device)
@@ -133,7 +133,7 @@ def unique_pairs(
     return pairs[:, 0], pairs[:, 1], first
 
 
-def nearest(queries: Float[Tensor, "q d"], candidates: Float[Tensor, "n d"], block: int = 1024) -> Int64[Tensor, "q"]:
+def nearest(queries: Float[Tensor, "q d"], candidates: Float[Tensor, "n d"], block: int = 1024) -> Int64[Tensor, " q"]:
     """For each query the candidate with the largest inner product, the first of equals; blocks fit the cache."""
     best = torch.full((len(queries),), -torch.inf, device=queries.device, dtype=queries.dtype)
     index = torch.zeros(len(queries), dtype=torch.int64, device=queries.device)
@@ -164,7 +164,7 @@ class _Searchable:
 
     all: Float[Tensor, "pixels d"]
     allowed: Float[Tensor, "n d"]
-    pixels: Int64[Tensor, "n"] | None
+    pixels: Int64[Tensor, " n"] | None
 
     @staticmethod
     def of(view: DescriptorMap) -> "_Searchable":
@@ -177,10 +177,10 @@ class _Searchable:
     def __len__(self) -> int:
         return len(self.allowed)
 
-    def at(self, index: Int64[Tensor, "q"]) -> Float[Tensor, "q d"]:
+    def at(self, index: Int64[Tensor, " q"]) -> Float[Tensor, "q d"]:
         return self.all[index]
 
-    def nearest(self, queries: Float[Tensor, "q d"]) -> Int64[Tensor, "q"]:
+    def nearest(self, queries: Float[Tensor, "q d"]) -> Int64[Tensor, " q"]:
         index = nearest(queries, self.allowed)
         return index if self.pixels is None else self.pixels[index]
 
@@ -202,7 +202,7 @@ def _merged(
     return PixelMatches(_pixels(index1, w1), _pixels(index2, w2), confidence[first])
 
 
-def _grid(view: DescriptorMap, subsample: int) -> Int64[Tensor, "s"]:
+def _grid(view: DescriptorMap, subsample: int) -> Int64[Tensor, " s"]:
     height, width = view.confidence.shape
     device = view.confidence.device
     y = torch.arange(subsample // 2, height, subsample, device=device)
@@ -210,5 +210,5 @@ def _grid(view: DescriptorMap, subsample: int) -> Int64[Tensor, "s"]:
     return (y[:, None] * width + x).flatten()
 
 
-def _pixels(index: Int64[Tensor, "m"], width: int) -> Int64[Tensor, "m 2"]:
+def _pixels(index: Int64[Tensor, " m"], width: int) -> Int64[Tensor, "m 2"]:
     return torch.stack([index % width, index // width], dim=1)

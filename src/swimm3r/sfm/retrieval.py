@@ -36,7 +36,7 @@ _HINT = "get the file again: swimm3r weights get mast3r-retrieval, mast3r-codebo
 class Whitening:
     """A linear map after which features have mean 0 and covariance 1 on the data it was learned from."""
 
-    mean: Float[Tensor, "c"]  # float64
+    mean: Float[Tensor, " c"]  # float64
     matrix: Float[Tensor, "c k"]  # float64
 
 
@@ -56,7 +56,7 @@ class AsmkSettings:
 class Signatures:
     """A frame's visual words and, for each, the signs of its summed residuals."""
 
-    words: Int64[np.ndarray, "w"]  # ascending
+    words: Int64[np.ndarray, " w"]  # ascending
     bits: UInt8[np.ndarray, "w bytes"]  # packed
 
 
@@ -84,7 +84,7 @@ def strongest(features: Float[Tensor, "n c"], count: int) -> Float[Tensor, "k c"
     return features[features.norm(dim=1).topk(min(count, len(features))).indices]
 
 
-def global_descriptor(features: Float[Tensor, "n c"]) -> Float[Tensor, "c"]:
+def global_descriptor(features: Float[Tensor, "n c"]) -> Float[Tensor, " c"]:
     """A frame as one unit vector: its features summed, each with its length as weight; zero for a blank frame."""
     return torch.nn.functional.normalize((features.norm(dim=1, keepdim=True) * features).sum(0), dim=0)
 
@@ -140,10 +140,10 @@ def aggregate(features: Float[Tensor, "n c"], codebook: Float[Tensor, "words c"]
 class _InvertedIndex:
     """The signatures of all frames, sorted by word."""
 
-    words: Int64[np.ndarray, "e"]
-    frames: Int64[np.ndarray, "e"]
+    words: Int64[np.ndarray, " e"]
+    frames: Int64[np.ndarray, " e"]
     bits: UInt8[np.ndarray, "e bytes"]
-    counts: Int64[np.ndarray, "n"]  # words per frame
+    counts: Int64[np.ndarray, " n"]  # words per frame
 
     @staticmethod
     def of(found: Sequence[Signatures]) -> "_InvertedIndex":
@@ -153,7 +153,7 @@ class _InvertedIndex:
         order = np.argsort(words, kind="stable")
         return _InvertedIndex(words[order], frames[order], np.concatenate([s.bits for s in found])[order], counts)
 
-    def ask(self, asking: Signatures, bits: int, power: float) -> Float[np.ndarray, "n"]:
+    def ask(self, asking: Signatures, bits: int, power: float) -> Float[np.ndarray, " n"]:
         """The score of every frame for one asking frame."""
         scores = np.zeros(len(self.counts))
         if len(asking.words) == 0:

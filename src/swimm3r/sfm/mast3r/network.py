@@ -53,7 +53,7 @@ class Encoded:
     positions: Int64[Tensor, "b n 2"]  # (y, x) of each token, whole tokens
     height: int  # of the images as they were passed, pixels
     width: int
-    portrait: Bool[Tensor, "b"] | None = None  # which ones were passed lying on their side; None: none
+    portrait: Bool[Tensor, " b"] | None = None  # which ones were passed lying on their side; None: none
 
 
 @dataclass(frozen=True)
@@ -63,7 +63,7 @@ class Decoded:
     tokens: tuple[Float[Tensor, "b n _"], ...]
     height: int
     width: int
-    portrait: Bool[Tensor, "b"] | None = None
+    portrait: Bool[Tensor, " b"] | None = None
 
 
 @dataclass(frozen=True)
@@ -239,7 +239,7 @@ class Mast3r(nn.Module):
         self.downstream_head2.float()
         return self
 
-    def encode(self, images: Float[Tensor, "b 3 h w"], portrait: Bool[Tensor, "b"] | None = None) -> Encoded:
+    def encode(self, images: Float[Tensor, "b 3 h w"], portrait: Bool[Tensor, " b"] | None = None) -> Encoded:
         """Tokens of images in -1..1 whose sides divide by the patch (16).
 
         A training batch may mix orientations: portrait images are then passed transposed, marked in `portrait`, and
