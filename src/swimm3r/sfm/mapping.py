@@ -35,6 +35,7 @@ _GLOBAL_ENOUGH = 0.9  # share of the frames below which the incremental method h
 _MAX_ERROR = 4.0  # pixels, where COLMAP drops observations
 _MAX_TANGENTIAL = 0.1  # a lens some 10 degrees askew behind its port
 _ROUNDS = 3
+_PASSES, _STILL = 6, 0.99  # adjustments of the lens at most, and the share of the last error that ends them
 _LOOSE_INLIERS, _LOOSE_SHARE = 15, 0.15  # to place a frame that COLMAP's 30 and 0.25 left over
 
 
@@ -171,7 +172,7 @@ def refine(
         if kept is not None and not distortion:
             break
         start = model if kept is None else kept
-        refined = _adjust(store, start, name, focal=True, distortion=distortion)
+        refined = _settled(store, start, name, distortion=distortion)
         gain = 1 - refined.compute_mean_reprojection_error() / start.compute_mean_reprojection_error()
         whole = refined.num_reg_images() >= model.num_reg_images()
         if is_lens(refined.cameras[1]) and whole and (kept is None or gain >= settings.mapping.opencv_gain):
@@ -352,6 +353,23 @@ def _best_connected(store: FeatureDatabase, count: int) -> list[str]:
         reach[chosen] = -1
         chosen.append(int(reach.argmax()))
     return [f"{i:06d}" for i in sorted(chosen)]
+
+
+def _settled(
+    store: FeatureDatabase, model: "pycolmap.Reconstruction", name: str, distortion: bool
+) -> "pycolmap.Reconstruction":
+    """The model and its lens adjusted until the reprojection error stands still.
+
+    A lens with many parameters leaves its start slowly: ruie_green_rock stopped at 0.71 px with poses bent by up to 17
+    degrees, and came to 0.56 px when asked again.
+    """
+    error = np.inf
+    for _ in range(_PASSES):
+        model = _adjust(store, model, name, focal=True, distortion=distortion)
+        before, error = error, model.compute_mean_reprojection_error()
+        if error > _STILL * before:
+            break
+    return model
 
 
 def _adjust(
