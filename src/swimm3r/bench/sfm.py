@@ -99,13 +99,13 @@ def _cells_of_clip(
 def _scores(
     folder: Path, *, clip: Path, settings: RunSettings, truth: GroundTruth | None, progress: Progress
 ) -> Scores:
-    run, rec, seconds = folder / "run", None, NotComputed("too few frames could be placed")
+    run, rec = folder / "run", None
     try:
         run_pipeline(clip, run, settings, last_stage="sfm", progress=progress)
         rec = reconstruction.load(run / "sfm")
         seconds = json.loads((run / "summary.json").read_text(encoding="utf-8"))["stages"]["sfm"]["cpu_seconds"]
-    except RegistrationError:  # its row says that nothing was registered
-        pass
+    except RegistrationError as failure:  # no frame counts as registered, and the row says why
+        seconds = NotComputed(failure.what)
     frames = load_frames(run / "prepare")
     scores = model_scores(rec, len(frames.train), original_pixels(clip, frames))
     if truth is not None:
