@@ -281,6 +281,15 @@ def test_only_what_can_be_a_lens_is_kept(params: list[float], believable: bool) 
     assert mapping.is_lens(camera) is believable
 
 
+@pytest.mark.parametrize(("tangential", "believable"), [(0.04, True), (-0.08, False)])
+def test_a_lens_is_not_far_askew(tangential: float, believable: bool) -> None:
+    import pycolmap
+
+    params = [260, 260, 160, 120, 0.05, 0.0, 0.0, tangential]
+    camera = pycolmap.Camera(model="OPENCV", width=WIDTH, height=HEIGHT, params=params)
+    assert mapping.is_lens(camera) is believable
+
+
 def test_pnp_finds_the_pose_among_outliers() -> None:
     truth = _cameras()[2]
     generator = torch.Generator().manual_seed(0)
