@@ -5,7 +5,6 @@ import json
 import math
 from dataclasses import asdict
 from pathlib import Path
-from typing import Any
 
 from swimm3r.frames import Frames
 from swimm3r.progress import Progress, silent
@@ -19,6 +18,7 @@ from swimm3r.splat.recipes.watersplatting import WaterSplatting
 from swimm3r.splat.rendering import SplatMap
 from swimm3r.splat.settings import McmcGsSettings, SeaSplatSettings, SplatSettings, UwbsSettings, WaterSplattingSettings
 from swimm3r.splat.site import Site, path_radius
+from swimm3r.splat.state import in_scene_units
 from swimm3r.splat.views import TrainingViews, working_scale
 
 
@@ -33,9 +33,8 @@ def train(
     views = TrainingViews(rec, frames, settings, scale)
     stations = training_stations(rec, views.names, views.cameras, scale) if settings.poses.enabled else None
     site = Site(rec, scale, path_radius(rec, scale, settings.working_depth), views, stations)
-    recipe = _recipe(settings, site)
-    final = training.run(recipe, views, _schedule(settings, rec, views), folder, progress)
-    primitives, field = recipe.rescaled(final, 1 / scale)
+    final = training.run(_recipe(settings, site), _schedule(settings, rec, views), folder, progress)
+    primitives, field = in_scene_units(final, 1 / scale)
     poses = None
     if stations is not None and final.poses is not None:
         poses = stations.refined(final.poses)
@@ -45,7 +44,7 @@ def train(
     return scene
 
 
-def _recipe(settings: SplatSettings, site: Site) -> training.Recipe[Any]:
+def _recipe(settings: SplatSettings, site: Site) -> training.Recipe:
     match settings:
         case UwbsSettings():
             return Uwbs(settings, site, known_water(site.rec, site.scale, settings))

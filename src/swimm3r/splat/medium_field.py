@@ -105,9 +105,9 @@ def initial_field(
 
 
 def in_unit(field: MediumField, length: float) -> MediumField:
-    """The trained field in the scene's own unit, `length` of which are a working unit, without gradient."""
+    """The trained field itself, now in the scene's own unit, `length` of which are a working unit."""
     field.length.fill_(length)
-    return field.requires_grad_(False)
+    return field
 
 
 def grid_of(field: MediumField, view: Pinhole, stride: int, time: Float[Tensor, ""] | None = None) -> FieldGrid:

@@ -8,8 +8,9 @@ from typing import Any, Generic, TypeVar
 import torch
 from torch import Tensor
 
+from swimm3r.splat import gaussians, primitives
 from swimm3r.splat.gaussians import GaussianPrimitives
-from swimm3r.splat.medium_field import MediumField
+from swimm3r.splat.medium_field import MediumField, in_unit
 from swimm3r.splat.optimiser import Moments, fresh
 from swimm3r.splat.pose_codes import PoseCodes
 from swimm3r.splat.primitives import BetaPrimitives
@@ -92,6 +93,16 @@ def restored(tensors: dict[str, Tensor], settings: SplatSettings, cameras: int) 
     memory = {k.removeprefix("memory."): t for k, t in tensors.items() if k.startswith("memory.")}
     field: Any = parts.field
     return State(p, field, poses, moments, memory)
+
+
+def in_scene_units(state: State, length: float) -> tuple[Primitives, Water]:
+    """What a map keeps of a finished state: primitives and water, `length` scene units to a working unit; no gradient.
+
+    SceneWater has no length.
+    """
+    p, field = state.primitives, state.field.requires_grad_(False)
+    moved = primitives.rescaled(p, length) if isinstance(p, BetaPrimitives) else gaussians.rescaled(p, length)
+    return moved, in_unit(field, length) if isinstance(field, MediumField) else field
 
 
 def clip_field(gradients: dict[str, Tensor]) -> None:

@@ -9,44 +9,41 @@ import logging
 import time
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Protocol, TypeVar, runtime_checkable
+from typing import Any, Protocol, runtime_checkable
 
 import torch
 
 from swimm3r.io.atomic import write_text
 from swimm3r.progress import Progress
 from swimm3r.splat import checkpoint
-from swimm3r.splat.projection import Primitives
-from swimm3r.splat.rendering import Water
-from swimm3r.splat.views import TrainingViews, View
+from swimm3r.splat.settings import SplatSettings
+from swimm3r.splat.site import Site
+from swimm3r.splat.state import State, restored, stored
+from swimm3r.splat.views import View
 
 log = logging.getLogger(__name__)
 
-State = TypeVar("State")
-
 
 @runtime_checkable  # so that the suite can check calls against it
-class Recipe(Protocol[State]):
-    """What a method brings to the loop."""
+class Recipe(Protocol):
+    """What a method brings to the loop: one scene's first state and every step."""
+
+    @property
+    def settings(self) -> SplatSettings:
+        """Every number of the method."""
+        ...
+
+    @property
+    def site(self) -> Site:
+        """The scene in working units, with the views to learn from."""
+        ...
 
     def start(self) -> State:
         """The state before step 1."""
         ...
 
-    def step(self, state: State, view: View, step: int) -> tuple[State, dict[str, float]]:
+    def step(self, state: Any, view: View, step: int) -> tuple[State, dict[str, float]]:
         """The state after training on one view, and the numbers of the step; steps count from 1."""
-        ...
-
-    def stored(self, state: State) -> dict[str, torch.Tensor]:
-        """Everything in a state, by name."""
-        ...
-
-    def restored(self, tensors: dict[str, torch.Tensor]) -> State:
-        """The state that `stored` was made of."""
-        ...
-
-    def rescaled(self, state: State, factor: float) -> tuple[Primitives, Water]:
-        """What the map keeps of a finished state, after every length was multiplied by `factor`; without gradient."""
         ...
 
 
@@ -73,8 +70,9 @@ def view_of_step(step: int, views: int, seed: int) -> int:
     return int(torch.randperm(views, generator=generator(seed, epoch, 1))[place])
 
 
-def run(recipe: Recipe[State], views: TrainingViews, schedule: Schedule, folder: Path, progress: Progress) -> State:
+def run(recipe: Recipe, schedule: Schedule, folder: Path, progress: Progress) -> State:
     """Train from the checkpoint in `folder`, if there is one of this training, else from the start."""
+    views = recipe.site.views
     path, metrics = folder / "checkpoint" / "state.safetensors", folder / "metrics.jsonl"
     folder.mkdir(parents=True, exist_ok=True)
     state, done = _resume(recipe, path, metrics, schedule)
@@ -96,19 +94,20 @@ def run(recipe: Recipe[State], views: TrainingViews, schedule: Schedule, folder:
             averages = {}
         if step % schedule.checkpoint_every == 0 or last:
             about = {"step": step, "fingerprint": schedule.fingerprint}
-            checkpoint.write(path, checkpoint.Stored(recipe.stored(state), about))
+            checkpoint.write(path, checkpoint.Stored(stored(state), about))
     progress("training the map", schedule.iterations, schedule.iterations)
     return state
 
 
-def _resume(recipe: Recipe[State], path: Path, metrics: Path, schedule: Schedule) -> tuple[State, int]:
+def _resume(recipe: Recipe, path: Path, metrics: Path, schedule: Schedule) -> tuple[State, int]:
     """The state to go on from, and its step; rows of metrics beyond it are dropped."""
     done = 0
     state = None
     if path.is_file():
-        stored = checkpoint.read(path)
-        if stored.about.get("fingerprint") == schedule.fingerprint:
-            state, done = recipe.restored(stored.tensors), stored.about["step"]
+        kept = checkpoint.read(path)
+        if kept.about.get("fingerprint") == schedule.fingerprint:
+            state = restored(kept.tensors, recipe.settings, recipe.site.refined_cameras)
+            done = kept.about["step"]
             log.info("going on from step %d", done)
         else:
             log.warning("%s belongs to a training with other settings or input; starting anew", path)

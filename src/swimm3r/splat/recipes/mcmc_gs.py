@@ -12,16 +12,15 @@ Gaussians start larger (`with_recipe`).
 from dataclasses import dataclass
 
 import torch
-from torch import Tensor
 
 from swimm3r.splat import gaussian_mcmc, losses, training
 from swimm3r.splat.gaussian_settings import McmcGsSettings
-from swimm3r.splat.gaussians import GaussianPrimitives, rescaled
-from swimm3r.splat.medium_field import NO_WATER, MediumField
+from swimm3r.splat.medium_field import MediumField
 from swimm3r.splat.optimiser import adam_step
 from swimm3r.splat.recipes.gaussian_step import InField, first_gaussians, look, rates_of, with_matches, with_rows
+from swimm3r.splat.scene_settings import MediumFieldSettings
 from swimm3r.splat.site import Site
-from swimm3r.splat.state import State, first_state, parameters_of, restored, stored
+from swimm3r.splat.state import State, first_state, parameters_of
 from swimm3r.splat.views import View
 
 
@@ -35,7 +34,8 @@ class McmcGs:
     def start(self) -> InField:
         """Small Gaussians on the cloud, coloured as filmed."""
         codes = self.site.codes(self.settings.poses, training.generator(self.settings.seed, 0, 6))
-        return first_state(first_gaussians(self.site, self.settings), NO_WATER, codes)
+        no_water = MediumField(MediumFieldSettings(model="none"))
+        return first_state(first_gaussians(self.site, self.settings), no_water, codes)
 
     def step(self, state: InField, view: View, step: int) -> tuple[InField, dict[str, float]]:
         """One view: forward, adjoint, Adam, relocation and growth on their cadence, noise."""
@@ -60,18 +60,6 @@ class McmcGs:
             p, d = state.primitives, settings.densify
             p.xyz.add_(gaussian_mcmc.noise(p, d.noise * rates["xyz"], d.dead_opacity, rng))
         return state, numbers
-
-    def stored(self, state: State) -> dict[str, Tensor]:
-        """Everything in a state, by name."""
-        return stored(state)
-
-    def restored(self, tensors: dict[str, Tensor]) -> State:
-        """The inverse of `stored`."""
-        return restored(tensors, self.settings, self.site.refined_cameras)
-
-    def rescaled(self, state: InField, factor: float) -> tuple[GaussianPrimitives, MediumField]:
-        """Gaussians, and no water, after every length was multiplied by `factor`, without gradient."""
-        return rescaled(state.primitives, factor), state.field.requires_grad_(False)
 
     def _every(self) -> int:
         d = self.settings.densify

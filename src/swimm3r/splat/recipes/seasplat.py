@@ -24,12 +24,12 @@ from torch.nn.functional import relu, smooth_l1_loss
 from swimm3r.raster import RasterOutput
 from swimm3r.splat import gradient_densify, losses, training
 from swimm3r.splat.gaussian_settings import SeaSplatSettings, SeaSplatWeights
-from swimm3r.splat.gaussians import GaussianPrimitives, rescaled
+from swimm3r.splat.gaussians import GaussianPrimitives
 from swimm3r.splat.optimiser import Moments, adam_step, fresh
 from swimm3r.splat.recipes.gaussian_step import first_gaussians, look, rates_of, with_matches, with_rows
 from swimm3r.splat.scene_water import SceneWater, initial_scene_water, layer, relative_depth, seen_through
 from swimm3r.splat.site import Site
-from swimm3r.splat.state import FIELD, State, first_state, parameters_of, restored, stored
+from swimm3r.splat.state import FIELD, State, first_state, parameters_of
 from swimm3r.splat.views import View
 
 UnderWater = State[GaussianPrimitives, SceneWater]
@@ -75,18 +75,6 @@ class SeaSplat:
             if d.begin < share <= d.end:
                 state = self._round(state, step)
         return state, numbers
-
-    def stored(self, state: State) -> dict[str, Tensor]:
-        """Everything in a state, by name."""
-        return stored(state)
-
-    def restored(self, tensors: dict[str, Tensor]) -> State:
-        """The inverse of `stored`."""
-        return restored(tensors, self.settings, self.site.refined_cameras)
-
-    def rescaled(self, state: UnderWater, factor: float) -> tuple[GaussianPrimitives, SceneWater]:
-        """Gaussians after every length was multiplied by `factor`, and the water, which has no length."""
-        return rescaled(state.primitives, factor), state.field.requires_grad_(False)
 
     def _share(self, of: float) -> int:
         return max(1, round(of * self.settings.iterations))

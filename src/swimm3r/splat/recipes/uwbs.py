@@ -18,10 +18,8 @@ from swimm3r.reconstruction import Reconstruction
 from swimm3r.splat import densify, losses, movers, training
 from swimm3r.splat.gradients import differentiate
 from swimm3r.splat.medium_field import (
-    MediumField,
     WaterPrior,
     deviation,
-    in_unit,
     initial_field,
     smoothness,
     water_prior,
@@ -33,7 +31,7 @@ from swimm3r.splat.projection import pinhole
 from swimm3r.splat.rendering import Drawing, draw
 from swimm3r.splat.settings import UwbsSettings
 from swimm3r.splat.site import Site
-from swimm3r.splat.state import FIELD, POSES, State, clip_field, first_state, parameters_of, restored, stored
+from swimm3r.splat.state import FIELD, POSES, State, clip_field, first_state, parameters_of
 from swimm3r.splat.views import View
 
 
@@ -116,18 +114,6 @@ class Uwbs:
                 rng = training.generator(settings.seed, step, 8)
                 parameters["xyz"].add_(self._noise(state.primitives, rates["xyz"], rng))
         return state, numbers
-
-    def stored(self, state: State) -> dict[str, Tensor]:
-        """Everything in a state, by name."""
-        return stored(state)
-
-    def restored(self, tensors: dict[str, Tensor]) -> State:
-        """The inverse of `stored`."""
-        return restored(tensors, self.settings, self.site.refined_cameras)
-
-    def rescaled(self, state: State, factor: float) -> tuple[BetaPrimitives, MediumField]:
-        """Primitives and water after every length was multiplied by `factor`, without gradient."""
-        return rescaled(state.primitives, factor), in_unit(state.field, factor)
 
     def _regularised(self, share: float) -> bool:
         return self.settings.weights.mcmc_begin < share <= self.settings.weights.mcmc_end

@@ -22,12 +22,11 @@ from torch import Tensor
 
 from swimm3r.splat import gradient_densify, losses, training
 from swimm3r.splat.gaussian_settings import WaterSplattingSettings
-from swimm3r.splat.gaussians import GaussianPrimitives, rescaled
-from swimm3r.splat.medium_field import MediumField, in_unit, initial_field
+from swimm3r.splat.medium_field import initial_field
 from swimm3r.splat.optimiser import adam_step, log_linear
 from swimm3r.splat.recipes.gaussian_step import InField, first_gaussians, look, rates_of, with_matches, with_rows
 from swimm3r.splat.site import Site
-from swimm3r.splat.state import FIELD, State, clip_field, first_state, parameters_of, restored, stored
+from swimm3r.splat.state import FIELD, State, clip_field, first_state, parameters_of
 from swimm3r.splat.views import View, smaller
 
 
@@ -71,18 +70,6 @@ class WaterSplatting:
             if step % self._every() == 0 and step > settings.densify.begin * settings.iterations:
                 state = self._round(state, step)
         return state, numbers
-
-    def stored(self, state: State) -> dict[str, Tensor]:
-        """Everything in a state, by name."""
-        return stored(state)
-
-    def restored(self, tensors: dict[str, Tensor]) -> State:
-        """The inverse of `stored`."""
-        return restored(tensors, self.settings, self.site.refined_cameras)
-
-    def rescaled(self, state: InField, factor: float) -> tuple[GaussianPrimitives, MediumField]:
-        """Gaussians and water after every length was multiplied by `factor`, without gradient."""
-        return rescaled(state.primitives, factor), in_unit(state.field, factor)
 
     def _divisor(self, step: int) -> int:
         """By how much the training picture is smaller."""
