@@ -25,6 +25,12 @@ torch.set_num_threads(1)  # two xdist workers share two cores
 SHARED = Path(os.environ.get("SWIMM3R_SHARED", Path(__file__).parents[2] / "shared"))
 
 
+@pytest.fixture(autouse=True)
+def seeded() -> None:
+    """Every test draws the same numbers in every run."""
+    torch.manual_seed(0)
+
+
 @pytest.fixture(scope="session")
 def shared() -> Path:
     """../shared: real footage and reference numbers that are not ours to commit."""

@@ -48,8 +48,7 @@ def zero(g, out, rows, columns):
 
 @no_type_check
 @inlined
-def product(g, out, a, b, rows, inner, columns, sign, add):
-    """out = sign a b, or out += with `add`, for a [rows, inner] and b [inner, columns]."""
+def _product(g, out, a, b, rows, inner, columns, sign, add, a_turned, b_turned):
     for i in range(rows):
         for j in range(columns):
             o = g[out, i, j]
@@ -57,41 +56,31 @@ def product(g, out, a, b, rows, inner, columns, sign, add):
                 for q in range(g.shape[3]):
                     o[q] = ZERO
             for k in range(inner):
-                u, v = g[a, i, k], g[b, k, j]
+                u = g[a, k, i] if a_turned else g[a, i, k]
+                v = g[b, j, k] if b_turned else g[b, k, j]
                 for q in range(g.shape[3]):
                     o[q] += sign * (u[q] * v[q])
+
+
+@no_type_check
+@inlined
+def product(g, out, a, b, rows, inner, columns, sign, add):
+    """out = sign a b, or out += with `add`, for a [rows, inner] and b [inner, columns]."""
+    _product(g, out, a, b, rows, inner, columns, sign, add, False, False)
 
 
 @no_type_check
 @inlined
 def product_at(g, out, a, b, rows, inner, columns, sign, add):
     """out = sign a^T b, or out += with `add`, for a [inner, rows] and b [inner, columns]."""
-    for i in range(rows):
-        for j in range(columns):
-            o = g[out, i, j]
-            if not add:
-                for q in range(g.shape[3]):
-                    o[q] = ZERO
-            for k in range(inner):
-                u, v = g[a, k, i], g[b, k, j]
-                for q in range(g.shape[3]):
-                    o[q] += sign * (u[q] * v[q])
+    _product(g, out, a, b, rows, inner, columns, sign, add, True, False)
 
 
 @no_type_check
 @inlined
 def product_bt(g, out, a, b, rows, inner, columns, sign, add):
     """out = sign a b^T, or out += with `add`, for a [rows, inner] and b [columns, inner]."""
-    for i in range(rows):
-        for j in range(columns):
-            o = g[out, i, j]
-            if not add:
-                for q in range(g.shape[3]):
-                    o[q] = ZERO
-            for k in range(inner):
-                u, v = g[a, i, k], g[b, j, k]
-                for q in range(g.shape[3]):
-                    o[q] += sign * (u[q] * v[q])
+    _product(g, out, a, b, rows, inner, columns, sign, add, False, True)
 
 
 @no_type_check
