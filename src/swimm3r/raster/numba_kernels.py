@@ -1,10 +1,13 @@
-"""The CPU kernels: a tile at a time, with an inner loop over pixels that LLVM turns into SIMD.
+"""The CPU kernels: a tile at a time, with inner loops over the pixels of a block that LLVM turns into SIMD.
 
-A tile's 256 pixels live in a workspace, one row per quantity, in the order of 4 x 4 blocks: the pixels that an ellipse
-covers in four image rows are then one contiguous range. What keeps the loops over that range vectorised (raster.md 6,
-asserted by tests): a one-dimensional workspace, unsigned indices, constant row offsets, float32 constants, and no call
-that is not inlined. Short loops one after the other beat one long loop: fewer values spill, and the long chain of the
-coverage overlaps with itself.
+A tile's 256 pixels live in a workspace, one row per quantity, in the order of its 4 x 4 blocks: a block is one vector
+of 512 bits where the machine has them. Only the blocks that an ellipse may touch, and that have not ended, are gone
+through. What keeps the loops over their pixels vectorised (raster.md 6, asserted by tests): a one-dimensional
+workspace, unsigned indices, constant row offsets, float32 constants, and no call that is not inlined. Short loops one
+after the other beat one long loop: fewer values spill, and the long chain of the coverage overlaps with itself.
+
+The water varies little within a tile, so e^{-beta z} is that of the tile's middle, which all pixels share, times what a
+pixel's departure from it makes: a short polynomial (`through_water`).
 """
 
 import zlib
@@ -16,7 +19,18 @@ from numba import njit
 
 from swimm3r.raster import bins, numba_math, pairmath
 from swimm3r.raster.bins import COLOR, CONIC_A, CONIC_B, CONIC_C, DEPTH, EXPONENT, LOG2_O, MEAN_X, MEAN_Y, R2_MAX
-from swimm3r.raster.numba_math import maximum, minimum, prefetch, select, vec3
+from swimm3r.raster.numba_math import (
+    any_positive,
+    disordered,
+    full_width_vectors,
+    lowest_bit,
+    maximum,
+    minimum,
+    ordered,
+    prefetch,
+    select,
+    vec3,
+)
 from swimm3r.raster.records import TILE
 
 _pair = pairmath.make(numba_math.inlined, numba_math.exp2, numba_math.log2, minimum, maximum, select, vec3, np.float32)
@@ -25,32 +39,39 @@ beta_falloff, gaussian_falloff = _pair.beta_falloff, _pair.gaussian_falloff
 advance, transmittance = _pair.advance, _pair.transmittance
 seen_colour, colour_slope, payloads = _pair.seen_colour, _pair.colour_slope, _pair.payloads
 shape_slopes, depth_slope = _pair.shape_slopes, _pair.depth_slope
+transmittance_near_one = pairmath.make(
+    numba_math.inlined, numba_math.exp2_near_zero, numba_math.log2, minimum, maximum, select, vec3, np.float32
+).transmittance
 
 # Numba's cache looks at the kernel's own file only. The sources that are inlined into a kernel enter its signature
 # through this number, the default of an argument that nobody passes: editing pairmath.py recompiles.
 SOURCES = zlib.crc32(b"".join(Path(str(m.__file__)).read_bytes() for m in (pairmath, numba_math, bins)))
 
-PIXELS = TILE * TILE
-STRIDE = PIXELS + 16  # rows 4 KiB apart would share cache sets, and loads would wait for stores to another row
+PIXELS, BLOCKS = TILE * TILE, 16
+BLOCK = np.uintp(PIXELS // BLOCKS)
+LINE = 16  # floats in a cache line
+STRIDE = PIXELS + LINE  # rows 4 KiB apart would share cache sets, and loads would wait for stores to another row
 AHEAD = 6  # pairs: the packed records are random reads from L3
-CHECK = 16  # pairs between two looks whether the whole tile has ended
-# first and beyond-the-last pixel of a row of blocks, by the mask of its four columns (masks have no holes)
-FIRST = np.array([0] + [16 * ((m & -m).bit_length() - 1) for m in range(1, 16)], np.uintp)
-BEYOND = np.array([16 * m.bit_length() for m in range(16)], np.uintp)
+CHECK = 8  # pairs between two looks which blocks have ended
+UP1, UP2, UP3, UP4, UP5 = (np.uintp(k) for k in range(1, 6))
 NEG_LOG2_E, LN_2 = np.float32(-pairmath.LOG2_E), np.float32(pairmath.LN_2)
 ZERO, HALF, ONE, TWO = np.float32(0.0), np.float32(0.5), np.float32(1.0), np.float32(2.0)
 
-# Rows of the workspace: pixel centre, transmittance, weight, exponents of the water, B_inf (adjoint: dL/dI B_inf)
-X, Y, T, W, KB0, KB1, KB2, KD0, KD1, KD2, B0, B1, B2 = (np.uintp(STRIDE * k) for k in range(13))
-# forward: sums of the underwater colour, the clear colour, z
-I0, I1, I2, J0, J1, J2, Z = (np.uintp(STRIDE * k) for k in range(13, 20))
+# Rows of the workspace: pixel centre, transmittance, the water's exponents less those of the tile's middle, B_inf
+# (adjoint: dL/dI B_inf)
+X, Y, T, KB0, KB1, KB2, KD0, KD1, KD2, B0, B1, B2 = (np.uintp(STRIDE * k) for k in range(12))
+MIDDLE = X + np.uintp(PIXELS)  # in a gap between rows: the six exponents of the tile's middle
+# forward: sums of the underwater colour, the clear colour, z; the pair's weight
+I0, I1, I2, J0, J1, J2, Z, W = (np.uintp(STRIDE * k) for k in range(12, 20))
 FORWARD_ROWS = 20
 # adjoint: dL/d rgb, clear, z depth, alpha; what lies behind, of the full, geometry and depth payloads;
-G0, G1, G2, C0, C1, C2, GZ, GA, RF, RG, RD = (np.uintp(STRIDE * k) for k in range(13, 24))
-# sums of w E_B, w z E_B, w z c E_D; per pair: u and l, the two shape slopes, dL/dr2 of each payload
-VB0, VB1, VB2, ZB0, ZB1, ZB2, ZD0, ZD1, ZD2 = (np.uintp(STRIDE * k) for k in range(24, 33))
-U, LOG_F, P, Q, TF, TG, TD = (np.uintp(STRIDE * k) for k in range(33, 40))
-ADJOINT_ROWS = 40
+G0, G1, G2, C0, C1, C2, GZ, GA, RF, RG, RD = (np.uintp(STRIDE * k) for k in range(12, 23))
+# sums of w E_B, w z E_B, w z c E_D
+VB0, VB1, VB2, ZB0, ZB1, ZB2, ZD0, ZD1, ZD2 = (np.uintp(STRIDE * k) for k in range(23, 32))
+# Rows of one primitive's pairs, its blocks one after the other: distance from its centre, u and l, weight, the two
+# shape slopes, dL/dr2 of each payload, and w times the slopes of colour, of z through the water, of z itself
+DX, DY, U, LOG_F, PW, P, Q, TF, TG, TD, S0, S1, S2, SW, SZ = (np.uintp(STRIDE * k) for k in range(15))
+ADJOINT_ROWS, PAIR_ROWS = 32, 15
 
 # Columns of a slot
 MEAN, CONIC, COL, OPACITY, BETA, Z_WATER, Z_DIRECT, GEO, GEO_ABS, FULL_ABS, DEPTH_MEAN = (
@@ -73,9 +94,25 @@ def falloff(r2, gaussian):
 
 @no_type_check
 @numba_math.inlined
+def workspace(rows):
+    """Rows that begin on cache lines: a vector that lies across two of them takes two loads."""
+    raw = np.zeros(rows * STRIDE + LINE, np.float32)
+    return raw[(-raw.ctypes.data % (4 * LINE)) // 4 :]
+
+
+@no_type_check
+@numba_math.inlined
 def block_order(y, x):
-    """Workspace column of pixel (y, x) of a tile."""
-    return 64 * (y >> 2) + 16 * (x >> 2) + 4 * (y & 3) + (x & 3)
+    """Workspace column of pixel (y, x) of a tile; unsigned, as a sign would have to be looked at."""
+    return np.uintp(64 * (y >> 2) + 16 * (x >> 2) + 4 * (y & 3) + (x & 3))
+
+
+@no_type_check
+@numba_math.inlined
+def copy_four(source, i, target, j):
+    """Copy four neighbours: all reads before all writes, or LLVM would fear that they overlap, and go one by one."""
+    a, b, c, d = source[i], source[i + UP1], source[i + UP2], source[i + UP3]
+    target[j], target[j + UP1], target[j + UP2], target[j + UP3] = a, b, c, d
 
 
 @no_type_check
@@ -84,13 +121,13 @@ def gather(ws, row, image, tile_y, tile_x):
     """Copy one tile of an image into a row; beyond the image its edge repeats."""
     height, width = image.shape
     for y in range(TILE):
-        image_y = min(tile_y + y, height - 1)
+        line = image[min(tile_y + y, height - 1)]
         if tile_x + TILE <= width:
-            for x in range(TILE):
-                ws[row + np.uintp(block_order(y, x))] = image[image_y, tile_x + x]
+            for x in range(0, TILE, 4):
+                copy_four(line, np.uintp(tile_x + x), ws, row + block_order(y, x))
         else:
             for x in range(TILE):
-                ws[row + np.uintp(block_order(y, x))] = image[image_y, min(tile_x + x, width - 1)]
+                ws[row + block_order(y, x)] = line[np.uintp(min(tile_x + x, width - 1))]
 
 
 @no_type_check
@@ -99,21 +136,93 @@ def put_back(ws, row, image, tile_y, tile_x):
     """Copy a row into its tile of an image."""
     height, width = image.shape
     for y in range(min(TILE, height - tile_y)):
+        line = image[tile_y + y]
         if tile_x + TILE <= width:
-            for x in range(TILE):
-                image[tile_y + y, tile_x + x] = ws[row + np.uintp(block_order(y, x))]
+            for x in range(0, TILE, 4):
+                copy_four(ws, row + block_order(y, x), line, np.uintp(tile_x + x))
         else:
             for x in range(width - tile_x):
-                image[tile_y + y, tile_x + x] = ws[row + np.uintp(block_order(y, x))]
+                line[np.uintp(tile_x + x)] = ws[row + block_order(y, x)]
+
+
+@no_type_check
+@numba_math.inlined
+def centred(ws):
+    """Move the middle of the water's exponents from its rows to MIDDLE; returns the largest departure left."""
+    spread = ZERO
+    for k in range(6):
+        row = KB0 + np.uintp(k * STRIDE)
+        least = most = ordered(ws[row])
+        for q in range(row, row + np.uintp(PIXELS)):
+            value = ordered(ws[q])
+            least, most = min(least, value), max(most, value)
+        middle = HALF * (disordered(least) + disordered(most))
+        for q in range(row, row + np.uintp(PIXELS)):
+            ws[q] -= middle
+        ws[MIDDLE + np.uintp(k)] = middle
+        spread = maximum(spread, maximum(disordered(most) - middle, middle - disordered(least)))
+    return spread
+
+
+@no_type_check
+@numba_math.inlined
+def plus(a, b):
+    """Sum of two times three channels."""
+    return a[0] + b[0], a[1] + b[1], a[2] + b[2]
+
+
+@no_type_check
+@numba_math.inlined
+def middle_of(ws):
+    """Exponents of backscatter and of attenuation in the tile's middle."""
+    return (
+        (ws[MIDDLE], ws[MIDDLE + UP1], ws[MIDDLE + UP2]),
+        (ws[MIDDLE + UP3], ws[MIDDLE + UP4], ws[MIDDLE + UP5]),
+    )
+
+
+@no_type_check
+@numba_math.inlined
+def through_water(departure, z, middle, at_middle, far):
+    """e^{-beta z} per channel: that of the tile's middle times 2^(departure z).
+
+    Where |departure z| <= 1/2, that factor is the polynomial inside of exp2, without what brings it into this range:
+    two roundings more than exp2 of the sum, which is what pairs beyond take (`far` is not None).
+    """
+    if far is None:
+        E = transmittance_near_one(departure, z)
+        return at_middle[0] * E[0], at_middle[1] * E[1], at_middle[2] * E[2]
+    return transmittance(plus(middle, departure), z)
+
+
+@no_type_check
+@numba_math.inlined
+def add_light(ws, blocks, n, color, z, middle, at_middle, far):
+    """Add the pairs of n blocks, whose weights are known, to the pictures."""
+    full_width_vectors()
+    for j in range(n):
+        first = blocks[j]
+        for q in range(first, first + BLOCK):
+            w = ws[W + q]
+            E_B = through_water((ws[KB0 + q], ws[KB1 + q], ws[KB2 + q]), z, middle[0], at_middle[0], far)
+            E_D = through_water((ws[KD0 + q], ws[KD1 + q], ws[KD2 + q]), z, middle[1], at_middle[1], far)
+            F = seen_colour(color, (ws[B0 + q], ws[B1 + q], ws[B2 + q]), E_B, E_D)
+            ws[I0 + q] += w * F[0]
+            ws[I1 + q] += w * F[1]
+            ws[I2 + q] += w * F[2]
+            ws[J0 + q] += w * color[0]
+            ws[J1 + q] += w * color[1]
+            ws[J2 + q] += w * color[2]
+            ws[Z + q] += w * z
 
 
 @no_type_check
 @numba_math.inlined
 def begin_tile(ws, tile_y, tile_x, height, width, binf, beta_b, beta_d):
-    """Pixel centres, T = 1, B_inf, and the betas as exponents of 2."""
+    """Pixel centres, T = 1, B_inf, and the water around its middle, which is returned (`centred`)."""
     for y in range(TILE):
         for x in range(TILE):
-            q = np.uintp(block_order(y, x))
+            q = block_order(y, x)
             ws[X + q], ws[Y + q] = np.float32(x) + HALF, np.float32(y) + HALF
             # a pixel outside the image has ended before it begins
             ws[T + q] = ONE if tile_y + y < height and tile_x + x < width else -ONE
@@ -124,27 +233,41 @@ def begin_tile(ws, tile_y, tile_x, height, width, binf, beta_b, beta_d):
         gather(ws, KD0 + row, beta_d[k], tile_y, tile_x)
     for q in range(KB0, B0):
         ws[q] *= NEG_LOG2_E
+    return centred(ws)
 
 
 @no_type_check
 @numba_math.inlined
-def all_ended(ws):
-    """Whether no pixel of the tile can change any more."""
-    most = -ONE
-    for q in range(T, T + np.uintp(PIXELS)):
-        most = maximum(most, ws[q])
-    return most <= ZERO
+def live_blocks(ws):
+    """Mask of the blocks in which some pixel can still change."""
+    live = np.int32(0)
+    for k in range(BLOCKS):
+        if any_positive(ws, T + BLOCK * np.uintp(k)):
+            live |= np.int32(1) << np.int32(k)
+    return live
+
+
+@no_type_check
+@numba_math.inlined
+def list_blocks(mask, first):
+    """Write down the first pixel of every block of a mask; returns how many there are."""
+    n = 0
+    while mask != 0:
+        first[n] = BLOCK * np.uintp(lowest_bit(mask))
+        mask &= mask - np.int32(1)
+        n += 1
+    return n
 
 
 @no_type_check
 @kernel
 def forward_tiles(
-    first,
+    first_tile,
     beyond,
     packed,
     tile_start,
     ids,
-    blocks,
+    masks,
     binf,
     beta_b,
     beta_d,
@@ -155,43 +278,41 @@ def forward_tiles(
     gaussian,
     sources=SOURCES,
 ):
-    """Images of the tiles first..beyond-1."""
+    """Images of the tiles first_tile..beyond-1."""
+    full_width_vectors()
     height, width = z_depth.shape
     columns = (width + TILE - 1) // TILE
-    ws = np.zeros(FORWARD_ROWS * STRIDE, np.float32)
-    for tile in range(first, beyond):
+    ws, blocks = workspace(FORWARD_ROWS), np.empty(BLOCKS, np.uintp)
+    for tile in range(first_tile, beyond):
         tile_y, tile_x = (tile // columns) * TILE, (tile % columns) * TILE
-        begin_tile(ws, tile_y, tile_x, height, width, binf, beta_b, beta_d)
+        spread = begin_tile(ws, tile_y, tile_x, height, width, binf, beta_b, beta_d)
         ws[I0:] = ZERO
+        middle = middle_of(ws)
         begin, end = tile_start[tile], tile_start[tile + 1]
+        live = live_blocks(ws)
         for entry in range(begin, end):
-            if (entry - begin) % CHECK == CHECK - 1 and all_ended(ws):
-                break
+            if (entry - begin) % CHECK == CHECK - 1:
+                live = live_blocks(ws)
+                if live == 0:
+                    break
             prefetch(packed, ids[min(entry + AHEAD, end - 1)])
-            p, mask = packed[ids[entry]], blocks[entry]
+            p = packed[ids[entry]]
+            n = list_blocks(masks[entry] & live, blocks)
             mean_x, mean_y = p[MEAN_X] - np.float32(tile_x), p[MEAN_Y] - np.float32(tile_y)
             conic, color = (p[CONIC_A], p[CONIC_B], p[CONIC_C]), (p[COLOR], p[COLOR + 1], p[COLOR + 2])
             log2_o, exponent, r2_max, z = p[LOG2_O], p[EXPONENT], p[R2_MAX], p[DEPTH]
-            for block_row in range(4):
-                hit = (mask >> (4 * block_row)) & 15
-                q0, q1 = np.uintp(64 * block_row) + FIRST[hit], np.uintp(64 * block_row) + BEYOND[hit]
-                for q in range(q0, q1):
+            at_middle = transmittance(middle[0], z), transmittance(middle[1], z)
+            for j in range(n):
+                first = blocks[j]
+                for q in range(first, first + BLOCK):
                     r2 = squared_distance(ws[X + q] - mean_x, ws[Y + q] - mean_y, conic)
                     _, log_f = falloff(r2, gaussian)
                     alpha, _ = coverage(r2, log_f, log2_o, exponent, r2_max)
                     ws[W + q], ws[T + q] = advance(ws[T + q], alpha)
-                for q in range(q0, q1):
-                    w = ws[W + q]
-                    E_B = transmittance((ws[KB0 + q], ws[KB1 + q], ws[KB2 + q]), z)
-                    E_D = transmittance((ws[KD0 + q], ws[KD1 + q], ws[KD2 + q]), z)
-                    F = seen_colour(color, (ws[B0 + q], ws[B1 + q], ws[B2 + q]), E_B, E_D)
-                    ws[I0 + q] += w * F[0]
-                    ws[I1 + q] += w * F[1]
-                    ws[I2 + q] += w * F[2]
-                    ws[J0 + q] += w * color[0]
-                    ws[J1 + q] += w * color[1]
-                    ws[J2 + q] += w * color[2]
-                    ws[Z + q] += w * z
+            if z * spread <= HALF:
+                add_light(ws, blocks, n, color, z, middle, at_middle, None)
+            else:
+                add_light(ws, blocks, n, color, z, middle, at_middle, True)
         for q in range(np.uintp(PIXELS)):
             ws[I0 + q] += ws[B0 + q]
             ws[I1 + q] += ws[B1 + q]
@@ -229,7 +350,7 @@ def begin_adjoint(ws, tile_y, tile_x, g_rgb, g_clear, g_z, g_alpha, rgb, clear, 
         ws[RG + q] = g[0] * J[0] + g[1] * J[1] + g[2] * J[2] + other
         ws[RD + q] = depth
         ws[B0 + q], ws[B1 + q], ws[B2 + q] = g[0] * B[0], g[1] * B[1], g[2] * B[2]
-    ws[VB0:U] = ZERO
+    ws[VB0:] = ZERO
 
 
 @no_type_check
@@ -248,100 +369,130 @@ def end_adjoint(ws, tile_y, tile_x, d_binf, d_beta_b, d_beta_d):
 
 
 @no_type_check
+@numba_math.inlined
+def take_light(ws, pairs, blocks, n, color, z, middle, at_middle, with_sgg, d_binf, far):
+    """The adjoint of `add_light`: slopes of the pairs, and sums of the pixels."""
+    full_width_vectors()
+    for j in range(n):
+        first, pair = blocks[j], BLOCK * np.uintp(j)
+        for i in range(BLOCK):
+            q, c = first + i, pair + i
+            w = pairs[PW + c]
+            d_b, d_d = (ws[KB0 + q], ws[KB1 + q], ws[KB2 + q]), (ws[KD0 + q], ws[KD1 + q], ws[KD2 + q])
+            E_B, E_D = (
+                through_water(d_b, z, middle[0], at_middle[0], far),
+                through_water(d_d, z, middle[1], at_middle[1], far),
+            )
+            k_b, k_d = plus(middle[0], d_b), plus(middle[1], d_d)
+            g, g_veil = (ws[G0 + q], ws[G1 + q], ws[G2 + q]), (ws[B0 + q], ws[B1 + q], ws[B2 + q])
+            g_clear = (ws[C0 + q], ws[C1 + q], ws[C2 + q])
+            slope = colour_slope(g, g_clear, E_D)
+            full, geo, depth = payloads(color, z, E_B, slope, g, g_veil, g_clear, ws[GZ + q], ws[GA + q])
+            pairs[S0 + c] = w * slope[0]
+            pairs[S1 + c] = w * slope[1]
+            pairs[S2 + c] = w * slope[2]
+            pairs[SW + c] = w * depth_slope(color, E_B, E_D, g, g_veil, k_b, k_d)
+            pairs[SZ + c] = w * ws[GZ + q]
+            if d_binf is not None:
+                ws[VB0 + q] += w * E_B[0]
+                ws[VB1 + q] += w * E_B[1]
+                ws[VB2 + q] += w * E_B[2]
+                wz = w * z
+                ws[ZB0 + q] += wz * E_B[0]
+                ws[ZB1 + q] += wz * E_B[1]
+                ws[ZB2 + q] += wz * E_B[2]
+                ws[ZD0 + q] += wz * color[0] * E_D[0]
+                ws[ZD1 + q] += wz * color[1] * E_D[1]
+                ws[ZD2 + q] += wz * color[2] * E_D[2]
+            behind = ws[RF + q] - w * full
+            ws[RF + q] = behind
+            pairs[TF + c] = pairs[P + c] * full - pairs[Q + c] * behind
+            if with_sgg is not None:
+                behind_geo, behind_depth = ws[RG + q] - w * geo, ws[RD + q] - w * depth
+                ws[RG + q], ws[RD + q] = behind_geo, behind_depth
+                pairs[TG + c] = pairs[P + c] * geo - pairs[Q + c] * behind_geo
+                pairs[TD + c] = pairs[P + c] * depth - pairs[Q + c] * behind_depth
+
+
+@no_type_check
 @adjoint_kernel
 def adjoint_tiles(
-    first, beyond, packed, tile_start, ids, blocks, slot, binf, beta_b, beta_d, g_rgb, g_clear, g_z, g_alpha,
+    first_tile, beyond, packed, tile_start, ids, masks, slot, binf, beta_b, beta_d, g_rgb, g_clear, g_z, g_alpha,
     rgb, clear, z_depth, alpha_out, slots, d_binf, d_beta_b, d_beta_d, with_sgg, gaussian, sources=SOURCES,
 ):  # fmt: skip
-    """Slots and water gradients of the tiles first..beyond-1; None for `with_sgg` or `d_binf` leaves that part out."""
+    """Slots and water gradients of the tiles first_tile..beyond-1.
+
+    None for `with_sgg` or `d_binf` leaves that part out.
+    """
+    full_width_vectors()
     height, width = z_depth.shape
     columns = (width + TILE - 1) // TILE
-    ws = np.zeros(ADJOINT_ROWS * STRIDE, np.float32)
-    for tile in range(first, beyond):
+    ws, pairs, blocks = workspace(ADJOINT_ROWS), workspace(PAIR_ROWS), np.empty(BLOCKS, np.uintp)
+    for tile in range(first_tile, beyond):
         tile_y, tile_x = (tile // columns) * TILE, (tile % columns) * TILE
-        begin_tile(ws, tile_y, tile_x, height, width, binf, beta_b, beta_d)
+        spread = begin_tile(ws, tile_y, tile_x, height, width, binf, beta_b, beta_d)
         begin_adjoint(ws, tile_y, tile_x, g_rgb, g_clear, g_z, g_alpha, rgb, clear, z_depth, alpha_out)
+        middle = middle_of(ws)
         begin, end = tile_start[tile], tile_start[tile + 1]
-        ended = False
+        live = live_blocks(ws)
         for entry in range(begin, end):
             out = slots[slot[entry]]
-            if (entry - begin) % CHECK == CHECK - 1 and not ended:
-                ended = all_ended(ws)
-            if ended:
+            if (entry - begin) % CHECK == CHECK - 1:
+                live = live_blocks(ws)
+            if live == 0:
                 out[:] = ZERO
                 continue
             prefetch(packed, ids[min(entry + AHEAD, end - 1)])
-            p, mask = packed[ids[entry]], blocks[entry]
+            p = packed[ids[entry]]
+            n = list_blocks(masks[entry] & live, blocks)
             mean_x, mean_y = p[MEAN_X] - np.float32(tile_x), p[MEAN_Y] - np.float32(tile_y)
             conic, color = (p[CONIC_A], p[CONIC_B], p[CONIC_C]), (p[COLOR], p[COLOR + 1], p[COLOR + 2])
             log2_o, exponent, r2_max, z = p[LOG2_O], p[EXPONENT], p[R2_MAX], p[DEPTH]
+            at_middle = transmittance(middle[0], z), transmittance(middle[1], z)
             mx = my = xx = xy = yy = red = green = blue = opacity = beta = z_water = z_direct = ZERO
             geo_x = geo_y = abs_geo_x = abs_geo_y = abs_x = abs_y = depth_x = depth_y = ZERO
-            for block_row in range(4):
-                hit = (mask >> (4 * block_row)) & 15
-                q0, q1 = np.uintp(64 * block_row) + FIRST[hit], np.uintp(64 * block_row) + BEYOND[hit]
-                for q in range(q0, q1):
+            for j in range(n):
+                first, pair = blocks[j], BLOCK * np.uintp(j)
+                for i in range(BLOCK):
+                    q, c = first + i, pair + i
                     before = ws[T + q]
-                    r2 = squared_distance(ws[X + q] - mean_x, ws[Y + q] - mean_y, conic)
-                    ws[U + q], log_f = falloff(r2, gaussian)
-                    ws[LOG_F + q] = log_f
+                    dx, dy = ws[X + q] - mean_x, ws[Y + q] - mean_y
+                    r2 = squared_distance(dx, dy, conic)
+                    u, log_f = falloff(r2, gaussian)
                     alpha, shaped = coverage(r2, log_f, log2_o, exponent, r2_max)
                     w, ws[T + q] = advance(before, alpha)
-                    ws[W + q] = w
-                    ws[P + q], ws[Q + q] = shape_slopes(w, before, alpha, shaped, ws[U + q])
-                for q in range(q0, q1):
-                    w = ws[W + q]
-                    k_b, k_d = (ws[KB0 + q], ws[KB1 + q], ws[KB2 + q]), (ws[KD0 + q], ws[KD1 + q], ws[KD2 + q])
-                    E_B, E_D = transmittance(k_b, z), transmittance(k_d, z)
-                    g, g_veil = (ws[G0 + q], ws[G1 + q], ws[G2 + q]), (ws[B0 + q], ws[B1 + q], ws[B2 + q])
-                    g_clear_q = (ws[C0 + q], ws[C1 + q], ws[C2 + q])
-                    slope = colour_slope(g, g_clear_q, E_D)
-                    full, geo, depth = payloads(color, z, E_B, slope, g, g_veil, g_clear_q, ws[GZ + q], ws[GA + q])
-                    red += w * slope[0]
-                    green += w * slope[1]
-                    blue += w * slope[2]
-                    z_water += w * depth_slope(color, E_B, E_D, g, g_veil, k_b, k_d)
-                    z_direct += w * ws[GZ + q]
-                    if d_binf is not None:
-                        ws[VB0 + q] += w * E_B[0]
-                        ws[VB1 + q] += w * E_B[1]
-                        ws[VB2 + q] += w * E_B[2]
-                        wz = w * z
-                        ws[ZB0 + q] += wz * E_B[0]
-                        ws[ZB1 + q] += wz * E_B[1]
-                        ws[ZB2 + q] += wz * E_B[2]
-                        ws[ZD0 + q] += wz * color[0] * E_D[0]
-                        ws[ZD1 + q] += wz * color[1] * E_D[1]
-                        ws[ZD2 + q] += wz * color[2] * E_D[2]
-                    behind = ws[RF + q] - w * full
-                    ws[RF + q] = behind
-                    ws[TF + q] = ws[P + q] * full - ws[Q + q] * behind
-                    if with_sgg is not None:
-                        behind_geo, behind_depth = ws[RG + q] - w * geo, ws[RD + q] - w * depth
-                        ws[RG + q], ws[RD + q] = behind_geo, behind_depth
-                        ws[TG + q] = ws[P + q] * geo - ws[Q + q] * behind_geo
-                        ws[TD + q] = ws[P + q] * depth - ws[Q + q] * behind_depth
-                for q in range(q0, q1):
-                    dx, dy, t = ws[X + q] - mean_x, ws[Y + q] - mean_y, ws[TF + q]
-                    half_x, half_y = half_slope(dx, dy, conic)
-                    mx += t * half_x
-                    my += t * half_y
-                    xx += t * dx * dx
-                    xy += t * dx * dy
-                    yy += t * dy * dy
-                    tu = t * ws[U + q]
-                    opacity += tu
-                    beta += tu * ws[LOG_F + q]
-                    if with_sgg is not None:
-                        abs_x += abs(t * half_x)
-                        abs_y += abs(t * half_y)
-                        t_geo, t_depth = ws[TG + q], ws[TD + q]
-                        geo_x += t_geo * half_x
-                        geo_y += t_geo * half_y
-                        abs_geo_x += abs(t_geo * half_x)
-                        abs_geo_y += abs(t_geo * half_y)
-                        depth_x += t_depth * half_x
-                        depth_y += t_depth * half_y
+                    pairs[DX + c], pairs[DY + c], pairs[U + c], pairs[LOG_F + c], pairs[PW + c] = dx, dy, u, log_f, w
+                    pairs[P + c], pairs[Q + c] = shape_slopes(w, before, alpha, shaped, u)
+            if z * spread <= HALF:
+                take_light(ws, pairs, blocks, n, color, z, middle, at_middle, with_sgg, d_binf, None)
+            else:
+                take_light(ws, pairs, blocks, n, color, z, middle, at_middle, with_sgg, d_binf, True)
+            for c in range(BLOCK * np.uintp(n)):
+                dx, dy, t = pairs[DX + c], pairs[DY + c], pairs[TF + c]
+                half_x, half_y = half_slope(dx, dy, conic)
+                mx += t * half_x
+                my += t * half_y
+                xx += t * dx * dx
+                xy += t * dx * dy
+                yy += t * dy * dy
+                tu = t * pairs[U + c]
+                opacity += tu
+                beta += tu * pairs[LOG_F + c]
+                red += pairs[S0 + c]
+                green += pairs[S1 + c]
+                blue += pairs[S2 + c]
+                z_water += pairs[SW + c]
+                z_direct += pairs[SZ + c]
+                if with_sgg is not None:
+                    abs_x += abs(t * half_x)
+                    abs_y += abs(t * half_y)
+                    t_geo, t_depth = pairs[TG + c], pairs[TD + c]
+                    geo_x += t_geo * half_x
+                    geo_y += t_geo * half_y
+                    abs_geo_x += abs(t_geo * half_x)
+                    abs_geo_y += abs(t_geo * half_y)
+                    depth_x += t_depth * half_x
+                    depth_y += t_depth * half_y
             out[MEAN], out[MEAN + 1], out[CONIC], out[CONIC + 1], out[CONIC + 2] = mx, my, xx, xy, yy
             out[COL], out[COL + 1], out[COL + 2] = red, green, blue
             out[OPACITY], out[BETA], out[Z_WATER], out[Z_DIRECT] = opacity, beta, z_water, z_direct

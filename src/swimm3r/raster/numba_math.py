@@ -80,6 +80,45 @@ def prefetch(typingctx: Any, array: Any, row: Any) -> Any:
 
 
 @no_type_check
+@intrinsic
+def full_width_vectors(typingctx: Any) -> Any:
+    """Let LLVM use 512-bit registers in the function that calls this; by itself it holds back on many CPUs."""
+
+    def generate(context: Any, builder: Any, signature: Any, args: Any) -> Any:
+        # llvmlite's own `add` knows the attributes without a value only
+        set.add(builder.function.attributes, '"prefer-vector-width"="512"')
+        return context.get_dummy_value()
+
+    return types.void(), generate
+
+
+@no_type_check
+@intrinsic
+def any_positive(typingctx: Any, array: Any, first: Any) -> Any:
+    """Whether any of the 16 values of a float32 array from `first` on is above 0."""
+
+    def generate(context: Any, builder: Any, signature: Any, args: Any) -> Any:
+        data = context.make_array(signature.args[0])(context, builder, args[0]).data
+        sixteen = ir.VectorType(ir.FloatType(), 16)
+        address = builder.bitcast(builder.gep(data, [args[1]]), sixteen.as_pointer())
+        above = builder.fcmp_ordered(">", builder.load(address, align=4), ir.Constant(sixteen, [0.0] * 16))
+        return builder.icmp_unsigned("!=", builder.bitcast(above, ir.IntType(16)), ir.IntType(16)(0))
+
+    return types.boolean(array, types.uintp), generate
+
+
+@no_type_check
+@intrinsic
+def lowest_bit(typingctx: Any, i: Any) -> Any:
+    """Place of the lowest bit that is set in an int32 other than 0."""
+
+    def generate(context: Any, builder: Any, signature: Any, args: Any) -> Any:
+        return builder.cttz(args[0], ir.IntType(1)(1))
+
+    return types.int32(types.int32), generate
+
+
+@no_type_check
 @inlined
 def minimum(a, b):
     """Smaller of two."""
@@ -109,12 +148,34 @@ def vec3(x, y, z):
 
 @no_type_check
 @inlined
+def ordered(x):
+    """An integer of each float32 that sorts as the floats do: LLVM has no vectors for the least of floats."""
+    i = bits(x)
+    return np.int32(i ^ ((i >> np.int32(31)) & np.int32(0x7FFFFFFF)))
+
+
+@no_type_check
+@inlined
+def disordered(i):
+    """The float32 of such an integer."""
+    return from_bits(np.int32(i ^ ((i >> np.int32(31)) & np.int32(0x7FFFFFFF))))
+
+
+@no_type_check
+@inlined
+def exp2_near_zero(x):
+    """2^x for |x| <= 1/2."""
+    x2 = x * x
+    return ((E5 * x + E4) * x2 + (E3 * x + E2)) * x2 + (E1 * x + ONE)
+
+
+@no_type_check
+@inlined
 def exp2(x):
     """2^x for x < 127."""
     x = maximum(x, LOWEST_EXPONENT)
     shifted = x + MAGIC
-    f = x - (shifted - MAGIC)  # kept by LLVM because `reassoc` is off
-    power = ((((E5 * f + E4) * f + E3) * f + E2) * f + E1) * f + ONE
+    power = exp2_near_zero(x - (shifted - MAGIC))  # kept by LLVM because `reassoc` is off
     return from_bits(np.int32(bits(power) + np.int32(bits(shifted) << MANTISSA_SHIFT)))
 
 
@@ -125,5 +186,9 @@ def log2(x):
     i = bits(x)
     exponent = np.int32(np.int32(i - TWO_THIRDS) >> MANTISSA_SHIFT)
     r = from_bits(np.int32(i - np.int32(exponent << MANTISSA_SHIFT))) - ONE
-    series = (((((((L8 * r + L7) * r + L6) * r + L5) * r + L4) * r + L3) * r + L2) * r + L1) * r + L0
+    r2 = r * r
+    r4 = r2 * r2
+    low = (L3 * r + L2) * r2 + (L1 * r + L0)
+    high = (L7 * r + L6) * r2 + (L5 * r + L4)
+    series = (L8 * r4 + high) * r4 + low
     return np.float32(exponent) + r * series
