@@ -14,7 +14,7 @@ from swimm3r.errors import InputError, RegistrationError, StorageError, UsageErr
 from swimm3r.frames import Frame, Frames
 from swimm3r.geometry import align_similarity, rotation_angle, so3_exp
 from swimm3r.reconstruction import Points, Reconstruction
-from swimm3r.sfm import colmap, feature_database, mapping, plausibility
+from swimm3r.sfm import calibration, colmap, feature_database, plausibility
 from swimm3r.sfm.settings import ColmapSettings, MappingSettings
 
 WIDTH, HEIGHT, FOCAL, COUNT = 320, 240, 260.0, 8
@@ -165,7 +165,7 @@ def test_an_interrupted_run_leaves_a_database_that_a_later_one_completes(
 
 
 def test_other_settings_start_a_new_database(frames: Frames, tmp_path: Path) -> None:
-    camera = mapping.first_camera(WIDTH, HEIGHT, SETTINGS)
+    camera = calibration.first_camera(WIDTH, HEIGHT, SETTINGS)
     store = feature_database.start_database(tmp_path, frames, camera, SETTINGS.features)
     with store.open() as database:
         database.write_keypoints(1, np.zeros((1, 4), np.float32))
@@ -185,7 +185,7 @@ def test_the_global_method_finds_the_same_cameras(frames: Frames, folder: Path, 
 
 
 def test_fixed_intrinsics_stay_as_given_but_for_a_flat_port_which_is_confessed(frames: Frames, tmp_path: Path) -> None:
-    settings = replace(SETTINGS, focal=FOCAL / mapping.WATER, k1=0.01, housing="flat", intrinsics="fixed")
+    settings = replace(SETTINGS, focal=FOCAL / calibration.WATER, k1=0.01, housing="flat", intrinsics="fixed")
     found = colmap.reconstruct(frames, settings, tmp_path)
     assert found.cameras.model == "SIMPLE_RADIAL"
     assert found.cameras.K[0, 0, 0].item() == pytest.approx(FOCAL)
@@ -242,7 +242,7 @@ def test_one_frame_is_an_input_error(frames: Frames, tmp_path: Path) -> None:
 )
 def test_settings_that_contradict_themselves_are_usage_errors(settings: ColmapSettings, message: str) -> None:
     with pytest.raises(UsageError, match=message):
-        mapping.first_camera(WIDTH, HEIGHT, settings)
+        calibration.first_camera(WIDTH, HEIGHT, settings)
 
 
 def test_a_full_disk_is_a_storage_error(frames: Frames, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
@@ -255,7 +255,7 @@ def test_a_full_disk_is_a_storage_error(frames: Frames, tmp_path: Path, monkeypa
 
 
 def test_video_is_matched_with_neighbours_and_lookalikes_only(rec, frames: Frames, folder: Path) -> None:
-    camera = mapping.first_camera(WIDTH, HEIGHT, SETTINGS)
+    camera = calibration.first_camera(WIDTH, HEIGHT, SETTINGS)
     store = feature_database.start_database(folder, frames, camera, SETTINGS.features)
     sparse = replace(SETTINGS, exhaustive_to=4, overlap=1, loops=1)
     pairs = colmap.choose_pairs(store, frames, sparse)
@@ -278,7 +278,7 @@ def test_only_what_can_be_a_lens_is_kept(params: list[float], believable: bool) 
     import pycolmap
 
     camera = pycolmap.Camera(model="SIMPLE_RADIAL", width=WIDTH, height=HEIGHT, params=params)
-    assert mapping.is_lens(camera) is believable
+    assert calibration.is_lens(camera) is believable
 
 
 @pytest.mark.parametrize(("tangential", "believable"), [(0.04, True), (-0.08, False)])
@@ -287,7 +287,7 @@ def test_a_lens_is_not_far_askew(tangential: float, believable: bool) -> None:
 
     params = [260, 260, 160, 120, 0.05, 0.0, 0.0, tangential]
     camera = pycolmap.Camera(model="OPENCV", width=WIDTH, height=HEIGHT, params=params)
-    assert mapping.is_lens(camera) is believable
+    assert calibration.is_lens(camera) is believable
 
 
 def test_pnp_finds_the_pose_among_outliers() -> None:
@@ -336,7 +336,7 @@ def test_a_tiled_floor_has_twins_and_a_reef_has_none() -> None:
 
 
 def test_halves_that_share_no_points_are_called_badly_joined(rec, frames: Frames, folder: Path) -> None:
-    camera = mapping.first_camera(WIDTH, HEIGHT, SETTINGS)
+    camera = calibration.first_camera(WIDTH, HEIGHT, SETTINGS)
     store = feature_database.start_database(folder, frames, camera, SETTINGS.features)
     first = rec.tracks.frame < COUNT // 2
     half = torch.where(first, rec.tracks.point, rec.tracks.point + len(rec.points.xyz))
@@ -350,7 +350,7 @@ def test_halves_that_share_no_points_are_called_badly_joined(rec, frames: Frames
 
 
 def test_a_camera_that_only_turned_is_implausible(rec, frames: Frames, folder: Path) -> None:
-    camera = mapping.first_camera(WIDTH, HEIGHT, SETTINGS)
+    camera = calibration.first_camera(WIDTH, HEIGHT, SETTINGS)
     store = feature_database.start_database(folder, frames, camera, SETTINGS.features)
     far = replace(rec, points=replace(rec.points, xyz=rec.points.xyz * 300))
     said = [caution.what for caution in plausibility.implausible(far, store, frames)]
@@ -358,7 +358,7 @@ def test_a_camera_that_only_turned_is_implausible(rec, frames: Frames, folder: P
 
 
 def test_a_leap_of_the_camera_is_said(rec, frames: Frames, folder: Path) -> None:
-    camera = mapping.first_camera(WIDTH, HEIGHT, SETTINGS)
+    camera = calibration.first_camera(WIDTH, HEIGHT, SETTINGS)
     store = feature_database.start_database(folder, frames, camera, SETTINGS.features)
     poses = rec.cameras.cam2world.clone()
     poses[5:, :3, 3] += 100 * rec.cameras.centres.std()

@@ -1,6 +1,7 @@
 """Frames that stand in the wrong place: one among others that stand right, and a whole part of the clip."""
 
 import shutil
+from dataclasses import replace
 
 import numpy as np
 import pycolmap
@@ -18,6 +19,7 @@ from swimm3r.synthetic import write_dive
 from swimm3r.synthetic.settings import DiveSettings
 
 SETTINGS = ColmapSettings(threads=2)
+INCREMENTAL = replace(SETTINGS, mapping=replace(SETTINGS.mapping, method="incremental"))
 WRONG = 3  # image id
 
 
@@ -33,7 +35,7 @@ def store(tmp_path_factory: pytest.TempPathFactory) -> FeatureDatabase:
 
 @pytest.fixture
 def model(store: FeatureDatabase) -> pycolmap.Reconstruction:
-    return mapping.map_frames(store, SETTINGS, "incremental", silent)[0]
+    return mapping.map_frames(store, INCREMENTAL, silent)[0]
 
 
 def moved(model: pycolmap.Reconstruction, degrees: float, which: tuple[int, ...] = (WRONG,)) -> pycolmap.Reconstruction:
@@ -73,6 +75,18 @@ def test_a_part_of_the_clip_that_agrees_with_itself_but_not_with_the_rest_is_pla
     wrong = moved(model, 25, part)
     assert contradicting_frames(store, wrong) == [*part]
     assert_same(rotations(mapping.replace_misplaced(store, wrong, SETTINGS, silent)), rotations(model))
+
+
+@pytest.mark.parametrize("wrong_one", ["_climb", "_map_globally"])
+def test_of_two_ways_to_place_a_small_clip_the_one_that_explains_more_is_kept(
+    store: FeatureDatabase, model: pycolmap.Reconstruction, monkeypatch: pytest.MonkeyPatch, wrong_one: str
+):
+    wrong = moved(model, 25, (1, 2, 3, 4))
+    wrong.update_point_3d_errors()
+    for way in ("_climb", "_map_globally"):
+        monkeypatch.setattr(mapping, way, lambda *_, found=wrong if way == wrong_one else model: [found])
+    monkeypatch.setattr(mapping, "replace_misplaced", lambda store, model, *_: model)
+    assert mapping.map_frames(store, SETTINGS, silent) == [model]
 
 
 def test_distances_from_the_lines_are_below_a_pixel_in_a_right_model_and_grow_with_the_error(

@@ -60,6 +60,19 @@ def test_gaps_in_the_depth_leave_no_holes_in_the_picture(dive):
     assert psnr(J, dive.clear[2]) > 28
 
 
+def test_surfaces_of_unknown_depth_in_green_water_look_like_those_of_known_depth(dive):
+    green = Medium(torch.tensor([0.02, 0.5, 0.35]), torch.tensor([0.2, 0.3, 0.2]), torch.tensor([0.1, 0.5, 0.3]))
+    g = torch.Generator().manual_seed(0)
+    J = torch.tensor([0.25, 0.5, 0.35]) * (0.6 + 0.4 * torch.rand(18, 24, 1, generator=g))
+    J = J.repeat_interleave(4, 0).repeat_interleave(4, 1)
+    z = torch.full((72, 96), 2.0)
+    camera = dive.rec.cameras[0]
+    raw = add_water(J, ray_depth_from_z(z, image_directions(camera).float()), green)
+    z[20:50, 50:] = 0
+    restored = restore_picture(raw, DepthMap(z, (z > 0).float()), rays_of(camera), exact(green)).clear
+    assert psnr(restored[25:45, 60:], J[25:45, 60:]) > 28
+
+
 def test_a_linear_fit_restores_light_that_was_lost_in_linear_light(dive):
     fit = exact(dive.medium)
     linear = MediumFit(fit.medium, fit.curve, fit.std, fit.identifiable, fit.z_range, "linear")

@@ -3,10 +3,8 @@
 The paper places test frames by poses of the full sequence, which no method's own training frames could give. They are
 made once per clip, without dense depth and water, and kept in a folder with the key of what they were made of.
 
-Both of COLMAP's methods are tried: the incremental one can end far from the truth with every frame placed, on a
-faultless clip, too (16 frames of a synthetic dive: at 1.0 px and 45 degrees, where the global one is at 0.2 px and
-exact). The lens is held at what the clip's first run found: calibrated anew, it would come out different on other
-frames (on small hazy pictures by a quarter), and poses under two lenses differ by more than a good localisation errs.
+The lens is held at what the clip's first run found: calibrated anew, it would come out different on other frames (on
+small hazy pictures by a quarter), and poses under two lenses differ by more than a good localisation errs.
 """
 
 import json
@@ -23,11 +21,9 @@ from swimm3r.ground_truth import GroundTruth, read_ground_truth
 from swimm3r.io import cameras_json
 from swimm3r.io.atomic import write_text
 from swimm3r.progress import Progress, silent
-from swimm3r.reconstruction import Reconstruction
 from swimm3r.run import FinishedSfm
 from swimm3r.sfm import colmap
 from swimm3r.sfm.settings import ColmapSettings
-from swimm3r.summary import retained_match_errors
 
 
 def of_clip(sfm: FinishedSfm, folder: Path, progress: Progress = silent) -> GroundTruth | NotComputed:
@@ -52,9 +48,13 @@ def whole_clip(
     if stored.get("key") == key:
         return NotComputed(stored["failed"]) if stored["failed"] else read_ground_truth(cameras)
     everything = replace(frames, frames=tuple(replace(frame, split="train") for frame in frames))
-    found = _best(everything, lens, settings, folder / "work", progress)
-    shutil.rmtree(folder / "work", ignore_errors=True)
-    if isinstance(found, Reconstruction):
+    settings = replace(settings, mapping=replace(settings.mapping, method="auto"))
+    failed = ""
+    try:
+        found = colmap.reconstruct(everything, settings, folder / "work", progress, lens)
+    except RegistrationError as error:
+        failed = f"no reference: {error.what}"
+    else:
         table = cameras_json.CameraTable(
             names=found.names,
             width=found.cameras.width,
@@ -66,27 +66,9 @@ def whole_clip(
             units="scene units",
         )
         cameras_json.write_cameras(cameras, table)
-    failed = found.reason if isinstance(found, NotComputed) else ""
+    shutil.rmtree(folder / "work", ignore_errors=True)
     write_text(record, json.dumps({"key": key, "failed": failed, "frames": len(frames)}, indent=2) + "\n")
     return NotComputed(failed) if failed else read_ground_truth(cameras)
-
-
-def _best(
-    frames: Frames, lens: Cameras | None, settings: ColmapSettings, folder: Path, progress: Progress
-) -> Reconstruction | NotComputed:
-    """Of the incremental and the global method's poses those that more of the verified matches agree with."""
-    best, most, failed = None, -1, ""
-    for method in ("incremental", "global"):
-        chosen = replace(settings, mapping=replace(settings.mapping, method=method))
-        try:
-            rec = colmap.reconstruct(frames, chosen, folder, progress, lens)
-        except RegistrationError as error:
-            failed = f"no reference: {error.what}"
-            continue
-        agreeing = int((retained_match_errors(rec) < 1).sum())
-        if agreeing > most:
-            best, most = rec, agreeing
-    return NotComputed(failed) if best is None else best
 
 
 def digest(reference: GroundTruth | NotComputed) -> str:

@@ -25,7 +25,7 @@ from swimm3r.io.atomic import atomic_path
 from swimm3r.io.colmap import ColmapModel, from_pycolmap, to_pycolmap
 from swimm3r.progress import Progress, silent
 from swimm3r.reconstruction import Caution, DepthMaps, Matches, Points, Reconstruction, Tracks, cameras_of, colmap_model
-from swimm3r.sfm import mapping, vlad
+from swimm3r.sfm import calibration, mapping, vlad
 from swimm3r.sfm.feature_database import FeatureDatabase, fill_features, match_pairs, start_database
 from swimm3r.sfm.plausibility import implausible
 from swimm3r.sfm.settings import ColmapSettings
@@ -60,7 +60,7 @@ def reconstruct(
     pycolmap.logging.minloglevel = pycolmap.logging.Level.ERROR.value  # its log is not for divers
     threads = settings.threads or os.cpu_count() or 1
     if lens is None:
-        camera = mapping.first_camera(frames.width, frames.height, settings)
+        camera = calibration.first_camera(frames.width, frames.height, settings)
     else:
         camera, settings = _lens(lens), replace(settings, intrinsics="fixed")
         camera.camera_id, camera.has_prior_focal_length = 1, True
@@ -173,10 +173,7 @@ def _map(
     progress: Progress,
 ) -> "tuple[pycolmap.Reconstruction, list[int], list[Caution]]":
     n, threads = len(frames), settings.threads or os.cpu_count() or 1
-    method = settings.mapping.method
-    if method == "auto":
-        method = "global" if n >= settings.mapping.global_from else "incremental"
-    models = mapping.map_frames(store, settings, method, progress)
+    models = mapping.map_frames(store, settings, progress)
     if not models:
         raise _too_few(0, n, settings)
     model = models[0]
@@ -185,15 +182,15 @@ def _map(
         again = [(i, j) for i, j in pairs if i not in placed or j not in placed]
         looser = replace(settings.features, max_ratio=settings.mapping.retry_ratio)
         match_pairs(store, again, looser, threads, progress, again=True)
-        model = mapping.refine(store, model, settings, progress).model  # a better lens places more
+        model = calibration.refine(store, model, settings, progress).model  # a better lens places more
         model = mapping.place_leftovers(store, model, settings, progress)
-    model = mapping.replace_misplaced(store, model, settings, progress)
+        model = mapping.replace_misplaced(store, model, settings, progress)
     sizes = [model.num_reg_images(), *(m.num_reg_images() for m in models[1:])]
     thin = model.compute_mean_observations_per_reg_image() < settings.mapping.thin_points
     share = settings.mapping.thin_share if thin else settings.mapping.min_share
     if sizes[0] < max(min(settings.mapping.min_frames, n), share * n):
         raise _too_few(sizes[0], n, settings)
-    mapped = mapping.refine(store, model, settings, progress)
+    mapped = calibration.refine(store, model, settings, progress)
     cautions = []
     if not mapped.refined and settings.intrinsics != "fixed":
         camera = mapped.model.cameras[1]

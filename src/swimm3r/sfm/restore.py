@@ -15,6 +15,7 @@ Near the camera all weights are 1 and J is the plain inverse. Nothing is stretch
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass
 
+import numpy as np
 import torch
 from jaxtyping import Bool, Float, Int
 from torch import Tensor
@@ -38,6 +39,7 @@ from swimm3r.sfm.tracks import DenseTracks, cubes, ray_depth_map, shared_rays
 MediumOfPixels = Callable[[str, Int[Tensor, " n"], Float[Tensor, " n"]], Medium]  # frame, pixels, ray depth
 
 _MAX_TINT = 1.0  # times the other channels, for blurred colours at a guessed distance
+_NEARLY_ALL = 0.95  # of the surfaces at known distance
 
 
 @dataclass(frozen=True)
@@ -158,17 +160,25 @@ def _not_beyond_white(
 ) -> Float[Tensor, "h w"]:
     """Ray depth, shortened where it is a guess until the blurred J is a colour that surfaces have.
 
-    That is below 0.9, and in the channel that the water takes first not far above the others: too long a path shows as
-    glaring red first.
+    That is below 0.9, and in the channel that the water takes first not far above the others (nor more than nearly all
+    surfaces of known depth are): too long a path shows as a glare of that channel first, mostly red.
     """
     first = int(fit.medium.beta_D.argmax())
     reach = 0.01 * max(I.shape[:2])
-    smooth, far = blur(I, reach)[guessed], ray_depth[guessed]
+    blurred = blur(I, reach)
+    smooth, far = blurred[guessed], ray_depth[guessed]
+
+    def tint(J: Float[Tensor, "n 3"]) -> Float[Tensor, " n"]:
+        others = torch.cat([J[:, :first], J[:, first + 1 :]], dim=-1).amax(-1)
+        return torch.where(others > 0, J[:, first] / others.clamp(min=1e-6), torch.inf)
+
+    measured = tint(remove_water(blurred[~guessed], ray_depth[~guessed], fit.at(ray_depth[~guessed])))
+    measured = measured[measured.isfinite()].numpy()
+    most = max(_MAX_TINT, float(np.quantile(measured, _NEARLY_ALL))) if len(measured) else _MAX_TINT
     shortened = torch.zeros_like(far)
     for trial in torch.linspace(0.05, 1.0, 20):
         J = remove_water(smooth, trial * far, fit.at(trial * far))
-        others = torch.cat([J[:, :first], J[:, first + 1 :]], dim=-1).amax(-1)
-        shortened = torch.where((J.amax(-1) < 0.9) & (J[:, first] < _MAX_TINT * others), trial, shortened)
+        shortened = torch.where((J.amax(-1) < 0.9) & (tint(J) < most), trial, shortened)
     share = torch.ones_like(ray_depth)
     share[guessed] = shortened
     return torch.where(guessed, ray_depth * blur(share[..., None], reach)[..., 0], ray_depth)

@@ -160,7 +160,7 @@ class MappingSettings:
     """From verified matches to cameras and points (`sfm/mapping.py`)."""
 
     method: Literal["auto", "incremental", "global"] = "auto"
-    """Auto takes the global method (GLOMAP) from `global_from` frames on."""
+    """Auto places clips below `global_from` frames both ways and keeps what explains more; above, globally (GLOMAP)."""
     global_from: int = 100
     lens_frames: int = 40
     """Best connected frames on which the lens is found before the global method places all."""
