@@ -245,6 +245,22 @@ def test_clear_water_shows_the_clear_image(backend: Backend, scene: Scene):
 
 
 @backends
+@kernels
+def test_clear_water_has_the_gradients_of_water_without_coefficients(backend: Backend, kernel: Kernel, scene: Scene):
+    p, _ = scene(60, 29, 37)
+    results = []
+    for way, medium in ((backend, None), ("reference", MediumMaps(*torch.zeros(3, 3, 29, 37, dtype=torch.float64)))):
+        leaves = [t.to(torch.float32 if medium is None else torch.float64).requires_grad_() for t in p]
+        sgg = SggBuffers(*(b.to(leaves[0]) for b in SggBuffers.zeros(60)))
+        out = rasterize(Primitives2D(*leaves), medium, 29, 37, kernel=kernel, sgg=sgg, backend=way)
+        rng = torch.Generator().manual_seed(9)
+        cotangent = [torch.randn(image.shape, generator=rng).to(leaves[0]) for image in out]
+        results.append([*out, *torch.autograd.grad(out, leaves, cotangent), *sgg])
+    for a, b in zip(*results, strict=True):
+        assert (a - b).norm() <= 2e-5 * b.norm() + 1e-6
+
+
+@backends
 def test_the_depth_branch_alone_is_the_isolated_depth_gradient(backend: Backend, scene: Scene):
     p, medium = scene(60, 29, 37)
     p, medium = Primitives2D(*(t.float() for t in p)), MediumMaps(*(t.float() for t in medium))

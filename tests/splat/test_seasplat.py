@@ -204,7 +204,7 @@ def test_water_learns_in_bursts_alone_and_they_move_nothing_else(recipe):
 def test_the_bursts_have_their_published_lengths(recipe):
     of = recipe()
     drawn = []
-    object.__setattr__(of, "_views", lambda step, purpose, count: drawn.append((purpose, round(count))) or [])
+    object.__setattr__(of, "_draws", lambda step, purpose, count: drawn.append((purpose, round(count))) or [])
     of._filled(of.start(), 10_001)
     assert drawn == [(10, 1000), (11, 2000)]
     assert of._dry_steps() == 10_000

@@ -93,18 +93,18 @@ def rasterize(
         raise ValueError(f"bins hold {len(bins.packed)} primitives, got {len(p.mean2d)}")
     if backend == "auto":
         backend = "warp" if p.mean2d.is_cuda else "numba"
-    if medium is None:
+    if medium is None and backend != "numba":  # which has kernels without water
         medium = MediumMaps(*p.mean2d.new_zeros(3, 3, height, width))
     dtype = p.mean2d.dtype
     if backend == "reference":
         job = _Job(backend, height, width, alpha_min, kernel, sgg, None, medium_depth_grad)
-        return RasterOutput(*_Rasterize.apply(job, *p, *medium))
+        return RasterOutput(*_Rasterize.apply(job, *p, *(medium or ())))
     p = Primitives2D(*(t.float().contiguous() for t in p))
-    medium = MediumMaps(*(t.float().contiguous() for t in medium))
+    maps = [t.float().contiguous() for t in medium or ()]
     if bins is None:
         bins = _kernels(backend).bin_primitives(_detached(p), height, width, alpha_min, kernel)
     job = _Job(backend, height, width, alpha_min, kernel, sgg, bins, medium_depth_grad)
-    return RasterOutput(*(image.to(dtype) for image in _Rasterize.apply(job, *p, *medium)))
+    return RasterOutput(*(image.to(dtype) for image in _Rasterize.apply(job, *p, *maps)))
 
 
 @dataclass(frozen=True)
@@ -126,8 +126,9 @@ class _Rasterize(torch.autograd.Function):
 
     @staticmethod
     def forward(ctx: Any, job: _Job, *tensors: Tensor) -> tuple[Tensor, ...]:
-        p, medium = Primitives2D(*tensors[:6]), MediumMaps(*tensors[6:])
+        p, medium = Primitives2D(*tensors[:6]), MediumMaps(*tensors[6:]) if tensors[6:] else None
         if job.bins is None:
+            assert medium is not None
             out = reference.render(p, medium, job.height, job.width, job.alpha_min, job.kernel)
         else:
             out = _kernels(job.backend).forward(job.bins, p, medium)
@@ -139,10 +140,12 @@ class _Rasterize(torch.autograd.Function):
     @torch.autograd.function.once_differentiable
     def backward(ctx: Any, *cotangents: Tensor) -> tuple[Tensor | None, ...]:
         job, saved = ctx.job, ctx.saved_tensors
-        p, medium, out = Primitives2D(*saved[:6]), MediumMaps(*saved[6:9]), RasterOutput(*saved[9:])
+        p, maps, out = Primitives2D(*saved[:6]), saved[6:-4], RasterOutput(*saved[-4:])
+        medium = MediumMaps(*maps) if maps else None
         cotangent = RasterOutput(*cotangents)
         parts = job.sgg if job.medium_depth_grad else _zeros(p)
         if job.bins is None:
+            assert medium is not None
             grads, medium_grads = reference.adjoint(
                 p, medium, job.height, job.width, job.alpha_min, job.kernel, cotangent, parts
             )
@@ -155,7 +158,7 @@ class _Rasterize(torch.autograd.Function):
             grads = grads._replace(depth=parts.depth_iso[:, 2])
             for given, part in zip(job.sgg or (), parts, strict=False):
                 given += part
-        return None, *grads, *(medium_grads or (None, None, None))
+        return None, *grads, *(medium_grads or (None,) * len(maps))
 
 
 def _kernels(backend: Backend) -> ModuleType:

@@ -21,21 +21,24 @@ from swimm3r.raster.records import Bins, CpuBins, MediumMaps, Primitives2D, Rast
 __all__ = ["backward", "bin_primitives", "forward"]
 
 
-def forward(bins: Bins, p: Primitives2D, medium: MediumMaps) -> RasterOutput:
-    """The four images."""
+def forward(bins: Bins, p: Primitives2D, medium: MediumMaps | None) -> RasterOutput:
+    """The four images; without a medium, rgb is a copy of the clear one."""
     height, width = bins.height, bins.width
     shapes = ((3, height, width), (3, height, width), (height, width), (height, width))
     out = RasterOutput(*(torch.empty(shape) for shape in shapes))
     lists = (bins.packed, bins.tile_start, bins.ids, _lists(bins).blocks)
-    arguments: tuple[Any, ...] = (*_arrays((*lists, *medium, *out)), _gaussian(bins))
+    maps = (None,) * 3 if medium is None else _arrays(medium)
+    arguments: tuple[Any, ...] = (*_arrays(lists), *maps, *_arrays(out), _gaussian(bins))
     _spread(lambda first, beyond: forward_tiles(first, beyond, *arguments), bins.tile_start.numpy())
+    if medium is None:
+        out.rgb.copy_(out.clear)
     return out
 
 
 def backward(
     bins: Bins,
     p: Primitives2D,
-    medium: MediumMaps,
+    medium: MediumMaps | None,
     out: RasterOutput,
     cotangent: RasterOutput,
     sgg: SggBuffers | None,
@@ -43,14 +46,19 @@ def backward(
 ) -> tuple[Primitives2D, MediumMaps | None]:
     """Gradients of the primitives and, where wanted, of the medium maps; adds to `sgg`."""
     grads = Primitives2D(*(torch.zeros_like(t) for t in p))
-    medium_grads = MediumMaps(*(torch.empty_like(t) for t in medium)) if with_medium else None
+    medium_grads = MediumMaps(*(torch.empty_like(t) for t in medium)) if medium is not None and with_medium else None
     own = _lists(bins)
     slots = np.empty((len(bins.ids), PLAIN if sgg is None else WITH_SGG), np.float32)
     lists = (bins.packed, bins.tile_start, bins.ids, own.blocks, own.slot)
-    images = (*medium, *(g.contiguous() for g in cotangent), *out)
+    g_rgb, g_clear, g_z, g_alpha = (g.contiguous() for g in cotangent)
+    images: tuple[Any, ...]
+    if medium is None:
+        images = (*(None,) * 4, *_arrays((g_rgb + g_clear, g_z, g_alpha)), None, *_arrays(out[1:]))
+    else:
+        images = _arrays((*medium, g_rgb, g_clear, g_z, g_alpha, *out))
     d_medium = (None,) * 3 if medium_grads is None else _arrays(medium_grads)
     with_sgg = None if sgg is None else True
-    arguments: tuple[Any, ...] = (*_arrays((*lists, *images)), slots, *d_medium, with_sgg, _gaussian(bins))
+    arguments: tuple[Any, ...] = (*_arrays(lists), *images, slots, *d_medium, with_sgg, _gaussian(bins))
     _spread(lambda first, beyond: adjoint_tiles(first, beyond, *arguments), bins.tile_start.numpy())
     buffers = (None,) * 5 if sgg is None else _arrays(sgg)
     totals: tuple[Any, ...] = (*_arrays((bins.packed, own.order, own.first_slot)), slots, *_arrays(grads), *buffers)

@@ -18,7 +18,7 @@ import numpy as np
 from numba import njit
 
 from swimm3r.raster import bins, numba_math, pairmath
-from swimm3r.raster.bins import COLOR, CONIC_A, CONIC_B, CONIC_C, DEPTH, EXPONENT, LOG2_O, MEAN_X, MEAN_Y, R2_MAX
+from swimm3r.raster.bins import COLOR, CONIC_A, DEPTH, EXPONENT, LOG2_O, MEAN_X, MEAN_Y, R2_MAX
 from swimm3r.raster.numba_math import (
     any_positive,
     disordered,
@@ -120,14 +120,15 @@ def copy_four(source, i, target, j):
 def gather(ws, row, image, tile_y, tile_x):
     """Copy one tile of an image into a row; beyond the image its edge repeats."""
     height, width = image.shape
+    flat = image.ravel()
     for y in range(TILE):
-        line = image[min(tile_y + y, height - 1)]
+        line = min(tile_y + y, height - 1) * width
         if tile_x + TILE <= width:
             for x in range(0, TILE, 4):
-                copy_four(line, np.uintp(tile_x + x), ws, row + block_order(y, x))
+                copy_four(flat, np.uintp(line + tile_x + x), ws, row + block_order(y, x))
         else:
             for x in range(TILE):
-                ws[row + block_order(y, x)] = line[np.uintp(min(tile_x + x, width - 1))]
+                ws[row + block_order(y, x)] = flat[np.uintp(line + min(tile_x + x, width - 1))]
 
 
 @no_type_check
@@ -135,14 +136,15 @@ def gather(ws, row, image, tile_y, tile_x):
 def put_back(ws, row, image, tile_y, tile_x):
     """Copy a row into its tile of an image."""
     height, width = image.shape
+    flat = image.ravel()
     for y in range(min(TILE, height - tile_y)):
-        line = image[tile_y + y]
+        line = (tile_y + y) * width
         if tile_x + TILE <= width:
             for x in range(0, TILE, 4):
-                copy_four(ws, row + block_order(y, x), line, np.uintp(tile_x + x))
+                copy_four(ws, row + block_order(y, x), flat, np.uintp(line + tile_x + x))
         else:
             for x in range(width - tile_x):
-                line[np.uintp(tile_x + x)] = ws[row + block_order(y, x)]
+                flat[np.uintp(line + tile_x + x)] = ws[row + block_order(y, x)]
 
 
 @no_type_check
@@ -162,6 +164,22 @@ def centred(ws):
         ws[MIDDLE + np.uintp(k)] = middle
         spread = maximum(spread, maximum(disordered(most) - middle, middle - disordered(least)))
     return spread
+
+
+@no_type_check
+@numba_math.inlined
+def channels(matrix, i, column):
+    """Three neighbours in a row."""
+    column = np.uintp(column)
+    return matrix[i, column], matrix[i, column + UP1], matrix[i, column + UP2]
+
+
+@no_type_check
+@numba_math.inlined
+def put_sums(slots, own, column, sums):
+    """Write neighbours in a row."""
+    for k in range(len(sums)):
+        slots[own, np.uintp(column + k)] = sums[k]
 
 
 @no_type_check
@@ -198,18 +216,19 @@ def through_water(departure, z, middle, at_middle, far):
 @no_type_check
 @numba_math.inlined
 def add_light(ws, blocks, n, color, z, middle, at_middle, far):
-    """Add the pairs of n blocks, whose weights are known, to the pictures."""
+    """Add the pairs of n blocks, whose weights are known, to the pictures; no `middle`, no water."""
     full_width_vectors()
     for j in range(n):
         first = blocks[j]
         for q in range(first, first + BLOCK):
             w = ws[W + q]
-            E_B = through_water((ws[KB0 + q], ws[KB1 + q], ws[KB2 + q]), z, middle[0], at_middle[0], far)
-            E_D = through_water((ws[KD0 + q], ws[KD1 + q], ws[KD2 + q]), z, middle[1], at_middle[1], far)
-            F = seen_colour(color, (ws[B0 + q], ws[B1 + q], ws[B2 + q]), E_B, E_D)
-            ws[I0 + q] += w * F[0]
-            ws[I1 + q] += w * F[1]
-            ws[I2 + q] += w * F[2]
+            if middle is not None:
+                E_B = through_water((ws[KB0 + q], ws[KB1 + q], ws[KB2 + q]), z, middle[0], at_middle[0], far)
+                E_D = through_water((ws[KD0 + q], ws[KD1 + q], ws[KD2 + q]), z, middle[1], at_middle[1], far)
+                F = seen_colour(color, (ws[B0 + q], ws[B1 + q], ws[B2 + q]), E_B, E_D)
+                ws[I0 + q] += w * F[0]
+                ws[I1 + q] += w * F[1]
+                ws[I2 + q] += w * F[2]
             ws[J0 + q] += w * color[0]
             ws[J1 + q] += w * color[1]
             ws[J2 + q] += w * color[2]
@@ -226,6 +245,8 @@ def begin_tile(ws, tile_y, tile_x, height, width, binf, beta_b, beta_d):
             ws[X + q], ws[Y + q] = np.float32(x) + HALF, np.float32(y) + HALF
             # a pixel outside the image has ended before it begins
             ws[T + q] = ONE if tile_y + y < height and tile_x + x < width else -ONE
+    if binf is None:
+        return ZERO
     for k in range(3):
         row = np.uintp(k * STRIDE)
         gather(ws, B0 + row, binf[k], tile_y, tile_x)
@@ -278,7 +299,7 @@ def forward_tiles(
     gaussian,
     sources=SOURCES,
 ):
-    """Images of the tiles first_tile..beyond-1."""
+    """Images of the tiles first_tile..beyond-1; without water (None for the maps) the clear one is all there is."""
     full_width_vectors()
     height, width = z_depth.shape
     columns = (width + TILE - 1) // TILE
@@ -287,7 +308,6 @@ def forward_tiles(
         tile_y, tile_x = (tile // columns) * TILE, (tile % columns) * TILE
         spread = begin_tile(ws, tile_y, tile_x, height, width, binf, beta_b, beta_d)
         ws[I0:] = ZERO
-        middle = middle_of(ws)
         begin, end = tile_start[tile], tile_start[tile + 1]
         live = live_blocks(ws)
         for entry in range(begin, end):
@@ -296,12 +316,11 @@ def forward_tiles(
                 if live == 0:
                     break
             prefetch(packed, ids[min(entry + AHEAD, end - 1)])
-            p = packed[ids[entry]]
+            i = np.uintp(ids[entry])  # no view of the row: counting references to it is atomic, and stalls
             n = list_blocks(masks[entry] & live, blocks)
-            mean_x, mean_y = p[MEAN_X] - np.float32(tile_x), p[MEAN_Y] - np.float32(tile_y)
-            conic, color = (p[CONIC_A], p[CONIC_B], p[CONIC_C]), (p[COLOR], p[COLOR + 1], p[COLOR + 2])
-            log2_o, exponent, r2_max, z = p[LOG2_O], p[EXPONENT], p[R2_MAX], p[DEPTH]
-            at_middle = transmittance(middle[0], z), transmittance(middle[1], z)
+            mean_x, mean_y = packed[i, MEAN_X] - np.float32(tile_x), packed[i, MEAN_Y] - np.float32(tile_y)
+            log2_o, exponent, r2_max, z = packed[i, LOG2_O], packed[i, EXPONENT], packed[i, R2_MAX], packed[i, DEPTH]
+            conic, color = channels(packed, i, CONIC_A), channels(packed, i, COLOR)
             for j in range(n):
                 first = blocks[j]
                 for q in range(first, first + BLOCK):
@@ -309,17 +328,23 @@ def forward_tiles(
                     _, log_f = falloff(r2, gaussian)
                     alpha, _ = coverage(r2, log_f, log2_o, exponent, r2_max)
                     ws[W + q], ws[T + q] = advance(ws[T + q], alpha)
-            if z * spread <= HALF:
-                add_light(ws, blocks, n, color, z, middle, at_middle, None)
+            if binf is None:
+                add_light(ws, blocks, n, color, z, None, None, None)
             else:
-                add_light(ws, blocks, n, color, z, middle, at_middle, True)
+                middle = middle_of(ws)
+                at_middle = transmittance(middle[0], z), transmittance(middle[1], z)
+                if z * spread <= HALF:
+                    add_light(ws, blocks, n, color, z, middle, at_middle, None)
+                else:
+                    add_light(ws, blocks, n, color, z, middle, at_middle, True)
         for q in range(np.uintp(PIXELS)):
-            ws[I0 + q] += ws[B0 + q]
-            ws[I1 + q] += ws[B1 + q]
-            ws[I2 + q] += ws[B2 + q]
             ws[T + q] = ONE - abs(ws[T + q])
         for k in range(3):
-            put_back(ws, I0 + np.uintp(k * STRIDE), rgb[k], tile_y, tile_x)
+            if binf is not None:
+                I, B = I0 + np.uintp(k * STRIDE), B0 + np.uintp(k * STRIDE)
+                for q in range(np.uintp(PIXELS)):
+                    ws[I + q] += ws[B + q]
+                put_back(ws, I, rgb[k], tile_y, tile_x)
             put_back(ws, J0 + np.uintp(k * STRIDE), clear[k], tile_y, tile_x)
         put_back(ws, Z, z_depth, tile_y, tile_x)
         put_back(ws, T, alpha_out, tile_y, tile_x)
@@ -331,25 +356,27 @@ def begin_adjoint(ws, tile_y, tile_x, g_rgb, g_clear, g_z, g_alpha, rgb, clear, 
     """dL/d image of a tile's pixels, and R = sum_j w_j e_j of the three payloads, which the forward images know."""
     for k in range(3):
         row = np.uintp(k * STRIDE)
-        gather(ws, G0 + row, g_rgb[k], tile_y, tile_x)
         gather(ws, C0 + row, g_clear[k], tile_y, tile_x)
-        gather(ws, VB0 + row, rgb[k], tile_y, tile_x)
         gather(ws, ZB0 + row, clear[k], tile_y, tile_x)
+        if rgb is not None:
+            gather(ws, G0 + row, g_rgb[k], tile_y, tile_x)
+            gather(ws, VB0 + row, rgb[k], tile_y, tile_x)
     gather(ws, GZ, g_z, tile_y, tile_x)
     gather(ws, GA, g_alpha, tile_y, tile_x)
     gather(ws, ZD0, z_depth, tile_y, tile_x)
     gather(ws, ZD1, alpha_out, tile_y, tile_x)
     for q in range(np.uintp(PIXELS)):
+        g_clear_q, J = (ws[C0 + q], ws[C1 + q], ws[C2 + q]), (ws[ZB0 + q], ws[ZB1 + q], ws[ZB2 + q])
         depth = ws[GZ + q] * ws[ZD0 + q]
-        both = depth + ws[GA + q] * ws[ZD1 + q]
-        g, g_clear_q = (ws[G0 + q], ws[G1 + q], ws[G2 + q]), (ws[C0 + q], ws[C1 + q], ws[C2 + q])
-        J, B = (ws[ZB0 + q], ws[ZB1 + q], ws[ZB2 + q]), (ws[B0 + q], ws[B1 + q], ws[B2 + q])
-        image = g[0] * (ws[VB0 + q] - B[0]) + g[1] * (ws[VB1 + q] - B[1]) + g[2] * (ws[VB2 + q] - B[2])
-        other = g_clear_q[0] * J[0] + g_clear_q[1] * J[1] + g_clear_q[2] * J[2] + both
-        ws[RF + q] = image + other
-        ws[RG + q] = g[0] * J[0] + g[1] * J[1] + g[2] * J[2] + other
-        ws[RD + q] = depth
-        ws[B0 + q], ws[B1 + q], ws[B2 + q] = g[0] * B[0], g[1] * B[1], g[2] * B[2]
+        other = depth + ws[GA + q] * ws[ZD1 + q]
+        other += g_clear_q[0] * J[0] + g_clear_q[1] * J[1] + g_clear_q[2] * J[2]
+        ws[RF + q], ws[RG + q], ws[RD + q] = other, other, depth
+        if rgb is not None:
+            g, B = (ws[G0 + q], ws[G1 + q], ws[G2 + q]), (ws[B0 + q], ws[B1 + q], ws[B2 + q])
+            image = g[0] * (ws[VB0 + q] - B[0]) + g[1] * (ws[VB1 + q] - B[1]) + g[2] * (ws[VB2 + q] - B[2])
+            ws[RF + q] = image + other
+            ws[RG + q] = g[0] * J[0] + g[1] * J[1] + g[2] * J[2] + other
+            ws[B0 + q], ws[B1 + q], ws[B2 + q] = g[0] * B[0], g[1] * B[1], g[2] * B[2]
     ws[VB0:] = ZERO
 
 
@@ -375,17 +402,18 @@ def take_light(ws, pairs, blocks, n, color, z, middle, at_middle, with_sgg, d_bi
     full_width_vectors()
     for j in range(n):
         first, pair = blocks[j], BLOCK * np.uintp(j)
-        for i in range(BLOCK):
-            q, c = first + i, pair + i
+        for k in range(BLOCK):
+            q, c = first + k, pair + k
             w = pairs[PW + c]
-            d_b, d_d = (ws[KB0 + q], ws[KB1 + q], ws[KB2 + q]), (ws[KD0 + q], ws[KD1 + q], ws[KD2 + q])
-            E_B, E_D = (
-                through_water(d_b, z, middle[0], at_middle[0], far),
-                through_water(d_d, z, middle[1], at_middle[1], far),
-            )
-            k_b, k_d = plus(middle[0], d_b), plus(middle[1], d_d)
-            g, g_veil = (ws[G0 + q], ws[G1 + q], ws[G2 + q]), (ws[B0 + q], ws[B1 + q], ws[B2 + q])
             g_clear = (ws[C0 + q], ws[C1 + q], ws[C2 + q])
+            if middle is None:
+                g = g_veil = E_B = E_D = k_b = k_d = (ZERO, ZERO, ZERO)  # and the compiler leaves out what they enter
+            else:
+                g, g_veil = (ws[G0 + q], ws[G1 + q], ws[G2 + q]), (ws[B0 + q], ws[B1 + q], ws[B2 + q])
+                d_b, d_d = (ws[KB0 + q], ws[KB1 + q], ws[KB2 + q]), (ws[KD0 + q], ws[KD1 + q], ws[KD2 + q])
+                E_B = through_water(d_b, z, middle[0], at_middle[0], far)
+                E_D = through_water(d_d, z, middle[1], at_middle[1], far)
+                k_b, k_d = plus(middle[0], d_b), plus(middle[1], d_d)
             slope = colour_slope(g, g_clear, E_D)
             full, geo, depth = payloads(color, z, E_B, slope, g, g_veil, g_clear, ws[GZ + q], ws[GA + q])
             pairs[S0 + c] = w * slope[0]
@@ -422,7 +450,7 @@ def adjoint_tiles(
 ):  # fmt: skip
     """Slots and water gradients of the tiles first_tile..beyond-1.
 
-    None for `with_sgg` or `d_binf` leaves that part out.
+    None for `with_sgg` or `d_binf` leaves that part out; without water, None for the maps, rgb and g_rgb.
     """
     full_width_vectors()
     height, width = z_depth.shape
@@ -432,29 +460,28 @@ def adjoint_tiles(
         tile_y, tile_x = (tile // columns) * TILE, (tile % columns) * TILE
         spread = begin_tile(ws, tile_y, tile_x, height, width, binf, beta_b, beta_d)
         begin_adjoint(ws, tile_y, tile_x, g_rgb, g_clear, g_z, g_alpha, rgb, clear, z_depth, alpha_out)
-        middle = middle_of(ws)
         begin, end = tile_start[tile], tile_start[tile + 1]
         live = live_blocks(ws)
         for entry in range(begin, end):
-            out = slots[slot[entry]]
+            own = np.uintp(slot[entry])
             if (entry - begin) % CHECK == CHECK - 1:
                 live = live_blocks(ws)
             if live == 0:
-                out[:] = ZERO
+                for k in range(slots.shape[1]):
+                    slots[own, np.uintp(k)] = ZERO
                 continue
             prefetch(packed, ids[min(entry + AHEAD, end - 1)])
-            p = packed[ids[entry]]
+            i = np.uintp(ids[entry])
             n = list_blocks(masks[entry] & live, blocks)
-            mean_x, mean_y = p[MEAN_X] - np.float32(tile_x), p[MEAN_Y] - np.float32(tile_y)
-            conic, color = (p[CONIC_A], p[CONIC_B], p[CONIC_C]), (p[COLOR], p[COLOR + 1], p[COLOR + 2])
-            log2_o, exponent, r2_max, z = p[LOG2_O], p[EXPONENT], p[R2_MAX], p[DEPTH]
-            at_middle = transmittance(middle[0], z), transmittance(middle[1], z)
+            mean_x, mean_y = packed[i, MEAN_X] - np.float32(tile_x), packed[i, MEAN_Y] - np.float32(tile_y)
+            log2_o, exponent, r2_max, z = packed[i, LOG2_O], packed[i, EXPONENT], packed[i, R2_MAX], packed[i, DEPTH]
+            conic, color = channels(packed, i, CONIC_A), channels(packed, i, COLOR)
             mx = my = xx = xy = yy = red = green = blue = opacity = beta = z_water = z_direct = ZERO
             geo_x = geo_y = abs_geo_x = abs_geo_y = abs_x = abs_y = depth_x = depth_y = ZERO
             for j in range(n):
                 first, pair = blocks[j], BLOCK * np.uintp(j)
-                for i in range(BLOCK):
-                    q, c = first + i, pair + i
+                for k in range(BLOCK):
+                    q, c = first + k, pair + k
                     before = ws[T + q]
                     dx, dy = ws[X + q] - mean_x, ws[Y + q] - mean_y
                     r2 = squared_distance(dx, dy, conic)
@@ -463,10 +490,15 @@ def adjoint_tiles(
                     w, ws[T + q] = advance(before, alpha)
                     pairs[DX + c], pairs[DY + c], pairs[U + c], pairs[LOG_F + c], pairs[PW + c] = dx, dy, u, log_f, w
                     pairs[P + c], pairs[Q + c] = shape_slopes(w, before, alpha, shaped, u)
-            if z * spread <= HALF:
-                take_light(ws, pairs, blocks, n, color, z, middle, at_middle, with_sgg, d_binf, None)
+            if binf is None:
+                take_light(ws, pairs, blocks, n, color, z, None, None, with_sgg, d_binf, None)
             else:
-                take_light(ws, pairs, blocks, n, color, z, middle, at_middle, with_sgg, d_binf, True)
+                middle = middle_of(ws)
+                at_middle = transmittance(middle[0], z), transmittance(middle[1], z)
+                if z * spread <= HALF:
+                    take_light(ws, pairs, blocks, n, color, z, middle, at_middle, with_sgg, d_binf, None)
+                else:
+                    take_light(ws, pairs, blocks, n, color, z, middle, at_middle, with_sgg, d_binf, True)
             for c in range(BLOCK * np.uintp(n)):
                 dx, dy, t = pairs[DX + c], pairs[DY + c], pairs[TF + c]
                 half_x, half_y = half_slope(dx, dy, conic)
@@ -493,12 +525,9 @@ def adjoint_tiles(
                     abs_geo_y += abs(t_geo * half_y)
                     depth_x += t_depth * half_x
                     depth_y += t_depth * half_y
-            out[MEAN], out[MEAN + 1], out[CONIC], out[CONIC + 1], out[CONIC + 2] = mx, my, xx, xy, yy
-            out[COL], out[COL + 1], out[COL + 2] = red, green, blue
-            out[OPACITY], out[BETA], out[Z_WATER], out[Z_DIRECT] = opacity, beta, z_water, z_direct
+            put_sums(slots, own, MEAN, (mx, my, xx, xy, yy, red, green, blue, opacity, beta, z_water, z_direct))
             if with_sgg is not None:
-                out[GEO], out[GEO + 1], out[GEO_ABS], out[GEO_ABS + 1] = geo_x, geo_y, abs_geo_x, abs_geo_y
-                out[FULL_ABS], out[FULL_ABS + 1], out[DEPTH_MEAN], out[DEPTH_MEAN + 1] = abs_x, abs_y, depth_x, depth_y
+                put_sums(slots, own, GEO, (geo_x, geo_y, abs_geo_x, abs_geo_y, abs_x, abs_y, depth_x, depth_y))
         if d_binf is not None:
             end_adjoint(ws, tile_y, tile_x, d_binf, d_beta_b, d_beta_d)
 

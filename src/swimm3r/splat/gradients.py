@@ -103,7 +103,7 @@ def differentiate(
     found = torch.autograd.grad(loss, wanted, materialize_grads=True)
     gradients, g0, on_images = found[: len(leaves)], found[len(leaves)], found[len(leaves) + 1 :]
     branches = Branches(buffers.geo, buffers.med, buffers.geo_abs)
-    if sgg.split == "direct":
+    if sgg.split == "direct" and drawing.maps is not None:
         branches = _direct(drawing, on_images, g0, settings.render.alpha_min)
     on_plane = filtered_gradient(branches, sgg.residual) - g0
     if apart and alone is not None:
@@ -123,6 +123,7 @@ def _direct(drawing: Drawing, on_images: tuple[Tensor, ...], g0: Float[Tensor, "
     Light without veil is what water of no colour shows, so one more pass through such water tells the two apart.
     """
     p, maps = drawing.projection.primitives, drawing.maps
+    assert maps is not None
     p = p._replace(**{name: t.detach() for name, t in p._asdict().items()})
     p = p._replace(mean2d=p.mean2d.requires_grad_())
     dark = maps._replace(binf=torch.zeros_like(maps.binf), beta_b=maps.beta_b.detach(), beta_d=maps.beta_d.detach())

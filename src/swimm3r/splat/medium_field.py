@@ -45,11 +45,16 @@ class MediumField(nn.Module):
             self.gamma, self.network = None, nn.Sequential()
         self.register_buffer("length", torch.ones(()))
 
+    @property
+    def is_clear(self) -> bool:
+        """Whether there is no water, wherever one looks."""
+        return not len(self.network)
+
     def forward(
         self, directions: Float[Tensor, "h w 3"], time: Float[Tensor, ""] | None = None
     ) -> Float[Tensor, "9 h w"]:
         """Binf, beta_B and beta_D, in this order, of unit directions in world axes, at a time in 0..1 of the clip."""
-        if not len(self.network):
+        if self.is_clear:
             return directions.new_zeros(9, *directions.shape[:2])
         features = spherical_harmonics(directions)
         if self.gamma is not None:

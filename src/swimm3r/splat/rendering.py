@@ -84,7 +84,7 @@ class Drawing:
     images: RasterOutput
     projection: Projection
     grid: FieldGrid
-    maps: MediumMaps  # as the rasteriser reads them, per unit of z depth
+    maps: MediumMaps | None  # as the rasteriser reads them, per unit of z depth; None in clear water
     sgg: SggBuffers | None  # filled when the gradient is taken
     time: Float[Tensor, ""] | None = None  # that primitives were conditioned on
 
@@ -101,8 +101,8 @@ def draw(
     time = time if p.dynamic else None
     projection = project(p, view, settings.render, time)
     grid = grid_of(field, view, field.stride, time)
-    maps = medium_at_pixels(grid, view.height, view.width)
-    if settings.render.depth == "ray":
+    maps = None if field.is_clear else medium_at_pixels(grid, view.height, view.width)
+    if maps is not None and settings.render.depth == "ray":
         maps = per_z_depth(maps, view)
     buffers = SggBuffers.zeros(len(p.xyz), p.xyz.device) if sgg else None
     images = rasterize(

@@ -15,6 +15,7 @@ short runs rounds are `min_every` steps apart at least, rates grow (`haste`), an
 """
 
 from dataclasses import dataclass
+from functools import lru_cache
 
 import torch
 from jaxtyping import Bool, Float
@@ -34,6 +35,7 @@ from swimm3r.splat.views import View
 
 UnderWater = State[GaussianPrimitives, SceneWater]
 _SMOOTH = 0.2  # of smooth-L1
+_KEPT = 32  # pictures, of the Gaussians that stand still while the water learns
 
 
 @dataclass(frozen=True)
@@ -89,7 +91,8 @@ class SeaSplat:
         state = State(state.primitives, state.field, state.poses, moments, state.memory)
         water = self.settings.water
         self._water_burst(state, step, water.first_burst * self.settings.iterations)
-        for view in self._views(step, 11, water.colour_burst * self.settings.iterations):
+        for k in self._draws(step, 11, water.colour_burst * self.settings.iterations):
+            view = self.site.views[k]
             seen = look(self.site, state, view, self.settings, step)
             gradients = seen.gradients(
                 objective(seen.drawing.images, state.field, view, self.settings.weights, True).total
@@ -104,19 +107,24 @@ class SeaSplat:
         """Steps of the water alone."""
         parameters: dict[str, Tensor] = {f"{FIELD}{name}": t for name, t in state.field.named_parameters()}
         rates = dict.fromkeys(parameters, self.settings.water.rate)
-        for view in self._views(step, 10, count):
+
+        @lru_cache(maxsize=_KEPT)
+        def as_it_stands(k: int) -> tuple[View, RasterOutput]:
+            view = self.site.views[k]
             with torch.no_grad():
-                images = look(self.site, state, view, self.settings, step).drawing.images
+                return view, look(self.site, state, view, self.settings, step).drawing.images
+
+        for k in self._draws(step, 10, count):
+            view, images = as_it_stands(k)
             loss = objective(images, state.field, view, self.settings.weights, True).total
             found = torch.autograd.grad(loss, list(parameters.values()), materialize_grads=True)
             with torch.no_grad():
                 adam_step(parameters, dict(zip(parameters, found, strict=True)), state.moments, rates)
 
-    def _views(self, step: int, purpose: int, count: float) -> list[View]:
+    def _draws(self, step: int, purpose: int, count: float) -> list[int]:
         """Some views, drawn anew each time."""
         rng = training.generator(self.settings.seed, step, purpose)
-        drawn = torch.randint(len(self.site.views), (max(1, round(count)),), generator=rng)
-        return [self.site.views[k] for k in drawn.tolist()]
+        return torch.randint(len(self.site.views), (max(1, round(count)),), generator=rng).tolist()
 
     def _round(self, state: UnderWater, step: int) -> UnderWater:
         """Multiply and cull, and cut opacities back, each on its cadence."""
@@ -180,8 +188,8 @@ def covered_background(
     shown: Float[Tensor, "3 h w"], alpha: Float[Tensor, "h w"], water: SceneWater, view: View, w: SeaSplatWeights
 ) -> Float[Tensor, ""]:
     """Mean alpha of the pixels that have the colour of the open water: nothing should stand there. 0 without any."""
-    off = torch.linalg.vector_norm(shown.detach() - water.Binf.detach()[:, None, None], dim=0)
-    open_water = (off < w.background_distance) & view.seen
+    off = (shown.detach() - water.Binf.detach()[:, None, None]).square().sum(0)  # vector_norm is 30 times as slow
+    open_water = (off < w.background_distance**2) & view.seen
     return torch.where(open_water, alpha, 0.0).sum() / open_water.sum().clamp(min=1)
 
 
