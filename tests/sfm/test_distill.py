@@ -14,6 +14,7 @@ from swimm3r.sfm.distill import (
     features,
     forward_loss,
     inverse_loss,
+    known_water_loss,
     overshoot_loss,
     physics_terms,
     squared_distance,
@@ -42,8 +43,10 @@ def scene(b: int = 2, seed: int = 0) -> tuple[torch.Tensor, torch.Tensor, Medium
 
 
 def test_the_paper_weighs_encoder_and_decoder_by_a_half_descriptors_by_two_and_the_rest_by_one():
-    ones = [torch.tensor([v]) for v in (1.0, 10.0, 100.0, 1e3, 1e4, 1e5, 1e6, 1e7)]
+    ones = [torch.tensor([v]) for v in (1.0, 10.0, 100.0, 1e3, 1e4, 1e5, 1e6, 1e7, 1e8)]
     assert LossTerms(*ones).total(PAPER).item() == 0.5 + 5.0 + 200.0 + 1e3 + 1e4 + 1e5 + 0.5e6
+    told = replace(PAPER, known_water=4.0)
+    assert LossTerms(*ones).total(told).item() == pytest.approx(LossTerms(*ones).total(PAPER).item() + 4e7, rel=1e-6)
 
 
 def test_squared_distances_by_hand():
@@ -208,6 +211,32 @@ def test_a_batch_is_the_mean_of_its_frames():
         alone = physics_terms(*(t[k : k + 1] for t in (I, J, z, valid)), own, PAPER)
         for name in ("forward", "inverse", "overshoot", "anchor"):
             torch.testing.assert_close(getattr(alone, name)[0], getattr(together, name)[k])
+
+
+def test_known_water_by_hand():
+    ln2 = torch.log(torch.tensor(2.0)).item()
+    drawn = torch.tensor([[[0.4, 0.4, 0.4], [ln2, ln2, 2 * ln2], [ln2, ln2, ln2]]])
+    found = Medium(torch.tensor([0.4, 0.8, 0.4]), torch.tensor([ln2, ln2, ln2]), torch.tensor([ln2, ln2, ln2]))
+    # at z = 1 blue's T_D is 1/2 instead of 1/4, green's B 0.4 instead of 0.2; at z = 0 any water is right
+    z = torch.tensor([[[1.0, 0.0]]])
+    torch.testing.assert_close(known_water_loss(z, ALL, found, drawn), torch.tensor([(0.25 + 0.2) / 2]))
+
+
+def test_only_frames_whose_water_was_drawn_are_compared_with_it():
+    _, z, medium = scene()
+    drawn = torch.stack([medium.Binf[:, 0, 0], medium.beta_D[:, 0, 0], medium.beta_B[:, 0, 0]], dim=1)
+    z[:, 0, 0] = torch.nan
+    assert (known_water_loss(z, ~z.isnan(), medium, drawn) < 1e-6).all()
+    drawn[1] = torch.nan
+    far_off = replace(medium, beta_D=(medium.beta_D + 1).requires_grad_())
+    found = known_water_loss(z, ~z.isnan(), far_off, drawn)
+    found.sum().backward()
+    assert found[0] > 0.1
+    assert found[1] == 0
+    assert far_off.beta_D.grad is not None
+    assert far_off.beta_D.grad[0].abs().sum() > 0
+    assert (far_off.beta_D.grad[1] == 0).all()
+    assert far_off.beta_D.grad.isfinite().all()
 
 
 @pytest.fixture(scope="module")

@@ -90,9 +90,17 @@ def test_frames_of_a_batch_do_not_see_each_other():
         torch.testing.assert_close(getattr(h(alone), name)[0], getattr(h(both), name)[1])
 
 
+def test_a_patchs_curve_knows_the_rest_of_its_frame():
+    e, h = encoded(), wild_head()
+    other = e.tokens.clone()
+    other[:, -1] *= -1
+    moved = h(Encoded(other, e.positions, e.height, e.width)).curve.a[:, 0, 0] - h(e).curve.a[:, 0, 0]
+    assert (moved.abs() > 1e-4).all()  # the corner of another patch, out of reach of the interpolation
+
+
 def test_the_head_is_light_on_the_published_network():
     with torch.device("meta"):
-        assert sum(p.numel() for p in PhysicsHead(1024).parameters()) == 143_571
+        assert sum(p.numel() for p in PhysicsHead(1024).parameters()) == 193_366
 
 
 def test_it_reads_the_encoder_of_the_network_and_its_gradient_reaches_the_tokens():

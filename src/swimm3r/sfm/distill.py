@@ -6,6 +6,10 @@
     L_sat  = 1/N sum_n |[J<- - 1]+|^2 + |[-J<-]+|^2 + 0.5 |Binf - Q_0.05(I)|^2               (Eq. stage1_loss_sat)
     L_SfM  = L_geom + L_for + L_inv + L_sat                                                  (Eq. stage1_objective)
 
+and where the augmentation drew the water, of weight 0 unless asked for, because the paper has no such term:
+
+    L_wat  = 1/N sum_n |T_D,n - T~_D,n|_1 + |B_n - B~_n|_1                    T~_D, B~: of the water that was drawn
+
 Norms go over the three channels, N counts a frame's valid pixels. Every loss returns one number per frame or pair, so
 that a batch may be cut into parts, or spread over processes, without changing the mean.
 
@@ -19,7 +23,7 @@ import torch
 from jaxtyping import Bool, Float
 from torch import Tensor
 
-from swimm3r.medium import Medium, add_water, remove_water
+from swimm3r.medium import Medium, add_water, backscatter, remove_water, transmittances
 from swimm3r.sfm.mast3r.network import Encoded, Mast3r
 from swimm3r.sfm.mast3r.settings import ObjectiveSettings
 
@@ -44,6 +48,7 @@ class LossTerms:
     inverse: Float[Tensor, " b"]
     overshoot: Float[Tensor, " b"]  # first part of L_sat
     anchor: Float[Tensor, " b"]  # second part, without its 0.5
+    known_water: Float[Tensor, " b"]  # 0 where no water was drawn
     clean: Float[Tensor, " b"]  # L_geom of the student on the clear pictures
 
     def total(self, s: ObjectiveSettings) -> Float[Tensor, " b"]:
@@ -51,7 +56,7 @@ class LossTerms:
         geometry = s.encoder * self.encoder + s.decoder * self.decoder + s.descriptors * self.descriptors
         saturation = self.overshoot + s.anchor * self.anchor
         physics = s.forward * self.forward + s.inverse * self.inverse + s.saturation * saturation
-        return geometry + physics + s.clean * self.clean
+        return geometry + physics + s.known_water * self.known_water + s.clean * self.clean
 
 
 @dataclass(frozen=True)
@@ -161,6 +166,18 @@ def physics_terms(
         overshoot=overshoot_loss(restored, valid),
         anchor=torch.where(valid.flatten(1).any(1), anchor, 0.0),
     )
+
+
+def known_water_loss(
+    ray_depth: Float[Tensor, "b h w"], valid: Bool[Tensor, "b h w"], medium: Medium, drawn: Float[Tensor, "b 3 3"]
+) -> Float[Tensor, " b"]:
+    """L_wat: T_D and B against those of the water that was drawn (its Binf, beta_D, beta_B); 0 where that is NaN."""
+    z = torch.where(valid, ray_depth, 0.0)
+    known = drawn.isfinite().flatten(1).all(1)
+    true = Medium(*torch.where(known[:, None, None], drawn, 0.0)[:, None, None].unbind(3))
+    of_scene = transmittances(z, medium)[0] - transmittances(z, true)[0]
+    of_water = backscatter(z, medium) - backscatter(z, true)
+    return torch.where(known, _mean_over((of_scene.abs() + of_water.abs()).sum(-1), valid), 0.0)
 
 
 def _mean_over(values: Float[Tensor, "b h w"], valid: Bool[Tensor, "b h w"]) -> Float[Tensor, " b"]:

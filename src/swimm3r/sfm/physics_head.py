@@ -3,8 +3,9 @@
     beta_D(z) = a e^{bz} + c e^{dz}      per pixel, a, c > 0 and b, d < 0 (Sea-Thru), evaluated at ray depth
     beta_B, Binf                         per frame, beta_B > 0, 0 < Binf < 1
 
-Every token gives the twelve numbers of its patch's curve, interpolated between patches; a pooling that learns where
-to look gives the frame's six. Coefficients are 1/m, because the network's points are metres: z is |point|, and whoever
+A pooling that learns where to look sums the frame up and gives its six numbers. Every token gives the twelve of its
+patch's curve, interpolated between patches, and knows that sum: one patch alone cannot tell a pale floor in dense water
+from a dark one in thin water. Coefficients are 1/m, because the network's points are metres: z is |point|, and whoever
 scales a scene scales the water with it (`WaterMaps.rescaled`).
 """
 
@@ -22,6 +23,7 @@ from swimm3r.sfm.mast3r.network import Encoded
 _CURVE_START = (0.3, 0.05, 0.05, 0.5)  # a, -b, c, -d
 _BETA_B_START = 0.2
 _BINF_START = 0.35
+_LOOKS = 4  # poolings of the tokens, each with weights of its own
 
 
 @dataclass(frozen=True)
@@ -47,16 +49,18 @@ class WaterMaps:
 
 
 class PhysicsHead(nn.Module):
-    """Encoder tokens -> water; 143,571 parameters for tokens of 1024 channels."""
+    """Encoder tokens -> water; 193,366 parameters for tokens of 1024 channels."""
 
     def __init__(self, token_dim: int, patch: int = 16, hidden: int = 128) -> None:
         super().__init__()
         self.patch = patch
         self.norm = nn.LayerNorm(token_dim)
         self.shared = nn.Linear(token_dim, hidden)
+        self.mixed = nn.Linear(hidden, hidden)
+        self.attention = nn.Linear(hidden, _LOOKS)
+        self.pooled = nn.Linear(_LOOKS * hidden, hidden // 2)
+        self.context = nn.Linear(hidden // 2, hidden)
         self.curve = nn.Linear(hidden, 12)
-        self.attention = nn.Linear(hidden, 1)
-        self.pooled = nn.Linear(hidden, hidden // 2)
         self.frame = nn.Linear(hidden // 2, 6)
         with torch.no_grad():
             for layer in (self.curve, self.frame):
@@ -71,13 +75,15 @@ class PhysicsHead(nn.Module):
             raise ValueError("the physics head reads upright frames; pass portrait ones as a batch of their own")
         height, width = encoded.height, encoded.width
         with torch.autocast(encoded.tokens.device.type, enabled=False):
-            tokens = F.gelu(self.shared(self.norm(encoded.tokens.float())))
-            grid = self.curve(tokens).mT.unflatten(2, (height // self.patch, width // self.patch))
+            tokens = F.gelu(self.mixed(F.gelu(self.shared(self.norm(encoded.tokens.float())))))
+            # the veil shows best where the scene is far, attenuation where it is near: every look learns whom to trust
+            looks = self.attention(tokens).softmax(dim=1).mT @ tokens
+            pooled = F.gelu(self.pooled(looks.flatten(1)))
+            frame = self.frame(pooled)
+            curves = self.curve(F.gelu(tokens + self.context(pooled)[:, None]))
+            grid = curves.mT.unflatten(2, (height // self.patch, width // self.patch))
             maps = F.softplus(F.interpolate(grid, (height, width), mode="bilinear"))
             a, b, c, d = maps.permute(0, 2, 3, 1).split(3, dim=-1)
-            # the veil shows best where the scene is far: the pooling learns which tokens to trust
-            weights = self.attention(tokens).softmax(dim=1)
-            frame = self.frame(F.gelu(self.pooled((weights * tokens).sum(1))))
             return WaterMaps(
                 Binf=torch.sigmoid(frame[:, :3]),
                 beta_B=F.softplus(frame[:, 3:]),

@@ -7,7 +7,7 @@ import torch
 from jaxtyping import Bool, Float
 from torch import Tensor, nn
 
-from swimm3r.sfm.distill import Features, LossTerms, features, physics_terms, squared_distance
+from swimm3r.sfm.distill import Features, LossTerms, features, known_water_loss, physics_terms, squared_distance
 from swimm3r.sfm.mast3r.lora import Adapters, attach
 from swimm3r.sfm.mast3r.network import Encoded, Mast3r
 from swimm3r.sfm.mast3r.settings import LoraSettings, ObjectiveSettings
@@ -42,11 +42,13 @@ class Student(nn.Module):
         raw: Float[Tensor, "b 2 3 h w"],
         ray_depth: Float[Tensor, "b 2 h w"],
         valid: Bool[Tensor, "b 2 h w"],
+        drawn: Float[Tensor, "b 2 3 3"],
         teacher: Features | None = None,
     ) -> dict[str, Float[Tensor, " b"]]:
         """The fields of `LossTerms` of pairs of the network's pictures (-1..1); ray depth in m, read where valid.
 
-        `teacher` is what it makes of the clear pictures, where that is known already.
+        `drawn` is Binf, beta_D and beta_B of the water the augmentation drew, NaN where it drew none. `teacher` is what
+        it makes of the clear pictures, where that is known already.
         """
         s = self.objective
         if teacher is None:
@@ -54,7 +56,7 @@ class Student(nn.Module):
         student, encoded = self._features(raw)
         terms = self._distances(teacher, student)
         zero = raw.new_zeros(len(raw), dtype=torch.float32)
-        for name in ("forward", "inverse", "overshoot", "anchor", "clean"):
+        for name in ("forward", "inverse", "overshoot", "anchor", "known_water", "clean"):
             terms[name] = zero
         if s.clean:
             again = self._distances(teacher, self._features(clean)[0])
@@ -63,8 +65,9 @@ class Student(nn.Module):
             I, J = (((p.flatten(0, 1) + 1) / 2).permute(0, 2, 3, 1).float() for p in (raw, clean))
             z, known = ray_depth.flatten(0, 1), valid.flatten(0, 1)
             medium = self.head(encoded).at(torch.where(known, z, 0.0))
-            physics = physics_terms(I, J, z, known, medium, s)
-            terms |= {name: values.unflatten(0, (-1, 2)).mean(1) for name, values in vars(physics).items()}
+            water = dict(vars(physics_terms(I, J, z, known, medium, s)))
+            water["known_water"] = known_water_loss(z, known, medium, drawn.flatten(0, 1))
+            terms |= {name: values.unflatten(0, (-1, 2)).mean(1) for name, values in water.items()}
         return terms
 
     def teacher(self, clean: Float[Tensor, "b 2 3 h w"]) -> Features:

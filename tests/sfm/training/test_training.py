@@ -355,7 +355,7 @@ def test_without_physics_there_is_no_head(
 def test_before_its_first_step_the_student_is_the_teacher(network: Mast3r, eight: PairData):
     student = new_student(network, SETTINGS.lora, ObjectiveSettings(), 0)
     item = eight.item(0, 0.0, torch.Generator())
-    batch = {"clean": item.clean[None], "ray_depth": item.ray_depth[None], "valid": item.valid[None]}
+    batch = {name: getattr(item, name)[None] for name in ("clean", "ray_depth", "valid", "drawn")}
     same = student(raw=item.clean[None], **batch)
     assert same["encoder"] == same["decoder"] == same["descriptors"] == 0
     assert student(raw=item.raw[None], **batch)["encoder"] > 0

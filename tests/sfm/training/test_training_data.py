@@ -61,6 +61,8 @@ def test_the_augmentation_is_the_clear_picture_through_one_water_at_ray_depth(tm
     known = item.valid
     torch.testing.assert_close(restored[known], colours(item.clean)[known], atol=2e-4, rtol=0)
     assert not torch.equal(item.raw, item.clean)
+    assert torch.equal(item.drawn, torch.stack([water.Binf, water.beta_D, water.beta_B]).expand(2, 3, 3))
+    assert made(tmp_path).item(0, 0.0, drawn(3)).drawn.isnan().all()  # as taken: nobody knows its water
 
 
 def test_half_of_the_items_are_augmented(tmp_path: Path):
@@ -76,6 +78,15 @@ def test_holes_in_the_depth_get_water_but_no_loss(tmp_path: Path):
     assert (item.ray_depth[hole] == 0).all()
     at_hole = hole[:, None].expand_as(item.raw)
     assert (item.raw - item.clean)[at_hole].abs().mean() > 0.05
+
+
+def test_where_nothing_is_seen_the_augmentation_shows_open_water(tmp_path: Path):
+    data = made(tmp_path)
+    write_rgb(tmp_path / "clean" / "0.png", np.zeros((HEIGHT, WIDTH, 3), np.uint8))
+    item, water = data.item(0, 1.0, drawn(3)), water_types.draw(drawn(3), 1.0)
+    assert water is not None
+    torch.testing.assert_close(colours(item.raw)[0][~item.valid[0]], water.Binf.expand(int((~item.valid[0]).sum()), 3))
+    assert (colours(item.raw)[0][item.valid[0]] < water.Binf).all()  # a black thing, nearer
 
 
 def test_pictures_taken_in_air_always_get_water(tmp_path: Path):

@@ -141,10 +141,13 @@ class ObjectiveSettings:
     """Inside L_sat, of the veiling light's distance to the dim pixels' colour. It pulls Binf below the truth wherever
     the dimmest pixels are nearer than the open water; 0 leaves it out."""
     anchor_quantile: float = 0.05
+    known_water: float = 0.0
+    """Weight of the head's mistake in T_D and B themselves, in pictures whose water the augmentation drew. Not in the
+    paper: L_inv makes a head that is not sure err on the side of clear water, and this does not."""
     min_transmittance: float = 0.05
     """eps_inv of Eq. swimm3r_render_inverse; the paper gives none. At 1/20 a noise of 1/255 stays below 0.08."""
 
     @property
     def physics(self) -> bool:
         """Whether the water is trained at all."""
-        return self.forward > 0 or self.inverse > 0 or self.saturation > 0
+        return max(self.forward, self.inverse, self.saturation, self.known_water) > 0

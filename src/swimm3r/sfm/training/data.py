@@ -3,7 +3,8 @@
     teacher: the clear picture       student: the raw one, or with probability p the clear one through drawn water
 
 Both come from one framing, so that every token shows the same piece of the scene to both. Water of the augmentation
-acts at ray depth; where depth is unknown the nearest known one stands in, and no loss looks there.
+acts at ray depth. Where depth is unknown no loss looks, but the student sees it: the open water's Binf where the clear
+picture is black, because nothing is there, and else water at the nearest known depth.
 """
 
 import hashlib
@@ -26,6 +27,8 @@ from swimm3r.io.images import image_size
 from swimm3r.medium import Medium, add_water
 from swimm3r.sfm.mast3r.preprocess import Framing, K_to_network, framing, to_network
 
+_BLACK = 5 / 255  # above what resizing leaves of a black area's own values
+
 
 @dataclass(frozen=True)
 class PairItem:
@@ -35,6 +38,7 @@ class PairItem:
     raw: Float[Tensor, "2 3 h w"]
     ray_depth: Float[Tensor, "2 h w"]  # m, 0 where unknown
     valid: Bool[Tensor, "2 h w"]  # where the water's losses look
+    drawn: Float[Tensor, "2 3 3"]  # Binf, beta_D, beta_B of the augmentation's water; NaN for a picture taken in water
 
 
 @dataclass(frozen=True)
@@ -108,14 +112,18 @@ class PairData:
         if view.z_depth is not None:
             depth = depth_to_network(view.z_depth, frame) * self.z_rays(sequence, frame)
         known = depth > 0
+        drawn = torch.full((3, 3), torch.nan)
         if water is not None and bool(known.any()):
+            drawn = torch.stack([water.Binf, water.beta_D, water.beta_B])
             J = ((clean + 1) / 2).permute(1, 2, 0)
-            raw = 2 * add_water(J, nearest_known(depth), water).permute(2, 0, 1) - 1
+            nothing = ~known & (J.amax(-1) < _BLACK)
+            wet = torch.where(nothing[..., None], water.Binf, add_water(J, nearest_known(depth), water))
+            raw = 2 * wet.permute(2, 0, 1) - 1
         elif view.raw is not None:
             raw = to_network(view.raw, frame)
         else:
             raise ValueError(f"{sequence.shots[k].name} has neither a raw picture nor any depth")
-        return _ViewItem(clean, raw, depth, known)
+        return _ViewItem(clean, raw, depth, known, drawn)
 
 
 @dataclass(frozen=True)
@@ -132,6 +140,7 @@ class _ViewItem:
     raw: Float[Tensor, "3 h w"]
     ray_depth: Float[Tensor, "h w"]
     valid: Bool[Tensor, "h w"]
+    drawn: Float[Tensor, "3 3"]
 
 
 def trainable(sequences: Items[Sequence], pairs: Items[Items[Pair]]) -> list[tuple[int, Pair]]:

@@ -39,7 +39,7 @@ from swimm3r.sfm.training.state import Rows, forget_rows_after, resume, write_st
 from swimm3r.sfm.training.teacher_cache import TeacherCache
 
 _ORDER, _WATER = 1, 2  # purposes of randomness
-_TERMS = ("encoder", "decoder", "descriptors", "forward", "inverse", "overshoot", "anchor", "clean")
+_TERMS = ("encoder", "decoder", "descriptors", "forward", "inverse", "overshoot", "anchor", "known_water", "clean")
 _LOADERS = 4  # threads that read and resize pictures while the network works
 
 Validate = Callable[[Student, PairData], dict[str, float | None]]
