@@ -10,8 +10,8 @@ On held-back dives everything is compared with the truth; a row is one network o
     rotation, translation    degrees, medians: the second camera from its pointmap (PnP) against the true pose
     T_D, B     mean absolute errors over pixels and channels at true ray depth; `near`: of the lower half of each
                picture, all that either method then sees, where the depth range is short. The head reads one picture
-               at a time, and `dive` is its median over all of them; Sea-Thru is given one picture, or the whole dive
-               at true poses
+               at a time, and `dive` is what `swimm3r sfm` makes of all its readings; Sea-Thru is given one picture,
+               or the whole dive at true poses
 
 On real clips with a COLMAP model, poses are compared with the model's; on FLSea's samples, depth with theirs.
 """
@@ -45,6 +45,7 @@ from swimm3r.sfm.mast3r.network import Encoded, Mast3r
 from swimm3r.sfm.mast3r.preprocess import K_to_network, framing, to_network
 from swimm3r.sfm.matching import nearest
 from swimm3r.sfm.physics_head import PhysicsHead, ray_depth_of
+from swimm3r.sfm.predicted_water import FrameReading, summed_up
 from swimm3r.sfm.seathru import estimate_medium
 from swimm3r.sfm.settings import SeathruSettings
 from swimm3r.sfm.training.data import depth_to_network
@@ -56,6 +57,7 @@ _LOST = 180.0
 _PARTS = {False: "all", True: "near"}
 _COEFFICIENTS = ("Binf", "beta_D", "beta_B")
 _ALONE = 8  # every so manieth frame is given to Sea-Thru alone
+_APART = 3  # every so manieth pixel tells about the dive's water
 
 
 WaterRows = dict[str, np.ndarray]  # what was looked at -> errors of T_D and B
@@ -177,13 +179,16 @@ def water_errors(views: list[tuple[Tensor, Medium]], true: Medium) -> tuple[floa
 
 
 def of_dive(views: list[tuple[Tensor, Medium]]) -> list[tuple[Tensor, Medium]]:
-    """The same views with one water: the median over their pixels."""
-    medians = {n: torch.cat([getattr(m, n).reshape(-1, 3) for _, m in views]).median(0).values for n in _COEFFICIENTS}
-    return [(z, Medium(**{n: v.expand(*z.shape, 3) for n, v in medians.items()})) for z, _ in views]
+    """The same views with the one water that a reconstruction takes for their dive."""
+    readings = [
+        FrameReading(m.Binf[0, 0], m.beta_B[0, 0], z[z > 0][::_APART], m.beta_D[z > 0][::_APART]) for z, m in views
+    ]
+    fit = summed_up(readings, SeathruSettings())
+    return [(z, fit.at(z)) for z, _ in views]
 
 
 def head_rows(network: Mast3r, head: PhysicsHead, dives: list[Shots], truth: list[Medium]) -> WaterRows:
-    """Errors of the head, which sees one picture, whole or its lower half, and of its median over each dive."""
+    """Errors of the head, which sees one picture, whole or its lower half, and of each dive as a whole."""
     rows: dict[str, list[tuple[float, float]]] = {}
     for near, where in _PARTS.items():
         for shots, true in zip(dives, truth, strict=True):

@@ -7,7 +7,7 @@ with it. The dive's fit is the median over frames; its curve is one exponential 
 they see. A coefficient counts as identifiable where the frames agree on it.
 """
 
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -49,6 +49,16 @@ class FrameWater:
         sampled = F.grid_sample(self.curve[None], grid, padding_mode="border", align_corners=False)[0, :, 0].T
         beta_D = AttenuationCurve(*sampled.split(3, dim=-1)).at(ray_depth)
         return Medium(self.Binf.expand_as(beta_D), beta_D, self.beta_B.expand_as(beta_D))
+
+
+@dataclass(frozen=True)
+class FrameReading:
+    """What one frame tells about the dive's water, at some of its pixels of known depth, at least one."""
+
+    Binf: Float[Tensor, "3"]
+    beta_B: Float[Tensor, "3"]
+    ray_depth: Float[Tensor, " n"]
+    beta_D: Float[Tensor, "n 3"]
 
 
 @dataclass(frozen=True)
@@ -94,7 +104,7 @@ def read(folder: Path, pictures: NetworkPictures) -> PredictedWater | None:
 def dive_fit(water: PredictedWater, rec: Reconstruction, settings: SeathruSettings) -> MediumFit:
     """One water for the dive, on values as stored. Raises InputError where no frame has any depth."""
     rays = shared_rays(rec.cameras)
-    frames, depths, betas = [], [], []
+    readings = []
     for i, name in enumerate(rec.names):
         if name not in rec.depth:
             continue
@@ -104,24 +114,27 @@ def dive_fit(water: PredictedWater, rec: Reconstruction, settings: SeathruSettin
             continue
         pixel = pixel[:: max(1, len(pixel) // _SAMPLES)]
         own = water.frame(name)
-        frames.append(own)
-        depths.append(z[pixel])
-        betas.append(own.at(z[pixel], water.place[pixel]).beta_D)
-    if not frames:
+        readings.append(FrameReading(own.Binf, own.beta_B, z[pixel], own.at(z[pixel], water.place[pixel]).beta_D))
+    if not readings:
         raise InputError(
             "no frame has any depth to read the water at",
             cause="the dense depth stage found almost no surface",
             hint="clearer or slower footage",
         )
-    z, beta_D = torch.cat(depths).double(), torch.cat(betas).double()
+    return summed_up(readings, settings)
+
+
+def summed_up(readings: Sequence[FrameReading], settings: SeathruSettings) -> MediumFit:
+    """The water that frames, at least one, agree on best: medians, and one exponential through their beta_D."""
+    z = torch.cat([r.ray_depth for r in readings]).double()
+    beta_D = torch.cat([r.beta_D for r in readings]).double()
     middle = z.median()
     level, slope = _exponential(z / middle, beta_D)
     curve = AttenuationCurve(level.float(), (slope / middle).float(), torch.zeros(3), torch.zeros(3))
-    at_middle = torch.stack([b.median(0).values for b in betas])
     per_frame = {
-        "Binf": torch.stack([f.Binf for f in frames]),
-        "beta_D": at_middle,
-        "beta_B": torch.stack([f.beta_B for f in frames]),
+        "Binf": torch.stack([r.Binf for r in readings]),
+        "beta_D": torch.stack([r.beta_D.median(0).values for r in readings]),
+        "beta_B": torch.stack([r.beta_B for r in readings]),
     }
     # from the median absolute deviation, as of a normal distribution
     spread = {k: 1.4826 * (v - v.median(0).values).abs().median(0).values for k, v in per_frame.items()}
