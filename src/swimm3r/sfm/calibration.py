@@ -23,7 +23,7 @@ if TYPE_CHECKING:
 WATER = 1.333  # refractive index; a flat port multiplies the focal length by it (to first order)
 SEED = 0
 THREADS = 1  # sums in a changing order end in poses 0.01 degrees apart, on weak clips more; a resumed run must not
-_MAX_TANGENTIAL = 0.05  # a lens some 5 degrees askew behind its port; what short clips fit beyond bends their poses
+_MAX_TANGENTIAL = 0.1  # a lens some 10 degrees askew behind its port, or a picture cut off-centre by a tenth
 _PASSES, _STILL = 6, 0.99  # adjustments of the lens at most, and the share of the last error that ends them
 
 
@@ -158,8 +158,8 @@ def _settled(
 ) -> "pycolmap.Reconstruction":
     """The model and its lens adjusted until the reprojection error stands still.
 
-    A lens with many parameters leaves its start slowly, and half way it may still look like one: on ruie_green_rock
-    OPENCV stopped at 0.71 px with tangential terms of 0.05 and 0.08, and went on to 0.56 px with 0.06 and 0.08.
+    A lens with many parameters leaves its start slowly: OPENCV on ruie_green_rock stopped at 0.71 px, and came to 0.56 px
+    when asked again.
     """
     error = np.inf
     for _ in range(_PASSES):
