@@ -1,90 +1,61 @@
 """Primitives for what moves, which the still scene that a dynamic map starts from does not have.
 
-Early in training the map shows the ground. Where one frame looks otherwise, and the frames that see the same ground at
-other times do not, something came between: `moving_pixels`. There primitives are born in that frame, before the ground,
-for a moment around its time, travelling as the optical flow to the frames before and after says (`travel`). A single
-moving camera cannot tell how far away they are; a share of the ground's distance is assumed, which their travel makes
-good in the frames between.
+Moving parts are found in every frame (`movement`), followed from frame to frame (`tracking`) and placed in space by the
+course they take (`courses`). In each frame primitives are born on them, for a moment around its time, which travel to
+where the frames before and after show them (`travel`).
 """
 
 from collections.abc import Sequence
 from dataclasses import dataclass
+from itertools import pairwise
 
 import numpy as np
 import torch
-from jaxtyping import Bool, Float
+from jaxtyping import Float
 from torch import Tensor
-from torch.nn.functional import avg_pool2d, grid_sample, interpolate, normalize
+from torch.nn.functional import normalize
 
-from swimm3r.cameras import Cameras, directions, pixel_grid, project, ray_depth_from_z, resized, unproject
+from swimm3r.cameras import Cameras, directions, project, ray_depth_from_z, unproject
 from swimm3r.medium import Medium, remove_water
+from swimm3r.splat.courses import course
 from swimm3r.splat.medium_field import MediumField
+from swimm3r.splat.movement import Look, moving_parts
+from swimm3r.splat.passages import Passage, carried, full_size, passages
 from swimm3r.splat.primitives import BetaPrimitives
-from swimm3r.splat.projection import pinhole
-from swimm3r.splat.rendering import draw, expected_z_depth
 from swimm3r.splat.settings import UwbsSettings
-from swimm3r.splat.travel import followed, full_size, mean_velocity, travelling
+from swimm3r.splat.tracking import Part, Track, tracks
+from swimm3r.splat.travel import LONGEST, travelling
 from swimm3r.splat.views import TrainingViews, View
 
-_LONG_SIDE = 160  # of the pictures in which movement is looked for, pixels
-_BLUR = 5  # side of the square that differences are averaged over
-_OTHERS = 8  # frames at other times, spread over the clip, that are asked about a frame's ground
-_HIDDEN = 0.8  # of a point's depth in another frame: what is nearer there hides it
-_BEYOND = 100.0  # distances of a frame's far ground at which open water is taken to be
-_SEEDS = 6  # pixels of a part that must differ clearly
 _SPACING = 3.0  # pixels between primitives that are born, at least
+_RADIUS = 1.6  # of a primitive, in their spacing, and
+_OPACITY = 0.9  # so that they cover what is behind from the first
+_BEFORE = 0.95  # of the ground's distance: what moves is nearer
+_ALONE = 0.5  # intervals between frames that primitives last which nothing shows how to follow
 
 
 @dataclass(frozen=True)
-class Residual:
-    """Where a map and a frame differ, and how far away the map's ground is; at most 160 pixels wide."""
+class Sighting:
+    """A part in one frame, how far away it is, and its way to the frames before and after where it is followed."""
 
+    part: Part
+    z_depth: float
+    ways: tuple["Way", ...]
+
+
+@dataclass(frozen=True)
+class Way:
+    """To the same part in another frame."""
+
+    passage: Passage
     camera: Cameras
-    off: Float[Tensor, "h w"]  # difference of the blurred pictures, as texture not yet learned averages out
-    z_depth: Float[Tensor, "h w"]  # of open water: far away
-    reach: float  # z depth of the frame's far ground
-    seen: Bool[Tensor, "h w"]
+    z_depth: float
+    after: float  # time between the two, lengths of the clip; negative for an earlier frame
 
-
-def residual(p: BetaPrimitives, field: MediumField, view: View, settings: UwbsSettings) -> Residual:
-    """A frame against the map at the frame's own time, without gradient."""
-    scale = min(1.0, _LONG_SIDE / max(view.camera.width, view.camera.height))
-    width, height = max(8, round(scale * view.camera.width)), max(8, round(scale * view.camera.height))
-    camera = resized(view.camera, width, height)
-    with torch.no_grad():
-        images = draw(p, field, pinhole(camera), settings, view.time).images
-    target = interpolate(view.rgb[None], (height, width), mode="area")[0]
-    seen = interpolate(view.seen[None, None].float(), (height, width), mode="area")[0, 0] > 0.999
-    off = torch.where(seen, images.rgb - target, 0.0)
-    off = avg_pool2d(off, _BLUR, 1, _BLUR // 2, count_include_pad=False).abs().mean(0)
-    z_depth = expected_z_depth(images)
-    ground = images.alpha > 0.5
-    reach = float(z_depth[ground].quantile(0.9)) if bool(ground.any()) else settings.working_depth
-    return Residual(camera, off, torch.where(ground, z_depth, _BEYOND * reach), reach, seen)
-
-
-def moving_pixels(mine: Residual, others: Sequence[Residual], contrast: float, least: float) -> Bool[Tensor, "h w"]:
-    """Where a frame differs from the map `contrast` times as much as the others that see the same ground, or water.
-
-    That is more than their median, of two frames at least, and by `least` of the full range. The regions around such
-    pixels that differ half as much are part of what moves: it may here and there look like the ground.
-    """
-    height, width = mine.off.shape
-    camera = mine.camera
-    ground = unproject(camera, pixel_grid(height, width).reshape(1, -1, 2), mine.z_depth.reshape(1, -1))
-    rows = []
-    for other in others:
-        pixels, z = project(other.camera, ground)
-        at = 2 * pixels.reshape(1, 1, -1, 2) / torch.tensor([other.camera.width, other.camera.height]) - 1
-        maps = torch.stack([other.off, other.z_depth, other.seen.float()])[None]
-        off, there, seen = grid_sample(maps, at.to(maps), align_corners=False)[0, :, 0]
-        same = (seen > 0.999) & (z[0] > 0) & (there > _HIDDEN * z[0])
-        rows.append(torch.where(same, off, torch.nan))
-    known = torch.stack(rows)
-    enough = (known.isfinite().sum(0) >= 2).reshape(height, width)
-    usual = known.nanmedian(0).values.reshape(height, width).nan_to_num()
-    asked, clearly = mine.seen & enough, (contrast * usual).clamp(min=least)
-    return _grown(asked & (mine.off > clearly), asked & (mine.off > clearly / 2))
+    def velocity(self, pixels: Float[Tensor, "n 2"], xyz: Float[Tensor, "n 3"]) -> Float[Tensor, "n 3"]:
+        """Of what is at `pixels` and `xyz`, lengths per clip."""
+        z_depth = torch.full((1, len(pixels)), self.z_depth)
+        return (unproject(self.camera, self.passage.there(pixels)[None], z_depth)[0] - xyz) / self.after
 
 
 def born(
@@ -94,48 +65,76 @@ def born(
 
     At most `MoverSettings.share` of the largest number of primitives.
     """
-    m = settings.movers
-    residuals = [residual(p, field, views[k], settings) for k in range(len(views))]
-    masks = []
-    for k, mine in enumerate(residuals):
-        apart = [j for j in range(len(views)) if j != k]
-        spread = np.unique(np.linspace(0, len(apart) - 1, min(_OTHERS, len(apart))).round().astype(int))
-        others = [residuals[apart[j]] for j in spread]
-        masks.append(moving_pixels(mine, others, m.contrast, m.least) if others else torch.zeros_like(mine.seen))
-    area = sum(float(mask.sum()) / mask.numel() * views[k].rgb[0].numel() for k, mask in enumerate(masks))
-    most = round(m.share * settings.densify.max_primitives)
+    none = BetaPrimitives(*(values[:0] for values in p))
+    times = np.array(views.times)
+    order = np.argsort(times, kind="stable").tolist()
+    gaps = np.diff(times[order])
+    if not gaps.any():
+        return none
+    interval = float(np.median(gaps[gaps > 0]))
+    looks, masks = moving_parts(p, field, views, settings)
+    parts = [[Part(k, float(times[k]), mask, looks[k].rgb) for mask in masks[k]] for k in order]
+    found = [s for track in tracks(parts) for s in _sightings(track, views, looks, interval, settings)]
+    area = sum(float(s.part.mask.sum()) / s.part.mask.numel() * views[s.part.frame].seen.numel() for s in found)
+    most = round(settings.movers.share * settings.densify.max_primitives)
     spacing = max(_SPACING, (area / max(1, most)) ** 0.5)
-    interval = float(np.median(np.diff(views.times))) if len(views) > 1 else 1.0
-    parts = [
-        _of_frame(field, views, masks, k, residuals[k], spacing, m.duration * interval, settings, rng)
-        for k, mask in enumerate(masks)
-        if bool(mask.any())
+    made = [_primitives(s, field, views[s.part.frame], spacing, interval, settings, rng) for s in found]
+    return BetaPrimitives(*(torch.cat(values) for values in zip(none, *made, strict=True)))
+
+
+def _sightings(
+    track: Track, views: TrainingViews, looks: Sequence[Look], interval: float, settings: UwbsSettings
+) -> list[Sighting]:
+    """A track's parts with their distances, by the course of the middle of its largest."""
+    parts = track.parts
+    frames = [part.frame for part in parts]
+    steps = [
+        passages(fit, a, b, views[a.frame], views[b.frame])
+        for fit, (a, b) in zip(track.fits, pairwise(parts), strict=True)
     ]
-    if not parts:
-        return BetaPrimitives(*(values[:0] for values in p))
-    return BetaPrimitives(*(torch.cat(values) for values in zip(*parts, strict=True)))
+    largest = max(range(len(parts)), key=lambda i: int(parts[i].mask.sum()))
+    middle = full_size(parts[largest].mask, views[frames[largest]]).nonzero().double().mean(0).flip(0) + 0.5
+    pixels = {largest: middle[None]}
+    for i in range(largest + 1, len(parts)):
+        pixels[i] = carried(steps[i - 1][0].whole, pixels[i - 1])
+    for i in range(largest - 1, -1, -1):
+        pixels[i] = carried(steps[i][1].whole, pixels[i + 1])
+    ground = torch.tensor([_ground(part, looks[part.frame]) for part in parts])
+    cameras = views.cameras[frames]
+    times = torch.tensor([part.time for part in parts])
+    on_course = torch.cat([pixels[i] for i in range(len(parts))])
+    xyz = course(cameras, on_course, times / interval, settings.movers.nearness * ground)
+    z = torch.minimum(project(cameras, xyz[:, None])[1][:, 0], _BEFORE * ground).tolist()
+
+    def way(i: int, j: int) -> Way:
+        passage = steps[i][0] if j > i else steps[j][1]
+        return Way(passage, cameras[j], z[j], float(times[j] - times[i]))
+
+    near = [[j for j in (i - 1, i + 1) if 0 <= j < len(parts)] for i in range(len(parts))]
+    return [Sighting(part, z[i], tuple(way(i, j) for j in near[i])) for i, part in enumerate(parts)]
 
 
-def _of_frame(
+def _ground(part: Part, look: Look) -> float:
+    """Z depth of the nearest ground that a part hides, but for a tenth."""
+    return float(look.z_depth.clamp(max=look.reach)[part.mask].quantile(0.1))
+
+
+def _primitives(
+    sighting: Sighting,
     field: MediumField,
-    views: TrainingViews,
-    masks: Sequence[Bool[Tensor, "h w"]],
-    k: int,
-    found: Residual,
+    view: View,
     spacing: float,
-    duration: float,
+    interval: float,
     settings: UwbsSettings,
     rng: torch.Generator,
 ) -> BetaPrimitives:
-    """Primitives at random pixels of a frame's moving parts, `spacing` apart on average, freed from the water."""
-    view, width = views[k], views[k].camera.width
-    rows = ((full_size(masks[k], view) > 0) & view.seen).reshape(-1).nonzero()[:, 0]
+    """Primitives at random pixels of a part, `spacing` apart on average, freed from the water."""
+    width, z_depth = view.camera.width, sighting.z_depth
+    rows = ((full_size(sighting.part.mask, view) > 0) & view.seen).reshape(-1).nonzero()[:, 0]
     count = max(1, round(len(rows) / spacing**2))
     rows = rows[torch.randperm(len(rows), generator=rng)[:count]]
     pixels = torch.stack([rows % width, rows // width], -1) + torch.rand(len(rows), 2, generator=rng)
-    near = [j for j in (k - 1, k + 1) if 0 <= j < len(views)]
-    ways = [way for j in near if (way := followed(view, masks[k], views[j], masks[j], pixels)) is not None]
-    z = settings.movers.nearness * full_size(found.z_depth.clamp(max=found.reach), view).reshape(-1)[rows]
+    z = torch.full((len(rows),), z_depth)
     xyz = unproject(view.camera, pixels[None], z[None])[0]
     towards = normalize(xyz - view.camera.centres[0].to(xyz), dim=-1)
     colours = view.rgb.reshape(3, -1).mT[rows]
@@ -144,27 +143,15 @@ def _of_frame(
             Binf, beta_B, beta_D = field(towards[None].float(), view.time)[:, 0].mT.split(3, -1)
         ray_depth = ray_depth_from_z(z, directions(view.camera, pixels[None])[0])
         colours = remove_water(colours, ray_depth, Medium(Binf, beta_D, beta_B)).clamp(0, 1)
+    velocities = [way.velocity(pixels, xyz) for way in sighting.ways]
     assert view.time is not None
     return travelling(
         xyz,
-        mean_velocity(xyz, z, ways),
+        torch.stack(velocities).mean(0) if velocities else torch.zeros_like(xyz),
         towards,
         float(view.time),
-        radius=spacing * z / float(view.camera.K[0, 0, 0]),
-        duration=duration,
+        radius=_RADIUS * spacing * z / float(view.camera.K[0, 0, 0]),
+        duration=min(LONGEST, interval * (settings.movers.duration if velocities else _ALONE)),
         rgb=colours,
-        opacity=settings.initial.opacity,
+        opacity=_OPACITY,
     )
-
-
-def _grown(seeds: Bool[Tensor, "h w"], region: Bool[Tensor, "h w"]) -> Bool[Tensor, "h w"]:
-    """The parts of a region, its small gaps closed and its specks gone, that a few of the seeds lie in."""
-    import cv2
-
-    closed = cv2.morphologyEx(region.numpy().astype(np.uint8), cv2.MORPH_CLOSE, np.ones((5, 5), np.uint8))
-    opened = cv2.morphologyEx(closed, cv2.MORPH_OPEN, np.ones((3, 3), np.uint8))
-    count, part = cv2.connectedComponents(opened)
-    part = torch.from_numpy(np.asarray(part, np.int64))
-    hits = torch.bincount(part[seeds], minlength=count)
-    hits[0] = 0  # what is no part
-    return hits[part] >= _SEEDS

@@ -137,11 +137,11 @@ class MoverSettings:
     at: float = 0.2
     """Share of the run after which the frames are searched for what moves; 0 leaves it to the densification."""
     contrast: float = 3.0
-    """How much more a pixel must be off in one frame than its ground is in the others."""
+    """How much more a pixel must be off in one frame, from map and other frames, than its ground is in those."""
     least: float = 0.04
     """And by how much at least, pixel values, with the texture of both averaged out."""
     nearness: float = 0.85
-    """Assumed distance from the camera, as a share of the ground's behind it."""
+    """Distance from the camera assumed where the course does not tell, as a share of the ground's behind it."""
     duration: float = 3.0
     """Scale in time, in intervals between training frames."""
     share: float = 0.15

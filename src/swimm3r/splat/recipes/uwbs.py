@@ -32,6 +32,7 @@ from swimm3r.splat.rendering import Drawing, draw
 from swimm3r.splat.settings import UwbsSettings
 from swimm3r.splat.site import Site
 from swimm3r.splat.state import FIELD, POSES, State, clip_field, first_state, parameters_of
+from swimm3r.splat.travel import ways
 from swimm3r.splat.views import View
 
 
@@ -107,7 +108,11 @@ class Uwbs:
         with torch.no_grad():
             parameters = parameters_of(state.primitives, state.field, state.poses)
             before = None if multiplier is None else parameters["xyz"].clone()
+            held = ways(state.primitives) if settings.dynamic and settings.movers.at else None
             adam_step(parameters, gradients, state.moments, rates)
+            if held is not None:  # each frame would bend them to its own moment, and what is between would be lost
+                for name, values in held.values.items():
+                    parameters[name][held.rows] = values
             if multiplier is not None and before is not None:
                 parameters["xyz"].sub_(before).mul_(multiplier[:, None]).add_(before)
             if settings.densify.noise_cadence == "step":
