@@ -8,32 +8,48 @@ import torch
 from swimm3r.cameras import project
 from swimm3r.geometry import relative_poses, rotation_angle, so3_exp
 from swimm3r.splat.pose_codes import moved
-from swimm3r.splat.poses import edges, refine_pose
+from swimm3r.splat.poses import edges, ends, refine_pose, sizes
 from swimm3r.splat.settings import PoseRefinementSettings
 
 SEEN = torch.ones(48, 64, dtype=torch.bool)
 
 
+def pixels_off(dive, camera) -> float:
+    """Median distance between where the points are and where a camera that should be frame 3's sees them."""
+    points = dive.rec.points.xyz[None]
+    return float((project(camera, points)[0] - project(dive.cameras[3], points)[0]).norm(dim=-1).median())
+
+
+def turned(dive, camera) -> float:
+    return float(rotation_angle(relative_poses(dive.cameras[3].cam2world, camera.cam2world)[0, :3, :3]))
+
+
+def disturbed(dive, turn: tuple[float, float, float], shift: tuple[float, float, float]):
+    pose = dive.cameras[3].cam2world.clone()
+    pose[0, :3, :3] = pose[0, :3, :3] @ so3_exp(torch.tensor(turn, dtype=torch.float64))
+    pose[0, :3, 3] += torch.tensor(shift)
+    return replace(dive.cameras[3], cam2world=pose)
+
+
 def test_a_disturbed_pose_finds_its_way_back(tiny_dive):
-    true, picture = tiny_dive.cameras[3], tiny_dive.frames.image(3)
-    pose = true.cam2world.clone()
-    pose[0, :3, :3] = pose[0, :3, :3] @ so3_exp(torch.tensor([0.012, -0.01, 0.015], dtype=torch.float64))
-    pose[0, :3, 3] += torch.tensor([0.02, -0.015, 0.02])
+    start = disturbed(tiny_dive, (0.012, -0.01, 0.015), (0.02, -0.015, 0.02))
     settings = PoseRefinementSettings(steps=120, rate=2e-3)
-    refined = refine_pose(tiny_dive.truth, replace(true, cam2world=pose), picture, SEEN, settings)
-
-    def turned(camera) -> float:
-        return float(rotation_angle(relative_poses(true.cam2world, camera.cam2world)[0, :3, :3]))
-
-    def pixels_off(camera) -> float:
-        points = tiny_dive.rec.points.xyz[None]
-        return float((project(camera, points)[0] - project(true, points)[0]).norm(dim=-1).median())
-
-    disturbed = replace(true, cam2world=pose)
+    refined = refine_pose(tiny_dive.truth, start, tiny_dive.frames.image(3), SEEN, settings)
     assert refined.loss < 0.2 * refined.start_loss
-    assert turned(refined.camera) < 0.4 * turned(disturbed)
-    assert pixels_off(disturbed) > 1
-    assert pixels_off(refined.camera) < 0.1  # before a wall, a shift and a turn are hard to tell apart: both may remain
+    assert turned(tiny_dive, refined.camera) < 0.4 * turned(tiny_dive, start)
+    assert pixels_off(tiny_dive, start) > 1
+    # before a wall, a shift and a turn are hard to tell apart: both may remain
+    assert pixels_off(tiny_dive, refined.camera) < 0.1
+
+
+def test_smaller_pictures_are_looked_at_first_for_half_of_the_steps():
+    settings = PoseRefinementSettings()
+    assert sizes(settings, 400) == [60, 120, 240]
+    assert sizes(settings, 150) == [75, 150]
+    assert sizes(settings, 64) == [64]
+    assert ends(300, 3) == [75, 150, 300]
+    assert ends(300, 1) == [300]
+    assert ends(0, 3) == [0, 0, 0]
 
 
 def test_a_pose_that_is_right_stays(tiny_dive):

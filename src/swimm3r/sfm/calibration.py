@@ -158,8 +158,8 @@ def _settled(
 ) -> "pycolmap.Reconstruction":
     """The model and its lens adjusted until the reprojection error stands still.
 
-    A lens with many parameters leaves its start slowly: OPENCV on ruie_green_rock stopped at 0.71 px, and came to 0.56 px
-    when asked again.
+    A lens with many parameters leaves its start slowly: OPENCV on ruie_green_rock stopped at 0.71 px, and came to
+    0.56 px when asked again.
     """
     error = np.inf
     for _ in range(_PASSES):

@@ -3,7 +3,8 @@
     cam2world' = cam2world [R(w) | length v]
 
 with a 9-vector (v, w), zero at first, w added to the 6D form of the identity. The loss is the mean absolute difference
-to the picture over its edges: pixels whose Scharr gradient exceeds a few medians.
+to the picture over its edges: pixels whose Scharr gradient exceeds a few medians. It has a minimum within a few pixels
+only, so that smaller pictures are looked at first.
 """
 
 from dataclasses import dataclass, replace
@@ -23,6 +24,7 @@ from swimm3r.splat.settings import PoseRefinementSettings
 from swimm3r.splat.views import pinhole_canvas, undistorted
 
 _DARK = 0.01  # sum of R, G, B below which a pixel is not looked at
+_SMALLEST = 60  # pixels of the longer side, below which a picture no longer tells a pose
 _MARGIN = 0.25  # of the picture, within which primitives outside it are kept: the pose moves
 
 
@@ -49,29 +51,68 @@ def refine_pose(
     `picture` and `mask` are the frame as prepared, distortion included; `time` is when it was taken, seconds.
     """
     settings = settings or PoseRefinementSettings()
-    canvas = pinhole_canvas(camera, settings.long_side)
-    target, seen = undistorted(picture, mask, camera, canvas)
-    wanted = edges(target, seen, settings)
-    units = in_scene_units(scene.settings, scene.length)
-    now = scene.moment(time)
-    primitives = in_sight(scene, canvas, now)
     delta = torch.zeros(9, requires_grad=True)
-    adam = torch.optim.Adam([delta], lr=settings.rate)
-    losses: list[tuple[float, Tensor]] = []
-    for step in range(settings.steps + 1):
-        progress("refining a pose", step, settings.steps)
-        pose = moved(canvas.cam2world[0], delta, scene.length)
-        images = pictures(primitives, scene.field, pinhole(replace(canvas, cam2world=pose[None])), units, now)
-        loss = ((images.rgb.permute(1, 2, 0) - target).abs().mean(-1) * wanted).sum() / wanted.sum()
-        losses.append((float(loss.detach()), pose.detach()))
-        if step == settings.steps:
-            break
-        adam.param_groups[0]["lr"] = settings.rate * 0.01 ** (step / settings.steps)
-        (delta.grad,) = torch.autograd.grad(loss, [delta])
-        adam.step()
-    start, end = losses[0], losses[-1]
-    best = end if end[0] < start[0] else start
-    return RefinedPose(replace(camera, cam2world=best[1][None]), start[0], best[0])
+    sides = sizes(settings, max(camera.width, camera.height))
+    looks = [_Look(scene, camera, picture, mask, replace(settings, long_side=side), time) for side in sides]
+    with torch.no_grad():
+        start = float(looks[-1].loss(delta))
+    done = 0
+    for look, until in zip(looks, ends(settings.steps, len(looks)), strict=True):
+        adam = torch.optim.Adam([delta], lr=settings.rate)
+        for step in range(count := until - done):
+            progress("refining a pose", done + step, settings.steps)
+            adam.param_groups[0]["lr"] = settings.rate * 0.01 ** (step / count)
+            (delta.grad,) = torch.autograd.grad(look.loss(delta), [delta])
+            adam.step()
+        done = until
+    progress("refining a pose", settings.steps, settings.steps)
+    with torch.no_grad():
+        end, pose = float(looks[-1].loss(delta)), looks[-1].pose(delta)
+    if end < start:
+        return RefinedPose(replace(camera, cam2world=pose[None]), start, end)
+    return RefinedPose(camera, start, start)
+
+
+class _Look:
+    """A camera's picture at one size, and how far the map is from it where the camera has moved to."""
+
+    def __init__(
+        self,
+        scene: SplatMap,
+        camera: Cameras,
+        picture: Float[Tensor, "h w 3"],
+        mask: Bool[Tensor, "h w"],
+        settings: PoseRefinementSettings,
+        time: float | None,
+    ) -> None:
+        self._scene, self._now = scene, scene.moment(time)
+        self._canvas = pinhole_canvas(camera, settings.long_side)
+        self._target, seen = undistorted(picture, mask, camera, self._canvas)
+        self._wanted = edges(self._target, seen, settings)
+        self._units = in_scene_units(scene.settings, scene.length)
+        self._primitives = in_sight(scene, self._canvas, self._now)
+
+    def pose(self, delta: Float[Tensor, "9"]) -> Float[Tensor, "4 4"]:
+        """cam2world after the motion."""
+        return moved(self._canvas.cam2world[0], delta, self._scene.length)
+
+    def loss(self, delta: Float[Tensor, "9"]) -> Float[Tensor, ""]:
+        """Mean absolute difference over the edges."""
+        view = pinhole(replace(self._canvas, cam2world=self.pose(delta)[None]))
+        rgb = pictures(self._primitives, self._scene.field, view, self._units, self._now).rgb
+        off = (rgb.permute(1, 2, 0) - self._target).abs().mean(-1)
+        return (off * self._wanted).sum() / self._wanted.sum()
+
+
+def sizes(settings: PoseRefinementSettings, long_side: int) -> list[int]:
+    """Longer sides that a picture of this longer side is looked at, in turn."""
+    largest = min(settings.long_side, long_side)
+    return [largest >> k for k in range(settings.halvings, 0, -1) if largest >> k >= _SMALLEST] + [largest]
+
+
+def ends(steps: int, count: int) -> list[int]:
+    """The steps after which each of the sizes is left: the smaller ones share the first half."""
+    return [steps * k // (2 * (count - 1)) for k in range(1, count)] + [steps]
 
 
 def edges(

@@ -206,6 +206,9 @@ class PoseRefinementSettings:
     """Of Adam, for a rotation in the 6D form and a translation in working units; decays to 1 %."""
     long_side: int = 240
     """Longer side of the picture the pose is refined on."""
+    halvings: int = 2
+    """How often that picture is halved at first; the smaller ones share half of the steps. A pose that starts 9 px off
+    (of 400) is found from a quarter of the size, and not from the whole: on ruie_green_rock 24.0 instead of 20.2 dB."""
     edge: float = 4.0
     """Pixels count whose gradient exceeds this many medians."""
     min_edges: float = 0.01
