@@ -104,7 +104,9 @@ def _sightings(
     times = torch.tensor([part.time for part in parts])
     on_course = torch.cat([pixels[i] for i in range(len(parts))])
     xyz = course(cameras, on_course, times / interval, settings.movers.nearness * ground)
-    z = torch.minimum(project(cameras, xyz[:, None])[1][:, 0], _BEFORE * ground).tolist()
+    on_rays = project(cameras, xyz[:, None])[1][:, 0]
+    nearer = float((_BEFORE * ground / on_rays).median().clamp(max=1))  # the whole course, or it would lose its shape
+    z = (nearer * on_rays).tolist()
 
     def way(i: int, j: int) -> Way:
         passage = steps[i][0] if j > i else steps[j][1]
