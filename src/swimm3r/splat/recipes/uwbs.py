@@ -15,7 +15,7 @@ from torch import Tensor
 
 from swimm3r.medium import Medium
 from swimm3r.reconstruction import Reconstruction
-from swimm3r.splat import densify, losses, movers, training
+from swimm3r.splat import densify, losses, training
 from swimm3r.splat.gradients import differentiate
 from swimm3r.splat.medium_field import (
     WaterPrior,
@@ -32,7 +32,8 @@ from swimm3r.splat.rendering import Drawing, draw
 from swimm3r.splat.settings import UwbsSettings
 from swimm3r.splat.site import Site
 from swimm3r.splat.state import FIELD, POSES, State, clip_field, first_state, parameters_of
-from swimm3r.splat.travel import ways
+from swimm3r.splat.moving.births import born
+from swimm3r.splat.moving.travel import ways
 from swimm3r.splat.views import View
 
 
@@ -141,7 +142,7 @@ class Uwbs:
     def _with_movers(self, state: State, step: int) -> State:
         """Primitives for what moves, behind the others; their optimiser starts anew."""
         rng = training.generator(self.settings.seed, step, 9)
-        fresh_ones = movers.born(state.primitives, state.field, self.site.views, self.settings, rng)
+        fresh_ones = born(state.primitives, state.field, self.site.views, self.settings, rng)
         moments = dict(state.moments)
         for name in BetaPrimitives._fields:
             m, count = moments[name], len(fresh_ones.xyz)

@@ -6,7 +6,7 @@ import pytest
 import torch
 
 from swimm3r.cameras import Cameras, project
-from swimm3r.splat.courses import course
+from swimm3r.splat.moving.courses import course
 
 COUNT, FOCAL = 13, 450.0
 TIMES = torch.arange(COUNT).double()

@@ -13,7 +13,7 @@ from torch import Tensor
 from torch.nn.functional import grid_sample, interpolate, pad
 
 from swimm3r.cameras import pixel_grid
-from swimm3r.splat.tracking import Fit, Part
+from swimm3r.splat.moving.tracking import Fit, Part
 from swimm3r.splat.views import View
 
 _RETURN = 1.5  # pixels within which flow there and back must end where it began

@@ -5,8 +5,8 @@ import torch
 from torch.nn.functional import interpolate
 
 from swimm3r.cameras import Cameras, pixel_grid
-from swimm3r.splat.passages import carried, full_size, passages
-from swimm3r.splat.tracking import Part, laid_over, tracks
+from swimm3r.splat.moving.passages import carried, full_size, passages
+from swimm3r.splat.moving.tracking import Part, laid_over, tracks
 from swimm3r.splat.views import View
 
 HEIGHT, WIDTH, SCALE = 54, 80, 3  # of the small pictures; the frames are three times as large

@@ -1,0 +1,1 @@
+"""What moves: found (`movement`), followed (`tracking`, `passages`), placed (`courses`), born (`births`, `travel`)."""
