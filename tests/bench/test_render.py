@@ -13,15 +13,11 @@ from swimm3r.bench import reference, tables
 from swimm3r.bench.localisation import maps_of
 from swimm3r.bench.render import compare_renderers, settings_for
 from swimm3r.bench.runs import clips_of, made_runs
-from swimm3r.cameras import project
 from swimm3r.errors import InputError
 from swimm3r.evaluate import NotComputed
-from swimm3r.ground_truth import GroundTruth
 from swimm3r.io.images import read_rgb
 from swimm3r.presets import RunSettings
-from swimm3r.reconstruction import Matches
 from swimm3r.run import open_finished_sfm
-from swimm3r.sfm import colmap
 from swimm3r.sfm.settings import ColmapSettings, PlaneSweepSettings
 from swimm3r.splat.settings import RECIPES, PoseRefinementSettings, UwbsSettings
 
@@ -107,25 +103,3 @@ def test_a_clip_that_cannot_be_placed_as_a_whole_is_remembered(run: Path, tmp_pa
     assert isinstance(found, NotComputed)
     assert json.loads((tmp_path / "reference.json").read_text())["failed"] == found.reason
     assert reference.of_clip(replace(sfm, frames=few), tmp_path) == found
-
-
-def test_the_reference_is_the_method_that_more_matches_agree_with(
-    run: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-):
-    """The incremental method may place every frame, and all of them wrongly."""
-    sfm = open_finished_sfm(run)
-    (a, _), (b, _) = (project(sfm.rec.cameras[k], sfm.rec.points.xyz[None]) for k in (0, 1))
-    none = torch.zeros(len(a[0]), dtype=torch.int64)
-    exact = replace(sfm.rec, matches=Matches(none, none + 1, a[0].float(), b[0].float(), torch.ones(len(none))))
-
-    def one_is_wrong(frames, settings, folder, progress, lens):
-        if settings.mapping.method == "global":
-            return exact
-        turned = exact.cameras.cam2world.clone()
-        turned[:, :3, :3] = turned.flip(0)[:, :3, :3]
-        return replace(exact, cameras=replace(exact.cameras, cam2world=turned))
-
-    monkeypatch.setattr(colmap, "reconstruct", one_is_wrong)
-    found = reference.of_clip(sfm, tmp_path)
-    assert isinstance(found, GroundTruth)
-    torch.testing.assert_close(found.cameras.cam2world, exact.cameras.cam2world)

@@ -15,14 +15,14 @@ from swimm3r.medium import Medium
 from swimm3r.splat import train
 from swimm3r.splat.conditioning import condition
 from swimm3r.splat.medium_field import MediumField, initial_field
-from swimm3r.splat.moving.movement import Look, against_others, look, moving_parts, moving_pixels
 from swimm3r.splat.moving.births import born
+from swimm3r.splat.moving.movement import Look, against_others, look, moving_parts, moving_pixels
+from swimm3r.splat.moving.travel import travelling
 from swimm3r.splat.primitives import BetaPrimitives, select, with_time
 from swimm3r.splat.recipes.uwbs import Uwbs
 from swimm3r.splat.settings import DensifySettings, InitialSettings, MediumFieldSettings, MoverSettings, UwbsSettings
 from swimm3r.splat.site import Site
 from swimm3r.splat.state import first_state
-from swimm3r.splat.moving.travel import travelling
 from swimm3r.splat.views import TrainingViews
 
 WATER = Medium(torch.tensor([0.1, 0.4, 0.5]), torch.tensor([0.4, 0.15, 0.1]), torch.tensor([0.3, 0.2, 0.2]))

@@ -17,14 +17,14 @@ from torch.nn.functional import normalize
 
 from swimm3r.cameras import Cameras, directions, project, ray_depth_from_z, unproject
 from swimm3r.medium import Medium, remove_water
-from swimm3r.splat.moving.courses import course
 from swimm3r.splat.medium_field import MediumField
+from swimm3r.splat.moving.courses import course
 from swimm3r.splat.moving.movement import Look, moving_parts
 from swimm3r.splat.moving.passages import Passage, carried, full_size, passages
-from swimm3r.splat.primitives import BetaPrimitives
-from swimm3r.splat.settings import UwbsSettings
 from swimm3r.splat.moving.tracking import Part, Track, tracks
 from swimm3r.splat.moving.travel import LONGEST, travelling
+from swimm3r.splat.primitives import BetaPrimitives
+from swimm3r.splat.settings import UwbsSettings
 from swimm3r.splat.views import TrainingViews, View
 
 _SPACING = 3.0  # pixels between primitives that are born, at least

@@ -24,6 +24,8 @@ from swimm3r.splat.medium_field import (
     smoothness,
     water_prior,
 )
+from swimm3r.splat.moving.births import born
+from swimm3r.splat.moving.travel import ways
 from swimm3r.splat.optimiser import Moments, adam_step, log_linear
 from swimm3r.splat.pose_codes import pose_rate
 from swimm3r.splat.primitives import BetaPrimitives, initial_primitives, rescaled, with_time
@@ -32,8 +34,6 @@ from swimm3r.splat.rendering import Drawing, draw
 from swimm3r.splat.settings import UwbsSettings
 from swimm3r.splat.site import Site
 from swimm3r.splat.state import FIELD, POSES, State, clip_field, first_state, parameters_of
-from swimm3r.splat.moving.births import born
-from swimm3r.splat.moving.travel import ways
 from swimm3r.splat.views import View
 
 
