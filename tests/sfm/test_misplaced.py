@@ -86,7 +86,9 @@ def test_of_two_ways_to_place_a_small_clip_the_one_that_explains_more_is_kept(
     for way in ("_climb", "_map_globally"):
         monkeypatch.setattr(mapping, way, lambda *_, found=wrong if way == wrong_one else model: [found])
     monkeypatch.setattr(mapping, "replace_misplaced", lambda store, model, *_: model)
-    assert mapping.map_frames(store, SETTINGS, silent) == [model]
+    for thin_points, kept in ((1, model), (100_000, wrong if wrong_one == "_climb" else model)):
+        settings = replace(SETTINGS, mapping=replace(SETTINGS.mapping, thin_points=thin_points))
+        assert mapping.map_frames(store, settings, silent) == [kept]
 
 
 def test_distances_from_the_lines_are_below_a_pixel_in_a_right_model_and_grow_with_the_error(

@@ -40,6 +40,8 @@ def map_frames(store: FeatureDatabase, settings: ColmapSettings, progress: Progr
     if method == "incremental" or not one_by_one:
         return one_by_one
     at_once = _put_right(store, _map_globally(store, settings, progress), settings, progress)
+    if not at_once or at_once[0].compute_mean_observations_per_reg_image() < settings.mapping.thin_points:
+        return one_by_one  # it gives every frame a pose, be there ever so little to see (dolphin_dynamic: 61 points)
     return max(one_by_one, at_once, key=_explained)
 
 
