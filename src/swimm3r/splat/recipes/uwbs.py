@@ -135,9 +135,10 @@ class Uwbs:
     def _looks_for_movers(self, step: int) -> bool:
         return self.settings.dynamic and step == round(self.settings.movers.at * self.settings.iterations)
 
-    def _has_movers(self, step: int) -> bool:
-        """Whether no room need be kept for what moves, any more or at all."""
-        return not self.settings.dynamic or step >= self.settings.movers.at * self.settings.iterations
+    def _kept_free(self, step: int) -> float:
+        """Share of the primitives' number that is left to what moves until it is born."""
+        m = self.settings.movers
+        return m.share if self.settings.dynamic and step < m.at * self.settings.iterations else 0.0
 
     def _with_movers(self, state: State, step: int) -> State:
         """Primitives for what moves, behind the others; their optimiser starts anew."""
@@ -172,8 +173,7 @@ class Uwbs:
         d = self.settings.densify
         n = len(state.primitives.xyz)
         growth = d.growth ** (self._every() / (d.every * self.settings.iterations))
-        kept_free = 0.0 if self._has_movers(step) else self.settings.movers.share
-        target = max(n, min(round((1 - kept_free) * d.max_primitives), int(growth * n)))
+        target = max(n, min(round((1 - self._kept_free(step)) * d.max_primitives), int(growth * n)))
         rng = training.generator(self.settings.seed, step, 4)
         with torch.no_grad():
             done = densify.relocate_and_grow(state.primitives, target, d.dead_opacity, rng)
