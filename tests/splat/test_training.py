@@ -1,5 +1,6 @@
 """The loop: it learns, it is exact about going on, and it writes what it says."""
 
+import copy
 import json
 from dataclasses import replace
 from pathlib import Path
@@ -13,7 +14,14 @@ from swimm3r.splat.checkpoint import load_map
 from swimm3r.splat.projection import pinhole
 from swimm3r.splat.recipes import uwbs
 from swimm3r.splat.rendering import SplatMap, draw
-from swimm3r.splat.settings import DensifySettings, InitialSettings, LossWeights, MediumFieldSettings, UwbsSettings
+from swimm3r.splat.settings import (
+    DensifySettings,
+    InitialSettings,
+    LossWeights,
+    MediumFieldSettings,
+    SggSettings,
+    UwbsSettings,
+)
 from swimm3r.splat.site import Site
 from swimm3r.splat.training import view_of_step
 from swimm3r.splat.views import TrainingViews
@@ -148,3 +156,18 @@ def test_mcmc_noise_comes_with_every_step_where_asked(tiny_dive):
         recipe = uwbs.Uwbs(settings, Site(tiny_dive.rec, 1.0, 1.0, views))
         moved[cadence] = recipe.step(recipe.start(), views[3], 1)[0].primitives.xyz
     assert (moved["round"] != moved["step"]).any(-1).float().mean() > 0.9
+
+
+def test_rates_settle_from_half_of_the_run_on(tiny_dive):
+    held = replace(SETTINGS, sgg=SggSettings(enabled=False), densify=DensifySettings(end=0.0))
+    views = TrainingViews(tiny_dive.rec, tiny_dive.frames, held, 1.0)
+    settling = replace(held, rates=replace(held.rates, settle=0.01))
+    start = uwbs.Uwbs(held, Site(tiny_dive.rec, 1.0, 1.0, views)).start()
+    for step, share in ((20, 1.0), (30, 0.1), (40, 0.01)):
+        moved = []
+        for settings in (held, settling):
+            recipe = uwbs.Uwbs(settings, Site(tiny_dive.rec, 1.0, 1.0, views))
+            after = recipe.step(copy.deepcopy(start), views[3], step)[0].primitives.opacity
+            moved.append((after - start.primitives.opacity).abs().max())
+        assert moved[0] > 0
+        torch.testing.assert_close(moved[1], share * moved[0], rtol=1e-4, atol=0)

@@ -76,6 +76,10 @@ class LearningRates:
     lower: float = 1e-3
     medium: float = 1e-3
     medium_end: float = 1.5e-4
+    settle: float = 1.0
+    """Share that the other rates have fallen to at the end of the run, log-linearly from `settle_begin` on; UBS holds
+    them, and at rates high enough for a short run the primitives then never come to rest."""
+    settle_begin: float = 0.5
 
 
 @dataclass(frozen=True)

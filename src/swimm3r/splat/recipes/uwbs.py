@@ -153,7 +153,8 @@ class Uwbs:
 
     def _rates(self, step: int, names: Collection[str]) -> dict[str, float]:
         r, share = self.settings.rates, step / self.settings.iterations
-        rates = {name: getattr(r, name) for name in BetaPrimitives._fields}
+        settled = log_linear(1.0, r.settle, max(0.0, (share - r.settle_begin) / (1 - r.settle_begin)))
+        rates = {name: settled * getattr(r, name) for name in BetaPrimitives._fields}
         rates["xyz"] = self.site.radius * log_linear(r.xyz, r.xyz_end, share)
         medium = log_linear(r.medium, r.medium_end, share)
         if self.prior is not None and share <= self.settings.medium.begin:
