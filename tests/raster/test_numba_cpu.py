@@ -18,8 +18,10 @@ from swimm3r.raster import (
     Primitives2D,
     SggBuffers,
     bin_primitives,
-    numba_kernels,
+    numba_adjoint,
+    numba_forward,
     numba_math,
+    numba_tiles,
     rasterize,
 )
 
@@ -79,7 +81,7 @@ def packed_operations(assembly: str) -> list[int]:
 )
 def test_the_loops_over_pixels_are_simd(name: str, kernel: Kernel, expected: list[int], scene: Scene):
     full_pass(*float32(scene(10, 20, 20)), kernel)
-    cached = getattr(numba_kernels, name)
+    cached = {"forward_tiles": numba_forward.forward_tiles, "adjoint_tiles": numba_adjoint.adjoint_tiles}[name]
     options = {key: cached.targetoptions[key] for key in ("nogil", "error_model", "fastmath")}
     fresh = numba.njit(**options)(cached.py_func)  # code from Numba's cache cannot be looked into
     parameters = list(inspect.signature(cached.py_func).parameters)
@@ -149,7 +151,7 @@ def test_water_of_a_tile_is_that_of_its_middle_times_a_short_polynomial():
             for share in np.linspace(-0.5, 0.5, 101):
                 departure = np.float32(share / z)
                 near, far = (
-                    numba_kernels.through_water((departure,) * 3, np.float32(z), (k,) * 3, (at_middle,) * 3, way)
+                    numba_tiles.through_water((departure,) * 3, np.float32(z), (k,) * 3, (at_middle,) * 3, way)
                     for way in (None, True)
                 )
                 rounding = 6e-8 * (3 + abs(middle * z))  # of the exponent, in float32

@@ -15,7 +15,8 @@ import torch
 from torch import Tensor
 
 from swimm3r.raster.bins import bin_primitives
-from swimm3r.raster.numba_kernels import PLAIN, WITH_SGG, adjoint_tiles, forward_tiles, sum_slots
+from swimm3r.raster.numba_adjoint import PLAIN, WITH_SGG, adjoint_tiles, sum_slots
+from swimm3r.raster.numba_forward import forward_tiles
 from swimm3r.raster.records import Bins, CpuBins, MediumMaps, Primitives2D, RasterOutput, SggBuffers
 
 __all__ = ["backward", "bin_primitives", "forward"]
