@@ -1,4 +1,4 @@
-"""What the peers' published schedules do to them in a short run, and what `with_recipe` does about it.
+"""What the published schedules do to a short run, and what the `fast` preset and `with_recipe` do about it.
 
     python benchmarks/short_runs.py RUN [--iterations 400] [--long-side 160] [--primitives 4000] [--only NAME ...]
 
@@ -19,6 +19,7 @@ from swimm3r.presets import PRESETS
 from swimm3r.run import FinishedSfm, open_finished_sfm
 from swimm3r.splat import train
 from swimm3r.splat.settings import (
+    LearningRates,
     McmcGsSettings,
     SeaSplatSettings,
     SplatSettings,
@@ -48,7 +49,9 @@ def variants(size: UwbsSettings) -> dict[str, SplatSettings]:
         for of, published in ((water, watersplatting()), (sea, seasplat()))
     }
     return {
-        "uwbs-static": with_recipe(size, "uwbs-static"),
+        "uwbs-static": size,
+        "uwbs-static, rates as published": replace(size, rates=LearningRates()),
+        "uwbs-static, rates held to the end": replace(size, rates=replace(size.rates, settle=1.0)),
         "mcmc_gs": mcmc,
         "mcmc_gs, first scale as published": replace(mcmc, initial=mcmc_first),
         "watersplatting": water,
