@@ -11,7 +11,7 @@ from jaxtyping import Float, UInt8
 from scipy.ndimage import gaussian_filter1d
 from torch import Tensor
 
-from swimm3r import reconstruction
+from swimm3r import devices, reconstruction
 from swimm3r.cameras import Cameras, project
 from swimm3r.errors import InputError
 from swimm3r.frames import Frames
@@ -100,7 +100,8 @@ def render_run(
     A dynamic map shows `time` (seconds of the clip), by default the moment when the frame of a camera's name was taken.
     Raises InputError where the run has no map, a name in the file leads out of the folder, or no moment is known.
     """
-    scene, rec = load_map(folder / "splat" / "map.safetensors"), reconstruction.load(folder / "sfm")
+    scene = load_map(folder / "splat" / "map.safetensors").to(devices.for_maps())
+    rec = reconstruction.load(folder / "sfm")
     refined = folder / "splat" / "cameras.json"
     table = cameras_json.read_cameras(cameras or (refined if refined.is_file() else folder / "sfm" / "cameras.json"))
     stations, out = reconstruction.cameras_of(table), out or folder / "renders" / "views"

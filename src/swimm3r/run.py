@@ -15,7 +15,7 @@ from hashlib import sha256
 from importlib.metadata import version
 from pathlib import Path
 
-from swimm3r import held_out, reconstruction
+from swimm3r import devices, held_out, reconstruction
 from swimm3r import summary as sections
 from swimm3r.errors import InputError, StorageError
 from swimm3r.frames import Frames
@@ -36,6 +36,7 @@ from swimm3r.splat import train
 from swimm3r.splat.checkpoint import load_map
 from swimm3r.splat.pose_codes import as_mapped
 from swimm3r.splat.rendering import SplatMap
+from swimm3r.splat.settings import MapDevice
 
 SCHEMA = 1
 STAGES = ("prepare", "sfm", "splat", "eval")
@@ -52,11 +53,13 @@ def run_pipeline(
     *,
     reference: Path | None = None,
     last_stage: str = "eval",
+    map_device: MapDevice = "auto",
     progress: Progress = silent,
 ) -> dict:
     """Run the stages up to `last_stage` and return the summary (layout: docs/conventions.md).
 
-    `reference` is a cameras.json to score against; a synthetic dive brings its own truth. Raises the errors of its
+    `reference` is a cameras.json to score against; a synthetic dive brings its own truth. `map_device` is where the map
+    is trained and rendered. Raises the errors of its
     stages (`swimm3r.errors`) and InputError where `folder` belongs to another input.
     """
     settings = settings or RunSettings()
@@ -67,6 +70,7 @@ def run_pipeline(
     write_text(folder / "settings.yaml", to_yaml(settings))
     write_text(folder / "versions.json", json.dumps(_versions(), indent=2) + "\n")
     truth = truth_of(source, reference)
+    devices.for_maps(map_device)  # before minutes of structure from motion
 
     key = _key("prepare", fingerprint, asdict(settings.frames))
     try:
@@ -104,8 +108,8 @@ def run_pipeline(
     scene = record.stage(
         "splat",
         key,
-        make=lambda: train(rec, frames, settings.splat, folder / "splat", progress),
-        reuse=lambda: load_map(folder / "splat" / "map.safetensors"),
+        make=lambda: train(rec, frames, settings.splat, folder / "splat", progress, map_device),
+        reuse=lambda: load_map(folder / "splat" / "map.safetensors").to(devices.for_maps(map_device)),
     )
     record.add(sections.splat_sections(scene, rec, frames, folder / "splat"))
     if last_stage == "splat":
@@ -194,7 +198,8 @@ def evaluate_run(
     record = _Record(folder, source, before["input"]["fingerprint"])
     record.summary |= {name: section for name, section in before.items() if name not in _SCORES}
     frames, rec = load_frames(folder / "prepare"), reconstruction.load(folder / "sfm")
-    run = _Run(folder, frames, rec, load_map(folder / "splat" / "map.safetensors"))
+    scene = load_map(folder / "splat" / "map.safetensors").to(devices.for_maps())
+    run = _Run(folder, frames, rec, scene)
     truth = truth_of(source, reference)
     key = _key("eval", before["stages"]["splat"]["key"], {"reference": str(reference), "test": asdict(settings.test)})
     record.stage("eval", key, make=lambda: record.add(_scores(run, settings, truth, progress)))

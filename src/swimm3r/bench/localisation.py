@@ -16,6 +16,7 @@ import torch
 from jaxtyping import Bool, Float
 from torch import Tensor
 
+from swimm3r import devices
 from swimm3r.bench import reference
 from swimm3r.bench.cells import Cell, Place, Scores, kept_cell, over_scenes, scene_folder
 from swimm3r.bench.memory import with_peak_mb
@@ -133,7 +134,7 @@ def _scores(
     settings: LocalizationSettings,
     progress: Progress,
 ) -> Scores:
-    scene = load_map(path)
+    scene = load_map(path).to(devices.for_maps())
 
     def work() -> tuple[Localizer, list[Answer]]:
         localizer = Localizer(scene, sfm.rec, sfm.frames, settings)

@@ -3,7 +3,7 @@
 import json
 from pathlib import Path
 
-from swimm3r import held_out
+from swimm3r import devices, held_out
 from swimm3r.bench.cells import Scores
 from swimm3r.evaluate import NotComputed
 from swimm3r.io import images
@@ -23,7 +23,7 @@ def trained(sfm: FinishedSfm, settings: SplatSettings, folder: Path, progress: P
     if path.is_file():
         scene = load_map(path)
         if scene.settings == settings:
-            return scene
+            return scene.to(devices.for_maps())
     return train(sfm.rec, sfm.frames, settings, folder, progress)
 
 

@@ -13,7 +13,7 @@ from swimm3r.errors import UsageError
 from swimm3r.frame_settings import FrameSettings
 from swimm3r.presets import MAST3R_PRESETS, PRESETS, RunSettings
 from swimm3r.sfm.settings import ColmapModelSettings, ColmapSettings, Mast3rSettings, SfmSettings
-from swimm3r.splat.settings import PoseRefinementSettings, Recipe, UwbsSettings, with_recipe
+from swimm3r.splat.settings import MapDevice, PoseRefinementSettings, Recipe, UwbsSettings, with_recipe
 
 Preset = Literal["fast", "default", "best"]
 Backend = Literal["colmap", "mast3r", "swimm3r"]
@@ -82,6 +82,7 @@ def commands_for_preset(name: str, backend: str = "colmap", recipe: Recipe = "uw
         images: Path | None = None,
         preset: Preset = "default",
         recipe: Recipe = "uwbs-static",
+        map_device: MapDevice = "auto",
         reference: Path | None = None,
         frames: Annotated[FrameSettings, _FLAT] = defaults.frames,
         sfm: Annotated[ColmapSettings, _FLAT] = defaults.sfm,
@@ -100,6 +101,7 @@ def commands_for_preset(name: str, backend: str = "colmap", recipe: Recipe = "uw
             preset: what the other defaults aim at.
             recipe: uwbs-static; uwbs-dynamic, whose map changes with time; or another method on the same start.
                 `--recipe NAME --help` shows its options.
+            map_device: where the map is trained and rendered; auto takes CUDA where there is a GPU and NVIDIA Warp.
             reference: a cameras.json with poses to compare with.
             frames: which frames to take.
             sfm: how poses, depth and water are found; with --colmap, depth and water alone.
@@ -123,7 +125,7 @@ def commands_for_preset(name: str, backend: str = "colmap", recipe: Recipe = "uw
             poses = ColmapModelSettings(
                 models[0].resolve(), features=sfm.features, depth=sfm.depth, water=sfm.water, restore=sfm.restore
             )
-        _pipeline(given, out, RunSettings(frames, poses, splat, test), reference, "eval")
+        _pipeline(given, out, RunSettings(frames, poses, splat, test), reference, "eval", map_device)
 
     def run(
         source: Positional[Path],
@@ -132,6 +134,7 @@ def commands_for_preset(name: str, backend: str = "colmap", recipe: Recipe = "uw
         preset: Preset = "default",
         backend: Backend = "colmap",
         recipe: Recipe = "uwbs-static",
+        map_device: MapDevice = "auto",
         reference: Path | None = None,
         frames: Annotated[FrameSettings, _FLAT] = defaults.frames,
         sfm: sfm_settings = sfm_defaults,
@@ -148,6 +151,7 @@ def commands_for_preset(name: str, backend: str = "colmap", recipe: Recipe = "uw
                 --help` shows its options.
             recipe: uwbs-static; uwbs-dynamic, whose map changes with time; or another method on the same start.
                 `--recipe NAME --help` shows its options.
+            map_device: where the map is trained and rendered; auto takes CUDA where there is a GPU and NVIDIA Warp.
             reference: a cameras.json with poses to compare with.
             frames: which frames to take.
             sfm: how poses, depth and water are found.
@@ -155,7 +159,7 @@ def commands_for_preset(name: str, backend: str = "colmap", recipe: Recipe = "uw
             test: how the test frames' poses are refined.
         """
         _require_adapter(backend, sfm)
-        _pipeline(source, out, RunSettings(frames, sfm, splat, test), reference, "eval")
+        _pipeline(source, out, RunSettings(frames, sfm, splat, test), reference, "eval", map_device)
 
     return {"run": run, "prepare": prepare, "sfm": sfm, "splat": splat}
 
@@ -169,7 +173,14 @@ def _require_adapter(backend: Backend, settings: SfmSettings) -> None:
         )
 
 
-def _pipeline(source: Path, out: Path, settings: RunSettings, reference: Path | None, last: str) -> None:
+def _pipeline(
+    source: Path,
+    out: Path,
+    settings: RunSettings,
+    reference: Path | None,
+    last: str,
+    map_device: MapDevice = "cpu",
+) -> None:
     if isinstance(settings.sfm, Mast3rSettings):  # before minutes of preparing frames
         from swimm3r.sfm.pairs import parse_graph
 
@@ -182,5 +193,7 @@ def _pipeline(source: Path, out: Path, settings: RunSettings, reference: Path | 
     from swimm3r.run import run_pipeline
 
     with drawn_progress() as progress:
-        summary = run_pipeline(source, out, settings, reference=reference, last_stage=last, progress=progress)
+        summary = run_pipeline(
+            source, out, settings, reference=reference, last_stage=last, map_device=map_device, progress=progress
+        )
     print_summary(summary, out)

@@ -15,7 +15,7 @@ import torch
 from jaxtyping import Bool, Float, UInt8
 from torch import Tensor
 
-from swimm3r import reconstruction
+from swimm3r import devices, reconstruction
 from swimm3r.cameras import Cameras
 from swimm3r.errors import InputError, RegistrationError
 from swimm3r.geometry import quaternion_from_rotation
@@ -63,7 +63,8 @@ def localize_run(
 
     Raises InputError where the run has no map, RegistrationError where not one picture could be placed.
     """
-    scene, rec = load_map(folder / "splat" / "map.safetensors"), reconstruction.load(folder / "sfm")
+    scene = load_map(folder / "splat" / "map.safetensors").to(devices.for_maps())
+    rec = reconstruction.load(folder / "sfm")
     frames = load_frames(folder / "prepare")
     localizer = Localizer(scene, rec, frames, settings)
     camera = None if lens is None else reconstruction.cameras_of(cameras_json.read_cameras(lens))[0]

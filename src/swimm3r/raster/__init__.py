@@ -55,7 +55,7 @@ def bin_primitives(
     Worth calling only to rasterise the same primitives twice: `rasterize` bins by itself.
     """
     _check_cut(alpha_min, kernel)
-    kernels = _kernels("warp" if p.mean2d.is_cuda else "numba")
+    kernels = _kernels("numba" if p.mean2d.device.type == "cpu" else "warp")
     return kernels.bin_primitives(_detached(p), height, width, alpha_min, kernel)
 
 
@@ -92,7 +92,7 @@ def rasterize(
     if bins is not None and len(bins.packed) != len(p.mean2d):
         raise ValueError(f"bins hold {len(bins.packed)} primitives, got {len(p.mean2d)}")
     if backend == "auto":
-        backend = "warp" if p.mean2d.is_cuda else "numba"
+        backend = "numba" if p.mean2d.device.type == "cpu" else "warp"
     if medium is None and backend != "numba":  # which has kernels without water
         medium = MediumMaps(*p.mean2d.new_zeros(3, 3, height, width))
     dtype = p.mean2d.dtype

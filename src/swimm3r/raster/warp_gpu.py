@@ -291,7 +291,7 @@ def bin_primitives(p: Primitives2D, height: int, width: int, alpha_min: float, k
     seen &= A.isfinite() & determinant.isfinite() & (p.beta > 0) & (p.opacity > 0) & (p.opacity >= alpha_min)
     safe = torch.where(seen, determinant, 1.0)
     half = torch.stack([r2_max * C / safe, r2_max * A / safe], -1).clamp(min=0).sqrt() + 1e-3
-    size = torch.tensor([width, height], device=device)
+    size = torch.tensor([width, height]).to(device)
     mean = torch.where(seen[:, None], p.mean2d.double(), 0.0)
     first = (mean - half - 0.5).ceil().clamp(min=0).minimum(size).nan_to_num(0).long()
     last = (mean + half - 0.5).floor().clamp(min=-1).minimum(size - 1).nan_to_num(-1).long()

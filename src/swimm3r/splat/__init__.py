@@ -5,7 +5,7 @@ from tempfile import mkdtemp
 from typing import TYPE_CHECKING
 
 from swimm3r.progress import Progress, silent
-from swimm3r.splat.settings import SplatSettings, UwbsSettings
+from swimm3r.splat.settings import MapDevice, SplatSettings, UwbsSettings
 
 if TYPE_CHECKING:
     import swimm3r.frames
@@ -21,13 +21,17 @@ def train(
     settings: SplatSettings | None = None,
     folder: Path | None = None,
     progress: Progress = silent,
+    device: MapDevice = "auto",
 ) -> "swimm3r.splat.rendering.SplatMap":
     """A map of the reconstruction, trained on the registered of `frames.train`.
 
     Works in `folder` (a new temporary one by default) and goes on exactly from what an interrupted call left there.
-    Raises InputError where no training frame is registered.
+    It is trained on `device`, where the map then stays: CUDA where it is here and NVIDIA Warp installed, by default.
+    Raises InputError where no training frame is registered, DeviceError where `device` is not here.
     """
+    from swimm3r import devices
     from swimm3r.splat import fitting
 
     folder = folder or Path(mkdtemp(prefix="swimm3r-splat-"))
-    return fitting.train(reconstruction, frames, settings or UwbsSettings(), folder, progress)
+    place = devices.for_maps(device)
+    return fitting.train(reconstruction, frames, settings or UwbsSettings(), folder, progress, place)

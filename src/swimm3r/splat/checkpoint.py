@@ -75,7 +75,7 @@ def load_map(path: Path) -> SplatMap:
 
 def write(path: Path, stored: Stored) -> None:
     """Tensors and header in one file, whole or not at all."""
-    tensors = {name: values.detach().contiguous() for name, values in stored.tensors.items()}
+    tensors = {name: values.detach().cpu().contiguous() for name, values in stored.tensors.items()}
     with atomic_path(path) as draft:
         save_file(tensors, draft, {"swimm3r": json.dumps({"schema": SCHEMA, **stored.about}, sort_keys=True)})
 

@@ -58,7 +58,7 @@ def queries(
 ) -> Float[Tensor, "n c"]:
     """What primitives are conditioned on: unit direction camera -> primitive in world axes, then time in 0..1."""
     direction = torch.nn.functional.normalize(xyz - centre, dim=-1)
-    return direction if time is None else torch.cat([direction, time.expand(len(xyz), 1)], -1)
+    return direction if time is None else torch.cat([direction, time.to(direction).expand(len(xyz), 1)], -1)
 
 
 def condition(p: BetaPrimitives, query: Float[Tensor, "n c"], rotation: str = "first_order") -> Conditioned:

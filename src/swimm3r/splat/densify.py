@@ -38,10 +38,10 @@ def relocate_and_grow(p: BetaPrimitives, target: int, dead_opacity: float, rng: 
     """Dead primitives take half of a live one, drawn by opacity; then more are drawn from all until `target` exist."""
     opacity = torch.sigmoid(p.opacity)
     n = len(opacity)
-    source = torch.arange(n)
+    source = torch.arange(n, device=opacity.device)
     dead = (opacity <= dead_opacity).nonzero()[:, 0]
     alive = (opacity > dead_opacity).nonzero()[:, 0]
-    restarted = [torch.zeros(0, dtype=torch.int64)]
+    restarted = [source[:0]]
     if len(dead) and len(alive):
         drawn = alive[draw_rows(opacity[alive], len(dead), rng)]
         opacity = _shared(opacity, drawn, dead_opacity)
@@ -54,9 +54,9 @@ def relocate_and_grow(p: BetaPrimitives, target: int, dead_opacity: float, rng: 
         opacity = _shared(opacity, drawn, dead_opacity)
         source = torch.cat([source, source[drawn]])
         opacity = torch.cat([opacity, opacity[drawn]])
-        restarted += [drawn, torch.arange(n, n + added)]
+        restarted += [drawn, torch.arange(n, n + added, device=drawn.device)]
     moved = select(p, source)
-    changed = source != torch.arange(len(source))
+    changed = source != torch.arange(len(source), device=source.device)
     touched = torch.cat(restarted).unique()
     raw = moved.opacity.clone()
     rows = torch.cat([touched, changed.nonzero()[:, 0]]).unique()
@@ -73,7 +73,7 @@ def noise(
     q, o = select(p, at), opacity[at]
     L = rotation_block(q.lower[:, :3], rotation) * torch.nn.functional.softplus(q.scale[:, None, :3])
     gate = (1 - o) ** _GATE if settings.noise_gate == "power" else torch.sigmoid(-_GATE * (o - settings.dead_opacity))
-    eps = torch.randn(len(at), 3, 1, generator=rng) * rate * gate[:, None, None]
+    eps = torch.randn(len(at), 3, 1, generator=rng).to(o) * rate * gate[:, None, None]
     moved = torch.zeros_like(p.xyz)
     moved[at] = (L @ (L.mT @ eps))[..., 0]
     return moved
@@ -82,9 +82,8 @@ def noise(
 def draw_rows(weights: Float[Tensor, " n"], count: int, rng: torch.Generator) -> Int[Tensor, " count"]:
     """Rows drawn with replacement; by the cumulative sum, as torch.multinomial stops at 2^24 categories."""
     edges = weights.double().cumsum(0)
-    return torch.searchsorted(edges, torch.rand(count, generator=rng, dtype=torch.float64) * edges[-1]).clamp(
-        max=len(weights) - 1
-    )
+    drawn = torch.rand(count, generator=rng, dtype=torch.float64).to(edges)
+    return torch.searchsorted(edges, drawn * edges[-1]).clamp(max=len(weights) - 1)
 
 
 def _shared(opacity: Float[Tensor, " n"], drawn: Int[Tensor, " m"], least: float) -> Float[Tensor, " n"]:

@@ -6,6 +6,9 @@ import math
 from dataclasses import asdict
 from pathlib import Path
 
+import torch
+
+from swimm3r.devices import CPU
 from swimm3r.frames import Frames
 from swimm3r.progress import Progress, silent
 from swimm3r.reconstruction import Reconstruction
@@ -23,7 +26,12 @@ from swimm3r.splat.views import TrainingViews, working_scale
 
 
 def train(
-    rec: Reconstruction, frames: Frames, settings: SplatSettings, folder: Path, progress: Progress = silent
+    rec: Reconstruction,
+    frames: Frames,
+    settings: SplatSettings,
+    folder: Path,
+    progress: Progress = silent,
+    device: torch.device = CPU,
 ) -> SplatMap:
     """Train a map in `folder`: checkpoint/, metrics.jsonl, and at the end map.safetensors and the refined cameras.json.
 
@@ -32,7 +40,8 @@ def train(
     scale = working_scale(rec, settings)
     views = TrainingViews(rec, frames, settings, scale)
     stations = training_stations(rec, views.names, views.cameras, scale) if settings.poses.enabled else None
-    site = Site(rec, scale, path_radius(rec, scale, settings.working_depth), views, stations)
+    radius = path_radius(rec, scale, settings.working_depth)
+    site = Site(rec, scale, radius, views, stations, device)
     final = training.run(_recipe(settings, site), _schedule(settings, rec, views), folder, progress)
     primitives, field = in_scene_units(final, 1 / scale)
     poses = None
@@ -47,7 +56,7 @@ def train(
 def _recipe(settings: SplatSettings, site: Site) -> training.Recipe:
     match settings:
         case UwbsSettings():
-            return Uwbs(settings, site, known_water(site.rec, site.scale, settings))
+            return Uwbs(settings, site, known_water(site, settings))
         case McmcGsSettings():
             return McmcGs(settings, site)
         case WaterSplattingSettings():

@@ -47,12 +47,12 @@ def relocate_and_grow(p: GaussianPrimitives, target: int, dead_opacity: float, r
     opacity = torch.sigmoid(p.opacity)
     dead, alive = (opacity <= dead_opacity).nonzero()[:, 0], (opacity > dead_opacity).nonzero()[:, 0]
     if not len(alive):
-        return Relocated(p, torch.zeros(0, dtype=torch.int64), 0, 0)
+        return Relocated(p, alive, 0, 0)
     restarted = []
     if len(dead):
         drawn = alive[draw_rows(opacity[alive], len(dead), rng)]
         p = _shared(p, drawn, dead_opacity)
-        source = torch.arange(n)
+        source = torch.arange(n, device=dead.device)
         source[dead] = drawn
         p = select(p, source)
         restarted.append(drawn)
@@ -60,9 +60,9 @@ def relocate_and_grow(p: GaussianPrimitives, target: int, dead_opacity: float, r
     if added:
         drawn = draw_rows(torch.sigmoid(p.opacity), added, rng)
         p = _shared(p, drawn, dead_opacity)
-        p = select(p, torch.cat([torch.arange(n), drawn]))
-        restarted += [drawn, torch.arange(n, n + added)]
-    touched = torch.cat(restarted).unique() if restarted else torch.zeros(0, dtype=torch.int64)
+        p = select(p, torch.cat([torch.arange(n, device=drawn.device), drawn]))
+        restarted += [drawn, torch.arange(n, n + added, device=drawn.device)]
+    touched = torch.cat(restarted).unique() if restarted else alive[:0]
     return Relocated(p, touched, len(dead), added)
 
 
@@ -72,7 +72,7 @@ def noise(p: GaussianPrimitives, rate: float, dead_opacity: float, rng: torch.Ge
     at = (opacity < dead_opacity + 0.2).nonzero()[:, 0]  # the gate is below 1e-8 beyond
     L = shape_factor(select(p, at))
     gate = torch.sigmoid(-_GATE * (opacity[at] - dead_opacity))
-    eps = torch.randn(len(at), 3, 1, generator=rng) * rate * gate[:, None, None]
+    eps = torch.randn(len(at), 3, 1, generator=rng).to(gate) * rate * gate[:, None, None]
     moved = torch.zeros_like(p.xyz)
     moved[at] = (L @ (L.mT @ eps))[..., 0]
     return moved

@@ -36,6 +36,10 @@ class GaussianPrimitives(NamedTuple):
         """Whether they change with time."""
         return False
 
+    def to(self, device: torch.device) -> "GaussianPrimitives":
+        """The same on a device."""
+        return GaussianPrimitives(*(values.to(device) for values in self))
+
 
 def rescaled(p: GaussianPrimitives, factor: float) -> GaussianPrimitives:
     """The same Gaussians after every length was multiplied by `factor`."""

@@ -28,16 +28,16 @@ class Changed:
     restarted: Int[Tensor, " m"]  # rows whose moments are zeroed
 
 
-def nothing_seen(n: int) -> dict[str, Tensor]:
-    """What is remembered of n Gaussians before any step: sums of pulls, how many they are, and the largest radius."""
-    return {name: torch.zeros(n) for name in ("pull", "times", "radius")}
+def nothing_seen(p: GaussianPrimitives) -> dict[str, Tensor]:
+    """What is remembered of Gaussians before any step: sums of pulls, how many they are, and the largest radius."""
+    return {name: torch.zeros_like(p.opacity) for name in ("pull", "times", "radius")}
 
 
 def remembered(
     memory: dict[str, Tensor], gradient: Float[Tensor, "n 2"], projection: Projection, view: Pinhole
 ) -> dict[str, Tensor]:
     """The memory after one more step, whose centres' gradient (per pixel) and projection are given."""
-    size = torch.tensor([view.width, view.height])
+    size = torch.tensor([view.width, view.height]).to(gradient)
     at, reach = projection.primitives.mean2d.detach(), projection.radius[:, None]
     shown = ((at > -reach) & (at < size + reach)).all(-1) & (projection.radius > 0)
     pull = torch.linalg.vector_norm(gradient * size / 2, dim=-1)
@@ -68,14 +68,14 @@ def multiply(
         asked = asked[torch.argsort(pull[asked], descending=True, stable=True)[:room]].sort().values
     halves = p.scale[asked].amax(-1).exp() > large
     split = asked[halves]
-    source = torch.cat([torch.arange(n), asked])
+    source = torch.cat([torch.arange(n, device=asked.device), asked])
     q = GaussianPrimitives(*(values.clone() for values in select(p, source)))
     both = torch.cat([split, n + halves.nonzero()[:, 0]])  # one half takes the place of the whole
     part = select(q, both)
-    eps = torch.randn(len(both), 3, 1, generator=rng)
+    eps = torch.randn(len(both), 3, 1, generator=rng).to(q.xyz)
     q.xyz[both] += (shape_factor(part) @ eps)[..., 0]
     q.scale[both] -= _SHRINK
-    return Changed(q, source, torch.cat([split, torch.arange(n, len(source))]))
+    return Changed(q, source, torch.cat([split, torch.arange(n, len(source), device=split.device)]))
 
 
 def only(changed: Changed, kept: Bool[Tensor, " n"]) -> Changed:
@@ -87,7 +87,8 @@ def only(changed: Changed, kept: Bool[Tensor, " n"]) -> Changed:
 
 def unchanged(p: GaussianPrimitives) -> Changed:
     """A round that has done nothing yet."""
-    return Changed(p, torch.arange(len(p.xyz)), torch.zeros(0, dtype=torch.int64))
+    rows = torch.arange(len(p.xyz), device=p.xyz.device)
+    return Changed(p, rows, rows[:0])
 
 
 def dimmed(

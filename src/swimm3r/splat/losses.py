@@ -30,7 +30,7 @@ def photometric(
     """(1 - w) L1 + w (1 - SSIM) (Eq. 3dgs_loss), SSIM zero-padded; pixels not `seen` count as matched."""
     if not bool(seen.all()):
         target = torch.where(seen, target, render.detach())
-    if render.is_cuda or render.dtype != torch.float32:
+    if render.device.type != "cpu" or render.dtype != torch.float32:
         l1, ssim = (render - target).abs().mean(), mean_ssim(render, target)
         loss = (1 - ssim_weight) * l1 + ssim_weight * (1 - ssim)
         return Photometric(loss, float(l1.detach()), float(ssim.detach()))

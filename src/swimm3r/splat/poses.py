@@ -87,8 +87,8 @@ class _Look:
     ) -> None:
         self._scene, self._now = scene, scene.moment(time)
         self._canvas = pinhole_canvas(camera, settings.long_side)
-        self._target, seen = undistorted(picture, mask, camera, self._canvas)
-        self._wanted = edges(self._target, seen, settings)
+        target, seen = undistorted(picture, mask, camera, self._canvas)
+        self._target, self._wanted = target.to(scene.device), edges(target, seen, settings).to(scene.device)
         self._units = in_scene_units(scene.settings, scene.length)
         self._primitives = in_sight(scene, self._canvas, self._now)
 
@@ -98,7 +98,7 @@ class _Look:
 
     def loss(self, delta: Float[Tensor, "9"]) -> Float[Tensor, ""]:
         """Mean absolute difference over the edges."""
-        view = pinhole(replace(self._canvas, cam2world=self.pose(delta)[None]))
+        view = pinhole(replace(self._canvas, cam2world=self.pose(delta)[None])).to(self._scene.device)
         rgb = pictures(self._primitives, self._scene.field, view, self._units, self._now).rgb
         off = (rgb.permute(1, 2, 0) - self._target).abs().mean(-1)
         return (off * self._wanted).sum() / self._wanted.sum()
@@ -131,8 +131,9 @@ def edges(
 def in_sight(scene: SplatMap, canvas: Cameras, now: Float[Tensor, ""] | None = None) -> Primitives:
     """The primitives that a camera sees, or would after a small motion."""
     with torch.no_grad():
-        seen = project(scene.primitives, pinhole(canvas), in_scene_units(scene.settings, scene.length).render, now)
-    size = torch.tensor([canvas.width, canvas.height])
+        view = pinhole(canvas).to(scene.device)
+        seen = project(scene.primitives, view, in_scene_units(scene.settings, scene.length).render, now)
+    size = torch.tensor([canvas.width, canvas.height]).to(seen.radius)
     reach = seen.radius[:, None] + _MARGIN * size
     at = seen.primitives.mean2d
     near = ((at > -reach) & (at < size + reach)).all(-1) & (seen.primitives.depth > 0)

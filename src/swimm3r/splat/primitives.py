@@ -38,6 +38,10 @@ class BetaPrimitives(NamedTuple):
         """Whether they change with time."""
         return self.query_mean.shape[1] > 3
 
+    def to(self, device: torch.device) -> "BetaPrimitives":
+        """The same on a device."""
+        return BetaPrimitives(*(values.to(device) for values in self))
+
 
 @runtime_checkable  # so that the suite can check calls against it
 class Rows(Protocol):

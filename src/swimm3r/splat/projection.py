@@ -8,7 +8,7 @@ where an opaque one falls below 1/255.
 """
 
 import math
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import torch
 from jaxtyping import Float
@@ -44,6 +44,10 @@ class Pinhole:
     cy: float
     width: int
     height: int
+
+    def to(self, device: torch.device) -> "Pinhole":
+        """The same camera for primitives on a device."""
+        return replace(self, R=self.R.to(device), t=self.t.to(device), centre=self.centre.to(device))
 
 
 @dataclass(frozen=True)
@@ -175,4 +179,4 @@ def centre_gradients(
 
 
 def _has_fast_form(p: BetaPrimitives, settings: RenderSettings) -> bool:
-    return not p.xyz.is_cuda and p.xyz.dtype == torch.float32 and settings.rotation == "first_order"
+    return p.xyz.device.type == "cpu" and p.xyz.dtype == torch.float32 and settings.rotation == "first_order"

@@ -1,5 +1,6 @@
 """A trained map and its pictures: with the water, without it, the water alone, and depth."""
 
+import copy
 from dataclasses import dataclass, replace
 from typing import TypeVar
 
@@ -59,8 +60,19 @@ class SplatMap:
     span: tuple[float, float] = (0.0, 1.0)  # of the clip it was trained on, seconds
     poses: RefinedPoses | None = None  # of the training frames; None where they were held
 
+    @property
+    def device(self) -> torch.device:
+        """Where it is rendered."""
+        return self.primitives.xyz.device
+
+    def to(self, device: torch.device) -> "SplatMap":
+        """The same map on a device."""
+        return replace(self, primitives=self.primitives.to(device), field=copy.deepcopy(self.field).to(device))
+
     def render(self, camera: Cameras, time: float | None = None) -> RenderOutput:
         """The view of one pinhole camera at a time of the clip (seconds; static maps need none), without gradient.
+
+        The pictures are where the camera is, on the processor as a rule, wherever the map may be.
 
         Raises ValueError where the camera has distortion, or where a dynamic map is given no time.
         """
@@ -149,7 +161,7 @@ def in_scene_units(settings: Settings, length: float) -> Settings:
 def render(scene: SplatMap, camera: Cameras, time: float | None = None) -> RenderOutput:
     """One view of a map at a time of its clip. Raises ValueError as `SplatMap.render` does."""
     settings = in_scene_units(scene.settings, scene.length)
-    view, now = pinhole(camera), scene.moment(time)
+    view, now = pinhole(camera).to(scene.device), scene.moment(time)
     match scene.field:
         case MediumField():
             drawing = draw(scene.primitives, scene.field, view, settings, now)
@@ -165,16 +177,17 @@ def render(scene: SplatMap, camera: Cameras, time: float | None = None) -> Rende
             over = layer(scene.field, relative_depth(images))
             medium, veil = _as_coefficients(scene.field, over, images, view), over.backscatter
             images = images._replace(rgb=seen_through(images.clear, over))
+    there = camera.cam2world.device
     return RenderOutput(
-        rgb=images.rgb.permute(1, 2, 0),
-        clear=surface_colour(images).permute(1, 2, 0),
-        veil=veil.permute(1, 2, 0),
-        z_depth=expected_z_depth(images),
-        alpha=images.alpha,
+        rgb=images.rgb.permute(1, 2, 0).to(there),
+        clear=surface_colour(images).permute(1, 2, 0).to(there),
+        veil=veil.permute(1, 2, 0).to(there),
+        z_depth=expected_z_depth(images).to(there),
+        alpha=images.alpha.to(there),
         medium=Medium(
-            Binf=medium.binf.permute(1, 2, 0),
-            beta_D=medium.beta_d.permute(1, 2, 0),
-            beta_B=medium.beta_b.permute(1, 2, 0),
+            Binf=medium.binf.permute(1, 2, 0).to(there),
+            beta_D=medium.beta_d.permute(1, 2, 0).to(there),
+            beta_B=medium.beta_b.permute(1, 2, 0).to(there),
         ),
     )
 
@@ -183,9 +196,9 @@ def mean_water(scene: SplatMap, camera: Cameras, time: float | None = None) -> M
     """The map's water averaged over one view, per scene unit of ray depth."""
     match scene.field:
         case MediumField():
-            mean = (
-                grid_of(scene.field, pinhole(camera), scene.field.stride, scene.moment(time)).values.flatten(1).mean(1)
-            )
+            view = pinhole(camera).to(scene.device)
+            grid = grid_of(scene.field, view, scene.field.stride, scene.moment(time))
+            mean = grid.values.flatten(1).mean(1).to(camera.cam2world.device)
             return Medium(mean[:3], beta_B=mean[3:6], beta_D=mean[6:])
         case SceneWater():
             medium = scene.render(camera, time).medium

@@ -222,6 +222,9 @@ class PoseRefinementSettings:
 SplatSettings = UwbsSettings | WaterSplattingSettings | SeaSplatSettings | McmcGsSettings
 uwbs = UwbsSettings  # as the Python API calls it: swimm3r.train(rec, frames, swimm3r.uwbs(iterations=20_000))
 
+MapDevice = Literal["auto", "cpu", "cuda"]
+"""Where maps are trained and rendered; no part of the settings, for a map can go from one to the other."""
+
 Recipe = Literal["uwbs-static", "uwbs-dynamic", "ubs", "watersplatting", "seasplat", "threers_gs", "mcmc_gs"]
 RECIPES: tuple[Recipe, ...] = get_args(Recipe)
 

@@ -7,8 +7,10 @@ from jaxtyping import Float
 from torch import Tensor
 
 from swimm3r.cameras import Cameras
+from swimm3r.devices import CPU
 from swimm3r.reconstruction import Reconstruction
 from swimm3r.splat.pose_codes import PoseCodes, Stations
+from swimm3r.splat.projection import Pinhole, pinhole
 from swimm3r.splat.scene_settings import TrainingPoseSettings
 from swimm3r.splat.views import TrainingViews, View
 
@@ -22,6 +24,7 @@ class Site:
     radius: float  # of the cameras' path, working units
     views: TrainingViews
     stations: Stations | None = None  # None where poses are held
+    device: torch.device = CPU  # of primitives and water; frames and poses are on the processor
 
     @property
     def refined_cameras(self) -> int:
@@ -32,12 +35,20 @@ class Site:
         """Poses as they are before the first step; None where they are held."""
         return None if self.stations is None else PoseCodes(len(self.stations), settings, rng)
 
+    def view(self, k: int) -> View:
+        """The k-th training picture, on the device."""
+        return self.views[k].to(self.device)
+
     def camera(self, view: View, codes: PoseCodes | None) -> Cameras:
         """A view's camera where training has moved it to."""
         if self.stations is None or codes is None:
             return view.camera
         place = torch.tensor([self.stations.names.index(view.name)])
         return replace(view.camera, cam2world=self.stations.moved(codes, place))
+
+    def sight(self, view: View, codes: PoseCodes | None) -> Pinhole:
+        """That camera for drawing."""
+        return pinhole(self.camera(view, codes)).to(self.device)
 
     def epipolar_error(
         self, codes: PoseCodes | None, settings: TrainingPoseSettings, share: float, rng: torch.Generator

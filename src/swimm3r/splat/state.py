@@ -1,5 +1,6 @@
 """What training changes, whatever the recipe, and what a map consists of."""
 
+import copy
 import dataclasses
 import math
 from dataclasses import dataclass
@@ -55,6 +56,15 @@ class State(Generic[P, W]):
     poses: PoseCodes | None  # None where poses are held
     moments: dict[str, Moments]  # of "xyz" ..., of the field's parameters by "field.*", of the poses' by "poses.*"
     memory: dict[str, Tensor] = dataclasses.field(default_factory=dict)
+
+    def to(self, device: torch.device) -> "State[P, W]":
+        """The state on a device; the poses stay on the processor, where the matches are."""
+        moments = {
+            name: m if name.startswith(POSES) else Moments(*(t.to(device) for t in vars(m).values()))
+            for name, m in self.moments.items()
+        }
+        memory = {name: t.to(device) for name, t in self.memory.items()}
+        return State(self.primitives.to(device), copy.deepcopy(self.field).to(device), self.poses, moments, memory)
 
 
 def parameters_of(p: Primitives, field: Water, poses: PoseCodes | None = None) -> dict[str, Tensor]:

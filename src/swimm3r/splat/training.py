@@ -72,15 +72,15 @@ def view_of_step(step: int, views: int, seed: int) -> int:
 
 def run(recipe: Recipe, schedule: Schedule, folder: Path, progress: Progress) -> State:
     """Train from the checkpoint in `folder`, if there is one of this training, else from the start."""
-    views = recipe.site.views
     path, metrics = folder / "checkpoint" / "state.safetensors", folder / "metrics.jsonl"
     folder.mkdir(parents=True, exist_ok=True)
     state, done = _resume(recipe, path, metrics, schedule)
+    state = state.to(recipe.site.device)
     started, cpu_started, first = time.perf_counter(), time.process_time(), done
     averages: dict[str, list[float]] = {}
     for step in range(done + 1, schedule.iterations + 1):
         progress("training the map", step - 1, schedule.iterations)
-        view = views[view_of_step(step, len(views), schedule.seed)]
+        view = recipe.site.view(view_of_step(step, len(recipe.site.views), schedule.seed))
         state, numbers = recipe.step(state, view, step)
         for name, value in numbers.items():
             averages.setdefault(name, []).append(value)

@@ -34,6 +34,17 @@ class View:
     depth_weight: Float[Tensor, "h w"]  # edge-aware, 0 where the depth is unknown or doubtful
     time: Float[Tensor, ""] | None = None  # of the clip, 0..1; static maps do not ask
 
+    def to(self, device: torch.device) -> "View":
+        """The same picture on a device; its camera stays with the poses."""
+        return replace(
+            self,
+            rgb=self.rgb.to(device),
+            seen=self.seen.to(device),
+            z_depth=self.z_depth.to(device),
+            depth_weight=self.depth_weight.to(device),
+            time=None if self.time is None else self.time.to(device),
+        )
+
 
 class TrainingViews:
     """The registered training frames as views; pictures are made when asked for and kept in a bounded cache."""
@@ -113,7 +124,7 @@ def smaller(view: View, divisor: int) -> View:
     height, width = (max(2, size // divisor) for size in view.seen.shape)
     rgb = interpolate(view.rgb[None], (height, width), mode="area")[0]
     seen = interpolate(view.seen[None, None].float(), (height, width), mode="area")[0, 0] > 0.999
-    nothing = torch.zeros(height, width)
+    nothing = view.rgb.new_zeros(height, width)
     return View(view.name, resized(view.camera, width, height), rgb, seen, nothing, nothing, view.time)
 
 

@@ -13,7 +13,7 @@ from pathlib import Path
 import torch
 from torch import Tensor
 
-from swimm3r import weights
+from swimm3r import devices, weights
 from swimm3r.errors import DeviceError
 from swimm3r.progress import Progress, silent
 from swimm3r.sfm import adapter_file
@@ -37,7 +37,7 @@ log = logging.getLogger(__name__)
 def load_network(settings: Mast3rSettings) -> Mast3r:
     """The network of the settings' checkpoint on their device."""
     path = weights.require("mast3r", settings.weights)
-    return checkpoint.load(path, _device(settings.device), getattr(torch, settings.precision))
+    return checkpoint.load(path, devices.chosen(settings.device), getattr(torch, settings.precision))
 
 
 def put_on(network: Mast3r, adapter: Path, settings: Mast3rSettings) -> PhysicsHead | None:
@@ -149,19 +149,6 @@ def _anchors(view: ViewPrediction, settings: AlignmentSettings) -> Predicted:
     return Predicted(
         view.points[first::s, first::s].flatten(0, 1).cpu(), view.confidence[first::s, first::s].flatten().cpu()
     )
-
-
-def _device(name: str) -> torch.device:
-    if name == "auto":
-        name = "cuda" if torch.cuda.is_available() else "mps" if torch.backends.mps.is_available() else "cpu"
-    here = {"cpu": True, "cuda": torch.cuda.is_available(), "mps": torch.backends.mps.is_available()}
-    if not here[name]:
-        raise DeviceError(
-            f"there is no {name} device on this computer",
-            cause="no accelerator, no driver for it, or a PyTorch without its support (swimm3r doctor shows which)",
-            hint="--device auto",
-        )
-    return torch.device(name)
 
 
 @contextmanager

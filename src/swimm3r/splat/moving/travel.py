@@ -35,7 +35,7 @@ def travelling(
     along = velocity / speed.clamp(min=1e-9)[:, None]
     along[still] = along.new_tensor([1.0, 0, 0])
     axis = along.abs().argmax(-1)  # the nearest axis is turned, by less than 55 degrees
-    rows = torch.arange(n)
+    rows = torch.arange(n, device=xyz.device)
     cosine = along[rows, axis].abs()
     unit = torch.zeros_like(along)
     unit[rows, axis] = along[rows, axis].sign()
@@ -51,8 +51,8 @@ def travelling(
         xyz=xyz,
         query_mean=torch.cat([direction, direction.new_full((n, 1), time)], -1),
         rgb=rgb,
-        opacity=torch.full((n,), opacity).logit(),
-        beta=torch.zeros(n, 5),
+        opacity=xyz.new_full((n,), opacity).logit(),
+        beta=xyz.new_zeros(n, 5),
         scale=inverse_softplus(spread),
         lower=torch.cat([skew, xyz.new_zeros(n, 12), lower, xyz.new_zeros(n, 3)], -1),
     )

@@ -13,7 +13,7 @@ from swimm3r.splat.gaussians import GaussianPrimitives, initial_gaussians, resca
 from swimm3r.splat.medium_field import NO_WATER, MediumField
 from swimm3r.splat.optimiser import Moments, log_linear
 from swimm3r.splat.pose_codes import pose_rate
-from swimm3r.splat.projection import Pinhole, pinhole
+from swimm3r.splat.projection import Pinhole
 from swimm3r.splat.rendering import Drawing, draw
 from swimm3r.splat.site import Site
 from swimm3r.splat.state import POSES, State, parameters_of
@@ -55,7 +55,7 @@ def look(site: Site, state: State, view: View, settings: GaussianSettings, step:
     """
     p = GaussianPrimitives(*(values.detach().requires_grad_() for values in state.primitives))
     degree = int((step - 1) / (settings.degree_every * settings.iterations))
-    sight = pinhole(site.camera(view, state.poses))
+    sight = site.sight(view, state.poses)
     field = state.field if isinstance(state.field, MediumField) else NO_WATER
     drawing = draw(to_degree(p, min(degree, settings.initial.harmonics)), field, sight, settings, sgg=sgg)
     return Look(p, drawing, sight, parameters_of(p, state.field, state.poses))
@@ -69,7 +69,7 @@ def with_matches(
     off = site.epipolar_error(state.poses, settings.poses, step / settings.iterations, rng)
     if off is None:
         return loss, {}
-    return loss + settings.poses.epipolar * off, {"epipolar_px": float(off.detach())}
+    return loss + settings.poses.epipolar * off.to(loss), {"epipolar_px": float(off.detach())}
 
 
 def haste(settings: GaussianSettings) -> float:

@@ -75,7 +75,8 @@ class McmcGs:
         target = max(n, min(self.settings.max_primitives, int(growth * n)))
         rng = training.generator(self.settings.seed, step, 4)
         done = gaussian_mcmc.relocate_and_grow(state.primitives, target, d.dead_opacity, rng)
-        rows = torch.arange(target).clamp(max=n - 1)  # the slots of the dead keep their memory, as gsplat has it
+        rows = torch.arange(target, device=state.primitives.xyz.device)
+        rows = rows.clamp(max=n - 1)  # the slots of the dead keep their memory, as gsplat has it
         moments = with_rows(state.moments, rows, done.restarted)
         counts = {"relocated": float(done.relocated), "added": float(done.added)}
         return State(done.primitives, state.field, state.poses, moments), counts

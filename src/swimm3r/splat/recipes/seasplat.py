@@ -51,7 +51,7 @@ class SeaSplat:
         p = first_gaussians(self.site, self.settings)
         water = initial_scene_water(training.generator(seed, 0, 3))
         codes = self.site.codes(self.settings.poses, training.generator(seed, 0, 6))
-        return first_state(p, water, codes, gradient_densify.nothing_seen(len(p.xyz)))
+        return first_state(p, water, codes, gradient_densify.nothing_seen(p))
 
     def step(self, state: UnderWater, view: View, step: int) -> tuple[UnderWater, dict[str, float]]:
         """Bursts where they are due, then one view: forward, adjoint, Adam, densification on its cadence."""
@@ -92,7 +92,7 @@ class SeaSplat:
         water = self.settings.water
         self._water_burst(state, step, water.first_burst * self.settings.iterations)
         for k in self._draws(step, 11, water.colour_burst * self.settings.iterations):
-            view = self.site.views[k]
+            view = self.site.view(k)
             seen = look(self.site, state, view, self.settings, step)
             gradients = seen.gradients(
                 objective(seen.drawing.images, state.field, view, self.settings.weights, True).total
@@ -110,7 +110,7 @@ class SeaSplat:
 
         @lru_cache(maxsize=_KEPT)
         def as_it_stands(k: int) -> tuple[View, RasterOutput]:
-            view = self.site.views[k]
+            view = self.site.view(k)
             with torch.no_grad():
                 return view, look(self.site, state, view, self.settings, step).drawing.images
 
@@ -142,7 +142,7 @@ class SeaSplat:
             if int(fit.sum()) >= 4:
                 done = gradient_densify.only(done, fit)
             p, moments = done.primitives, with_rows(moments, done.source, done.restarted)
-            memory = gradient_densify.nothing_seen(len(p.xyz))
+            memory = gradient_densify.nothing_seen(p)
         if d.reset_every and step % cut_every == 0:
             p, moments = gradient_densify.dimmed(p, moments, d.reset_opacity)
         return State(p, state.field, state.poses, moments, memory)

@@ -13,8 +13,8 @@ import torch
 from jaxtyping import Float, Int
 from torch import Tensor
 
+from swimm3r.devices import CPU
 from swimm3r.medium import Medium
-from swimm3r.reconstruction import Reconstruction
 from swimm3r.splat import densify, losses, training
 from swimm3r.splat.gradients import differentiate
 from swimm3r.splat.medium_field import (
@@ -29,7 +29,6 @@ from swimm3r.splat.moving.travel import ways
 from swimm3r.splat.optimiser import Moments, adam_step, log_linear
 from swimm3r.splat.pose_codes import pose_rate
 from swimm3r.splat.primitives import BetaPrimitives, initial_primitives, rescaled, with_time
-from swimm3r.splat.projection import pinhole
 from swimm3r.splat.rendering import Drawing, draw
 from swimm3r.splat.settings import UwbsSettings
 from swimm3r.splat.site import Site
@@ -77,14 +76,14 @@ class Uwbs:
         parameters = parameters_of(state.primitives, state.field, state.poses)
         p = BetaPrimitives(*(values.detach().requires_grad_() for values in state.primitives))
         filtered = settings.sgg.enabled and share <= settings.sgg.end
-        sight = pinhole(self.site.camera(view, state.poses))
+        sight = self.site.sight(view, state.poses)
         drawing = draw(p, state.field, sight, settings, view.time, sgg=filtered)
         loss = objective(p, drawing, view, settings, self.prior, self._regularised(share))
         numbers, total = loss.numbers | {"primitives": float(len(p.xyz))}, loss.total
         rng = training.generator(settings.seed, step, 7)
         off = self.site.epipolar_error(state.poses, settings.poses, share, rng)
         if off is not None:
-            total = total + settings.poses.epipolar * off
+            total = total + settings.poses.epipolar * off.to(total)
             numbers |= {"epipolar_px": float(off.detach())}
         leaves = [*p, *state.field.parameters(), *(state.poses.parameters() if state.poses else ())]
         multiplier = None
@@ -143,7 +142,8 @@ class Uwbs:
     def _with_movers(self, state: State, step: int) -> State:
         """Primitives for what moves, behind the others; their optimiser starts anew."""
         rng = training.generator(self.settings.seed, step, 9)
-        fresh_ones = born(state.primitives, state.field, self.site.views, self.settings, rng)
+        here = state.to(CPU)  # where the pictures are looked at
+        fresh_ones = born(here.primitives, here.field, self.site.views, self.settings, rng).to(self.site.device)
         moments = dict(state.moments)
         for name in BetaPrimitives._fields:
             m, count = moments[name], len(fresh_ones.xyz)
@@ -183,9 +183,8 @@ class Uwbs:
                 p = p._replace(xyz=p.xyz + self._noise(p, rate, rng))
             moments, gradients = dict(state.moments), dict(gradients)
             appended = len(p.xyz) - n
-            stale = torch.cat(
-                [done.restarted, (done.source != torch.arange(len(done.source))).nonzero()[:, 0]]
-            ).unique()
+            rows = torch.arange(len(done.source), device=done.source.device)
+            stale = torch.cat([done.restarted, (done.source != rows).nonzero()[:, 0]]).unique()
             for name in BetaPrimitives._fields:
                 m = moments[name]
                 first, second = _extended(m.first, appended), _extended(m.second, appended)
@@ -237,11 +236,13 @@ def objective(
     return Objective(total, depth, {k: float(torch.as_tensor(v).detach()) for k, v in numbers.items()})
 
 
-def known_water(rec: Reconstruction, scale: float, settings: UwbsSettings) -> WaterPrior | None:
+def known_water(site: Site, settings: UwbsSettings) -> WaterPrior | None:
     """What structure from motion says about the water, per working unit; None for maps without water."""
-    if settings.medium.model == "none" or rec.medium is None:
+    fit = site.rec.medium
+    if settings.medium.model == "none" or fit is None:
         return None
-    return water_prior(rec.medium, 1 / scale, settings.medium)
+    prior = water_prior(fit, 1 / site.scale, settings.medium)
+    return WaterPrior(prior.mean.to(site.device), prior.std.to(site.device))
 
 
 def _extended(rows: Tensor, count: int) -> Tensor:

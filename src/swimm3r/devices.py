@@ -1,0 +1,48 @@
+"""Where tensors live: the processor, or an accelerator where there is one."""
+
+import importlib.util
+import logging
+from collections.abc import Sequence
+
+import torch
+
+from swimm3r.errors import DeviceError
+
+log = logging.getLogger(__name__)
+
+CPU = torch.device("cpu")
+
+
+def chosen(name: str, accelerators: Sequence[str] = ("cuda", "mps")) -> torch.device:
+    """The device of that name; "auto" is the first of `accelerators` that is here, else the processor.
+
+    Raises DeviceError for one that is not here.
+    """
+    here = {"cpu": True, "cuda": torch.cuda.is_available(), "mps": torch.backends.mps.is_available()}
+    if name == "auto":
+        name = next((accelerator for accelerator in accelerators if here[accelerator]), "cpu")
+    if not here[name]:
+        raise DeviceError(
+            f"there is no {name} device on this computer",
+            cause="no accelerator, no driver for it, or a PyTorch without its support (swimm3r doctor shows which)",
+            hint="--device auto",
+        )
+    return torch.device(name)
+
+
+def for_maps(name: str = "auto") -> torch.device:
+    """Where a map is trained and rendered: on CUDA by NVIDIA Warp, else on the processor.
+
+    Raises DeviceError where "cuda" was asked for and a part of it is missing; "auto" says so in the log.
+    """
+    device = chosen(name, ("cuda",))
+    if device.type == "cuda" and importlib.util.find_spec("warp") is None:
+        if name == "cuda":
+            raise DeviceError(
+                "the GPU rasteriser needs NVIDIA Warp, which is not installed",
+                cause="Swimm3R was installed without its cuda extra",
+                hint="pip install 'swimm3r[cuda]', or --device cpu",
+            )
+        log.warning("there is a GPU, but maps need NVIDIA Warp to use it: pip install 'swimm3r[cuda]'")
+        return CPU
+    return device

@@ -1,0 +1,81 @@
+"""A pretended accelerator: tensors that say they are elsewhere, while an ordinary tensor holds their values.
+
+Code that mixes them with ordinary tensors, reads their memory, or makes new ones in the wrong place fails as it would
+on a GPU; what it computes can be compared with the processor's. Torch's "meta" device is what they claim to be on: the
+one besides the processor that autograd takes without a driver.
+"""
+
+from collections.abc import Callable
+from typing import Any
+
+import torch
+from torch import Tensor
+from torch.utils._python_dispatch import TorchDispatchMode
+from torch.utils._pytree import tree_flatten, tree_map
+
+DEVICE = torch.device("meta")
+_MAY_MIX = {"aten::copy_", "aten::_to_copy"}  # what goes from one place to the other
+_INDICES_FROM_ANYWHERE = {"aten::index", "aten::index_put", "aten::index_put_"}
+
+
+class Elsewhere(Tensor):
+    """A tensor on the pretended device."""
+
+    held: Tensor
+
+    @staticmethod
+    def __new__(cls, held: Tensor) -> "Elsewhere":
+        made = Tensor._make_wrapper_subclass(
+            cls,
+            held.shape,
+            strides=held.stride(),
+            storage_offset=held.storage_offset(),
+            dtype=held.dtype,
+            device=DEVICE,
+        )
+        made.held = held
+        return made
+
+    def __repr__(self, **_: Any) -> str:  # pyright: ignore[reportIncompatibleMethodOverride]
+        return f"Elsewhere({self.held})"
+
+    def tolist(self) -> Any:
+        """As any tensor's; torch has none for other kinds."""
+        return self.held.tolist()
+
+    @classmethod
+    def __torch_dispatch__(cls, func: Any, types: Any, args: Any = (), kwargs: Any = None) -> Any:
+        return _run(func, args, kwargs or {})
+
+
+class Pretended(TorchDispatchMode):
+    """While it is on, DEVICE is a device."""
+
+    def __torch_dispatch__(self, func: Any, types: Any, args: Any = (), kwargs: Any = None) -> Any:
+        return _run(func, args, kwargs or {})
+
+
+def held(t: Tensor) -> Tensor:
+    """The values of a tensor that may be elsewhere."""
+    return t.held if isinstance(t, Elsewhere) else t
+
+
+def _run(func: Callable[..., Any], args: Any, kwargs: dict[str, Any]) -> Any:
+    name = func._schema.name  # pyright: ignore[reportFunctionMemberAccess]
+    given = [t for t in tree_flatten((args, kwargs))[0] if isinstance(t, Tensor)]
+    away = any(isinstance(t, Elsewhere) for t in given)
+    checked = tree_flatten(args[:1])[0] if name in _INDICES_FROM_ANYWHERE else given
+    if away and name not in _MAY_MIX:
+        strangers = [t for t in checked if isinstance(t, Tensor) and not isinstance(t, Elsewhere) and t.dim()]
+        assert not strangers, f"{name} of tensors on the device and on the processor"
+    empty = [t for t in given if t.device.type == DEVICE.type and not isinstance(t, Elsewhere)]
+    assert not empty, f"{name} of a tensor made with torch.tensor(..., device=): only .to(device) is seen here"
+    asked = kwargs.get("device")
+    if asked is not None:
+        away = torch.device(asked).type == DEVICE.type
+        kwargs = kwargs | {"device": torch.device("cpu")}
+    unwrapped = tree_map(lambda t: held(t) if isinstance(t, Tensor) else t, (args, kwargs))
+    result = func(*unwrapped[0], **unwrapped[1])
+    if func._schema.is_mutable:  # pyright: ignore[reportFunctionMemberAccess]  # the same tensor comes back
+        return args[0] if isinstance(result, Tensor) else result
+    return tree_map(lambda t: Elsewhere(t) if isinstance(t, Tensor) else t, result) if away else result
