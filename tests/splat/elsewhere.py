@@ -5,7 +5,9 @@ on a GPU; what it computes can be compared with the processor's. Torch's "meta" 
 one besides the processor that autograd takes without a driver.
 """
 
+import traceback
 from collections.abc import Callable
+from pathlib import Path
 from typing import Any
 
 import torch
@@ -16,6 +18,11 @@ from torch.utils._pytree import tree_flatten, tree_map
 DEVICE = torch.device("meta")
 _MAY_MIX = {"aten::copy_", "aten::_to_copy"}  # what goes from one place to the other
 _INDICES_FROM_ANYWHERE = {"aten::index", "aten::index_put", "aten::index_put_"}
+
+
+_WAITS = {"aten::_local_scalar_dense", "aten::nonzero", "aten::_unique2", "aten::repeat_interleave", "aten::bincount"}
+waits: list[str] = []
+"""Where in the package the processor has waited for the device, in turn; whoever counts them empties it first."""
 
 
 class Elsewhere(Tensor):
@@ -60,6 +67,17 @@ def held(t: Tensor) -> Tensor:
     return t.held if isinstance(t, Elsewhere) else t
 
 
+def _picks_by_mask(name: str, args: Any) -> bool:
+    picking = args[1] if name == "aten::index" else []
+    return any(t is not None and t.dtype == torch.bool for t in picking)
+
+
+def _who() -> str:
+    """The innermost of the package's files and functions on the stack."""
+    ours = [frame for frame in traceback.extract_stack() if "/src/swimm3r/" in frame.filename]
+    return f"{Path(ours[-1].filename).name}:{ours[-1].name}" if ours else "outside"
+
+
 def _run(func: Callable[..., Any], args: Any, kwargs: dict[str, Any]) -> Any:
     name = func._schema.name  # pyright: ignore[reportFunctionMemberAccess]
     given = [t for t in tree_flatten((args, kwargs))[0] if isinstance(t, Tensor)]
@@ -71,6 +89,9 @@ def _run(func: Callable[..., Any], args: Any, kwargs: dict[str, Any]) -> Any:
     empty = [t for t in given if t.device.type == DEVICE.type and not isinstance(t, Elsewhere)]
     assert not empty, f"{name} of a tensor made with torch.tensor(..., device=): only .to(device) is seen here"
     asked = kwargs.get("device")
+    back = name == "aten::_to_copy" and asked is not None and torch.device(asked).type == "cpu"
+    if given and isinstance(given[0], Elsewhere) and (name in _WAITS or back or _picks_by_mask(name, args)):
+        waits.append(_who())
     if asked is not None:
         away = torch.device(asked).type == DEVICE.type
         kwargs = kwargs | {"device": torch.device("cpu")}

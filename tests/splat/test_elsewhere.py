@@ -7,12 +7,13 @@ from pathlib import Path
 
 import pytest
 import torch
-from tests.splat.elsewhere import DEVICE, Elsewhere, Pretended, held
+from tests.splat.elsewhere import DEVICE, Elsewhere, Pretended, held, waits
 
 from swimm3r.evaluate.images import psnr
 from swimm3r.splat import fitting
 from swimm3r.splat.checkpoint import load_map
 from swimm3r.splat.poses import refine_pose
+from swimm3r.splat.recipes import uwbs
 from swimm3r.splat.rendering import mean_water
 from swimm3r.splat.settings import (
     DensifySettings,
@@ -23,6 +24,8 @@ from swimm3r.splat.settings import (
     UwbsSettings,
     with_recipe,
 )
+from swimm3r.splat.site import Site
+from swimm3r.splat.views import TrainingViews
 
 pytest.importorskip("warp", reason="warp-lang is not installed: maps were not trained on a pretended device")
 from swimm3r.raster import warp_gpu
@@ -103,6 +106,19 @@ def test_an_interrupted_training_goes_on_elsewhere(tiny_dive, tmp_path):
         scene = fitting.train(tiny_dive.rec, tiny_dive.frames, settings, tmp_path, device=DEVICE)
     assert scene.device == DEVICE
     assert len(losses(tmp_path)) == 12
+
+
+def test_a_step_waits_for_the_device_only_to_bin(tiny_dive):
+    settings = replace(SIZE, iterations=1000, poses=replace(SIZE.poses, enabled=False))
+    views = TrainingViews(tiny_dive.rec, tiny_dive.frames, settings, 1.0)
+    with Pretended():
+        site = Site(tiny_dive.rec, 1.0, 1.0, views, None, DEVICE)
+        recipe = uwbs.Uwbs(settings, site, uwbs.known_water(site, settings))
+        state, view = recipe.start().to(DEVICE), site.view(2)
+        waits.clear()
+        recipe.step(state, view, 26)
+    assert set(waits) == {"warp_gpu.py:bin_primitives"}
+    assert len(waits) == 2  # how many tiles the primitives may touch, and how many they do
 
 
 def test_the_pretence_sees_tensors_in_two_places():

@@ -279,7 +279,10 @@ _PASSES: dict[Kernel, PixelKernels] = {
 
 
 def bin_primitives(p: Primitives2D, height: int, width: int, alpha_min: float, kernel: Kernel) -> Bins:
-    """Tile lists on the primitives' device, exact as on the CPU; the number of pairs is the one trip to the host."""
+    """Tile lists on the primitives' device, exact as on the CPU.
+
+    The host waits twice: for the number of tiles around the primitives, and for that of those they touch.
+    """
     n, device = len(p.depth), p.depth.device
     A, B, C = p.conic.double().unbind(-1)
     determinant = A * C - B * B
@@ -311,15 +314,14 @@ def bin_primitives(p: Primitives2D, height: int, width: int, alpha_min: float, k
     right = mean[ids, 0] + (-b * y + (reach - d * y * y).clamp(min=0).sqrt()) / a + 1e-3
     y = (-offset).clamp(low_y, high_y)
     left = mean[ids, 0] + (-b * y - (reach - d * y * y).clamp(min=0).sqrt()) / a - 1e-3
-    kept = (left <= column * TILE + TILE - 0.5) & (right >= column * TILE + 0.5)
+    kept = ((left <= column * TILE + TILE - 0.5) & (right >= column * TILE + 0.5)).nonzero()[:, 0]
     ids, tile = ids[kept], (row * ((width + TILE - 1) // TILE) + column)[kept]
     key = (tile << 32) | p.depth.float().view(torch.int32)[
         ids
     ].long()  # the bits of positive floats sort like the floats
     order = torch.argsort(key, stable=True)
     tiles = ((height + TILE - 1) // TILE) * ((width + TILE - 1) // TILE)
-    tile_start = torch.zeros(tiles + 1, dtype=torch.int32, device=device)
-    tile_start[1:] = torch.bincount(tile, minlength=tiles).cumsum(0)
+    tile_start = torch.searchsorted(tile[order], torch.arange(tiles + 1, device=device)).int()
     record = torch.zeros(n, 16, device=device)
     record[:, :2], record[:, 2:5], record[:, 5] = p.mean2d, p.conic, p.opacity.log2()
     record[:, 6], record[:, 7], record[:, 8], record[:, 9:12] = p.beta, r2_max, p.depth, p.color

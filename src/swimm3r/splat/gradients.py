@@ -73,8 +73,8 @@ def step_multiplier(
     Where no primitive has such a gradient there is no depth to protect, and uncertainty decides alone.
     """
     s = torch.linalg.vector_norm(isolated, dim=-1)
-    positive = s[s > 0]
-    gate = s / (s + positive.median()) if len(positive) else torch.ones_like(s)
+    median = torch.where(s > 0, s, torch.nan).nanmedian()
+    gate = torch.where(median.isnan(), 1.0, s / (s + median))
     return 1 + (largest - 1) * uncertainty * gate
 
 

@@ -20,20 +20,19 @@ class Photometric:
     """Eq. 3dgs_loss and its two parts; the parts are for the record."""
 
     loss: Float[Tensor, ""]
-    l1: float
-    ssim: float
+    l1: float | Tensor
+    ssim: float | Tensor
 
 
 def photometric(
     render: Float[Tensor, "3 h w"], target: Float[Tensor, "3 h w"], seen: Bool[Tensor, "h w"], ssim_weight: float
 ) -> Photometric:
     """(1 - w) L1 + w (1 - SSIM) (Eq. 3dgs_loss), SSIM zero-padded; pixels not `seen` count as matched."""
-    if not bool(seen.all()):
-        target = torch.where(seen, target, render.detach())
+    target = torch.where(seen, target, render.detach())
     if render.device.type != "cpu" or render.dtype != torch.float32:
         l1, ssim = (render - target).abs().mean(), mean_ssim(render, target)
         loss = (1 - ssim_weight) * l1 + ssim_weight * (1 - ssim)
-        return Photometric(loss, float(l1.detach()), float(ssim.detach()))
+        return Photometric(loss, l1.detach(), ssim.detach())
     l1, ssim, gradient = ssim_cpu.photometric(render, target, ssim_weight)
     value = torch.tensor((1 - ssim_weight) * l1 + ssim_weight * (1 - ssim))
     gradient = torch.where(seen, gradient, 0.0)
@@ -83,10 +82,11 @@ def mean_scale(p: BetaPrimitives, ubs_bug: bool = False) -> Float[Tensor, ""]:
 
 def oversize(p: BetaPrimitives, radius: Float[Tensor, " n"], limit: float) -> Float[Tensor, ""]:
     """L_rad (Eq. radius_reg): mean spatial scale of the primitives whose radius exceeds `limit` pixels, 0 for none."""
-    large = (radius > limit).nonzero()[:, 0]
-    if not len(large):
+    large = (radius > limit)[:, None]
+    if large.device.type == "cpu" and not bool(large.any()):  # a GPU would have to be waited for
         return p.scale.new_zeros(())
-    return softplus(p.scale[large, :3]).mean()
+    scales = torch.where(large, softplus(p.scale[:, :3]), 0.0)
+    return scales.sum() / (3 * large.sum()).clamp(min=1)
 
 
 def depth_error(
@@ -99,14 +99,10 @@ def depth_error(
 
     D^ is the expected depth. `weight` is the edge-aware weight, 0 where the prior is unknown.
     """
-    valid = (weight > 0) & (images.alpha.detach() > least_alpha)
-    at = valid.flatten().nonzero()[:, 0]
-    if not len(at):
-        return images.z_depth.new_zeros(())
-    alpha, total = images.alpha.flatten()[at], images.z_depth.flatten()[at]
-    prior = z_depth.flatten()[at].clamp(min=_NEAREST)
-    rendered = (total / alpha).clamp(min=_NEAREST)
-    return (weight.flatten()[at] * torch.log1p((1 / rendered - 1 / prior).abs())).mean()
+    covered = images.alpha.detach() > least_alpha
+    inverse = images.alpha / images.z_depth.clamp(min=_NEAREST * least_alpha)
+    off = torch.log1p((inverse - 1 / z_depth.clamp(min=_NEAREST)).abs())
+    return (weight * covered * off).sum() / ((weight > 0) & covered).sum().clamp(min=1)
 
 
 def uncovered(images: RasterOutput, weight: Float[Tensor, "h w"]) -> Float[Tensor, ""]:

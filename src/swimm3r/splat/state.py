@@ -2,7 +2,6 @@
 
 import copy
 import dataclasses
-import math
 from dataclasses import dataclass
 from typing import Any, Generic, TypeVar
 
@@ -118,7 +117,7 @@ def in_scene_units(state: State, length: float) -> tuple[Primitives, Water]:
 def clip_field(gradients: dict[str, Tensor]) -> None:
     """Hold the gradient of the water's network to a norm of 1e-3, in place (WaterSplatting)."""
     of_field = [gradient for name, gradient in gradients.items() if name.startswith(FIELD)]
-    norm = math.hypot(*(float(g.norm()) for g in of_field))
-    if norm > 1e-3:
+    if of_field:
+        norm = torch.stack([g.norm() for g in of_field]).norm()
         for g in of_field:
-            g.mul_(1e-3 / norm)
+            g.mul_((1e-3 / norm).clamp(max=1))

@@ -12,6 +12,7 @@ from pathlib import Path
 from typing import Any, Protocol, runtime_checkable
 
 import torch
+from torch import Tensor
 
 from swimm3r.io.atomic import write_text
 from swimm3r.progress import Progress
@@ -22,6 +23,9 @@ from swimm3r.splat.state import State, restored, stored
 from swimm3r.splat.views import View
 
 log = logging.getLogger(__name__)
+
+Numbers = dict[str, float | Tensor]
+"""What a step says for the record; tensors stay on their device until the record is written."""
 
 
 @runtime_checkable  # so that the suite can check calls against it
@@ -42,7 +46,7 @@ class Recipe(Protocol):
         """The state before step 1."""
         ...
 
-    def step(self, state: Any, view: View, step: int) -> tuple[State, dict[str, float]]:
+    def step(self, state: Any, view: View, step: int) -> tuple[State, Numbers]:
         """The state after training on one view, and the numbers of the step; steps count from 1."""
         ...
 
@@ -77,21 +81,22 @@ def run(recipe: Recipe, schedule: Schedule, folder: Path, progress: Progress) ->
     state, done = _resume(recipe, path, metrics, schedule)
     state = state.to(recipe.site.device)
     started, cpu_started, first = time.perf_counter(), time.process_time(), done
-    averages: dict[str, list[float]] = {}
+    sums: dict[str, tuple[float | Tensor, int]] = {}
     for step in range(done + 1, schedule.iterations + 1):
         progress("training the map", step - 1, schedule.iterations)
         view = recipe.site.view(view_of_step(step, len(recipe.site.views), schedule.seed))
         state, numbers = recipe.step(state, view, step)
         for name, value in numbers.items():
-            averages.setdefault(name, []).append(value)
+            total, count = sums.get(name, (0.0, 0))
+            sums[name] = total + (value.detach() if isinstance(value, Tensor) else value), count + 1
         last = step == schedule.iterations
         if step % schedule.log_every == 0 or last:
-            row = {"step": step} | {name: sum(v) / len(v) for name, v in averages.items()}
+            row = {"step": step} | {name: float(total) / count for name, (total, count) in sums.items()}
             row["seconds_per_step"] = (time.perf_counter() - started) / (step - first)
             row["cpu_seconds_per_step"] = (time.process_time() - cpu_started) / (step - first)
             with metrics.open("a", encoding="utf-8") as file:
                 file.write(json.dumps(row) + "\n")
-            averages = {}
+            sums = {}
         if step % schedule.checkpoint_every == 0 or last:
             about = {"step": step, "fingerprint": schedule.fingerprint}
             checkpoint.write(path, checkpoint.Stored(stored(state), about))

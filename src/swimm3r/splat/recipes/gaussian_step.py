@@ -63,13 +63,13 @@ def look(site: Site, state: State, view: View, settings: GaussianSettings, step:
 
 def with_matches(
     site: Site, state: State, loss: Float[Tensor, ""], settings: GaussianSettings, step: int
-) -> tuple[Float[Tensor, ""], dict[str, float]]:
+) -> tuple[Float[Tensor, ""], training.Numbers]:
     """The loss, with the epipolar error of the training poses while it takes part, and that for the record."""
     rng = training.generator(settings.seed, step, 7)
     off = site.epipolar_error(state.poses, settings.poses, step / settings.iterations, rng)
     if off is None:
         return loss, {}
-    return loss + settings.poses.epipolar * off.to(loss), {"epipolar_px": float(off.detach())}
+    return loss + settings.poses.epipolar * off.to(loss), {"epipolar_px": off}
 
 
 def haste(settings: GaussianSettings) -> float:

@@ -37,7 +37,7 @@ class McmcGs:
         no_water = MediumField(MediumFieldSettings(model="none"))
         return first_state(first_gaussians(self.site, self.settings), no_water, codes)
 
-    def step(self, state: InField, view: View, step: int) -> tuple[InField, dict[str, float]]:
+    def step(self, state: InField, view: View, step: int) -> tuple[InField, training.Numbers]:
         """One view: forward, adjoint, Adam, relocation and growth on their cadence, noise."""
         settings, w = self.settings, self.settings.weights
         seen = look(self.site, state, view, settings, step)
@@ -45,8 +45,8 @@ class McmcGs:
         opacity, scale = torch.sigmoid(seen.p.opacity).mean(), seen.p.scale.exp().mean()
         loss = photo.loss + w.opacity * opacity + w.scale * scale
         total, numbers = with_matches(self.site, state, loss, settings, step)
-        numbers |= {"loss": float(total.detach()), "l1": photo.l1, "ssim": photo.ssim}
-        numbers |= {"opacity": float(opacity.detach()), "scale": float(scale.detach())}
+        numbers |= {"loss": total, "l1": photo.l1, "ssim": photo.ssim}
+        numbers |= {"opacity": opacity, "scale": scale}
         numbers |= {"primitives": float(len(seen.p.xyz))}
         gradients = seen.gradients(total)
         with torch.no_grad():

@@ -53,7 +53,7 @@ class SeaSplat:
         codes = self.site.codes(self.settings.poses, training.generator(seed, 0, 6))
         return first_state(p, water, codes, gradient_densify.nothing_seen(p))
 
-    def step(self, state: UnderWater, view: View, step: int) -> tuple[UnderWater, dict[str, float]]:
+    def step(self, state: UnderWater, view: View, step: int) -> tuple[UnderWater, training.Numbers]:
         """Bursts where they are due, then one view: forward, adjoint, Adam, densification on its cadence."""
         settings, w, wet = self.settings, self.settings.weights, step > self._dry_steps()
         if step == self._dry_steps() + 1:
@@ -63,7 +63,7 @@ class SeaSplat:
         seen = look(self.site, state, view, settings, step)
         found = objective(seen.drawing.images, state.field, view, w, wet)
         total, numbers = with_matches(self.site, state, found.total, settings, step)
-        numbers |= found.numbers | {"loss": float(total.detach()), "primitives": float(len(seen.p.xyz))}
+        numbers |= found.numbers | {"loss": total, "primitives": float(len(seen.p.xyz))}
         gradients = seen.gradients(total)
         with torch.no_grad():
             still = () if wet else (f"{FIELD}veil",)
@@ -153,7 +153,7 @@ class Objective:
     """The losses of one view."""
 
     total: Float[Tensor, ""]
-    numbers: dict[str, float]  # unweighted, for the record
+    numbers: training.Numbers  # unweighted, for the record
 
 
 def objective(images: RasterOutput, water: SceneWater, view: View, w: SeaSplatWeights, wet: bool) -> Objective:
@@ -175,7 +175,7 @@ def objective(images: RasterOutput, water: SceneWater, view: View, w: SeaSplatWe
     total = photo.loss
     for weight, term in terms.values():
         total = total + weight * term
-    numbers = {"l1": photo.l1, "ssim": photo.ssim} | {name: float(term.detach()) for name, (_, term) in terms.items()}
+    numbers = {"l1": photo.l1, "ssim": photo.ssim} | {name: term for name, (_, term) in terms.items()}
     return Objective(total, numbers)
 
 

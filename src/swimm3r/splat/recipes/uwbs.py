@@ -68,7 +68,7 @@ class Uwbs:
         field = initial_field(medium, settings.medium, training.generator(settings.seed, 0, 3), settings.dynamic)
         return first_state(p, field, self.site.codes(settings.poses, training.generator(settings.seed, 0, 6)))
 
-    def step(self, state: State, view: View, step: int) -> tuple[State, dict[str, float]]:
+    def step(self, state: State, view: View, step: int) -> tuple[State, training.Numbers]:
         """One view: forward, adjoint, densification on its cadence, Adam."""
         settings, share = self.settings, step / self.settings.iterations
         if self._looks_for_movers(step):
@@ -84,7 +84,7 @@ class Uwbs:
         off = self.site.epipolar_error(state.poses, settings.poses, share, rng)
         if off is not None:
             total = total + settings.poses.epipolar * off.to(total)
-            numbers |= {"epipolar_px": float(off.detach())}
+            numbers |= {"epipolar_px": off}
         leaves = [*p, *state.field.parameters(), *(state.poses.parameters() if state.poses else ())]
         multiplier = None
         if filtered:
@@ -92,7 +92,8 @@ class Uwbs:
             gradients = dict(zip(parameters, sgg.gradients, strict=True))
             gradients["xyz"] = gradients["xyz"] + sgg.xyz
             multiplier = sgg.multiplier
-            numbers |= {"medium_uncertainty": float(sgg.uncertainty[sgg.uncertainty > 0].mean().nan_to_num())}
+            pulled = sgg.uncertainty > 0
+            numbers |= {"medium_uncertainty": sgg.uncertainty.sum() / pulled.sum().clamp(min=1)}
         else:
             found = torch.autograd.grad(total, leaves, materialize_grads=True)
             gradients = dict(zip(parameters, found, strict=True))
@@ -202,7 +203,7 @@ class Objective:
 
     total: Float[Tensor, ""]
     depth: Float[Tensor, ""]  # the depth regulariser as it stands in the total
-    numbers: dict[str, float]  # the terms unweighted, for the record
+    numbers: training.Numbers  # the terms unweighted, for the record
 
 
 def objective(
@@ -232,8 +233,7 @@ def objective(
         opacity, scale = losses.mean_opacity(p), losses.mean_scale(p, w.ubs_scale_reg_bug)
         total = total + w.opacity * opacity + w.scale * scale
         numbers |= {"opacity": opacity, "scale": scale}
-    numbers = {"loss": total} | numbers
-    return Objective(total, depth, {k: float(torch.as_tensor(v).detach()) for k, v in numbers.items()})
+    return Objective(total, depth, {"loss": total} | numbers)
 
 
 def known_water(site: Site, settings: UwbsSettings) -> WaterPrior | None:

@@ -45,7 +45,7 @@ class WaterSplatting:
         codes = self.site.codes(self.settings.poses, training.generator(seed, 0, 6))
         return first_state(p, field, codes, gradient_densify.nothing_seen(p))
 
-    def step(self, state: InField, view: View, step: int) -> tuple[InField, dict[str, float]]:
+    def step(self, state: InField, view: View, step: int) -> tuple[InField, training.Numbers]:
         """One view at the resolution this step has come to: forward, adjoint, Adam, densification on its cadence."""
         settings = self.settings
         view = smaller(view, self._divisor(step))
@@ -53,7 +53,7 @@ class WaterSplatting:
         photo = relative_photometric(seen.drawing.images.rgb, view, settings.weights.floor, settings.weights.ssim)
         total, numbers = with_matches(self.site, state, photo.loss, settings, step)
         l1 = (seen.drawing.images.rgb.detach() - view.rgb)[:, view.seen].abs().mean()
-        numbers |= {"loss": float(total.detach()), "l1": float(l1), "relative_l1": photo.l1, "ssim": photo.ssim}
+        numbers |= {"loss": total, "l1": l1, "relative_l1": photo.l1, "ssim": photo.ssim}
         numbers |= {"primitives": float(len(seen.p.xyz))}
         gradients = seen.gradients(total)
         clip_field(gradients)
