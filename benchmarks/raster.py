@@ -4,7 +4,8 @@
 
 Prints CPU-ms (process CPU time summed over threads, median) beside a calibration, 1e9 float32 FMAs on one thread,
 measured before and after. "ratio" is CPU-ms / calibration, which compares across machines. The reference is dense
-(pixels x primitives) and runs at XS only (400 primitives, 64 x 36), with Numba at the same size beside it.
+(pixels x primitives) and runs at XS only (400 primitives, 64 x 36), with Numba at the same size beside it. Where there
+is a GPU, rows "warp" follow: wall-clock milliseconds, the device waited for after every stage, and no ratio.
 """
 
 import argparse
@@ -86,29 +87,39 @@ class Row(NamedTuple):
     wall: float
 
 
+def now(backend: str) -> float:
+    """Seconds of the processor; on a GPU those that have passed once it has finished."""
+    if backend != "warp":
+        return time.process_time()
+    torch.cuda.synchronize()
+    return time.perf_counter()
+
+
 def measure(size: Size, backend: str, repeats: int) -> tuple[Row, Bins]:
     """Each stage alone, medians over interleaved repeats."""
+    device = "cuda" if backend == "warp" else "cpu"
     p, medium = workload(size)
-    leaves = [t.requires_grad_() for t in (*p, *medium)]
+    leaves = [t.to(device).requires_grad_() for t in (*p, *medium)]
+    p = Primitives2D(*leaves[:6])
     rng = torch.Generator().manual_seed(1)
     bins = bin_primitives(p, size.height, size.width)
     stages: dict[str, list[float]] = {"bins": [], "forward": [], "adjoint": [], "wall": []}
     for repeat in range(repeats + 1):
-        sgg = SggBuffers(*(b.to(p.mean2d.dtype) for b in SggBuffers.zeros(size.primitives)))
-        clock = [time.process_time()]
+        sgg = SggBuffers(*(b.to(p.mean2d.dtype) for b in SggBuffers.zeros(size.primitives, device)))
+        clock = [now(backend)]
         wall = time.perf_counter()
-        if backend == "numba":
+        if backend != "reference":
             bins = bin_primitives(p, size.height, size.width)
-        clock.append(time.process_time())
+        clock.append(now(backend))
         out = rasterize(
             Primitives2D(*leaves[:6]), MediumMaps(*leaves[6:]), size.height, size.width,
-            sgg=sgg, bins=bins if backend == "numba" else None, backend=backend,
+            sgg=sgg, bins=None if backend == "reference" else bins, backend=backend,
         )  # fmt: skip
-        clock.append(time.process_time())
-        cotangent = [torch.randn(image.shape, generator=rng) for image in out]
-        clock.append(time.process_time())
+        clock.append(now(backend))
+        cotangent = [torch.randn(image.shape, generator=rng).to(device) for image in out]
+        clock.append(now(backend))
         torch.autograd.grad(out, leaves, cotangent)
-        clock.append(time.process_time())
+        clock.append(now(backend))
         wall = time.perf_counter() - wall
         if repeat == 0:
             continue  # compilation, first touch of memory
@@ -135,12 +146,14 @@ def main() -> None:
     print("| size | back end | pairs tile x primitive | bins | forward | adjoint | sum CPU-ms | ratio | wall ms |")
     print("|---|---|---|---|---|---|---|---|---|")
     plan = [("XS", "reference"), ("XS", "numba"), *((name, "numba") for name in arguments.sizes)]
+    if torch.cuda.is_available():
+        plan += [(name, "warp") for name in arguments.sizes]
     for name, backend in plan:
         row, bins = measure(SIZES[name], backend, 1 if backend == "reference" else arguments.repeats)
         total = row.bins + row.forward + row.adjoint
         print(
             f"| {name} | {backend} | {len(bins.ids)} | {row.bins:.1f} | {row.forward:.1f} | {row.adjoint:.1f} "
-            f"| {total:.1f} | {total / calibration:.2f} | {row.wall:.1f} |"
+            f"| {total:.1f} | {'' if backend == 'warp' else f'{total / calibration:.2f}'} | {row.wall:.1f} |"
         )
     print(f"calibration again: {cpu_ms(lambda: multiply_add(lanes, passes), 5):.1f} CPU-ms")
 

@@ -3,7 +3,10 @@
     python benchmarks/train_step.py [--sizes S M L] [--threads N] [--repeats N]
 
 The primitives are those of benchmarks/raster.py, lifted into space so that one camera sees them all, with conditioning
-that does something. CPU-ms are process CPU time summed over threads, medians. The bar is a ratio of 1.5 at M.
+that does something. CPU-ms are process CPU time summed over threads, medians. The bar is a ratio of 1.5 at M. Where
+there is a GPU, rows follow in wall-clock milliseconds of it, the device waited for after every call, and, where gsplat
+can be built, one of its rasteriser (its projection included, 3D Gaussians of the same place, size and number, no water)
+beside the sum of our projection and rasteriser.
 """
 
 import argparse
@@ -20,7 +23,7 @@ from raster import SIZES, Size, workload
 from swimm3r.cameras import Cameras
 from swimm3r.raster import MediumMaps, rasterize
 from swimm3r.splat.medium_field import grid_of, initial_field, medium_at_pixels, per_z_depth
-from swimm3r.splat.optimiser import adam_step, fresh
+from swimm3r.splat.optimiser import adam_step
 from swimm3r.splat.primitives import BetaPrimitives, inverse_softplus
 from swimm3r.splat.projection import pinhole, project
 from swimm3r.splat.recipes import uwbs
@@ -61,30 +64,66 @@ def lifted(size: Size) -> BetaPrimitives:
     )
 
 
-def cpu_ms(work: Callable[[], Any], repeats: int) -> float:
-    """Median CPU milliseconds of a call, all threads; the first call is not counted."""
+def now(device: torch.device) -> float:
+    """Seconds of the processor, all threads; on a GPU those that have passed once it has finished."""
+    if device.type == "cpu":
+        return time.process_time()
+    torch.cuda.synchronize()
+    return time.perf_counter()
+
+
+def median_ms(work: Callable[[], Any], repeats: int, device: torch.device) -> float:
+    """Median milliseconds of a call; the first call is not counted."""
     times = []
     for _ in range(repeats + 1):
-        start = time.process_time()
+        start = now(device)
         work()
-        times.append(1e3 * (time.process_time() - start))
+        times.append(1e3 * (now(device) - start))
     return statistics.median(times[1:])
 
 
-def measure(size: Size, repeats: int) -> dict[str, float]:
-    """CPU-ms of the step and of its parts."""
+def gsplat_ms(size: Size, repeats: int, device: torch.device) -> float | None:
+    """The same of gsplat, forward and backward; None where it is not installed or cannot be built."""
+    try:
+        from gsplat import rasterization  # pyright: ignore[reportMissingImports]
+    except (ImportError, OSError):
+        return None
+    p, lens = lifted(size), camera(size)
+    leaves = [
+        t.to(device).requires_grad_()
+        for t in (
+            p.xyz,
+            torch.tensor([1.0, 0, 0, 0]).repeat(size.primitives, 1),
+            torch.nn.functional.softplus(p.scale[:, :3]),
+            p.opacity.sigmoid(),
+            p.rgb,
+        )
+    ]
+    view, K = torch.eye(4)[None].to(device), lens.K.float().to(device)
+
+    def work() -> None:
+        images, alpha, _ = rasterization(*leaves, view, K, size.width, size.height, render_mode="RGB+D")
+        torch.autograd.grad(images.sum() + alpha.sum(), leaves)
+
+    return median_ms(work, repeats, device)
+
+
+def measure(size: Size, repeats: int, device: torch.device) -> dict[str, float]:
+    """Milliseconds of the step and of its parts."""
     settings = UwbsSettings(iterations=20_000)
     rng = torch.Generator().manual_seed(1)
     height, width = size.height, size.width
-    recipe = uwbs.Uwbs(settings, Site(None, 1.0, 1.0, None))  # reconstruction and views are read at the start only
-    p, field = lifted(size), initial_field(None, settings.medium, rng)
-    state = first_state(p, field, None)
+    recipe = uwbs.Uwbs(
+        settings, Site(None, 1.0, 1.0, None, device=device)
+    )  # reconstruction and views are read at the start only
+    state = first_state(lifted(size), initial_field(None, settings.medium, rng), None).to(device)
+    p, field = state.primitives, state.field
     prior = 1 + 9 * torch.rand(height, width, generator=rng)
     view = View(
         "benchmark", camera(size), torch.rand(3, height, width, generator=rng),
         torch.ones(height, width, dtype=torch.bool), prior, torch.full((height, width), 1.8),
-    )  # fmt: skip
-    sight = pinhole(view.camera)
+    ).to(device)  # fmt: skip
+    sight = pinhole(view.camera).to(device)
     leaves = BetaPrimitives(*(t.clone().requires_grad_() for t in p))
 
     seen = project(leaves, sight, settings.render)
@@ -93,9 +132,9 @@ def measure(size: Size, repeats: int) -> dict[str, float]:
     maps = [t.detach().requires_grad_() for t in water]
     images = rasterize(type(seen.primitives)(*plane), MediumMaps(*maps), height, width)
     drawn = [t.detach().requires_grad_() for t in images]
-    cotangent = [torch.randn(t.shape, generator=rng) / t.numel() for t in images]
-    on_plane = [torch.randn(t.shape, generator=rng) for t in plane]
-    on_maps = [torch.randn(t.shape, generator=rng) for t in maps]
+    cotangent = [torch.randn(t.shape, generator=rng).to(device) / t.numel() for t in images]
+    on_plane = [torch.randn(t.shape, generator=rng).to(device) for t in plane]
+    on_maps = [torch.randn(t.shape, generator=rng).to(device) for t in maps]
     grid = grid_of(field, sight, settings.medium.stride)
     drawing = Drawing(type(images)(*drawn), seen, grid, MediumMaps(*maps), None)
 
@@ -116,8 +155,8 @@ def measure(size: Size, repeats: int) -> dict[str, float]:
         torch.autograd.grad(loss, [*drawn, leaves.opacity, leaves.scale], allow_unused=True)
 
     parameters = parameters_of(BetaPrimitives(*(t.clone() for t in p)), field)
-    moments = {name: fresh(t) for name, t in parameters.items()}
-    gradients = {name: torch.randn(t.shape, generator=rng) for name, t in parameters.items()}
+    moments = {name: m for name, m in first_state(p, field, None).to(device).moments.items()}
+    gradients = {name: torch.randn(t.shape, generator=rng).to(device) for name, t in parameters.items()}
     rates = recipe._rates(1, parameters)
 
     def adam() -> None:
@@ -125,7 +164,7 @@ def measure(size: Size, repeats: int) -> dict[str, float]:
             adam_step(parameters, gradients, moments, rates)
 
     works = {"raster": raster, "projection": projection, "medium": medium, "losses": losses, "adam": adam}
-    parts = {name: cpu_ms(work, repeats) for name, work in works.items()}
+    parts = {name: median_ms(work, repeats, device) for name, work in works.items()}
     held = {"state": state}
     plain = replace(recipe, settings=replace(settings, sgg=replace(settings.sgg, enabled=False)))
 
@@ -135,7 +174,8 @@ def measure(size: Size, repeats: int) -> dict[str, float]:
 
         return one
 
-    return {"step": cpu_ms(step(recipe), repeats), "plain": cpu_ms(step(plain), repeats)} | parts
+    steps = {"step": step(recipe), "plain": step(plain)}
+    return {name: median_ms(work, repeats, device) for name, work in steps.items()} | parts
 
 
 def main() -> None:
@@ -146,16 +186,31 @@ def main() -> None:
     parser.add_argument("--repeats", type=int, default=7)
     arguments = parser.parse_args()
     torch.set_num_threads(arguments.threads)
-    print(f"{arguments.threads} threads; CPU-ms")
-    print("| size | step with SGG | step | raster | step / raster | projection | medium | losses | adam | peak MB |")
-    print("|---|---|---|---|---|---|---|---|---|---|")
-    for name in arguments.sizes:
-        row = measure(SIZES[name], arguments.repeats)
+    print(f"{arguments.threads} threads; CPU-ms, on a GPU milliseconds")
+    print(
+        "| size | on | step with SGG | step | raster | step / raster | projection | medium | losses | adam | peak MB |"
+    )
+    print("|---|---|---|---|---|---|---|---|---|---|---|")
+    devices = ["cpu", "cuda"] if torch.cuda.is_available() else ["cpu"]
+    for device, name in [(torch.device(device), name) for device in devices for name in arguments.sizes]:
+        if device.type == "cuda":
+            torch.cuda.reset_peak_memory_stats()
+        row = measure(SIZES[name], arguments.repeats, device)
         peak = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 1024
-        milliseconds = [f"{row[part]:.0f}" for part in ("projection", "medium", "losses", "adam")]
-        ratio = f"{row['plain'] / row['raster']:.2f}"
-        cells = [name, f"{row['step']:.0f}", f"{row['plain']:.0f}", f"{row['raster']:.0f}", ratio, *milliseconds]
-        print(f"| {' | '.join(cells)} | {peak:.0f} |")
+        if device.type == "cuda":
+            peak = torch.cuda.max_memory_allocated() / 2**20
+        digits = 0 if device.type == "cpu" else 2
+        times = [
+            f"{row[part]:.{digits}f}" for part in ("step", "plain", "raster", "projection", "medium", "losses", "adam")
+        ]
+        times.insert(3, f"{row['plain'] / row['raster']:.2f}")
+        print(f"| {name} | {device.type} | {' | '.join(times)} | {peak:.0f} |")
+        if device.type == "cuda":
+            theirs, ours = gsplat_ms(SIZES[name], arguments.repeats, device), row["raster"] + row["projection"]
+            found = (
+                "cannot be built here" if theirs is None else f"{theirs:.2f} ms, {theirs / ours:.2f} of our {ours:.2f}"
+            )
+            print(f"gsplat's rasteriser at {name}: {found}")
 
 
 if __name__ == "__main__":

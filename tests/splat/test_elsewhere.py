@@ -128,3 +128,15 @@ def test_the_pretence_sees_tensors_in_two_places():
             there + torch.ones(3)
         with pytest.raises(RuntimeError):
             there.numpy()
+
+
+@pytest.mark.gpu
+@pytest.mark.skipif(not torch.cuda.is_available(), reason="no CUDA device: no map was trained on a GPU")
+@pytest.mark.parametrize("recipe", RECIPES)
+def test_every_recipe_trains_on_the_gpu_as_on_the_processor(recipe: Recipe, tiny_dive, tmp_path, monkeypatch):
+    monkeypatch.undo()  # Warp's kernels as they are
+    settings = with_recipe(SIZE, recipe)
+    fitting.train(tiny_dive.rec, tiny_dive.frames, settings, tmp_path / "here")
+    there = fitting.train(tiny_dive.rec, tiny_dive.frames, settings, tmp_path / "there", device=torch.device("cuda"))
+    assert losses(tmp_path / "there") == pytest.approx(losses(tmp_path / "here"), rel=0.03)
+    assert there.render(tiny_dive.cameras[1], tiny_dive.frames.frames[1].time).rgb.device.type == "cpu"

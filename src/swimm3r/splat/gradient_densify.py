@@ -11,6 +11,7 @@ import torch
 from jaxtyping import Bool, Float, Int
 from torch import Tensor
 
+from swimm3r.devices import CPU
 from swimm3r.splat.gaussians import GaussianPrimitives, shape_factor
 from swimm3r.splat.optimiser import Moments
 from swimm3r.splat.primitives import select
@@ -28,9 +29,9 @@ class Changed:
     restarted: Int[Tensor, " m"]  # rows whose moments are zeroed
 
 
-def nothing_seen(p: GaussianPrimitives) -> dict[str, Tensor]:
-    """What is remembered of Gaussians before any step: sums of pulls, how many they are, and the largest radius."""
-    return {name: torch.zeros_like(p.opacity) for name in ("pull", "times", "radius")}
+def nothing_seen(n: int, device: torch.device = CPU) -> dict[str, Tensor]:
+    """What is remembered of n Gaussians before any step: sums of pulls, how many they are, and the largest radius."""
+    return {name: torch.zeros(n, device=device) for name in ("pull", "times", "radius")}
 
 
 def remembered(

@@ -51,7 +51,7 @@ class SeaSplat:
         p = first_gaussians(self.site, self.settings)
         water = initial_scene_water(training.generator(seed, 0, 3))
         codes = self.site.codes(self.settings.poses, training.generator(seed, 0, 6))
-        return first_state(p, water, codes, gradient_densify.nothing_seen(p))
+        return first_state(p, water, codes, gradient_densify.nothing_seen(len(p.xyz)))
 
     def step(self, state: UnderWater, view: View, step: int) -> tuple[UnderWater, training.Numbers]:
         """Bursts where they are due, then one view: forward, adjoint, Adam, densification on its cadence."""
@@ -142,7 +142,7 @@ class SeaSplat:
             if int(fit.sum()) >= 4:
                 done = gradient_densify.only(done, fit)
             p, moments = done.primitives, with_rows(moments, done.source, done.restarted)
-            memory = gradient_densify.nothing_seen(p)
+            memory = gradient_densify.nothing_seen(len(p.xyz), p.xyz.device)
         if d.reset_every and step % cut_every == 0:
             p, moments = gradient_densify.dimmed(p, moments, d.reset_opacity)
         return State(p, state.field, state.poses, moments, memory)

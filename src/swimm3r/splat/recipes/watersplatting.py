@@ -43,7 +43,7 @@ class WaterSplatting:
         p = first_gaussians(self.site, self.settings)
         field = initial_field(None, self.settings.medium, training.generator(seed, 0, 3))
         codes = self.site.codes(self.settings.poses, training.generator(seed, 0, 6))
-        return first_state(p, field, codes, gradient_densify.nothing_seen(p))
+        return first_state(p, field, codes, gradient_densify.nothing_seen(len(p.xyz)))
 
     def step(self, state: InField, view: View, step: int) -> tuple[InField, training.Numbers]:
         """One view at the resolution this step has come to: forward, adjoint, Adam, densification on its cadence."""
@@ -103,7 +103,7 @@ class WaterSplatting:
             if int(fit.sum()) >= 4:
                 done = gradient_densify.only(done, fit)
             p, moments = done.primitives, with_rows(moments, done.source, done.restarted)
-            memory = gradient_densify.nothing_seen(p)
+            memory = gradient_densify.nothing_seen(len(p.xyz), p.xyz.device)
         if growing and d.reset_every and since == self._every():
             p, moments = gradient_densify.dimmed(p, moments, d.reset_opacity)
         return State(p, state.field, state.poses, moments, memory)
