@@ -138,7 +138,7 @@ def test_the_objective_is_the_papers_sum_with_the_papers_weights(tiny_dive):
     p.scale[0] = 3.0  # larger than 100 px of a 1280 px wide picture
     drawing = draw(p, tiny_dive.truth.field, pinhole(view.camera), paper)
     found = uwbs.objective(p, drawing, view, paper, None, regularised=True)
-    n = {name: float(value) for name, value in found.numbers.items()}
+    n = {name: float(torch.as_tensor(value).detach()) for name, value in found.numbers.items()}
     expected = 0.8 * n["l1"] + 0.2 * (1 - n["ssim"]) + 0.01 * n["opacity"] + 0.01 * n["scale"]
     expected += 0.1 * n["depth"] + 1.0 * n["medium_smoothness"] + 0.1 * n["radius"]
     assert float(found.total) == pytest.approx(expected, rel=1e-5)

@@ -6,11 +6,11 @@ from pathlib import Path
 
 import torch
 
+from swimm3r import devices
 from swimm3r import weights as published
 from swimm3r.datasets import PairSettings, load, make_pairs, read_tree
 from swimm3r.datasets.pairs import Pair
 from swimm3r.datasets.sequences import Sequence
-from swimm3r.errors import DeviceError
 from swimm3r.progress import Progress, silent
 from swimm3r.sfm.adapter_file import Base, fingerprint
 from swimm3r.sfm.mast3r import checkpoint
@@ -96,12 +96,9 @@ def retrieved_pairs(
 
 
 def _device(name: str) -> torch.device:
-    there = torch.cuda.is_available()
-    if name == "cuda" and not there:
-        raise DeviceError("there is no CUDA device", cause="no GPU, or torch's CPU build", hint="--device cpu")
-    if name == "cpu" or not there:
-        return torch.device("cpu")
-    return torch.device("cuda", int(os.environ.get("LOCAL_RANK", "0")))
+    """Each process of torchrun has a GPU of its own."""
+    device = devices.chosen(name, ("cuda",))
+    return torch.device("cuda", int(os.environ.get("LOCAL_RANK", "0"))) if device.type == "cuda" else device
 
 
 def _licence(path: Path) -> str:
