@@ -39,3 +39,9 @@ def test_a_gpu_without_warp_is_not_left_idle_in_silence(monkeypatch, caplog):
     assert "pip install 'swimm3r[cuda]'" in caplog.text
     with pytest.raises(DeviceError, match="NVIDIA Warp"):
         devices.for_maps("cuda")
+
+
+def test_too_little_memory_says_what_to_make_smaller():
+    with pytest.raises(DeviceError, match="too small for this map") as caught, devices.memory_for("this map", "less"):
+        raise torch.OutOfMemoryError("CUDA out of memory. Tried to allocate 20 GiB\nmore")
+    assert (caught.value.cause, caught.value.hint) == ("CUDA out of memory. Tried to allocate 20 GiB", "less")

@@ -2,7 +2,8 @@
 
 import importlib.util
 import logging
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
+from contextlib import contextmanager
 
 import torch
 
@@ -46,3 +47,14 @@ def for_maps(name: str = "auto") -> torch.device:
         log.warning("there is a GPU, but maps need NVIDIA Warp to use it: pip install 'swimm3r[cuda]'")
         return CPU
     return device
+
+
+@contextmanager
+def memory_for(what: str, hint: str) -> Iterator[None]:
+    """Work that may need more memory than the accelerator has, and what to do then. Raises DeviceError."""
+    try:
+        yield
+    except torch.OutOfMemoryError as error:
+        raise DeviceError(
+            f"the accelerator's memory is too small for {what}", cause=str(error).splitlines()[0], hint=hint
+        ) from error

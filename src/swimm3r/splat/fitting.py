@@ -8,6 +8,7 @@ from pathlib import Path
 
 import torch
 
+from swimm3r import devices
 from swimm3r.devices import CPU
 from swimm3r.frames import Frames
 from swimm3r.progress import Progress, silent
@@ -42,7 +43,10 @@ def train(
     stations = training_stations(rec, views.names, views.cameras, scale) if settings.poses.enabled else None
     radius = path_radius(rec, scale, settings.working_depth)
     site = Site(rec, scale, radius, views, stations, device)
-    final = training.run(_recipe(settings, site), _schedule(settings, rec, views), folder, progress)
+    with devices.memory_for(
+        "this map", "a smaller --splat.densify.max-primitives or --splat.long-side, or --map-device cpu"
+    ):
+        final = training.run(_recipe(settings, site), _schedule(settings, rec, views), folder, progress)
     primitives, field = in_scene_units(final, 1 / scale)
     poses = None
     if stations is not None and final.poses is not None:

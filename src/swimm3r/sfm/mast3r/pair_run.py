@@ -4,8 +4,6 @@ A pair is done when its matches are written and both pointmaps are in their fram
 """
 
 import logging
-from collections.abc import Iterator
-from contextlib import contextmanager
 from dataclasses import dataclass
 from functools import lru_cache
 from pathlib import Path
@@ -14,7 +12,6 @@ import torch
 from torch import Tensor
 
 from swimm3r import devices, weights
-from swimm3r.errors import DeviceError
 from swimm3r.progress import Progress, silent
 from swimm3r.sfm import adapter_file
 from swimm3r.sfm.alignment_problem import Predicted
@@ -32,6 +29,9 @@ from swimm3r.sfm.physics_head import PhysicsHead
 from swimm3r.sfm.settings import Mast3rSettings
 
 log = logging.getLogger(__name__)
+
+_PAIR = "one pair of pictures"
+_SMALLER = "--precision bfloat16, a smaller --size (384), less --memory-mb, or --device cpu"
 
 
 def load_network(settings: Mast3rSettings) -> Mast3r:
@@ -72,7 +72,7 @@ def look_at_pairs(
     """The network over all pairs of a graph; goes on from what `cache` holds."""
     n = len(pictures.frames)
     encodings = EncodingStore(network, pictures, cache / "encodings")
-    with _memory_of_the_device():
+    with devices.memory_for(_PAIR, _SMALLER):
         log.info("%s", make_plan(network, pictures, graph, settings))
         encodings.fill(progress)
     similarity = None
@@ -98,7 +98,7 @@ def look_at_pairs(
     todo = [pair for pair in pairs if not _is_done(said, *pair)]
     for done, (i, j) in enumerate(todo):
         progress("two-view network", done, len(todo))
-        with torch.no_grad(), _memory_of_the_device():
+        with torch.no_grad(), devices.memory_for(_PAIR, _SMALLER):
             prediction = predict_pair(network, (i, cached[i]), (j, cached[j]))
         _keep(prediction, [mask_of(f) for f in (i, j)], said, settings)
     progress("two-view network", len(todo), len(todo))
@@ -149,15 +149,3 @@ def _anchors(view: ViewPrediction, settings: AlignmentSettings) -> Predicted:
     return Predicted(
         view.points[first::s, first::s].flatten(0, 1).cpu(), view.confidence[first::s, first::s].flatten().cpu()
     )
-
-
-@contextmanager
-def _memory_of_the_device() -> Iterator[None]:
-    try:
-        yield
-    except torch.OutOfMemoryError as error:
-        raise DeviceError(
-            "the accelerator's memory is too small for one pair of pictures",
-            cause=str(error).splitlines()[0],
-            hint="--precision bfloat16, a smaller --size (384), less --memory-mb, or --device cpu",
-        ) from error
