@@ -113,9 +113,8 @@ def measure(size: Size, repeats: int, device: torch.device) -> dict[str, float]:
     settings = UwbsSettings(iterations=20_000)
     rng = torch.Generator().manual_seed(1)
     height, width = size.height, size.width
-    recipe = uwbs.Uwbs(
-        settings, Site(None, 1.0, 1.0, None, device=device)
-    )  # reconstruction and views are read at the start only
+    # reconstruction and views are read at the start only
+    recipe = uwbs.Uwbs(settings, Site(None, 1.0, 1.0, None, device=device))
     state = first_state(lifted(size), initial_field(None, settings.medium, rng), None).to(device)
     p, field = state.primitives, state.field
     prior = 1 + 9 * torch.rand(height, width, generator=rng)
@@ -155,7 +154,7 @@ def measure(size: Size, repeats: int, device: torch.device) -> dict[str, float]:
         torch.autograd.grad(loss, [*drawn, leaves.opacity, leaves.scale], allow_unused=True)
 
     parameters = parameters_of(BetaPrimitives(*(t.clone() for t in p)), field)
-    moments = {name: m for name, m in first_state(p, field, None).to(device).moments.items()}
+    moments = first_state(p, field, None).to(device).moments
     gradients = {name: torch.randn(t.shape, generator=rng).to(device) for name, t in parameters.items()}
     rates = recipe._rates(1, parameters)
 

@@ -14,10 +14,10 @@ log = logging.getLogger(__name__)
 CPU = torch.device("cpu")
 
 
-def chosen(name: str, accelerators: Sequence[str] = ("cuda", "mps")) -> torch.device:
+def chosen(name: str, accelerators: Sequence[str] = ("cuda", "mps"), option: str = "--device") -> torch.device:
     """The device of that name; "auto" is the first of `accelerators` that is here, else the processor.
 
-    Raises DeviceError for one that is not here.
+    Raises DeviceError for one that is not here; `option` is how the user names it.
     """
     here = {"cpu": True, "cuda": torch.cuda.is_available(), "mps": torch.backends.mps.is_available()}
     if name == "auto":
@@ -26,7 +26,7 @@ def chosen(name: str, accelerators: Sequence[str] = ("cuda", "mps")) -> torch.de
         raise DeviceError(
             f"there is no {name} device on this computer",
             cause="no accelerator, no driver for it, or a PyTorch without its support (swimm3r doctor shows which)",
-            hint="--device auto",
+            hint=f"{option} auto",
         )
     return torch.device(name)
 
@@ -36,17 +36,22 @@ def for_maps(name: str = "auto") -> torch.device:
 
     Raises DeviceError where "cuda" was asked for and a part of it is missing; "auto" says so in the log.
     """
-    device = chosen(name, ("cuda",))
+    device = chosen(name, ("cuda",), "--map-device")
     if device.type == "cuda" and importlib.util.find_spec("warp") is None:
         if name == "cuda":
-            raise DeviceError(
-                "the GPU rasteriser needs NVIDIA Warp, which is not installed",
-                cause="Swimm3R was installed without its cuda extra",
-                hint="pip install 'swimm3r[cuda]', or --device cpu",
-            )
+            raise without_warp("--map-device cpu")
         log.warning("there is a GPU, but maps need NVIDIA Warp to use it: pip install 'swimm3r[cuda]'")
         return CPU
     return device
+
+
+def without_warp(instead: str) -> DeviceError:
+    """What is said where a GPU was asked for and its kernels cannot be; `instead` does without."""
+    return DeviceError(
+        "the GPU rasteriser needs NVIDIA Warp, which is not installed",
+        cause="Swimm3R was installed without its cuda extra",
+        hint=f"pip install 'swimm3r[cuda]', or {instead}",
+    )
 
 
 @contextmanager

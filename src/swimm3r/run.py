@@ -64,13 +64,13 @@ def run_pipeline(
     """
     settings = settings or RunSettings()
     check_source(source)
+    devices.for_maps(map_device)  # before there is a folder, and minutes of structure from motion
     fingerprint = fingerprint_of(source, folder)
     is_new = not folder.exists()
     record = _Record(folder, source, fingerprint)
     write_text(folder / "settings.yaml", to_yaml(settings))
     write_text(folder / "versions.json", json.dumps(_versions(), indent=2) + "\n")
     truth = truth_of(source, reference)
-    devices.for_maps(map_device)  # before minutes of structure from motion
 
     key = _key("prepare", fingerprint, asdict(settings.frames))
     try:

@@ -18,8 +18,6 @@ from torch.utils._pytree import tree_flatten, tree_map
 DEVICE = torch.device("meta")
 _MAY_MIX = {"aten::copy_", "aten::_to_copy"}  # what goes from one place to the other
 _INDICES_FROM_ANYWHERE = {"aten::index", "aten::index_put", "aten::index_put_"}
-
-
 _WAITS = {"aten::_local_scalar_dense", "aten::nonzero", "aten::_unique2", "aten::repeat_interleave", "aten::bincount"}
 waits: list[str] = []
 """Where in the package the processor has waited for the device, in turn; whoever counts them empties it first."""
@@ -82,7 +80,7 @@ def _run(func: Callable[..., Any], args: Any, kwargs: dict[str, Any]) -> Any:
     name = func._schema.name  # pyright: ignore[reportFunctionMemberAccess]
     given = [t for t in tree_flatten((args, kwargs))[0] if isinstance(t, Tensor)]
     away = any(isinstance(t, Elsewhere) for t in given)
-    checked = tree_flatten(args[:1])[0] if name in _INDICES_FROM_ANYWHERE else given
+    checked = [args[0], *args[2:3]] if name in _INDICES_FROM_ANYWHERE else given  # what is indexed, and what is put
     if away and name not in _MAY_MIX:
         strangers = [t for t in checked if isinstance(t, Tensor) and not isinstance(t, Elsewhere) and t.dim()]
         assert not strangers, f"{name} of tensors on the device and on the processor"

@@ -39,8 +39,10 @@ SIZE = UwbsSettings(
 )
 RECIPES: list[Recipe] = ["uwbs-static", "uwbs-dynamic", "ubs", "watersplatting", "seasplat", "threers_gs", "mcmc_gs"]
 
+on_the_processor = pytest.mark.usefixtures("warp_on_the_processor")
 
-@pytest.fixture(autouse=True)
+
+@pytest.fixture
 def warp_on_the_processor(monkeypatch: pytest.MonkeyPatch) -> None:
     launch = warp_gpu._launch
 
@@ -55,6 +57,7 @@ def losses(folder: Path) -> list[float]:
     return [json.loads(line)["loss"] for line in (folder / "metrics.jsonl").read_text().splitlines()]
 
 
+@on_the_processor
 @pytest.mark.parametrize("recipe", RECIPES)
 def test_every_recipe_trains_elsewhere_as_on_the_processor(recipe: Recipe, tiny_dive, tmp_path):
     settings = with_recipe(SIZE, recipe)
@@ -72,6 +75,7 @@ def test_every_recipe_trains_elsewhere_as_on_the_processor(recipe: Recipe, tiny_
     assert torch.equal(kept.primitives.xyz, held(there.primitives.xyz))
 
 
+@on_the_processor
 def test_a_map_elsewhere_shows_and_places_what_it_does_here(tiny_dive):
     scene, lens = tiny_dive.truth, tiny_dive.rec.cameras[1]
     steps = PoseRefinementSettings(steps=6, long_side=64, halvings=0)
@@ -90,6 +94,7 @@ def test_a_map_elsewhere_shows_and_places_what_it_does_here(tiny_dive):
     torch.testing.assert_close(placed.camera.cam2world, expected.camera.cam2world, atol=1e-4, rtol=0)
 
 
+@on_the_processor
 def test_an_interrupted_training_goes_on_elsewhere(tiny_dive, tmp_path):
     settings = replace(SIZE, sgg=SggSettings(enabled=False))
 
@@ -108,6 +113,7 @@ def test_an_interrupted_training_goes_on_elsewhere(tiny_dive, tmp_path):
     assert len(losses(tmp_path)) == 12
 
 
+@on_the_processor
 def test_a_step_waits_for_the_device_only_to_bin(tiny_dive):
     settings = replace(SIZE, iterations=1000, poses=replace(SIZE.poses, enabled=False))
     views = TrainingViews(tiny_dive.rec, tiny_dive.frames, settings, 1.0)
@@ -133,8 +139,7 @@ def test_the_pretence_sees_tensors_in_two_places():
 @pytest.mark.gpu
 @pytest.mark.skipif(not torch.cuda.is_available(), reason="no CUDA device: no map was trained on a GPU")
 @pytest.mark.parametrize("recipe", RECIPES)
-def test_every_recipe_trains_on_the_gpu_as_on_the_processor(recipe: Recipe, tiny_dive, tmp_path, monkeypatch):
-    monkeypatch.undo()  # Warp's kernels as they are
+def test_every_recipe_trains_on_the_gpu_as_on_the_processor(recipe: Recipe, tiny_dive, tmp_path):
     settings = with_recipe(SIZE, recipe)
     fitting.train(tiny_dive.rec, tiny_dive.frames, settings, tmp_path / "here")
     there = fitting.train(tiny_dive.rec, tiny_dive.frames, settings, tmp_path / "there", device=torch.device("cuda"))

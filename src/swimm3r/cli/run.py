@@ -179,7 +179,7 @@ def _pipeline(
     settings: RunSettings,
     reference: Path | None,
     last: str,
-    map_device: MapDevice = "cpu",
+    map_device: MapDevice = "cpu",  # stages before the map ask for no GPU
 ) -> None:
     if isinstance(settings.sfm, Mast3rSettings):  # before minutes of preparing frames
         from swimm3r.sfm.pairs import parse_graph

@@ -13,7 +13,7 @@ from typing import Any, Literal
 import torch
 from torch import Tensor
 
-from swimm3r.errors import DeviceError
+from swimm3r import devices
 from swimm3r.raster import reference
 from swimm3r.raster.records import (
     ALPHA_MAX,
@@ -172,11 +172,7 @@ def _kernels(backend: Backend) -> ModuleType:
     except ModuleNotFoundError as error:
         if error.name != "warp":
             raise
-        raise DeviceError(
-            "The GPU rasteriser needs NVIDIA Warp, which is not installed.",
-            cause="Swimm3R was installed without its cuda extra.",
-            hint="pip install 'swimm3r[cuda]', or move the tensors to the CPU.",
-        ) from error
+        raise devices.without_warp("move the tensors to the CPU") from error
     return warp_gpu
 
 

@@ -43,9 +43,7 @@ def train(
     stations = training_stations(rec, views.names, views.cameras, scale) if settings.poses.enabled else None
     radius = path_radius(rec, scale, settings.working_depth)
     site = Site(rec, scale, radius, views, stations, device)
-    with devices.memory_for(
-        "this map", "a smaller --splat.densify.max-primitives or --splat.long-side, or --map-device cpu"
-    ):
+    with devices.memory_for("this map", "fewer primitives, a smaller --splat.long-side, or --map-device cpu"):
         final = training.run(_recipe(settings, site), _schedule(settings, rec, views), folder, progress)
     primitives, field = in_scene_units(final, 1 / scale)
     poses = None
