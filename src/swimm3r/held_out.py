@@ -28,8 +28,8 @@ from swimm3r.localization.landmarks import landmarks_of, locate
 from swimm3r.localization.neighbours import neighbours, pose_from_neighbours
 from swimm3r.progress import Progress, silent
 from swimm3r.reconstruction import Reconstruction
-from swimm3r.renders import depth_span, write_view
-from swimm3r.sfm.settings import FeatureSettings
+from swimm3r.renders import look_of, write_view
+from swimm3r.sfm.settings import FeatureSettings, RestoreSettings
 from swimm3r.splat.poses import refine_pose
 from swimm3r.splat.rendering import SplatMap
 from swimm3r.splat.settings import PoseRefinementSettings
@@ -129,12 +129,16 @@ def score_views(
     poses: dict[str, FirstPose],
     folder: Path,
     settings: PoseRefinementSettings | None = None,
+    restore: RestoreSettings | None = None,
     progress: Progress = silent,
 ) -> list[HeldOutView]:
-    """Refine, render and score each frame of `poses`; its pictures go to folder/NAME_{rgb,clear,z_depth,veil}.png."""
+    """Refine, render and score each frame of `poses`; its pictures go to folder/NAME_{rgb,clear,z_depth,veil}.png.
+
+    The clear ones look like the frames that `restore` made.
+    """
     perceptual = published_lpips()
     views = []
-    span = depth_span(rec)
+    look = look_of(scene, rec, restore)
     for done, (name, first) in enumerate(poses.items()):
         progress("scoring test frames", done, len(poses))
         f = frames.index(name)
@@ -147,10 +151,11 @@ def score_views(
         target, seen = (
             part[window.rows, window.columns] for part in undistorted(frames.image(f), frames.mask(f), lens, canvas)
         )
-        out = scene.render(cut(canvas, window), time)
-        write_view(folder, name, out, span)
+        camera = cut(canvas, window)
+        out = scene.render(camera, time)
+        write_view(folder, name, out, camera, look)
         scores = view_scores(out.rgb, target, perceptual, seen)
-        covered = covered_scores(out.rgb, target, seen, covered_by_training(rec, cut(canvas, window)))
+        covered = covered_scores(out.rgb, target, seen, covered_by_training(rec, camera))
         views.append(HeldOutView(name, time, lens, canvas, window, first.source, scores, covered))
     progress("scoring test frames", len(poses), len(poses))
     return views

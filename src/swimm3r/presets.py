@@ -64,6 +64,12 @@ def from_yaml(path: Path) -> RunSettings:
     """The settings that `to_yaml` wrote to a file. Raises InputError."""
     import yaml
 
+    if not path.is_file():
+        raise InputError(
+            f"{path.parent} holds no run",
+            cause="it is another folder, or was moved",
+            hint="the folder that --out named when the run was made",
+        )
     try:
         return _converter().structure(yaml.safe_load(path.read_text(encoding="utf-8")), RunSettings)
     except Exception as error:  # whatever a file of another version or another hand may cause, one by one unforeseeable

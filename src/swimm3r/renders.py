@@ -1,7 +1,7 @@
 """A map's views on disk: pictures of one camera, and a flight along the path of the dive."""
 
 from collections.abc import Iterable, Sequence
-from dataclasses import replace
+from dataclasses import dataclass, replace
 from fractions import Fraction
 from pathlib import Path, PurePosixPath
 
@@ -12,16 +12,19 @@ from scipy.ndimage import gaussian_filter1d
 from torch import Tensor
 
 from swimm3r import devices, reconstruction
-from swimm3r.cameras import Cameras, project
+from swimm3r.cameras import Cameras, image_directions, project, ray_depth_from_z
 from swimm3r.errors import InputError
 from swimm3r.frames import Frames
 from swimm3r.geometry import pose_from, quaternion_from_rotation, rotation_from_quaternion
 from swimm3r.io import cameras_json, images
 from swimm3r.io.atomic import atomic_path
+from swimm3r.medium import transmittances
 from swimm3r.prepare import load_frames
 from swimm3r.progress import Progress, silent
 from swimm3r.reconstruction import Reconstruction
 from swimm3r.report.charts import depth_picture
+from swimm3r.sfm.restore import display_gains, horizon
+from swimm3r.sfm.settings import RestoreSettings
 from swimm3r.splat.checkpoint import load_map
 from swimm3r.splat.rendering import RenderOutput, SplatMap
 from swimm3r.splat.views import pinhole_canvas
@@ -31,11 +34,40 @@ _RATE = 15  # pictures per second of the flight
 _SMOOTH = 1.5  # frames of the dive over which the flight's hand steadies
 
 
-def write_view(folder: Path, name: str, out: RenderOutput, near_far: tuple[float, float]) -> None:
-    """NAME_rgb.png, _clear, _veil, and _z_depth in colours, near red and far blue over `near_far` (scene units)."""
-    for kind in ("rgb", "clear", "veil"):
-        images.write_rgb(folder / f"{name}_{kind}.png", getattr(out, kind).numpy())
-    images.write_rgb(folder / f"{name}_z_depth.png", depth_picture(out.z_depth.numpy(), *near_far))
+@dataclass(frozen=True)
+class Look:
+    """How a dive's pictures are shown: its restored frames, and the clear views and depths of its map."""
+
+    gains: Float[Tensor, "3"]  # white balance of clear pictures
+    near_far: tuple[float, float]  # z depths that are red and blue, scene units
+    restore: RestoreSettings
+
+
+def look_of(scene: SplatMap, rec: Reconstruction, restore: RestoreSettings | None = None) -> Look:
+    """The look that the restored frames of a reconstruction have, for views of its map."""
+    restore = restore or RestoreSettings()
+    restored = scene.has_water and rec.cloud is not None and restore.white_balance
+    gains = display_gains(rec.cloud.restored) if restored and rec.cloud is not None else torch.ones(3)
+    return Look(gains, depth_span(rec), restore)
+
+
+def shown_clear(out: RenderOutput, camera: Cameras, look: Look) -> Float[Tensor, "h w 3"]:
+    """A map's clear view as the restored frames are shown, white-balanced; open water keeps the colour it has.
+
+    So does what the water lets no channel see: the clear colour of such a surface is noise. `out.clear` itself is
+    physical, and what scores are taken of.
+    """
+    ray_depth = ray_depth_from_z(out.z_depth, image_directions(camera).to(out.z_depth))
+    T_D, _ = transmittances(ray_depth, out.medium)
+    return horizon(out.clear * look.gains, T_D, out.rgb, 1 - out.alpha, look.restore)
+
+
+def write_view(folder: Path, name: str, out: RenderOutput, camera: Cameras, look: Look) -> None:
+    """NAME_rgb.png, _clear (`shown_clear`), _veil, and _z_depth in colours."""
+    pictures = {"rgb": out.rgb, "clear": shown_clear(out, camera, look), "veil": out.veil}
+    for kind, picture in pictures.items():
+        images.write_rgb(folder / f"{name}_{kind}.png", picture.numpy())
+    images.write_rgb(folder / f"{name}_z_depth.png", depth_picture(out.z_depth.numpy(), *look.near_far))
 
 
 def depth_span(rec: Reconstruction) -> tuple[float, float]:
@@ -65,9 +97,15 @@ def smooth_path(cam2world: Float[Tensor, "c 4 4"], count: int) -> Float[Tensor, 
 
 
 def write_flythrough(
-    path: Path, scene: SplatMap, canvas: Cameras, cam2world: Float[Tensor, "c 4 4"], times: Sequence[float], count: int,
+    path: Path,
+    scene: SplatMap,
+    canvas: Cameras,
+    cam2world: Float[Tensor, "c 4 4"],
+    times: Sequence[float],
+    count: int,
+    look: Look,
     progress: Progress = silent,
-) -> None:  # fmt: skip
+) -> None:
     """An H.264 video of `count` views along the cameras' path: with the water, and beside it without.
 
     `times` are the cameras' own, seconds of the clip; the flight takes as many of its own on the way.
@@ -77,8 +115,9 @@ def write_flythrough(
     def views() -> Iterable[UInt8[np.ndarray, "h w 3"]]:
         for i, pose in enumerate(smooth_path(cam2world, count)):
             progress("filming the flight", i, count)
-            out = scene.render(replace(canvas, cam2world=pose[None]), float(clock[i]))
-            both = torch.cat([out.rgb, out.clear], 1)
+            camera = replace(canvas, cam2world=pose[None])
+            out = scene.render(camera, float(clock[i]))
+            both = torch.cat([out.rgb, shown_clear(out, camera, look)], 1)
             yield (both.clamp(0, 1) * 255).round().to(torch.uint8).numpy()
         progress("filming the flight", count, count)
 
@@ -93,12 +132,14 @@ def render_run(
     long_side: int = 0,
     flight: int = 0,
     time: float | None = None,
+    restore: RestoreSettings | None = None,
     progress: Progress = silent,
 ) -> Path:
     """Pictures of a finished run's map from the cameras of a cameras.json, by default those of training; into `out`.
 
-    A dynamic map shows `time` (seconds of the clip), by default the moment when the frame of a camera's name was taken.
-    Raises InputError where the run has no map, a name in the file leads out of the folder, or no moment is known.
+    Clear pictures look like the frames that `restore` made. A dynamic map shows `time` (seconds of the clip), by
+    default when the frame of a camera's name was taken. Raises InputError where the run has no map, a name in the
+    file leads out of the folder, or no moment is known.
     """
     scene = load_map(folder / "splat" / "map.safetensors").to(devices.for_maps())
     rec = reconstruction.load(folder / "sfm")
@@ -113,14 +154,15 @@ def render_run(
                 hint="names relative to the picture folder",
             )
     times = moments_of(scene, table.names, load_frames(folder / "prepare"), time)
-    span = depth_span(rec)
+    look = look_of(scene, rec, restore)
     for i, name in enumerate(table.names):
         progress("rendering", i, len(table.names))
-        write_view(out, name, scene.render(pinhole_canvas(stations[i], long_side), times[i]), span)
+        camera = pinhole_canvas(stations[i], long_side)
+        write_view(out, name, scene.render(camera, times[i]), camera, look)
     progress("rendering", len(table.names), len(table.names))
     if flight:
         canvas = pinhole_canvas(stations[0], long_side)
-        write_flythrough(out / "flythrough.mp4", scene, canvas, stations.cam2world, times, flight, progress)
+        write_flythrough(out / "flythrough.mp4", scene, canvas, stations.cam2world, times, flight, look, progress)
     return out
 
 

@@ -27,7 +27,7 @@ from swimm3r.prepare import check_source, load_frames, read_frames
 from swimm3r.presets import RunSettings, from_yaml, to_yaml
 from swimm3r.progress import Progress, silent
 from swimm3r.reconstruction import Reconstruction
-from swimm3r.renders import write_flythrough
+from swimm3r.renders import look_of, write_flythrough
 from swimm3r.report import write_report
 from swimm3r.sfm import reconstruct
 from swimm3r.sfm.model_frames import model_cameras
@@ -212,19 +212,19 @@ def _scores(run: _Run, settings: RunSettings, truth: GroundTruth | None, progres
     folder, frames, rec, scene = run.folder, run.frames, run.rec, run.scene
     poses = FinishedSfm(frames, rec, settings, truth, "").first_poses(progress)
     poses = held_out.in_axes_of(scene, rec, poses)
-    views = held_out.score_views(scene, rec, frames, poses, folder / "renders" / "test", settings.test, progress)
+    restore, into = settings.sfm.restore, folder / "renders" / "test"
+    views = held_out.score_views(scene, rec, frames, poses, into, settings.test, restore, progress)
     canvas = held_out.cut(views[0].canvas, views[0].window)
     path = as_mapped(rec, scene.poses)
     times = [frames.frames[frames.index(name)].time for name in path.names]
     flight = folder / "renders" / "flythrough.mp4"
-    write_flythrough(flight, scene, canvas, path.cameras.cam2world, times, _FLIGHT, progress)
+    look = look_of(scene, rec, restore)
+    write_flythrough(flight, scene, canvas, path.cameras.cam2world, times, _FLIGHT, look, progress)
     return {
         "test": sections.test_section(views, settings.test),
         "restored": {
             "sfm": sections.restored_section(folder / "sfm" / "restored", rec.names, progress),
-            "splat": sections.restored_section(
-                folder / "renders" / "test", [f"{view.name}_clear" for view in views], progress
-            ),
+            "splat": sections.restored_section(into, [f"{view.name}_clear" for view in views], progress),
         },
         "truth": sections.truth_section(rec, frames, truth, scene, views, progress) if truth else None,
     }

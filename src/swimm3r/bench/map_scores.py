@@ -41,7 +41,9 @@ def map_scores(
     colours and of the water.
     """
     there = held_out.in_axes_of(scene, sfm.rec, poses)
-    views = held_out.score_views(scene, sfm.rec, sfm.frames, there, folder / "test", test, progress)
+    views = held_out.score_views(
+        scene, sfm.rec, sfm.frames, there, folder / "test", test, sfm.settings.sfm.restore, progress
+    )
     for view in views:
         f, window = sfm.frames.index(view.name), (view.window.rows, view.window.columns)
         target, _ = undistorted(sfm.frames.image(f), sfm.frames.mask(f), view.lens, view.canvas)

@@ -27,7 +27,10 @@ def render(
         flight: film a flight of this many pictures along the cameras, too: OUT/flythrough.mp4.
         time: second of the clip that a dynamic map is shown at; each camera's own frame's where none is given.
     """
+    from swimm3r.presets import from_yaml
     from swimm3r.renders import render_run
 
+    restore = from_yaml(run / "settings.yaml").sfm.restore
+
     with drawn_progress() as progress:
-        print(render_run(run, cameras, out, long_side, flight, time, progress))
+        print(render_run(run, cameras, out, long_side, flight, time, restore, progress))

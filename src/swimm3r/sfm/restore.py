@@ -93,8 +93,8 @@ def restore_picture(
     direct = I - backscatter(path, medium)
     J = _without_noise(direct, T_D, I @ LUMA, settings)
     stored = srgb_from_linear(J.clamp(min=0)) if fit.encoding == "linear" else J
-    clear = _horizon(stored, T_D, image, sea, settings).clamp(0, 1)
-    shown = clear if gains is None else _horizon(stored * gains, T_D, image, sea, settings).clamp(0, 1)
+    clear = horizon(stored, T_D, image, sea, settings).clamp(0, 1)
+    shown = clear if gains is None else horizon(stored * gains, T_D, image, sea, settings).clamp(0, 1)
     return RestoredPicture(clear, shown, ray_depth, sea)
 
 
@@ -205,14 +205,14 @@ def _without_noise(
     return sees * J + (1 - sees) * share * grey / used.clamp(min=1e-3)
 
 
-def _horizon(
+def horizon(
     surface: Float[Tensor, "h w 3"],
     T_D: Float[Tensor, "h w 3"],
     image: Float[Tensor, "h w 3"],
     sea: Float[Tensor, "h w"],
     settings: RestoreSettings,
 ) -> Float[Tensor, "h w 3"]:
-    """The veil itself where there is no surface, or no channel that sees it."""
+    """The veil itself, as `image` has it, where there is no surface (`sea`, 0..1) or no channel that sees it."""
     floor = settings.veil_error / settings.colour_error
     best = T_D.amax(-1, keepdim=True)
     sees = best**2 / (best**2 + floor**2) * (1 - sea[..., None])

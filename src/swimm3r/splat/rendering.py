@@ -65,6 +65,11 @@ class SplatMap:
         """Where it is rendered."""
         return self.primitives.xyz.device
 
+    @property
+    def has_water(self) -> bool:
+        """Whether it tells water and scene apart."""
+        return isinstance(self.field, SceneWater) or not self.field.is_clear
+
     def to(self, device: torch.device) -> "SplatMap":
         """The same map on a device."""
         return replace(self, primitives=self.primitives.to(device), field=copy.deepcopy(self.field).to(device))
