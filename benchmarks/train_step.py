@@ -121,6 +121,7 @@ def measure(size: Size, repeats: int, device: torch.device) -> dict[str, float]:
     view = View(
         "benchmark", camera(size), torch.rand(3, height, width, generator=rng),
         torch.ones(height, width, dtype=torch.bool), prior, torch.full((height, width), 1.8),
+        prior < 0,
     ).to(device)  # fmt: skip
     sight = pinhole(view.camera).to(device)
     leaves = BetaPrimitives(*(t.clone().requires_grad_() for t in p))

@@ -10,7 +10,7 @@ import swimm3r
 PACKAGE = Path(swimm3r.__file__).parent
 ROWS = [  # a module sees only rows before its own
     {"errors", "progress"},
-    {"medium", "geometry", "weights", "devices"},
+    {"medium", "geometry", "weights", "devices", "open_water"},
     {"io", "cameras", "water_types", "raster"},
     {"frame_settings", "frames"},
     {"prepare"},

@@ -6,9 +6,9 @@ import torch
 
 from swimm3r.cameras import Cameras, image_directions, ray_depth_from_z
 from swimm3r.medium import AttenuationCurve, Medium, MediumFit, add_water, linear_from_srgb, srgb_from_linear
+from swimm3r.open_water import open_water_mask
 from swimm3r.reconstruction import DepthMap
 from swimm3r.sfm.depth_filling import fill_z_depth
-from swimm3r.sfm.open_water import open_water_mask
 from swimm3r.sfm.restore import display_gains, restore_picture, restored_cloud
 from swimm3r.sfm.settings import RestoreSettings, TrackSettings
 from swimm3r.sfm.tracks import fuse_depth

@@ -87,7 +87,8 @@ def scene(dive):
     camera = dive.cameras[4]
     z_depth = dive.rec.depth["4.png"].z_depth
     rgb = dive.frames.image(4).permute(2, 0, 1)
-    view = View("4.png", camera, rgb, torch.ones(48, 64, dtype=torch.bool), z_depth, torch.full_like(z_depth, 2.0))
+    everywhere = torch.ones(48, 64, dtype=torch.bool)
+    view = View("4.png", camera, rgb, everywhere, z_depth, torch.full_like(z_depth, 2.0), ~everywhere)
     return p, view
 
 

@@ -98,6 +98,27 @@ def test_a_surface_that_is_known_is_to_be_opaque_and_open_water_is_not():
     assert losses.uncovered(images, torch.zeros(2, 2)) == 0
 
 
+def test_what_looks_past_every_surface_is_to_show_nothing_but_water():
+    alpha = torch.tensor([[0.6, 1.0], [0.2, 0.0]], requires_grad=True)
+    images = depth_images(torch.ones(2, 2), alpha)
+    share = losses.drawn_on_water(images, torch.tensor([[True, False], [True, False]]))
+    assert share.item() == pytest.approx(0.4)
+    (slope,) = torch.autograd.grad(share, alpha)
+    torch.testing.assert_close(slope, torch.tensor([[0.5, 0.0], [0.5, 0.0]]))
+    assert losses.drawn_on_water(images, torch.zeros(2, 2, dtype=torch.bool)) == 0
+
+
+def test_colours_in_view_are_drawn_back_to_those_that_there_are(primitives):
+    p = primitives(3)
+    rgb = torch.tensor([[0.0, 0.5, 1.0], [1.5, -0.2, 0.3], [9.0, -9.0, 9.0]]).to(p.rgb).requires_grad_()
+    outside = losses.outside_gamut(p._replace(rgb=rgb), torch.tensor([2.0, 7.0, 0.0]))
+    assert outside.item() == pytest.approx((0.5**2 + 0.2**2) / 6)
+    (slope,) = torch.autograd.grad(outside, rgb)
+    expected = torch.zeros(3, 3)
+    expected[1, 0], expected[1, 1] = 2 * 0.5 / 6, -2 * 0.2 / 6
+    torch.testing.assert_close(slope, expected.to(slope), rtol=1e-5, atol=1e-8)
+
+
 def test_depth_may_step_where_colour_does():
     rgb = torch.zeros(6, 8, 3)
     rgb[:, 4:] = 1.0

@@ -42,7 +42,8 @@ def view_like(images: RasterOutput) -> View:
     )
     rgb = torch.rand(3, height, width, generator=rng).to(images.alpha)
     seen = torch.ones(height, width, dtype=torch.bool)
-    return View("a", camera, rgb, seen, torch.zeros(height, width), torch.zeros(height, width))
+    nothing = torch.zeros(height, width)
+    return View("a", camera, rgb, seen, nothing, nothing, nothing > 0)
 
 
 @pytest.fixture

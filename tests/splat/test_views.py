@@ -7,6 +7,9 @@ import torch
 
 from swimm3r.cameras import Cameras, image_directions
 from swimm3r.errors import InputError
+from swimm3r.frames import Frame, Frames
+from swimm3r.io.images import write_rgb
+from swimm3r.reconstruction import DepthMap, DepthMaps
 from swimm3r.splat.settings import UwbsSettings
 from swimm3r.splat.views import TrainingViews, median_z_depth, pinhole_canvas, undistorted, working_scale
 
@@ -71,6 +74,21 @@ def test_views_are_the_registered_training_frames_with_pictures_and_depth_in_wor
     expected = 2 * tiny_dive.rec.depth[view.name].z_depth
     torch.testing.assert_close(view.z_depth, expected, rtol=1e-3, atol=0)
     torch.testing.assert_close(view.camera.centres[0], 2 * tiny_dive.rec.cameras.centres[2])
+
+
+def test_views_know_where_they_look_past_every_surface(tiny_dive, tmp_path):
+    rgb = torch.tensor([0.1, 0.5, 0.6]).expand(96, 128, 3).clone()
+    rgb[48:] = 0.4 * torch.rand(48, 128, 3, generator=torch.Generator().manual_seed(0))  # a rough sea floor
+    z_depth = torch.zeros(96, 128)
+    z_depth[48:] = 3.0
+    write_rgb(tmp_path / "a.png", rgb.numpy())
+    depth = DepthMaps(tmp_path / "z_depth")
+    depth.write("a.png", DepthMap(z_depth, torch.ones(96, 128)))
+    frames = Frames((Frame("a.png", tmp_path / "a.png", 0.0, 1.0, "train"),), 128, 96, True)
+    rec = replace(tiny_dive.rec, names=("a.png",), cameras=lens(128, 96, 0.0), depth=depth)
+    open_water = TrainingViews(rec, frames, UwbsSettings(), 1.0)[0].open_water
+    assert open_water[:40].float().mean() > 0.7
+    assert not open_water[48:].any()
 
 
 def test_test_frames_are_never_views(tiny_dive):

@@ -7,8 +7,8 @@ from scipy.sparse import coo_matrix, diags
 from scipy.sparse.linalg import spsolve
 from torch import Tensor
 
+from swimm3r.open_water import open_water_mask
 from swimm3r.reconstruction import DepthMap
-from swimm3r.sfm.open_water import open_water_mask
 
 _COARSE = 96  # long side of the grid on which unknown depth is filled
 LUMA = torch.tensor([0.299, 0.587, 0.114])

@@ -109,3 +109,15 @@ def uncovered(images: RasterOutput, weight: Float[Tensor, "h w"]) -> Float[Tenso
     """Mean of 1 - alpha over the pixels where a surface is known to be; 0 where none is known."""
     known = weight > 0
     return torch.where(known, 1 - images.alpha, 0.0).sum() / known.sum().clamp(min=1)
+
+
+def drawn_on_water(images: RasterOutput, open_water: Bool[Tensor, "h w"]) -> Float[Tensor, ""]:
+    """Mean of alpha over the pixels that look past every surface; 0 where none does."""
+    return torch.where(open_water, images.alpha, 0.0).sum() / open_water.sum().clamp(min=1)
+
+
+def outside_gamut(p: BetaPrimitives, radius: Float[Tensor, " n"]) -> Float[Tensor, ""]:
+    """Mean squared excess of clear colours over 0..1, of the primitives in view (`radius` > 0); 0 for none."""
+    in_view = (radius > 0)[:, None]
+    excess = p.rgb - p.rgb.detach().clamp(0, 1)
+    return torch.where(in_view, excess.square(), 0.0).sum() / (3 * in_view.sum()).clamp(min=1)

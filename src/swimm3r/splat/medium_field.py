@@ -179,9 +179,13 @@ def water_prior(fit: MediumFit, length: float, settings: MediumFieldSettings) ->
 
 
 def deviation(grid: FieldGrid, prior: WaterPrior) -> Float[Tensor, ""]:
-    """Mean squared deviation of the field from the prior, in its standard deviations."""
+    """Mean pseudo-Huber deviation of the field from the prior, in its standard deviations d: 2 sqrt(1 + d^2) - 2.
+
+    It is d^2 near the prior and 2 |d| far from it: open water that is twice as bright to one side must stay possible.
+    """
     here = torch.cat([grid.values[:3], grid.values[3:].clamp(min=1e-6).log()])
-    return ((here - prior.mean[:, None, None]) / prior.std[:, None, None]).square().mean()
+    d = (here - prior.mean[:, None, None]) / prior.std[:, None, None]
+    return 2 * ((1 + d.square()).sqrt() - 1).mean()
 
 
 def smoothness(grid: FieldGrid) -> Float[Tensor, ""]:

@@ -97,7 +97,7 @@ class LossWeights:
     depth: float = 0.1
     medium_smoothness: float = 1.0
     medium_prior: float = 0.01
-    """Of the squared deviation from the reconstruction's water in its standard deviations; 0 is the paper's objective.
+    """Of the deviation from the reconstruction's water in its standard deviations; 0 is the paper's objective.
     Colours and water can trade places in a map, and without it they do."""
     radius: float = 0.1
     max_radius: float = 256.0
@@ -105,6 +105,12 @@ class LossWeights:
     coverage: float = 0.05
     """Of the light that passes a surface whose depth is known; 0 is the paper's objective. A map may leave a surface
     half transparent and let the veil behind it fill in; its clear colours are then dark."""
+    open_water: float = 0.025
+    """Of what is drawn over pixels that look past every surface; 0 is the paper's objective. Painted on primitives,
+    open water is part of the scene: in clear pictures it glares."""
+    gamut: float = 1.0
+    """Of the squared excess of clear colours over 0..1; 0 is the paper's objective. Where the water leaves little of a
+    channel nearly any value of it explains the pictures, and Adam, whose steps know no scale, lets it stray."""
     depth_confidence: float = 0.3
     """Least confidence of a depth that regularises."""
     depth_alpha: float = 0.5
@@ -237,7 +243,7 @@ def with_recipe(settings: UwbsSettings, recipe: Recipe) -> SplatSettings:
         case "uwbs-dynamic":
             return replace(settings, dynamic=True)
         case "ubs":  # Universal Beta Splatting as published, on the given cloud: no water or depth, poses held
-            none = dict.fromkeys(("depth", "medium_smoothness", "medium_prior", "radius", "coverage"), 0.0)
+            none = dict.fromkeys(_BEYOND_UBS, 0.0)
             return replace(
                 settings,
                 initial=replace(settings.initial, directions="uniform", colours="raw"),
@@ -266,6 +272,7 @@ def with_recipe(settings: UwbsSettings, recipe: Recipe) -> SplatSettings:
             return peer
 
 
+_BEYOND_UBS = ("depth", "medium_smoothness", "medium_prior", "radius", "coverage", "open_water", "gamut")
 _SHORT = 10_000
 """Runs shorter than this give the peers what they would else lack the time for. WaterSplatting's Gaussians start at an
 opacity of 0.1 and are culled below 0.5: of 4,000 on ruie_green_rock (160 px) 724 were left after 400 steps, at 23.6 dB

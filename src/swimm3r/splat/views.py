@@ -18,6 +18,7 @@ from swimm3r.cameras import Cameras, distorted_grid, project, resized
 from swimm3r.errors import InputError
 from swimm3r.frames import Frames
 from swimm3r.io.cache import ArrayCache
+from swimm3r.open_water import open_water_mask
 from swimm3r.reconstruction import Reconstruction
 from swimm3r.splat.settings import SplatSettings
 
@@ -32,6 +33,7 @@ class View:
     seen: Bool[Tensor, "h w"]
     z_depth: Float[Tensor, "h w"]  # working units, 0 = unknown
     depth_weight: Float[Tensor, "h w"]  # edge-aware, 0 where the depth is unknown or doubtful
+    open_water: Bool[Tensor, "h w"]  # looks past every surface; nowhere where depth is not read
     time: Float[Tensor, ""] | None = None  # of the clip, 0..1; static maps do not ask
 
     def to(self, device: torch.device) -> "View":
@@ -42,6 +44,7 @@ class View:
             seen=self.seen.to(device),
             z_depth=self.z_depth.to(device),
             depth_weight=self.depth_weight.to(device),
+            open_water=self.open_water.to(device),
             time=None if self.time is None else self.time.to(device),
         )
 
@@ -88,10 +91,10 @@ class TrainingViews:
             f = self.frames.index(name)
             rgb, seen = undistorted(self.frames.image(f), self.frames.mask(f), lens, canvas)
             stored = (rgb * 255).round().to(torch.uint8).permute(2, 0, 1).contiguous().numpy()
-            z_depth, weight = self._depth(name, lens, canvas, rgb, seen)
-            return stored, seen.numpy(), z_depth.half().numpy(), weight.half().numpy()
+            z_depth, weight, open_water = self._depth(name, lens, canvas, rgb, seen)
+            return stored, seen.numpy(), z_depth.half().numpy(), weight.half().numpy(), open_water.numpy()
 
-        rgb, seen, z_depth, weight = self._cache.get(name, make)
+        rgb, seen, z_depth, weight, open_water = self._cache.get(name, make)
         return View(
             name,
             _in_working_units(canvas, self.scale),
@@ -99,33 +102,39 @@ class TrainingViews:
             torch.from_numpy(seen.copy()),
             torch.from_numpy(z_depth.astype(np.float32)),
             torch.from_numpy(weight.astype(np.float32)),
+            torch.from_numpy(open_water.copy()),
             self._times[name],
         )
 
     def _depth(
         self, name: str, lens: Cameras, canvas: Cameras, rgb: Float[Tensor, "h w 3"], seen: Bool[Tensor, "h w"]
-    ) -> tuple[Float[Tensor, "h w"], Float[Tensor, "h w"]]:
+    ) -> tuple[Float[Tensor, "h w"], Float[Tensor, "h w"], Bool[Tensor, "h w"]]:
+        """Depth, its weight, and where there is none to be known because the picture shows open water."""
         least = self.settings.depth_confidence
         if least is None or name not in self.rec.depth:
-            return torch.zeros(canvas.height, canvas.width), torch.zeros(canvas.height, canvas.width)
+            nothing = torch.zeros(canvas.height, canvas.width)
+            return nothing, nothing, nothing > 0
         depth = self.rec.depth[name]
         column, row, _ = _grid(_key(lens), _key(canvas))
         row = np.clip(row.round().astype(np.int64), 0, lens.height - 1)
         column = np.clip(column.round().astype(np.int64), 0, lens.width - 1)
         z_depth, confidence = depth.z_depth[row, column], depth.confidence[row, column]
         known = seen & z_depth.isfinite() & (z_depth > 0) & (confidence >= least)
-        return torch.where(known, z_depth * self.scale, 0.0), torch.where(known, edge_weight(rgb), 0.0)
+        z_depth = torch.where(known, z_depth * self.scale, 0.0)
+        fit = self.rec.medium
+        open_water = open_water_mask(rgb, z_depth, None if fit is None else fit.medium.Binf) & seen
+        return z_depth, torch.where(known, edge_weight(rgb), 0.0), open_water
 
 
 def smaller(view: View, divisor: int) -> View:
-    """A view of fewer pixels, each the mean of those it covers; without depth."""
+    """A view of fewer pixels, each the mean of those it covers; without depth or open water."""
     if divisor == 1:
         return view
     height, width = (max(2, size // divisor) for size in view.seen.shape)
     rgb = interpolate(view.rgb[None], (height, width), mode="area")[0]
     seen = interpolate(view.seen[None, None].float(), (height, width), mode="area")[0, 0] > 0.999
     nothing = view.rgb.new_zeros(height, width)
-    return View(view.name, resized(view.camera, width, height), rgb, seen, nothing, nothing, view.time)
+    return View(view.name, resized(view.camera, width, height), rgb, seen, nothing, nothing, nothing > 0, view.time)
 
 
 def _in_working_units(cameras: Cameras, scale: float) -> Cameras:

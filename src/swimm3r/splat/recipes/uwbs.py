@@ -2,8 +2,8 @@
 
 L = L_3DGS + lambda_opa L_opa + lambda_scale L_scale + lambda_depth L_depth + lambda_smooth L_smooth + lambda_rad L_rad
 
-and, beyond the paper, terms that hold the water to what structure from motion measured (`LossWeights.medium_prior`) and
-known surfaces opaque (`coverage`).
+and, beyond the paper, terms that hold the water to what structure from motion measured (`LossWeights.medium_prior`),
+known surfaces opaque (`coverage`), open water empty (`open_water`) and clear colours to those that there are (`gamut`).
 """
 
 from collections.abc import Collection
@@ -220,11 +220,14 @@ def objective(
     depth_error = losses.depth_error(drawing.images, view.z_depth, view.depth_weight, w.depth_alpha)
     smooth = smoothness(drawing.grid)
     open_share = losses.uncovered(drawing.images, view.depth_weight)
+    on_water = losses.drawn_on_water(drawing.images, view.open_water)
+    outside = losses.outside_gamut(p, drawing.projection.radius)
     large = losses.oversize(p, drawing.projection.radius, w.max_radius * view.camera.width / 1280)
     depth = w.depth * depth_error
-    total = photo.loss + depth + w.coverage * open_share + w.medium_smoothness * smooth + w.radius * large
-    numbers = {"l1": photo.l1, "ssim": photo.ssim, "depth": depth_error, "uncovered": open_share}
-    numbers |= {"medium_smoothness": smooth, "radius": large}
+    total = photo.loss + depth + w.medium_smoothness * smooth + w.radius * large
+    total = total + w.coverage * open_share + w.open_water * on_water + w.gamut * outside
+    numbers = {"l1": photo.l1, "ssim": photo.ssim, "depth": depth_error, "medium_smoothness": smooth, "radius": large}
+    numbers |= {"uncovered": open_share, "drawn_on_water": on_water, "outside_gamut": outside}
     if prior is not None:
         off = deviation(drawing.grid, prior)
         total = total + w.medium_prior * off
