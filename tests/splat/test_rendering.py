@@ -5,9 +5,12 @@ from dataclasses import replace
 import pytest
 import torch
 
-from swimm3r.cameras import image_directions, ray_depth_from_z
+from swimm3r.cameras import Cameras, image_directions, ray_depth_from_z
+from swimm3r.errors import DeviceError
 from swimm3r.medium import add_water
+from swimm3r.splat.poses import RefinedPose, refine_pose
 from swimm3r.splat.primitives import select
+from swimm3r.splat.rendering import SplatMap
 
 
 def test_where_nothing_is_there_is_only_water(wall, camera):
@@ -76,3 +79,18 @@ def test_more_water_between_means_less_clear_colour(wall, camera):
     both = (near.alpha > 0.95) & (far.alpha > 0.95)
     through = [(o.rgb - o.veil)[both].mean() / o.clear[both].mean() for o in (near, far)]
     assert through[1] < 0.8 * through[0]
+
+
+def refined(scene: SplatMap, view: Cameras) -> RefinedPose:
+    return refine_pose(scene, view, torch.zeros(view.height, view.width, 3), torch.ones(view.height, view.width) > 0)
+
+
+@pytest.mark.parametrize("look", [SplatMap.render, refined])
+def test_a_view_that_does_not_fit_the_accelerator_says_what_to_make_smaller(wall, camera, monkeypatch, look):
+    def too_much(*_, **__):
+        raise torch.OutOfMemoryError("CUDA out of memory. Tried to allocate 20 GiB")
+
+    monkeypatch.setattr("swimm3r.splat.rendering.project", too_much)
+    with pytest.raises(DeviceError, match="too small for views of this map") as caught:
+        look(wall(10), camera())
+    assert "CUDA_VISIBLE_DEVICES=" in (caught.value.hint or "")

@@ -19,7 +19,7 @@ from swimm3r.progress import Progress, silent
 from swimm3r.splat.pose_codes import moved
 from swimm3r.splat.primitives import select
 from swimm3r.splat.projection import Primitives, pinhole, project
-from swimm3r.splat.rendering import SplatMap, in_scene_units, pictures
+from swimm3r.splat.rendering import SplatMap, in_scene_units, memory_for_views, pictures
 from swimm3r.splat.settings import PoseRefinementSettings
 from swimm3r.splat.views import pinhole_canvas, undistorted
 
@@ -37,6 +37,7 @@ class RefinedPose:
     loss: float
 
 
+@memory_for_views
 def refine_pose(
     scene: SplatMap,
     camera: Cameras,

@@ -9,6 +9,7 @@ from jaxtyping import Float
 from torch import Tensor
 from torch.nn.functional import relu
 
+from swimm3r import devices
 from swimm3r.cameras import Cameras
 from swimm3r.medium import Medium
 from swimm3r.raster import MediumMaps, RasterOutput, SggBuffers, rasterize
@@ -163,6 +164,13 @@ def in_scene_units(settings: Settings, length: float) -> Settings:
     return replace(settings, render=replace(settings.render, near=settings.render.near * length))
 
 
+memory_for_views = devices.memory_for(
+    "views of this map", "smaller pictures; or the processor, by CUDA_VISIBLE_DEVICES= before the command"
+)
+"""Wraps what renders a map wherever it may be."""
+
+
+@memory_for_views
 def render(scene: SplatMap, camera: Cameras, time: float | None = None) -> RenderOutput:
     """One view of a map at a time of its clip. Raises ValueError as `SplatMap.render` does."""
     settings = in_scene_units(scene.settings, scene.length)
