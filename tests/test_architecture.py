@@ -10,8 +10,8 @@ import swimm3r
 PACKAGE = Path(swimm3r.__file__).parent
 ROWS = [  # a module sees only rows before its own
     {"errors", "progress"},
-    {"medium", "geometry", "weights", "devices", "open_water"},
-    {"io", "cameras", "water_types", "raster"},
+    {"medium", "geometry", "weights", "devices", "filters"},
+    {"io", "cameras", "water_types", "raster", "open_water"},
     {"frame_settings", "frames"},
     {"prepare"},
     {"reconstruction"},

@@ -12,6 +12,8 @@ from jaxtyping import Bool, Float
 from scipy import ndimage
 from torch import Tensor
 
+from swimm3r.filters import LUMA, blur, local_linear
+
 _WINDOW = 7
 _RIM = 9  # pixels around a region in which its neighbours are looked for
 _FEW = 100  # pixels of known depth that decide nothing
@@ -66,6 +68,24 @@ def open_water_mask(
         if rim.sum() < _FEW or np.median(z_depth.numpy()[rim]) >= 0.8 * middle:
             found |= region
     return torch.from_numpy(_without_specks(found, known))
+
+
+def sea_share(
+    image: Float[Tensor, "h w 3"], z_depth: Float[Tensor, "h w"], veil: Float[Tensor, "3"] | None = None
+) -> Float[Tensor, "h w"]:
+    """How surely a pixel shows water only: open water, unknown depth around it in the same colour; soft where hazy."""
+    water = open_water_mask(image, z_depth, veil).float()
+    if not water.any():
+        return water
+    reach = 0.02 * max(image.shape[:2])
+    nearby = blur(water[..., None], reach)
+    local = blur(water[..., None] * image, reach) / nearby.clamp(min=1e-6)
+    away = (blur(image, 0.7) - local).square().sum(-1) / (2 * 0.02**2)
+    hard = torch.maximum(torch.exp(-away) * (nearby[..., 0] > 1e-3), water)
+    guide = blur(image @ LUMA[:, None], 0.7)[..., 0]
+    soft = local_linear(guide, hard[..., None], torch.ones_like(hard)[..., None], reach / 2, 2e-5)[..., 0]
+    share = blur(torch.maximum(soft, hard)[..., None], reach / 5)[..., 0]
+    return torch.where(z_depth > 0, 0.0, share.clamp(0, 1))
 
 
 def _without_specks(found: np.ndarray, known: np.ndarray) -> np.ndarray:

@@ -11,9 +11,9 @@ from jaxtyping import Bool, Float
 from torch import Tensor
 
 from swimm3r.cameras import Cameras, directions, project
+from swimm3r.filters import blur
 from swimm3r.frames import Frames
 from swimm3r.reconstruction import DenseCloud, Reconstruction
-from swimm3r.sfm.depth_filling import blur
 from swimm3r.sfm.restore import RestoredPicture
 
 _CELLS = 48  # cells along the long side of a picture in which ground is looked for

@@ -7,29 +7,10 @@ from scipy.sparse import coo_matrix, diags
 from scipy.sparse.linalg import spsolve
 from torch import Tensor
 
-from swimm3r.open_water import open_water_mask
+from swimm3r.filters import LUMA, local_linear
 from swimm3r.reconstruction import DepthMap
 
 _COARSE = 96  # long side of the grid on which unknown depth is filled
-LUMA = torch.tensor([0.299, 0.587, 0.114])
-
-
-def sea_share(
-    image: Float[Tensor, "h w 3"], z_depth: Float[Tensor, "h w"], veil: Float[Tensor, "3"]
-) -> Float[Tensor, "h w"]:
-    """How surely a pixel shows water only: open water, unknown depth around it in the same colour; soft where hazy."""
-    water = open_water_mask(image, z_depth, veil).float()
-    if not water.any():
-        return water
-    reach = 0.02 * max(image.shape[:2])
-    nearby = blur(water[..., None], reach)
-    local = blur(water[..., None] * image, reach) / nearby.clamp(min=1e-6)
-    away = (blur(image, 0.7) - local).square().sum(-1) / (2 * 0.02**2)
-    hard = torch.maximum(torch.exp(-away) * (nearby[..., 0] > 1e-3), water)
-    guide = blur(image @ LUMA[:, None], 0.7)[..., 0]
-    soft = local_linear(guide, hard[..., None], torch.ones_like(hard)[..., None], reach / 2, 2e-5)[..., 0]
-    share = blur(torch.maximum(soft, hard)[..., None], reach / 5)[..., 0]
-    return torch.where(z_depth > 0, 0.0, share.clamp(0, 1))
 
 
 def fill_z_depth(image: Float[Tensor, "h w 3"], depth: DepthMap, sea: Float[Tensor, "h w"]) -> Float[Tensor, "h w"]:
@@ -83,29 +64,3 @@ def _diffused(
     solved = spsolve((laplacian + diags(10 * weight.ravel() + 1e-8)).tocsc(), (10 * weight * value).ravel())
     grid = torch.from_numpy(np.asarray(solved, dtype=np.float32)).reshape(1, 1, *size)
     return torch.nn.functional.interpolate(grid, (height, width), mode="bilinear", align_corners=False)[0, 0]
-
-
-def blur(x: Float[Tensor, "h w c"], sigma: float) -> Float[Tensor, "h w c"]:
-    """Gaussian blur over rows and columns."""
-    import cv2
-
-    size = 2 * round(2.5 * sigma) + 1
-    blurred = cv2.GaussianBlur(x.numpy(), (size, size), sigma, borderType=cv2.BORDER_REFLECT)
-    return torch.from_numpy(blurred.reshape(x.shape))
-
-
-def local_linear(
-    guide: Float[Tensor, "h w"],
-    value: Float[Tensor, "h w c"],
-    weight: Float[Tensor, "h w c"],
-    sigma: float,
-    ridge: float,
-) -> Float[Tensor, "h w c"]:
-    """`value` as a locally linear function of `guide` (a weighted guided filter with Gaussian windows)."""
-    g = guide[..., None]
-    total = blur(weight, sigma).clamp(min=1e-8)
-    mean_g, mean_v = blur(weight * g, sigma) / total, blur(weight * value, sigma) / total
-    covariance = blur(weight * g * value, sigma) / total - mean_g * mean_v
-    variance = (blur(weight * g * g, sigma) / total - mean_g**2).clamp(min=0)
-    slope = covariance / (variance + ridge)
-    return mean_v + slope * (g - mean_g)

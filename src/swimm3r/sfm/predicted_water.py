@@ -21,9 +21,10 @@ from swimm3r.errors import InputError
 from swimm3r.frames import Frames
 from swimm3r.io.atomic import atomic_path
 from swimm3r.medium import AttenuationCurve, Medium, MediumFit, remove_water
+from swimm3r.open_water import sea_share
 from swimm3r.progress import Progress, silent
 from swimm3r.reconstruction import Reconstruction
-from swimm3r.sfm.depth_filling import fill_z_depth, sea_share
+from swimm3r.sfm.depth_filling import fill_z_depth
 from swimm3r.sfm.mast3r.pictures import NetworkPictures
 from swimm3r.sfm.physics_head import WaterMaps
 from swimm3r.sfm.restore import RestoredPicture

@@ -20,6 +20,7 @@ import torch
 from jaxtyping import Bool, Float, Int
 from torch import Tensor
 
+from swimm3r.filters import LUMA, blur, local_linear
 from swimm3r.frames import Frames
 from swimm3r.medium import (
     Medium,
@@ -30,9 +31,10 @@ from swimm3r.medium import (
     srgb_from_linear,
     transmittances,
 )
+from swimm3r.open_water import sea_share
 from swimm3r.progress import Progress, silent
 from swimm3r.reconstruction import DenseCloud, DepthMap, Reconstruction
-from swimm3r.sfm.depth_filling import LUMA, blur, fill_z_depth, local_linear, sea_share
+from swimm3r.sfm.depth_filling import fill_z_depth
 from swimm3r.sfm.settings import RestoreSettings
 from swimm3r.sfm.tracks import DenseTracks, cubes, ray_depth_map, shared_rays
 

@@ -12,11 +12,12 @@ import torch
 from jaxtyping import Bool, Float, Int
 from torch import Tensor
 
+from swimm3r.filters import blur
 from swimm3r.frames import Frames
 from swimm3r.open_water import open_water_mask
 from swimm3r.progress import Progress, silent
 from swimm3r.reconstruction import DepthMap, Reconstruction
-from swimm3r.sfm.depth_filling import blur, fill_z_depth
+from swimm3r.sfm.depth_filling import fill_z_depth
 from swimm3r.sfm.settings import SeathruSettings
 from swimm3r.sfm.tracks import DenseTracks, cubes, ray_depth_map, shared_rays
 

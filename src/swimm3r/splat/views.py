@@ -18,7 +18,7 @@ from swimm3r.cameras import Cameras, distorted_grid, project, resized
 from swimm3r.errors import InputError
 from swimm3r.frames import Frames
 from swimm3r.io.cache import ArrayCache
-from swimm3r.open_water import open_water_mask
+from swimm3r.open_water import sea_share
 from swimm3r.reconstruction import Reconstruction
 from swimm3r.splat.settings import SplatSettings
 
@@ -122,8 +122,8 @@ class TrainingViews:
         known = seen & z_depth.isfinite() & (z_depth > 0) & (confidence >= least)
         z_depth = torch.where(known, z_depth * self.scale, 0.0)
         fit = self.rec.medium
-        open_water = open_water_mask(rgb, z_depth, None if fit is None else fit.medium.Binf) & seen
-        return z_depth, torch.where(known, edge_weight(rgb), 0.0), open_water
+        open_water = sea_share(rgb, z_depth, None if fit is None else fit.medium.Binf) > 0.5
+        return z_depth, torch.where(known, edge_weight(rgb), 0.0), open_water & seen
 
 
 def smaller(view: View, divisor: int) -> View:

@@ -16,6 +16,7 @@ from torch import Tensor
 from swimm3r import reconstruction
 from swimm3r.cameras import Cameras, project
 from swimm3r.errors import RegistrationError
+from swimm3r.filters import LUMA
 from swimm3r.frames import Frames
 from swimm3r.progress import Progress, silent
 from swimm3r.reconstruction import Caution, DepthMap, DepthMaps, Matches, Reconstruction
@@ -23,7 +24,6 @@ from swimm3r.sfm import aligned_depth, colmap, match_tracks, predicted_water
 from swimm3r.sfm.alignment import Alignment, align, dense_z_depth
 from swimm3r.sfm.alignment_problem import AnchoredPair, Known
 from swimm3r.sfm.canonical import AnchoredFrame, anchors_of
-from swimm3r.sfm.depth_filling import LUMA
 from swimm3r.sfm.mast3r.encodings import EncodingStore
 from swimm3r.sfm.mast3r.pair_run import Said, load_network, look_at_pairs, put_on
 from swimm3r.sfm.mast3r.pair_store import PairRecord
