@@ -261,11 +261,15 @@ def published_lpips() -> Lpips | NotComputed:
 
 
 def best_similarity(source: Float[Tensor, "n 4 4"], target: Float[Tensor, "n 4 4"]) -> Similarity | None:
-    """The similarity of the centres, of the poses where the centres lie on a line, None where neither is determined."""
+    """The similarity of the poses, of their centres where orientations contradict those, None where neither is fixed.
+
+    A dive's centres alone leave its turn to a few percent of bending: on two reconstructions of ruie_cyan_slope the
+    orientations are 3.5 degrees apart under the similarity of the centres, 0.4 under that of the poses.
+    """
     try:
-        return align_similarity(source[:, :3, 3], target[:, :3, 3])
+        return align_poses(source, target)
     except DegenerateAlignmentError:
         try:
-            return align_poses(source, target)
+            return align_similarity(source[:, :3, 3], target[:, :3, 3])
         except DegenerateAlignmentError:
             return None

@@ -7,8 +7,9 @@ import torch
 
 from swimm3r.cameras import Cameras
 from swimm3r.evaluate import NotComputed
+from swimm3r.geometry import Similarity, align_similarity, pose_from, rotation_angle, so3_exp
 from swimm3r.ground_truth import GroundTruth
-from swimm3r.held_out import covered_by_training, covered_scores, cut, first_poses, visible_window
+from swimm3r.held_out import best_similarity, covered_by_training, covered_scores, cut, first_poses, visible_window
 from swimm3r.reconstruction import DenseCloud
 from swimm3r.renders import smooth_path
 from swimm3r.sfm.settings import FeatureSettings
@@ -91,3 +92,32 @@ def test_the_covered_score_looks_at_covered_pixels_alone():
     assert scores.share == 0.5
     assert scores.psnr == pytest.approx(20.17, abs=0.01)  # 25 of 255
     assert isinstance(covered_scores(render, target, seen, ~seen).psnr, NotComputed)
+
+
+def test_a_track_that_bends_a_little_is_turned_by_its_orientations():
+    rng = torch.Generator().manual_seed(0)
+    R = so3_exp(0.3 * torch.randn(12, 3, generator=rng, dtype=torch.float64))
+    centres = torch.stack([torch.linspace(-3, 3, 12).double(), *0.05 * torch.randn(2, 12, generator=rng).double()], -1)
+    theirs = pose_from(R, centres)
+    bent = centres + 0.05 * torch.randn(12, 3, generator=rng).double()
+    truth = Similarity(torch.tensor(2.0).double(), R[0], torch.tensor([1.0, 2.0, 3.0]).double())
+    ours = truth.poses(pose_from(R, bent))
+    found = best_similarity(theirs, ours)
+    assert found is not None
+    assert rotation_angle(found.R @ truth.R.mT) < 1e-6
+    by_centres = align_similarity(theirs[:, :3, 3], ours[:, :3, 3])
+    assert rotation_angle(by_centres.R @ truth.R.mT).rad2deg() > 3  # the turn about the track is anybody's guess
+
+
+def test_orientations_that_contradict_the_track_leave_it_to_the_centres():
+    centres = torch.randn(6, 3, generator=torch.Generator().manual_seed(1)).double()
+    theirs = pose_from(torch.eye(3).double().expand(6, 3, 3), centres)
+    about = torch.diag(torch.tensor([-1.0, -1.0, 1.0])).double()
+    ours = pose_from(torch.eye(3).double().expand(6, 3, 3), centres @ about.mT)
+    ours[:, 2, 3] *= 0  # flat, and turned half round
+    theirs[:, 2, 3] *= 0
+    found = best_similarity(theirs, ours)
+    assert found is not None
+    torch.testing.assert_close(found.poses(theirs)[:, :3, 3], ours[:, :3, 3], atol=1e-9, rtol=0)
+    still = theirs[:1].expand(6, 4, 4)
+    assert best_similarity(still, ours) is None

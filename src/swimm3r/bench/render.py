@@ -1,8 +1,8 @@
 """How maps show the frames they never saw: structure from motion x renderer (the paper's Tab. quantitative_comparison).
 
 Every recipe is trained on the same reconstruction and frames. A test frame's pose comes from the structure from motion
-of all frames, brought into the reconstruction's axes by the similarity of the training cameras (Umeyama), and is then
-refined on each frozen map from the same start: the paper's route, after 3R-GS.
+of all frames, brought into the reconstruction's axes by the similarity of the training cameras, and is then refined on
+each frozen map from the same start: the paper's route, after 3R-GS, but that the cameras' orientations count, too.
 """
 
 from collections.abc import Mapping, Sequence
