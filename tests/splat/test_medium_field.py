@@ -3,9 +3,10 @@
 from dataclasses import replace
 
 import numpy as np
+import pytest
 import torch
 
-from swimm3r.medium import Medium
+from swimm3r.medium import Medium, backscatter
 from swimm3r.splat.medium_field import (
     deviation,
     grid_of,
@@ -15,6 +16,7 @@ from swimm3r.splat.medium_field import (
     smoothness,
     spherical_harmonics,
     water_prior,
+    with_expected_horizon,
 )
 from swimm3r.splat.projection import pinhole
 from swimm3r.splat.settings import MediumFieldSettings
@@ -114,3 +116,15 @@ def test_the_prior_is_what_the_first_field_says_in_the_fields_own_unit(camera, t
     one_off = replace(grid, values=grid.values * torch.cat([torch.ones(8), torch.tensor([1.1])])[:, None, None])
     d = torch.tensor(1.1).log() / settings.least_std
     torch.testing.assert_close(deviation(one_off, prior), 2 * ((1 + d**2).sqrt() - 1) / 9, rtol=1e-4, atol=0)
+
+
+@pytest.mark.parametrize(("spread", "expected"), [(1e-4, [0.6, 0.99, 0.7]), (1e3, [0.5, 0.6, 0.5])])
+def test_an_unknown_horizon_looks_like_the_scene_and_a_known_one_like_itself(tiny_dive, spread, expected):
+    fit = tiny_dive.rec.medium
+    Binf = torch.tensor([0.6, 0.99, 0.7])
+    fit = replace(fit, medium=replace(fit.medium, Binf=Binf), std=replace(fit.std, Binf=torch.full((3,), spread)))
+    drawn = with_expected_horizon(fit, torch.tensor([0.5, 0.6, 0.5]), 0.2)
+    torch.testing.assert_close(drawn.medium.Binf, torch.tensor(expected), atol=1e-3, rtol=0)
+    assert (drawn.std.Binf <= torch.tensor(min(spread, 0.2)) + 1e-6).all()
+    z = torch.tensor(fit.z_range).prod().sqrt()
+    torch.testing.assert_close(backscatter(z, drawn.medium), backscatter(z, fit.medium), rtol=1e-4, atol=1e-5)

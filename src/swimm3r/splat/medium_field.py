@@ -10,7 +10,7 @@ interpolated in between (stride 1 is exact).
 """
 
 import math
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import torch
 from jaxtyping import Float
@@ -153,6 +153,24 @@ def per_z_depth(maps: MediumMaps, view: Pinhole) -> MediumMaps:
     """Betas for a rasteriser that blends z depth: times the length of the pixel's ray at z = 1, which is exact."""
     length = ray_lengths(view).to(maps.binf)
     return MediumMaps(maps.binf, maps.beta_b * length, maps.beta_d * length)
+
+
+def with_expected_horizon(fit: MediumFit, colour: Float[Tensor, "3"], std: float) -> MediumFit:
+    """The fit with Binf drawn to `colour` (0..1, within `std`) by what it does not know; backscatter in range stays.
+
+    Frames that never look far enough leave Binf open, and a map shows it wherever no frame has looked.
+    """
+    spread = fit.std.Binf.square()
+    sure = std**2 / (std**2 + spread)
+    Binf = sure * fit.medium.Binf + (1 - sure) * colour.to(fit.medium.Binf)
+    z = math.sqrt(fit.z_range[0] * fit.z_range[1])
+    B = fit.medium.Binf * -torch.expm1(-fit.medium.beta_B * z)
+    beta_B = -torch.log1p(-(B / Binf).clamp(max=0.95)) / z
+    return replace(
+        fit,
+        medium=Medium(Binf, fit.medium.beta_D, beta_B),
+        std=replace(fit.std, Binf=(sure * spread).sqrt()),
+    )
 
 
 @dataclass(frozen=True)

@@ -14,7 +14,8 @@ from jaxtyping import Float, Int
 from torch import Tensor
 
 from swimm3r.devices import CPU
-from swimm3r.medium import Medium
+from swimm3r.medium import Medium, MediumFit
+from swimm3r.reconstruction import Reconstruction
 from swimm3r.splat import densify, losses, training
 from swimm3r.splat.gradients import differentiate
 from swimm3r.splat.medium_field import (
@@ -23,6 +24,7 @@ from swimm3r.splat.medium_field import (
     initial_field,
     smoothness,
     water_prior,
+    with_expected_horizon,
 )
 from swimm3r.splat.moving.births import born
 from swimm3r.splat.moving.travel import ways
@@ -34,6 +36,8 @@ from swimm3r.splat.settings import UwbsSettings
 from swimm3r.splat.site import Site
 from swimm3r.splat.state import FIELD, POSES, State, clip_field, first_state, parameters_of
 from swimm3r.splat.views import View
+
+_HORIZON_STD = 0.2  # of the open water's colour around the scene's mean colour, as structure from motion assumes
 
 
 @dataclass(frozen=True)
@@ -62,8 +66,9 @@ class Uwbs:
             p = with_time(p, settings.initial, training.generator(settings.seed, 0, 5))
         p = rescaled(p, scale)
         medium = None
-        if rec.medium is not None:
-            fit = rec.medium.medium
+        water = measured_water(rec)
+        if water is not None:
+            fit = water.medium
             medium = Medium(fit.Binf, fit.beta_D / scale, fit.beta_B / scale)
         field = initial_field(medium, settings.medium, training.generator(settings.seed, 0, 3), settings.dynamic)
         return first_state(p, field, self.site.codes(settings.poses, training.generator(settings.seed, 0, 6)))
@@ -239,9 +244,16 @@ def objective(
     return Objective(total, depth, {"loss": total} | numbers)
 
 
+def measured_water(rec: Reconstruction) -> MediumFit | None:
+    """The reconstruction's water; where it leaves Binf open, that is near the scene's mean colour as filmed."""
+    if rec.medium is None or rec.cloud is None:
+        return rec.medium
+    return with_expected_horizon(rec.medium, rec.cloud.raw.mean(0), _HORIZON_STD)
+
+
 def known_water(site: Site, settings: UwbsSettings) -> WaterPrior | None:
     """What structure from motion says about the water, per working unit; None for maps without water."""
-    fit = site.rec.medium
+    fit = measured_water(site.rec)
     if settings.medium.model == "none" or fit is None:
         return None
     prior = water_prior(fit, 1 / site.scale, settings.medium)
