@@ -46,9 +46,9 @@ class Look:
 def look_of(scene: SplatMap, rec: Reconstruction, restore: RestoreSettings | None = None) -> Look:
     """The look that the restored frames of a reconstruction have, for views of its map."""
     restore = restore or RestoreSettings()
-    restored = scene.has_water and rec.cloud is not None and restore.white_balance
-    gains = display_gains(rec.cloud.restored) if restored and rec.cloud is not None else torch.ones(3)
-    return Look(gains, depth_span(rec), restore)
+    if rec.cloud is None or not (scene.has_water and restore.white_balance):
+        return Look(torch.ones(3), depth_span(rec), restore)
+    return Look(display_gains(rec.cloud.restored), depth_span(rec), restore)
 
 
 def shown_clear(out: RenderOutput, camera: Cameras, look: Look) -> Float[Tensor, "h w 3"]:

@@ -128,3 +128,13 @@ def test_an_unknown_horizon_looks_like_the_scene_and_a_known_one_like_itself(tin
     assert (drawn.std.Binf <= torch.tensor(min(spread, 0.2)) + 1e-6).all()
     z = torch.tensor(fit.z_range).prod().sqrt()
     torch.testing.assert_close(backscatter(z, drawn.medium), backscatter(z, fit.medium), rtol=1e-4, atol=1e-5)
+
+
+def test_a_known_horizon_that_is_black_or_nearly_reached_stays(tiny_dive):
+    fit = tiny_dive.rec.medium
+    medium = replace(fit.medium, Binf=torch.tensor([0.0, 0.4, 0.5]), beta_B=torch.tensor([0.3, 2.0, 0.2]))
+    fit = replace(fit, medium=medium, std=replace(fit.std, Binf=torch.zeros(3)))
+    drawn = with_expected_horizon(fit, torch.tensor([0.5, 0.6, 0.5]), 0.2).medium
+    assert drawn.beta_B.isfinite().all()
+    torch.testing.assert_close(drawn.Binf, medium.Binf)
+    torch.testing.assert_close(drawn.beta_B[1:], medium.beta_B[1:], rtol=1e-4, atol=0)

@@ -67,9 +67,7 @@ def condition(p: BetaPrimitives, query: Float[Tensor, "n c"], rotation: str = "f
     V = L @ L.mT
     V11, V12, V22 = V[:, :3, :3], V[:, :3, 3:], V[:, 3:, 3:]
     B = 4 * torch.exp(p.beta[:, 1:])
-    Lc = torch.linalg.cholesky_ex(
-        V22
-    ).L  # positive by its making; to have it checked, a GPU would have to be waited for
+    Lc = torch.linalg.cholesky_ex(V22).L  # positive by its making: to check it, a GPU would have to be waited for
     x = (query - p.query_mean)[..., None]
     half = torch.linalg.solve_triangular(Lc, V12.mT, upper=False)  # cholesky_solve goes matrix by matrix on a GPU
     G = torch.linalg.solve_triangular(Lc.mT, half, upper=True).mT

@@ -158,14 +158,15 @@ def per_z_depth(maps: MediumMaps, view: Pinhole) -> MediumMaps:
 def with_expected_horizon(fit: MediumFit, colour: Float[Tensor, "3"], std: float) -> MediumFit:
     """The fit with Binf drawn to `colour` (0..1, within `std`) by what it does not know; backscatter in range stays.
 
-    Frames that never look far enough leave Binf open, and a map shows it wherever no frame has looked.
+    It stays as far as the new Binf can give it. Frames that never look far enough leave Binf open, and a map shows it
+    wherever no frame has looked.
     """
     spread = fit.std.Binf.square()
     sure = std**2 / (std**2 + spread)
     Binf = sure * fit.medium.Binf + (1 - sure) * colour.to(fit.medium.Binf)
     z = math.sqrt(fit.z_range[0] * fit.z_range[1])
     B = fit.medium.Binf * -torch.expm1(-fit.medium.beta_B * z)
-    beta_B = -torch.log1p(-(B / Binf).clamp(max=0.95)) / z
+    beta_B = -torch.log1p(-(B / Binf.clamp(min=1e-6)).clamp(max=0.999)) / z
     return replace(
         fit,
         medium=Medium(Binf, fit.medium.beta_D, beta_B),
