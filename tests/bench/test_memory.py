@@ -1,8 +1,10 @@
 """The peak of memory belongs to the work it is measured over."""
 
+import os
+
 import numpy as np
 
-from swimm3r.bench.memory import with_peak_mb
+from swimm3r.bench.memory import in_own_process, with_peak_mb
 from swimm3r.evaluate import NotComputed
 
 
@@ -17,3 +19,7 @@ def test_the_peak_is_of_the_work_alone():
         return
     assert isinstance(little["peak_mb"], float)
     assert much["peak_mb"] - little["peak_mb"] > 300
+
+
+def test_work_that_is_to_be_alone_runs_in_another_process():
+    assert in_own_process(os.getpid) != os.getpid()

@@ -4,6 +4,7 @@ Every test frame of a run is a query. Its pose is judged against the structure f
 test, by relative poses: of test frame and training frame, where the map's training frames anchor the answer, and of two
 test frames, of which short clips have few. The pairs of two training frames say how far the map's own poses agree with
 the reference: nothing placed in the map can agree better. Maps are the runs' own, and those that `bench render` left.
+Each map is measured in a process of its own, so that neither memory nor time depends on the maps before it.
 """
 
 import json
@@ -11,6 +12,7 @@ from collections.abc import Sequence
 from dataclasses import asdict, dataclass
 from functools import partial
 from pathlib import Path
+from typing import Any
 
 import torch
 from jaxtyping import Bool, Float
@@ -19,7 +21,7 @@ from torch import Tensor
 from swimm3r import devices
 from swimm3r.bench import reference
 from swimm3r.bench.cells import Cell, Place, Scores, kept_cell, over_scenes, scene_folder
-from swimm3r.bench.memory import with_peak_mb
+from swimm3r.bench.memory import in_own_process, with_peak_mb
 from swimm3r.bench.runs import POSES_REFINED, Clip, SfmRun, clips_of
 from swimm3r.bench.scores import columns
 from swimm3r.bench.settings import JobSettings
@@ -107,54 +109,55 @@ def _cells_of_clip(
     first = clip.runs[0].open()
     truth = reference.of_clip(first, scene_folder((maps or out) / "references", clip.name), progress)
     cells = []
-    for run in clip.runs:
-        sfm = run.open()
-        for found in maps_of(run, maps):
-            stat = found.path.stat()
-            depends_on = [
-                sfm.key,
-                str(found.path),
-                stat.st_size,
-                stat.st_mtime_ns,
-                asdict(settings),
-                reference.digest(truth),
-            ]
-            make = partial(_scores, sfm=sfm, path=found.path, truth=truth, settings=settings, progress=progress)
-            place = Place(clip.name, found.method, found.seed)
-            cells.append(kept_cell(out, place, [*depends_on, [c.score for c in COLUMNS]], make))
+    work = [(run, found) for run in clip.runs for found in maps_of(run, maps)]
+    for done, (run, found) in enumerate(work):
+        progress("localising in maps", done, len(work))
+        stat = found.path.stat()
+        depends_on = [
+            run.open().key,
+            str(found.path),
+            stat.st_size,
+            stat.st_mtime_ns,
+            asdict(settings),
+            reference.digest(truth),
+            [c.score for c in COLUMNS],
+        ]
+        make = partial(_scores_of_map, run=run, path=found.path, truth=truth, settings=settings)
+        cells.append(kept_cell(out, Place(clip.name, found.method, found.seed), depends_on, make))
+    progress("localising in maps", len(work), len(work))
     return cells
 
 
-def _scores(
-    folder: Path,
-    *,
-    sfm: FinishedSfm,
-    path: Path,
-    truth: GroundTruth | NotComputed,
-    settings: LocalizationSettings,
-    progress: Progress,
+def _scores_of_map(folder: Path, **given: Any) -> Scores:
+    return in_own_process(partial(_measured, folder, **given))
+
+
+def _measured(
+    folder: Path, *, run: SfmRun, path: Path, truth: GroundTruth | NotComputed, settings: LocalizationSettings
 ) -> Scores:
+    sfm = run.open()
     scene = load_map(path).to(devices.for_maps())
 
     def work() -> tuple[Localizer, list[Answer]]:
         localizer = Localizer(scene, sfm.rec, sfm.frames, settings)
-        return localizer, _answers(localizer, sfm, folder, progress)
+        return localizer, _answers(localizer, sfm, folder)
 
     (localizer, answers), peaks = with_peak_mb(work)
     return {**localisation_scores(answers), **pose_scores(localizer.rec, answers, truth), **peaks}
 
 
-def _answers(localizer: Localizer, sfm: FinishedSfm, folder: Path, progress: Progress) -> list[Answer]:
+def _answers(localizer: Localizer, sfm: FinishedSfm, folder: Path) -> list[Answer]:
     """Every test frame placed; folder/matches/NAME.png shows what with."""
-    found = []
-    for done, frame in enumerate(sfm.frames.test):
-        progress("localising", done, len(sfm.frames.test))
+    queries = []
+    for frame in sfm.frames.test:
         f = sfm.frames.index(frame.name)
-        query = Query(frame.name, frame.time, sfm.frames.image(f), sfm.frames.mask(f), frame.time)
-        found.append(answer(localizer, query))
-        place = found[-1].found
-        if place is not None and place.evidence is not None:
-            images.write_rgb(folder / "matches" / f"{frame.name}.png", match_picture(place.evidence))
+        queries.append(Query(frame.name, frame.time, sfm.frames.image(f), sfm.frames.mask(f), frame.time))
+    answer(localizer, queries[0])  # once more than needed: kernels are loaded, references described
+    found = [answer(localizer, query) for query in queries]
+    for place in found:
+        if place.found is not None and place.found.evidence is not None:
+            picture = match_picture(place.found.evidence)
+            images.write_rgb(folder / "matches" / f"{place.name}.png", picture)
     return found
 
 

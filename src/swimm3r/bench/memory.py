@@ -1,7 +1,9 @@
-"""The most memory a piece of work held."""
+"""What a piece of work costs apart from what ran before it."""
 
 import sys
 from collections.abc import Callable
+from concurrent.futures import ProcessPoolExecutor
+from multiprocessing import get_context
 from pathlib import Path
 from typing import TypeVar
 
@@ -11,6 +13,15 @@ from swimm3r.evaluate import NotComputed
 
 Result = TypeVar("Result")
 _STATUS, _RESET = Path("/proc/self/status"), Path("/proc/self/clear_refs")
+
+
+def in_own_process(work: Callable[[], Result]) -> Result:
+    """What `work` returns where nothing has run before: kernels that others loaded, memory that they left.
+
+    `work` and its result are sent between processes, so `work` is a module's function or a `partial` of one.
+    """
+    with ProcessPoolExecutor(1, get_context("spawn")) as pool:
+        return pool.submit(work).result()
 
 
 def with_peak_mb(work: Callable[[], Result]) -> tuple[Result, dict[str, float | NotComputed]]:

@@ -76,7 +76,7 @@ COLUMNS = (
         for stage in ("retrieve", "coarse", "render", "match", "refine")
     ),
     Column("fps_localise", "Loc. FPS", 3, "high", "all stages together, without what is done once per map"),
-    Column("peak_mb", "Peak, MB", 0, "low", "resident memory of the process while it localised"),
+    Column("peak_mb", "Peak, MB", 0, "low", "resident memory of a process that localises in this map alone"),
     Column("peak_vram_mb", "Peak VRAM, MB", 0, "low", "allocated by torch on the GPU while it localised"),
 )
 
