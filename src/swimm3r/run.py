@@ -59,8 +59,8 @@ def run_pipeline(
     """Run the stages up to `last_stage` and return the summary (layout: docs/conventions.md).
 
     `reference` is a cameras.json to score against; a synthetic dive brings its own truth. `map_device` is where the map
-    is trained and rendered. Raises the errors of its
-    stages (`swimm3r.errors`) and InputError where `folder` belongs to another input.
+    is trained and rendered. Raises the errors of its stages (`swimm3r.errors`) and InputError where `folder` belongs to
+    another input.
     """
     settings = settings or RunSettings()
     check_source(source)
