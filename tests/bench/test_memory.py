@@ -3,8 +3,10 @@
 import os
 
 import numpy as np
+import pytest
 
 from swimm3r.bench.memory import in_own_process, with_peak_mb
+from swimm3r.errors import DeviceError
 from swimm3r.evaluate import NotComputed
 
 
@@ -23,3 +25,8 @@ def test_the_peak_is_of_the_work_alone():
 
 def test_work_that_is_to_be_alone_runs_in_another_process():
     assert in_own_process(os.getpid) != os.getpid()
+
+
+def test_a_process_that_was_ended_from_outside_says_so():
+    with pytest.raises(DeviceError, match="ended from outside"):
+        in_own_process(os._exit, 9)

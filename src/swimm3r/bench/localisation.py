@@ -12,7 +12,6 @@ from collections.abc import Sequence
 from dataclasses import asdict, dataclass
 from functools import partial
 from pathlib import Path
-from typing import Any
 
 import torch
 from jaxtyping import Bool, Float
@@ -109,12 +108,13 @@ def _cells_of_clip(
     first = clip.runs[0].open()
     truth = reference.of_clip(first, scene_folder((maps or out) / "references", clip.name), progress)
     cells = []
+    keys = {run.folder: run.open().key for run in clip.runs}
     work = [(run, found) for run in clip.runs for found in maps_of(run, maps)]
     for done, (run, found) in enumerate(work):
         progress("localising in maps", done, len(work))
         stat = found.path.stat()
         depends_on = [
-            run.open().key,
+            keys[run.folder],
             str(found.path),
             stat.st_size,
             stat.st_mtime_ns,
@@ -122,17 +122,14 @@ def _cells_of_clip(
             reference.digest(truth),
             [c.score for c in COLUMNS],
         ]
-        make = partial(_scores_of_map, run=run, path=found.path, truth=truth, settings=settings)
-        cells.append(kept_cell(out, Place(clip.name, found.method, found.seed), depends_on, make))
+        place = Place(clip.name, found.method, found.seed)
+        scores = partial(_scores, run=run, path=found.path, truth=truth, settings=settings)
+        cells.append(kept_cell(out, place, depends_on, partial(in_own_process, scores)))
     progress("localising in maps", len(work), len(work))
     return cells
 
 
-def _scores_of_map(folder: Path, **given: Any) -> Scores:
-    return in_own_process(partial(_measured, folder, **given))
-
-
-def _measured(
+def _scores(
     folder: Path, *, run: SfmRun, path: Path, truth: GroundTruth | NotComputed, settings: LocalizationSettings
 ) -> Scores:
     sfm = run.open()

@@ -3,25 +3,35 @@
 import sys
 from collections.abc import Callable
 from concurrent.futures import ProcessPoolExecutor
+from concurrent.futures.process import BrokenProcessPool
 from multiprocessing import get_context
 from pathlib import Path
 from typing import TypeVar
 
 import torch
 
+from swimm3r.errors import DeviceError
 from swimm3r.evaluate import NotComputed
 
 Result = TypeVar("Result")
 _STATUS, _RESET = Path("/proc/self/status"), Path("/proc/self/clear_refs")
 
 
-def in_own_process(work: Callable[[], Result]) -> Result:
-    """What `work` returns where nothing has run before: kernels that others loaded, memory that they left.
+def in_own_process(work: Callable[..., Result], *given: object) -> Result:
+    """What `work(*given)` returns where nothing has run before: kernels that others loaded, memory that they left.
 
-    `work` and its result are sent between processes, so `work` is a module's function or a `partial` of one.
+    All of it is sent between processes, so `work` is a module's function or a `partial` of one. Raises its errors, and
+    DeviceError where the process was ended from outside.
     """
-    with ProcessPoolExecutor(1, get_context("spawn")) as pool:
-        return pool.submit(work).result()
+    try:
+        with ProcessPoolExecutor(1, get_context("spawn")) as pool:
+            return pool.submit(work, *given).result()
+    except BrokenProcessPool as error:
+        raise DeviceError(
+            "the process that was measured was ended from outside",
+            cause="most likely the computer ran out of memory",
+            hint="fewer --jobs, or close other programs; the same command then goes on from here",
+        ) from error
 
 
 def with_peak_mb(work: Callable[[], Result]) -> tuple[Result, dict[str, float | NotComputed]]:
