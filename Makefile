@@ -3,7 +3,7 @@ PYTHON ?= python3
 VENV := .venv
 BIN := $(VENV)/bin
 
-.PHONY: setup demo test lint clean
+.PHONY: setup demo test test-processors attack lint clean
 .DEFAULT_GOAL := demo
 
 $(VENV)/.installed: pyproject.toml
@@ -16,6 +16,9 @@ setup: $(VENV)/.installed
 demo: setup  ## A synthetic dive through the whole pipeline; the result is runs/demo/report.html
 	$(BIN)/swimm3r demo --out runs/demo
 
+attack: setup  ## Bad input over every command; hours on two cores, or one family: make attack FAMILIES=outputs
+	$(BIN)/python -m tests.attack $(FAMILIES)
+
 lint: setup
 	$(BIN)/ruff check .
 	$(BIN)/ruff format --check .
@@ -23,6 +26,9 @@ lint: setup
 
 test: lint  ## Linters, type checker and the whole test suite
 	$(BIN)/pytest -n 2 --dist loadfile
+
+test-processors: setup  ## The numerically delicate tests as other processors and thread counts see them
+	$(BIN)/python tests/processors.py $(PROFILES)
 
 clean:
 	rm -rf runs .pytest_cache .ruff_cache

@@ -30,7 +30,7 @@ from swimm3r.splat.settings import (
     watersplatting,
     with_recipe,
 )
-from swimm3r.splat.views import pinhole_canvas, undistorted
+from swimm3r.splat.views import undistorted
 
 
 def variants(size: UwbsSettings) -> dict[str, SplatSettings]:
@@ -76,7 +76,7 @@ def score(sfm: FinishedSfm, settings: SplatSettings) -> tuple[float, int]:
     found = []
     for name in held:
         lens, f = sfm.rec.cameras[sfm.rec.index(name)], frames.index(name)
-        canvas = pinhole_canvas(lens, settings.long_side)
+        canvas = lens.pinhole(settings.long_side)
         target, seen = undistorted(frames.image(f), frames.mask(f), lens, canvas)
         render = scene.render(canvas, frames.frames[f].time).rgb.clamp(0, 1)
         found.append(psnr(render[seen], target[seen]))

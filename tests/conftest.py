@@ -20,7 +20,7 @@ import torch
 
 from swimm3r.sfm.mast3r.network import Architecture, Mast3r
 
-torch.set_num_threads(1)  # two xdist workers share two cores
+torch.set_num_threads(int(os.environ.get("SWIMM3R_TEST_THREADS", "1")))  # two xdist workers share two cores
 
 SHARED = Path(os.environ.get("SWIMM3R_SHARED", Path(__file__).parents[2] / "shared"))
 

@@ -1,10 +1,13 @@
 """Frames load from disk one at a time, and only so many stay in memory."""
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 import torch
 
 from swimm3r import frames as frames_module
+from swimm3r.errors import InputError
 from swimm3r.frames import Frame, Frames
 from swimm3r.io import images
 from swimm3r.io.cache import ArrayCache
@@ -61,3 +64,13 @@ def test_what_is_in_use_is_not_read_again(dive, monkeypatch):
 def test_changing_a_loaded_picture_does_not_change_the_next_load(dive):
     dive.image(5).zero_()
     assert dive.image(5).min() == pytest.approx(5 / 255)
+
+
+@pytest.mark.parametrize("what", ["picture", "mask"])
+def test_a_file_of_another_size_than_the_frames_is_named(what: str, dive, tmp_path):
+    small = tmp_path / "small.png"
+    images.write_rgb(small, np.full((50, 80, 3), 255, np.uint8))
+    frame = replace(dive.frames[3], path=small) if what == "picture" else replace(dive.frames[3], mask=small)
+    damaged = replace(dive, frames=(frame,))
+    with pytest.raises(InputError, match=r"small\.png is 80 x 50, the frames are 160 x 100"):
+        damaged.image(0) if what == "picture" else damaged.mask(0)

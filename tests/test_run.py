@@ -11,13 +11,17 @@ from dataclasses import replace
 from hashlib import sha256
 from pathlib import Path
 
+import numpy as np
 import pytest
 import torch
 
 from swimm3r import reconstruction
 from swimm3r.errors import InputError, StorageError
 from swimm3r.evaluate.poses import absolute_pose_errors
+from swimm3r.evaluate.underwater import uciqe
 from swimm3r.ground_truth import read_ground_truth
+from swimm3r.io import images
+from swimm3r.io.depth import read_depth
 from swimm3r.io.video import Video
 from swimm3r.localization.batch import localize_run
 from swimm3r.localization.settings import LocalizationSettings
@@ -90,14 +94,22 @@ def test_the_run_folder_holds_what_the_conventions_promise(finished: tuple[Path,
         assert (folder / name).stat().st_size > 0, name
     for name in ("cameras.json", "matches.npz", "medium.json", "points.ply", "points_raw.ply", "sparse/images.bin"):
         assert (folder / "sfm" / name).stat().st_size > 0, name
-    for name in reconstruction.load(folder / "sfm").names:
+    frames, names = load_frames(folder / "prepare"), reconstruction.load(folder / "sfm").names
+    table = json.loads((folder / "sfm" / "cameras.json").read_text())["frames"]
+    assert {entry["name"]: entry["time"] for entry in table} == dict(zip(names, frames.times_of(names), strict=True))
+    trajectory = np.loadtxt(folder / "sfm" / "trajectory.tum")
+    assert trajectory[:, 0].tolist() == sorted(frames.times_of(names))
+    for name in names:
         assert (folder / "sfm" / "z_depth" / f"{name}.npz").is_file()
         assert (folder / "sfm" / "restored" / f"{name}.png").is_file()
+        assert images.read_rgb(folder / "sfm" / "restored_physical" / f"{name}.png").dtype == np.uint16
     for name in ("map.safetensors", "metrics.jsonl", "checkpoint/state.safetensors"):
         assert (folder / "splat" / name).stat().st_size > 0, name
-    for name in load_frames(folder / "prepare").test.names:
+    for name in frames.test.names:
+        stem = folder / "renders" / "test" / Path(name).stem
         for kind in KINDS:
-            assert (folder / "renders" / "test" / f"{name}_{kind}.png").is_file()
+            assert Path(f"{stem}_{kind}.png").is_file()
+        assert read_depth(Path(f"{stem}_z_depth.npz")).any()
 
 
 def test_the_map_shows_frames_it_never_saw(finished: tuple[Path, dict]):
@@ -135,6 +147,27 @@ def test_a_finished_run_is_scored_and_rendered_again(finished: tuple[Path, dict]
     assert len(list(pictures.rglob("*_rgb.png"))) == summary["sfm"]["registered"]
 
 
+def test_scores_by_another_protocol_stand_beside_the_runs_own(dive: Path, finished: tuple[Path, dict], tmp_path: Path):
+    folder, summary = finished
+    copy = tmp_path / "run"
+    shutil.copytree(folder, copy)
+    before = digests(copy / "renders")
+    again = evaluate_run(copy, steps=1)
+    assert {name: again[name] for name in ("test", "restored", "truth", "stages")} == {
+        name: summary[name] for name in ("test", "restored", "truth", "stages")
+    }
+    other = again["other_protocols"]["steps-1"]
+    assert other["settings"]["steps"] == 1
+    assert "refined 1 steps" in other["test"]["protocol"]
+    assert other["test"]["psnr"] != summary["test"]["psnr"]
+    assert other["truth"]["sfm"] == summary["truth"]["sfm"]
+    views = digests(copy / "renders")
+    assert {name: views[name] for name in before} == before
+    assert (copy / other["views"] / "0000_rgb.png").is_file()
+    assert "steps-1" in (copy / "report.html").read_text()
+    assert run_pipeline(dive, copy, TINY_MAP) == again
+
+
 def test_the_test_frames_are_localised_in_the_map(dive: Path, finished: tuple[Path, dict], tmp_path: Path):
     answers, out = localize_run(finished[0], out=tmp_path / "places", settings=LocalizationSettings(matcher="sift"))
     frames, rec = load_frames(finished[0] / "prepare"), reconstruction.load(finished[0] / "sfm")
@@ -165,7 +198,7 @@ def test_settings_come_back_from_their_file(tmp_path: Path):
 @pytest.mark.parametrize("text", ["", "frames: {fps: 5}\nwarp: 9\n", "sfm: {kind: Sonar}\n", "[1, 2"])
 def test_a_settings_file_of_another_version_is_named(tmp_path: Path, text: str):
     (tmp_path / "settings.yaml").write_text(text)
-    with pytest.raises(InputError, match="does not hold the settings of a run"):
+    with pytest.raises(InputError, match="is damaged"):
         from_yaml(tmp_path / "settings.yaml")
 
 
@@ -186,6 +219,26 @@ def test_a_number_that_was_not_computed_is_null_with_its_reason(finished: tuple[
     assert restored["urank"] is None
     assert restored["urank_reason"]
     assert restored["uiqm"] > 0
+
+
+@pytest.mark.parametrize(
+    ("part", "physical", "shown"),
+    [
+        ("sfm", "sfm/restored_physical/*.png", "sfm/restored/*.png"),
+        ("splat", "renders/test/*_clear_physical.png", "renders/test/*_clear.png"),
+    ],
+)
+def test_scores_without_reference_are_of_physical_colors(
+    part: str, physical: str, shown: str, finished: tuple[Path, dict]
+):
+    folder, summary = finished
+    section = summary["restored"][part]
+    for scores, files in ((section, sorted(folder.glob(physical))), (section["shown"], sorted(folder.glob(shown)))):
+        stored = [images.read_rgb(path) for path in files]
+        shares = [torch.from_numpy(image.astype("float32") / np.iinfo(image.dtype).max) for image in stored]
+        assert scores["uciqe"] == pytest.approx(sum(uciqe(image) for image in shares) / len(files), rel=1e-4)
+    assert section["uciqe"] != section["shown"]["uciqe"]
+    assert "before the white balance" in section["colors"]
 
 
 def test_test_frames_never_reach_structure_from_motion(finished: tuple[Path, dict]):
@@ -222,7 +275,7 @@ def test_a_training_that_was_interrupted_goes_on(dive: Path, finished: tuple[Pat
             raise KeyboardInterrupt
 
     with pytest.raises(KeyboardInterrupt):
-        run_pipeline(dive, copy, other, progress=interrupt)
+        run_pipeline(dive, copy, other, redo=True, progress=interrupt)
     steps: list[int] = []
 
     def count(what: str, done: int, total: int, /) -> None:
@@ -248,11 +301,11 @@ def test_a_folder_with_other_things_in_it_is_refused(dive: Path, tmp_path: Path)
         run_pipeline(dive, tmp_path)
 
 
-def test_changed_settings_make_their_stage_again(dive: Path, tmp_path: Path):
+def test_changed_settings_make_their_stage_again_where_that_is_asked_for(dive: Path, tmp_path: Path):
     settings = PRESETS["fast"]
     run_pipeline(dive, tmp_path / "run", settings, last_stage="prepare")
     fewer = replace(settings, frames=replace(settings.frames, long_side=160))
-    assert run_pipeline(dive, tmp_path / "run", fewer, last_stage="prepare")["input"]["width"] == 160
+    assert run_pipeline(dive, tmp_path / "run", fewer, last_stage="prepare", redo=True)["input"]["width"] == 160
 
 
 def test_too_little_disk_is_said_before_anything_is_begun(dive: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
@@ -264,12 +317,15 @@ def test_too_little_disk_is_said_before_anything_is_begun(dive: Path, tmp_path: 
 def test_a_disk_that_fills_under_the_database_is_said_with_its_exit_code(dive: Path, tmp_path: Path):
     """Stands in for a full disk: no file may grow beyond 1 MB, which the prepared frames do not, the database does."""
     folder = tmp_path / "run"
+    (tmp_path / "temporary").mkdir()
     command = f"ulimit -f 1000; exec {sys.executable} -m swimm3r sfm {dive} --out {folder} --preset fast"
-    done = subprocess.run(["bash", "-c", command], capture_output=True, text=True, check=False)
+    elsewhere = {**os.environ, "TMPDIR": str(tmp_path / "temporary")}
+    done = subprocess.run(["bash", "-c", command], capture_output=True, text=True, check=False, env=elsewhere)
     assert done.returncode == 7, done.stderr
     assert "database" in done.stderr
     assert "Traceback" not in done.stderr
     assert json.loads((folder / "summary.json").read_text())["stages"]["prepare"]["status"] == "done"
+    assert list((tmp_path / "temporary").iterdir()) == []  # of no library
 
 
 @pytest.mark.parametrize("marker", ["sfm/database.db", "sfm/reconstruction.json"])
@@ -287,3 +343,6 @@ def test_a_killed_run_goes_on(marker: str, dive: Path, finished: tuple[Path, dic
     assert again.names == first.names
     assert absolute_pose_errors(again.cameras.cam2world, first.cameras.cam2world).rotation_deg < 0.05
     assert torch.isfinite(again.cloud.xyz).all()
+    if marker == "sfm/reconstruction.json":  # killed after the poses were found: all that follows has the same bits
+        for name in ("cameras.json", "medium.json", "points.ply", "matches.npz"):
+            assert (folder / "sfm" / name).read_bytes() == (finished[0] / "sfm" / name).read_bytes(), name

@@ -97,7 +97,9 @@ def _jittered(pictures: Tensor, generator: torch.Generator) -> Tensor:
     return x.clamp(0, 1) * 2 - 1
 
 
-def losses(network: Mast3r, pictures: Tensor, truth: tuple, matches: TrueMatches) -> tuple[Tensor, Tensor]:
+def losses(
+    network: Mast3r, pictures: Tensor, truth: tuple, matches: TrueMatches, least_share: float
+) -> tuple[Tensor, Tensor]:
     """L_conf and L_match of a batch."""
     both = network.encode(pictures.flatten(0, 1))
     half = len(pictures[0])
@@ -108,7 +110,7 @@ def losses(network: Mast3r, pictures: Tensor, truth: tuple, matches: TrueMatches
     maps = tuple(network.pointmap(v, k) for k, v in enumerate(views, 1))
     described = tuple(network.descriptors(v, k) for k, v in enumerate(views, 1))
     metric = torch.ones(half, dtype=torch.bool)
-    return pointmap_loss(maps, truth, metric), matching_loss(described, matches)
+    return pointmap_loss(maps, truth, metric), matching_loss(described, matches, least_share)
 
 
 def main() -> None:
@@ -120,6 +122,12 @@ def main() -> None:
     parser.add_argument("--size", type=int, default=96, help="long side, pixels")
     parser.add_argument("--rate", type=float, default=1e-3)
     parser.add_argument("--seed", type=int, default=0)
+    parser.add_argument(
+        "--least-share",
+        type=float,
+        default=0.0,
+        help="bound of the matching loss; the reference has 1e-8, beyond which a new network learns nothing",
+    )
     args = parser.parse_args()
     shots = read_shots(args.dives, args.size)
     network = new_network(SMALL, args.seed)
@@ -138,7 +146,7 @@ def main() -> None:
         generator = torch.Generator().manual_seed(args.seed * 1_000_003 + step)
         for group in optimiser.param_groups:
             group["lr"] = args.rate * min(1.0, step / _WARM_UP, (args.steps + 1 - step) / (_COOL_DOWN * args.steps))
-        points, matching = losses(network, *batch(shots, args.batch, generator))
+        points, matching = losses(network, *batch(shots, args.batch, generator), args.least_share)
         (points + MATCHING_WEIGHT * matching).backward()
         nn.utils.clip_grad_norm_(network.parameters(), 1.0)
         optimiser.step()

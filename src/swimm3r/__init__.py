@@ -2,17 +2,22 @@
 
     frames = swimm3r.read_frames("dive.mp4", fps=5)
     rec = swimm3r.reconstruct(frames, swimm3r.ColmapSettings())
-    scene = swimm3r.train(rec, frames, swimm3r.uwbs(iterations=20_000))
-    pose = swimm3r.localize(image, scene, rec, frames)
+    scene = swimm3r.train(rec, frames, swimm3r.PRESETS["fast"].splat)
+    out = scene.render(rec.cameras[0].pinhole())
+    pose = swimm3r.localize(frames.image(0), scene, rec, frames)
 
 Names load on first use, so that importing the package, and every --help, is instant.
 """
 
 from importlib import import_module
+from importlib.metadata import version
 from typing import TYPE_CHECKING
 
 if TYPE_CHECKING:
+    from swimm3r.cameras import Cameras
+    from swimm3r.errors import Swimm3rError
     from swimm3r.frame_settings import FrameSettings
+    from swimm3r.frames import Frames
     from swimm3r.localization import localize
     from swimm3r.localization.settings import LocalizationSettings
     from swimm3r.medium import Medium, MediumFit, add_water, remove_water
@@ -40,6 +45,9 @@ if TYPE_CHECKING:
     from swimm3r.synthetic import DiveSettings, write_dive
 
 _HOME = {
+    "Cameras": "cameras",
+    "Frames": "frames",
+    "Swimm3rError": "errors",
     "FrameSettings": "frame_settings",
     "LocalizationSettings": "localization.settings",
     "localize": "localization",
@@ -74,9 +82,11 @@ _HOME = {
 
 __all__ = [
     "PRESETS",
+    "Cameras",
     "ColmapSettings",
     "DiveSettings",
     "FrameSettings",
+    "Frames",
     "LocalizationSettings",
     "Mast3rSettings",
     "McmcGsSettings",
@@ -86,6 +96,7 @@ __all__ = [
     "RunSettings",
     "SeaSplatSettings",
     "SplatMap",
+    "Swimm3rError",
     "UwbsSettings",
     "WaterSplattingSettings",
     "add_water",
@@ -107,6 +118,8 @@ __all__ = [
 
 
 def __getattr__(name: str) -> object:
+    if name == "__version__":
+        return version("swimm3r")
     if name not in _HOME:
         raise AttributeError(f"module 'swimm3r' has no attribute {name!r}")
     return getattr(import_module(f"swimm3r.{_HOME[name]}"), name)

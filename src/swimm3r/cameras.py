@@ -11,8 +11,9 @@ follows COLMAP's models, for (x, y) on the plane z = 1, r^2 = x^2 + y^2 and thet
 """
 
 from dataclasses import dataclass, replace
-from typing import Literal, get_args
+from typing import Literal, Protocol, get_args, runtime_checkable
 
+import numpy as np
 import torch
 from jaxtyping import Bool, Float, Int
 from torch import Tensor
@@ -24,12 +25,19 @@ DISTORTION_PARAMETERS: dict[str, tuple[str, ...]] = {
     "OPENCV": ("k1", "k2", "p1", "p2"),
     "OPENCV_FISHEYE": ("k1", "k2", "k3", "k4"),
 }
+_ORTHONORMAL = 5e-3  # of R R^T: rotations are printed with as few as three decimals
+_FOCAL = (0.01, 1000.0)  # of the long side: fields of view of 178 and 0.06 degrees
+_FARTHEST = 1e12  # of a camera or a principal point; its square is a number still
+_BEND = 2.5  # how far a lens may move a point a quarter of the short side from the middle, as a ratio of radii
 _UNDISTORT_STEPS = 20  # Newton from the distorted point converges to 1e-10 in fewer for any lens COLMAP accepts
 
 
 @dataclass(frozen=True)
 class Cameras:
-    """The cameras of c frames that share one image size and one camera model."""
+    """The cameras of c frames that share one image size and one camera model.
+
+    Building one is free, as inner loops do it all the time; numbers from outside go through `check_cameras`.
+    """
 
     K: Float[Tensor, "c 3 3"]  # pixels
     distortion: Float[Tensor, "c d"]  # d as the model says
@@ -67,6 +75,85 @@ class Cameras:
     def centres(self) -> Float[Tensor, "c 3"]:
         """Camera centres in the world."""
         return self.cam2world[:, :3, 3]
+
+    def pinhole(self, long_side: int = 0) -> "Cameras":
+        """The same cameras without lens distortion, on images of at most `long_side` pixels; 0 keeps their size."""
+        scale = min(1.0, long_side / max(self.width, self.height)) if long_side else 1.0
+        small = resized(self, max(2, round(self.width * scale)), max(2, round(self.height * scale)))
+        return replace(small, distortion=small.distortion[:, :0], model="PINHOLE")
+
+
+@runtime_checkable  # so that the suite can check calls against it
+class CameraArrays(Protocol):
+    """Cameras as files hold them."""
+
+    @property
+    def K(self) -> np.ndarray: ...
+    @property
+    def distortion(self) -> np.ndarray: ...
+    @property
+    def cam2world(self) -> np.ndarray: ...
+    @property
+    def width(self) -> int: ...
+    @property
+    def height(self) -> int: ...
+    @property
+    def model(self) -> str: ...
+
+
+def cameras_of(table: CameraArrays) -> Cameras:
+    """The cameras of a table read from disk."""
+    K, distortion, cam2world = (torch.from_numpy(a) for a in (table.K, table.distortion, table.cam2world))
+    return Cameras(K, distortion, cam2world, table.width, table.height, table.model)
+
+
+def check_cameras(cameras: Cameras) -> None:
+    """Raise ValueError unless sizes and focal lengths are positive, poses rigid, and all numbers finite.
+
+    Whatever comes from a file passes here once: the tables of `io` call it when they are made.
+    """
+    width, height, K = cameras.width, cameras.height, cameras.K
+    if width < 1 or height < 1:
+        raise ValueError(f"pictures have a size in whole pixels, got {width}x{height}")
+    _require(torch.isfinite(K).all((1, 2)), "intrinsics are finite numbers")
+    low, high = (bound * max(width, height) for bound in _FOCAL)
+    focal, centre = K[:, [0, 1], [0, 1]], K[:, :2, 2]
+    _require(((focal > low) & (focal < high)).all(1), f"focal lengths are between {low:g} and {high:g} px")
+    _require((centre.abs() < _FARTHEST).all(1), "the principal point is near the picture")
+    skewed = K - torch.diag_embed(torch.cat([focal, torch.ones_like(focal[:, :1])], 1))
+    skewed[:, :2, 2] = 0
+    _require((skewed == 0).all(2).all(1), "intrinsics have the form [[fx, 0, cx], [0, fy, cy], [0, 0, 1]]")
+    _require(torch.isfinite(cameras.distortion).all(1), "distortion parameters are finite numbers")
+    check_poses(cameras.cam2world)
+
+
+def check_poses(cam2world: Float[Tensor, "c 4 4"]) -> None:
+    """Raise ValueError unless poses are finite, rigid and not mirrored."""
+    _require(torch.isfinite(cam2world).all((1, 2)), "poses are finite numbers")
+    _require((cam2world[:, :3, 3].abs() < _FARTHEST).all(1), f"camera centres are within {_FARTHEST:g}")
+    R, eye = cam2world[:, :3, :3], torch.eye(4, dtype=cam2world.dtype)
+    off = (R @ R.mT - eye[:3, :3]).abs().amax((1, 2))
+    rigid = (off < _ORTHONORMAL) & (torch.linalg.det(R) > 0) & (cam2world[:, 3] == eye[3]).all(1)
+    _require(rigid, "poses are a rotation and a translation")
+
+
+def check_lens(cameras: Cameras) -> None:
+    """Raise ValueError where distortion folds or crumples the very middle of the picture, as no lens does."""
+    if cameras.model == "PINHOLE":
+        return
+    angle = torch.arange(8) * (torch.pi / 4)
+    ring = torch.stack([angle.cos(), angle.sin()], -1).double() * (min(cameras.width, cameras.height) / 4)
+    K = cameras.K.double()
+    pixels = K[:, None, :2, 2] + ring
+    straight = directions(cameras, pixels)[..., :2]
+    ratio = torch.linalg.vector_norm(straight * K[:, None, [0, 1], [0, 1]], dim=-1) / ring[0].norm()
+    _require(((ratio > 1 / _BEND) & (ratio < _BEND)).all(1), "the distortion is that of a lens in this picture")
+
+
+def _require(holds: Bool[Tensor, " c"], what: str) -> None:
+    if not bool(holds.all()):
+        first = int((~holds).nonzero()[0, 0])
+        raise ValueError(f"{what}; not so of {int((~holds).sum())} of {len(holds)} cameras, the first number {first}")
 
 
 def distort(

@@ -1,6 +1,7 @@
 """Failures a user can cause or mend: what happened, the likely cause, one thing to try, and the exit code.
 
-Exit codes: 0 done, 2 usage, 3 input data, 4 weights, 5 device, 6 too few registered images, 7 storage, 130 interrupted.
+Exit codes: 0 done, 2 usage, 3 input data, 4 weights, 5 device or memory, 6 too few registered images, 7 storage, 130
+interrupted.
 Everything else is our own mistake and keeps its traceback.
 """
 
@@ -44,7 +45,7 @@ class WeightsError(Swimm3rError):
 
 
 class DeviceError(Swimm3rError):
-    """The requested accelerator is missing or out of memory."""
+    """The requested accelerator is missing, or memory ran out: its own or the computer's."""
 
     exit_code = 5
 

@@ -2,26 +2,27 @@
 
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Literal
+from typing import Annotated, Literal
 
 from swimm3r.errors import UsageError
+from swimm3r.settings import ClipSecond, CountOrZero, LongSideOrOwn, Range, Settings
 
 
 @dataclass(frozen=True)
-class FrameSettings:
+class FrameSettings(Settings):
     """How `prepare.read_frames` samples a video and checks a folder of stills."""
 
-    fps: float = 5.0
+    fps: Annotated[float, Range(0, 1000)] = 5.0
     """Frames per second taken from a video; 0 takes every frame. Of stills every one is taken."""
     pick: Literal["sharpest", "uniform"] = "sharpest"
     """The frame taken of each 1/fps: the sharpest, or the first (at 30 fps the paper's every 6th)."""
-    start: float = 0.0
+    start: ClipSecond = 0.0
     """Second of the video to begin at: leaves out the descent."""
-    end: float | None = None
+    end: ClipSecond | None = None
     """Second of the video to stop at; its end where none is given."""
-    max_frames: int = 0
+    max_frames: CountOrZero = 0
     """Most frames, spread evenly over the dive; 0 is no limit."""
-    long_side: int = 1600
+    long_side: LongSideOrOwn = 1600
     """Larger pictures are scaled down to this many pixels along their longer side; 0 keeps them as they are."""
     masks: Path | None = None
     """Folder of masks NAME.png, NAME.jpg.png or NAME_mask.png (0 = leave out); else masks/ in the input, if any."""
@@ -29,13 +30,7 @@ class FrameSettings:
     """What is done about stills of another size than most."""
 
     def __post_init__(self) -> None:
-        for name in ("fps", "start", "max_frames", "long_side"):
-            if not getattr(self, name) >= 0:  # catches nan, too
-                raise UsageError(
-                    f"{name} must not be negative, got {getattr(self, name)}",
-                    cause="a slip in the command or the settings",
-                    hint="0, or leave it out for the default",
-                )
+        super().__post_init__()
         if self.end is not None and not self.end > self.start:
             raise UsageError(
                 f"end ({self.end} s) is not after start ({self.start} s)",

@@ -14,6 +14,7 @@ import torch
 from jaxtyping import Bool, Float
 from torch import Tensor
 
+from swimm3r.errors import InputError
 from swimm3r.io import images
 from swimm3r.io.cache import ArrayCache
 
@@ -41,6 +42,8 @@ class Frames:
     height: int
     ordered: bool  # neighbours in the list are neighbours in time: true of video, a guess for stills
     cautions: tuple[str, ...] = ()  # what was left out or looks odd, in plain words
+    gray: bool = False  # the three channels of every picture are equal
+    unused_masks: int = 0  # masks given that belong to no frame
 
     def __len__(self) -> int:
         return len(self.frames)
@@ -76,20 +79,36 @@ class Frames:
         """The position of a frame by its name."""
         return self.names.index(name)
 
+    def times_of(self, names: Sequence[str]) -> tuple[float, ...]:
+        """When the frames of these names were taken, seconds since the start of the clip."""
+        times = {frame.name: frame.time for frame in self.frames}
+        return tuple(times[name] for name in names)
+
     def image(self, i: int) -> Float[Tensor, "h w 3"]:
-        """Picture i as stored (sRGB-encoded unless the input was linear), 0..1."""
+        """Picture i as stored (sRGB-encoded unless the input was linear), 0..1. Raises InputError on a damaged one."""
         path = self.frames[i].path
         (stored,) = _CACHE.get(_version(path), lambda: (images.read_rgb(path),))
+        self._check_size(stored, path)
         scale = 255.0 if stored.dtype == np.uint8 else 65535.0
         return torch.from_numpy(stored.astype(np.float32)) / scale
 
     def mask(self, i: int) -> Bool[Tensor, "h w"]:
-        """True where picture i may be used; true everywhere without a mask."""
+        """True where picture i may be used; true everywhere without a mask. Raises InputError where it is damaged."""
         path = self.frames[i].mask
         if path is None:
             return torch.ones(self.height, self.width, dtype=torch.bool)
         (usable,) = _CACHE.get(_version(path), lambda: (images.read_mask(path),))
+        self._check_size(usable, path)
         return torch.from_numpy(usable.copy())
+
+    def _check_size(self, stored: np.ndarray, path: Path) -> None:
+        height, width = stored.shape[:2]
+        if (width, height) != (self.width, self.height):
+            raise InputError(
+                f"{path} is {width} x {height}, the frames are {self.width} x {self.height}",
+                cause="the file was replaced or resized after the frames were prepared",
+                hint="put the prepared one back; or another --out, which prepares the frames anew",
+            )
 
 
 def _version(path: Path) -> tuple[Path, int]:

@@ -4,7 +4,6 @@ On disk a folder beside the pictures: cameras.json; z_depth/NAME.npz (key z_dept
 where something moves) and medium.json where they exist. A cameras.json alone is a reference, too.
 """
 
-import json
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -13,11 +12,18 @@ import torch
 from jaxtyping import Bool, Float
 from torch import Tensor
 
-from swimm3r.cameras import Cameras
+from swimm3r.cameras import Cameras, cameras_of
 from swimm3r.io import cameras_json, images
+from swimm3r.io.array_file import Layout, read_arrays
+from swimm3r.io.damage import Remedy, damaged
+from swimm3r.io.json_file import read_json
+from swimm3r.io.medium_json import MediumRecord
 from swimm3r.medium import Medium
-from swimm3r.reconstruction import cameras_of
 
+_REMEDY = Remedy(
+    "make the dive again, or move its truth folder away to run without one",
+    cause="it was cut off or edited, or is of another dive",
+)
 FOLDER = "truth"  # where a synthetic dive keeps it, beside images/
 
 
@@ -36,18 +42,33 @@ class GroundTruth:
         path = self._path("z_depth", f"{name}.npz")
         if path is None:
             return None
-        with np.load(path) as stored:
-            return torch.from_numpy(stored["z_depth"].astype(np.float32))
+        z_depth = read_arrays(path, {"z_depth": Layout("h w")}, _REMEDY)["z_depth"]
+        self._check_size(path, z_depth)
+        return torch.from_numpy(z_depth.astype(np.float32))
 
     def clear(self, name: str) -> Float[Tensor, "h w 3"] | None:
         """The picture without water, 0..1; None where the reference has none."""
         path = self._path("clear", f"{name}.png")
-        return None if path is None else torch.from_numpy(images.read_rgb(path).astype(np.float32)) / 255
+        if path is None:
+            return None
+        rgb = images.read_rgb(path)
+        self._check_size(path, rgb)
+        return torch.from_numpy(rgb.astype(np.float32)) / (255.0 if rgb.dtype == np.uint8 else 65535.0)
 
     def moving(self, name: str) -> Bool[Tensor, "h w"] | None:
         """True where the picture shows something that moves; None where the reference does not say."""
         path = self._path("masks", f"{name}.png")
-        return None if path is None else ~torch.from_numpy(images.read_mask(path).copy())
+        if path is None:
+            return None
+        still = images.read_mask(path)
+        self._check_size(path, still)
+        return ~torch.from_numpy(still.copy())
+
+    def _check_size(self, path: Path, values: np.ndarray) -> None:
+        width, height = self.cameras.width, self.cameras.height
+        if values.shape[:2] != (height, width):
+            why = f"it has {values.shape[1]}x{values.shape[0]} pixels, its cameras.json says {width}x{height}"
+            raise damaged(path, why, _REMEDY)
 
     def _path(self, kind: str, file: str) -> Path | None:
         path = None if self.folder is None else self.folder / kind / file
@@ -60,7 +81,5 @@ def read_ground_truth(path: Path) -> GroundTruth:
     table = cameras_json.read_cameras(path / "cameras.json" if folder else path)
     medium = None
     if folder and (folder / "medium.json").is_file():
-        medium = Medium(
-            **{k: torch.tensor(v) for k, v in json.loads((folder / "medium.json").read_text(encoding="utf-8")).items()}
-        )
+        medium = read_json(folder / "medium.json", MediumRecord, _REMEDY).medium()
     return GroundTruth(table.names, cameras_of(table), table.units == "metres", medium, folder)

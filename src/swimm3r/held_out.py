@@ -22,18 +22,20 @@ from swimm3r.evaluate import NotComputed
 from swimm3r.evaluate.images import ViewScores, as_8_bit, blur4_psnr, mean_view_scores, psnr, view_scores
 from swimm3r.evaluate.lpips import Lpips, load_lpips
 from swimm3r.frames import Frames
-from swimm3r.geometry import DegenerateAlignmentError, Similarity, align_poses, align_similarity
+from swimm3r.geometry import best_similarity
 from swimm3r.ground_truth import GroundTruth
+from swimm3r.io.view_names import view_stems
 from swimm3r.localization.landmarks import landmarks_of, locate
 from swimm3r.localization.neighbours import neighbours, pose_from_neighbours
 from swimm3r.progress import Progress, silent
 from swimm3r.reconstruction import Reconstruction
 from swimm3r.renders import look_of, write_view
 from swimm3r.sfm.settings import FeatureSettings, RestoreSettings
+from swimm3r.splat.pose_codes import axes_of_map
 from swimm3r.splat.poses import refine_pose
 from swimm3r.splat.rendering import SplatMap
 from swimm3r.splat.settings import PoseRefinementSettings
-from swimm3r.splat.views import pinhole_canvas, undistorted
+from swimm3r.splat.views import undistorted
 
 Source = Literal["reference", "2D-3D matches", "neighbours"]
 _GAP = 0.03  # of the picture's width: gaps in the cloud up to this size are closed where coverage is asked
@@ -113,13 +115,10 @@ def reference_poses(rec: Reconstruction, reference: GroundTruth) -> dict[str, Fl
 
 def in_axes_of(scene: SplatMap, rec: Reconstruction, poses: dict[str, FirstPose]) -> dict[str, FirstPose]:
     """The reconstruction's poses in the axes and unit of the map, whose training cameras may have moved together."""
-    if scene.poses is None:
+    to_map = axes_of_map(rec, scene.poses)
+    if to_map is None:
         return poses
-    before = rec.cameras.cam2world[[rec.index(name) for name in scene.poses.names]].double()
-    moved = best_similarity(before, scene.poses.cam2world)
-    if moved is None:
-        return poses
-    return {name: replace(pose, cam2world=moved.poses(pose.cam2world.double())) for name, pose in poses.items()}
+    return {name: replace(pose, cam2world=to_map.poses(pose.cam2world.double())) for name, pose in poses.items()}
 
 
 def score_views(
@@ -132,12 +131,12 @@ def score_views(
     restore: RestoreSettings | None = None,
     progress: Progress = silent,
 ) -> list[HeldOutView]:
-    """Refine, render and score each frame of `poses`; its pictures go to folder/NAME_{rgb,clear,z_depth,veil}.png.
+    """Refine, render and score each frame of `poses`; its images go to `folder` (`renders.write_view`).
 
     The clear ones look like the frames that `restore` made.
     """
     perceptual = published_lpips()
-    views = []
+    views, stems = [], view_stems(frames.names)
     look = look_of(scene, rec, restore)
     for done, (name, first) in enumerate(poses.items()):
         progress("scoring test frames", done, len(poses))
@@ -146,14 +145,14 @@ def score_views(
         lens = replace(lens, cam2world=first.cam2world[None].to(lens.cam2world))
         time = frames.frames[f].time
         lens = refine_pose(scene, lens, frames.image(f), frames.mask(f), settings, time=time).camera
-        canvas = pinhole_canvas(lens, scene.settings.long_side)
+        canvas = lens.pinhole(scene.settings.long_side)
         window = visible_window(lens, canvas)
         target, seen = (
             part[window.rows, window.columns] for part in undistorted(frames.image(f), frames.mask(f), lens, canvas)
         )
         camera = cut(canvas, window)
         out = scene.render(camera, time)
-        write_view(folder, name, out, camera, look)
+        write_view(folder, stems[name], out, camera, look)
         scores = view_scores(out.rgb, target, perceptual, seen)
         covered = covered_scores(out.rgb, target, seen, covered_by_training(rec, camera))
         views.append(HeldOutView(name, time, lens, canvas, window, first.source, scores, covered))
@@ -174,14 +173,14 @@ def mean_scores(views: Sequence[HeldOutView]) -> ViewScores:
 
 
 def covered_by_training(rec: Reconstruction, canvas: Cameras) -> Bool[Tensor, "h w"]:
-    """The pixels of a view into which measured or guessed ground of the reconstruction falls, small gaps closed.
+    """The pixels of a view into which measured points of the reconstruction fall, small gaps closed.
 
-    It asks the reconstruction, not the map: a map that leaves holes is not excused for them.
+    It asks the reconstruction, not the map: a map that leaves holes is not excused for them. The backdrop, whose depth
+    is a guess, does not count.
     """
     import cv2
 
-    clouds = [cloud.xyz for cloud in (rec.cloud, rec.backdrop) if cloud is not None]
-    xyz = torch.cat(clouds or [rec.points.xyz])
+    xyz = rec.points.xyz if rec.cloud is None else rec.cloud.xyz
     pixels, z = project(canvas, xyz[None].double())
     inside = (z[0] > 0) & (pixels[0] > 0).all(-1) & (pixels[0] < torch.tensor([canvas.width, canvas.height])).all(-1)
     column, row = pixels[0][inside].long().unbind(-1)
@@ -258,18 +257,3 @@ def cut(canvas: Cameras, window: Window) -> Cameras:
 def published_lpips() -> Lpips | NotComputed:
     """LPIPS where its two weight files are on this computer."""
     return load_lpips(weights.find("vgg16"), weights.find("lpips-vgg"))
-
-
-def best_similarity(source: Float[Tensor, "n 4 4"], target: Float[Tensor, "n 4 4"]) -> Similarity | None:
-    """The similarity of the poses, of their centres where orientations contradict those, None where neither is fixed.
-
-    A dive's centres alone leave its turn to a few percent of bending: on two reconstructions of ruie_cyan_slope the
-    orientations are 3.5 degrees apart under the similarity of the centres, 0.4 under that of the poses.
-    """
-    try:
-        return align_poses(source, target)
-    except DegenerateAlignmentError:
-        try:
-            return align_similarity(source[:, :3, 3], target[:, :3, 3])
-        except DegenerateAlignmentError:
-            return None

@@ -15,6 +15,7 @@ from jaxtyping import Bool, Float
 from torch import Tensor
 
 Encoding = Literal["srgb", "linear"]
+Estimator = Literal["Sea-Thru", "physics head"]
 
 
 @dataclass(frozen=True)
@@ -59,6 +60,7 @@ class MediumFit:
     identifiable: dict[str, Bool[Tensor, "3"]]
     z_range: tuple[float, float]  # ray depths the fit has seen
     encoding: Encoding  # of the pixel values it explains
+    estimator: Estimator = "Sea-Thru"  # that found it, and restored the images and points it goes with
 
     def at(self, ray_depth: Float[Tensor, "*pixels"]) -> Medium:
         """The medium as each pixel sees it: beta_D follows the curve, held constant outside `z_range`."""

@@ -1,12 +1,14 @@
-"""The settings of a whole run, their file, and the three starting points users choose from; torch-free."""
+"""The settings of a whole run, their file, and the presets users start from; torch-free."""
 
 from dataclasses import dataclass, field
-from functools import cache
 from pathlib import Path
-from typing import TYPE_CHECKING
+from typing import Literal
 
 from swimm3r.errors import InputError
 from swimm3r.frame_settings import FrameSettings
+from swimm3r.io.damage import Remedy, first_line, guard
+from swimm3r.settings import Settings
+from swimm3r.settings_document import from_document, to_document
 from swimm3r.sfm.mast3r.settings import AlignmentSettings
 from swimm3r.sfm.settings import (
     ColmapSettings,
@@ -20,15 +22,21 @@ from swimm3r.splat.settings import (
     DensifySettings,
     InitialSettings,
     LearningRates,
+    LossWeights,
+    MediumFieldSettings,
+    MoverSettings,
     PoseRefinementSettings,
+    RenderSettings,
     SggSettings,
     SplatSettings,
     TrainingPoseSettings,
     UwbsSettings,
 )
 
-if TYPE_CHECKING:
-    from cattrs import Converter
+_REMEDY = Remedy(
+    cause="it was edited, or written by another version of swimm3r",
+    hint="correct it there; or the same swimm3r run command with its --preset, which writes it anew",
+)
 
 # in short runs, and faster without (benchmarks/README.md): SGG costs 0.1 dB on the synthetic dive, and poses refined
 # along with the map 0.5 dB on ruie_green_rock, whose poses were good
@@ -44,7 +52,7 @@ LAPTOP = UwbsSettings(  # the paper's settings are made for a GPU
 
 
 @dataclass(frozen=True)
-class RunSettings:
+class RunSettings(Settings):
     """Everything that decides what a run computes."""
 
     frames: FrameSettings = field(default_factory=FrameSettings)
@@ -57,7 +65,7 @@ def to_yaml(settings: RunSettings) -> str:
     """Every setting by name; the back end and the kind of map are named by `kind`."""
     import yaml
 
-    return yaml.safe_dump(_converter().unstructure(settings), sort_keys=False)
+    return yaml.safe_dump(to_document(settings), sort_keys=False)
 
 
 def from_yaml(path: Path) -> RunSettings:
@@ -70,30 +78,34 @@ def from_yaml(path: Path) -> RunSettings:
             cause="it is another folder, or was moved",
             hint="the folder that --out named when the run was made",
         )
-    try:
-        return _converter().structure(yaml.safe_load(path.read_text(encoding="utf-8")), RunSettings)
-    except Exception as error:  # whatever a file of another version or another hand may cause, one by one unforeseeable
-        raise InputError(
-            f"{path} does not hold the settings of a run ({type(error).__name__})",
-            cause="it was edited, or written by another version of swimm3r",
-            hint="the same swimm3r run command again, which writes it anew",
-        ) from error
+    with guard(path, _REMEDY):
+        try:
+            document = yaml.safe_load(path.read_text(encoding="utf-8"))
+        except yaml.YAMLError as error:
+            raise ValueError(f"no YAML: {first_line(error)}") from error
+        return from_document(document, RunSettings)
 
 
-@cache
-def _converter() -> "Converter":
-    from cattrs import Converter
-    from cattrs.strategies import configure_tagged_union
+Preset = Literal["fast", "default", "best", "paper"]
 
-    converter = Converter(forbid_extra_keys=True)
-    converter.register_unstructure_hook(Path, str)
-    converter.register_structure_hook(Path, lambda value, _: Path(value))
-    configure_tagged_union(SfmSettings, converter, tag_name="kind")
-    configure_tagged_union(SplatSettings, converter, tag_name="kind", default=UwbsSettings)  # the only kind there was
-    return converter
+_PAPER_POINTS = 2_190_000  # of the restored cloud (Tab. sfm_metrics)
+PAPER = UwbsSettings(  # Eq. 18 and nothing else; where the paper is silent UBS's choices, as it says it follows UBS
+    initial=InitialSettings(backdrop=0.0, directions="uniform", time_scale=1.0),
+    render=RenderSettings(alpha_min=0.0, covariance="upper"),
+    medium=MediumFieldSettings(stride=1, begin=0.0),  # evaluated at every pixel, trained from the first step
+    weights=LossWeights(
+        depth_edges=1.0,  # DN-Splatter's edge-aware weight: no scale is printed
+        max_radius_width=0,  # 256 pixels are printed, of no particular width
+        medium_prior=0.0,
+        coverage=0.0,
+        open_water=0.0,
+        gamut=0.0,
+    ),
+    densify=DensifySettings(noise_dynamic=1.0),
+    movers=MoverSettings(at=0.0),
+)
 
-
-PRESETS: dict[str, RunSettings] = {
+PRESETS: dict[Preset, RunSettings] = {
     "fast": RunSettings(  # a look at a dive on a laptop
         frames=FrameSettings(long_side=960),
         sfm=ColmapSettings(depth=PlaneSweepSettings(long_side=480, sources=4)),
@@ -117,14 +129,26 @@ PRESETS: dict[str, RunSettings] = {
             restore=RestoreSettings(max_points=2_000_000),
         ),
         splat=UwbsSettings(long_side=0),
+        test=PoseRefinementSettings(long_side=0),
+    ),
+    "paper": RunSettings(  # the paper's numbers, to compare with it; its structure from motion is --backend swimm3r
+        frames=FrameSettings(pick="uniform", long_side=0),
+        sfm=ColmapSettings(
+            features=FeatureSettings(count=4096, long_side=1600),
+            depth=PlaneSweepSettings(long_side=1280, sources=8),
+            restore=RestoreSettings(max_points=_PAPER_POINTS),
+        ),
+        splat=PAPER,
+        test=PoseRefinementSettings(long_side=0, halvings=0),
     ),
 }
 
-MAST3R_PRESETS: dict[str, Mast3rSettings] = {  # the same aims with --backend mast3r
+MAST3R_PRESETS: dict[Preset, Mast3rSettings] = {  # the same aims with --backend mast3r
     "fast": Mast3rSettings(
         graph="video-2-1",
         alignment=AlignmentSettings(intrinsics="shared", coarse_iterations=150, fine_iterations=150),
     ),
     "default": Mast3rSettings(),
     "best": Mast3rSettings(graph="video-6-4", bundle_adjustment=True, restore=RestoreSettings(max_points=2_000_000)),
+    "paper": Mast3rSettings(restore=RestoreSettings(max_points=_PAPER_POINTS)),
 }

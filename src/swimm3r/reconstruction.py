@@ -1,8 +1,9 @@
 """What structure from motion knows about a dive; the one record every back end fills and every later stage reads.
 
-On disk (`save`, `load`) it is a folder: sparse/ (COLMAP model), cameras.json, z_depth/NAME.npz, matches.npz,
-medium.json, points.ply (restored colours), points_raw.ply, backdrop.ply (guessed ground, restored colours),
-backdrop_raw.ply, reconstruction.json (back end, metric flag, cautions).
+On disk (`save`, `load`) it is a folder: sparse/ (COLMAP model), cameras.json, trajectory.tum, z_depth/NAME.npz,
+matches.npz, medium.json, points.ply (restored colours), points_raw.ply, backdrop.ply (guessed ground, restored
+colours), backdrop_raw.ply, reconstruction.json (back end, metric flag, cautions, points found). Where matches that
+contradict the result were dropped, matches_unfiltered.npz has all of them: what epipolar scores are taken over.
 """
 
 import json
@@ -14,13 +15,27 @@ import torch
 from jaxtyping import Float, Int
 from torch import Tensor
 
-from swimm3r.cameras import Cameras
+from swimm3r.cameras import Cameras, cameras_of
+from swimm3r.frames import Frames
 from swimm3r.io import cameras_json, colmap, medium_json, ply
+from swimm3r.io.array_file import Layout, read_arrays
 from swimm3r.io.atomic import atomic_path, write_text
 from swimm3r.io.cache import ArrayCache
+from swimm3r.io.damage import guard, remake
+from swimm3r.io.json_file import read_json
+from swimm3r.io.trajectory import write_tum
 from swimm3r.medium import MediumFit
 
 _CACHE = ArrayCache(max_bytes=1 << 30)
+_UNFILTERED = "matches_unfiltered.npz"
+_DEPTH = {"z_depth": Layout("h w"), "confidence": Layout("h w")}
+_MATCHES = {
+    "i": Layout("matches", "int"),
+    "j": Layout("matches", "int"),
+    "xy_i": Layout("matches 2"),
+    "xy_j": Layout("matches 2"),
+    "confidence": Layout("matches"),
+}
 
 
 @dataclass(frozen=True)
@@ -75,8 +90,8 @@ class DepthMaps:
 
     def __getitem__(self, name: str) -> DepthMap:
         def load() -> tuple[np.ndarray, np.ndarray]:
-            with np.load(self.path(name)) as stored:
-                return stored["z_depth"], stored["confidence"]
+            stored = read_arrays(self.path(name), _DEPTH, remake(self.folder.parent))
+            return stored["z_depth"], stored["confidence"]
 
         z_depth, confidence = _CACHE.get((self.folder, name), load)
         return DepthMap(torch.from_numpy(z_depth.astype(np.float32)), torch.from_numpy(confidence.astype(np.float32)))
@@ -126,6 +141,7 @@ class Reconstruction:
     cloud: DenseCloud | None = None  # fused from the depth maps; colours averaged over each point's track
     backdrop: DenseCloud | None = None  # ground filmed but not measured, at a guessed depth, for maps to start on
     cautions: tuple[Caution, ...] = ()
+    points_found: int | None = None  # sparse ones, before the settings' cap; None: nothing was left out
 
     def index(self, name: str) -> int:
         """The position of a registered frame by its name."""
@@ -151,9 +167,11 @@ def colmap_model(rec: Reconstruction) -> colmap.ColmapModel:
     )
 
 
-def save(rec: Reconstruction, folder: Path) -> None:
-    """Write a reconstruction into a folder; depth maps already live under it."""
+def save(rec: Reconstruction, frames: Frames, folder: Path) -> None:
+    """Write a reconstruction of some frames into a folder; depth maps already live under it."""
     colmap.write_model(folder / "sparse", colmap_model(rec))
+    times = frames.times_of(rec.names)
+    write_tum(folder / "trajectory.tum", times, rec.cameras.cam2world.numpy())
     cameras_json.write_cameras(
         folder / "cameras.json",
         cameras_json.CameraTable(
@@ -165,10 +183,10 @@ def save(rec: Reconstruction, folder: Path) -> None:
             distortion=rec.cameras.distortion.numpy(),
             cam2world=rec.cameras.cam2world.numpy(),
             units="metres" if rec.metric else "scene units",
+            times=times,
         ),
     )
-    with atomic_path(folder / "matches.npz") as draft:
-        np.savez_compressed(draft, **{name: tensor.numpy() for name, tensor in vars(rec.matches).items()})
+    _write_matches(folder / "matches.npz", rec.matches)
     fits = {"stored": rec.medium, "linear": rec.medium_linear}
     medium_json.write_fits(folder / "medium.json", {name: fit for name, fit in fits.items() if fit is not None})
     for stem, cloud in (("points", rec.cloud), ("backdrop", rec.backdrop)):
@@ -176,16 +194,29 @@ def save(rec: Reconstruction, folder: Path) -> None:
             ply.write_points(folder / f"{stem}.ply", cloud.xyz.numpy(), cloud.restored.numpy())
             ply.write_points(folder / f"{stem}_raw.ply", cloud.xyz.numpy(), cloud.raw.numpy())
     about = {"backend": rec.backend, "metric": rec.metric, "cautions": [vars(caution) for caution in rec.cautions]}
+    about["points_found"] = rec.points_found
     write_text(folder / "reconstruction.json", json.dumps(about, indent=2) + "\n")
 
 
-def load(folder: Path) -> Reconstruction:
-    """Read what `save` wrote."""
-    sparse = colmap.read_model(folder / "sparse")
-    about = json.loads((folder / "reconstruction.json").read_text(encoding="utf-8"))
-    with np.load(folder / "matches.npz") as stored:
-        matches = Matches(**{name: torch.from_numpy(stored[name]) for name in stored.files})
-    fits = medium_json.read_fits(folder / "medium.json")
+@dataclass(frozen=True)
+class _About:
+    """reconstruction.json."""
+
+    backend: str
+    metric: bool
+    cautions: tuple[Caution, ...]
+    points_found: int | None = None  # earlier versions did not count
+
+
+def load(folder: Path, frames: Frames | None = None) -> Reconstruction:
+    """Read what `save` wrote. Raises InputError where it is damaged, or not of the training frames in `frames`."""
+    remedy = remake(folder)
+    sparse = colmap.read_model(folder / "sparse", remedy)
+    if frames is not None:
+        with guard(folder / "sparse", remedy):
+            _check_frames(sparse, frames)
+    about = read_json(folder / "reconstruction.json", _About, remedy)
+    fits = medium_json.read_fits(folder / "medium.json", remedy)
     return Reconstruction(
         names=sparse.names,
         cameras=cameras_of(sparse),
@@ -195,33 +226,62 @@ def load(folder: Path) -> Reconstruction:
             torch.from_numpy(sparse.error),
         ),
         tracks=Tracks(*(torch.from_numpy(a) for a in (sparse.track_point, sparse.track_frame, sparse.track_xy))),
-        matches=matches,
+        matches=_read_matches(folder / "matches.npz", len(sparse.names)),
         depth=DepthMaps(folder / "z_depth"),
-        backend=about["backend"],
-        metric=about["metric"],
+        backend=about.backend,
+        metric=about.metric,
         medium=fits.get("stored"),
         medium_linear=fits.get("linear"),
         cloud=_load_cloud(folder, "points"),
         backdrop=_load_cloud(folder, "backdrop"),
-        cautions=tuple(Caution(**caution) for caution in about["cautions"]),
+        cautions=about.cautions,
+        points_found=about.points_found,
     )
+
+
+def _check_frames(sparse: colmap.ColmapModel, frames: Frames) -> None:
+    unknown = set(sparse.names) - set(frames.train.names)
+    if unknown:
+        raise ValueError(f"it places {min(unknown)}, which is no training frame of prepare/")
+    if (sparse.width, sparse.height) != (frames.width, frames.height):
+        raise ValueError(
+            f"its pictures have {sparse.width}x{sparse.height} pixels, the frames {frames.width}x{frames.height}"
+        )
+
+
+def write_unfiltered_matches(folder: Path, matches: Matches) -> None:
+    """Keep the matches that a reconstruction was made from, before those that contradict it are dropped."""
+    _write_matches(folder / _UNFILTERED, matches)
+
+
+def unfiltered_matches(folder: Path, rec: Reconstruction) -> Matches:
+    """All matches that a reconstruction was made from: its own, where none of them was dropped."""
+    path = folder / _UNFILTERED
+    return _read_matches(path, len(rec.names)) if path.is_file() else rec.matches
+
+
+def _write_matches(path: Path, matches: Matches) -> None:
+    with atomic_path(path) as draft:
+        np.savez_compressed(draft, **{name: tensor.numpy() for name, tensor in vars(matches).items()})
+
+
+def _read_matches(path: Path, frames: int) -> Matches:
+    remedy = remake(path.parent)
+    stored = read_arrays(path, _MATCHES, remedy)
+    with guard(path, remedy):
+        for index in (stored["i"], stored["j"]):
+            if len(index) and not 0 <= int(index.min()) <= int(index.max()) < frames:
+                raise ValueError(f"its matches point beyond the {frames} registered frames")
+    return Matches(**{name: torch.from_numpy(values) for name, values in stored.items()})
 
 
 def _load_cloud(folder: Path, stem: str) -> DenseCloud | None:
     if not (folder / f"{stem}.ply").is_file():
         return None
-    xyz, restored = ply.read_points(folder / f"{stem}.ply")
-    _, raw = ply.read_points(folder / f"{stem}_raw.ply")
+    remedy = remake(folder)
+    xyz, restored = ply.read_points(folder / f"{stem}.ply", remedy)
+    _, raw = ply.read_points(folder / f"{stem}_raw.ply", remedy)
+    with guard(folder / f"{stem}_raw.ply", remedy):
+        if len(raw) != len(xyz):
+            raise ValueError(f"it has {len(raw)} points, {stem}.ply {len(xyz)}")
     return DenseCloud(torch.from_numpy(xyz), torch.from_numpy(raw), torch.from_numpy(restored))
-
-
-def cameras_of(table: colmap.ColmapModel | cameras_json.CameraTable) -> Cameras:
-    """The cameras of a table read from disk."""
-    return Cameras(
-        torch.from_numpy(table.K),
-        torch.from_numpy(table.distortion),
-        torch.from_numpy(table.cam2world),
-        table.width,
-        table.height,
-        table.model,
-    )

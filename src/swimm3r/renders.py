@@ -1,9 +1,14 @@
-"""A map's views on disk: pictures of one camera, and a flight along the path of the dive."""
+"""A map's views on disk: images of one camera, and a flight along the path of the dive.
+
+NAME_rgb.png             with the water                NAME_clear.png            without it, white-balanced for display
+NAME_backscatter.png     the light of the water alone  NAME_clear_physical.png   before the white balance, 16 bits
+NAME_z_depth.png         depth in colors               NAME_z_depth.npz          z_depth, scene units, and alpha
+"""
 
 from collections.abc import Iterable, Sequence
 from dataclasses import dataclass, replace
 from fractions import Fraction
-from pathlib import Path, PurePosixPath
+from pathlib import Path
 
 import numpy as np
 import torch
@@ -12,25 +17,33 @@ from scipy.ndimage import gaussian_filter1d
 from torch import Tensor
 
 from swimm3r import devices, reconstruction
-from swimm3r.cameras import Cameras, image_directions, project, ray_depth_from_z
+from swimm3r.cameras import Cameras, cameras_of, image_directions, project, ray_depth_from_z
 from swimm3r.errors import InputError
 from swimm3r.frames import Frames
 from swimm3r.geometry import pose_from, quaternion_from_rotation, rotation_from_quaternion
 from swimm3r.io import cameras_json, images
 from swimm3r.io.atomic import atomic_path
+from swimm3r.io.cameras_json import CameraTable
+from swimm3r.io.view_names import view_stems
 from swimm3r.medium import transmittances
 from swimm3r.prepare import load_frames
 from swimm3r.progress import Progress, silent
 from swimm3r.reconstruction import Reconstruction
 from swimm3r.report.charts import depth_picture
-from swimm3r.sfm.restore import display_gains, horizon
+from swimm3r.run_folder import open_run
+from swimm3r.settings import ClipSecond, CountOrZero, LongSideOrOwn, accepted
+from swimm3r.sfm.restore import horizon, shown_gains
 from swimm3r.sfm.settings import RestoreSettings
 from swimm3r.splat.checkpoint import load_map
+from swimm3r.splat.pose_codes import axes_of_map
 from swimm3r.splat.rendering import RenderOutput, SplatMap
-from swimm3r.splat.views import pinhole_canvas
 
-KINDS = ("rgb", "clear", "z_depth", "veil")
+KINDS = ("rgb", "clear", "clear_physical", "backscatter", "z_depth")
+"""The PNG files of one view, NAME_KIND.png."""
 _RATE = 15  # pictures per second of the flight
+_X264 = {"crf": "23", "preset": "medium", "x264-params": "mbtree=0"}
+"""Options of the video encoder, which gives the same bits for the same images: the vector code of its macroblock tree
+reads beyond its rows where half a width is no multiple of a vector, and what it finds there moves its decisions."""
 _SMOOTH = 1.5  # frames of the dive over which the flight's hand steadies
 
 
@@ -46,9 +59,8 @@ class Look:
 def look_of(scene: SplatMap, rec: Reconstruction, restore: RestoreSettings | None = None) -> Look:
     """The look that the restored frames of a reconstruction have, for views of its map."""
     restore = restore or RestoreSettings()
-    if rec.cloud is None or not (scene.has_water and restore.white_balance):
-        return Look(torch.ones(3), depth_span(rec), restore)
-    return Look(display_gains(rec.cloud.restored), depth_span(rec), restore)
+    gains = shown_gains(rec, restore) if scene.has_water else torch.ones(3)
+    return Look(gains, depth_span(rec), restore)
 
 
 def shown_clear(out: RenderOutput, camera: Cameras, look: Look) -> Float[Tensor, "h w 3"]:
@@ -62,12 +74,20 @@ def shown_clear(out: RenderOutput, camera: Cameras, look: Look) -> Float[Tensor,
     return horizon(out.clear * look.gains, T_D, out.rgb, 1 - out.alpha, look.restore)
 
 
-def write_view(folder: Path, name: str, out: RenderOutput, camera: Cameras, look: Look) -> None:
-    """NAME_rgb.png, _clear (`shown_clear`), _veil, and _z_depth in colours."""
-    pictures = {"rgb": out.rgb, "clear": shown_clear(out, camera, look), "veil": out.veil}
-    for kind, picture in pictures.items():
-        images.write_rgb(folder / f"{name}_{kind}.png", picture.numpy())
-    images.write_rgb(folder / f"{name}_z_depth.png", depth_picture(out.z_depth.numpy(), *look.near_far))
+def physical_clear(out: RenderOutput, camera: Cameras, look: Look) -> Float[Tensor, "h w 3"]:
+    """The same before the white balance: colors that scores without a reference may be taken of."""
+    return shown_clear(out, camera, replace(look, gains=torch.ones(3)))
+
+
+def write_view(folder: Path, stem: str, out: RenderOutput, camera: Cameras, look: Look) -> None:
+    """The files of one view, as the head of this module lists them."""
+    shown = {"rgb": out.rgb, "clear": shown_clear(out, camera, look), "backscatter": out.backscatter}
+    for kind, image in shown.items():
+        images.write_rgb(folder / f"{stem}_{kind}.png", image.numpy())
+    images.write_rgb_16(folder / f"{stem}_clear_physical.png", physical_clear(out, camera, look).numpy())
+    images.write_rgb(folder / f"{stem}_z_depth.png", depth_picture(out.z_depth.numpy(), *look.near_far))
+    with atomic_path(folder / f"{stem}_z_depth.npz") as draft:
+        np.savez_compressed(draft, z_depth=out.z_depth.numpy(), alpha=out.alpha.numpy())
 
 
 def depth_span(rec: Reconstruction) -> tuple[float, float]:
@@ -92,7 +112,8 @@ def smooth_path(cam2world: Float[Tensor, "c 4 4"], count: int) -> Float[Tensor, 
     at = np.linspace(0, len(stations) - 1, count)
     dense = np.stack([np.interp(at, np.arange(len(stations)), column) for column in stations.T], 1)
     per_frame = (count - 1) / max(1, len(stations) - 1)
-    steady = torch.from_numpy(gaussian_filter1d(dense, _SMOOTH * per_frame, axis=0, mode="nearest"))
+    width = _SMOOTH * per_frame
+    steady = torch.from_numpy(gaussian_filter1d(dense, width, axis=0, mode="nearest") if width else dense)
     return pose_from(rotation_from_quaternion(steady[:, 3:]), steady[:, :3])
 
 
@@ -137,52 +158,58 @@ def render_run(
 ) -> Path:
     """Pictures of a finished run's map from the cameras of a cameras.json, by default those of training; into `out`.
 
+    `cameras` are in the axes of RUN/sfm, or the map's own, RUN/splat/cameras.json.
+
     Clear pictures look like the frames that `restore` made. A dynamic map shows `time` (seconds of the clip), by
-    default when the frame of a camera's name was taken. Raises InputError where the run has no map, a name in the
-    file leads out of the folder, or no moment is known.
+    default the cameras' own times, else when the frames of their names were taken. Raises InputError where the run has
+    no map or no moment is known.
     """
+    accepted("long_side", long_side, LongSideOrOwn)
+    accepted("flight", flight, CountOrZero)
+    accepted("time", time, ClipSecond | None)
+    open_run(folder, "splat")
     scene = load_map(folder / "splat" / "map.safetensors").to(devices.for_maps())
-    rec = reconstruction.load(folder / "sfm")
+    frames = load_frames(folder / "prepare")
+    rec = reconstruction.load(folder / "sfm", frames)
     refined = folder / "splat" / "cameras.json"
-    table = cameras_json.read_cameras(cameras or (refined if refined.is_file() else folder / "sfm" / "cameras.json"))
-    stations, out = reconstruction.cameras_of(table), out or folder / "renders" / "views"
-    for name in table.names:
-        if PurePosixPath(name).is_absolute() or ".." in PurePosixPath(name).parts:
-            raise InputError(
-                f"{cameras} names a picture outside its folder: {name}",
-                cause="the file was made by another program, or was tampered with",
-                hint="names relative to the picture folder",
-            )
-    times = moments_of(scene, table.names, load_frames(folder / "prepare"), time)
+    own = refined if refined.is_file() else folder / "sfm" / "cameras.json"
+    table = cameras_json.read_cameras(cameras or own)
+    stations, out = cameras_of(table), out or folder / "renders" / "views"
+    to_map = axes_of_map(rec, scene.poses)
+    if to_map is not None and cameras is not None and cameras.resolve() != own.resolve():
+        stations = replace(stations, cam2world=to_map.poses(stations.cam2world.double()))
+    times = moments_of(scene, table, frames, time)
     look = look_of(scene, rec, restore)
+    stems = view_stems(table.names)
     for i, name in enumerate(table.names):
         progress("rendering", i, len(table.names))
-        camera = pinhole_canvas(stations[i], long_side)
-        write_view(out, name, scene.render(camera, times[i]), camera, look)
+        camera = stations[i].pinhole(long_side)
+        write_view(out, stems[name], scene.render(camera, times[i]), camera, look)
     progress("rendering", len(table.names), len(table.names))
     if flight:
-        canvas = pinhole_canvas(stations[0], long_side)
+        canvas = stations[0].pinhole(long_side)
         write_flythrough(out / "flythrough.mp4", scene, canvas, stations.cam2world, times, flight, look, progress)
     return out
 
 
-def moments_of(scene: SplatMap, names: Sequence[str], frames: Frames, time: float | None) -> list[float]:
-    """When each picture shows the scene, seconds of the clip: `time`, or when the frame of that name was taken.
+def moments_of(scene: SplatMap, table: CameraTable, frames: Frames, time: float | None) -> Sequence[float]:
+    """When each view shows the scene, seconds of the clip: `time`, the camera's, or that of the frame of its name.
 
     Raises InputError where a dynamic map is to be shown at a moment that is not known.
     """
     if time is not None or not scene.primitives.dynamic:
-        return [time or 0.0] * len(names)
-    taken = {frame.name: frame.time for frame in frames}
-    strangers = [name for name in names if name not in taken]
+        return [time or 0.0] * len(table.names)
+    if table.times is not None:
+        return table.times
+    strangers = [name for name in table.names if name not in set(frames.names)]
     if strangers:
         start, end = scene.span
         raise InputError(
             f"{strangers[0]} is no frame of the dive, so it is not known when it would have been taken",
             cause="the map changes with time, and the cameras are not those of its frames",
-            hint=f"--time SECONDS, {start:g} to {end:g}",
+            hint=f"--time SECONDS, {start:g} to {end:g}, or a time for every frame of the file",
         )
-    return [taken[name] for name in names]
+    return frames.times_of(table.names)
 
 
 def _encode(path: Path, pictures: Iterable[UInt8[np.ndarray, "h w 3"]]) -> None:
@@ -191,8 +218,9 @@ def _encode(path: Path, pictures: Iterable[UInt8[np.ndarray, "h w 3"]]) -> None:
     tick = Fraction(1, _RATE)
     # the header goes first, so that a browser shows the video before it has it all
     with av.open(str(path), "w", format="mp4", options={"movflags": "faststart"}) as file:
-        stream = file.add_stream("libx264", rate=_RATE, options={"crf": "23", "preset": "medium"})
+        stream = file.add_stream("libx264", rate=_RATE, options=_X264)
         stream.pix_fmt, stream.codec_context.time_base = "yuv420p", tick
+        stream.codec_context.thread_count = 1  # x264 cuts frames by the number of threads: other cores, other bits
         for i, picture in enumerate(pictures):
             height, width = (size // 2 * 2 for size in picture.shape[:2])  # 4:2:0 halves both
             if i == 0:

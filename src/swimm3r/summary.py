@@ -1,6 +1,5 @@
 """The sections of summary.json: records in, plain numbers out (layout: docs/conventions.md)."""
 
-import json
 from collections.abc import Sequence
 from pathlib import Path
 
@@ -14,26 +13,29 @@ from swimm3r.evaluate.depth import depth_scores
 from swimm3r.evaluate.images import as_8_bit, psnr
 from swimm3r.evaluate.matches import epipolar_errors, match_scores
 from swimm3r.evaluate.poses import absolute_pose_errors, pose_scores
-from swimm3r.evaluate.underwater import URANKER, clear_psnr, uciqe, uiqm, water_scores, water_scores_from_views
+from swimm3r.evaluate.underwater import clear_psnr, water_scores, water_scores_from_views
 from swimm3r.frames import Frames
 from swimm3r.geometry import DegenerateAlignmentError, align_poses, align_similarity
 from swimm3r.ground_truth import GroundTruth
 from swimm3r.held_out import HeldOutView, cut, mean_covered, mean_scores, protocol
-from swimm3r.io import images
+from swimm3r.io.metrics_log import read_rows
 from swimm3r.medium import Medium, MediumFit, remove_water, rescale
 from swimm3r.progress import Progress, silent
-from swimm3r.reconstruction import Reconstruction
+from swimm3r.reconstruction import Matches, Reconstruction
 from swimm3r.splat.pose_codes import RefinedPoses
 from swimm3r.splat.rendering import SplatMap, mean_water
 from swimm3r.splat.settings import PoseRefinementSettings, recipe_of
-from swimm3r.splat.views import pinhole_canvas, undistorted
+from swimm3r.splat.views import undistorted
 
 _ASKED = 16  # training views that the map's mean water is taken over
 
 
-def sfm_sections(rec: Reconstruction, frames: Frames) -> dict[str, object]:
-    """ "sfm", "medium" and "cautions": what structure from motion found."""
-    epipolar = match_scores(retained_match_errors(rec))
+def sfm_sections(rec: Reconstruction, frames: Frames, matches: Matches | None = None) -> dict[str, object]:
+    """ "sfm", "medium" and "cautions": what structure from motion found.
+
+    Epipolar scores are of `matches`, by default those that the reconstruction keeps.
+    """
+    epipolar = match_scores(match_errors(rec, matches or rec.matches))
     observations = torch.bincount(rec.tracks.point, minlength=len(rec.points.xyz)).double()
     sfm = {
         "backend": rec.backend,
@@ -61,51 +63,28 @@ def sfm_sections(rec: Reconstruction, frames: Frames) -> dict[str, object]:
     return sections
 
 
-def retained_match_errors(rec: Reconstruction) -> Float[Tensor, " m"]:
-    """Symmetric epipolar error of every match the reconstruction keeps, under its own cameras; pixels of the frames."""
+def match_errors(rec: Reconstruction, matches: Matches) -> Float[Tensor, " m"]:
+    """Symmetric epipolar error of matches under the reconstruction's own cameras; pixels of the frames."""
     return epipolar_errors(
-        rec.matches.i,
-        rec.matches.j,
-        _undistorted(rec.cameras, rec.matches.i, rec.matches.xy_i),
-        _undistorted(rec.cameras, rec.matches.j, rec.matches.xy_j),
+        matches.i,
+        matches.j,
+        _undistorted(rec.cameras, matches.i, matches.xy_i),
+        _undistorted(rec.cameras, matches.j, matches.xy_j),
         rec.cameras.K,
         rec.cameras.cam2world,
     )
 
 
-def restored_section(folder: Path, names: Sequence[str], progress: Progress = silent) -> dict[str, object]:
-    """Reference-free scores of the restored pictures, native size, averaged over frames."""
-    scores = []
-    names = [name for name in names if (folder / f"{name}.png").is_file()]
-    if not names:
-        nothing = NotComputed("no frame was restored")
-        return summary_entries({"uiqm": nothing, "uciqe": nothing, "urank": nothing})
-    for done, name in enumerate(names):
-        progress("scoring restored pictures", done, len(names))
-        rgb = torch.from_numpy(images.read_rgb(folder / f"{name}.png")).float() / 255
-        scores.append((uiqm(rgb).uiqm, uciqe(rgb)))
-    mean = torch.tensor(scores).mean(0).tolist()
-    return summary_entries(
-        {
-            "uiqm": mean[0],
-            "uiqm_variant": "FUnIE-GAN, native size",
-            "uciqe": mean[1],
-            "uciqe_variant": "CIELAB, own units",
-            "urank": URANKER,
-        }
-    )
-
-
 def splat_sections(scene: SplatMap, rec: Reconstruction, frames: Frames, folder: Path) -> dict[str, object]:
     """ "splat" and the map's own water in "medium": the field's mean over the training views."""
-    rows = (folder / "metrics.jsonl").read_text(encoding="utf-8").splitlines()
-    last = json.loads(rows[-1])
+    rows = read_rows(folder / "metrics.jsonl")
+    lost = NotComputed("the record of the training, metrics.jsonl, is lost")
     section = {
         "recipe": recipe_of(scene.settings),
         "primitives": len(scene.primitives.xyz),
         "iterations": scene.settings.iterations,
-        "seconds_per_iteration": last["seconds_per_step"],
-        "cpu_seconds_per_iteration": last["cpu_seconds_per_step"],
+        "seconds_per_iteration": rows[-1].get("seconds_per_step", lost) if rows else lost,
+        "cpu_seconds_per_iteration": rows[-1].get("cpu_seconds_per_step", lost) if rows else lost,
         "device": scene.primitives.xyz.device.type,
     }
     water = mean_medium(scene, rec, frames)
@@ -115,7 +94,7 @@ def splat_sections(scene: SplatMap, rec: Reconstruction, frames: Frames, folder:
         "unit": "1/m" if scene.metric else "per scene unit",
         "encoding": "srgb",
     }
-    return {"splat": section, "medium": {"splat": medium}}
+    return {"splat": summary_entries(section), "medium": {"splat": medium}}
 
 
 def test_section(views: Sequence[HeldOutView], settings: PoseRefinementSettings) -> dict[str, object]:
@@ -132,13 +111,10 @@ def test_section(views: Sequence[HeldOutView], settings: PoseRefinementSettings)
 
 def mean_medium(scene: SplatMap, rec: Reconstruction, frames: Frames) -> Medium:
     """The map's water averaged over the directions and times of the training frames, per scene unit of ray depth."""
-    taken = {frame.name: frame.time for frame in frames}
+    times = frames.times_of(rec.names)
     every = max(1, len(rec.names) // _ASKED)
     with torch.no_grad():
-        views = [
-            mean_water(scene, pinhole_canvas(rec.cameras[i], 64), taken[rec.names[i]])
-            for i in range(0, len(rec.names), every)
-        ]
+        views = [mean_water(scene, rec.cameras[i].pinhole(64), times[i]) for i in range(0, len(rec.names), every)]
     return Medium(**{name: torch.stack([getattr(view, name) for view in views]).mean(0) for name in vars(views[0])})
 
 
@@ -209,6 +185,7 @@ def _medium_section(fit: MediumFit, metric: bool) -> dict[str, object]:
         "identifiable": {name: flags.tolist() for name, flags in fit.identifiable.items()},
         "unit": "1/m" if metric else "per scene unit",
         "encoding": fit.encoding,
+        "estimator": fit.estimator,
     }
 
 

@@ -51,8 +51,9 @@ def run(tmp_path_factory: pytest.TempPathFactory) -> Path:
         Tracks(none, none, torch.zeros(0, 2, dtype=torch.float64)),
         Matches(none, none, torch.zeros(0, 2), torch.zeros(0, 2), torch.zeros(0)), depth, "truth", metric=True,
     )  # fmt: skip
-    reconstruction.save(rec, out / "sfm")
+    reconstruction.save(rec, frames, out / "sfm")
     about = {
+        "schema": 1,
         "input": {"path": str(folder / "dive"), "fingerprint": "f"},
         "stages": {"prepare": {"status": "done", "key": "p"}, "sfm": {"status": "done", "key": "k"}},
     }

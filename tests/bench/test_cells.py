@@ -8,6 +8,7 @@ from types import SimpleNamespace
 
 import pytest
 
+from swimm3r.bench import cells
 from swimm3r.bench.cells import Cell, Place, Scores, kept_cell, over_scenes
 from swimm3r.bench.settings import JobSettings
 from swimm3r.errors import InputError, UsageError, WeightsError
@@ -33,6 +34,61 @@ def test_a_cell_is_computed_once_for_what_it_depends_on(tmp_path: Path):
     assert made == [tmp_path / "reef" / "colmap" / "plus-SGG" / "2"] * 2
 
 
+def test_scores_are_taken_anew_where_only_they_are_decided_by_something_else(tmp_path: Path):
+    folder = PLACE.folder(tmp_path)
+
+    def make(folder: Path) -> Scores:
+        (folder / "map.safetensors").touch()
+        return {"psnr": 1.0, "lpips_vgg": NotComputed("no weights")}
+
+    def again(folder: Path) -> Scores:
+        assert (folder / "map.safetensors").is_file()
+        return {"psnr": 1.0, "lpips_vgg": 0.2}
+
+    kept_cell(tmp_path, PLACE, "settings", make, [None])
+    assert kept_cell(tmp_path, PLACE, "settings", again, ["digest of the weights"]).scores["lpips_vgg"] == 0.2
+    assert not (folder / "old").exists()
+
+
+def test_what_was_made_from_something_else_is_set_aside_and_not_taken(tmp_path: Path):
+    folder = PLACE.folder(tmp_path)
+
+    def make(folder: Path) -> Scores:
+        assert not (folder / "map.safetensors").exists()
+        (folder / "map.safetensors").touch()
+        return {"psnr": 1.0}
+
+    def cut_short(folder: Path) -> Scores:
+        (folder / "checkpoint").touch()
+        raise InputError("stopped", cause="", hint="")
+
+    def goes_on(folder: Path) -> Scores:
+        assert (folder / "checkpoint").is_file()
+        return {"psnr": 2.0}
+
+    for settings in ("first", "second", "first"):
+        kept_cell(tmp_path, PLACE, settings, make)
+    assert len(list(folder.glob("old/*/map.safetensors"))) == 2
+    with pytest.raises(InputError):
+        kept_cell(tmp_path, PLACE, "third", cut_short)
+    assert kept_cell(tmp_path, PLACE, "third", goes_on).scores == {"psnr": 2.0}
+    assert len(list(folder.glob("old/*/scores.json"))) == 3
+
+
+def test_other_code_makes_other_cells(tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
+    monkeypatch.setattr(cells, "code_version", lambda: "before")
+    assert kept_cell(tmp_path, PLACE, 1, lambda _: {"psnr": 1.0}).scores == {"psnr": 1.0}
+    monkeypatch.setattr(cells, "code_version", lambda: "after")
+    assert kept_cell(tmp_path, PLACE, 1, lambda _: {"psnr": 2.0}).scores == {"psnr": 2.0}
+
+
+def test_a_damaged_record_of_a_cell_is_made_anew(tmp_path: Path):
+    kept_cell(tmp_path, PLACE, 1, lambda _: {"psnr": 1.0})
+    for text in ("{", "[]", "[" * 100_000):
+        (PLACE.folder(tmp_path) / "scores.json").write_text(text)
+        assert kept_cell(tmp_path, PLACE, 1, lambda _: {"psnr": 2.0}).scores == {"psnr": 2.0}
+
+
 def test_a_method_without_its_weights_is_not_run_and_tried_again(tmp_path: Path):
     def refuse(folder: Path) -> Scores:
         raise WeightsError("the weights 'mast3r' are not on this computer", cause="", hint="")
@@ -52,8 +108,8 @@ def names_lead_out(scene: str, /, *, out: Path, progress: Progress) -> list[Cell
 @pytest.mark.parametrize("jobs", [1, 2])
 def test_scenes_keep_their_order_and_one_error_waits_for_the_others(tmp_path: Path, jobs: int):
     work = partial(names_lead_out, out=tmp_path)
-    cells = over_scenes(["c", "a"], work, tmp_path, JobSettings(jobs))
-    assert [c.scene for c in cells] == ["c", "a"]
+    found = over_scenes(["c", "a"], work, tmp_path, JobSettings(jobs))
+    assert [c.scene for c in found] == ["c", "a"]
     with pytest.raises(InputError, match="b is damaged") as raised:
         over_scenes(["b", "d"], work, tmp_path, JobSettings(jobs))
     assert (raised.value.cause, raised.value.hint) == ("why", "try")
@@ -86,8 +142,8 @@ def test_a_cluster_gets_a_job_per_scene(tmp_path: Path, monkeypatch: pytest.Monk
 
     monkeypatch.setitem(sys.modules, "submitit", SimpleNamespace(AutoExecutor=AutoExecutor))
     how = JobSettings(slurm=True, partition="sea", minutes=5, cpus=3)
-    cells = over_scenes(["a", "c"], partial(names_lead_out, out=tmp_path), tmp_path, how)
-    assert [c.scene for c in cells] == ["a", "c"]
+    found = over_scenes(["a", "c"], partial(names_lead_out, out=tmp_path), tmp_path, how)
+    assert [c.scene for c in found] == ["a", "c"]
     assert told == {
         "folder": tmp_path / "slurm",
         "timeout_min": 5,

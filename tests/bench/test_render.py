@@ -9,11 +9,12 @@ import pytest
 import torch
 
 from swimm3r import held_out
-from swimm3r.bench import reference, tables
+from swimm3r.bench import map_scores, reference, render, tables
+from swimm3r.bench.cells import Cell
 from swimm3r.bench.localisation import maps_of
 from swimm3r.bench.render import compare_renderers, settings_for
 from swimm3r.bench.runs import clips_of, made_runs
-from swimm3r.errors import InputError
+from swimm3r.errors import InputError, UsageError
 from swimm3r.evaluate import NotComputed
 from swimm3r.io.images import read_rgb
 from swimm3r.presets import RunSettings
@@ -71,7 +72,7 @@ def test_clips_are_reconstructed_once_and_runs_are_taken_as_they_are(
 ):
     made = []
 
-    def run_pipeline(source, folder, settings, *, last_stage, progress):
+    def run_pipeline(source, folder, settings, *, redo, last_stage, progress):
         made.append((source, folder, last_stage))
 
     monkeypatch.setattr("swimm3r.bench.runs.run_pipeline", run_pipeline)
@@ -103,3 +104,50 @@ def test_a_clip_that_cannot_be_placed_as_a_whole_is_remembered(run: Path, tmp_pa
     assert isinstance(found, NotComputed)
     assert json.loads((tmp_path / "reference.json").read_text())["failed"] == found.reason
     assert reference.of_clip(replace(sfm, frames=few), tmp_path) == found
+
+
+@pytest.mark.parametrize(
+    ("recipes", "seeds", "against"),
+    [(("ubs",), 1, "uwbs-static"), ((), 1, None), (("ubs",), 0, None), (("ubs",), -1, None)],
+)
+def test_what_cannot_be_compared_is_refused_before_anything_is_trained(
+    run: Path, tmp_path: Path, tiny: UwbsSettings, recipes: tuple, seeds: int, against: str | None
+):
+    with pytest.raises(UsageError):
+        compare_renderers([run], tmp_path / "out", recipes, tiny, seeds, against=against)
+    assert not (tmp_path / "out").exists()
+
+
+def test_poses_that_somebody_else_found_take_the_references_place(
+    run: Path, tmp_path: Path, tiny: UwbsSettings, quick: PoseRefinementSettings, monkeypatch: pytest.MonkeyPatch
+):
+    monkeypatch.setattr(reference, "of_clip", lambda *_: pytest.fail("they are given"))
+    shutil.copy(run.parent / "dive" / "truth" / "cameras.json", tmp_path / "dive.json")
+    table = compare_renderers([run], tmp_path / "out", ("ubs",), tiny, test=quick, references=tmp_path)
+    assert table.cells[0].scores["from_reference_pct"] == 100
+    (tmp_path / "dive.json").unlink()
+    with pytest.raises(InputError, match="no reference poses of dive"):
+        compare_renderers([run], tmp_path / "out", ("ubs",), tiny, test=quick, references=tmp_path)
+    with pytest.raises(InputError, match="is no folder"):
+        compare_renderers([run], tmp_path / "out", ("ubs",), tiny, test=quick, references=tmp_path / "none")
+
+
+def test_weights_that_arrive_fill_the_scores_that_lacked_them(
+    run: Path, tmp_path: Path, tiny: UwbsSettings, quick: PoseRefinementSettings, monkeypatch: pytest.MonkeyPatch
+):
+    monkeypatch.setenv("SWIMM3R_WEIGHTS_DIR", str(tmp_path / "weights"))
+    monkeypatch.setenv("SWIMM3R_CACHE", str(tmp_path / "cache"))
+    monkeypatch.setattr(reference, "of_clip", lambda *_: open_finished_sfm(run).truth)
+
+    def compared() -> Cell:
+        return compare_renderers([run], tmp_path / "out", ("ubs",), tiny, test=quick).cells[0]
+
+    trainings, train = [], map_scores.train
+    monkeypatch.setattr(map_scores, "train", lambda *given: trainings.append(1) or train(*given))
+    assert isinstance(compared().scores["lpips_vgg"], NotComputed)
+    (tmp_path / "weights").mkdir()
+    monkeypatch.setattr(render, "lpips_weights", lambda: ["trunk", "heads"])
+    mean_scores = held_out.mean_scores
+    monkeypatch.setattr(held_out, "mean_scores", lambda views: replace(mean_scores(views), lpips=0.25))
+    assert compared().scores["lpips_vgg"] == 0.25
+    assert trainings == [1]

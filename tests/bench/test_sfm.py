@@ -7,23 +7,27 @@ from pathlib import Path
 import pytest
 import torch
 
+from swimm3r import reconstruction
 from swimm3r.bench import sfm as bench_sfm
 from swimm3r.bench import tables
 from swimm3r.bench.restoration import score_restoration
 from swimm3r.bench.runs import original_pixels, sfm_label
 from swimm3r.bench.settings import PEERS, SfmMethods
 from swimm3r.bench.sfm import compare_sfm
-from swimm3r.bench.sfm_methods import model_scores, reference_scores, settings_for
+from swimm3r.bench.sfm_methods import Uncapped, model_scores, reference_scores, settings_for
 from swimm3r.cameras import project
 from swimm3r.errors import InputError, RegistrationError
 from swimm3r.evaluate import NotComputed
 from swimm3r.evaluate.underwater import URANKER, uciqe, uiqm
-from swimm3r.io.images import read_rgb, write_rgb
+from swimm3r.io.images import read_rgb, write_rgb, write_rgb_16
+from swimm3r.medium import AttenuationCurve, Estimator, Medium, MediumFit
 from swimm3r.prepare import load_frames
 from swimm3r.presets import PRESETS, RunSettings
-from swimm3r.reconstruction import Matches, Reconstruction
+from swimm3r.progress import silent
+from swimm3r.reconstruction import DepthMaps, Matches, Reconstruction
 from swimm3r.run import open_finished_sfm
-from swimm3r.sfm.settings import ColmapModelSettings, ColmapSettings, Mast3rSettings
+from swimm3r.sfm.settings import ColmapModelSettings, ColmapSettings, Mast3rSettings, TrackSettings
+from swimm3r.sfm.tracks import count_tracks, fuse_depth
 
 
 @pytest.fixture
@@ -45,17 +49,44 @@ def with_matches(rec: Reconstruction, off: float) -> Reconstruction:
 
 def test_a_map_is_scored_in_pixels_of_the_original_pictures(run: Path):
     rec = open_finished_sfm(run).rec
-    exact = model_scores(with_matches(rec, 0.0), 14, 1.0)
+    seen = with_matches(rec, 0.0)
+    exact = model_scores(seen, Uncapped(seen.matches, 7), 14, 1.0)
     assert exact["registered_pct"] == 50
     assert exact["epipolar_mean_px"] == pytest.approx(0, abs=1e-3)
     assert exact["inlier_1px_pct"] == 100
     assert exact["points"] == len(rec.points.xyz)
+    assert exact["dense_points"] == 7
     off = with_matches(rec, 0.8)
-    once, twice = model_scores(off, 7, 1.0), model_scores(off, 7, 2.0)
+    once, twice = (model_scores(off, Uncapped(off.matches, 7), 7, pixels) for pixels in (1.0, 2.0))
     assert isinstance(once["epipolar_mean_px"], float)
     assert twice["epipolar_mean_px"] == pytest.approx(2 * once["epipolar_mean_px"])
     assert isinstance(twice["inlier_1px_pct"], float)
     assert twice["inlier_1px_pct"] < 100
+
+
+def test_no_cap_and_no_filter_by_its_own_result_flatters_a_map(run: Path, tmp_path: Path):
+    sfm = open_finished_sfm(run)
+    shutil.copytree(run / "sfm", tmp_path / "sfm")
+    handed = with_matches(sfm.rec, 5.0).matches
+    reconstruction.write_unfiltered_matches(tmp_path / "sfm", handed)
+    rec = replace(with_matches(sfm.rec, 0.0), points_found=1_010_000, depth=DepthMaps(tmp_path / "sfm" / "z_depth"))
+    uncapped = Uncapped.of(tmp_path / "sfm", rec, sfm.frames, TrackSettings(max_tracks=10), silent)
+    scores = model_scores(rec, uncapped, 7, 1.0)
+    assert scores["points"] == 1_010_000
+    assert isinstance(scores["inlier_1px_pct"], float)
+    assert scores["inlier_1px_pct"] < 10  # of those it keeps, all
+    assert isinstance(scores["epipolar_mean_px"], float)
+    assert scores["epipolar_mean_px"] > 1
+    assert isinstance(scores["dense_points"], float)
+    assert scores["dense_points"] > 10 * len(fuse_depth(rec, sfm.frames, TrackSettings(max_tracks=100)).xyz)
+
+
+def test_dense_points_are_those_of_the_fused_depth_maps(run: Path):
+    sfm = open_finished_sfm(run)
+    everything = TrackSettings(max_tracks=10_000_000)
+    assert count_tracks(sfm.rec, sfm.frames, TrackSettings(max_tracks=10)) == len(
+        fuse_depth(sfm.rec, sfm.frames, everything).xyz
+    )
 
 
 def test_frames_that_are_not_placed_fail_their_pairs(run: Path):
@@ -105,13 +136,13 @@ def test_every_method_is_a_row_and_none_is_skipped_in_silence(
 ):
     calls = []
 
-    def run_pipeline(source, folder, settings, *, last_stage, progress):
+    def run_pipeline(source, folder, settings, *, redo, last_stage, progress):
         calls.append(settings.sfm.mapping.method)
         shutil.copytree(run, folder, dirs_exist_ok=True)
         if settings.sfm.mapping.method == "global":
             shutil.rmtree(folder / "sfm")
             raise RegistrationError("only 2 of 7 frames", cause="", hint="")
-        (folder / "summary.json").write_text('{"stages": {"sfm": {"cpu_seconds": 3.5}}}')
+        return {"stages": {"sfm": {"cpu_seconds": 3.5}}}
 
     monkeypatch.setattr(bench_sfm, "run_pipeline", run_pipeline)
     clip = run.parent / "dive"
@@ -141,20 +172,53 @@ def test_original_pixels_are_those_of_the_clip(run: Path):
     assert original_pixels(run.parent / "dive", replace(frames, width=96)) == 2
 
 
-def test_restored_frames_are_scored_beside_those_as_filmed(run: Path, tmp_path: Path):
-    restored = tmp_path / "restored run"
-    shutil.copytree(run, restored)
+def water(estimator: Estimator) -> MediumFit:
+    """Some water of that origin."""
+    one = torch.ones(3)
+    medium, known = Medium(0.3 * one, 0.4 * one, 0.2 * one), torch.ones(3, dtype=torch.bool)
+    curve = AttenuationCurve(0.4 * one, 0 * one, 0 * one, 0 * one)
+    flags = dict.fromkeys(("Binf", "beta_D", "beta_B"), known)
+    return MediumFit(medium, curve, medium, flags, (0.5, 4.0), "srgb", estimator)
+
+
+def with_water(run: Path, folder: Path, estimator: Estimator = "Sea-Thru") -> Path:
+    """A copy of the run whose water that estimator found."""
+    shutil.copytree(run, folder)
+    sfm = open_finished_sfm(folder)
+    rec = replace(sfm.rec, medium=water(estimator), depth=DepthMaps(folder / "sfm" / "z_depth"))
+    reconstruction.save(rec, sfm.frames, folder / "sfm")
+    return folder
+
+
+def test_a_row_says_which_algorithm_restored_it_or_that_none_did(run: Path, tmp_path: Path):
+    runs = [with_water(run, tmp_path / "learned", "physics head"), with_water(run, tmp_path / "fitted"), run]
+    _, learned, _, fitted, _, dry = score_restoration(runs, tmp_path / "out").cells
+    assert learned.method.endswith("(learned) + physics head")
+    assert fitted.method.endswith("(fitted) + Sea-Thru")
+    assert (dry.not_run, dry.scores) == ("its water was not estimated", {})
+
+
+def test_restored_frames_are_scored_in_physical_colors_beside_the_shown_ones_and_those_as_filmed(
+    run: Path, tmp_path: Path
+):
+    restored = with_water(run, tmp_path / "restored run")
     sfm = open_finished_sfm(restored)
-    brighter = [sfm.frames.train.image(k).sqrt() for k in (0, 1)]
-    for name, picture in zip(sfm.rec.names, brighter, strict=False):
-        write_rgb(restored / "sfm" / "restored" / f"{name}.png", picture.numpy())
+    physical = [sfm.frames.train.image(k).sqrt() for k in (0, 1)]
+    balanced = [image * torch.tensor([1.0, 0.8, 0.7]) for image in physical]
+    for name, clear, shown in zip(sfm.rec.names, physical, balanced, strict=False):
+        write_rgb_16(restored / "sfm" / "restored_physical" / f"{name}.png", clear.numpy())
+        write_rgb(restored / "sfm" / "restored" / f"{name}.png", shown.numpy())
     table = score_restoration([restored], tmp_path / "out")
-    filmed, clear = table.cells
-    assert (filmed.method, clear.method) == ("as filmed", "truth")
-    assert clear.scores["uiqm_funie"] == pytest.approx(sum(uiqm(picture).uiqm for picture in brighter) / 2, rel=1e-5)
-    assert clear.scores["uciqe_cielab"] == pytest.approx(sum(uciqe(picture) for picture in brighter) / 2, rel=1e-5)
-    assert filmed.scores["uiqm_funie"] != clear.scores["uiqm_funie"]
-    assert clear.scores["uranker"] == URANKER
+    assert [cell.method for cell in table.cells] == [
+        "as filmed",
+        "truth + Sea-Thru",
+        "truth + Sea-Thru, white-balanced",
+    ]
+    for cell, images in zip(table.cells[1:], (physical, balanced), strict=True):
+        assert cell.scores["uiqm_funie"] == pytest.approx(sum(uiqm(image).uiqm for image in images) / 2, rel=1e-3)
+        assert cell.scores["uciqe_cielab"] == pytest.approx(sum(uciqe(image) for image in images) / 2, rel=1e-3)
+        assert cell.scores["uranker"] == URANKER
+    assert len({round(cell.scores["uciqe_cielab"], 2) for cell in table.cells}) == 3
     assert list((tmp_path / "out" / "pictures" / "dive").glob("*.png"))
-    nothing = score_restoration([run], tmp_path / "none").cells[1]
+    nothing = score_restoration([with_water(run, tmp_path / "unrestored")], tmp_path / "none").cells[1]
     assert isinstance(nothing.scores["uiqm_funie"], NotComputed)

@@ -52,6 +52,14 @@ def test_what_is_missing_is_told_with_its_reason():
     assert "(`psnr`): dB" in text
 
 
+def test_a_table_names_its_preset_wherever_one_has_a_say():
+    cells = cells_with_a_gain(0.1)
+    named = Table("t", "T", cells, columns("psnr"), preset="fast, changed by options")
+    assert "2 scenes, 2 seeds, preset fast, changed by options." in markdown(named)
+    assert latex(named).startswith("% T (preset fast, changed by options)")
+    assert "preset" not in markdown(Table("t", "T", cells, columns("psnr")))
+
+
 def test_a_table_of_methods_that_were_not_run_still_has_its_columns():
     text = markdown(Table("t", "T", [Cell("a", "mast3r", 0, {}, "no weights")], columns("psnr")))
     assert "| method | cells | PSNR ↑ |" in text

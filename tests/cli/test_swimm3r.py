@@ -9,6 +9,7 @@ import torch
 from swimm3r import reconstruction
 from swimm3r.cli.main import main
 from swimm3r.io import medium_json
+from swimm3r.io.damage import remake
 from swimm3r.sfm.mast3r import checkpoint
 from swimm3r.sfm.mast3r.network import Architecture, Mast3r
 from swimm3r.synthetic import DiveSettings, write_dive
@@ -58,7 +59,7 @@ def test_the_students_water_restores_the_dive(place: Path, tmp_path: Path, capsy
     assert summary["sfm"]["backend"] == "swimm3r"
     rec = reconstruction.load(run / "sfm")
     assert len(list((run / "sfm" / "water").glob("*.npz"))) == len(rec.names) == 4
-    fit = medium_json.read_fits(run / "sfm" / "medium.json")["stored"]
+    fit = medium_json.read_fits(run / "sfm" / "medium.json", remake(run / "sfm"))["stored"]
     assert ((fit.medium.Binf > 0) & (fit.medium.Binf < 1)).all()
     assert (fit.medium.beta_D > 0).all()
     assert len(list((run / "sfm" / "restored").glob("*.png"))) == 4

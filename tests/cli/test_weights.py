@@ -29,6 +29,21 @@ def small(home: Path) -> Path:
     return path
 
 
+def test_a_folder_that_cannot_be_read_is_said_to_be_one(
+    home: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
+):
+    def is_file(path: Path) -> bool:  # tests may run as root, whom no folder refuses
+        raise PermissionError(13, "Permission denied", str(path))
+
+    monkeypatch.setattr(Path, "is_file", is_file)
+    code, out, _ = outcome(capsys, "list")
+    assert code == 0
+    assert f"{home} cannot be looked into (Permission denied)" in out
+    code, _, err = outcome(capsys, "path", "mast3r")
+    assert code == 4
+    assert "chmod" in err
+
+
 def outcome(capsys: pytest.CaptureFixture[str], *arguments: str) -> tuple[int, str, str]:
     code = 0
     try:

@@ -22,6 +22,11 @@ def test_two_pixels_by_hand():
     assert scores.variant == "none"
 
 
+def test_scores_keep_double_precision():
+    true, predicted = torch.tensor([[3.0]], dtype=torch.float64), torch.tensor([[3.1]], dtype=torch.float64)
+    assert depth_scores([predicted], [true], "none").absrel == pytest.approx(0.1 / 3.0, rel=1e-14)
+
+
 def test_median_alignment_forgives_one_scale_per_frame():
     true = some_depths()
     scaled = [s * z for s, z in zip((0.2, 3.0, 11.0), true, strict=True)]

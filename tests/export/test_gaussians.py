@@ -22,7 +22,7 @@ from swimm3r.splat.primitives import BetaPrimitives, inverse_softplus
 from swimm3r.splat.rendering import SplatMap
 from swimm3r.splat.settings import MediumFieldSettings, UwbsSettings, mcmc_gs
 
-PARTS = {"f_dc": 3, "opacity": 0, "scale": 3, "rot": 4}
+PARTS = {"f_dc": 3, "f_rest": 45, "opacity": 0, "scale": 3, "rot": 4}  # f_rest: 3 (3 + 1)^2 - 3, which 3DGS asserts
 FIELDS = ["x", "y", "z", "nx", "ny", "nz"]
 FIELDS += [f"{part}_{k}" if n else part for part, n in PARTS.items() for k in range(n or 1)]
 

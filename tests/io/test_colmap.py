@@ -102,7 +102,7 @@ def test_a_truncated_model_is_an_input_error(tmp_path: Path, name: str, left: in
     colmap.write_model(tmp_path / "sparse", _model())
     file = tmp_path / "sparse" / name
     file.write_bytes(file.read_bytes()[:left])
-    with pytest.raises(InputError, match=f"not a readable COLMAP model \\({name} is not whole") as caught:
+    with pytest.raises(InputError, match=f"is not a readable COLMAP model \\({name} is not whole") as caught:
         colmap.read_model(tmp_path / "sparse")
     assert caught.value.exit_code == 3
 
@@ -122,7 +122,9 @@ def test_a_model_with_a_rig_of_two_cameras_is_whole(tmp_path: Path) -> None:
 
 def test_names_that_leave_the_folder_are_refused(tmp_path: Path) -> None:
     model = _model()
-    colmap.write_model(tmp_path / "sparse", replace(model, names=("../x.jpg", *model.names[1:])))
+    colmap.write_model(tmp_path / "sparse", replace(model, names=("aa/x.jpg", *model.names[1:])))
+    images = tmp_path / "sparse" / "images.bin"
+    images.write_bytes(images.read_bytes().replace(b"aa/x.jpg", b"../x.jpg"))
     with pytest.raises(InputError, match="outside"):
         colmap.read_model(tmp_path / "sparse")
 

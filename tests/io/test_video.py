@@ -1,5 +1,6 @@
 """Videos tell true times, stand upright, and give what they can when damaged."""
 
+import math
 import struct
 from fractions import Fraction
 
@@ -162,3 +163,9 @@ def test_sound_alone_is_no_video(tmp_path):
 def test_names_with_colons_and_spaces_open(tmp_path, write_video):
     path = write_video(tmp_path / "dive.mp4", scene(3)).rename(tmp_path / "dive 2: the wreck.mp4")
     assert len(list(Video(path).frames())) == 3
+
+
+@pytest.mark.parametrize("start", [1e9, 1e300, math.inf])
+def test_a_start_beyond_every_clock_gives_no_frames(tmp_path, write_video, start):
+    video = Video(write_video(tmp_path / "a.mp4", [np.full((48, 64, 3), 9 * i, np.uint8) for i in range(9)]))
+    assert list(video.frames(start)) == []

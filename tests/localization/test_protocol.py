@@ -1,20 +1,23 @@
 """The paper's protocol on a map that is exactly known."""
 
 from dataclasses import replace
+from pathlib import Path
 
 import pytest
 import torch
 
 import swimm3r
-from swimm3r.errors import InputError, RegistrationError
-from swimm3r.geometry import pose_from, rotation_angle, so3_exp
-from swimm3r.localization.batch import Query, answer, match_picture, tum_line
-from swimm3r.localization.matchers import Mast3rMatcher, SiftMatcher
+from swimm3r.errors import InputError, RegistrationError, WeightsError
+from swimm3r.geometry import rotation_angle
+from swimm3r.localization.batch import Query, answer, match_picture
+from swimm3r.localization.matchers import Mast3rMatcher, SiftMatcher, matcher_for
 from swimm3r.localization.protocol import STAGES, Localizer
 from swimm3r.localization.references import rendered
-from swimm3r.localization.settings import LocalizationSettings
-from swimm3r.sfm.settings import FeatureSettings
+from swimm3r.localization.settings import LocalizationSettings, with_checkpoint_of
+from swimm3r.sfm.mast3r import checkpoint
+from swimm3r.sfm.settings import ColmapSettings, FeatureSettings, Mast3rSettings
 from swimm3r.splat.medium_field import initial_field
+from swimm3r.splat.pose_codes import RefinedPoses
 from swimm3r.splat.primitives import with_time
 from swimm3r.splat.settings import InitialSettings
 
@@ -57,6 +60,21 @@ def test_the_map_alone_is_enough(place):
     assert distance < 0.005
 
 
+def test_poses_are_those_of_the_reconstruction_even_where_the_maps_training_moved_all_cameras(place):
+    shift = torch.tensor([0.5, -0.2, 0.1], dtype=torch.float64)
+    poses = place.rec.cameras.cam2world.clone()
+    poses[:, :3, 3] += shift
+    p = place.scene.primitives
+    moved = replace(
+        place.scene, primitives=p._replace(xyz=p.xyz + shift.float()), poses=RefinedPoses(place.rec.names, poses)
+    )
+    image = place.frames.image(2)
+    true = place.cameras.cam2world[2]
+    assert off(swimm3r.localize(image, moved, place.rec, place.frames, settings=SETTINGS), true)[1] < 0.005
+    in_map = Localizer(moved, place.rec, place.frames, SETTINGS).locate(image).cam2world
+    assert off(in_map, true)[1] == pytest.approx(float(shift.norm()), abs=0.005)
+
+
 def test_a_dynamic_map_is_shown_at_the_pictures_time_and_half_way_through_the_clip_where_nobody_knows(place):
     p = with_time(place.scene.primitives, InitialSettings(time_scale=0.4), torch.Generator().manual_seed(0))
     field = initial_field(None, place.scene.settings.medium, torch.Generator().manual_seed(0), dynamic=True)
@@ -89,12 +107,25 @@ def test_a_picture_of_something_else_is_refused(localizer: Localizer):
 
 def test_without_a_good_rendering_the_coarse_pose_stands(place, localizer: Localizer):
     hollow = Localizer(
-        place.scene, place.rec, place.frames, LocalizationSettings(min_alpha=1.1, matcher="sift", candidates=3)
+        place.scene, place.rec, place.frames, LocalizationSettings(min_alpha=1.0, matcher="sift", candidates=3)
     )
     found = hollow.locate(place.frames.image(2))
     assert found.stage == "coarse"
     assert found.reprojection_px is None
     assert off(found.cam2world, place.cameras.cam2world[2])[0] < 1.0
+
+
+@pytest.mark.parametrize("i", [2, 4])
+def test_a_pose_from_a_rough_rendering_does_not_replace_a_better_one(place, i: int):
+    p, rng = place.scene.primitives, torch.Generator().manual_seed(0)
+    rough = replace(place.scene, primitives=p._replace(xyz=p.xyz + 0.01 * torch.randn(p.xyz.shape, generator=rng)))
+    kept, replaced = (
+        Localizer(rough, place.rec, place.frames, settings).locate(place.frames.image(i))
+        for settings in (SETTINGS, replace(SETTINGS, accept="inliers"))
+    )
+    assert (kept.stage, replaced.stage) == ("coarse", "refined")
+    error, other = (off(f.cam2world, place.cameras.cam2world[i])[0] for f in (kept, replaced))
+    assert error < 0.6 * other
 
 
 def test_masked_pixels_take_no_part(place):
@@ -119,6 +150,28 @@ def test_the_network_finds_the_picture_itself_and_matches_within_both_pictures(p
         assert ((xy > 0) & (xy < torch.tensor([240.0, 180.0]))).all()
 
 
+def test_the_network_is_loaded_as_the_settings_say(small_network, tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
+    path = tmp_path / "own.safetensors"
+    checkpoint.save(small_network, path)
+    named = LocalizationSettings(weights=path, device="cpu", precision="bfloat16")
+    matcher = matcher_for(named)
+    assert isinstance(matcher, Mast3rMatcher)
+    assert matcher.network.patch_embed.proj.weight.dtype == torch.bfloat16
+    monkeypatch.setenv("SWIMM3R_WEIGHTS_DIR", str(tmp_path / "none"))
+    monkeypatch.setenv("SWIMM3R_CACHE", str(tmp_path / "none"))
+    assert isinstance(matcher_for(LocalizationSettings()), SiftMatcher)
+    with pytest.raises(WeightsError, match="no weights at"):
+        matcher_for(LocalizationSettings(weights=tmp_path / "missing.pth"))
+
+
+def test_a_run_lends_the_checkpoint_that_found_its_poses():
+    found, own = Path("found.pth"), LocalizationSettings(weights=Path("own.pth"))
+    by_network = Mast3rSettings(weights=found)
+    assert with_checkpoint_of(LocalizationSettings(), by_network).weights == found
+    assert with_checkpoint_of(own, by_network) == own
+    assert with_checkpoint_of(LocalizationSettings(), ColmapSettings()) == LocalizationSettings()
+
+
 def test_a_match_picture_shows_both_and_joins_inliers(localizer: Localizer, place):
     evidence = localizer.locate(place.frames.image(2)).evidence
     assert evidence is not None
@@ -126,13 +179,3 @@ def test_a_match_picture_shows_both_and_joins_inliers(localizer: Localizer, plac
     assert picture.shape == (180, 480, 3)
     plain = (torch.cat([evidence.query, evidence.rendering], 1).clamp(0, 1) * 255).round().numpy()
     assert (abs(picture - plain).max(-1) > 30).mean() > 0.01
-
-
-def test_a_tum_line_turns_back_into_the_pose():
-    pose = pose_from(so3_exp(torch.tensor([0.3, -0.2, 0.5]).double()), torch.tensor([1.0, 2.0, 3.0]).double())
-    time, *numbers = (float(value) for value in tum_line(0.25, pose).split())
-    assert (time, numbers[:3]) == (0.25, [1.0, 2.0, 3.0])
-    x, y, z, w = numbers[3:]
-    v = torch.tensor([x, y, z]).double()
-    angle = 2 * torch.atan2(v.norm(), torch.tensor(w))
-    torch.testing.assert_close(so3_exp(angle * v / v.norm()), pose[:3, :3], atol=1e-6, rtol=0)

@@ -1,5 +1,6 @@
 """Masks follow their pictures in name and size, and cannot leave nothing."""
 
+import json
 from pathlib import Path
 
 import numpy as np
@@ -39,6 +40,60 @@ def test_masks_are_found_by_each_way_of_naming(dive, tmp_path, name, given):
     for i, has in enumerate([True, True, False, True]):
         np.testing.assert_array_equal(frames.mask(i), USABLE if has else np.ones_like(USABLE))
     assert frames.cautions == ("Masks: 3 of 4 frames have one; 1 masks match no frame (stranger.png).",)
+
+
+@pytest.mark.parametrize("suffix", [".png", ".jpg", ".JPG", ".tif", ".bmp", ".webp"])
+@pytest.mark.parametrize("layout", ["masks", "images/masks", "masks beside images", "given", "given inside"])
+def test_masks_may_have_the_very_names_of_the_pictures(tmp_path, suffix, layout):
+    root = tmp_path / "dive" / "images" if layout in ("images/masks", "masks beside images") else tmp_path / "dive"
+    folders = {
+        "masks": root / "masks",
+        "images/masks": root / "masks",
+        "masks beside images": tmp_path / "dive" / "masks",
+        "given": tmp_path / "elsewhere",
+        "given inside": root / "hand-drawn",
+    }
+    root.mkdir(parents=True)
+    folders[layout].mkdir(parents=True)
+    for i in range(4):
+        picture = np.random.default_rng(i).integers(0, 255, (48, 64, 3), dtype=np.uint8)
+        Image.fromarray(picture).save(root / f"{i}{suffix}")
+        mask = USABLE.astype(np.uint8) * 255
+        tight = {"quality": 100} if suffix in (".jpg", ".JPG") else {"lossless": True} if suffix == ".webp" else {}
+        Image.fromarray(mask).save(folders[layout] / f"{i}{suffix}", **tight)
+    masks = folders[layout] if layout.startswith("given") else None
+    frames = read_frames(tmp_path / "dive", folder=tmp_path / "prepare", masks=masks)
+    assert len(frames) == 4
+    assert frames.cautions == ()
+    for i in range(4):
+        np.testing.assert_array_equal(frames.mask(i)[:, 40:], USABLE[:, 40:])
+        assert frames.mask(i)[:, :10].float().mean() < 0.5  # JPEG rings
+    counts = json.loads((tmp_path / "prepare" / "frames.json").read_text())["masks"]
+    assert counts == {"used": 4, "unused": 0}
+
+
+def test_masks_of_a_video_have_the_names_of_its_frames(tmp_path, write_video):
+    pictures = [np.random.default_rng(i).integers(0, 255, (48, 64, 3), dtype=np.uint8) for i in range(30)]
+    write_video(tmp_path / "dive.mp4", pictures)
+    for i in range(4):
+        write_mask(tmp_path / "masks" / f"frame_{i:06d}.png")
+    frames = read_frames(tmp_path / "dive.mp4", folder=tmp_path / "prepare", masks=tmp_path / "masks")
+    assert [frame.mask is not None for frame in frames] == [True] * 4 + [False]
+    assert frames.cautions == ("Masks: 4 of 5 frames have one; 0 masks match no frame.",)
+
+
+def test_masks_that_nobody_asked_for_and_that_match_nothing_are_said(dive, tmp_path):
+    write_mask(dive / "masks" / "stranger.png")
+    frames = read_frames(dive, folder=tmp_path / "prepare")
+    assert frames.cautions == ("Masks: 0 of 4 frames have one; 1 masks match no frame (stranger.png).",)
+    assert frames.unused_masks == 1
+
+
+def test_a_folder_of_masks_that_is_not_there_is_noticed_first(dive, tmp_path):
+    with pytest.raises(InputError, match="no folder of masks"):
+        read_frames(
+            dive, folder=tmp_path / "prepare", masks=tmp_path / "nowhere", progress=lambda *_: pytest.fail("prepared")
+        )
 
 
 def test_masks_are_found_when_the_images_folder_itself_is_given(dive, tmp_path):

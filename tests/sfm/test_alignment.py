@@ -185,6 +185,20 @@ def test_shared_intrinsics_are_one(scene: Scene):
     torch.testing.assert_close(found.K[0, 0, 0].item(), FOCAL, rtol=0.02, atol=0)
 
 
+def test_shared_intrinsics_leave_every_frame_its_own_first_focal_length(scene: Scene):
+    """Depth relative to a block's anchor was measured under the pointmap's own focal length, whatever is shared."""
+    own = torch.tensor([0.9, 1.0, 1.1, 1.2]) * FOCAL
+    frames = [replace(f, focal=float(focal)) for f, focal in zip(scene.frames, own, strict=True)]
+    shared = replace(QUICK, intrinsics="shared", coarse_iterations=0, fine_iterations=0)
+    found = align(frames, scene.pairs, shared)
+    torch.testing.assert_close(found.focal_before, own)
+    torch.testing.assert_close(found.K[:, 0, 0].float(), torch.full((4,), 1.05 * FOCAL))
+    # the focal plane keeps the size that the frame had under its own focal length: z = s m f / f0
+    for frame, depth, focal in zip(frames, found.anchor_z_depth, own, strict=True):
+        median = frame.anchor_depth.median()
+        torch.testing.assert_close(depth, frame.anchor_depth + median * (1.05 * FOCAL / focal - 1))
+
+
 def test_known_poses_are_kept_and_the_others_found(scene: Scene):
     posed = torch.tensor([True, False, True, True])
     known = Known(cam2world=scene.cameras.cam2world, posed=posed)

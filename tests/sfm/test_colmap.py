@@ -178,7 +178,7 @@ def test_other_settings_start_a_new_database(frames: Frames, tmp_path: Path) -> 
 
 
 def test_the_global_method_finds_the_same_cameras(frames: Frames, folder: Path, rec: Reconstruction) -> None:
-    settings = replace(SETTINGS, mapping=MappingSettings(method="global", lens_frames=6))
+    settings = replace(SETTINGS, mapping=MappingSettings(method="global"))
     found = colmap.reconstruct(frames, settings, folder)
     assert found.names == rec.names
     assert _worst_rotation_deg(found, _cameras()) < 0.3

@@ -60,7 +60,7 @@ def test_cameras_points_scale_and_sightings_are_those_of_the_file(dive, model: C
     assert len(rec.points.xyz) == 30
     uv, _ = project(rec.cameras, rec.points.xyz.expand(len(rec.names), -1, -1))
     torch.testing.assert_close(uv[rec.tracks.frame, rec.tracks.point], rec.tracks.xy, atol=1e-9, rtol=0)
-    reconstruction.save(rec, tmp_path)
+    reconstruction.save(rec, dive.frames, tmp_path)
     again = reconstruction.load(tmp_path)
     torch.testing.assert_close(again.points.xyz, rec.points.xyz)
     assert torch.equal(again.matches.xy_i, rec.matches.xy_i)
@@ -151,7 +151,7 @@ def test_a_cloud_without_sightings_stays_beside_the_triangulated_points(posed_di
     found = triangulate(rec, frames, FeatureSettings(), tmp_path / "sfm")
     assert found.points.xyz[:3].tolist() == np.ones((3, 3)).tolist()
     assert found.tracks.point.min() == 3
-    reconstruction.save(found, tmp_path / "sfm")
+    reconstruction.save(found, frames, tmp_path / "sfm")
     assert len(reconstruction.load(tmp_path / "sfm").points.xyz) == len(found.points.xyz)
 
 

@@ -5,7 +5,7 @@ import pytest
 import torch
 
 from swimm3r.geometry import so3_exp
-from swimm3r.sfm.kinematic import compose, kinematic_tree
+from swimm3r.sfm.kinematic import compose, kinematic_tree, rooted_tree
 
 
 def chain(n: int) -> np.ndarray:
@@ -61,3 +61,14 @@ def test_composed_pose_is_the_parents_times_its_own(method):
         p = int(tree.parent[f])
         torch.testing.assert_close(world_R[f], world_R[p] @ R[f])
         torch.testing.assert_close(world_t[f], world_R[p] @ t[f] + world_t[p])
+
+
+def test_root_depends_neither_on_the_order_nor_on_the_direction_of_edges():
+    edges = [(3, 0), (1, 4), (4, 0), (2, 1), (5, 2), (6, 2), (3, 7)]
+    first = rooted_tree(edges, 8)
+    generator = np.random.default_rng(0)
+    for _ in range(20):
+        mixed = [edges[k] if generator.random() < 0.5 else edges[k][::-1] for k in generator.permutation(len(edges))]
+        tree = rooted_tree(mixed, 8)
+        assert (tree.root, tree.order) == (first.root, first.order)
+        assert tree.parent.tolist() == first.parent.tolist()

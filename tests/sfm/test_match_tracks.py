@@ -3,7 +3,7 @@
 import torch
 
 from swimm3r.cameras import Cameras, project
-from swimm3r.sfm.match_tracks import FrameMatches, consistent, join, reprojection_errors, without
+from swimm3r.sfm.match_tracks import FrameMatches, consistent, join, most_seen, reprojection_errors, without
 
 WIDTH, HEIGHT = 40, 30
 
@@ -61,9 +61,10 @@ def test_points_left_in_one_frame_are_dropped_and_the_most_seen_stay():
         HEIGHT,
     )
     bad = (found.frame == 0) & (found.xy == torch.tensor([7, 7])).all(1)
-    kept = without(found, bad, 10)
+    kept = without(found, bad)
     assert sightings(kept) == {frozenset({(0, 1, 1), (1, 2, 2), (2, 3, 3)}), frozenset({(0, 9, 9), (1, 6, 6)})}
-    assert sightings(without(found, bad, 1)) == {frozenset({(0, 1, 1), (1, 2, 2), (2, 3, 3)})}
+    assert sightings(most_seen(kept, 10)) == sightings(kept)
+    assert sightings(most_seen(kept, 1)) == {frozenset({(0, 1, 1), (1, 2, 2), (2, 3, 3)})}
 
 
 def camera_pair() -> Cameras:

@@ -10,7 +10,7 @@ import pytest
 from swimm3r.frames import Frames
 from swimm3r.prepare import read_frames
 from swimm3r.progress import silent
-from swimm3r.sfm import colmap, mapping
+from swimm3r.sfm import calibration, colmap, mapping
 from swimm3r.sfm.feature_database import FeatureDatabase
 from swimm3r.sfm.pair_agreement import contradicting_frames, pair_distances
 from swimm3r.sfm.resection import misplaced_frames
@@ -21,12 +21,13 @@ from swimm3r.synthetic.settings import DiveSettings
 SETTINGS = ColmapSettings(threads=2)
 INCREMENTAL = replace(SETTINGS, mapping=replace(SETTINGS.mapping, method="incremental"))
 WRONG = 3  # image id
+WIDTH = 240
 
 
 @pytest.fixture(scope="module")
 def store(tmp_path_factory: pytest.TempPathFactory) -> FeatureDatabase:
     folder = tmp_path_factory.mktemp("resection")
-    write_dive(DiveSettings(frames=10, width=240, height=160), folder / "dive")
+    write_dive(DiveSettings(frames=10, width=WIDTH, height=160), folder / "dive")
     frames: Frames = read_frames(folder / "dive", folder=folder / "prepare").train
     colmap.reconstruct(frames, SETTINGS, folder / "sfm")
     shutil.copyfile(folder / "sfm" / "database.db", folder / "mapping.db")
@@ -68,6 +69,25 @@ def test_a_swung_frame_is_found_and_placed_again(store: FeatureDatabase, model: 
     assert_same(rotations(mapping.replace_misplaced(store, wrong, SETTINGS, silent)), rotations(model))
 
 
+def test_every_round_of_placing_counts_up_to_its_end(store: FeatureDatabase, model: pycolmap.Reconstruction):
+    told: list[tuple[str, int, int]] = []
+    settings = replace(SETTINGS, mapping=replace(SETTINGS.mapping, method="auto"))
+    mapping.map_frames(store, settings, lambda *call: told.append(call))
+    mapping.replace_misplaced(store, moved(model, 25, (1, 2, 3)), settings, lambda *call: told.append(call))
+    assert {what for what, _, _ in told} >= {"placing frames", "placing all frames at once"}
+    rounds: list[list[tuple[str, int, int]]] = []
+    for call in told:
+        if not rounds or rounds[-1][-1][0] != call[0] or rounds[-1][-1][1] == rounds[-1][-1][2]:
+            rounds.append([])
+        rounds[-1].append(call)
+    for calls in rounds:
+        counts = [done for _, done, _ in calls]
+        assert counts == sorted(counts)
+        assert calls[-1][1] == calls[-1][2]
+    leftover = {total for what, _, total in told if what == "placing the frames left over"}
+    assert leftover == {3}  # not of all nine frames
+
+
 def test_a_part_of_the_clip_that_agrees_with_itself_but_not_with_the_rest_is_placed_again(
     store: FeatureDatabase, model: pycolmap.Reconstruction
 ):
@@ -89,6 +109,37 @@ def test_of_two_ways_to_place_a_small_clip_the_one_that_explains_more_is_kept(
     for thin_points, kept in ((1, model), (100_000, wrong if wrong_one == "_climb" else model)):
         settings = replace(SETTINGS, mapping=replace(SETTINGS.mapping, thin_points=thin_points))
         assert mapping.map_frames(store, settings, silent) == [kept]
+
+
+@pytest.mark.parametrize("share", [0.7, 1.3])
+def test_all_frames_at_once_stay_in_place_though_the_lens_was_far_off(
+    store: FeatureDatabase, monkeypatch: pytest.MonkeyPatch, share: float
+):
+    """Their lens is adjusted before frames are judged: none is taken out, and nothing is mapped in turn."""
+
+    def never(*_, **__):
+        pytest.fail("frames were mapped in turn")
+
+    monkeypatch.setattr(mapping, "_map_in_turn", never)
+    focal = WIDTH / 2 / np.tan(np.deg2rad(DiveSettings().fov / 2))
+    settings = replace(
+        SETTINGS, mapping=replace(SETTINGS.mapping, method="global", focal_ladder=(share * focal / WIDTH,))
+    )
+    found = mapping.map_frames(store, settings, silent)[0]
+    assert found.num_reg_images() == store.frames
+    assert found.cameras[1].mean_focal_length() == pytest.approx(focal, rel=0.03)
+
+
+@pytest.mark.parametrize(("known", "expected"), [(None, 0.7), (0.8, 0.8)])
+def test_the_lens_that_pairs_agree_on_is_tried_alone_unless_it_is_known(
+    store: FeatureDatabase, monkeypatch: pytest.MonkeyPatch, known: float | None, expected: float
+):
+    monkeypatch.setattr(calibration, "focal_of_pairs", lambda _: 0.7 * WIDTH)
+    settings = replace(SETTINGS, focal=None if known is None else known * WIDTH)
+    assert [lens.mean_focal_length() for lens in calibration.lenses_of_pairs(store, settings)] == [expected * WIDTH]
+    monkeypatch.setattr(calibration, "focal_of_pairs", lambda _: None)
+    tried = [lens.mean_focal_length() for lens in calibration.lenses_of_pairs(store, settings)]
+    assert tried == ([share * WIDTH for share in SETTINGS.mapping.focal_ladder] if known is None else [known * WIDTH])
 
 
 def test_distances_from_the_lines_are_below_a_pixel_in_a_right_model_and_grow_with_the_error(

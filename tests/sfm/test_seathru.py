@@ -1,5 +1,7 @@
 """The water from pixels and depths: recovery, invariances, and honesty about what cannot be known."""
 
+from dataclasses import replace
+
 import cv2
 import numpy as np
 import pytest
@@ -14,8 +16,10 @@ from swimm3r.medium import (
     srgb_from_linear,
     transmittances,
 )
+from swimm3r.sfm import seathru
 from swimm3r.sfm.seathru import estimate_medium, fit_medium
 from swimm3r.sfm.settings import SeathruSettings
+from swimm3r.sfm.water_fit import fit_channel
 from swimm3r.sfm.water_samples import WaterSamples
 
 SETTINGS = SeathruSettings()
@@ -139,6 +143,58 @@ def test_beta_D_is_the_curve_at_the_median_depth(teal):
     fit = fit_medium(samples, SETTINGS, "srgb")
     middle = samples.ray_depth.double().median().float()
     torch.testing.assert_close(fit.medium.beta_D, fit.curve.at(middle), rtol=1e-3, atol=1e-5)
+
+
+def test_surfaces_hundreds_of_times_as_far_as_the_rest_do_no_harm(teal):
+    """Where T_D is too small for a number; numerical warnings are errors here."""
+    near, g = draw_samples(teal, points=400), torch.Generator().manual_seed(0)
+    far = torch.linspace(100.0, 2000.0, 1000)
+    nothing = torch.zeros(len(far), dtype=torch.long)
+    samples = WaterSamples(
+        torch.cat([near.I, teal.Binf + 0.01 * torch.rand(len(far), 3, generator=g)]),
+        torch.cat([near.ray_depth, far]),
+        torch.cat([near.frame, nothing]),
+        torch.cat([near.track, nothing - 1]),
+        near.open_water,
+    )
+    T_D, B = errors(fit_medium(samples, SETTINGS, "srgb"), teal, near.ray_depth)
+    assert T_D < 0.05
+    assert B < 0.03
+
+
+def grey_copy(samples: WaterSamples) -> WaterSamples:
+    def grey(colours: torch.Tensor) -> torch.Tensor:
+        return colours.mean(-1, keepdim=True).expand_as(colours).contiguous()
+
+    return replace(samples, I=grey(samples.I), open_water=grey(samples.open_water))
+
+
+def test_of_a_grey_clip_one_channel_is_fitted_and_stands_for_all(teal, monkeypatch: pytest.MonkeyPatch):
+    fitted = []
+
+    def counted(*arguments):
+        fitted.append(arguments)
+        return fit_channel(*arguments)
+
+    monkeypatch.setattr(seathru, "fit_channel", counted)
+    samples = draw_samples(Medium(*(v.mean().expand(3) for v in vars(teal).values())), open_water=1000)
+    fit = fit_medium(grey_copy(samples), SETTINGS, "srgb")
+    assert len(fitted) == 1
+    for value in (fit.medium.Binf, fit.medium.beta_D, fit.medium.beta_B, fit.std.beta_D, fit.curve.a):
+        assert torch.equal(value, value[:1].expand(3))
+    assert torch.equal(fit.identifiable["beta_D"], torch.ones(3, dtype=torch.bool))
+    fit_medium(samples, SETTINGS, "srgb")
+    assert len(fitted) == 1 + 3
+
+
+def test_a_time_stamp_in_colour_leaves_a_clip_grey_and_a_tinted_clip_is_in_colour(teal):
+    samples = draw_samples(teal)
+    assert not samples.grey
+    stamped = grey_copy(samples)
+    assert stamped.grey
+    stamped.I[:3, 0] = 1.0
+    assert stamped.grey
+    assert not replace(stamped, I=stamped.I * torch.tensor([1.0, 0.97, 1.0])).grey
 
 
 def test_too_few_pixels_are_an_error_in_plain_words(teal):

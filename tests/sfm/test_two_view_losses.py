@@ -76,10 +76,23 @@ def test_confidence_in_the_sky_is_punished(views: tuple[TruePoints, TruePoints])
 def test_matching_error_of_two_rows_by_hand():
     first = torch.tensor([[[1.0, 0.0], [0.0, 1.0]]])
     second = torch.tensor([[[1.0, 0.0], [1.0, 0.0]]])  # the second of them is wrong
-    found = matching_errors(first, second)
+    found = matching_errors(first, second, least_share=0.0)
     right = math.log(2) + math.log1p(math.exp(-20.0))  # both of the other view look alike, T = 0.05
     wrong = math.log(2) + 20 + math.log1p(math.exp(-20.0))
     torch.testing.assert_close(found, torch.tensor([[right, wrong]]))
+    torch.testing.assert_close(matching_errors(first, second)[0, 0], torch.tensor(right))
+
+
+def test_a_match_rarer_than_the_least_share_costs_no_more_and_teaches_nothing():
+    first = torch.tensor([[[1.0, 0.0], [0.0, 1.0]]], requires_grad=True)
+    second = torch.tensor([[[-1.0, 0.0], [1.0, 0.0]]])  # both rows of the first view belong to the wrong one
+    bound = 2 * -math.log(1e-8)
+    found = matching_errors(first, second)
+    torch.testing.assert_close(found[0, 0], torch.tensor(bound))
+    found[0, 0].backward()
+    assert first.grad is not None
+    assert (first.grad == 0).all()
+    assert matching_errors(first, second, least_share=0.0)[0, 0] > bound
 
 
 def test_only_true_matches_are_rows_but_all_are_wrong_answers():

@@ -1,6 +1,7 @@
 """Maps that change with time: primitives and water conditioned on it, from training to the file and back."""
 
 from dataclasses import replace
+from pathlib import Path
 
 import numpy as np
 import pytest
@@ -11,6 +12,7 @@ from swimm3r.evaluate.images import psnr
 from swimm3r.frames import Frames
 from swimm3r.ground_truth import GroundTruth
 from swimm3r.held_out import FirstPose, score_views
+from swimm3r.io.cameras_json import CameraTable
 from swimm3r.io.images import read_rgb, write_rgb
 from swimm3r.renders import moments_of
 from swimm3r.splat import train
@@ -132,7 +134,7 @@ def test_held_out_frames_are_shown_at_their_own_times(tiny_dive, trained, tmp_pa
     views = score_views(scene, tiny_dive.rec, frames, poses, tmp_path, PoseRefinementSettings(steps=1))
     assert [view.time for view in views] == [0.0, 8.0]
     for view in views:
-        shown = read_rgb(tmp_path / f"{view.name}_rgb.png").astype(int)
+        shown = read_rgb(tmp_path / f"{Path(view.name).stem}_rgb.png").astype(int)
         expected = (scene.render(view.canvas, view.time).rgb.clamp(0, 1) * 255).round().int().numpy()
         assert abs(shown - expected).max() <= 1
 
@@ -156,10 +158,21 @@ def test_what_moves_is_scored_apart_where_the_truth_knows_it(tiny_dive, trained,
     assert section["psnr_still"] != section["psnr_moving"]
 
 
+def cameras_named(*names: str, times: tuple[float, ...] | None = None) -> CameraTable:
+    K, pose = (np.eye(n)[None].repeat(len(names), 0) for n in (3, 4))
+    return CameraTable(names, 64, 48, "PINHOLE", K, np.zeros((len(names), 0)), pose, times=times)
+
+
 def test_cameras_that_are_no_frames_of_the_dive_need_a_moment(tiny_dive, trained):
     scene, frames = trained[0], tiny_dive.frames
-    assert moments_of(scene, ["3.png", "8.png"], frames, None) == [3.0, 8.0]
-    assert moments_of(scene, ["elsewhere.png"], frames, 2.5) == [2.5]
+    assert moments_of(scene, cameras_named("3.png", "8.png"), frames, None) == (3.0, 8.0)
+    assert moments_of(scene, cameras_named("elsewhere.png"), frames, 2.5) == [2.5]
     with pytest.raises(InputError, match="--time SECONDS, 0 to 8"):
-        moments_of(scene, ["3.png", "elsewhere.png"], frames, None)
-    assert len(moments_of(tiny_dive.truth, ["elsewhere.png"], frames, None)) == 1
+        moments_of(scene, cameras_named("3.png", "elsewhere.png"), frames, None)
+    assert len(moments_of(tiny_dive.truth, cameras_named("elsewhere.png"), frames, None)) == 1
+
+
+def test_cameras_with_times_of_their_own_show_the_scene_then(tiny_dive, trained):
+    own = cameras_named("3.png", "elsewhere.png", times=(1.25, 6.5))
+    assert moments_of(trained[0], own, tiny_dive.frames, None) == (1.25, 6.5)
+    assert moments_of(trained[0], own, tiny_dive.frames, 2.0) == [2.0, 2.0]

@@ -88,7 +88,7 @@ def test_a_map_elsewhere_shows_and_places_what_it_does_here(tiny_dive):
         moved = scene.to(DEVICE)
         there, water = moved.render(tiny_dive.cameras[1]), mean_water(moved, tiny_dive.cameras[1])
         placed = refine_pose(moved, off, picture, mask, steps)
-    for name in ("rgb", "clear", "veil", "z_depth", "alpha"):
+    for name in ("rgb", "clear", "backscatter", "z_depth", "alpha"):
         torch.testing.assert_close(getattr(there, name), getattr(here, name), atol=2e-5, rtol=2e-4)
     torch.testing.assert_close(water.Binf, mean_water(scene, tiny_dive.cameras[1]).Binf)
     torch.testing.assert_close(placed.camera.cam2world, expected.camera.cam2world, atol=1e-4, rtol=0)

@@ -10,6 +10,7 @@ import torch
 from torch.nn.functional import normalize
 
 from swimm3r.cameras import Cameras
+from swimm3r.errors import InputError
 from swimm3r.geometry import rotation_from_quaternion
 from swimm3r.raster import rasterize
 from swimm3r.splat import gaussian_mcmc, gradient_densify
@@ -188,7 +189,7 @@ def test_noise_moves_what_is_nearly_dead_and_leaves_the_rest():
 def test_fewer_points_than_a_neighbourhood_are_refused(tiny_dive):
     cloud = tiny_dive.rec.cloud
     few = replace(tiny_dive.rec, cloud=type(cloud)(*(values[:3] for values in vars(cloud).values())))
-    with pytest.raises(ValueError, match="at least 4 points"):
+    with pytest.raises(InputError, match="at least 4 points"):
         initial_gaussians(few, GaussianInitialSettings(), torch.Generator())
 
 

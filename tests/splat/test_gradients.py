@@ -88,7 +88,7 @@ def scene(dive):
     z_depth = dive.rec.depth["4.png"].z_depth
     rgb = dive.frames.image(4).permute(2, 0, 1)
     everywhere = torch.ones(48, 64, dtype=torch.bool)
-    view = View("4.png", camera, rgb, everywhere, z_depth, torch.full_like(z_depth, 2.0), ~everywhere)
+    view = View("4.png", camera, rgb, everywhere, z_depth, ~everywhere)
     return p, view
 
 

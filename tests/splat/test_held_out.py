@@ -7,13 +7,12 @@ import torch
 
 from swimm3r.cameras import Cameras
 from swimm3r.evaluate import NotComputed
-from swimm3r.geometry import Similarity, align_similarity, pose_from, rotation_angle, so3_exp
+from swimm3r.geometry import Similarity, align_similarity, best_similarity, pose_from, rotation_angle, so3_exp
 from swimm3r.ground_truth import GroundTruth
-from swimm3r.held_out import best_similarity, covered_by_training, covered_scores, cut, first_poses, visible_window
+from swimm3r.held_out import covered_by_training, covered_scores, cut, first_poses, visible_window
 from swimm3r.reconstruction import DenseCloud
 from swimm3r.renders import smooth_path
 from swimm3r.sfm.settings import FeatureSettings
-from swimm3r.splat.views import pinhole_canvas
 
 
 def lens(k1: float) -> Cameras:
@@ -23,13 +22,13 @@ def lens(k1: float) -> Cameras:
 
 
 def test_the_window_of_a_lens_without_distortion_is_the_whole_canvas():
-    window = visible_window(lens(0.0), pinhole_canvas(lens(0.0), 0))
+    window = visible_window(lens(0.0), lens(0.0).pinhole())
     assert (window.rows, window.columns) == (slice(0, 48), slice(0, 64))
 
 
 def test_the_window_leaves_out_what_the_lens_does_not_show():
     camera = lens(0.25)
-    canvas = pinhole_canvas(camera, 0)
+    canvas = camera.pinhole()
     window = visible_window(camera, canvas)
     assert window.columns.start > 0
     assert window.columns.stop - window.columns.start > 40
@@ -79,6 +78,19 @@ def test_what_no_training_frame_saw_is_not_covered(tiny_dive):
     beyond = covered_by_training(rec, replace(camera, cam2world=away))
     assert beyond[:, :10].all()
     assert not beyond[:, 50:].any()
+
+
+def test_ground_at_a_guessed_distance_is_not_covered(tiny_dive):
+    x, y = torch.meshgrid(torch.linspace(-2.6, 2.6, 150), torch.linspace(-2.1, 2.1, 120), indexing="ij")
+    wall = torch.stack([x, y, torch.full_like(x, 3.0)], -1).reshape(-1, 3)
+    measured, guessed = wall[wall[:, 0] < 0.2], wall[wall[:, 0] >= 0.2]
+    cloud, backdrop = (DenseCloud(part, part, part) for part in (measured, guessed))
+    camera = tiny_dive.cameras[4]
+    shares = [
+        covered_by_training(rec, camera).float().mean()
+        for rec in (replace(tiny_dive.rec, cloud=cloud), replace(tiny_dive.rec, cloud=cloud, backdrop=backdrop))
+    ]
+    assert shares[0] == shares[1] < 0.9
 
 
 def test_the_covered_score_looks_at_covered_pixels_alone():

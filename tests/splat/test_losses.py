@@ -1,12 +1,15 @@
 """The terms of the objective: their limits, and gradients against autograd."""
 
+import math
+
 import pytest
 import torch
 
 from swimm3r.evaluate.images import ssim
 from swimm3r.raster import RasterOutput
 from swimm3r.splat import losses
-from swimm3r.splat.views import edge_weight
+from swimm3r.splat.settings import LossWeights, UwbsSettings
+from swimm3r.splat.views import TrainingViews
 
 
 def pictures(height: int = 40, width: int = 50) -> tuple[torch.Tensor, torch.Tensor]:
@@ -67,12 +70,19 @@ def test_a_map_at_the_prior_depth_has_no_depth_error_however_transparent():
     assert losses.depth_error(depth_images(z, alpha), z, torch.ones(2, 2), 0.5) < 1e-6
 
 
-def test_the_depth_error_is_the_papers_mean_over_known_and_covered_pixels():
+def test_the_depth_error_is_a_weighted_mean_over_known_and_covered_pixels():
     z = torch.tensor([[2.0, 3.0, 4.0, 9.0]])
     prior = torch.tensor([[4.0, 3.0, 0.0, 1.0]])
-    alpha, weight = torch.tensor([[0.8, 0.8, 0.8, 0.2]]), torch.tensor([[1.5, 2.0, 0.0, 2.0]])
-    expected = 1.5 * torch.log(torch.tensor(1.25)) / 2
+    alpha, weight = torch.tensor([[0.8, 0.8, 0.8, 0.2]]), torch.tensor([[0.5, 1.0, 1.0, 1.0]])
+    expected = 0.5 * torch.log(torch.tensor(1.25)) / 1.5
     torch.testing.assert_close(losses.depth_error(depth_images(z, alpha), prior, weight, 0.5), expected)
+
+
+def test_a_picture_without_known_depth_has_no_depth_error():
+    z = torch.full((2, 2), 3.0)
+    images = depth_images(z, torch.ones(2, 2))
+    assert losses.depth_error(images, torch.zeros(2, 2), torch.ones(2, 2), 0.5) == 0
+    assert losses.depth_error(images, z + 1, torch.zeros(2, 2), 0.5) == 0  # every weight underflows
 
 
 def test_the_depth_gradient_agrees_with_finite_differences():
@@ -120,11 +130,32 @@ def test_colours_in_view_are_drawn_back_to_those_that_there_are(primitives):
 
 
 def test_depth_may_step_where_colour_does():
-    rgb = torch.zeros(6, 8, 3)
-    rgb[:, 4:] = 1.0
-    weight = edge_weight(rgb)
-    assert weight[3, 0] == 2
-    assert weight[3, 3] == pytest.approx(1 + torch.exp(torch.tensor(-1.0)).item())
+    rgb = torch.zeros(3, 6, 8)
+    rgb[:, :, 4:] = 0.2
+    weight = losses.edge_weight(rgb, 10.0)
+    assert weight[3, 0] == 1
+    assert weight[3, 3] == pytest.approx((1 + math.exp(-2.0)) / 2)
+    assert (losses.edge_weight(rgb, 0.0) == 1).all()
+
+
+def test_the_weights_are_normalised_so_that_lambda_depth_is_what_it_says(tiny_dive):
+    """1 / D is 0.1 too large everywhere; DN-Splatter's own two means, one per axis, would count that twice."""
+    view = TrainingViews(tiny_dive.rec, tiny_dive.frames, UwbsSettings(), 1.0)[2]
+    images = depth_images(view.z_depth, torch.ones_like(view.z_depth))
+    off = view.z_depth / (1 + 0.1 * view.z_depth)
+    for scale in (0.0, 1.0, 10.0, 100.0):
+        error = losses.depth_error(images, off, losses.edge_weight(view.rgb, scale), 0.5)
+        assert error.item() == pytest.approx(math.log(1.1), rel=1e-5)
+
+
+def test_an_edge_of_a_tenth_counts_half_or_less_by_default():
+    """On ruie_teal_rocks the depth maps step twice as far there as where the picture is flat (benchmarks/README.md)."""
+    rgb = torch.zeros(3, 6, 8)
+    rgb[:, :, 4:] += 0.1
+    rgb[:, 3:] += 0.1
+    corner = losses.edge_weight(rgb, LossWeights().depth_edges)[2, 3]
+    assert corner < 0.5
+    assert corner < 0.5 * losses.edge_weight(rgb, LossWeights().depth_edges)[0, 0]
 
 
 def test_only_oversize_primitives_are_held_back(primitives):

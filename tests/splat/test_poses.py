@@ -47,6 +47,8 @@ def test_smaller_pictures_are_looked_at_first_for_half_of_the_steps():
     assert sizes(settings, 400) == [60, 120, 240]
     assert sizes(settings, 150) == [75, 150]
     assert sizes(settings, 64) == [64]
+    assert sizes(PoseRefinementSettings(long_side=0), 1600) == [400, 800, 1600]
+    assert sizes(PoseRefinementSettings(long_side=0, halvings=0), 1600) == [1600]
     assert ends(300, 3) == [75, 150, 300]
     assert ends(300, 1) == [300]
     assert ends(0, 3) == [0, 0, 0]
@@ -57,6 +59,23 @@ def test_a_pose_that_is_right_stays(tiny_dive):
     refined = refine_pose(tiny_dive.truth, true, tiny_dive.frames.image(3), SEEN, PoseRefinementSettings(steps=5))
     assert refined.loss <= refined.start_loss
     assert (refined.camera.centres - true.centres).norm() < 5e-3
+
+
+def test_a_picture_of_full_size_is_the_training_pictures_not_the_frames(tiny_dive, monkeypatch):
+    small = replace(tiny_dive.truth, settings=replace(tiny_dive.truth.settings, long_side=32))
+    seen = []
+    monkeypatch.setattr("swimm3r.splat.poses.pictures", lambda p, f, view, *_: seen.append(view.width) or drawn(view))
+    for settings in (PoseRefinementSettings(steps=1, long_side=0), PoseRefinementSettings(steps=1)):
+        refine_pose(small, tiny_dive.cameras[3], tiny_dive.frames.image(3), SEEN, settings)
+    assert set(seen) == {32}
+
+
+def drawn(view):
+    """Black, and differentiable in the pose."""
+    from swimm3r.raster import RasterOutput
+
+    rgb = torch.zeros(3, view.height, view.width) + 0 * view.t.sum().float()
+    return RasterOutput(rgb, rgb, rgb[0], rgb[0])
 
 
 def test_no_motion_is_the_given_pose():

@@ -9,7 +9,7 @@ import torch
 from swimm3r.evaluate.images import psnr
 from swimm3r.presets import RunSettings, from_yaml, to_yaml
 from swimm3r.splat import train
-from swimm3r.splat.checkpoint import load_map, read
+from swimm3r.splat.checkpoint import load_map
 from swimm3r.splat.primitives import BetaPrimitives
 from swimm3r.splat.settings import (
     RECIPES,
@@ -49,11 +49,11 @@ def test_ubs_as_the_python_api_has_it():
 def test_ubs_paints_the_water_onto_the_scene(tiny_dive, tmp_path):
     """Nothing is known of the water afterwards: the clear picture is the filmed one."""
     scene = train(tiny_dive.rec, tiny_dive.frames, with_recipe(FEW, "ubs"), tmp_path)
-    assert read(tmp_path / "map.safetensors").about["recipe"] == "ubs"
+    assert recipe_of(load_map(tmp_path / "map.safetensors").settings) == "ubs"
     view = tiny_dive.cameras[4]
     out = load_map(tmp_path / "map.safetensors").render(view)
     assert torch.equal(out.rgb, scene.render(view).rgb)
-    assert not out.veil.any()
+    assert not out.backscatter.any()
     covered = out.alpha > 0.5
     torch.testing.assert_close(out.rgb[covered], out.clear[covered] * out.alpha[covered][:, None])
 

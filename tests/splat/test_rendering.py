@@ -1,4 +1,4 @@
-"""Pictures of a map: water, clear colours, veil and depth are consistent."""
+"""Pictures of a map: water, clear colours, backscatter and depth are consistent."""
 
 from dataclasses import replace
 
@@ -18,7 +18,7 @@ def test_where_nothing_is_there_is_only_water(wall, camera):
     empty = replace(scene, primitives=select(scene.primitives, torch.zeros(0, dtype=torch.int64)))
     out = empty.render(camera())
     torch.testing.assert_close(out.rgb, out.medium.Binf, atol=1e-6, rtol=0)
-    torch.testing.assert_close(out.veil, out.rgb)
+    torch.testing.assert_close(out.backscatter, out.rgb)
     assert (out.z_depth == 0).all()
     assert (out.clear == 0).all()
 
@@ -44,11 +44,11 @@ def test_a_surface_looks_as_the_water_makes_it_look_along_the_ray(wall, camera):
     assert out.z_depth[50, 6] == pytest.approx(4.0, abs=1e-3)
 
 
-def test_the_picture_is_the_veil_plus_what_comes_through(wall, camera):
+def test_the_picture_is_the_backscatter_plus_what_comes_through(wall, camera):
     scene = wall()
     out = scene.render(camera())
-    assert (out.veil <= out.medium.Binf + 1e-5).all()
-    assert (out.rgb >= out.veil - 1e-5).all()
+    assert (out.backscatter <= out.medium.Binf + 1e-5).all()
+    assert (out.rgb >= out.backscatter - 1e-5).all()
 
 
 def test_without_water_the_picture_is_the_clear_one(wall, camera):
@@ -77,7 +77,7 @@ def test_more_water_between_means_less_clear_colour(wall, camera):
     pose[:, 2, 3] -= 1.5
     far = scene.render(replace(view, cam2world=pose))
     both = (near.alpha > 0.95) & (far.alpha > 0.95)
-    through = [(o.rgb - o.veil)[both].mean() / o.clear[both].mean() for o in (near, far)]
+    through = [(o.rgb - o.backscatter)[both].mean() / o.clear[both].mean() for o in (near, far)]
     assert through[1] < 0.8 * through[0]
 
 

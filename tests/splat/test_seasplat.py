@@ -43,7 +43,7 @@ def view_like(images: RasterOutput) -> View:
     rgb = torch.rand(3, height, width, generator=rng).to(images.alpha)
     seen = torch.ones(height, width, dtype=torch.bool)
     nothing = torch.zeros(height, width)
-    return View("a", camera, rgb, seen, nothing, nothing, nothing > 0)
+    return View("a", camera, rgb, seen, nothing, nothing > 0)
 
 
 @pytest.fixture
@@ -226,8 +226,8 @@ def test_a_map_shows_its_water_as_coefficients_that_take_the_same_light(tiny_div
         ]
     )
     ray_depth = z * rays.norm(dim=0).reshape(48, 64)
-    veil = out.medium.Binf * (1 - torch.exp(-out.medium.beta_B * ray_depth[..., None]))
-    torch.testing.assert_close(veil, out.veil, rtol=1e-4, atol=1e-5)
+    backscatter = out.medium.Binf * (1 - torch.exp(-out.medium.beta_B * ray_depth[..., None]))
+    torch.testing.assert_close(backscatter, out.backscatter, rtol=1e-4, atol=1e-5)
     mean = mean_water(scene, tiny_dive.cameras[4])
     torch.testing.assert_close(mean.beta_D, out.medium.beta_D.flatten(0, 1).mean(0))
 

@@ -8,6 +8,7 @@ from pathlib import Path
 import pytest
 import torch
 
+from swimm3r.errors import UsageError
 from swimm3r.evaluate.images import psnr
 from swimm3r.splat import train
 from swimm3r.splat.checkpoint import load_map
@@ -71,6 +72,8 @@ def test_an_interrupted_training_ends_with_the_bits_of_one_that_was_not(tiny_div
     with pytest.raises(StoppedError):
         train(tiny_dive.rec, tiny_dive.frames, SETTINGS, tmp_path / "cut", stop_at(27))
     assert not (tmp_path / "cut/map.safetensors").exists()
+    with (tmp_path / "cut/metrics.jsonl").open("a") as torn:
+        torn.write('{"step": 30, "loss": {"l1": 0.5}')
     resumed = train(tiny_dive.rec, tiny_dive.frames, SETTINGS, tmp_path / "cut")
     assert equal(whole, resumed)
     assert len(whole.primitives.xyz) > 500
@@ -171,3 +174,10 @@ def test_rates_settle_from_half_of_the_run_on(tiny_dive):
             moved.append((after - start.primitives.opacity).abs().max())
         assert moved[0] > 0
         torch.testing.assert_close(moved[1], share * moved[0], rtol=1e-4, atol=0)
+
+
+def test_a_near_plane_behind_the_scene_is_refused_before_training(tiny_dive, tmp_path):
+    settings = replace(SETTINGS, render=replace(SETTINGS.render, near=10.0))
+    with pytest.raises(UsageError, match="near plane"):
+        train(tiny_dive.rec, tiny_dive.frames, settings, tmp_path)
+    assert not any(tmp_path.iterdir())

@@ -11,7 +11,7 @@ from swimm3r.frames import Frame, Frames
 from swimm3r.io.images import write_rgb
 from swimm3r.reconstruction import DepthMap, DepthMaps
 from swimm3r.splat.settings import UwbsSettings
-from swimm3r.splat.views import TrainingViews, median_z_depth, pinhole_canvas, undistorted, working_scale
+from swimm3r.splat.views import TrainingViews, median_z_depth, undistorted, working_scale
 
 
 def lens(width: int = 96, height: int = 64, k: float = -0.15) -> Cameras:
@@ -31,7 +31,7 @@ def scenery(camera: Cameras) -> torch.Tensor:
 @pytest.mark.parametrize("long_side", [0, 48])
 def test_an_undistorted_picture_shows_what_a_pinhole_camera_would(long_side: int):
     camera = lens()
-    canvas = pinhole_canvas(camera, long_side)
+    canvas = camera.pinhole(long_side)
     assert max(canvas.width, canvas.height) == (long_side or 96)
     got, seen = undistorted(scenery(camera), torch.ones(64, 96, dtype=torch.bool), camera, canvas)
     assert seen.double().mean() > 0.95
@@ -43,7 +43,7 @@ def test_an_undistorted_picture_shows_what_a_pinhole_camera_would(long_side: int
 def test_a_picture_without_distortion_keeps_its_bits():
     camera = replace(lens(), distortion=torch.zeros(1, 1, dtype=torch.float64))
     picture = torch.rand(64, 96, 3)
-    got, seen = undistorted(picture, torch.ones(64, 96, dtype=torch.bool), camera, pinhole_canvas(camera, 0))
+    got, seen = undistorted(picture, torch.ones(64, 96, dtype=torch.bool), camera, camera.pinhole())
     assert torch.equal(got, picture)
     assert seen.all()
 
@@ -51,7 +51,7 @@ def test_a_picture_without_distortion_keeps_its_bits():
 def test_what_the_lens_did_not_see_is_not_seen():
     """A pincushion lens's picture does not reach the corners of its pinhole canvas."""
     camera = lens(k=0.3)
-    _, seen = undistorted(scenery(camera), torch.ones(64, 96, dtype=torch.bool), camera, pinhole_canvas(camera, 0))
+    _, seen = undistorted(scenery(camera), torch.ones(64, 96, dtype=torch.bool), camera, camera.pinhole())
     assert not seen[0, 0]
     assert seen[32, 48]
 
@@ -60,7 +60,7 @@ def test_a_mask_is_undistorted_with_its_picture():
     camera = lens()
     mask = torch.ones(64, 96, dtype=torch.bool)
     mask[:, :48] = False
-    _, seen = undistorted(scenery(camera), mask, camera, pinhole_canvas(camera, 0))
+    _, seen = undistorted(scenery(camera), mask, camera, camera.pinhole())
     assert not seen[:, :46].any()
     assert seen[20:40, 52:80].all()
 

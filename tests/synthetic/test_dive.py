@@ -188,11 +188,29 @@ def test_a_written_dive_is_read_back_as_its_truth(fishy, tmp_path, monkeypatch):
             assert (images.read_mask(folder / f"{name}.png") == frame.usable.numpy()).all()
 
 
-def test_a_folder_with_another_dives_pictures_is_refused(tmp_path):
-    (tmp_path / "images").mkdir()
-    (tmp_path / "images" / "0007.png").touch()
-    with pytest.raises(InputError, match=r"0007\.png"):
-        write_dive(replace(QUIET, frames=2, width=60, height=40), tmp_path)
+def test_a_folder_with_anything_else_in_it_is_refused(tmp_path):
+    settings = replace(QUIET, frames=2, width=60, height=40)
+    (tmp_path / "mine" / "images").mkdir(parents=True)
+    (tmp_path / "mine" / "images" / "0000.png").write_text("of somebody else, under a dive's own name")
+    write_dive(replace(settings, seed=1), tmp_path / "other")
+    for folder in (tmp_path / "mine", tmp_path / "other"):
+        before = {path: path.read_bytes() for path in folder.rglob("*") if path.is_file()}
+        with pytest.raises(InputError, match="holds other things than this dive"):
+            write_dive(settings, folder)
+        assert {path: path.read_bytes() for path in folder.rglob("*") if path.is_file()} == before
+
+
+def test_a_dive_that_was_interrupted_is_made_whole(tmp_path):
+    def interrupt(what: str, done: int, total: int, /) -> None:
+        if done == 1:
+            raise KeyboardInterrupt
+
+    settings = replace(QUIET, frames=2, width=60, height=40)
+    with pytest.raises(KeyboardInterrupt):
+        write_dive(settings, tmp_path, interrupt)
+    assert not (tmp_path / "images" / "0001.png").exists()
+    write_dive(settings, tmp_path)
+    assert (tmp_path / "images" / "0001.png").is_file()
 
 
 @pytest.mark.parametrize(

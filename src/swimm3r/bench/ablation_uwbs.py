@@ -6,19 +6,21 @@ terms (the water's prior, coverage) stay as they are in every variant, and need 
 
 import shutil
 from collections.abc import Sequence
-from dataclasses import asdict, dataclass, replace
+from dataclasses import dataclass, replace
 from functools import partial
 from pathlib import Path
 
 from swimm3r import held_out
 from swimm3r.bench.cells import Cell, Place, Scores, kept_cell, over_scenes
+from swimm3r.bench.inputs import lpips_weights, reconstruction_of
 from swimm3r.bench.map_scores import map_scores, trained
 from swimm3r.bench.scores import columns
-from swimm3r.bench.settings import JobSettings
+from swimm3r.bench.settings import JobSettings, Seeds
 from swimm3r.bench.tables import Table
 from swimm3r.errors import InputError
 from swimm3r.progress import Progress, silent
 from swimm3r.run import FinishedSfm, open_finished_sfm
+from swimm3r.settings import accepted
 from swimm3r.splat.settings import PoseRefinementSettings, UwbsSettings
 
 COLUMNS = columns("psnr", "ssim_3dgs", "lpips_vgg", "sharpness", "clear_psnr", "train_cpu_seconds")
@@ -59,8 +61,10 @@ def ablate(
 ) -> Table:
     """The scores of every run, variant and seed; `full` is what the paper calls UWBS (full).
 
-    Raises InputError where a folder holds no finished structure from motion, or two have one name.
+    Raises InputError where a folder holds no finished structure from motion, or two have one name, and UsageError for
+    no seed.
     """
+    accepted("seeds", seeds, Seeds)
     names = [run.resolve().name for run in runs]
     if len(set(names)) < len(names):
         raise InputError(
@@ -89,9 +93,10 @@ def _cells_of_run(
     for seed in range(seeds):  # seed by seed, so that what is there at any time can be compared
         for variant in VARIANTS:
             settings = variant.settings(full, seed)
-            depends_on = [sfm.key, asdict(settings), asdict(test), [c.score for c in COLUMNS]]
+            made_from = [reconstruction_of(run, sfm), settings]
+            scored_by = [test, lpips_weights(), [c.score for c in COLUMNS]]
             place = Place(run.resolve().name, variant.name, seed)
-            cells.append(kept_cell(out, place, depends_on, partial(scores, settings)))
+            cells.append(kept_cell(out, place, made_from, partial(scores, settings), scored_by))
     return cells
 
 

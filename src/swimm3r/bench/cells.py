@@ -1,8 +1,13 @@
 """One cell of a table: the scores of one method on one scene under one seed.
 
-A cell's folder OUT/SCENE/METHOD/SEED keeps what the method made (a map, pictures) and scores.json with the key of
-everything the scores depend on: a cell that is there is not computed again, one that was cut short goes on from what
-its folder holds. Torch-free: worker processes learn their share of the cores before torch starts its threads.
+A cell's folder OUT/SCENE/METHOD/SEED keeps what the method made (a map, pictures) and two keys (`io.cache_key`):
+
+    made_from.json   of everything that decides what the method makes: input, settings, weights, the package's code
+    scores.json      of that and of what decides the scores alone: the reference, weights of perceptual scores
+
+A cell whose scores have the key is not computed again. One that was cut short, or is only scored differently, goes on
+from what its folder holds; what was made from something else is set aside in SEED/old and never taken for it.
+Torch-free: worker processes learn their share of the cores before torch starts its threads.
 """
 
 import json
@@ -12,7 +17,6 @@ from collections.abc import Callable, Mapping, Sequence
 from concurrent.futures import ProcessPoolExecutor
 from dataclasses import dataclass, field
 from functools import partial
-from hashlib import sha256
 from multiprocessing import get_context
 from pathlib import Path
 from typing import Any
@@ -21,6 +25,7 @@ from swimm3r.bench.settings import JobSettings
 from swimm3r.errors import DeviceError, Swimm3rError, UsageError, WeightsError
 from swimm3r.evaluate import NotComputed, summary_entries
 from swimm3r.io.atomic import write_text
+from swimm3r.io.cache_key import cache_key, code_version
 from swimm3r.progress import Progress, silent
 
 Scores = Mapping[str, float | NotComputed]
@@ -55,23 +60,29 @@ def scene_folder(out: Path, scene: str) -> Path:
     return out / _plain(scene)
 
 
+_MARK, _OLD = "made_from.json", "old"
+
 SceneWork = Callable[..., list[Cell]]
 """`work(scene, progress=...)`; a `partial` of a module's function, for it is sent to other processes."""
 
 
-def kept_cell(out: Path, place: Place, depends_on: object, make: Callable[[Path], Scores]) -> Cell:
+def kept_cell(
+    out: Path, place: Place, made_from: object, make: Callable[[Path], Scores], scored_by: object = None
+) -> Cell:
     """The cell of that place, from its folder where it was computed from the same; else `make(folder)` computes it.
 
-    `depends_on` is anything JSON can hold (paths by their names). Where weights or a device are missing the cell says
-    so and is not kept: the next call tries again.
+    `made_from` decides what the method makes, `scored_by` besides it the scores; both are what `cache_key` takes, and
+    the package's code counts by itself. Where weights or a device are missing the cell says so and is not kept: the
+    next call tries again.
     """
     folder = place.folder(out)
     path = folder / "scores.json"
-    key = sha256(json.dumps(depends_on, sort_keys=True, default=str).encode()).hexdigest()
-    if path.is_file():
-        stored = json.loads(path.read_text(encoding="utf-8"))
-        if stored.get("key") == key:
-            return Cell(place.scene, place.method, place.seed, _scores(stored["scores"]))
+    work = cache_key(code_version(), made_from)
+    key = cache_key(work, scored_by)
+    stored = _stored(path)
+    if stored.get("key") == key:
+        return Cell(place.scene, place.method, place.seed, _scores(stored["scores"]))
+    _set_aside(folder, work)
     try:
         scores = dict(make(folder))
     except (WeightsError, DeviceError) as missing:
@@ -79,6 +90,44 @@ def kept_cell(out: Path, place: Place, depends_on: object, make: Callable[[Path]
     document = {"key": key, "scene": place.scene, "method": place.method, "seed": place.seed}
     write_text(path, json.dumps({**document, "scores": summary_entries(scores)}, indent=2) + "\n")
     return Cell(place.scene, place.method, place.seed, _scores(summary_entries(scores)))
+
+
+def _set_aside(folder: Path, work: str) -> None:
+    """Leaves in a cell's folder only what was made from that key; the rest moves into folder/old."""
+    mark = folder / _MARK
+    before = _stored(mark).get("key")
+    if before == work:
+        return
+    others = [path for path in folder.iterdir() if path.name != _OLD] if folder.is_dir() else []
+    if others:
+        known = before[:8] if isinstance(before, str) else "unknown"
+        count = len(list((folder / _OLD).glob(f"{known}-*"))) if (folder / _OLD).is_dir() else 0
+        aside = folder / _OLD / f"{known}-{count}"
+        aside.mkdir(parents=True)
+        for path in others:
+            path.rename(aside / path.name)
+    write_text(mark, json.dumps({"key": work}) + "\n")
+
+
+def _stored(path: Path) -> dict[str, Any]:
+    """A record of this module; empty where there is none, or one that cannot be read: the cell is then made anew."""
+    try:
+        found = json.loads(path.read_text(encoding="utf-8"))
+    except (FileNotFoundError, NotADirectoryError, ValueError, RecursionError):
+        return {}
+    return found if isinstance(found, dict) else {}
+
+
+def check_choice(what: str, chosen: Sequence[str], against: str | None = None) -> None:
+    """Raises UsageError where nothing is compared, or differences are asked from something that is not."""
+    if not chosen:
+        raise UsageError(f"no {what} were named", cause=f"--{what} stands alone", hint=f"leave --{what} out for all")
+    if against is not None and against not in chosen:
+        raise UsageError(
+            f"differences cannot be taken from {against}: it is not among the {what}",
+            cause=f"compared are {', '.join(chosen)}",
+            hint=f"--against one of them, or add {against} to --{what}",
+        )
 
 
 def over_scenes(

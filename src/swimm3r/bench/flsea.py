@@ -6,20 +6,19 @@ structure from motion of the restored (seaErra) pictures of the same frames, mad
 set's calibration where that has a distortion, and begins with its focal length where it has none.
 """
 
-import json
 import os
 import shutil
 from collections.abc import Sequence as Many
 from contextlib import suppress
-from dataclasses import asdict, replace
+from dataclasses import replace
 from functools import partial
-from hashlib import sha256
 from pathlib import Path
 
 import torch
 
 from swimm3r.bench import reference
-from swimm3r.bench.cells import Cell, Place, Scores, kept_cell, over_scenes, scene_folder
+from swimm3r.bench.cells import Cell, Place, Scores, check_choice, kept_cell, over_scenes, scene_folder
+from swimm3r.bench.inputs import files_of
 from swimm3r.bench.scores import columns
 from swimm3r.bench.settings import JobSettings, SfmMethods
 from swimm3r.bench.sfm_methods import reference_scores, settings_for
@@ -33,9 +32,11 @@ from swimm3r.evaluate.depth import depth_scores
 from swimm3r.frame_settings import FrameSettings
 from swimm3r.frames import Frames
 from swimm3r.ground_truth import GroundTruth
+from swimm3r.io.cache_key import cache_key
 from swimm3r.prepare import load_frames, read_frames
 from swimm3r.progress import Progress, silent
 from swimm3r.reconstruction import Reconstruction
+from swimm3r.settings import Count, accepted
 from swimm3r.sfm import reconstruct
 from swimm3r.sfm.settings import ColmapSettings, Mast3rSettings, SfmSettings
 
@@ -61,8 +62,10 @@ def compare_on_flsea(
 ) -> Table:
     """Every method on every test sequence below `root`, or on those that `sequences` names.
 
-    Raises InputError where there is none of them.
+    Raises InputError where there is none of them, and UsageError for no method.
     """
+    check_choice("methods", given.methods)
+    accepted("stride", stride, Count)
     found = chosen_sequences(root, sequences)
     options = {"root": root, "out": out, "given": given, "colmap": colmap, "mast3r": mast3r, "stride": stride}
     cells = over_scenes(found, partial(_cells_of_sequence, **options), out, how or JobSettings(), progress)
@@ -107,10 +110,10 @@ def _cells_of_sequence(
         if isinstance(chosen, NotComputed):
             cells.append(Cell(scene, method, 0, not_run=chosen.reason))
             continue
-        depends_on = [_listing(frames), type(chosen).__name__, asdict(chosen), reference.digest(truth)]
-        depends_on.append([c.score for c in COLUMNS])
+        made_from = [_listing(frames), chosen, files_of(chosen)]
+        scored_by = [reference.digest(truth), [c.score for c in COLUMNS]]
         make = partial(_scores, sequence=sequence, frames=frames, settings=chosen, truth=truth, progress=progress)
-        cells.append(kept_cell(out, Place(scene, method), depends_on, make))
+        cells.append(kept_cell(out, Place(scene, method), made_from, make, scored_by))
     return cells
 
 
@@ -148,7 +151,7 @@ def reference_of(
 def _frames(pictures: dict[str, Path], folder: Path, progress: Progress) -> Frames:
     """The pictures as frames, none of them held back; prepared once into a folder by what they are."""
     listing = sorted(f"{name}|{path}|{path.stat().st_size}" for name, path in pictures.items())
-    folder = folder / sha256("\n".join(listing).encode()).hexdigest()[:12]
+    folder = folder / cache_key(listing)[:12]
     if not (folder / "prepare" / "frames.json").is_file():
         together = folder / "pictures"
         together.mkdir(parents=True, exist_ok=True)
@@ -174,13 +177,9 @@ def _scores(
     truth: GroundTruth | NotComputed,
     progress: Progress,
 ) -> Scores:
-    everything = [type(settings).__name__, asdict(settings), _listing(frames)]
-    work = folder / f"sfm-{sha256(json.dumps(everything, default=str).encode()).hexdigest()[:12]}"
-    for other in set(folder.glob("sfm-*")) - {work}:  # of other settings, which would be taken for these
-        shutil.rmtree(other)
     rec = None
     with suppress(RegistrationError):  # its row then says that nothing was registered
-        rec = reconstruct(frames, settings, work, progress)
+        rec = reconstruct(frames, settings, folder / "sfm", progress)
     placed = 0 if rec is None else len(rec.names)
     return {
         **sequence_depth_scores(rec, sequence, frames.names, progress),
@@ -194,7 +193,7 @@ def sequence_depth_scores(
 ) -> dict[str, float | NotComputed]:
     """Means over the frames that have depth; each frame is scaled by its median, and loaded alone."""
     index = {shot.name: i for i, shot in enumerate(sequence.shots)}
-    totals, scored, known, covered = torch.zeros(3).double(), 0, 0, 0.0
+    totals, scored, known, covered = torch.zeros(3, dtype=torch.float64), 0, 0, 0.0
     for done, name in enumerate(names):
         progress("scoring depth", done, len(names))
         true = load(sequence, index[Path(name).stem]).z_depth
@@ -206,7 +205,7 @@ def sequence_depth_scores(
             continue
         frame = depth_scores([rec.depth[name].z_depth], [true])
         if not isinstance(frame.absrel, NotComputed):
-            totals += torch.tensor([frame.absrel, frame.delta_125, frame.rmse_log]).double()
+            totals += torch.tensor([frame.absrel, frame.delta_125, frame.rmse_log], dtype=torch.float64)
             covered += pixels * float(frame.coverage) if not isinstance(frame.coverage, NotComputed) else 0.0
             scored += 1
     scores = ("absrel_median", "delta125_median", "rmselog_median")

@@ -9,7 +9,7 @@ Each map is measured in a process of its own, so that neither memory nor time de
 
 import json
 from collections.abc import Sequence
-from dataclasses import asdict, dataclass
+from dataclasses import dataclass
 from functools import partial
 from pathlib import Path
 
@@ -20,21 +20,23 @@ from torch import Tensor
 from swimm3r import devices
 from swimm3r.bench import reference
 from swimm3r.bench.cells import Cell, Place, Scores, kept_cell, over_scenes, scene_folder
+from swimm3r.bench.inputs import reconstruction_of, weights_digest
 from swimm3r.bench.memory import in_own_process, with_peak_mb
 from swimm3r.bench.runs import POSES_REFINED, Clip, SfmRun, clips_of
 from swimm3r.bench.scores import columns
 from swimm3r.bench.settings import JobSettings
 from swimm3r.bench.tables import Table
-from swimm3r.errors import InputError
+from swimm3r.errors import InputError, WeightsError
 from swimm3r.evaluate import NotComputed
 from swimm3r.evaluate.poses import RelativePoseErrors, relative_pose_errors, rra, rta
-from swimm3r.geometry import rotation_angle
+from swimm3r.geometry import best_similarity, rotation_angle
 from swimm3r.ground_truth import GroundTruth
-from swimm3r.held_out import best_similarity
 from swimm3r.io import images
+from swimm3r.io.cache_key import content_digest
 from swimm3r.localization.batch import Answer, Query, answer, match_picture
+from swimm3r.localization.matchers import chosen_matcher
 from swimm3r.localization.protocol import STAGES, Localizer
-from swimm3r.localization.settings import LocalizationSettings
+from swimm3r.localization.settings import GS_CPR, LocalizationSettings, with_checkpoint_of
 from swimm3r.progress import Progress, silent
 from swimm3r.reconstruction import Reconstruction
 from swimm3r.run import FinishedSfm
@@ -63,18 +65,21 @@ def localise(
     out: Path,
     settings: LocalizationSettings | None = None,
     maps: Path | None = None,
+    references: Path | None = None,
     how: JobSettings | None = None,
     progress: Progress = silent,
 ) -> Table:
     """Every test frame of every run in each of its maps; `maps` is a folder that `bench render` filled.
 
-    Raises InputError where a run has no map, or holds no finished structure from motion.
+    `references` holds NAME.json (a cameras.json) of all frames of every clip, in the place of our own. Raises
+    InputError where a run has no map, or holds no finished structure from motion, or a clip has no reference there.
     """
     clips = clips_of(runs)
+    reference.required(references, [clip.name for clip in clips])
     for clip in clips:
         for run in clip.runs:
             maps_of(run, maps)
-    work = partial(_cells_of_clip, out=out, settings=settings or LocalizationSettings(), maps=maps)
+    work = partial(_cells_of_clip, out=out, settings=settings or GS_CPR, maps=maps, references=references)
     cells = over_scenes(clips, work, out, how or JobSettings(), progress)
     return Table("localisation", "Test frames placed in maps", cells, COLUMNS)
 
@@ -103,30 +108,41 @@ def maps_of(run: SfmRun, maps: Path | None) -> list[FoundMap]:
 
 
 def _cells_of_clip(
-    clip: Clip, /, *, out: Path, settings: LocalizationSettings, maps: Path | None, progress: Progress
+    clip: Clip,
+    /,
+    *,
+    out: Path,
+    settings: LocalizationSettings,
+    maps: Path | None,
+    references: Path | None,
+    progress: Progress,
 ) -> list[Cell]:
-    first = clip.runs[0].open()
-    truth = reference.of_clip(first, scene_folder((maps or out) / "references", clip.name), progress)
+    truth = reference.given(references, clip.name)
+    if truth is None:
+        own = scene_folder((maps or out) / "references", clip.name)
+        truth = reference.of_clip(clip.runs[0].open(), own, progress)
     cells = []
-    keys = {run.folder: run.open().key for run in clip.runs}
+    keys = {run.folder: reconstruction_of(run.folder, run.open()) for run in clip.runs}
     work = [(run, found) for run in clip.runs for found in maps_of(run, maps)]
     for done, (run, found) in enumerate(work):
         progress("localising in maps", done, len(work))
-        stat = found.path.stat()
-        depends_on = [
-            keys[run.folder],
-            str(found.path),
-            stat.st_size,
-            stat.st_mtime_ns,
-            asdict(settings),
-            reference.digest(truth),
-            [c.score for c in COLUMNS],
-        ]
+        chosen = with_checkpoint_of(settings, run.open().settings.sfm)
+        made_from = [keys[run.folder], content_digest(found.path), chosen, _matcher(chosen)]
+        scored_by = [reference.digest(truth), [c.score for c in COLUMNS]]
         place = Place(clip.name, found.method, found.seed)
-        scores = partial(_scores, run=run, path=found.path, truth=truth, settings=settings)
-        cells.append(kept_cell(out, place, depends_on, partial(in_own_process, scores)))
+        scores = partial(_scores, run=run, path=found.path, truth=truth, settings=chosen)
+        cells.append(kept_cell(out, place, made_from, partial(in_own_process, scores), scored_by))
     progress("localising in maps", len(work), len(work))
     return cells
+
+
+def _matcher(settings: LocalizationSettings) -> list[str | None]:
+    """The matcher that is used here, with its weights."""
+    try:
+        chosen = chosen_matcher(settings)
+    except WeightsError as unfit:  # the cell then says the same
+        return [unfit.what]
+    return [chosen, weights_digest("mast3r", settings.weights) if chosen == "mast3r" else None]
 
 
 def _scores(

@@ -1,12 +1,13 @@
 """The scores of a trained map on held-out frames, as the rendering tables print them."""
 
-import json
 from pathlib import Path
 
 from swimm3r import devices, held_out
 from swimm3r.bench.cells import Scores
 from swimm3r.evaluate import NotComputed
 from swimm3r.io import images
+from swimm3r.io.metrics_log import read_rows
+from swimm3r.io.view_names import view_stems
 from swimm3r.progress import Progress, silent
 from swimm3r.run import FinishedSfm
 from swimm3r.splat import train
@@ -18,12 +19,10 @@ from swimm3r.summary import truth_section
 
 
 def trained(sfm: FinishedSfm, settings: SplatSettings, folder: Path, progress: Progress = silent) -> SplatMap:
-    """The map in `folder`, trained there where it is not finished yet."""
+    """The map in a cell's folder, trained there where it is not finished yet."""
     path = folder / "map.safetensors"
     if path.is_file():
-        scene = load_map(path)
-        if scene.settings == settings:
-            return scene.to(devices.for_maps())
+        return load_map(path).to(devices.for_maps())
     return train(sfm.rec, sfm.frames, settings, folder, progress)
 
 
@@ -44,10 +43,11 @@ def map_scores(
     views = held_out.score_views(
         scene, sfm.rec, sfm.frames, there, folder / "test", test, sfm.settings.sfm.restore, progress
     )
+    stems = view_stems(sfm.frames.names)
     for view in views:
         f, window = sfm.frames.index(view.name), (view.window.rows, view.window.columns)
         target, _ = undistorted(sfm.frames.image(f), sfm.frames.mask(f), view.lens, view.canvas)
-        images.write_rgb(folder / "test" / f"{view.name}_target.png", target[window].numpy())
+        images.write_rgb(folder / "test" / f"{stems[view.name]}_target.png", target[window].numpy())
     mean = held_out.mean_scores(views)
     scores: dict[str, float | NotComputed] = {
         "psnr": mean.psnr,
@@ -71,8 +71,7 @@ def map_scores(
 
 def _training_seconds(folder: Path, settings: SplatSettings) -> float | NotComputed:
     """By the record of the training, so that a map scored again keeps what it took."""
-    path = folder / "metrics.jsonl"
-    if not path.is_file():
+    rows = read_rows(folder / "metrics.jsonl")
+    if not rows or "cpu_seconds_per_step" not in rows[-1]:
         return NotComputed("the map came without the record of its training")
-    last = json.loads(path.read_text(encoding="utf-8").splitlines()[-1])
-    return last["cpu_seconds_per_step"] * settings.iterations
+    return rows[-1]["cpu_seconds_per_step"] * settings.iterations

@@ -12,9 +12,10 @@ import torch
 
 from swimm3r.errors import DeviceError
 from swimm3r.evaluate import NotComputed
+from swimm3r.memory import MB, peak_since_reset_mb
 
 Result = TypeVar("Result")
-_STATUS, _RESET = Path("/proc/self/status"), Path("/proc/self/clear_refs")
+_RESET = Path("/proc/self/clear_refs")
 
 
 def in_own_process(work: Callable[..., Result], *given: object) -> Result:
@@ -48,12 +49,7 @@ def with_peak_mb(work: Callable[[], Result]) -> tuple[Result, dict[str, float | 
     if cuda:
         torch.cuda.reset_peak_memory_stats()
     result = work()
-    peaks: dict[str, float | NotComputed] = {"peak_mb": before if before is not None else _resident_peak_mb()}
+    peaks: dict[str, float | NotComputed] = {"peak_mb": before if before is not None else peak_since_reset_mb()}
     if torch.cuda.is_available() and torch.cuda.is_initialized():
-        peaks["peak_vram_mb"] = torch.cuda.max_memory_allocated() / 1024**2
+        peaks["peak_vram_mb"] = torch.cuda.max_memory_allocated() / MB
     return result, peaks
-
-
-def _resident_peak_mb() -> float:
-    line = next(line for line in _STATUS.read_text().splitlines() if line.startswith("VmHWM:"))
-    return int(line.split()[1]) / 1024

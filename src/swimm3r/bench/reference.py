@@ -3,27 +3,55 @@
 The paper places test frames by poses of the full sequence, which no method's own training frames could give. They are
 made once per clip, without dense depth and water, and kept in a folder with the key of what they were made of.
 
+Poses that somebody else found can take their place: a folder with NAME.json, a cameras.json, for each clip.
+
 The lens is held at what the clip's first run found: calibrated anew, it would come out different on other frames (on
 small hazy pictures by a quarter), and poses under two lenses differ by more than a good localisation errs.
 """
 
 import json
 import shutil
+from collections.abc import Sequence
 from dataclasses import asdict, replace
-from hashlib import sha256
 from pathlib import Path
 
 from swimm3r.cameras import Cameras
-from swimm3r.errors import RegistrationError
+from swimm3r.errors import InputError, RegistrationError
 from swimm3r.evaluate import NotComputed
 from swimm3r.frames import Frames
 from swimm3r.ground_truth import GroundTruth, read_ground_truth
 from swimm3r.io import cameras_json
 from swimm3r.io.atomic import write_text
+from swimm3r.io.cache_key import cache_key, code_version
 from swimm3r.progress import Progress, silent
 from swimm3r.run import FinishedSfm
 from swimm3r.sfm import colmap
 from swimm3r.sfm.settings import ColmapSettings
+
+
+def given(references: Path | None, scene: str) -> GroundTruth | None:
+    """The poses that a folder of references has for a scene, if it has any. Raises InputError for no such folder."""
+    if references is None:
+        return None
+    if not references.is_dir():
+        raise InputError(
+            f"{references} is no folder",
+            cause="the path is mistyped, or names a single file",
+            hint="--references DIR with DIR/CLIP.json, a cameras.json, for each clip",
+        )
+    path = references / f"{scene}.json"
+    return read_ground_truth(path) if path.is_file() else None
+
+
+def required(references: Path | None, scenes: Sequence[str]) -> None:
+    """Raises InputError where a folder of references lacks one of the scenes, before there is any work to lose."""
+    missing = [scene for scene in scenes if references is not None and given(references, scene) is None]
+    if missing:
+        raise InputError(
+            f"{references} has no reference poses of {', '.join(missing)}",
+            cause=f"they are looked for in {missing[0]}.json, a cameras.json",
+            hint="add the file, or leave --references out: poses of all frames are then found by COLMAP",
+        )
 
 
 def of_clip(sfm: FinishedSfm, folder: Path, progress: Progress = silent) -> GroundTruth | NotComputed:
@@ -42,7 +70,7 @@ def whole_clip(
     listing = [(f.name, f.path.stat().st_size) for f in frames]
     through = None if lens is None else [lens.model, lens.K.tolist(), lens.distortion.tolist()]
     used = {k: v for k, v in asdict(settings).items() if k not in ("depth", "water", "restore", "threads")}
-    key = sha256(json.dumps([listing, through, used], sort_keys=True).encode()).hexdigest()
+    key = cache_key(code_version(), listing, through, used)
     record, cameras = folder / "reference.json", folder / "cameras.json"
     stored = json.loads(record.read_text(encoding="utf-8")) if record.is_file() else {}
     if stored.get("key") == key:
@@ -64,6 +92,7 @@ def whole_clip(
             distortion=found.cameras.distortion.numpy(),
             cam2world=found.cameras.cam2world.numpy(),
             units="scene units",
+            times=frames.times_of(found.names),
         )
         cameras_json.write_cameras(cameras, table)
     shutil.rmtree(folder / "work", ignore_errors=True)
@@ -75,4 +104,4 @@ def digest(reference: GroundTruth | NotComputed) -> str:
     """Another one for other poses."""
     if isinstance(reference, NotComputed):
         return reference.reason
-    return sha256(json.dumps([reference.names, reference.cameras.cam2world.tolist()]).encode()).hexdigest()
+    return cache_key(reference.names, reference.cameras.cam2world.tolist())

@@ -1,7 +1,8 @@
-"""How good the pictures without water look to scores that need no reference (the paper's Tab. barbados_color_noref).
+"""How good the images without water look to scores that need no reference (the paper's Tab. barbados_color_noref).
 
-The restored training frames of run folders, and as a row of their own the frames as filmed: what a score gives a
-picture from which nothing was taken. UIQM and UCIQE reward contrast stretching; look at the pictures side by side.
+The restored training frames of run folders in physical colors, before any white balance; as rows of their own the same
+frames as shown, with the white balance, and the frames as filmed: what a score gives an image from which nothing was
+taken. UIQM and UCIQE reward contrast stretching; look at the images side by side.
 """
 
 from collections.abc import Sequence
@@ -11,19 +12,20 @@ from pathlib import Path
 import torch
 
 from swimm3r.bench.cells import Cell, Place, Scores, kept_cell, over_scenes
+from swimm3r.bench.inputs import reconstruction_of
 from swimm3r.bench.pictures import Panel, stored, write_grid
 from swimm3r.bench.runs import Clip, clips_of
 from swimm3r.bench.scores import columns
 from swimm3r.bench.settings import JobSettings
 from swimm3r.bench.tables import Table
-from swimm3r.evaluate import NotComputed
-from swimm3r.evaluate.underwater import URANKER, uciqe, uiqm
 from swimm3r.frames import Frames
-from swimm3r.io import images
+from swimm3r.io.cache_key import content_digest
 from swimm3r.progress import Progress, silent
+from swimm3r.restored_scores import no_reference_scores
 
 COLUMNS = columns("uiqm_funie", "uciqe_cielab", "uranker")
 _FILMED = "as filmed"
+_SHOWN_AS = "{}, white-balanced"
 _SHOWN = 4  # frames side by side
 
 
@@ -43,38 +45,30 @@ def _cells_of_clip(clip: Clip, /, *, out: Path, progress: Progress) -> list[Cell
         kept_cell(
             out,
             Place(clip.name, _FILMED),
-            [clip.runs[0].frames, scored],
-            lambda _: no_reference_scores([frame.path for frame in frames], progress),
+            [clip.runs[0].frames, [content_digest(frame.path) for frame in frames]],
+            partial(_of_paths, paths=[frame.path for frame in frames], progress=progress),
+            scored,
         )
     ]
     for run in clip.runs:
         sfm = run.open()
-        paths = [run.folder / "sfm" / "restored" / f"{name}.png" for name in sfm.rec.names]
-        make = partial(_of_paths, paths=paths, progress=progress)
-        cells.append(kept_cell(out, Place(clip.name, run.sfm), [sfm.key, scored], make))
+        if sfm.rec.medium is None:
+            cells.append(Cell(clip.name, run.sfm, 0, not_run="its water was not estimated"))
+            continue
+        restored = f"{run.sfm} + {sfm.rec.medium.estimator}"
+        for method, kind in ((restored, "restored_physical"), (_SHOWN_AS.format(restored), "restored")):
+            paths = [run.folder / "sfm" / kind / f"{name}.png" for name in sfm.rec.names]
+            make = partial(_of_paths, paths=paths, progress=progress)
+            made_from = [reconstruction_of(run.folder, sfm), [content_digest(path) for path in paths]]
+            cells.append(kept_cell(out, Place(clip.name, method), made_from, make, scored))
     for i in range(0, len(frames), max(1, len(frames) // _SHOWN)):
         _side_by_side(out, clip, frames, i)
     return cells
 
 
-def no_reference_scores(paths: Sequence[Path], progress: Progress = silent) -> dict[str, float | NotComputed]:
-    """Means over pictures of native size, those that are not there left out."""
-    scores = []
-    paths = [path for path in paths if path.is_file()]
-    for done, path in enumerate(paths):
-        progress("scoring pictures", done, len(paths))
-        picture = images.read_rgb(path)
-        rgb = torch.from_numpy(picture.astype("float32")) / (255 if picture.dtype == "uint8" else 65535)
-        scores.append((uiqm(rgb).uiqm, uciqe(rgb)))
-    if not scores:
-        nothing = NotComputed("no frame was restored")
-        return {"uiqm_funie": nothing, "uciqe_cielab": nothing, "uranker": URANKER}
-    mean = torch.tensor(scores).mean(0).tolist()
-    return {"uiqm_funie": mean[0], "uciqe_cielab": mean[1], "uranker": URANKER}
-
-
-def _of_paths(folder: Path, *, paths: Sequence[Path], progress: Progress) -> Scores:
-    return no_reference_scores(paths, progress)
+def _of_paths(_: Path, *, paths: Sequence[Path], progress: Progress) -> Scores:
+    found = no_reference_scores(paths, progress)
+    return {"uiqm_funie": found.uiqm, "uciqe_cielab": found.uciqe, "uranker": found.urank}
 
 
 def _side_by_side(out: Path, clip: Clip, frames: Frames, i: int) -> None:

@@ -1,6 +1,5 @@
 """Run folders as scenes and methods of a table: one scene per clip, one method per way its poses were found."""
 
-import json
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
@@ -12,10 +11,12 @@ from swimm3r.errors import InputError
 from swimm3r.frames import Frames
 from swimm3r.io.images import image_size
 from swimm3r.io.video import Video
+from swimm3r.prepare import check_source
 from swimm3r.prepare.stills import pictures_of
 from swimm3r.presets import RunSettings
 from swimm3r.progress import Progress, silent
 from swimm3r.run import FinishedSfm, open_finished_sfm, run_pipeline
+from swimm3r.run_folder import is_run, open_run
 from swimm3r.sfm.settings import ColmapModelSettings, ColmapSettings, Mast3rSettings
 from swimm3r.sfm.training.settings import RECIPES
 
@@ -55,20 +56,18 @@ def clips_of(folders: Sequence[Path]) -> list[Clip]:
     found: dict[str, list[SfmRun]] = {}
     prints: dict[str, str] = {}
     for folder in folders:
-        settings = open_finished_sfm(folder).settings
-        summary = json.loads((folder / "summary.json").read_text(encoding="utf-8"))
-        source = Path(summary["input"]["path"])
+        sfm, run = open_finished_sfm(folder), open_run(folder, "sfm")
+        source = Path(run.input.path)
         named = source.parent if source.name.lower() in PICTURES else source
         name = named.stem if named.suffix and not named.is_dir() else named.name
-        if prints.setdefault(name, summary["input"]["fingerprint"]) != summary["input"]["fingerprint"]:
+        if prints.setdefault(name, run.input.fingerprint) != run.input.fingerprint:
             raise InputError(
                 f"two clips have the name {name}",
                 cause="results are kept by the clips' names",
                 hint="another name for one of them, and a run of it under that name",
             )
-        label = sfm_label(settings, json.loads((folder / "sfm" / "reconstruction.json").read_text())["backend"])
-        frames = summary["stages"]["prepare"]["key"]
-        found.setdefault(name, []).append(SfmRun(folder, name, label, frames))
+        label = sfm_label(sfm.settings, sfm.rec.backend)
+        found.setdefault(name, []).append(SfmRun(folder, name, label, run.stages["prepare"].key))
     return [Clip(name, _told_apart(runs)) for name, runs in found.items()]
 
 
@@ -86,12 +85,12 @@ def made_runs(
     """
     runs = []
     for given in inputs:
-        if (given / "summary.json").is_file():
+        if is_run(given):
             runs.append(given)
             continue
         runs.append(out / "runs" / given.stem)
         source, chosen = _with_given_poses(given, settings) if given_poses else (given, settings)
-        run_pipeline(source, runs[-1], chosen, last_stage="sfm", progress=progress)
+        run_pipeline(source, runs[-1], chosen, redo=True, last_stage="sfm", progress=progress)
     return tuple(runs)
 
 
@@ -111,7 +110,8 @@ def _with_given_poses(scene: Path, settings: RunSettings) -> tuple[Path, RunSett
 
 def original_pixels(source: Path, frames: Frames) -> float:
     """Pixels of the clip's own pictures per pixel of the frames made of them."""
-    width = image_size(pictures_of(source)[1][0])[0] if source.is_dir() else Video(source).width
+    source = check_source(source)
+    width = image_size(pictures_of(source).paths[0])[0] if source.is_dir() else Video(source).width
     return width / frames.width
 
 

@@ -20,13 +20,14 @@ _MAP_PAIRS = f"a test frame with each training frame; {_PAIRS}"
 _TRAINING_PAIRS = "two training frames, the map's own poses against the reference: what localisation can reach"
 _QUERY_PAIRS = f"two test frames; {_PAIRS}"
 _EPIPOLAR = (
-    "mean of both distances, original pixels, under each method's own poses, over the matches it keeps: COLMAP's"
-    " verified two-view ones, MASt3R's that agree with its map; of imported models sightings of one point"
+    "mean of both distances, original pixels, under each method's own poses, over the matches its map was made from:"
+    " COLMAP's verified two-view ones, all of MASt3R's; of imported models sightings of one point"
 )
 _DEPTH = "z depth, each frame scaled by its median, mean over frames"
 _AFTER = "over located frames, after the similarity of the training frames"
 _FIRST_POSES = "test frames whose refinement began at the reference's pose; else at one from 2D-3D matches"
 _WATER = "mean over held-out pixels at true ray depth and over channels"
+_COLORS = "physical colors unless the row says white-balanced"
 
 COLUMNS = (
     Column("psnr", "PSNR", 2, "high", "dB, test frames as 8-bit pictures, their poses refined on the frozen map"),
@@ -42,8 +43,8 @@ COLUMNS = (
     Column("registered_pct", "Reg., %", 1, "high", "training frames placed, in the largest model; mean over scenes"),
     Column("epipolar_mean_px", "EpiErr, px", 3, "low", _EPIPOLAR),
     Column("inlier_1px_pct", "Inlier@1px, %", 1, "high", f"share with that error below 1; {_EPIPOLAR}"),
-    Column("points", "#Points", 0, "neither", "sparse points of the map, seen by several frames"),
-    Column("dense_points", "#Dense points", 0, "neither", "of the restored cloud"),
+    Column("points", "#Points", 0, "neither", "sparse points seen by several frames, before any cap"),
+    Column("dense_points", "#Dense points", 0, "neither", "surface points of the fused depth maps, not thinned"),
     Column("sfm_cpu_seconds", "SfM, CPU s", 0, "low", "poses, dense depth, water and cloud"),
     Column("absrel_median", "AbsRel", 4, "low", _DEPTH),
     Column("delta125_median", "δ<1.25", 2, "high", f"%, {_DEPTH}"),
@@ -53,8 +54,14 @@ COLUMNS = (
     Column("rta15", "RTA@15", 2, "high", _PAIRS),
     Column("maa30", "mAA(30)", 2, "high", f"whole-degree bins of the larger error; {_PAIRS}"),
     Column("reference_pct", "In reference, %", 1, "neither", "frames that the reference knows; others do not count"),
-    Column("uiqm_funie", "UIQM", 3, "high", "FUnIE-GAN variant, native size"),
-    Column("uciqe_cielab", "UCIQE", 2, "high", "CIELAB's own units"),
+    Column(
+        "uiqm_funie",
+        "UIQM",
+        3,
+        "high",
+        f"FUnIE-GAN variant, native size; {_COLORS}",
+    ),
+    Column("uciqe_cielab", "UCIQE", 2, "high", f"CIELAB's own units; {_COLORS}"),
     Column("uranker", "URank", 3, "high", "URanker"),
     Column("located_pct", "Located, %", 1, "high", "test frames that were given a pose"),
     Column("inlier_5px_pct", "Inlier@5px, %", 1, "high", "of query-to-render matches; 0 where not located"),

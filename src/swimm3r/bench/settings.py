@@ -2,36 +2,29 @@
 
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Literal
+from typing import Annotated, Literal
 
-from swimm3r.errors import UsageError
+from swimm3r.settings import Count, CountOrZero, Range, Settings
+
+Seeds = Annotated[int, Range(1, 1000)]  # trainings of one method on one scene
 
 
 @dataclass(frozen=True)
-class JobSettings:
+class JobSettings(Settings):
     """Scenes one after the other, in processes side by side, or as jobs of a Slurm cluster."""
 
-    jobs: int = 1
+    jobs: Annotated[int, Range(1, 1024)] = 1
     """Scenes computed at once, each in a process with its share of the cores."""
     slurm: bool = False
     """Each scene as a job through submitit (pip install 'swimm3r[slurm]'); all need the same disk."""
     partition: str = ""
     """Slurm's; its default where empty."""
-    minutes: int = 24 * 60
+    minutes: Count = 24 * 60
     """Most a Slurm job may take."""
-    cpus: int = 8
+    cpus: Count = 8
     """Of a Slurm job."""
-    gpus: int = 0
+    gpus: CountOrZero = 0
     """Of a Slurm job."""
-
-    def __post_init__(self) -> None:
-        for name in ("jobs", "minutes", "cpus"):
-            if getattr(self, name) < 1:
-                raise UsageError(
-                    f"{name} is at least 1, got {getattr(self, name)}",
-                    cause="a slip in the command",
-                    hint="leave it out for the default",
-                )
 
 
 SfmMethod = Literal[
@@ -66,7 +59,7 @@ ABLATION: tuple[SfmMethod, ...] = (
 
 
 @dataclass(frozen=True)
-class SfmMethods:
+class SfmMethods(Settings):
     """Which ways of structure from motion are compared. One that lacks its files is reported as not run."""
 
     methods: tuple[SfmMethod, ...] = PEERS

@@ -3,33 +3,33 @@
 A method that succeeds leaves a run folder OUT/SCENE/METHOD/0/run for `bench render`, `localisation` and `restoration`.
 """
 
-import json
 import shutil
 from collections.abc import Sequence
-from dataclasses import asdict, replace
+from dataclasses import replace
 from functools import partial
 from pathlib import Path
 
 from swimm3r import reconstruction
 from swimm3r.bench import reference
-from swimm3r.bench.cells import Cell, Place, Scores, kept_cell, over_scenes
+from swimm3r.bench.cells import Cell, Place, Scores, check_choice, kept_cell, over_scenes
+from swimm3r.bench.inputs import files_of
 from swimm3r.bench.pictures import Panel, write_grid
 from swimm3r.bench.runs import original_pixels
 from swimm3r.bench.scores import columns
 from swimm3r.bench.settings import JobSettings, SfmMethods
-from swimm3r.bench.sfm_methods import model_scores, reference_scores, settings_for
+from swimm3r.bench.sfm_methods import Uncapped, model_scores, reference_scores, settings_for
 from swimm3r.bench.tables import Table
 from swimm3r.errors import InputError, RegistrationError
 from swimm3r.evaluate import NotComputed
-from swimm3r.geometry import Similarity
+from swimm3r.geometry import Similarity, best_similarity
 from swimm3r.ground_truth import GroundTruth
-from swimm3r.held_out import best_similarity
+from swimm3r.inputs import truth_of
 from swimm3r.prepare import check_source, load_frames
 from swimm3r.presets import RunSettings
 from swimm3r.progress import Progress, silent
 from swimm3r.reconstruction import Reconstruction
 from swimm3r.report.charts import plan_view
-from swimm3r.run import fingerprint_of, run_pipeline, truth_of
+from swimm3r.run import fingerprint_of, run_pipeline
 from swimm3r.sfm.settings import ColmapSettings, Mast3rSettings
 
 COLUMNS = columns(
@@ -51,8 +51,11 @@ def compare_sfm(
     """Every method on every clip; `settings` say how frames are taken and how COLMAP works.
 
     Poses are judged where a reference is known: a synthetic dive brings its own, `references` holds NAME.json (a
-    cameras.json) of others. Raises InputError where a clip cannot be read or two have one name.
+    cameras.json) of others. Raises InputError where a clip cannot be read or two have one name, and UsageError for no
+    method.
     """
+    check_choice("methods", given.methods)
+    reference.given(references, "")
     names = [clip.stem for clip in clips]
     if len(set(names)) < len(names):
         raise InputError(
@@ -79,8 +82,7 @@ def _cells_of_clip(
     progress: Progress,
 ) -> list[Cell]:
     scene = clip.stem
-    named = None if references is None else references / f"{scene}.json"
-    truth = truth_of(clip, named if named is not None and named.is_file() else None)
+    truth = reference.given(references, scene) or truth_of(clip, None)
     assert isinstance(settings.sfm, ColmapSettings)
     cells = []
     for method in given.methods:
@@ -88,10 +90,10 @@ def _cells_of_clip(
         if isinstance(chosen, NotComputed):
             cells.append(Cell(scene, method, 0, not_run=chosen.reason))
             continue
-        depends_on = [fingerprint_of(clip, out), asdict(settings.frames), type(chosen).__name__, asdict(chosen)]
-        depends_on += [None if truth is None else reference.digest(truth), [c.score for c in COLUMNS]]
+        made_from = [fingerprint_of(clip, out), settings.frames, chosen, files_of(chosen)]
+        scored_by = [None if truth is None else reference.digest(truth), [c.score for c in COLUMNS]]
         make = partial(_scores, clip=clip, settings=replace(settings, sfm=chosen), truth=truth, progress=progress)
-        cells.append(kept_cell(out, Place(scene, method), depends_on, make))
+        cells.append(kept_cell(out, Place(scene, method), made_from, make, scored_by))
     _cloud_grid(out, scene, [cell.method for cell in cells if not cell.not_run])
     return cells
 
@@ -99,15 +101,17 @@ def _cells_of_clip(
 def _scores(
     folder: Path, *, clip: Path, settings: RunSettings, truth: GroundTruth | None, progress: Progress
 ) -> Scores:
-    run, rec = folder / "run", None
+    run, rec, uncapped = folder / "run", None, None
     try:
-        run_pipeline(clip, run, settings, last_stage="sfm", progress=progress)
+        summary = run_pipeline(clip, run, settings, redo=True, last_stage="sfm", progress=progress)
         rec = reconstruction.load(run / "sfm")
-        seconds = json.loads((run / "summary.json").read_text(encoding="utf-8"))["stages"]["sfm"]["cpu_seconds"]
+        seconds = summary["stages"]["sfm"]["cpu_seconds"]
     except RegistrationError as failure:  # no frame counts as registered, and the row says why
         seconds = NotComputed(failure.what)
     frames = load_frames(run / "prepare")
-    scores = model_scores(rec, len(frames.train), original_pixels(clip, frames))
+    if rec is not None:
+        uncapped = Uncapped.of(run / "sfm", rec, frames, settings.sfm.water.tracks, progress)
+    scores = model_scores(rec, uncapped, len(frames.train), original_pixels(clip, frames))
     if truth is not None:
         scores |= reference_scores(rec, frames.train.names, truth)
     if rec is None:  # METHOD/0/run is for others to take

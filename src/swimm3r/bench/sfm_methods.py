@@ -1,20 +1,23 @@
 """The ways of structure from motion as settings, or the reason why one cannot be run here; and their common scores."""
 
 from collections.abc import Sequence
-from dataclasses import replace
+from dataclasses import dataclass, replace
 from pathlib import Path
 
 import torch
 
-from swimm3r import weights
+from swimm3r import reconstruction, weights
 from swimm3r.bench.settings import SfmMethod, SfmMethods
 from swimm3r.evaluate import NotComputed
 from swimm3r.evaluate.matches import match_scores
 from swimm3r.evaluate.poses import pose_scores
+from swimm3r.frames import Frames
 from swimm3r.ground_truth import GroundTruth
-from swimm3r.reconstruction import Reconstruction
-from swimm3r.sfm.settings import ColmapModelSettings, ColmapSettings, Mast3rSettings, SfmSettings
-from swimm3r.summary import retained_match_errors
+from swimm3r.progress import Progress
+from swimm3r.reconstruction import Matches, Reconstruction
+from swimm3r.sfm.settings import ColmapModelSettings, ColmapSettings, Mast3rSettings, SfmSettings, TrackSettings
+from swimm3r.sfm.tracks import count_tracks
+from swimm3r.summary import match_errors
 
 
 def settings_for(
@@ -39,23 +42,38 @@ def settings_for(
     return replace(mast3r, adapter=adapter)
 
 
-def model_scores(rec: Reconstruction | None, frames: int, pixels: float) -> dict[str, float | NotComputed]:
+@dataclass(frozen=True)
+class Uncapped:
+    """What a map was made from and found, before it was thinned to what later stages need."""
+
+    matches: Matches
+    dense_points: int
+
+    @staticmethod
+    def of(folder: Path, rec: Reconstruction, frames: Frames, tracks: TrackSettings, progress: Progress) -> "Uncapped":
+        """Of a run's sfm folder; the dense points are counted over every pixel of known depth."""
+        return Uncapped(reconstruction.unfiltered_matches(folder, rec), count_tracks(rec, frames, tracks, progress))
+
+
+def model_scores(
+    rec: Reconstruction | None, uncapped: Uncapped | None, frames: int, pixels: float
+) -> dict[str, float | NotComputed]:
     """What a map says of itself (the paper's Tab. sfm_metrics); None where no map came about.
 
     `frames` were asked for; `pixels` is original pixels per pixel of the frames.
     """
-    if rec is None:
+    if rec is None or uncapped is None:
         nothing = NotComputed("too few frames could be placed")
         missing = dict.fromkeys(("epipolar_mean_px", "inlier_1px_pct"), nothing)
         return {"registered_pct": 0.0, **missing, "points": 0.0, "dense_points": 0.0}
-    agreement = match_scores(retained_match_errors(rec), pixels)
+    agreement = match_scores(match_errors(rec, uncapped.matches), pixels)
     inliers = agreement.inlier_1px
     return {
         "registered_pct": 100 * len(rec.names) / frames,
         "epipolar_mean_px": agreement.epipolar_px,
         "inlier_1px_pct": inliers if isinstance(inliers, NotComputed) else 100 * inliers,
-        "points": float(len(rec.points.xyz)),
-        "dense_points": 0.0 if rec.cloud is None else float(len(rec.cloud.xyz)),
+        "points": float(len(rec.points.xyz) if rec.points_found is None else rec.points_found),
+        "dense_points": float(uncapped.dense_points),
     }
 
 

@@ -32,6 +32,7 @@ class Table:
     cells: Sequence[Cell]
     columns: Sequence[Column]
     against: str | None = None  # the method that differences are taken from; the first where none is named
+    preset: str = ""  # that supplied the settings, and whether options changed them; none where no preset has a say
 
     @property
     def shown(self) -> list[Column]:
@@ -54,7 +55,8 @@ def markdown(table: Table) -> str:
     """Means by method, by scene, paired differences, and in words what is missing and what the columns mean."""
     found = rows(table.cells, table.against)
     scenes, seeds = len({c.scene for c in table.cells}), len({c.seed for c in table.cells})
-    parts = [f"# {table.title}", f"{_counted(scenes, 'scene')}, {_counted(seeds, 'seed')}."]
+    facts = [_counted(scenes, "scene"), _counted(seeds, "seed"), *([f"preset {table.preset}"] if table.preset else [])]
+    parts = [f"# {table.title}", f"{', '.join(facts)}."]
     parts.append(_means(table, found, seeds))
     if scenes > 1:
         parts.append(_by_scene(table))
@@ -85,7 +87,12 @@ def latex(table: Table) -> str:
 
 def _tabular(table: Table, heads: Sequence[str], columns: Sequence[tuple[Sequence[Row], Column]]) -> str:
     """One line per method, one column per rows and score."""
-    lines = [rf"% {table.title}", r"\begin{tabular}{l|" + "c" * len(columns) + "}", *heads, r"\hline"]
+    lines = [
+        f"% {table.title}" + (f" (preset {table.preset})" if table.preset else ""),
+        r"\begin{tabular}{l|" + "c" * len(columns) + "}",
+        *heads,
+        r"\hline",
+    ]
     best = [_best([r for r in found if r.score == c.score], c) for found, c in columns]
     for method in _methods(table.cells):
         values = []
@@ -189,7 +196,8 @@ def _json(table: Table) -> str:
         for c in table.cells
     ]
     notes = {c.score: c.note for c in table.shown}
-    document = {"schema": 2, "protocol": table.name, "title": table.title, "variants": notes}
+    document = {"schema": 2, "protocol": table.name, "title": table.title, "preset": table.preset or None}
+    document["variants"] = notes
     return json.dumps({**document, "cells": cells, "rows": plain}, indent=2) + "\n"
 
 

@@ -3,30 +3,31 @@
 from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Literal
+from typing import TYPE_CHECKING, Annotated
 
 from tyro.conf import Positional, arg, subcommand
 
-from swimm3r.bench.settings import ABLATION, JobSettings, SfmMethods
+from swimm3r.bench.settings import ABLATION, JobSettings, Seeds, SfmMethods
 from swimm3r.cli.console import drawn_progress
+from swimm3r.cli.ranges import with_ranges
 from swimm3r.frame_settings import FrameSettings
-from swimm3r.localization.settings import LocalizationSettings
-from swimm3r.presets import MAST3R_PRESETS, PRESETS, RunSettings
+from swimm3r.localization.settings import GS_CPR, LocalizationSettings
+from swimm3r.presets import MAST3R_PRESETS, PRESETS, Preset, RunSettings
 from swimm3r.progress import Progress
+from swimm3r.settings import Count
 from swimm3r.sfm.settings import ColmapSettings, Mast3rSettings
 from swimm3r.splat.settings import RECIPES, PoseRefinementSettings, Recipe, UwbsSettings
 
 if TYPE_CHECKING:
     from swimm3r.bench.tables import Table
 
-Preset = Literal["fast", "default", "best"]
 _FLAT = arg(name="")
 _Jobs = Annotated[JobSettings, _FLAT]
 _Methods = Annotated[SfmMethods, _FLAT]
 _ONE_BY_ONE, _ALL_METHODS = JobSettings(), SfmMethods()
 
 
-def command_for_preset(name: str) -> Callable:
+def command_for_preset(name: Preset) -> Callable:
     """The command, with the map settings of a preset as defaults."""
     defaults = PRESETS[name]
     assert isinstance(defaults.sfm, ColmapSettings)
@@ -39,7 +40,7 @@ def command_for_preset(name: str) -> Callable:
         runs: Positional[tuple[Path, ...]],
         /,
         out: Path,
-        seeds: int = 3,
+        seeds: Seeds = 3,
         preset: Preset = "fast",
         splat: UwbsSettings = full,
         test: PoseRefinementSettings = defaults.test,
@@ -58,17 +59,19 @@ def command_for_preset(name: str) -> Callable:
         """
         from swimm3r.bench.ablation_uwbs import ablate
 
-        _show(out, lambda progress: ablate(runs, out, splat, seeds, test, jobs, progress))
+        kept = (splat, test) == (full, defaults.test)
+        _show(out, lambda progress: ablate(runs, out, splat, seeds, test, jobs, progress), _preset(preset, kept))
 
     def render(
         inputs: Positional[tuple[Path, ...]],
         /,
         out: Path,
         recipes: tuple[Recipe, ...] = RECIPES,
-        seeds: int = 1,
+        seeds: Seeds = 1,
         poses: bool = False,
         given_poses: bool = False,
         against: Recipe | None = None,
+        references: Path | None = None,
         preset: Preset = "fast",
         frames: FrameSettings = picked_evenly,
         sfm: ColmapSettings = found_poses,
@@ -87,6 +90,8 @@ def command_for_preset(name: str) -> Callable:
             poses: add all recipes again with the training frames' poses refined along with the map.
             given_poses: clips are folders of pictures with a COLMAP model (SeaThru-NeRF and its kin); take its poses.
             against: the recipe that differences are taken from; the first where none is named.
+            references: a folder with CLIP.json (a cameras.json) of all frames of each clip, test frames included; by
+                default their poses are found by COLMAP.
             preset: what the other defaults aim at.
             frames: which frames to take of clips; the paper's are evenly spaced.
             sfm: how poses, depth and water of clips are found.
@@ -94,14 +99,19 @@ def command_for_preset(name: str) -> Callable:
             test: how the test frames' poses are refined.
             jobs: scenes in parallel.
         """
+        from swimm3r.bench import reference
+        from swimm3r.bench.cells import check_choice
         from swimm3r.bench.render import compare_renderers
         from swimm3r.bench.runs import made_runs
 
         def run(progress: Progress) -> "Table":
+            check_choice("recipes", recipes, against)  # before minutes of structure from motion
+            reference.given(references, "")
             runs = made_runs(inputs, out, RunSettings(frames, sfm, splat, test), given_poses, progress)
-            return compare_renderers(runs, out, recipes, splat, seeds, poses, test, against, jobs, progress)
+            return compare_renderers(runs, out, recipes, splat, seeds, poses, test, against, references, jobs, progress)
 
-        _show(out, run)
+        kept = (frames, sfm, splat, test) == (picked_evenly, found_poses, full, defaults.test)
+        _show(out, run, _preset(preset, kept))
 
     def sfm(
         clips: Positional[tuple[Path, ...]],
@@ -134,14 +144,19 @@ def command_for_preset(name: str) -> Callable:
         from swimm3r.bench.sfm import compare_sfm
 
         settings = RunSettings(frames, colmap, defaults.splat, defaults.test)
-        _show(out, lambda progress: compare_sfm(clips, out, given, settings, mast3r, references, jobs, progress))
+        kept = (frames, colmap, mast3r) == (as_filmed, found_poses, MAST3R_PRESETS[name])
+        _show(
+            out,
+            lambda progress: compare_sfm(clips, out, given, settings, mast3r, references, jobs, progress),
+            _preset(preset, kept),
+        )
 
     def flsea(
         root: Positional[Path],
         /,
         out: Path,
         given: _Methods = _ALL_METHODS,
-        stride: int = 1,
+        stride: Count = 1,
         sequences: tuple[str, ...] = (),
         preset: Preset = "fast",
         colmap: ColmapSettings = found_poses,
@@ -168,6 +183,7 @@ def command_for_preset(name: str) -> Callable:
         _show(
             out,
             lambda progress: compare_on_flsea(root, out, given, colmap, mast3r, stride, sequences, jobs, progress),
+            _preset(preset, (colmap, mast3r) == (found_poses, MAST3R_PRESETS[name])),
         )
 
     def ablation_sfm(
@@ -175,7 +191,7 @@ def command_for_preset(name: str) -> Callable:
         /,
         out: Path,
         adapters: Path | None = None,
-        stride: int = 1,
+        stride: Count = 1,
         sequences: tuple[str, ...] = (),
         preset: Preset = "fast",
         colmap: ColmapSettings = found_poses,
@@ -205,6 +221,7 @@ def command_for_preset(name: str) -> Callable:
             lambda progress: compare_on_flsea(
                 root, out, given, colmap, mast3r, stride, sequences, jobs, progress, "ablation-sfm"
             ),
+            _preset(preset, (colmap, mast3r) == (found_poses, MAST3R_PRESETS[name])),
         )
 
     protocols = {
@@ -218,7 +235,7 @@ def command_for_preset(name: str) -> Callable:
     }
     action = None
     for protocol, command in protocols.items():
-        one = Annotated[None, subcommand(protocol, constructor=command)]
+        one = Annotated[None, subcommand(protocol, constructor=with_ranges(command))]
         action = one if action is None else action | one
 
     def bench(action: Annotated[action, arg(name="")]) -> None:  # pyright: ignore[reportInvalidTypeForm]
@@ -235,6 +252,8 @@ def restoration(
 ) -> None:
     """Score the restored frames of runs without reference: UIQM, UCIQE, and URanker or why it is not there.
 
+    Rows are of physical colors, before the white balance of the shown images, which has rows of its own.
+
     Args:
         runs: run folders with finished structure from motion, such as bench sfm leaves; they are only read.
         out: where pictures side by side and the tables go: restoration.md, .csv, .json and .tex.
@@ -250,7 +269,8 @@ def localisation(
     /,
     out: Path,
     maps: Path | None = None,
-    settings: LocalizationSettings = LocalizationSettings(),  # noqa: B008
+    references: Path | None = None,
+    settings: LocalizationSettings = GS_CPR,
     jobs: _Jobs = _ONE_BY_ONE,
 ) -> None:
     """Place every test frame of finished runs in their maps, judged by structure from motion of all frames.
@@ -261,17 +281,26 @@ def localisation(
         runs: run folders; they are only read.
         out: where match pictures, references and the tables go: localisation.md, .csv, .json and .tex.
         maps: a folder of swimm3r bench render; its maps of these runs take the place of the runs' own.
+        references: a folder with CLIP.json (a cameras.json) of all frames of each clip, test frames included; by
+            default their poses are found by COLMAP.
         settings: the protocol; SIFT where no MASt3R weights are here.
         jobs: scenes in parallel.
     """
     from swimm3r.bench.localisation import localise
 
-    _show(out, lambda progress: localise(runs, out, settings, maps, jobs, progress))
+    _show(out, lambda progress: localise(runs, out, settings, maps, references, jobs, progress))
 
 
-def _show(out: Path, protocol: "Callable[[Progress], Table]") -> None:
+def _preset(name: Preset, kept: bool) -> str:
+    """The preset as a table names it."""
+    return name if kept else f"{name}, changed by options"
+
+
+def _show(out: Path, protocol: "Callable[[Progress], Table]", preset: str = "") -> None:
     from swimm3r.bench import tables
+    from swimm3r.io.folder_lock import folder_lock
+    from swimm3r.io.outputs import output_folder
 
-    with drawn_progress() as progress:
+    with output_folder(out), folder_lock(out), drawn_progress() as progress:
         table = protocol(progress)
-    print(tables.write(out, table))
+        print(tables.write(out, replace(table, preset=preset)))

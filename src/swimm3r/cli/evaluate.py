@@ -5,15 +5,19 @@ from pathlib import Path
 from tyro.conf import Positional
 
 from swimm3r.cli.console import drawn_progress, print_summary
+from swimm3r.settings import CountOrZero
 
 
 def evaluate(
     run: Positional[Path],
     /,
     reference: Path | None = None,
-    steps: int | None = None,
+    steps: CountOrZero | None = None,
 ) -> None:
     """Score a run's map on its test frames again, and write its report.
+
+    With other steps or another reference than the run's own, the scores stand beside its own: other_protocols in
+    summary.json, the views in RUN/renders/protocols.
 
     Args:
         run: the run folder.

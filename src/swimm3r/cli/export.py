@@ -4,8 +4,10 @@ from pathlib import Path
 
 from tyro.conf import Positional
 
+from swimm3r.settings import ClipSecond
 
-def export(run: Positional[Path], /, ply: Path | None = None, time: float | None = None) -> None:
+
+def export(run: Positional[Path], /, ply: Path | None = None, time: ClipSecond | None = None) -> None:
     """Write a run's map, without its water, as Gaussians for 3DGS viewers, and say how much is lost on the way.
 
     Args:
@@ -14,8 +16,12 @@ def export(run: Positional[Path], /, ply: Path | None = None, time: float | None
         time: second of the clip that a dynamic map is exported at; half way where none is given.
     """
     from swimm3r.export.gaussians import export_run
+    from swimm3r.io.outputs import output_file
+    from swimm3r.run_folder import open_run
 
-    done = export_run(run, ply or run / "splat" / "gaussians.ply", time)
+    open_run(run, "splat")
+    with output_file(ply or run / "splat" / "gaussians.ply", "--ply") as path:
+        done = export_run(run, path, time)
     print(
         f"{done.path}: {done.gaussians:,} Gaussians of {done.primitives:,} primitives.\n"
         f"Beside the map's own clear pictures: {done.difference.psnr:.1f} dB, mean alpha {done.difference.alpha:+.3f}."

@@ -2,11 +2,10 @@
 
 from pathlib import Path
 
-from rich.console import Console
 from rich.table import Table
 from tyro.conf import Positional
 
-from swimm3r.cli.console import drawn_progress
+from swimm3r.cli.console import drawn_progress, outcome_console
 from swimm3r.localization.settings import LocalizationSettings
 
 
@@ -27,9 +26,15 @@ def localize(
         out: where poses.json, poses.tum and the match pictures go; RUN/localization otherwise.
         settings: the protocol.
     """
+    from swimm3r.io.outputs import output_folder
     from swimm3r.localization.batch import localize_run
+    from swimm3r.localization.settings import with_checkpoint_of
+    from swimm3r.presets import from_yaml
+    from swimm3r.run_folder import open_run
 
-    with drawn_progress() as progress:
+    open_run(run, "splat")
+    settings = with_checkpoint_of(settings, from_yaml(run / "settings.yaml").sfm)
+    with output_folder(out or run / "localization"), drawn_progress() as progress:
         answers, folder = localize_run(run, images, lens, out, settings, progress)
     table = Table("picture", "place", "inliers", "median error, px", "seconds")
     for a in answers:
@@ -41,6 +46,5 @@ def localize(
         )
         error = "" if a.found.reprojection_px is None else f"{a.found.reprojection_px:.2f}"
         table.add_row(a.name, a.found.stage, inliers, error, f"{sum(a.found.seconds.values()):.1f}")
-    console = Console()
-    console.print(table)
-    console.print(folder)
+    outcome_console().print(table)
+    print(f"Poses: {folder}")

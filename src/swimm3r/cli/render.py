@@ -5,6 +5,7 @@ from pathlib import Path
 from tyro.conf import Positional
 
 from swimm3r.cli.console import drawn_progress
+from swimm3r.settings import ClipSecond, CountOrZero, LongSideOrOwn
 
 
 def render(
@@ -12,9 +13,9 @@ def render(
     /,
     cameras: Path | None = None,
     out: Path | None = None,
-    long_side: int = 0,
-    flight: int = 0,
-    time: float | None = None,
+    long_side: LongSideOrOwn = 0,
+    flight: CountOrZero = 0,
+    time: ClipSecond | None = None,
 ) -> None:
     """Render a run's map: with its water, without it, the water alone, and depth.
 
@@ -25,12 +26,16 @@ def render(
         out: where the pictures go; RUN/renders/views otherwise.
         long_side: longer side of the pictures, pixels, at most the cameras' own; 0 is the cameras' own.
         flight: film a flight of this many pictures along the cameras, too: OUT/flythrough.mp4.
-        time: second of the clip that a dynamic map is shown at; each camera's own frame's where none is given.
+        time: second of the clip that a dynamic map is shown at; each camera's, else its frame's, where none is given.
     """
+    from swimm3r.io.outputs import output_folder
     from swimm3r.presets import from_yaml
     from swimm3r.renders import render_run
+    from swimm3r.run_folder import open_run
 
+    open_run(run, "splat")
     restore = from_yaml(run / "settings.yaml").sfm.restore
 
-    with drawn_progress() as progress:
-        print(render_run(run, cameras, out, long_side, flight, time, restore, progress))
+    with output_folder(out or run / "renders" / "views"), drawn_progress() as progress:
+        folder = render_run(run, cameras, out, long_side, flight, time, restore, progress)
+    print(f"Pictures: {folder}")

@@ -1,58 +1,71 @@
-"""`swimm3r run`, `prepare`, `sfm` and `splat`: the pipeline, whole or up to a stage."""
+"""`swimm3r run`, `prepare`, `sfm` and `splat`: the pipeline, whole or up to a stage.
 
-from collections.abc import Callable
-from dataclasses import replace
+The defaults of the options are those of a preset that is named, else the settings that the run folder holds: a command
+without settings goes on with them, and one with a few changes those alone.
+"""
+
+from collections.abc import Callable, Sequence
+from itertools import pairwise
 from pathlib import Path
 from typing import Annotated, Literal
 
 from tyro.conf import Positional, arg
 
-from swimm3r import weights
-from swimm3r.cli.console import drawn_progress, print_summary
+from swimm3r.cli.console import drawn_progress, print_next, print_summary
 from swimm3r.errors import UsageError
 from swimm3r.frame_settings import FrameSettings
-from swimm3r.presets import MAST3R_PRESETS, PRESETS, RunSettings
-from swimm3r.sfm.settings import ColmapModelSettings, ColmapSettings, Mast3rSettings, SfmSettings
-from swimm3r.splat.settings import MapDevice, PoseRefinementSettings, Recipe, UwbsSettings, with_recipe
+from swimm3r.presets import Preset, RunSettings, from_yaml
+from swimm3r.run_folder import is_run, read_run
+from swimm3r.sfm.settings import ColmapModelSettings, Mast3rSettings, SfmSettings
+from swimm3r.splat.settings import MapDevice, PoseRefinementSettings, Recipe, recipe_of
 
-Preset = Literal["fast", "default", "best"]
 Backend = Literal["colmap", "mast3r", "swimm3r"]
 _FLAT = arg(name="")  # --fps, not --frames.fps; what lies deeper keeps its prefix: --depth.planes
 
 
-def commands_for_preset(name: str, backend: str = "colmap", recipe: Recipe = "uwbs-static") -> dict[str, Callable]:
-    """The commands that share the pipeline's settings, with the defaults of a preset, a back end and a recipe."""
-    defaults = PRESETS[name]
-    assert isinstance(defaults.splat, UwbsSettings)
-    defaults = replace(defaults, splat=with_recipe(defaults.splat, recipe))
-    assert isinstance(defaults.sfm, ColmapSettings)
-    sfm_defaults = MAST3R_PRESETS[name] if backend != "colmap" else defaults.sfm
+def held_settings(arguments: Sequence[str]) -> RunSettings | None:
+    """The settings in the run folder that a command line names: after --out, else as its source. Raises InputError."""
+    after_out = [after for option, after in pairwise(arguments) if option == "--out"]
+    after_out += [word.removeprefix("--out=") for word in arguments if word.startswith("--out=")]
+    folders = after_out or [word for word in arguments[1:] if not word.startswith("-")]
+    path = next((Path(folder) / "settings.yaml" for folder in folders if is_run(Path(folder))), None)
+    return from_yaml(path) if path is not None and path.is_file() else None
+
+
+def commands_for_settings(defaults: RunSettings) -> dict[str, Callable]:
+    """The commands that share the pipeline's settings, with these as the defaults of their options."""
+    sfm_defaults, default_recipe = defaults.sfm, recipe_of(defaults.splat)
+    default_backend: Backend = "mast3r" if isinstance(sfm_defaults, Mast3rSettings) else "colmap"
     sfm_settings = Annotated[type(sfm_defaults), _FLAT]
     map_settings = type(defaults.splat)
 
     def prepare(
         source: Positional[Path],
         /,
-        out: Path,
-        preset: Preset = "default",
+        out: Path | None = None,
+        preset: Preset | None = None,
+        redo: bool = False,
         frames: Annotated[FrameSettings, _FLAT] = defaults.frames,
     ) -> None:
         """Sample a video or check a folder of stills into RUN/prepare.
 
         Args:
-            source: a video, or a folder of pictures.
-            out: the run folder.
-            preset: what the other defaults aim at.
+            source: a video, or a folder of pictures; or a run folder, to go on with its own input and settings.
+            out: the run folder; not needed where SOURCE is one.
+            preset: preset that supplies the other defaults; otherwise the run folder's own settings do, where it has
+                any, else `default`.
+            redo: make stages again that were made with other settings; what is there moves to RUN/old.
             frames: which frames to take.
         """
-        _pipeline(source, out, RunSettings(frames, defaults.sfm, defaults.splat, defaults.test), None, "prepare")
+        _pipeline(source, out, RunSettings(frames, defaults.sfm, defaults.splat, defaults.test), None, "prepare", redo)
 
     def sfm(
         source: Positional[Path],
         /,
-        out: Path,
-        preset: Preset = "default",
-        backend: Backend = "colmap",
+        out: Path | None = None,
+        preset: Preset | None = None,
+        redo: bool = False,
+        backend: Backend = default_backend,
         reference: Path | None = None,
         frames: Annotated[FrameSettings, _FLAT] = defaults.frames,
         sfm: sfm_settings = sfm_defaults,
@@ -60,9 +73,11 @@ def commands_for_preset(name: str, backend: str = "colmap", recipe: Recipe = "uw
         """Poses, dense depth, water, restored pictures and the restored cloud, without map and scores.
 
         Args:
-            source: a video, or a folder of pictures.
-            out: the run folder.
-            preset: what the other defaults aim at.
+            source: a video, or a folder of pictures; or a run folder, to go on with its own input and settings.
+            out: the run folder; not needed where SOURCE is one.
+            preset: preset that supplies the other defaults; otherwise the run folder's own settings do, where it has
+                any, else `default`.
+            redo: make stages again that were made with other settings; what is there moves to RUN/old.
             backend: how poses and depth are found; mast3r needs weights, swimm3r an adapter, too. `--backend mast3r
                 --help` shows its options.
             reference: a cameras.json with poses to compare with.
@@ -70,35 +85,39 @@ def commands_for_preset(name: str, backend: str = "colmap", recipe: Recipe = "uw
             sfm: how poses, depth and water are found.
         """
         _require_adapter(backend, sfm)
-        _pipeline(source, out, RunSettings(frames, sfm, defaults.splat, defaults.test), reference, "sfm")
+        _pipeline(source, out, RunSettings(frames, sfm, defaults.splat, defaults.test), reference, "sfm", redo)
 
     def splat(
         source: Positional[Path | None] = None,
         /,
         *,
-        out: Path,
+        out: Path | None = None,
         colmap: Path | None = None,
         transforms: Path | None = None,
         images: Path | None = None,
-        preset: Preset = "default",
-        recipe: Recipe = "uwbs-static",
+        preset: Preset | None = None,
+        redo: bool = False,
+        recipe: Recipe = default_recipe,
         map_device: MapDevice = "auto",
         reference: Path | None = None,
         frames: Annotated[FrameSettings, _FLAT] = defaults.frames,
-        sfm: Annotated[ColmapSettings, _FLAT] = defaults.sfm,
+        sfm: sfm_settings = sfm_defaults,
         splat: map_settings = defaults.splat,
         test: PoseRefinementSettings = defaults.test,
     ) -> None:
         """A map of a dive, or of any COLMAP model: swimm3r splat --colmap sparse/0 --images pictures/ --out RUN.
 
         Args:
-            source: a video, or a folder of pictures; or give --colmap and --images, or --transforms.
-            out: the run folder.
+            source: a video, or a folder of pictures; or a run folder, to go on with its own input and settings; or
+                give --colmap and --images, or --transforms.
+            out: the run folder; not needed where SOURCE is one.
             colmap: a COLMAP model (or cameras.xml, sfm_data.json, predictions.npz) taken as it is.
             transforms: nerfstudio's transforms.json, taken as it is.
             images: the pictures it was made of; its names are relative to this folder. Those that a transforms.json
                 names are found without.
-            preset: what the other defaults aim at.
+            preset: preset that supplies the other defaults; otherwise the run folder's own settings do, where it has
+                any, else `default`.
+            redo: make stages again that were made with other settings; what is there moves to RUN/old.
             recipe: uwbs-static; uwbs-dynamic, whose map changes with time; or another method on the same start.
                 `--recipe NAME --help` shows its options.
             map_device: where the map is trained and rendered; auto takes CUDA where there is a GPU and NVIDIA Warp.
@@ -122,18 +141,17 @@ def commands_for_preset(name: str, backend: str = "colmap", recipe: Recipe = "uw
             )
         poses = sfm
         if models:
-            poses = ColmapModelSettings(
-                models[0].resolve(), features=sfm.features, depth=sfm.depth, water=sfm.water, restore=sfm.restore
-            )
-        _pipeline(given, out, RunSettings(frames, poses, splat, test), reference, "eval", map_device)
+            poses = _on_model(models[0].resolve(), sfm)
+        _pipeline(given, out, RunSettings(frames, poses, splat, test), reference, "eval", redo, map_device)
 
     def run(
         source: Positional[Path],
         /,
-        out: Path,
-        preset: Preset = "default",
-        backend: Backend = "colmap",
-        recipe: Recipe = "uwbs-static",
+        out: Path | None = None,
+        preset: Preset | None = None,
+        redo: bool = False,
+        backend: Backend = default_backend,
+        recipe: Recipe = default_recipe,
         map_device: MapDevice = "auto",
         reference: Path | None = None,
         frames: Annotated[FrameSettings, _FLAT] = defaults.frames,
@@ -141,12 +159,14 @@ def commands_for_preset(name: str, backend: str = "colmap", recipe: Recipe = "uw
         splat: map_settings = defaults.splat,
         test: PoseRefinementSettings = defaults.test,
     ) -> None:
-        """Everything, from a clip to the report page. The same command again goes on where it was interrupted.
+        """Everything, from a clip to the report page. Re-run the same command to resume, or swimm3r run RUN.
 
         Args:
-            source: a video, or a folder of pictures.
-            out: the run folder.
-            preset: what the other defaults aim at.
+            source: a video, or a folder of pictures; or a run folder, to go on with its own input and settings.
+            out: the run folder; not needed where SOURCE is one.
+            preset: preset that supplies the other defaults; otherwise the run folder's own settings do, where it has
+                any, else `default`.
+            redo: make stages again that were made with other settings; what is there moves to RUN/old.
             backend: how poses and depth are found; mast3r needs weights, swimm3r an adapter, too. `--backend mast3r
                 --help` shows its options.
             recipe: uwbs-static; uwbs-dynamic, whose map changes with time; or another method on the same start.
@@ -159,7 +179,7 @@ def commands_for_preset(name: str, backend: str = "colmap", recipe: Recipe = "uw
             test: how the test frames' poses are refined.
         """
         _require_adapter(backend, sfm)
-        _pipeline(source, out, RunSettings(frames, sfm, splat, test), reference, "eval", map_device)
+        _pipeline(source, out, RunSettings(frames, sfm, splat, test), reference, "eval", redo, map_device)
 
     return {"run": run, "prepare": prepare, "sfm": sfm, "splat": splat}
 
@@ -173,27 +193,49 @@ def _require_adapter(backend: Backend, settings: SfmSettings) -> None:
         )
 
 
+def _on_model(model: Path, like: SfmSettings) -> ColmapModelSettings:
+    """The poses of a model, with depth and water as settings have them."""
+    kept = {name: getattr(like, name) for name in ("features", "depth", "water", "restore") if hasattr(like, name)}
+    return ColmapModelSettings(model, **kept)
+
+
 def _pipeline(
     source: Path,
-    out: Path,
+    out: Path | None,
     settings: RunSettings,
     reference: Path | None,
     last: str,
+    redo: bool,
     map_device: MapDevice = "cpu",  # stages before the map ask for no GPU
 ) -> None:
-    if isinstance(settings.sfm, Mast3rSettings):  # before minutes of preparing frames
-        from swimm3r.sfm.pairs import parse_graph
-
-        parse_graph(settings.sfm.graph)
-        weights.require("mast3r", settings.sfm.weights)
-        if settings.sfm.adapter is not None:
-            from swimm3r.sfm import adapter_file
-
-            adapter_file.describe(settings.sfm.adapter)
+    if out is None:
+        if not is_run(source):
+            raise UsageError(
+                "--out RUN is missing",
+                cause=f"{source} is no run folder, which could go on without it",
+                hint="--out with a folder that does not exist yet",
+            )
+        source, out = Path(read_run(source).input.path), source
     from swimm3r.run import run_pipeline
 
     with drawn_progress() as progress:
         summary = run_pipeline(
-            source, out, settings, reference=reference, last_stage=last, map_device=map_device, progress=progress
+            source,
+            out,
+            settings,
+            redo=redo,
+            reference=reference,
+            last_stage=last,
+            map_device=map_device,
+            progress=progress,
         )
     print_summary(summary, out)
+    match last:
+        case "prepare":
+            print(f"Frames: {out / 'prepare'}")
+            print_next("poses, depth and water", "sfm", source, "--out", out)
+        case "sfm":
+            print(f"Results: {out / 'sfm'}: points.ply (restored cloud), cameras.json (poses), medium.json, restored/")
+            print_next("the map, scores and report", "run", source, "--out", out)
+        case _:
+            print_next("other views of the map", "render", out)

@@ -3,12 +3,13 @@
 import os
 import sys
 from collections.abc import Callable
+from contextlib import nullcontext
 from pathlib import Path
 from typing import Annotated, Literal
 
 from tyro.conf import Positional, arg
 
-from swimm3r.cli.console import drawn_progress
+from swimm3r.cli.console import drawn_progress, print_next
 from swimm3r.sfm.training.settings import RECIPES, TrainSettings
 
 Recipe = Literal[
@@ -48,19 +49,25 @@ def command_for_recipe(name: str) -> Callable:
             device: where the network runs.
             settings: every number of the training.
         """
+        from swimm3r.io.folder_lock import folder_lock
+        from swimm3r.io.outputs import output_folder
         from swimm3r.sfm.training.job import train_sfm as run
         from swimm3r.sfm.training.loop import Estimate
 
         def announce(e: Estimate) -> None:
+            memory = "" if e.peak_mb is None else f", {e.peak_mb:.0f} MB"
             print(
                 f"{e.pairs} pairs, {e.steps} steps, {e.trained:,} trained numbers; "
-                f"about {e.seconds_per_step:.3g} s per step, {e.hours:.2g} h in all, {e.peak_mb:.0f} MB",
+                f"about {e.seconds_per_step:.3g} s per step, {e.hours:.2g} h in all{memory}",
                 file=sys.stderr,
             )
 
-        with drawn_progress() as progress:
+        # of torchrun's processes the first holds the folder for all
+        hold = folder_lock(out) if os.environ.get("RANK", "0") == "0" else nullcontext()
+        with output_folder(out), hold, drawn_progress() as progress:
             adapter = run(data, out, settings, weights, base_licence, device, announce, progress)
         if os.environ.get("RANK", "0") == "0":  # torchrun's other processes have the same to say
             print(f"Adapter: {adapter}")
+            print_next("poses with it", "sfm", "dive.mp4", "--out", "RUN", "--backend", "swimm3r", "--adapter", adapter)
 
     return train_sfm

@@ -14,7 +14,7 @@ def list_all() -> None:
     """Print every file this program can use: what for, its size, its licence, and where it lies. No network."""
     for entry in store.MANIFEST:
         size = "size not published" if entry.about_mb is None else f"{entry.about_mb:,.4g} MB"
-        print(f"{entry.name:<20} {_whereabouts(entry.name)}\n    {entry.purpose}; {size}\n    {entry.licence}")
+        print(f"{entry.name:<20} {whereabouts(entry.name)}\n    {entry.purpose}; {size}\n    {entry.licence}")
     print(f"Downloads go to {store.directory()}")
 
 
@@ -67,9 +67,12 @@ def weights(action: Annotated[_Action, arg(name="")]) -> None:
     """List, download, check and find model weights. Nothing but --backend mast3r and some scores needs any."""
 
 
-def _whereabouts(name: str) -> str:
+def whereabouts(name: str) -> str:
+    """The path of weights, or why there is none."""
     try:
         found = store.find(name)
     except WeightsError as damaged:
         return damaged.what
+    except OSError as error:
+        return f"not known: {error.filename} cannot be read ({error.strerror})"
     return "not here" if found is None else str(found)

@@ -64,7 +64,8 @@ def depth_scores(
             scales = [_median(torch.cat([g for _, g in pairs])) / _median(torch.cat([p for p, _ in pairs]))] * len(
                 pairs
             )
-    frames = torch.tensor([_frame_scores(s * p, g) for s, (p, g) in zip(scales, pairs, strict=True)])
+    scored = [_frame_scores(s * p, g) for s, (p, g) in zip(scales, pairs, strict=True)]
+    frames = torch.tensor(scored, dtype=torch.float64)
     absrel, delta, rmse_log = frames.mean(0).tolist()
     coverage = sum(len(g) for _, g in pairs) / known_pixels
     return DepthScores(absrel, 100 * delta, rmse_log, coverage, len(pairs), align)

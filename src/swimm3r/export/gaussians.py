@@ -18,13 +18,14 @@ from jaxtyping import Float
 from torch import Tensor
 from torch.nn.functional import normalize
 
-from swimm3r.cameras import Cameras
+from swimm3r.cameras import Cameras, cameras_of
 from swimm3r.evaluate.images import psnr_from_errors
 from swimm3r.geometry import quaternion_from_rotation
 from swimm3r.io import cameras_json
 from swimm3r.io.ply import write_vertices
 from swimm3r.raster import ALPHA_MAX, ALPHA_MIN, RasterOutput, rasterize
-from swimm3r.reconstruction import cameras_of
+from swimm3r.run_folder import open_run
+from swimm3r.settings import ClipSecond, accepted
 from swimm3r.splat.checkpoint import load_map
 from swimm3r.splat.conditioning import Conditioned, condition, queries, symmetric
 from swimm3r.splat.gaussians import coloured, covariance
@@ -33,7 +34,6 @@ from swimm3r.splat.projection import pinhole, project, project_conditioned
 from swimm3r.splat.rendering import SplatMap, in_scene_units
 from swimm3r.splat.settings import RenderSettings
 from swimm3r.splat.spherical import Y_00
-from swimm3r.splat.views import pinhole_canvas
 
 _CONDON_SHORTLEY = [(-1.0) ** m for degree in (1, 2, 3) for m in range(-degree, degree + 1)]
 _ASKED = 64  # cameras, spread over the dive, that say which way a primitive is looked at
@@ -108,13 +108,18 @@ def moment_matched(scene: SplatMap, cameras: Cameras, time: float | None = None)
 
 
 def write_ply(path: Path, g: Gaussians) -> None:
-    """The Gaussians as 3DGS stores them: logits, log scales, quaternions wxyz, harmonics channel by channel."""
+    """The Gaussians as 3DGS stores them: logits, log scales, quaternions wxyz, harmonics channel by channel.
+
+    There are always the 45 harmonics of degree 1 to 3 that its loader insists on; those the map has not are 0.
+    """
     variance, axes = torch.linalg.eigh(g.covariance.double())
     scale = variance.clamp(min=0).sqrt()
     scale = scale.clamp(min=_FLATTEST * scale.amax(-1, keepdim=True)).clamp(min=1e-12)
     axes = axes * torch.linalg.det(axes).sign()[:, None, None]  # a rotation, not a reflection
     quaternion = quaternion_from_rotation(axes)
-    signed = g.harmonics * torch.tensor(_CONDON_SHORTLEY[: g.harmonics.shape[1]])[:, None]
+    known = g.harmonics.shape[1]
+    signed = torch.zeros(len(g.xyz), len(_CONDON_SHORTLEY), 3)
+    signed[:, :known] = g.harmonics * torch.tensor(_CONDON_SHORTLEY[:known])[:, None]
     columns = {
         **{name: g.xyz[:, k] for k, name in enumerate("xyz")},
         **{f"n{name}": torch.zeros(len(g.xyz)) for name in "xyz"},
@@ -169,13 +174,15 @@ def export_run(folder: Path, path: Path, time: float | None = None) -> Exported:
 
     A dynamic map is exported at `time`, seconds of the clip; half way by default. Raises InputError without a map.
     """
+    accepted("time", time, ClipSecond | None)
+    open_run(folder, "splat")
     scene = load_map(folder / "splat" / "map.safetensors")
     stations = folder / "splat" / "cameras.json"  # where training moved them
     stations = stations if stations.is_file() else folder / "sfm" / "cameras.json"
     cameras = cameras_of(cameras_json.read_cameras(stations))
     time = sum(scene.span) / 2 if time is None else time
     station = torch.linspace(0, len(cameras) - 1, min(_ASKED, len(cameras))).round().long()
-    canvas = pinhole_canvas(cameras[station], scene.settings.long_side)
+    canvas = cameras[station].pinhole(scene.settings.long_side)
     g = clear_gaussians(scene, canvas, time)
     write_ply(path, g)
     looked_at = canvas[torch.linspace(0, len(canvas) - 1, min(_COMPARED, len(canvas))).round().long()]

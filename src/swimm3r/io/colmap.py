@@ -6,28 +6,49 @@ cam2world. A pinhole or radial lens that `cameras` does not name is the same len
     SIMPLE_PINHOLE f cx cy -> PINHOLE        RADIAL k1 k2 -> OPENCV k1 k2 0 0
 """
 
-import os
-import shutil
-import tempfile
 from dataclasses import dataclass
-from pathlib import Path, PurePosixPath
+from pathlib import Path
 from typing import TYPE_CHECKING
 
 import numpy as np
 
+from swimm3r.cameras import cameras_of, check_cameras
 from swimm3r.errors import InputError
+from swimm3r.io.atomic import atomic_folder
 from swimm3r.io.colmap_files import damaged_file
+from swimm3r.io.damage import Remedy, first_line, guard
+from swimm3r.io.safe_names import check_names
 
 if TYPE_CHECKING:
     import pycolmap
 
 _FILES = ("cameras", "images", "points3D")
+_REMEDY = Remedy(
+    "open it with COLMAP itself, or write it again with its model_converter",
+    cause="a file is truncated or was written by an incompatible version",
+    fault="is not a readable COLMAP model",
+)
+_NOT_FOUND = Remedy(
+    "give the folder that COLMAP wrote, for example my_dive/sparse/0",
+    cause="cameras, images and points3D (.bin or .txt) are not all in it, nor in its 0/ or sparse/0/",
+)
 _FOCALS = {"SIMPLE_PINHOLE": 1, "SIMPLE_RADIAL": 1, "RADIAL": 1, "PINHOLE": 2, "OPENCV": 2, "OPENCV_FISHEYE": 2}
+
+
+def silence_log() -> None:
+    """Have COLMAP report errors alone, and to stderr rather than into files of the folder for temporary files."""
+    import pycolmap
+
+    pycolmap.logging.minloglevel = pycolmap.logging.Level.ERROR.value
+    pycolmap.logging.logtostderr = True
 
 
 @dataclass(frozen=True)
 class ColmapModel:
-    """Registered pictures of one size under one camera model, in the order of their COLMAP image ids."""
+    """Registered pictures of one size under one camera model, in the order of their COLMAP image ids.
+
+    Raises ValueError where an index points nowhere or a number is none.
+    """
 
     names: tuple[str, ...]
     model: str  # PINHOLE, SIMPLE_RADIAL, OPENCV or OPENCV_FISHEYE
@@ -43,54 +64,53 @@ class ColmapModel:
     track_frame: np.ndarray  # [o] index into names
     track_xy: np.ndarray  # [o, 2] pixels
 
+    def __post_init__(self) -> None:
+        check_names(self.names)
+        if not len(self.names) == len(self.K) == len(self.distortion) == len(self.cam2world):
+            raise ValueError("each picture has one name, one lens and one pose")
+        check_cameras(cameras_of(self))
+        if not (np.isfinite(self.xyz).all() and np.isfinite(self.track_xy).all()) or np.isnan(self.error).any():
+            raise ValueError("positions of points and of their sightings are finite numbers")
+        for index, length, what in (
+            (self.track_point, len(self.xyz), "points"),
+            (self.track_frame, len(self.names), "pictures"),
+        ):
+            if len(index) and not 0 <= int(index.min()) <= int(index.max()) < length:
+                raise ValueError(f"its tracks point beyond its {length} {what}")
 
-def read_model(folder: Path) -> ColmapModel:
+
+def read_model(folder: Path, remedy: Remedy | None = None) -> ColmapModel:
     """Read the binary or text model in `folder`, `folder/0`, `folder/sparse` or `folder/sparse/0`, the first found.
 
     Raises InputError where there is none, or one that mixes picture sizes or has a lens `cameras` cannot express.
     """
     import pycolmap
 
-    found = find_model(folder)
-    if (damaged := damaged_file(found)) is not None:  # pycolmap would hang on some of them
-        raise _unreadable(found, f"{damaged} is not whole")
-    try:
-        model = pycolmap.Reconstruction(str(found))
-    except (RuntimeError, ValueError, IndexError) as error:  # what pycolmap raises on damaged files
-        raise _unreadable(found, str(error).splitlines()[-1][:200]) from error
-    return from_pycolmap(model)
+    found = find_model(folder, remedy or _NOT_FOUND)
+    with guard(found, remedy or _REMEDY):
+        if (damaged := damaged_file(found)) is not None:  # pycolmap would hang on some of them
+            raise ValueError(f"{damaged} is not whole")
+        try:
+            model = pycolmap.Reconstruction(str(found))
+        except RuntimeError as error:  # pycolmap on a damaged file
+            raise ValueError(first_line(error)) from error
+        return from_pycolmap(model)
 
 
-def find_model(folder: Path) -> Path:
+def find_model(folder: Path, remedy: Remedy = _NOT_FOUND) -> Path:
     """The folder that holds the model's files. Raises InputError where none does."""
     for candidate in (folder, folder / "0", folder / "sparse", folder / "sparse" / "0"):
         for suffix in (".bin", ".txt"):
             if all((candidate / f"{name}{suffix}").is_file() for name in _FILES):
                 return candidate
-    raise InputError(
-        f"{folder} holds no COLMAP model",
-        cause="cameras, images and points3D (.bin or .txt) are not all in it, nor in its 0/ or sparse/0/",
-        hint="give the folder that COLMAP wrote, for example my_dive/sparse/0",
-    )
+    raise remedy.error(f"{folder} holds no COLMAP model", cause=remedy.cause, hint=remedy.hint)
 
 
 def write_model(folder: Path, model: ColmapModel) -> None:
     """Write a binary model; the folder appears, or is replaced, only once it is whole."""
     reconstruction = to_pycolmap(model)
-    folder.parent.mkdir(parents=True, exist_ok=True)
-    draft = Path(tempfile.mkdtemp(dir=folder.parent, prefix=f".{folder.name}."))
-    try:
+    with atomic_folder(folder) as draft:
         reconstruction.write_binary(str(draft))
-        draft.chmod(0o755)  # mkdtemp makes private folders; a run folder is shared
-        if folder.exists():
-            retired = Path(tempfile.mkdtemp(dir=folder.parent, prefix=f".{folder.name}."))
-            os.replace(folder, retired / folder.name)
-            os.replace(draft, folder)
-            shutil.rmtree(retired)
-        else:
-            os.replace(draft, folder)
-    finally:
-        shutil.rmtree(draft, ignore_errors=True)
 
 
 def from_pycolmap(model: "pycolmap.Reconstruction") -> ColmapModel:
@@ -103,7 +123,6 @@ def from_pycolmap(model: "pycolmap.Reconstruction") -> ColmapModel:
             hint="use another sub-model (sparse/0, sparse/1, ...)",
         )
     names = tuple(image.name for image in images)
-    check_names(names)
     cameras = [model.cameras[image.camera_id] for image in images]
     sizes = sorted({(camera.width, camera.height) for camera in cameras})
     if len(sizes) > 1:
@@ -116,7 +135,10 @@ def from_pycolmap(model: "pycolmap.Reconstruction") -> ColmapModel:
     intrinsics = [_intrinsics(camera, lens) for camera in cameras]
     cam2world = np.tile(np.eye(4), (len(images), 1, 1))
     for pose, image in zip(cam2world, images, strict=True):
-        pose[:3] = image.cam_from_world().inverse().matrix()
+        world2cam = image.cam_from_world()
+        if not np.linalg.norm(world2cam.rotation.quat) > 0.5:  # zero would be taken for no rotation
+            raise ValueError(f"the rotation of {image.name} is a quaternion of zeros")
+        pose[:3] = world2cam.inverse().matrix()
 
     points = [model.points3D[i] for i in sorted(model.point3D_ids())]
     frame_of = {image.image_id: frame for frame, image in enumerate(images)}
@@ -142,17 +164,6 @@ def from_pycolmap(model: "pycolmap.Reconstruction") -> ColmapModel:
         track_frame=np.array([frame for _, frame, _, _ in observations], np.int64),
         track_xy=np.array([seen[image][k] for _, _, image, k in observations], np.float64).reshape(-1, 2),
     )
-
-
-def check_names(names: tuple[str, ...]) -> None:
-    """Raises InputError for a picture's name that leads out of its folder."""
-    for name in names:
-        if PurePosixPath(name).is_absolute() or ".." in PurePosixPath(name).parts:
-            raise InputError(
-                f"the model names a picture outside its folder: {name}",
-                cause="the model was made with absolute paths, or was tampered with",
-                hint="make it again with names relative to the picture folder",
-            )
 
 
 def to_pycolmap(model: ColmapModel) -> "pycolmap.Reconstruction":
@@ -187,14 +198,6 @@ def to_pycolmap(model: ColmapModel) -> "pycolmap.Reconstruction":
         point.xyz, point.color, point.error, point.track = xyz, rgb, error, track
         out.add_point3D_with_id(p + 1, point)
     return out
-
-
-def _unreadable(folder: Path, why: str) -> InputError:
-    return InputError(
-        f"{folder} is not a readable COLMAP model ({why})",
-        cause="a file is truncated or was written by an incompatible version",
-        hint="open it with COLMAP itself, or write it again with its model_converter",
-    )
 
 
 def _common_lens(models: set[str]) -> str:

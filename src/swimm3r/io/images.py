@@ -1,32 +1,33 @@
 """Pictures and masks on disk <-> arrays, without losing bits on the way.
 
-Arrays are [h, w, 3] RGB, upright (the EXIF orientation is applied), in the depth of the file: uint8 or uint16. Pillow
-reads only headers here: it turns 16-bit colour into 8 bits without a word.
+Arrays are [h, w, 3] RGB, upright (the EXIF orientation is applied), in the depth of the file: uint8 or uint16. OpenCV
+and tifffile decode, for Pillow turns 16-bit colour into 8 bits without a word.
 """
 
 import io
-import struct
-import zlib
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 import tifffile
 from jaxtyping import Bool, Float, UInt8, UInt16
-from PIL import Image, UnidentifiedImageError
 
-from swimm3r.errors import InputError
 from swimm3r.io.atomic import atomic_path
+from swimm3r.io.image_header import (
+    DAMAGED,
+    TRANSPOSED,
+    read_header,
+    tiff_orientation,
+    too_large_for_memory,
+    unreadable,
+    verify_checksums,
+)
 
 SUFFIXES = (".jpg", ".jpeg", ".png", ".tif", ".tiff", ".bmp", ".webp")  # what a folder is searched for
 
 Rgb = UInt8[np.ndarray, "h w 3"] | UInt16[np.ndarray, "h w 3"]
 
-_ORIENTATION = 274  # the tag's number in EXIF and in TIFF
-_TRANSPOSED = (5, 6, 7, 8)  # orientations that swap width and height
-_TIFF_MAGIC = (b"II*\x00", b"MM\x00*", b"II+\x00", b"MM\x00+")
 _NEEDS_NO_CODEC = (1, 8, 32773, 32946)  # TIFF compressions that tifffile undoes alone: none, deflate, packbits, deflate
-_DAMAGED = (OSError, ValueError, IndexError, KeyError, SyntaxError, struct.error, zlib.error, tifffile.TiffFileError)
 
 
 def read_rgb(path: Path) -> Rgb:
@@ -49,32 +50,7 @@ def read_mask(path: Path) -> Bool[np.ndarray, "h w"]:
 
 def image_size(path: Path) -> tuple[int, int]:
     """Width and height of the upright picture in pixels, from its header alone. Raises InputError."""
-    try:
-        with path.open("rb") as file:
-            if file.read(4) in _TIFF_MAGIC:
-                file.seek(0)
-                with tifffile.TiffFile(file) as tiff:
-                    page: Any = tiff.pages[0]
-                    width, height, orientation = page.imagewidth, page.imagelength, _tiff_orientation(page)
-            else:
-                file.seek(0)
-                with Image.open(file) as header:
-                    (width, height), orientation = header.size, _exif_orientation(header)
-    except _DAMAGED as error:
-        raise _unreadable(path, error) from error
-    return (height, width) if orientation in _TRANSPOSED else (width, height)
-
-
-def is_plain(path: Path) -> bool:
-    """Whether every reader sees the same in it: JPEG or PNG, upright, RGB or grey, nothing transparent."""
-    try:
-        with Image.open(path) as header:
-            plain = header.mode in ("RGB", "L", "I;16") and "transparency" not in header.info
-            return plain and header.format in ("JPEG", "MPO", "PNG") and _exif_orientation(header) == 1
-    except UnidentifiedImageError:  # a TIFF that Pillow does not know
-        return False
-    except _DAMAGED as error:
-        raise _unreadable(path, error) from error
+    return read_header(path).size
 
 
 def write_rgb(path: Path, picture: Rgb | Float[np.ndarray, "h w 3"]) -> None:
@@ -85,6 +61,11 @@ def write_rgb(path: Path, picture: Rgb | Float[np.ndarray, "h w 3"]) -> None:
     if picture.dtype.kind == "f":
         picture = (np.clip(picture, 0, 1) * 255 + 0.5).astype(np.uint8)
     _write_png(path, np.ascontiguousarray(picture[..., ::-1]))
+
+
+def write_rgb_16(path: Path, picture: Float[np.ndarray, "h w 3"]) -> None:
+    """Write values 0..1 (clipped) as a PNG of 16 bits, whole or not at all."""
+    write_rgb(path, (np.clip(picture, 0, 1) * 65535 + 0.5).astype(np.uint16))
 
 
 def write_mask(path: Path, usable: Bool[np.ndarray, "h w"]) -> None:
@@ -104,25 +85,26 @@ def _write_png(path: Path, stored: np.ndarray) -> None:
 
 def _decode(path: Path) -> tuple[np.ndarray, int]:
     """[h, w] or [h, w, channels] in RGB(A) order, not yet upright, and the orientation still to be applied."""
+    header = read_header(path)
     try:
         data = path.read_bytes()
-        if data[:4] in _TIFF_MAGIC:
+        if header.kind == "TIFF":
             return _decode_tiff(data)
-        with Image.open(io.BytesIO(data)) as header:  # refuses what is no picture, and tells the format
-            orientation, kind = _exif_orientation(header), header.format
-            if kind == "PNG":
-                header.verify()  # checksums: libpng hands out what it has of a damaged file
-        if kind in ("JPEG", "MPO") and data.rfind(b"\xff\xd9") < data.rfind(b"\xff\xda"):
+        if header.kind == "PNG":
+            verify_checksums(data)  # libpng hands out what it has of a damaged file
+        if header.kind == "JPEG" and data.rfind(b"\xff\xd9") < data.rfind(b"\xff\xda"):
             raise ValueError("the file ends inside its picture")  # libjpeg paints the rest grey
-        return _opencv(data), orientation
-    except _DAMAGED as error:
-        raise _unreadable(path, error) from error
+        return _opencv(data), header.orientation
+    except DAMAGED as error:
+        raise unreadable(path, error) from error
+    except MemoryError as error:
+        raise too_large_for_memory(path, header.size, header.decoding_bytes) from error
 
 
 def _decode_tiff(data: bytes) -> tuple[np.ndarray, int]:
     with tifffile.TiffFile(io.BytesIO(data)) as tiff:
         page: Any = tiff.pages[0]
-        orientation = _tiff_orientation(page)
+        orientation = tiff_orientation(page)
         if page.compression not in _NEEDS_NO_CODEC:
             return _opencv(data), 1  # LZW, JPEG ...; OpenCV turns TIFF upright itself, whatever the flags
         stored = page.asarray()
@@ -135,18 +117,13 @@ def _decode_tiff(data: bytes) -> tuple[np.ndarray, int]:
         return stored, orientation
 
 
-def _exif_orientation(header: Image.Image) -> int:
-    return Image.Image.getexif(header).get(_ORIENTATION, 1)  # PngImageFile's own decodes the whole picture first
-
-
-def _tiff_orientation(page: Any) -> int:
-    return int(page.tags[_ORIENTATION].value) if _ORIENTATION in page.tags else 1
-
-
 def _opencv(data: bytes) -> np.ndarray:
     import cv2
 
-    stored = cv2.imdecode(np.frombuffer(data, np.uint8), cv2.IMREAD_UNCHANGED)
+    try:
+        stored = cv2.imdecode(np.frombuffer(data, np.uint8), cv2.IMREAD_UNCHANGED)
+    except cv2.error as error:  # its own limit of 2^30 pixels, or memory
+        raise ValueError(f"its contents do not decode ({error.err})") from error
     if stored is None:
         raise ValueError("its contents do not decode")
     if stored.ndim == 3 and stored.shape[2] >= 3:
@@ -156,7 +133,7 @@ def _opencv(data: bytes) -> np.ndarray:
 
 def _upright(stored: np.ndarray, orientation: int) -> np.ndarray:
     """Undo the camera's rotation: EXIF 2.3, tag 274."""
-    if orientation in _TRANSPOSED:
+    if orientation in TRANSPOSED:
         stored = stored.swapaxes(0, 1)
     if orientation in (3, 4, 7, 8):
         stored = stored[::-1]
@@ -171,28 +148,19 @@ def _three_channels(stored: np.ndarray, path: Path) -> np.ndarray:
     if stored.dtype.kind == "f":
         stored = _quantised(stored, path)
     if stored.dtype not in (np.uint8, np.uint16):
-        raise _unreadable(path, f"its values are {stored.dtype}; 8 or 16 bits without sign, or floats, were expected")
+        raise unreadable(path, f"its values are {stored.dtype}; 8 or 16 bits without sign, or floats, were expected")
     if stored.ndim == 2:
         stored = stored[..., None]
     if stored.ndim != 3 or not 1 <= stored.shape[2] <= 4:
-        raise _unreadable(path, f"its array is {stored.shape}; one to four channels were expected")
+        raise unreadable(path, f"its array is {stored.shape}; one to four channels were expected")
     colours = stored[..., :3] if stored.shape[2] >= 3 else stored[..., [0, 0, 0]]
     return np.ascontiguousarray(colours)
 
 
 def _quantised(stored: np.ndarray, path: Path) -> np.ndarray:
     if not np.isfinite(stored).all():
-        raise _unreadable(path, "it holds values that are not finite")
+        raise unreadable(path, "it holds values that are not finite")
     scale = next((full for limit, full in ((2, 1), (256, 255), (65536, 65535)) if stored.max() <= limit), None)
     if scale is None:
-        raise _unreadable(path, f"its largest value is {stored.max():g}; a scale of 1, 255 or 65535 was expected")
+        raise unreadable(path, f"its largest value is {stored.max():g}; a scale of 1, 255 or 65535 was expected")
     return (np.clip(stored / scale, 0, 1) * 65535 + 0.5).astype(np.uint16)
-
-
-def _unreadable(path: Path, why: object) -> InputError:
-    reason = "it is of no known picture format" if isinstance(why, UnidentifiedImageError) else why
-    return InputError(
-        f"{path} cannot be read as a picture: {reason}",
-        cause="the file is missing, damaged, cut off or of another format",
-        hint="open it in a picture viewer; copy it again, or save it as PNG, JPEG or TIFF",
-    )

@@ -5,9 +5,14 @@ from pathlib import Path
 import numpy as np
 from jaxtyping import Float, Float32
 
-from swimm3r.errors import InputError
 from swimm3r.io.atomic import atomic_path
+from swimm3r.io.damage import Remedy, guard
 
+_REMEDY = Remedy(
+    "save it as binary PLY with colours, in CloudCompare or MeshLab for example",
+    cause="the file is cut off, or a PLY of another kind (text, big-endian, without colours)",
+    fault="cannot be read as a coloured point cloud",
+)
 _RECORD = np.dtype([(axis, "<f4") for axis in "xyz"] + [(colour, "u1") for colour in ("red", "green", "blue")])
 _TYPES = {
     **dict.fromkeys(("char", "int8"), "i1"),
@@ -42,39 +47,44 @@ def write_vertices(path: Path, vertices: np.ndarray) -> None:
         file.write(vertices.tobytes())
 
 
-def read_points(path: Path) -> tuple[Float32[np.ndarray, "n 3"], Float32[np.ndarray, "n 3"]]:
+def read_points(path: Path, remedy: Remedy = _REMEDY) -> tuple[Float32[np.ndarray, "n 3"], Float32[np.ndarray, "n 3"]]:
     """Positions and colours 0..1 of a cloud. Raises InputError.
 
     Other tools' clouds are read too where they are binary little-endian, begin with the vertices, and give them
     scalar properties; those that are neither position nor colour are left out.
     """
-    try:
+    with guard(path, remedy):
         data = path.read_bytes()
         head, found, body = data.partition(b"end_header\n")
         lines = head.decode("ascii").splitlines()
         if not found or lines[:2] != ["ply", "format binary_little_endian 1.0"]:
             raise ValueError("a binary little-endian header was expected")
         count, record = _vertices(lines[2:])
+        if not 0 <= count * record.itemsize <= len(body):
+            raise ValueError(f"{count} vertices are promised, and {len(body)} bytes follow")
         points = np.frombuffer(body, record, count)
-        xyz = np.stack([points[name] for name in "xyz"], -1).astype(np.float32)
+        missing = {"x", "y", "z", "red", "green", "blue"} - set(record.names or ())
+        if missing:
+            raise ValueError(f"its vertices have no {', '.join(sorted(missing))}")
+        with np.errstate(over="ignore"):  # double precision beyond single is infinite, and refused
+            xyz = np.stack([points[name] for name in "xyz"], -1).astype(np.float32)
         rgb = np.stack([points[name] for name in ("red", "green", "blue")], -1)
-    except (OSError, ValueError, KeyError) as error:
-        raise InputError(
-            f"{path} cannot be read as a coloured point cloud ({error})",
-            cause="the file is missing, cut off, or a PLY of another kind (text, big-endian, without colours)",
-            hint="save it as binary PLY with colours, in CloudCompare or MeshLab for example",
-        ) from error
-    return xyz, rgb.astype(np.float32) / (1 if rgb.dtype.kind == "f" else np.iinfo(rgb.dtype).max)
+        rgb = rgb.astype(np.float32) / (1 if rgb.dtype.kind == "f" else np.iinfo(rgb.dtype).max)
+        if not (np.isfinite(xyz).all() and np.isfinite(rgb).all()):
+            raise ValueError("it has positions or colours that are not finite numbers")
+        return xyz, rgb
 
 
 def _vertices(lines: list[str]) -> tuple[int, np.dtype]:
     """How many vertices, and how each one lies in the file."""
     words = [line.split() for line in lines if not line.startswith(("comment", "obj_info"))]
-    if not words or words[0][:2] != ["element", "vertex"]:
+    if not words or words[0][:2] != ["element", "vertex"] or len(words[0]) != 3:
         raise ValueError("the vertices were expected first")
     fields = []
     for word in words[1:]:
-        if word[0] != "property":
+        if not word or word[0] != "property":
             break  # the next element: faces
+        if len(word) != 3 or word[1] not in _TYPES:
+            raise ValueError(f"a property of its vertices is {' '.join(word[1:])}")
         fields.append((word[2], _TYPES[word[1]]))
     return int(words[0][2]), np.dtype(fields)

@@ -1,30 +1,50 @@
-"""A folder of stills: which of its files are pictures, which are masks, in which order, and when they were taken."""
+"""A folder of stills: which of its files are pictures, which are masks, and in which order."""
 
 import os
 import re
-from collections.abc import Sequence
-from datetime import datetime
+from collections.abc import Collection, Sequence
+from dataclasses import dataclass
 from pathlib import Path
-
-from PIL import Image
 
 from swimm3r.io.images import SUFFIXES
 
 RUN_MARK = Path("prepare") / "frames.json"  # a folder that holds this is a run folder
-_TAKEN, _FRACTION, _EXIF = 36867, 37521, 0x8769  # DateTimeOriginal, SubSecTimeOriginal and the IFD they stand in
-_MASK_SUFFIXES = (".png", ".jpg", ".jpeg", ".tif", ".tiff", ".bmp")
 
 
-def find_pictures(folder: Path, leave_out: Sequence[Path] = ()) -> list[Path]:
-    """Every picture below a folder, in natural order, without masks, hidden files, run folders and `leave_out`."""
+@dataclass(frozen=True)
+class FilesBelow:
+    """The files below a folder in natural order, and the folders that could not be searched."""
+
+    paths: list[Path]
+    unreadable: list[Path]
+
+
+def find_files(folder: Path, suffixes: tuple[str, ...], leave_out: Sequence[Path] = ()) -> FilesBelow:
+    """Every file of these kinds below a folder, without hidden files, run folders and `leave_out`.
+
+    Raises OSError where the folder itself cannot be searched.
+    """
     closed = {path.resolve() for path in leave_out}
+    unreadable: list[Path] = []
+
+    def pass_over(error: OSError) -> None:
+        if Path(error.filename) == folder:
+            raise error
+        unreadable.append(Path(error.filename))
+
     found: list[Path] = []
-    for where, folders, files in os.walk(folder):
+    for where, folders, files in os.walk(folder, onerror=pass_over):
         here = Path(where)
         folders[:] = [name for name in folders if not _hidden(name) and not _closed(here / name, closed)]
-        found += [here / name for name in files if not _hidden(name) and name.lower().endswith(SUFFIXES)]
-    masks = masks_beside(found)
-    return sorted((path for path in found if path not in masks), key=lambda path: natural_key(path, folder))
+        found += [here / name for name in files if not _hidden(name) and name.lower().endswith(suffixes)]
+    return FilesBelow(sorted(found, key=lambda path: natural_key(path, folder)), unreadable)
+
+
+def find_pictures(folder: Path, leave_out: Sequence[Path] = ()) -> FilesBelow:
+    """Every picture below a folder; masks beside their pictures are none."""
+    found = find_files(folder, SUFFIXES, leave_out)
+    masks = masks_beside(found.paths)
+    return FilesBelow([path for path in found.paths if path not in masks], found.unreadable)
 
 
 def masks_beside(pictures: Sequence[Path]) -> set[Path]:
@@ -39,14 +59,20 @@ def masks_beside(pictures: Sequence[Path]) -> set[Path]:
     }
 
 
-def find_mask(name: Path, folder: Path, not_masks: set[Path]) -> Path | None:
-    """The mask of the picture with this relative name: NAME_mask.png, NAME.jpg.png or NAME.png."""
-    for stem in (f"{name.with_suffix('')}_mask", str(name), str(name.with_suffix(""))):
-        for suffix in _MASK_SUFFIXES:
-            candidate = folder / f"{stem}{suffix}"
-            if candidate.is_file() and candidate not in not_masks:
-                return candidate
-    return None
+class MaskFolder:
+    """The masks below a folder, by the names of the pictures they belong to."""
+
+    def __init__(self, folder: Path, pictures: Collection[Path], leave_out: Sequence[Path] = ()) -> None:
+        """`pictures` are files that are no masks, wherever they lie. Raises OSError where there is no such folder."""
+        found = find_files(folder, SUFFIXES, leave_out).paths
+        self.paths = [path for path in found if path not in pictures]
+        self._by_stem = {path.relative_to(folder).with_suffix(""): path for path in reversed(self.paths)}
+
+    def mask_of(self, picture: Path) -> Path | None:
+        """The mask of the picture with this relative name: NAME_mask.png, NAME.jpg.png or NAME.png, of any suffix."""
+        stem = picture.with_suffix("")
+        candidates = (stem.with_name(f"{stem.name}_mask"), picture, stem)
+        return next((self._by_stem[name] for name in candidates if name in self._by_stem), None)
 
 
 def natural_key(path: Path, folder: Path) -> list[tuple[int, int, str]]:
@@ -55,18 +81,6 @@ def natural_key(path: Path, folder: Path) -> list[tuple[int, int, str]]:
     pieces = re.split(r"(\d+)", relative.as_posix().lower())
     number = [(0, int(piece), "") if piece.isdigit() else (1, 0, piece) for piece in pieces]
     return [(len(relative.parts) > 1, 0, ""), *number, (1, 0, relative.as_posix())]
-
-
-def capture_time(path: Path) -> float | None:
-    """Seconds on the camera's clock (EXIF DateTimeOriginal with its fraction); None where the file does not tell."""
-    try:
-        with Image.open(path) as header:
-            exif = Image.Image.getexif(header).get_ifd(_EXIF)  # PngImageFile's own decodes the picture
-            taken = datetime.strptime(str(exif[_TAKEN]).strip("\x00 "), "%Y:%m:%d %H:%M:%S")
-            digits = str(exif.get(_FRACTION, "")).strip("\x00 ")
-    except (OSError, KeyError, ValueError, SyntaxError):
-        return None
-    return (taken - datetime(1970, 1, 1)).total_seconds() + (float(f"0.{digits}") if digits.isdigit() else 0.0)
 
 
 def numbered(pictures: Sequence[Path]) -> bool:
@@ -80,4 +94,4 @@ def _hidden(name: str) -> bool:
 
 
 def _closed(folder: Path, closed: set[Path]) -> bool:
-    return folder.resolve() in closed or (folder / RUN_MARK).is_file()
+    return folder.resolve() in closed or os.path.isfile(folder / RUN_MARK)  # Path.is_file raises where it may not look

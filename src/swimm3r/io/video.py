@@ -15,13 +15,18 @@ import numpy as np
 from jaxtyping import UInt8
 
 from swimm3r.errors import InputError
+from swimm3r.io.regular_file import require_regular_file
 
 if TYPE_CHECKING:
     import av
     from av.container import InputContainer
 
+VIDEO_SUFFIXES = (".mp4", ".mov", ".m4v", ".mkv", ".webm", ".avi", ".mts", ".m2ts", ".mpg", ".mpeg", ".wmv", ".3gp")
+"""What a folder without pictures is searched for; FFmpeg reads more."""
+
 _NOT_VIDEO = ("tty", "image2", "_pipe")  # FFmpeg's readers of text and of single pictures
 _INDEXED = ("mov,mp4,m4a,3gp,3g2,mj2", "matroska,webm")  # the containers whose seeking can be relied on
+_FARTHEST = 2**62  # ticks; FFmpeg counts them in 64 bits
 _UNSPECIFIED = 2  # AVCOL_SPC_UNSPECIFIED
 _HD_LINES = 720  # from here on untagged video is BT.709, as players take it; below BT.601
 
@@ -63,6 +68,7 @@ class Video:
         from av.error import FFmpegError
         from av.video.reformatter import VideoReformatter
 
+        require_regular_file(path, "a video")
         self.path, self.damaged, self.interlaced = path, 0, False
         self._reformatters = {"gray": VideoReformatter(), "rgb24": VideoReformatter()}  # each keeps its scaler
         try:
@@ -121,7 +127,7 @@ class Video:
             stream: Any = file.streams[self._stream]
             stream.thread_type = "AUTO"
             if start > 0 and file.format.name in _INDEXED:
-                file.seek(self._origin + int(start / self._tick), stream=stream)
+                file.seek(self._origin + int(min(start / self._tick, _FARTHEST)), stream=stream)
             packets = file.demux(stream)
             while True:
                 try:

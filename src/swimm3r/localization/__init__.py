@@ -30,4 +30,5 @@ def localize(
     """
     from swimm3r.localization.protocol import Localizer
 
-    return Localizer(scene, rec, frames, settings).locate(image, lens=lens, time=time).cam2world
+    localizer = Localizer(scene, rec, frames, settings)
+    return localizer.in_axes_of_sfm(localizer.locate(image, lens=lens, time=time).cam2world)

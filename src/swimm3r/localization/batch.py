@@ -7,7 +7,7 @@ OUT/matches/NAME.png the query beside the rendering, a line per inlier
 
 import json
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 
 import numpy as np
@@ -16,15 +16,17 @@ from jaxtyping import Bool, Float, UInt8
 from torch import Tensor
 
 from swimm3r import devices, reconstruction
-from swimm3r.cameras import Cameras
+from swimm3r.cameras import Cameras, cameras_of
 from swimm3r.errors import InputError, RegistrationError
-from swimm3r.geometry import quaternion_from_rotation
 from swimm3r.io import cameras_json, images
 from swimm3r.io.atomic import write_text
+from swimm3r.io.image_header import read_header
+from swimm3r.io.trajectory import write_tum
 from swimm3r.localization.protocol import STAGES, Evidence, Localization, Localizer
 from swimm3r.localization.settings import LocalizationSettings
 from swimm3r.prepare import load_frames
 from swimm3r.progress import Progress, silent
+from swimm3r.run_folder import open_run
 from swimm3r.splat.checkpoint import load_map
 
 _LINES = 60  # inliers drawn, spread over all of them
@@ -61,13 +63,18 @@ def localize_run(
 ) -> tuple[list[Answer], Path]:
     """Places pictures, by default the run's test frames, in the run's map; the record goes to `out`.
 
+    Poses are in the axes and unit of RUN/sfm.
+
     Raises InputError where the run has no map, RegistrationError where not one picture could be placed.
     """
+    camera = None if lens is None else cameras_of(cameras_json.read_cameras(lens))[0]
+    for path in pictures:
+        read_header(path)  # before minutes of matching
+    open_run(folder, "splat")
     scene = load_map(folder / "splat" / "map.safetensors").to(devices.for_maps())
-    rec = reconstruction.load(folder / "sfm")
     frames = load_frames(folder / "prepare")
+    rec = reconstruction.load(folder / "sfm", frames)
     localizer = Localizer(scene, rec, frames, settings)
-    camera = None if lens is None else reconstruction.cameras_of(cameras_json.read_cameras(lens))[0]
     out = out or folder / "localization"
     answers = []
     names = [path.name for path in pictures] or list(frames.test.names)
@@ -85,10 +92,10 @@ def localize_run(
             f = frames.index(name)
             time = frames.frames[f].time
             query = Query(name, time, frames.image(f), frames.mask(f), time)
-        answers.append(answer(localizer, query, camera))
-        found = answers[-1].found
-        if found is not None and found.evidence is not None:
-            images.write_rgb(out / "matches" / f"{name}.png", match_picture(found.evidence))
+        found = answer(localizer, query, camera)
+        answers.append(_in_axes_of_sfm(found, localizer))
+        if found.found is not None and found.found.evidence is not None:
+            images.write_rgb(out / "matches" / f"{name}.png", match_picture(found.found.evidence))
         _write(out, answers, localizer.matcher.name, rec.metric)
     progress("localising", len(names), len(names))
     if all(a.found is None for a in answers):
@@ -109,12 +116,6 @@ def answer(localizer: Localizer, query: Query, lens: Cameras | None = None) -> A
         return Answer(query.name, query.time, None, failure.what)
 
 
-def tum_line(time: float, cam2world: Float[Tensor, "4 4"]) -> str:
-    """One line of a TUM trajectory."""
-    w, x, y, z = quaternion_from_rotation(cam2world[:3, :3].double()).tolist()
-    return " ".join(f"{value:.9f}" for value in (time, *cam2world[:3, 3].tolist(), x, y, z, w))
-
-
 def match_picture(evidence: Evidence) -> UInt8[np.ndarray, "h w2 3"]:
     """Query and rendering side by side, with inliers joined."""
     import cv2
@@ -128,6 +129,12 @@ def match_picture(evidence: Evidence) -> UInt8[np.ndarray, "h w2 3"]:
         right = [round(float(v)) for v in evidence.xy_rendering[k]]
         cv2.line(canvas, left, (right[0] + width, right[1]), (255, 220, 60), 1, cv2.LINE_AA)
     return canvas
+
+
+def _in_axes_of_sfm(a: Answer, localizer: Localizer) -> Answer:
+    if a.found is None:
+        return a
+    return replace(a, found=replace(a.found, cam2world=localizer.in_axes_of_sfm(a.found.cam2world)))
 
 
 def _picture(path: Path) -> Float[Tensor, "h w 3"]:
@@ -146,7 +153,8 @@ def _write(out: Path, answers: Sequence[Answer], matcher: str, metric: bool) -> 
         "pictures": [_described(a) for a in answers],
     }
     write_text(out / "poses.json", json.dumps(document, indent=1) + "\n")
-    write_text(out / "poses.tum", "".join(tum_line(a.time, found.cam2world) + "\n" for a, found in placed))
+    poses = np.stack([found.cam2world.numpy() for _, found in placed]) if placed else np.empty((0, 4, 4))
+    write_tum(out / "poses.tum", [a.time for a, _ in placed], poses)
 
 
 def _described(a: Answer) -> dict[str, object]:

@@ -15,6 +15,7 @@ from torch import Tensor
 
 from swimm3r.cameras import Cameras
 from swimm3r.frames import Frames
+from swimm3r.io.colmap import silence_log
 from swimm3r.reconstruction import Reconstruction
 from swimm3r.sfm.colmap import absolute_pose
 from swimm3r.sfm.settings import FeatureSettings
@@ -48,9 +49,7 @@ def landmarks_of(
 ) -> Callable[[str], Landmarks]:
     """The landmarks of a registered frame by its name; those of the last `keep` frames asked for are remembered."""
 
-    import pycolmap
-
-    pycolmap.logging.minloglevel = pycolmap.logging.Level.ERROR.value
+    silence_log()
 
     @lru_cache(maxsize=keep)
     def of(name: str) -> Landmarks:

@@ -6,13 +6,14 @@ the references. MASt3R matches every pixel, and compares pictures by their encod
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
-from typing import Any, Protocol, runtime_checkable
+from typing import Any, Literal, Protocol, runtime_checkable
 
 import torch
 from jaxtyping import Bool, Float
 from torch import Tensor
 
 from swimm3r import weights
+from swimm3r.io.colmap import silence_log
 from swimm3r.localization.settings import LocalizationSettings
 from swimm3r.sfm import retrieval, vlad
 from swimm3r.sfm.mast3r.inference import ViewPrediction, predict_pair
@@ -59,9 +60,8 @@ class SiftMatcher:
     name = "SIFT"
 
     def __init__(self, settings: LocalizationSettings) -> None:
-        import pycolmap
 
-        pycolmap.logging.minloglevel = pycolmap.logging.Level.ERROR.value
+        silence_log()
         self.settings = settings.features
 
     def describe(self, picture: Float[Tensor, "h w 3"], usable: Bool[Tensor, "h w"]) -> _Keypoints:
@@ -151,8 +151,18 @@ def _tokens(seen: _Seen) -> Float[Tensor, "k c"]:
     return seen.encoded.tokens[0].float().cpu()
 
 
+def chosen_matcher(settings: LocalizationSettings) -> Literal["mast3r", "sift"]:
+    """What "auto" stands for here. Raises WeightsError for weights that are named and not there."""
+    if settings.matcher != "auto":
+        return settings.matcher
+    return "sift" if weights.find("mast3r", settings.weights) is None else "mast3r"
+
+
 def matcher_for(settings: LocalizationSettings) -> Matcher:
     """The matcher that the settings name. Raises WeightsError where MASt3R is asked for and its weights are missing."""
-    if settings.matcher == "mast3r" or (settings.matcher == "auto" and weights.find("mast3r") is not None):
-        return Mast3rMatcher(load_network(Mast3rSettings()), settings)
-    return SiftMatcher(settings)
+    match chosen_matcher(settings):
+        case "mast3r":
+            network = Mast3rSettings(settings.weights, device=settings.device, precision=settings.precision)
+            return Mast3rMatcher(load_network(network), settings)
+        case "sift":
+            return SiftMatcher(settings)

@@ -6,9 +6,12 @@
 4. match       the rendering with the query;
 5. refine      the rendering's pixels as points of the world: PnP with RANSAC again.
 
-The renderer is whatever map there is; where the last step finds too few inliers, the coarse pose stands.
+The renderer is whatever map there is. The refined pose stands where enough of its inliers agree and, unless GS-CPR's
+own rule is asked for (`settings.accept`), where its standard error is smaller than that of the coarse one: a few dozen
+loose matches with a poor rendering must not replace a pose that hundreds of pixels agree on.
 """
 
+import math
 from collections.abc import Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass, field, replace
@@ -23,16 +26,16 @@ from torch import Tensor
 from swimm3r.cameras import Cameras, project, resized
 from swimm3r.errors import InputError, RegistrationError
 from swimm3r.frames import Frames
+from swimm3r.geometry import pose_from, so3_exp
 from swimm3r.localization.matchers import Matcher, matcher_for
 from swimm3r.localization.references import FilmedReferences, Reference, References, RenderedReferences, rendered
 from swimm3r.localization.settings import LocalizationSettings
 from swimm3r.reconstruction import Reconstruction
 from swimm3r.sfm.colmap import absolute_pose
-from swimm3r.splat.pose_codes import as_mapped
+from swimm3r.splat.pose_codes import as_mapped, axes_of_map
 from swimm3r.splat.rendering import SplatMap
-from swimm3r.splat.views import pinhole_canvas, undistorted
+from swimm3r.splat.views import undistorted
 
-_Pose = tuple[Tensor, int]  # cam2world [4, 4], inliers
 STAGES = ("retrieve", "coarse", "render", "match", "refine")
 
 
@@ -62,8 +65,44 @@ class Localization:
     seconds: dict[str, float] = field(default_factory=dict)  # by stage
 
 
+@dataclass(frozen=True)
+class _Solved:
+    """Pixels of a query that show known points, and the pose that most of them agree on."""
+
+    pixels: Float[Tensor, "m 2"]
+    points: Float[Tensor, "m 3"]  # world
+    camera: Cameras  # whose pixels they are; its pose unused
+    max_error: float  # of an inlier, its pixels
+    cam2world: Float[Tensor, "4 4"] | None  # None where too few agree
+    inlier: Bool[Tensor, " m"]
+
+    def errors(self, cam2world: Float[Tensor, "4 4"]) -> Float[Tensor, " m"]:
+        """Distance of each pixel from its point seen from a pose; infinite for points behind the camera."""
+        reprojected, z = project(replace(self.camera, cam2world=cam2world[None]), self.points[None])
+        off = torch.linalg.vector_norm(reprojected[0] - self.pixels, dim=-1)
+        return torch.where(z[0] > 0, off, torch.inf)
+
+    def uncertainty(self, at: Float[Tensor, "k 3"]) -> float:
+        """Pixels (root mean square) by which the pose's standard error moves the images of points.
+
+        The covariance s^2 (J^T J)^-1 of least squares, s^2 from the inliers' own residuals; infinite without a pose.
+        """
+        if self.cam2world is None:
+            return math.inf
+        residuals = self.errors(self.cam2world)[self.inlier]
+        J = _pose_jacobian(self.camera, self.cam2world, self.points[self.inlier])
+        variance = residuals.square().sum() / max(1, 2 * len(residuals) - 6)
+        covariance = variance * torch.linalg.pinv(J.mT @ J, hermitian=True)
+        moved = _pose_jacobian(self.camera, self.cam2world, at)
+        return float(torch.einsum("ij,jk,ik->i", moved, covariance, moved).sum().div(max(1, len(at))).sqrt())
+
+
 class Localizer:
-    """Places pictures in one map; what it learns of the references serves every query."""
+    """Places pictures in one map; what it learns of the references serves every query.
+
+    Poses are in the axes and unit of the map, and so of `rec`, the reconstruction with the poses as the map's training
+    left them; `in_axes_of_sfm` takes them back to those of structure from motion.
+    """
 
     def __init__(
         self,
@@ -73,8 +112,9 @@ class Localizer:
         settings: LocalizationSettings | None = None,
         matcher: Matcher | None = None,
     ) -> None:
-        rec = as_mapped(rec, scene.poses)
+        to_map, rec = axes_of_map(rec, scene.poses), as_mapped(rec, scene.poses)
         self.scene, self.rec = scene, rec
+        self._to_sfm = None if to_map is None else to_map.inverse()
         self.settings = settings or LocalizationSettings()
         self.matcher = matcher or matcher_for(self.settings)
         self.long_side = self.settings.long_side or scene.settings.long_side
@@ -110,22 +150,44 @@ class Localizer:
             candidates = tuple(self.rec.names[k] for k in likest)
         lens = self._own_lens(likest[0], width, height) if lens is None else lens
         with _timed(seconds, "coarse"):
-            found = self._coarse(query, candidates, lens)
-        if found is None:
+            coarse = self._coarse(query, candidates, lens)
+        if coarse.cam2world is None:
             raise RegistrationError(
                 f"the picture could not be placed: fewer than {s.min_inliers} of its matches agree on a pose",
                 cause="it shows a place that the map does not, or too little of it, or through very different water",
                 hint="a picture from nearer to the dive's path, or more --settings.candidates",
             )
-        pose, coarse_inliers = found
-        best = Localization(pose, "coarse", candidates, coarse_inliers, 0, 0, None, None, seconds)
+        coarse_inliers = int(coarse.inlier.sum())
+        best = Localization(coarse.cam2world, "coarse", candidates, coarse_inliers, 0, 0, None, None, seconds)
+        before = coarse
         for _ in range(s.rounds):
-            refined = self._refined(picture, mask, replace(lens, cam2world=best.cam2world[None]), time, seconds)
-            best = replace(best, matches=refined.matches, evidence=refined.evidence)
-            if refined.inliers < s.min_inliers:
+            there = replace(lens, cam2world=best.cam2world[None])
+            solved, evidence = self._against_rendering(picture, mask, there, time, seconds)
+            best = replace(best, matches=len(solved.pixels), evidence=evidence)
+            if solved.cam2world is None or not self._stands(solved, before):
                 break
-            best = replace(refined, candidates=candidates, coarse_inliers=coarse_inliers, seconds=seconds)
+            before, per_pixel = solved, lens.width / solved.camera.width
+            error = float(solved.errors(solved.cam2world)[solved.inlier].median()) * per_pixel
+            best = replace(
+                best,
+                cam2world=solved.cam2world,
+                stage="refined",
+                inliers=int(solved.inlier.sum()),
+                reprojection_px=error,
+            )
         return best
+
+    def _stands(self, refined: _Solved, before: _Solved) -> bool:
+        """Whether a refined pose takes the place of the pose before it."""
+        if refined.cam2world is None or self.settings.accept == "inliers":
+            return refined.cam2world is not None
+        seen = torch.cat([before.points[before.inlier], refined.points[refined.inlier]])
+        per_pixel = before.camera.width / refined.camera.width
+        return refined.uncertainty(seen) * per_pixel < before.uncertainty(seen)
+
+    def in_axes_of_sfm(self, cam2world: Float[Tensor, "4 4"]) -> Float[Tensor, "4 4"]:
+        """A pose of the map where structure from motion has it: the map's training may have moved all cameras."""
+        return cam2world if self._to_sfm is None else self._to_sfm.poses(cam2world.double())
 
     def _described_reference(self, name: str) -> tuple[Reference, Any]:
         reference = self.references[name]
@@ -142,9 +204,8 @@ class Localizer:
             )
         return resized(lens, width, height)
 
-    def _coarse(
-        self, query: Any, candidates: tuple[str, ...], lens: Cameras
-    ) -> tuple[Float[Tensor, "4 4"], int] | None:
+    def _coarse(self, query: Any, candidates: tuple[str, ...], lens: Cameras) -> _Solved:
+        """The query's matches with the references, whose pixels are points of the world."""
         pixels, points = [], []
         for name in candidates:
             reference, described = self._reference(name)
@@ -152,22 +213,22 @@ class Localizer:
             xyz, known = reference.points(xy_reference)
             pixels.append(xy_query[known])
             points.append(xyz)
-        return self._pose(torch.cat(pixels), torch.cat(points), lens, self.settings.max_error)[0]
+        return self._solved(torch.cat(pixels), torch.cat(points), lens, self.settings.max_error)
 
-    def _refined(
+    def _against_rendering(
         self,
         picture: Float[Tensor, "h w 3"],
         mask: Bool[Tensor, "h w"],
         lens: Cameras,
         time: float | None,
         seconds: dict[str, float],
-    ) -> Localization:
+    ) -> tuple[_Solved, Evidence]:
         """One round of rendering, matching and PnP from the pose of `lens`."""
         s = self.settings
         with _timed(seconds, "render"):
             reference = rendered(self.scene, lens, self.long_side, s.min_alpha, time)
         with _timed(seconds, "match"):
-            canvas = pinhole_canvas(lens, self.long_side)
+            canvas = lens.pinhole(self.long_side)
             shown, usable = undistorted(picture, mask, lens, canvas)
             xy_query, xy_rendering = self.matcher.match(
                 self.matcher.describe(shown, usable), self.matcher.describe(reference.rgb, reference.usable)
@@ -177,27 +238,30 @@ class Localizer:
             xyz, known = reference.points(xy_rendering[inner])
             xy_query, xy_rendering = xy_query[inner][known], xy_rendering[inner][known]
         with _timed(seconds, "refine"):
-            per_canvas_pixel = lens.width / canvas.width
-            found, inlier = self._pose(xy_query, xyz, canvas, s.max_error / per_canvas_pixel)
-        evidence = Evidence(shown, reference.rgb, xy_query, xy_rendering, inlier)
-        if found is None:
-            return Localization(lens.cam2world[0], "coarse", (), 0, 0, len(xyz), None, evidence)
-        pose, count = found
-        reprojected = project(replace(canvas, cam2world=pose[None]), xyz[inlier][None])[0][0]
-        error = torch.linalg.vector_norm(reprojected - xy_query[inlier], dim=-1).median() * per_canvas_pixel
-        return Localization(pose, "refined", (), 0, count, len(xyz), float(error), evidence)
+            solved = self._solved(xy_query, xyz, canvas, s.max_error * canvas.width / lens.width)
+        return solved, Evidence(shown, reference.rgb, xy_query, xy_rendering, solved.inlier)
 
-    def _pose(
-        self, pixels: Float[Tensor, "n 2"], points: Float[Tensor, "n 3"], lens: Cameras, max_error: float
-    ) -> tuple[_Pose | None, Bool[Tensor, " n"]]:
+    def _solved(
+        self, pixels: Float[Tensor, "n 2"], points: Float[Tensor, "n 3"], camera: Cameras, max_error: float
+    ) -> _Solved:
         """PnP with RANSAC where enough matches agree, and which do."""
-        nothing = torch.zeros(len(pixels), dtype=torch.bool)
-        if len(pixels) < self.settings.min_inliers:
-            return None, nothing
-        estimate = absolute_pose(pixels, points, lens, max_error)
+        enough = len(pixels) >= self.settings.min_inliers
+        estimate = absolute_pose(pixels, points, camera, max_error) if enough else None
         if estimate is None or int(estimate[1].sum()) < self.settings.min_inliers:
-            return None, nothing
-        return (estimate[0], int(estimate[1].sum())), estimate[1]
+            return _Solved(pixels, points, camera, max_error, None, torch.zeros(len(pixels), dtype=torch.bool))
+        return _Solved(pixels, points, camera, max_error, *estimate)
+
+
+def _pose_jacobian(
+    camera: Cameras, cam2world: Float[Tensor, "4 4"], points: Float[Tensor, "n 3"], step: float = 1e-5
+) -> Float[Tensor, "n2 6"]:
+    """Central differences of the points' pixels, rows u and v in turn, by the pose's turn and shift in camera axes."""
+    columns = []
+    for axis in torch.eye(6, dtype=torch.float64) * step:
+        both = [pose_from(so3_exp(sign * axis[:3]), sign * axis[3:]) for sign in (1.0, -1.0)]
+        views = [project(replace(camera, cam2world=(cam2world @ motion)[None]), points[None])[0][0] for motion in both]
+        columns.append((views[0] - views[1]).flatten() / (2 * step))
+    return torch.stack(columns, -1)
 
 
 @contextmanager

@@ -11,7 +11,6 @@ from swimm3r.cameras import Cameras, directions
 from swimm3r.frames import Frames
 from swimm3r.reconstruction import Reconstruction
 from swimm3r.splat.rendering import SplatMap
-from swimm3r.splat.views import pinhole_canvas
 
 
 @dataclass(frozen=True)
@@ -73,7 +72,7 @@ def rendered(scene: SplatMap, lens: Cameras, long_side: int, min_alpha: float, t
 
     A dynamic map is shown at `time`, seconds of its clip, or half way through where nobody knows it.
     """
-    canvas = pinhole_canvas(lens, long_side)
+    canvas = lens.pinhole(long_side)
     out = scene.render(canvas, sum(scene.span) / 2 if time is None else time)
     covered = out.alpha > min_alpha
     camera = replace(canvas, cam2world=canvas.cam2world.double())

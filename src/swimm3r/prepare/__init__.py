@@ -37,8 +37,11 @@ def load_frames(folder: Path) -> "swimm3r.frames.Frames":
     return reading.load_frames(folder)
 
 
-def check_source(source: Path) -> None:
-    """Raises InputError where a source is plainly no video and no folder of pictures; cheap, and writes nothing."""
+def check_source(source: Path) -> Path:
+    """The video or folder of pictures that a source stands for: a folder's only video where it has no pictures.
+
+    Cheap, and writes nothing. Raises InputError where a source is plainly none of them, or cannot be read.
+    """
     from swimm3r.prepare import reading
 
-    reading.check_source(source)
+    return reading.check_source(source)

@@ -17,6 +17,7 @@ from swimm3r.prepare.pictures import (
     Dive,
     Picture,
     blank_caution,
+    is_gray,
     scaled_down,
     sharpness,
     thinned,
@@ -55,8 +56,9 @@ def prepare_clip(source: Path, draft: Path, settings: FrameSettings, progress: P
             continue
         frame, sharp = best
         name = f"frame_{len(pictures):06d}.png"
-        images.write_rgb(draft / name, scaled_down(frame.rgb(), settings.long_side))
-        pictures.append(Picture(name, Path(name), (video.width, video.height), frame.time, sharp))
+        rgb = scaled_down(frame.rgb(), settings.long_side)
+        images.write_rgb(draft / name, rgb)
+        pictures.append(Picture(name, Path(name), (video.width, video.height), frame.time, sharp, is_gray(rgb)))
     progress(STEP, max(seen, 1), max(seen, 1))
 
     if not seen:

@@ -1,34 +1,41 @@
 """Masks: found by name, checked against their pictures, prepared at the size of the frames."""
 
+from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
+from jaxtyping import Bool
 
 from swimm3r.errors import InputError
 from swimm3r.frame_settings import FrameSettings
 from swimm3r.io import images, stills
-from swimm3r.prepare.pictures import Dive, some_names
+from swimm3r.prepare.pictures import Dive, Picture, some_names
 
 FOLDER = "masks"  # of the prepared ones, within the folder of the frames
 
 
-def prepare_masks(
-    dive: Dive, draft: Path, size: tuple[int, int], settings: FrameSettings, cautions: list[str]
-) -> tuple[dict[str, str], set[str]]:
-    """The masks' places by the frames' names, and the frames that a mask covers wholly."""
-    import cv2
+@dataclass(frozen=True)
+class PreparedMasks:
+    """The masks of a dive as written into the draft folder."""
 
-    folders = [folder for folder in dive.mask_folders if folder.is_dir()]
-    if settings.masks is not None and not folders:
+    places: dict[str, str]  # relative paths by the frames' names
+    covered: set[str]  # names of the frames that a mask covers wholly
+    unused: int  # masks that belong to no frame
+
+
+def check_masks(settings: FrameSettings) -> None:
+    """Raise InputError where the folder of masks that was asked for is not there."""
+    if settings.masks is not None and not settings.masks.is_dir():
         raise InputError(
             f"there is no folder of masks {settings.masks}", cause="a slip in the name", hint="check --masks"
         )
-    pictures = {folder / original for folder in folders for original in dive.originals}
-    found: dict[Path, Path] = {}
-    for original in dive.originals:
-        mask = next((m for folder in folders if (m := stills.find_mask(original, folder, pictures))), None)
-        if mask is not None:
-            found[original] = mask
+
+
+def prepare_masks(
+    dive: Dive, draft: Path, size: tuple[int, int], settings: FrameSettings, cautions: list[str]
+) -> PreparedMasks:
+    """Write the masks of the frames; says in `cautions` which masks or frames are left without their counterpart."""
+    found, unused = _find(dive, settings)
     if not found and settings.masks is not None:
         raise InputError(
             f"no mask in {settings.masks} belongs to a frame",
@@ -39,30 +46,45 @@ def prepare_masks(
     for picture in dive.pictures:
         if picture.original not in found:
             continue
-        usable = images.read_mask(found[picture.original])
-        given = usable.shape[::-1]
-        if given not in (picture.size, size):
-            raise InputError(
-                f"the mask {found[picture.original]} is {given[0]}x{given[1]}, "
-                f"its picture {picture.original} is {picture.size[0]}x{picture.size[1]}",
-                cause="the mask was made for a resized, cropped or turned picture",
-                hint="make the masks at the size of the pictures",
-            )
+        usable = _read(found[picture.original], picture, size)
         if not usable.any():
             covered.add(picture.name)
-        scaled = cv2.resize(usable.astype(np.uint8), size, interpolation=cv2.INTER_NEAREST).astype(bool)
         places[picture.name] = f"{FOLDER}/{picture.name}.png"  # COLMAP's way of naming
-        images.write_mask(draft / places[picture.name], scaled)
-    if found:
-        strangers = {mask for folder in folders for mask in _mask_files(folder, pictures)} - set(found.values())
-        names = f" ({some_names(sorted(strangers), folders[-1])})" if strangers else ""
+        images.write_mask(draft / places[picture.name], usable)
+    if unused or (found and len(places) < len(dive.pictures)):
+        names = f" ({some_names(unused, unused[0].parent)})" if unused else ""
         matched = f"Masks: {len(places)} of {len(dive.pictures)} frames have one"
-        cautions.append(f"{matched}; {len(strangers)} masks match no frame{names}.")
-    return places, covered
+        cautions.append(f"{matched}; {len(unused)} masks match no frame{names}.")
+    return PreparedMasks(places, covered, len(unused))
 
 
-def _mask_files(folder: Path, pictures: set[Path]) -> list[Path]:
-    """What a folder of masks holds; nothing where the frames' own pictures lie there."""
-    if any(picture.is_file() for picture in pictures if picture.is_relative_to(folder)):
-        return []
-    return [path for path in folder.rglob("*") if path.suffix.lower() in images.SUFFIXES]
+def _find(dive: Dive, settings: FrameSettings) -> tuple[dict[Path, Path], list[Path]]:
+    """The masks of the originals, from the first folder that has one, and the masks that belong to none."""
+    check_masks(settings)
+    folders = [folder.resolve() for folder in dive.mask_folders if folder.is_dir()]
+    found: dict[Path, Path] = {}
+    masks: set[Path] = set()
+    for folder in folders:
+        within = stills.MaskFolder(folder, dive.files, [other for other in folders if other != folder])
+        masks.update(within.paths)
+        for original in dive.originals:
+            mask = within.mask_of(original)
+            if mask is not None:
+                found.setdefault(original, mask)
+    return found, sorted(masks - set(found.values()))
+
+
+def _read(path: Path, picture: Picture, size: tuple[int, int]) -> Bool[np.ndarray, "h w"]:
+    """A mask at the size of the frames, where it is of the picture's size or of that. Raises InputError."""
+    import cv2
+
+    usable = images.read_mask(path)
+    given = usable.shape[::-1]
+    if given not in (picture.size, size):
+        raise InputError(
+            f"the mask {path} is {given[0]}x{given[1]}, "
+            f"its picture {picture.original} is {picture.size[0]}x{picture.size[1]}",
+            cause="the mask was made for a resized, cropped or turned picture",
+            hint="make the masks at the size of the pictures",
+        )
+    return cv2.resize(usable.astype(np.uint8), size, interpolation=cv2.INTER_NEAREST).astype(bool)

@@ -9,6 +9,7 @@ import numpy as np
 from jaxtyping import UInt8, UInt16
 
 from swimm3r.io.images import Rgb
+from swimm3r.io.safe_names import shown_name
 
 STEP = "preparing frames"  # what progress calls it
 GREY_SIDE = 960  # pixels; sharpness is judged on a copy of this size, so that it compares across cameras
@@ -26,6 +27,7 @@ class Picture:
     size: tuple[int, int]  # of the original, upright
     time: float
     sharpness: float
+    gray: bool  # three equal channels
 
 
 @dataclass(frozen=True)
@@ -37,6 +39,7 @@ class Dive:
     cautions: list[str]
     mask_folders: list[Path]
     originals: list[Path]  # what a mask may belong to, frames left out included
+    files: frozenset[Path] = frozenset()  # the originals of stills where they lie: no masks, whatever their names
 
 
 def sharpness(grey: UInt8[np.ndarray, "h w"]) -> float:
@@ -54,6 +57,14 @@ def small_grey(picture: Rgb) -> UInt8[np.ndarray, "h w"]:
     if small.dtype == np.uint16:
         small = (small >> 8).astype(np.uint8)
     return cv2.cvtColor(small, cv2.COLOR_RGB2GRAY)
+
+
+def is_gray(picture: Rgb) -> bool:
+    """Whether the three channels are equal, but for the rounding of JPEG and video in one pixel of a thousand."""
+    small = scaled_down(picture, GREY_SIDE).astype(np.int32)
+    spread = small.max(axis=2) - small.min(axis=2)
+    rounding = 2 if picture.dtype == np.uint8 else 2 * 257
+    return float((spread <= rounding).mean()) >= 0.999
 
 
 def scaled_down(
@@ -86,7 +97,7 @@ def blank_caution(count: int, of: str) -> str:
     return f"{count} {of} show nothing (black, or one even colour) and were left out."
 
 
-def some_names(paths: Sequence[Path], root: Path) -> str:
-    """The first three names, and how many more."""
-    names = [path.relative_to(root).as_posix() if path.is_relative_to(root) else path.name for path in paths[:3]]
-    return ", ".join(names) + (f" and {len(paths) - 3} more" if len(paths) > 3 else "")
+def some_names(paths: Sequence[Path], root: Path, most: int = 3) -> str:
+    """The first names, and how many more."""
+    names = [path.relative_to(root).as_posix() if path.is_relative_to(root) else path.name for path in paths[:most]]
+    return ", ".join(map(shown_name, names)) + (f" and {len(paths) - most} more" if len(paths) > most else "")

@@ -10,15 +10,20 @@ from functools import partial
 from pathlib import Path
 from typing import TypeVar
 
+from swimm3r import memory
 from swimm3r.errors import InputError
 from swimm3r.frame_settings import FrameSettings
 from swimm3r.io import images, stills
+from swimm3r.io.image_header import ImageHeader, ImageSizeError, capture_time, read_header
+from swimm3r.io.safe_names import safe_name, shown_name
+from swimm3r.io.video import VIDEO_SUFFIXES
 from swimm3r.prepare.pictures import (
     BLANK,
     STEP,
     Dive,
     Picture,
     blank_caution,
+    is_gray,
     scaled_down,
     sharpness,
     small_grey,
@@ -42,61 +47,115 @@ class _Still:
     linked: bool  # the original serves as it is
 
 
+@dataclass(frozen=True)
+class PictureFolder:
+    """The pictures of a folder."""
+
+    root: Path  # names are relative to it
+    paths: list[Path]
+    unreadable: list[Path]  # folders that could not be searched
+
+
 def prepare_stills(
     source: Path, draft: Path, settings: FrameSettings, progress: Progress, leave_out: Sequence[Path]
 ) -> Dive:
-    root, paths = pictures_of(source, [*leave_out, *([settings.masks] if settings.masks else [])])
-    originals = [path.relative_to(root) for path in paths]
-    sizes, damaged = {}, []
-    for path in paths:
+    """Write the frames of a folder of pictures into `draft`. Raises InputError."""
+    folder = pictures_of(source, [*leave_out, *([settings.masks] if settings.masks else [])])
+    root, originals = folder.root, [path.relative_to(folder.root) for path in folder.paths]
+    headers: dict[Path, ImageHeader] = {}
+    refused: dict[Path, InputError] = {}
+    for path in folder.paths:
         try:
-            sizes[path] = images.image_size(path)
-        except InputError:
-            damaged.append(path)
-    paths, cautions = _one_size([path for path in paths if path in sizes], sizes, root, settings)
+            headers[path] = read_header(path)
+        except InputError as error:
+            refused[path] = error
+    sizes = {path: header.size for path, header in headers.items()}
+    paths, cautions = _one_size(list(headers), sizes, root, settings)
     paths, times, ordered = _in_time_order(paths, cautions)
     chosen = thinned(list(zip(paths, times, strict=True)), settings.max_frames)
-    work = _named(chosen, root, settings.long_side)
-    results = _in_threads(partial(_prepare_still, draft=draft, long_side=settings.long_side), work, progress)
+    work = _named(chosen, root, settings.long_side, headers)
+    most = max((headers[path].decoding_bytes for path in paths), default=0)
+    results = _in_threads(partial(_prepare_still, draft=draft, long_side=settings.long_side), work, most, progress)
     pictures, blank = [], 0
     for still, result in zip(work, results, strict=True):
         match result:
             case InputError():
-                damaged.append(still.source)
+                refused[still.source] = result
             case None:
                 blank += 1
-            case float():
-                pictures.append(Picture(still.name, still.original, sizes[still.source], still.time, result))
-    if damaged:
-        cautions.append(
-            f"{len(damaged)} of {len(originals)} files cannot be read as pictures and were left out "
-            f"({some_names(damaged, root)}). Copy them again if the originals are whole."
-        )
+            case (sharp, gray):
+                pictures.append(Picture(still.name, still.original, sizes[still.source], still.time, sharp, gray))
+    cautions += _left_out(refused, folder)
     if blank:
         cautions.append(blank_caution(blank, "pictures"))
     if settings.masks is not None:
         mask_folders = [settings.masks]
     else:
-        mask_folders = list(dict.fromkeys([root, source / MASKS, *([root.parent / MASKS] * (root.name == "images"))]))
-    return Dive(pictures, ordered, cautions, mask_folders, originals)
+        mask_folders = list(
+            dict.fromkeys([root, root / MASKS, source / MASKS, *([root.parent / MASKS] * (root.name == "images"))])
+        )
+    files = frozenset(root.resolve() / original for original in originals)
+    return Dive(pictures, ordered, cautions, mask_folders, originals, files)
 
 
-def pictures_of(source: Path, leave_out: Sequence[Path] = ()) -> tuple[Path, list[Path]]:
-    """The folder that names are relative to, and its pictures: images/ where there is one and no picture beside it."""
-    inner = source / "images"
-    beside = any(path.suffix.lower() in images.SUFFIXES for path in source.iterdir() if path.is_file())
-    root = inner if inner.is_dir() and not beside else source
+def pictures_of(source: Path, leave_out: Sequence[Path] = ()) -> PictureFolder:
+    """The pictures of a folder: those in images/ where there is one and no picture beside it. Raises InputError."""
+    root = _root_of(source)
     outer = [path for path in leave_out if path.resolve() != root.resolve()]
-    paths = stills.find_pictures(root, [*outer, root / MASKS])
-    if paths:
-        return root, paths
-    kinds = Counter(path.suffix.lower() for path in root.rglob("*") if path.is_file())
+    found = stills.find_pictures(root, [*outer, root / MASKS])
+    if found.paths:
+        return PictureFolder(root, found.paths, found.unreadable)
+    kinds = Counter(path.suffix.lower() for path in root.rglob("*") if os.path.isfile(path))
     instead = ", ".join(f"{count} {kind or 'nameless'}" for kind, count in kinds.most_common(4))
     raise InputError(
         f"{source} holds no pictures" + (f", only {instead}" if instead else ": it is empty"),
-        cause="another folder was meant, or the pictures are videos, raw files or HEIC",
+        cause="another folder was meant, or the pictures are raw files or HEIC",
         hint=f"a folder with {', '.join(images.SUFFIXES)}; a video is given by its own path; develop raw files first",
     )
+
+
+def only_video(source: Path) -> Path | None:
+    """The one video of a folder without pictures; None where it holds pictures, or no video.
+
+    Raises InputError where there are several.
+    """
+    root = _root_of(source)
+    if stills.find_pictures(root, [root / MASKS]).paths:
+        return None
+    videos = stills.find_files(source, VIDEO_SUFFIXES).paths
+    if len(videos) > 1:
+        raise InputError(
+            f"{source} holds no pictures and {len(videos)} videos: {some_names(videos, source, most=10)}",
+            cause="a folder stands for the pictures in it, or for its only video",
+            hint=f"give one of the videos by its own path, such as {videos[0]}",
+        )
+    return videos[0] if videos else None
+
+
+def _root_of(source: Path) -> Path:
+    inner = source / "images"
+    beside = any(path.suffix.lower() in images.SUFFIXES for path in source.iterdir() if path.is_file())
+    return inner if inner.is_dir() and not beside else source
+
+
+def _left_out(refused: dict[Path, InputError], folder: PictureFolder) -> list[str]:
+    """What to say about files and folders that could not be read."""
+    cautions = []
+    too_large = [error for error in refused.values() if isinstance(error, ImageSizeError)]
+    damaged = [path for path, error in refused.items() if not isinstance(error, ImageSizeError)]
+    if damaged:
+        cautions.append(
+            f"{len(damaged)} of {len(folder.paths)} files cannot be read as pictures and were left out "
+            f"({some_names(damaged, folder.root)}). Copy them again if the originals are whole."
+        )
+    if too_large:
+        more = f" (and {len(too_large) - 3} more such files)" if len(too_large) > 3 else ""
+        what = "; ".join(shown_name(error.what) for error in too_large[:3])
+        cautions.append(f"{len(too_large)} of {len(folder.paths)} files were left out: {what}{more}.")
+    if folder.unreadable:
+        names = some_names(folder.unreadable, folder.root)
+        cautions.append(f"{len(folder.unreadable)} folders may not be searched and were left out ({names}).")
+    return cautions
 
 
 def _one_size(
@@ -122,7 +181,7 @@ def _one_size(
 
 def _in_time_order(paths: list[Path], cautions: list[str]) -> tuple[list[Path], list[float], bool]:
     """Sorted pictures, their times, whether neighbours were taken in turn; by the camera's clock where all carry it."""
-    taken = [stills.capture_time(path) for path in paths]
+    taken = [capture_time(path) for path in paths]
     known = [time for time in taken if time is not None]
     if len(known) < len(paths) or len(set(known)) < 2:
         return paths, [float(i) for i in range(len(paths))], stills.numbered(paths)
@@ -132,26 +191,28 @@ def _in_time_order(paths: list[Path], cautions: list[str]) -> tuple[list[Path], 
     return [paths[i] for i in order], [known[i] - min(known) for i in order], True
 
 
-def _named(chosen: list[tuple[Path, float]], root: Path, long_side: int) -> list[_Still]:
-    """Names that stay unique even without their suffix and where case does not count."""
+def _named(
+    chosen: list[tuple[Path, float]], root: Path, long_side: int, headers: dict[Path, ImageHeader]
+) -> list[_Still]:
+    """Names that every file system takes, and that stay unique even without their suffix and where case is ignored."""
     relatives = [path.relative_to(root) for path, _ in chosen]
-    stems = Counter(relative.with_suffix("").as_posix().lower() for relative in relatives)
+    wanted = [safe_name(relative) for relative in relatives]
+    stems = Counter(stem.lower() for stem in wanted)
     taken = set(stems)
     work = []
-    for relative, (path, time) in zip(relatives, chosen, strict=True):
-        stem = relative.with_suffix("").as_posix()
+    for relative, stem, (path, time) in zip(relatives, wanted, chosen, strict=True):
         if stems[stem.lower()] > 1:  # a.jpg beside a.png
             stem += f"_{relative.suffix[1:]}"
             while stem.lower() in taken:
                 stem += "_"
             taken.add(stem.lower())
-        linked = images.is_plain(path) and (not long_side or max(images.image_size(path)) <= long_side)
+        linked = headers[path].plain and (not long_side or max(headers[path].size) <= long_side)
         work.append(_Still(path, relative, f"{stem}{path.suffix if linked else '.png'}", time, linked))
     return work
 
 
-def _prepare_still(still: _Still, draft: Path, long_side: int) -> float | InputError | None:
-    """Put one picture in its place: its sharpness, None where it shows nothing, or what is wrong with it."""
+def _prepare_still(still: _Still, draft: Path, long_side: int) -> tuple[float, bool] | InputError | None:
+    """Put one picture in its place: its sharpness and greyness, None where it shows nothing, or what is wrong."""
     target = draft / still.name
     try:
         picture = images.read_rgb(still.source)
@@ -162,19 +223,23 @@ def _prepare_still(still: _Still, draft: Path, long_side: int) -> float | InputE
         return None
     if not still.linked:
         images.write_rgb(target, scaled_down(picture, long_side))
-        return sharpness(grey)
+        return sharpness(grey), is_gray(picture)
     target.parent.mkdir(parents=True, exist_ok=True)
     try:
         os.link(still.source.resolve(), target)
     except OSError:  # another disk, or a file system without links
         shutil.copyfile(still.source, target)
-    return sharpness(grey)
+    return sharpness(grey), is_gray(picture)
 
 
-def _in_threads(work: Callable[[Job], Result], jobs: Sequence[Job], progress: Progress) -> list[Result]:
-    """The results in order; decoding and encoding run outside Python's lock. Few at once: each holds a picture."""
+def _in_threads(
+    work: Callable[[Job], Result], jobs: Sequence[Job], bytes_each: int, progress: Progress
+) -> list[Result]:
+    """The results in order; decoding and encoding run outside Python's lock. As many at once as fit the memory."""
+    free = memory.available_mb()
+    fitting = 4 if free is None else max(1, int(free * memory.MB) // max(1, bytes_each))
     results: list[Result] = []
-    with ThreadPoolExecutor(max_workers=min(4, os.cpu_count() or 1)) as pool:
+    with ThreadPoolExecutor(max_workers=min(4, os.cpu_count() or 1, fitting)) as pool:
         try:
             for result in pool.map(work, jobs):
                 results.append(result)

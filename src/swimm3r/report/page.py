@@ -14,10 +14,14 @@ from swimm3r import reconstruction
 from swimm3r.frames import Frames
 from swimm3r.io import images
 from swimm3r.io.atomic import write_text
+from swimm3r.io.damage import Remedy, damaged, first_line, guard
+from swimm3r.io.view_names import view_stems
 from swimm3r.medium import MediumFit, backscatter, transmittances
 from swimm3r.prepare import load_frames
 from swimm3r.reconstruction import Reconstruction
 from swimm3r.report import charts
+from swimm3r.run_folder import open_run
+from swimm3r.sfm.water_plausibility import any_determined, attenuation_is_a_guess
 
 _SHOWN_FRAMES = 8
 _SHOWN_TESTS = 4
@@ -47,14 +51,22 @@ class TestRow:
 
 
 def write(folder: Path) -> Path:
-    """Write RUN/report.html and return its path."""
-    summary = json.loads((folder / "summary.json").read_text(encoding="utf-8"))
+    """Write RUN/report.html and return its path. Raises InputError where there is no run, or its files are damaged."""
+    summary = open_run(folder, "prepare").sections
+    remedy = Remedy(f"swimm3r run {folder}, which writes it anew")
+    with guard(folder / "settings.yaml", remedy):
+        settings = (folder / "settings.yaml").read_text(encoding="utf-8")
+    with guard(folder / "versions.json", remedy):
+        versions = json.loads((folder / "versions.json").read_text(encoding="utf-8"))
+        if not isinstance(versions, dict):
+            raise ValueError("names and numbers of versions are expected")
     frames = load_frames(folder / "prepare")
-    rec = reconstruction.load(folder / "sfm") if (folder / "sfm" / "reconstruction.json").is_file() else None
+    sfm = folder / "sfm"
+    rec = reconstruction.load(sfm, frames) if (sfm / "reconstruction.json").is_file() else None
     template = jinja2.Environment(autoescape=True, undefined=jinja2.StrictUndefined, trim_blocks=True).from_string(
         files("swimm3r.report").joinpath("page.html.j2").read_text(encoding="utf-8")
     )
-    page = template.render(
+    fields = dict(
         title=Path(summary["input"]["path"]).name,
         summary=summary,
         cautions=summary.get("cautions", []),
@@ -64,13 +76,26 @@ def write(folder: Path) -> Path:
         truths=_truth_rows(summary.get("truth")),
         plan=_plan(rec) if rec and rec.cloud is not None and len(rec.cloud.xyz) else None,
         water=_water(rec) if rec and rec.medium else None,
+        guessed=rec is not None and rec.medium is not None and attenuation_is_a_guess(rec.medium),
+        shown_as=_shown_as(rec.medium) if rec and rec.medium else "",
         missing=[name for name in frames.train.names if rec and name not in set(rec.names)],
-        versions=json.loads((folder / "versions.json").read_text(encoding="utf-8")),
-        settings=(folder / "settings.yaml").read_text(encoding="utf-8"),
+        versions=versions,
+        settings=settings,
     )
+    try:
+        page = template.render(fields)
+    except (jinja2.UndefinedError, TypeError, ValueError) as error:  # a number is absent, or something else
+        raise damaged(folder / "summary.json", first_line(error), remedy) from error
     path = folder / "report.html"
     write_text(path, page)
     return path
+
+
+def _shown_as(fit: MediumFit) -> str:
+    """How the restored frames differ from those filmed, which depends on what is known of the water."""
+    if attenuation_is_a_guess(fit):
+        return "left as filmed: the water is not determined"
+    return "without the water" + (", white-balanced for display" if any_determined(fit) else ", not white-balanced")
 
 
 def _triptychs(rec: Reconstruction, frames: Frames, folder: Path) -> list[Triptych]:
@@ -98,11 +123,11 @@ def _triptychs(rec: Reconstruction, frames: Frames, folder: Path) -> list[Tripty
 def _test_rows(frames: Frames, folder: Path) -> list[TestRow]:
     """A few test frames, evenly spread, beside what the map shows from there."""
     names = frames.test.names
-    chosen = sorted({round(i) for i in np.linspace(0, len(names) - 1, _SHOWN_TESTS)})
-    rows = []
+    chosen = sorted({round(i) for i in np.linspace(0, len(names) - 1, _SHOWN_TESTS)}) if names else []
+    rows, stems = [], view_stems(frames.names)
     for name in (names[i] for i in chosen):
         taken = (frames.image(frames.index(name)).numpy() * 255).round().astype(np.uint8)
-        seen = (images.read_rgb(folder / "renders" / "test" / f"{name}_{kind}.png") for kind in _KINDS)
+        seen = (images.read_rgb(folder / "renders" / "test" / f"{stems[name]}_{kind}.png") for kind in _KINDS)
         rows.append(TestRow(name, charts.picture(taken, 480), *(charts.picture(picture, 480) for picture in seen)))
     return rows
 

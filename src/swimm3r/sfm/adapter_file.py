@@ -7,9 +7,9 @@ over its tensors, whatever file they came from), that base's licence, which bind
 import hashlib
 import json
 from collections.abc import Mapping
-from dataclasses import asdict, dataclass
+from dataclasses import asdict, dataclass, field
 from pathlib import Path
-from typing import Any
+from typing import Any, Literal
 
 import numpy as np
 import torch
@@ -19,10 +19,13 @@ from torch import Tensor
 
 from swimm3r.errors import WeightsError
 from swimm3r.io.atomic import atomic_path
+from swimm3r.io.damage import first_line
+from swimm3r.io.json_file import structure
+from swimm3r.medium import Medium
 from swimm3r.sfm.mast3r.network import Mast3r
 from swimm3r.sfm.mast3r.peft_format import attach_stored, config
 from swimm3r.sfm.mast3r.settings import ObjectiveSettings
-from swimm3r.sfm.physics_head import PhysicsHead
+from swimm3r.sfm.physics_head import HeadFacts, PhysicsHead
 from swimm3r.sfm.student import Student
 
 _SCHEMA, _HEAD = 1, "head."
@@ -35,6 +38,38 @@ class Base:
     name: str  # file name
     sha256: str  # of its tensors
     licence: str
+
+
+@dataclass(frozen=True)
+class _WaterError:
+    """Relative standard errors of the head's water on held-out pairs (`training.scores.water_error`)."""
+
+    Binf: tuple[float, float, float]
+    beta_D: tuple[float, float, float]
+    beta_B: tuple[float, float, float]
+
+    def __post_init__(self) -> None:
+        if min(*self.Binf, *self.beta_D, *self.beta_B) < 0:
+            raise ValueError("the errors of its water are negative")
+
+
+@dataclass(frozen=True)
+class _Validation:
+    water_error: _WaterError | None = None
+
+
+@dataclass(frozen=True)
+class _Trained:
+    validation: _Validation = field(default_factory=_Validation)
+
+
+@dataclass(frozen=True)
+class _Header:
+    schema: Literal[1]
+    base: Base
+    peft: dict[str, Any]
+    objective: ObjectiveSettings
+    trained: _Trained
 
 
 def fingerprint(state: Mapping[str, Tensor]) -> str:
@@ -81,10 +116,11 @@ def load(path: Path, network: Mast3r, sha256: str | None = None) -> Student:
     `sha256` is the network's `fingerprint`, None to trust the caller. Raises WeightsError for a file that is missing or
     damaged, and for adapters of another base.
     """
-    header, stored = _read(path)
-    base = header["base"]
-    if sha256 is not None and sha256 != base["sha256"]:
-        raise _unfit(path, f"it was trained on {base['name']} ({base['sha256'][:12]}), this network is {sha256[:12]}")
+    document, stored = _read(path)
+    header = _checked(document, path)
+    base = header.base
+    if sha256 is not None and sha256 != base.sha256:
+        raise _unfit(path, f"it was trained on {base.name} ({base.sha256[:12]}), this network is {sha256[:12]}")
     head_state = {k.removeprefix(_HEAD): v for k, v in stored.items() if k.startswith(_HEAD)}
     rest = {k: v for k, v in stored.items() if not k.startswith(_HEAD)}
     head = None
@@ -96,29 +132,43 @@ def load(path: Path, network: Mast3r, sha256: str | None = None) -> Student:
         except (KeyError, RuntimeError, ValueError) as error:
             raise _unfit(path, f"its physics head does not fit: {str(error).splitlines()[0]}") from error
         head.to(network.decoder_embed.weight.device)
-    adapters = attach_stored(rest, header["peft"], network, path)
-    try:
-        objective = ObjectiveSettings(**header["objective"])
-    except TypeError as error:
-        raise _unfit(path, str(error)) from error
-    return Student(network, adapters, head, objective).eval().requires_grad_(False)
+    adapters = attach_stored(rest, header.peft, network, path)
+    return Student(network, adapters, head, header.objective).eval().requires_grad_(False)
 
 
 def describe(path: Path) -> dict[str, Any]:
     """The header of a file: base, licence, settings. Raises WeightsError as `load` does."""
-    return _read(path)[0]
+    document, _ = _read(path)
+    _checked(document, path)
+    return document
 
 
-def _read(path: Path) -> tuple[dict[str, Any], dict[str, Tensor]]:
+def head_facts(path: Path) -> HeadFacts:
+    """How the water of a file's physics head is to be used. Raises WeightsError as `load` does."""
+    document, _ = _read(path)
+    header = _checked(document, path)
+    error = header.trained.validation.water_error
+    measured = None if error is None else Medium(*(torch.tensor(getattr(error, name)) for name in vars(error)))
+    return HeadFacts(header.objective.min_transmittance, measured)
+
+
+def _read(path: Path) -> tuple[Any, dict[str, Tensor]]:
     try:
         with safe_open(path, "pt") as file:
-            header = json.loads((file.metadata() or {}).get("swimm3r", "{}"))
+            document = json.loads((file.metadata() or {}).get("swimm3r", "null"))
             stored = {name: file.get_tensor(name) for name in file.keys()}  # noqa: SIM118
-    except (OSError, SafetensorError, ValueError) as error:
-        raise _unfit(path, str(error).splitlines()[0]) from error
-    if header.get("schema") != _SCHEMA or not {"base", "peft", "objective"} <= header.keys():
+    except (OSError, SafetensorError, ValueError, RecursionError) as error:
+        raise _unfit(path, first_line(error)) from error
+    if not isinstance(document, dict) or document.get("schema") != _SCHEMA:
         raise _unfit(path, "it is no adapter file of this version")
-    return header, stored
+    return document, stored
+
+
+def _checked(document: Any, path: Path) -> _Header:
+    try:
+        return structure(document, _Header)
+    except (ValueError, RecursionError) as error:
+        raise _unfit(path, f"its header: {first_line(error)}") from error
 
 
 def _unfit(path: Path, why: str) -> WeightsError:

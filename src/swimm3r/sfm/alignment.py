@@ -1,6 +1,6 @@
 """Sparse global alignment: poses, focals and block depths that make matched pixels meet (MASt3R-SfM, sec. 3.3).
 
-    frame i:  scale s_i, focal f_i, principal point c_i, block depths d; m_i, f0_i: its median depth and first focal
+    frame i:  scale s_i, focal f_i, principal point c_i, block depths d; m_i, f0_i: its median depth and own first focal
     focal plane  z_i = s_i m_i f_i / f0_i;     block depth  D = g (z_i + (d - 1) m_i s_i),   g = 1 / min s
     pose         R_i, centre = g (t_i - R_i o_i),   o_i = z_i (((W/2, H/2) - c_i) / f_i, 1)
     pixel p of a block  X = pose_i (D * (1 + (r(p) - 1) f0 / f) * K^-1 (p, 1)),   r(p): its relative depth
@@ -122,7 +122,7 @@ class _Parameters:
             quaternion,
             translation,
             torch.zeros(n),
-            (problem.focal[:1] if shared else problem.focal).log(),
+            (problem.start_focal[:1] if shared else problem.start_focal).log(),
             principal[:1] if shared else principal,
             depth.clamp(min=1e-4).log() if settings.exponential_depth else depth,
         )
@@ -276,7 +276,8 @@ def _relative_to_parents(problem: AlignmentProblem, principal: Tensor) -> tuple[
     """Chained parameters that give the known poses; a frame without one starts where its parent is."""
     pose = problem.known_pose
     assert pose is not None
-    offset = _focal_point(problem.median, problem.focal, principal, problem)
+    plane = problem.median * problem.start_focal / problem.focal
+    offset = _focal_point(plane, problem.start_focal, principal, problem)
     n = len(problem.focal)
     R, t = torch.eye(3).repeat(n, 1, 1), torch.zeros(n, 3)
     posed = problem.posed.tolist()

@@ -68,7 +68,8 @@ class AlignmentProblem:
     """Everything that stays constant during an alignment."""
 
     size: Float[Tensor, "n 2"]  # width, height
-    focal: Float[Tensor, " n"]
+    focal: Float[Tensor, " n"]  # every frame's own first one, which its depths and relative depths belong to
+    start_focal: Float[Tensor, " n"]  # where the optimization starts
     median: Float[Tensor, " n"]
     confidence: Float[Tensor, " n"]
     anchor_ratio: Float[Tensor, " a"]  # depth / median
@@ -111,15 +112,17 @@ class AlignmentProblem:
             K = known.K.float().clone()
             K[:, :2, 2] += centre - 0.5
             focal = K[:, 0, 0].clone()
+        start = focal
         if settings.intrinsics == "shared":
             weight = torch.tensor([f.confidence for f in frames])
-            focal = ((focal * weight).sum() / weight.sum()).expand(len(frames)).clone()
+            start = ((focal * weight).sum() / weight.sum()).expand(len(frames)).clone()
         anchor_frame = torch.repeat_interleave(torch.arange(len(frames)), torch.tensor(counts))
         pose = None if known.cam2world is None else known.cam2world.float()
         posed = known.posed if known.posed is not None else torch.full((len(frames),), pose is not None)
         return AlignmentProblem(
             size=torch.tensor([[f.width, f.height] for f in frames], dtype=torch.float32),
             focal=focal,
+            start_focal=start,
             median=median,
             confidence=torch.tensor([f.confidence for f in frames]),
             anchor_ratio=torch.cat([f.anchor_depth for f in frames]) / median[anchor_frame],

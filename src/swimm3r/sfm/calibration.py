@@ -15,6 +15,7 @@ from swimm3r.cameras import DISTORTION_PARAMETERS, distort
 from swimm3r.errors import UsageError
 from swimm3r.progress import Progress
 from swimm3r.sfm.feature_database import MIN_INLIERS, FeatureDatabase
+from swimm3r.sfm.pair_focal import focal_of_pairs
 from swimm3r.sfm.settings import ColmapSettings
 
 if TYPE_CHECKING:
@@ -24,7 +25,8 @@ WATER = 1.333  # refractive index; a flat port multiplies the focal length by it
 SEED = 0
 THREADS = 1  # sums in a changing order end in poses 0.01 degrees apart, on weak clips more; a resumed run must not
 _MAX_TANGENTIAL = 0.1  # a lens some 10 degrees askew behind its port, or a picture cut off-centre by a tenth
-_PASSES, _STILL = 6, 0.99  # adjustments of the lens at most, and the share of the last error that ends them
+_PASSES, _ENOUGH = 6, 0.99  # adjustments of the lens at most, and the share of the last error that ends them
+STILL = 1e-6  # relative change of the cost that ends a bundle adjustment; COLMAP's 0 always takes 50 or 100 iterations
 
 
 @dataclass(frozen=True)
@@ -91,6 +93,39 @@ def ladder(width: int, height: int, settings: ColmapSettings) -> "list[pycolmap.
         camera.has_prior_focal_length = settings.focal is not None or name == "OPENCV_FISHEYE"
         out.append(camera)
     return out
+
+
+def lenses(store: FeatureDatabase, settings: ColmapSettings) -> "list[pycolmap.Camera]":
+    """The lenses to try in turn, likelier ones first: the database's where that is held, else the ladder."""
+    with store.open() as database:
+        camera = database.read_camera(1)
+    return [camera] if settings.intrinsics == "fixed" else ladder(camera.width, camera.height, settings)
+
+
+def lenses_of_pairs(store: FeatureDatabase, settings: ColmapSettings) -> "list[pycolmap.Camera]":
+    """The likeliest lens with the focal length that the pairs agree on; where they do not, or it is known, `lenses`."""
+    likely = lenses(store, settings)
+    focal = None if likely[0].has_prior_focal_length else focal_of_pairs(store)
+    if focal is None:
+        return likely
+    lens = likely[0]
+    lens.params = [focal if i in lens.focal_length_idxs() else value for i, value in enumerate(lens.params)]
+    return [lens]
+
+
+def adjust_lens(
+    store: FeatureDatabase, model: "pycolmap.Reconstruction", settings: ColmapSettings, progress: Progress
+) -> "pycolmap.Reconstruction":
+    """The model after one bundle adjustment with its lens; as it was where that gives no lens or loses frames."""
+    if settings.intrinsics == "fixed":
+        return model
+    progress("refining the lens", 0, 1)
+    adjusted = _adjust(store, model, model.cameras[1].model.name, focal=True, distortion=True)
+    progress("refining the lens", 1, 1)
+    if is_lens(adjusted.cameras[1]) and adjusted.num_reg_images() >= model.num_reg_images():
+        return adjusted
+    set_camera(store, model.cameras[1])
+    return model
 
 
 def refine(
@@ -165,7 +200,7 @@ def _settled(
     for _ in range(_PASSES):
         model = _adjust(store, model, name, focal=True, distortion=distortion)
         before, error = error, model.compute_mean_reprojection_error()
-        if error > _STILL * before:
+        if error > _ENOUGH * before:
             break
     return model
 
@@ -202,6 +237,7 @@ def _adjust(
     adjustment.print_summary = False
     adjustment.refine_focal_length, adjustment.refine_extra_params = focal, distortion
     adjustment.ceres.solver_options.num_threads = THREADS
+    adjustment.ceres.solver_options.function_tolerance = STILL
     adjustment.ceres.loss_function_type = pycolmap.LossFunctionType.SOFT_L1
     mapper.iterative_global_refinement(5, 0.0005, mapping, adjustment, triangulation)
     mapper.end_reconstruction(False)

@@ -18,13 +18,13 @@ import torch
 from jaxtyping import Bool, Float
 from torch import Tensor
 
-from swimm3r.cameras import Cameras
+from swimm3r.cameras import Cameras, cameras_of
 from swimm3r.errors import InputError, RegistrationError, StorageError
 from swimm3r.frames import Frames
 from swimm3r.io.atomic import atomic_path
-from swimm3r.io.colmap import ColmapModel, from_pycolmap, to_pycolmap
+from swimm3r.io.colmap import ColmapModel, from_pycolmap, silence_log, to_pycolmap
 from swimm3r.progress import Progress, silent
-from swimm3r.reconstruction import Caution, DepthMaps, Matches, Points, Reconstruction, Tracks, cameras_of, colmap_model
+from swimm3r.reconstruction import Caution, DepthMaps, Matches, Points, Reconstruction, Tracks, colmap_model
 from swimm3r.sfm import calibration, mapping, vlad
 from swimm3r.sfm.feature_database import FeatureDatabase, fill_features, match_pairs, start_database
 from swimm3r.sfm.plausibility import implausible
@@ -49,7 +49,6 @@ def reconstruct(
     `lens` (one camera, its pose unused) is held where it is given; else the settings say what is known of it. Raises
     InputError for fewer than 2 frames and RegistrationError where too few can be placed.
     """
-    import pycolmap
 
     if len(frames) < 2:
         raise InputError(
@@ -57,7 +56,7 @@ def reconstruct(
             cause="the clip is too short or the sampling too coarse",
             hint="a longer clip or a higher --fps",
         )
-    pycolmap.logging.minloglevel = pycolmap.logging.Level.ERROR.value  # its log is not for divers
+    silence_log()
     threads = settings.threads or os.cpu_count() or 1
     if lens is None:
         camera = calibration.first_camera(frames.width, frames.height, settings)

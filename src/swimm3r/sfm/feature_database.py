@@ -8,9 +8,11 @@ frame (keypoints) and of a pair (two-view geometry) says that it is complete.
 """
 
 import json
+import logging
+import sqlite3
 from collections.abc import Iterator, Sequence
 from concurrent.futures import ThreadPoolExecutor
-from contextlib import contextmanager
+from contextlib import closing, contextmanager
 from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING
@@ -28,6 +30,8 @@ from swimm3r.sfm.sift import Features, extract_features, match_descriptors, unit
 
 if TYPE_CHECKING:
     import pycolmap
+
+log = logging.getLogger(__name__)
 
 MIN_INLIERS = 15  # of a pair; COLMAP's limit, below it chance agrees with some geometry
 _HINT_OF_OVERLAP = 8  # matches
@@ -69,10 +73,13 @@ def start_database(
         "params": camera.params.tolist() if camera.has_prior_focal_length else [],
     }
     out = FeatureDatabase(path, len(frames))
-    if path.is_file() and about.is_file() and json.loads(about.read_text(encoding="utf-8")) == content:
-        with out.open() as database:
-            database.update_camera(camera)
-        return out
+    described = json.dumps(content)
+    if path.is_file() and about.is_file() and about.read_bytes() == described.encode():
+        if _is_whole(path, len(frames)):
+            with out.open() as database:
+                database.update_camera(camera)
+            return out
+        log.warning("%s is damaged: features and matches are found again", path)
     folder.mkdir(parents=True, exist_ok=True)
     about.unlink(missing_ok=True)
     for leftover in folder.glob("database.db*"):
@@ -90,8 +97,19 @@ def start_database(
             frame.rig_id = rig_id
             frame.add_data_id(pycolmap.data_t(sensor, i + 1))
             database.write_frame(frame)
-    write_text(about, json.dumps(content))
+    write_text(about, described)
     return out
+
+
+def _is_whole(path: Path, frames: int) -> bool:
+    """Whether a file is a database that SQLite finds no fault with, of so many frames."""
+    try:
+        with closing(sqlite3.connect(path)) as database:
+            (verdict,) = database.execute("PRAGMA quick_check(1)").fetchone()
+            (found,) = database.execute("SELECT COUNT(*) FROM images").fetchone()
+    except sqlite3.DatabaseError:
+        return False
+    return verdict == "ok" and found == frames
 
 
 def fill_features(

@@ -14,7 +14,7 @@ import numpy as np
 import torch
 
 from swimm3r import reconstruction
-from swimm3r.cameras import Cameras
+from swimm3r.cameras import Cameras, cameras_of
 from swimm3r.errors import InputError
 from swimm3r.frames import Frames
 from swimm3r.io.colmap import ColmapModel
@@ -28,7 +28,6 @@ from swimm3r.reconstruction import (
     Points,
     Reconstruction,
     Tracks,
-    cameras_of,
 )
 from swimm3r.sfm.match_tracks import MatchTracks, as_points
 from swimm3r.sfm.model_frames import at_frame_size, named_frames
@@ -47,13 +46,13 @@ def reconstruct(
     rec = from_foreign(frames, foreign, folder)
     if len(rec.tracks.point) == 0 and foreign.depth is None:
         rec = _with_points(rec, frames, foreign, settings, folder, progress)
-    reconstruction.save(rec, folder)
+    reconstruction.save(rec, frames, folder)
     if foreign.depth is None:
         estimate_depth(rec, frames, settings.depth, progress)
     else:
         write_depth(rec, frames, foreign, progress)
     rec = with_water(rec, frames, settings, folder, progress)
-    reconstruction.save(rec, folder)
+    reconstruction.save(rec, frames, folder)
     return rec
 
 

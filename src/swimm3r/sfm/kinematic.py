@@ -40,7 +40,13 @@ def kinematic_tree(
     if n == 1:
         return KinematicTree(0, torch.zeros(1, dtype=torch.int64), (0,))
     edges = _ward_edges(matches, np.asarray(blocks)) if method == "ward" else _spanning_edges(matches)
-    a, b = np.array(edges).T
+    return rooted_tree(edges, n)
+
+
+def rooted_tree(edges: Sequence[tuple[int, int]], n: int) -> KinematicTree:
+    """The tree of n frames with these edges, rooted near its middle; neither order nor direction of edges matters."""
+    # breadth-first search visits a frame's neighbors as they are stored: i < j, sorted, as the reference has them
+    a, b = np.array(sorted((min(edge), max(edge)) for edge in edges)).T
     graph = coo_array((np.ones(len(a)), (a, b)), shape=(n, n)).tocsr()
     root = _middle(graph)
     order, predecessor = breadth_first_order(graph, root, directed=False)

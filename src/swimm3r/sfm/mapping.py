@@ -3,7 +3,8 @@
 A short ladder of focal lengths is mapped until all frames are placed; then frames left over are tried again with looser
 limits, and frames that stand against their matches are placed anew. Flat or small hazy scenes allow more than one
 motion, and a mapper that begins with the wrong one ends with every frame in place, many of them tens of degrees off. So
-small clips are placed twice, frame by frame and all at once, and what explains more observations is kept.
+small clips are placed twice, frame by frame and all at once, and what explains more observations is kept. Long ones are
+placed all at once, under the lens that their pairs agree on.
 """
 
 import tempfile
@@ -11,8 +12,6 @@ import threading
 from collections.abc import Callable
 from pathlib import Path
 from typing import TYPE_CHECKING
-
-import numpy as np
 
 from swimm3r.progress import Progress
 from swimm3r.sfm import calibration
@@ -36,7 +35,9 @@ def map_frames(store: FeatureDatabase, settings: ColmapSettings, progress: Progr
     method = settings.mapping.method
     if method == "global" or (method == "auto" and store.frames >= settings.mapping.global_from):
         return _put_right(store, _place_many(store, settings, progress), settings, progress)
-    one_by_one = _put_right(store, _climb(store, settings, None, progress), settings, progress)
+    one_by_one = _put_right(
+        store, _climb(store, calibration.lenses(store, settings), settings, progress), settings, progress
+    )
     if method == "incremental" or not one_by_one:
         return one_by_one
     at_once = _put_right(store, _map_globally(store, settings, progress), settings, progress)
@@ -48,15 +49,17 @@ def map_frames(store: FeatureDatabase, settings: ColmapSettings, progress: Progr
 def _place_many(
     store: FeatureDatabase, settings: ColmapSettings, progress: Progress
 ) -> list["pycolmap.Reconstruction"]:
-    """Models of all frames at once, which takes a lens: the one found on a part of the clip."""
-    part = _climb(store, settings, _best_connected(store, settings.mapping.lens_frames), progress)
-    if not part:
-        return []
-    calibration.set_camera(store, calibration.refine(store, part[0], settings, progress).model.cameras[1])
+    """Models of all frames at once, under the lens that their pairs agree on, adjusted once the frames are in place.
+
+    Under a lens that is far off, frames bend the scene, stand against their own pairs and are taken out for it. A part
+    of the clip is no place to look for the lens: the frames that share most stand side by side, and leave it open.
+    """
+    lenses = calibration.lenses_of_pairs(store, settings)
+    calibration.set_camera(store, lenses[0])
     models = _map_globally(store, settings, progress)
-    if models and models[0].num_reg_images() >= _GLOBAL_ENOUGH * store.frames:
-        return models
-    return max(models, _map_in_turn(store, settings, "placing frames", progress), key=_merit)
+    if not models or models[0].num_reg_images() < _GLOBAL_ENOUGH * store.frames:
+        models = max(models, _climb(store, lenses, settings, progress), key=_merit)
+    return [calibration.adjust_lens(store, model, settings, progress) for model in models[:1]] + models[1:]
 
 
 def _put_right(
@@ -69,24 +72,20 @@ def _put_right(
 
 
 def _climb(
-    store: FeatureDatabase, settings: ColmapSettings, names: list[str] | None, progress: Progress
+    store: FeatureDatabase, lenses: list["pycolmap.Camera"], settings: ColmapSettings, progress: Progress
 ) -> list["pycolmap.Reconstruction"]:
-    """The models of the ladder's best rung; the lens of that rung is left in the database."""
-    with store.open() as database:
-        camera = database.read_camera(1)
+    """The models under the best of some lenses, which is left in the database."""
     best: list[pycolmap.Reconstruction] = []
-    rungs = [camera] if settings.intrinsics == "fixed" else calibration.ladder(camera.width, camera.height, settings)
-    for k, rung in enumerate(rungs):
-        calibration.set_camera(store, rung)
-        what = "placing frames" if k == 0 else f"placing frames, lens {k + 1} of {len(rungs)}"
-        models = _map_in_turn(store, settings, what, progress, names=names)
+    for k, lens in enumerate(lenses):
+        calibration.set_camera(store, lens)
+        what = "placing frames" if k == 0 else f"placing frames, lens {k + 1} of {len(lenses)}"
+        models = _map_in_turn(store, settings, what, progress)
         frames, score = _merit(models)
         best_frames, best_score = _merit(best)
-        # earlier rungs are likelier lenses: a later one must place more frames, or explain clearly more
+        # earlier ones are likelier lenses: a later one must place more frames, or explain clearly more
         if frames > best_frames or (frames == best_frames and score > _CLEARLY * best_score):
             best = models
-        total = store.frames if names is None else len(names)
-        if best and best[0].num_reg_images() >= settings.mapping.enough * total:
+        if best and best[0].num_reg_images() >= settings.mapping.enough * store.frames:
             break
     if best:
         calibration.set_camera(store, best[0].cameras[1])
@@ -100,7 +99,8 @@ def place_leftovers(
     calibration.set_camera(store, model.cameras[1])
     with tempfile.TemporaryDirectory(dir=store.path.parent, prefix=".mapping.") as folder:
         model.write_binary(folder)
-        models = _map_in_turn(store, settings, "placing the frames left over", progress, goes_on_from=Path(folder))
+        what, missing = "placing the frames left over", store.frames - model.num_reg_images()
+        models = _map_in_turn(store, settings, what, progress, goes_on_from=Path(folder), total=missing)
     return max([model, *models], key=lambda m: _merit([m]))
 
 
@@ -148,8 +148,9 @@ def _map_in_turn(
     progress: Progress,
     *,
     goes_on_from: Path | None = None,
-    names: list[str] | None = None,
+    total: int | None = None,
 ) -> "list[pycolmap.Reconstruction]":
+    """The models found. Progress counts to `total`, by default all frames, and ends there though some stay out."""
     import pycolmap
 
     options = pycolmap.IncrementalPipelineOptions()
@@ -157,10 +158,10 @@ def _map_in_turn(
     options.num_threads = calibration.THREADS
     options.random_seed = calibration.SEED
     options.min_model_size = 2
-    options.image_names = names or []
-    total = len(names) if names else store.frames
+    most = total or store.frames
     options.min_num_matches = MIN_INLIERS
     options.ba_refine_focal_length = options.ba_refine_extra_params = False
+    options.ba_global_function_tolerance = calibration.STILL
     options.mapper.abs_pose_refine_focal_length = options.mapper.abs_pose_refine_extra_params = False
     if goes_on_from is not None:
         options.multiple_models = False
@@ -171,8 +172,8 @@ def _map_in_turn(
     def count(step: int) -> Callable[[], None]:
         def tell() -> None:
             nonlocal placed
-            placed = min(placed + step, total) if step == 1 else step
-            progress(what, placed, total)
+            placed = min(placed + step, most)
+            progress(what, placed, most)
 
         return tell
 
@@ -186,6 +187,7 @@ def _map_in_turn(
             initial_image_pair_callback=count(2),
             next_image_callback=count(1),
         )
+    progress(what, most, most)
     return sorted(models.values(), key=lambda m: _merit([m]), reverse=True)
 
 
@@ -219,21 +221,5 @@ def _map_globally(
             worker.join(0.5)
     if failures:
         raise failures[0]
+    progress("placing all frames at once", store.frames, store.frames)
     return sorted(models, key=lambda m: _merit([m]), reverse=True)
-
-
-def _best_connected(store: FeatureDatabase, count: int) -> list[str]:
-    """Names of the frames that hang together by the most matches, grown from the richest one."""
-    import pycolmap
-
-    inliers = np.zeros((store.frames, store.frames))
-    with store.open() as database:
-        for pair, number in zip(*database.read_two_view_geometry_num_inliers(), strict=True):
-            a, b = pycolmap.pair_id_to_image_pair(pair)
-            inliers[a - 1, b - 1] = inliers[b - 1, a - 1] = number
-    chosen = [int(inliers.sum(1).argmax())]
-    while len(chosen) < min(count, store.frames):
-        reach = inliers[chosen].sum(0)
-        reach[chosen] = -1
-        chosen.append(int(reach.argmax()))
-    return [f"{i:06d}" for i in sorted(chosen)]

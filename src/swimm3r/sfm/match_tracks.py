@@ -100,16 +100,27 @@ def join(matches: FrameMatches, width: int, height: int) -> MatchTracks:
     return MatchTracks(xyz / total[:, None], track[kept], frame[kept], xy)
 
 
-def without(tracks: MatchTracks, dropped: Bool[Tensor, " o"], most: int) -> MatchTracks:
-    """Without some sightings, then without points seen in fewer than 2 frames; at most `most`, the most seen first."""
+def without(tracks: MatchTracks, dropped: Bool[Tensor, " o"]) -> MatchTracks:
+    """Without some sightings, then without points seen in fewer than 2 frames."""
     seen = torch.bincount(tracks.point[~dropped], minlength=len(tracks.xyz))
-    enough = torch.nonzero(seen >= 2)[:, 0]
-    if len(enough) > most:
-        enough = enough[torch.argsort(seen[enough], descending=True, stable=True)[:most]].sort().values
+    return _selected(tracks, torch.nonzero(seen >= 2)[:, 0], ~dropped)
+
+
+def most_seen(tracks: MatchTracks, most: int) -> MatchTracks:
+    """At most so many points, those that are seen in most frames first."""
+    if len(tracks.xyz) <= most:
+        return tracks
+    seen = torch.bincount(tracks.point, minlength=len(tracks.xyz))
+    chosen = torch.argsort(seen, descending=True, stable=True)[:most].sort().values
+    return _selected(tracks, chosen, torch.ones(len(tracks.point), dtype=torch.bool))
+
+
+def _selected(tracks: MatchTracks, points: Int64[Tensor, " k"], sightings: Bool[Tensor, " o"]) -> MatchTracks:
+    """Some of the points with some of their sightings."""
     number = torch.full((len(tracks.xyz),), -1)
-    number[enough] = torch.arange(len(enough))
-    kept = ~dropped & (number[tracks.point] >= 0)
-    return MatchTracks(tracks.xyz[enough], number[tracks.point[kept]], tracks.frame[kept], tracks.xy[kept])
+    number[points] = torch.arange(len(points))
+    kept = sightings & (number[tracks.point] >= 0)
+    return MatchTracks(tracks.xyz[points], number[tracks.point[kept]], tracks.frame[kept], tracks.xy[kept])
 
 
 def as_points(

@@ -2,11 +2,10 @@
 
 from pathlib import PurePosixPath
 
-from swimm3r.cameras import Cameras, resized
+from swimm3r.cameras import Cameras, cameras_of, resized
 from swimm3r.errors import InputError
 from swimm3r.frames import Frames
 from swimm3r.io.colmap import ColmapModel
-from swimm3r.reconstruction import cameras_of
 
 _ASPECT = 0.01  # relative difference of aspect ratios beyond which pictures are not those of the model
 

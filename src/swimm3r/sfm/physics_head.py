@@ -48,6 +48,14 @@ class WaterMaps:
         return WaterMaps(self.Binf, self.beta_B / scale, curve)
 
 
+@dataclass(frozen=True)
+class HeadFacts:
+    """How the water of a trained head is to be used, beside its weights."""
+
+    min_transmittance: float  # eps_inv of Eq. 4, as in its training
+    error: Medium | None = None  # one relative standard error per coefficient and channel, [3]; None: never measured
+
+
 class PhysicsHead(nn.Module):
     """Encoder tokens -> water; 193,366 parameters for tokens of 1024 channels."""
 

@@ -22,8 +22,10 @@ from torch import Tensor
 
 from swimm3r.cameras import Cameras
 from swimm3r.frames import Frames
+from swimm3r.io.array_file import Layout, read_arrays
 from swimm3r.io.atomic import atomic_path, write_text
 from swimm3r.io.cache import ArrayCache
+from swimm3r.io.damage import remake
 from swimm3r.progress import Progress, silent
 from swimm3r.reconstruction import DepthMap, DepthMaps, Reconstruction
 from swimm3r.sfm import sweep_agreement, sweep_kernels
@@ -40,6 +42,7 @@ from swimm3r.sfm.sweep_views import (
 )
 
 _RAW = ".raw"  # beside the finished maps: each frame's own opinion, removed once every frame is finished
+_RAW_LAYOUTS = {"inverse_depth": Layout("h w"), "correlation": Layout("h w")}
 _STAMP = ".made_from"  # of which cameras, points and settings the folder's maps were made
 _NEIGHBOURS = 8  # frames asked whether they agree
 _MOST_SOURCES = 16
@@ -85,8 +88,8 @@ def estimate_depth(
 
     def raw_of(i: int) -> RawDepth:
         def load() -> tuple[np.ndarray, ...]:
-            with np.load(raw_path(i)) as stored:
-                return stored["inverse_depth"], stored["correlation"]
+            stored = read_arrays(raw_path(i), _RAW_LAYOUTS, remake(folder))
+            return stored["inverse_depth"], stored["correlation"]
 
         return RawDepth(*(torch.from_numpy(a.copy()) for a in raws.get(i, load)))
 
@@ -240,7 +243,7 @@ def _stamp(rec: Reconstruction, frames: Frames, settings: PlaneSweepSettings) ->
 def _claim(folder: Path, stamp: str) -> None:
     """Empty the folder of maps unless they were made from the same cameras, points and settings."""
     path = folder / _STAMP
-    if path.is_file() and path.read_text(encoding="utf-8") == stamp:
+    if path.is_file() and path.read_bytes() == stamp.encode():
         return
     shutil.rmtree(folder / _RAW, ignore_errors=True)
     for stale in folder.rglob("*.npz"):

@@ -4,7 +4,12 @@
 
 in the reconstruction's unit: the head speaks of the network's metres, the alignment scales each frame, and the water
 with it. The dive's fit is the median over frames; its curve is one exponential through the frames' beta_D at the depths
-they see. A coefficient counts as identifiable where the frames agree on it.
+they see.
+
+That frames agree is no sign that they are right: a head that always says the same agrees with itself. A coefficient's
+standard deviation is therefore the head's own error, measured on held-out pairs whose water was known (`HeadFacts`),
+and the frames' spread, added in squares; it counts as identifiable where that is small. Without a measured error
+nothing is identifiable, and every standard deviation is as large as the coefficient itself.
 """
 
 from collections.abc import Iterator, Sequence
@@ -20,19 +25,21 @@ from torch.nn import functional as F
 from swimm3r.errors import InputError
 from swimm3r.frames import Frames
 from swimm3r.io.atomic import atomic_path
+from swimm3r.io.damage import guard, remake
 from swimm3r.medium import AttenuationCurve, Medium, MediumFit, remove_water
 from swimm3r.open_water import sea_share
 from swimm3r.progress import Progress, silent
 from swimm3r.reconstruction import Reconstruction
 from swimm3r.sfm.depth_filling import fill_z_depth
 from swimm3r.sfm.mast3r.pictures import NetworkPictures
-from swimm3r.sfm.physics_head import WaterMaps
+from swimm3r.sfm.physics_head import HeadFacts, WaterMaps
 from swimm3r.sfm.restore import RestoredPicture
 from swimm3r.sfm.settings import SeathruSettings
 from swimm3r.sfm.tracks import ray_depth_map, shared_rays
 
 _CELL = 8  # network pixels; the head's maps are smooth over 16
 _SAMPLES = 2_000  # pixels of each frame that the dive's curve is fitted to
+_UNMEASURED = 1.0  # relative error of a head whose error nobody has measured
 
 
 @dataclass(frozen=True)
@@ -68,10 +75,12 @@ class PredictedWater:
 
     folder: Path
     place: Float[Tensor, "pixels 2"]  # of the prepared frames' pixels in the network's picture, -1..1
+    head: HeadFacts
 
     def frame(self, name: str) -> FrameWater:
         """The water of a frame."""
-        with np.load(self.folder / f"{name}.npz") as stored:
+        path = self.folder / f"{name}.npz"
+        with guard(path, remake(self.folder.parent)), np.load(path, allow_pickle=False) as stored:
             return FrameWater(*(torch.from_numpy(stored[key]) for key in ("Binf", "beta_B", "curve")))
 
     def at(self, name: str, pixel: Int[Tensor, " n"], ray_depth: Float[Tensor, " n"]) -> Medium:
@@ -90,8 +99,8 @@ def write(maps: WaterMaps, scale: float, folder: Path, name: str) -> None:
         )
 
 
-def read(folder: Path, pictures: NetworkPictures) -> PredictedWater | None:
-    """What `write` kept in a folder; None where there is none, because the adapter has no head."""
+def read(folder: Path, pictures: NetworkPictures, head: HeadFacts) -> PredictedWater | None:
+    """What `write` kept of a head in a folder; None where there is none, because the adapter has no head."""
     if not folder.is_dir():
         return None
     frames, frame = pictures.frames, pictures.framing
@@ -99,7 +108,7 @@ def read(folder: Path, pictures: NetworkPictures) -> PredictedWater | None:
     pixels = torch.cartesian_prod(rows, columns).flip(-1).double()
     size = torch.tensor([frame.network_width, frame.network_height])
     place = (2 * pictures.from_frame(pixels) / size - 1).nan_to_num(0.0).float()
-    return PredictedWater(folder, place)
+    return PredictedWater(folder, place, head)
 
 
 def dive_fit(water: PredictedWater, rec: Reconstruction, settings: SeathruSettings) -> MediumFit:
@@ -122,11 +131,14 @@ def dive_fit(water: PredictedWater, rec: Reconstruction, settings: SeathruSettin
             cause="the dense depth stage found almost no surface",
             hint="clearer or slower footage",
         )
-    return summed_up(readings, settings)
+    return summed_up(readings, settings, water.head.error)
 
 
-def summed_up(readings: Sequence[FrameReading], settings: SeathruSettings) -> MediumFit:
-    """The water that frames, at least one, agree on best: medians, and one exponential through their beta_D."""
+def summed_up(readings: Sequence[FrameReading], settings: SeathruSettings, error: Medium | None = None) -> MediumFit:
+    """The water that frames, at least one, agree on best: medians, and one exponential through their beta_D.
+
+    `error` is the head's relative standard error per coefficient and channel, None where it was never measured.
+    """
     z = torch.cat([r.ray_depth for r in readings]).double()
     beta_D = torch.cat([r.beta_D for r in readings]).double()
     middle = z.median()
@@ -140,17 +152,23 @@ def summed_up(readings: Sequence[FrameReading], settings: SeathruSettings) -> Me
     # from the median absolute deviation, as of a normal distribution
     spread = {k: 1.4826 * (v - v.median(0).values).abs().median(0).values for k, v in per_frame.items()}
     medium = Medium(per_frame["Binf"].median(0).values, curve.at(middle.float()), per_frame["beta_B"].median(0).values)
-    agreed = {k: spread[k] < settings.identifiable_std * getattr(medium, k) for k in spread}
+    relative = Medium(*(torch.full((3,), _UNMEASURED) for _ in per_frame)) if error is None else error
+    std = {k: (spread[k] ** 2 + (getattr(relative, k) * getattr(medium, k)) ** 2).sqrt() for k in spread}
+    known = {k: std[k] < settings.identifiable_std * getattr(medium, k) for k in std}
     low, high = torch.quantile(z[:: max(1, len(z) // 1_000_000)], torch.tensor([0.002, 0.998]).double()).tolist()
-    return MediumFit(medium, curve, Medium(**spread), agreed, (low, high), "srgb")
+    return MediumFit(medium, curve, Medium(**std), known, (low, high), "srgb", "physics head")
 
 
 def predicted_pictures(
-    rec: Reconstruction, frames: Frames, water: PredictedWater, progress: Progress = silent
+    rec: Reconstruction,
+    frames: Frames,
+    water: PredictedWater,
+    progress: Progress = silent,
+    gains: Float[Tensor, "3"] | None = None,
 ) -> Iterator[tuple[int, RestoredPicture]]:
     """Every frame with depth, by its place in `rec`: the inverse of Eq. 3, clamped, by the frame's own water.
 
-    Unknown depth is filled in along the edges; open water keeps the colour it has.
+    Unknown depth is filled in along the edges; open water keeps the colour it has. `gains` balance the images as shown.
     """
     rays = shared_rays(rec.cameras)
     for i, name in enumerate(rec.names):
@@ -163,9 +181,11 @@ def predicted_pictures(
         sea = sea_share(image, depth.z_depth, own.Binf)
         ray_depth = ray_depth_map(fill_z_depth(image, depth, sea), rays[i])
         z = ray_depth.flatten()
-        J = remove_water(image.reshape(-1, 3), z, own.at(z, water.place)).clamp(0, 1).reshape(image.shape)
-        J = J + sea[..., None] * (image - J)
-        yield i, RestoredPicture(J, J, ray_depth, sea)
+        J = remove_water(image.reshape(-1, 3), z, own.at(z, water.place), water.head.min_transmittance)
+        J = J.clamp(0, 1).reshape(image.shape)
+        balanced = J if gains is None else (J * gains).clamp(0, 1)
+        clear, shown = (surface + sea[..., None] * (image - surface) for surface in (J, balanced))
+        yield i, RestoredPicture(clear, shown, ray_depth, sea)
     progress("restoring pictures", len(rec.names), len(rec.names))
 
 

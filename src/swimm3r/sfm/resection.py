@@ -77,14 +77,14 @@ def _matched_points(
             for here, there, columns in ((a, b, matches), (b, a, matches[:, ::-1])):
                 points = point_of[there][columns[:, 1]]
                 rows[here].append(np.stack((columns[:, 0], points), axis=1)[points >= 0])
+    seen_in = {p: {element.image_id for element in point.track.elements} for p, point in model.points3D.items()}
+    xyz = {p: point.xyz for p, point in model.points3D.items()}
     out = {}
     for i, found in rows.items():
         pairs = np.unique(np.concatenate([np.empty((0, 2), np.int64), *found]), axis=0)
-        tracks = [model.points3D[p] for p in pairs[:, 1]]
-        independent = [len({e.image_id for e in track.track.elements} - {i}) >= 2 for track in tracks]
-        pairs, tracks = pairs[independent], [t for t, keep in zip(tracks, independent, strict=True) if keep]
+        pairs = pairs[[len(seen_in[p]) - (i in seen_in[p]) >= 2 for p in pairs[:, 1].tolist()]]
         if len(pairs) >= 4:
-            out[i] = pairs[:, 0], pixels[i][pairs[:, 0]], np.stack([track.xyz for track in tracks])
+            out[i] = pairs[:, 0], pixels[i][pairs[:, 0]], np.stack([xyz[p] for p in pairs[:, 1].tolist()])
     return out
 
 

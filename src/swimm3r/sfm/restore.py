@@ -9,7 +9,8 @@ Where T_D is small the quotient is noise, so per channel with s = T_D:
               G: the channels weighted by how well they see; k: this channel's share of colour where it does see
     horizon   in open water, and where no channel sees (max w -> 0), the picture's own veil remains
 
-Near the camera all weights are 1 and J is the plain inverse. Nothing is stretched; `display_gains` serve the eye alone.
+Near the camera all weights are 1 and J is the plain inverse. Nothing is stretched; white balance serves the eye alone,
+and only where the frames say which colours the water took (`water_plausibility`).
 """
 
 from collections.abc import Callable, Iterator
@@ -37,6 +38,7 @@ from swimm3r.reconstruction import DenseCloud, DepthMap, Reconstruction
 from swimm3r.sfm.depth_filling import fill_z_depth
 from swimm3r.sfm.settings import RestoreSettings
 from swimm3r.sfm.tracks import DenseTracks, cubes, ray_depth_map, shared_rays
+from swimm3r.sfm.water_plausibility import any_determined
 
 MediumOfPixels = Callable[[str, Int[Tensor, " n"], Float[Tensor, " n"]], Medium]  # frame, pixels, ray depth
 
@@ -59,8 +61,7 @@ def restored_pictures(
 ) -> Iterator[tuple[int, RestoredPicture]]:
     """Every registered frame with some known depth, by its place in `rec`; needs the medium and the cloud."""
     assert rec.medium is not None
-    assert rec.cloud is not None
-    gains = display_gains(rec.cloud.restored) if settings.white_balance else None
+    gains = shown_gains(rec, settings)
     rays = shared_rays(rec.cameras)
     for i, name in enumerate(rec.names):
         progress("restoring pictures", i, len(rec.names))
@@ -108,11 +109,13 @@ def restored_cloud(
     settings: RestoreSettings | None = None,
     progress: Progress = silent,
     medium_at: MediumOfPixels | None = None,
+    min_transmittance: float = 0.05,
 ) -> DenseCloud:
     """The tracks as points: raw and restored colours averaged over the sightings, thinned by voxels.
 
     Restored colours are weighted by confidence and mean T_D squared, the inverse variance of an amplified colour.
-    `medium_at` gives each pixel its own water in the place of the dive's, in the encoding of `fit`.
+    `medium_at` gives each pixel its own water in the place of the dive's, in the encoding of `fit`, and
+    `min_transmittance` bounds what is divided by (eps_inv).
     """
     settings = settings or RestoreSettings()
     n = len(tracks.xyz)
@@ -133,7 +136,7 @@ def restored_cloud(
         weight = trust * T_D.clamp(min=0.01) ** 2
         raw.index_add_(0, tracks.track[mine], I * trust)
         raw_weight.index_add_(0, tracks.track[mine], trust)
-        restored.index_add_(0, tracks.track[mine], remove_water(light, z, medium) * weight)
+        restored.index_add_(0, tracks.track[mine], remove_water(light, z, medium, min_transmittance) * weight)
         restored_weight.index_add_(0, tracks.track[mine], weight)
     progress("restoring points", len(rec.names), len(rec.names))
     J = restored / restored_weight.clamp(min=1e-12)
@@ -141,6 +144,17 @@ def restored_cloud(
         J = srgb_from_linear(J.clamp(min=0))
     cloud = DenseCloud(tracks.xyz, (raw / raw_weight.clamp(min=1e-12)).clamp(0, 1), J.clamp(0, 1))
     return _thinned(cloud, settings.max_points)
+
+
+def shown_gains(rec: Reconstruction, settings: RestoreSettings) -> Float[Tensor, "3"]:
+    """White balance of a dive's clear pictures (`display_gains`).
+
+    Ones where nobody asked for it, and where the frames determine nothing of the water: neutral greys would pass for
+    the true colours of surfaces.
+    """
+    if rec.cloud is None or rec.medium is None or not settings.white_balance or not any_determined(rec.medium):
+        return torch.ones(3)
+    return display_gains(rec.cloud.restored)
 
 
 def display_gains(restored: Float[Tensor, "n 3"]) -> Float[Tensor, "3"]:

@@ -27,6 +27,7 @@ from torch import Tensor
 
 from swimm3r.errors import WeightsError
 from swimm3r.progress import Progress, silent
+from swimm3r.settings import Count, Positive, Settings
 
 _POPCOUNT = np.array([bin(byte).count("1") for byte in range(256)], dtype=np.uint8)
 _HINT = "get the file again: swimm3r weights get mast3r-retrieval, mast3r-codebook"
@@ -41,14 +42,14 @@ class Whitening:
 
 
 @dataclass(frozen=True)
-class AsmkSettings:
+class AsmkSettings(Settings):
     """Aggregated selective match kernel."""
 
-    features: int = 300
+    features: Count = 300
     """The strongest features of a frame that are kept."""
-    words_when_found: int = 1
-    words_when_asking: int = 5
-    power: float = 3.0
+    words_when_found: Count = 1
+    words_when_asking: Count = 5
+    power: Positive = 3.0
     """Exponent of a signature's similarity: a few good words beat many mediocre ones."""
 
 

@@ -47,7 +47,8 @@ def estimate_medium(
 def fit_medium(samples: WaterSamples, settings: SeathruSettings, encoding: Encoding) -> MediumFit:
     """The water that explains the samples, on values as stored ("srgb") or in linear light.
 
-    Raises InputError where fewer than `settings.min_samples` pixels have a depth.
+    Grey samples are one channel, which is fitted once and stands for all three. Raises InputError where fewer than
+    `settings.min_samples` pixels have a depth.
     """
     n = len(samples.ray_depth)
     if n < settings.min_samples:
@@ -59,6 +60,8 @@ def fit_medium(samples: WaterSamples, settings: SeathruSettings, encoding: Encod
     values = [samples.I.double(), samples.open_water.double()]
     if encoding == "linear":
         values = [linear_from_srgb(v) for v in values]
+    if samples.grey:
+        values = [v.mean(1, keepdim=True) for v in values]
     colour, open_water = (v.numpy() for v in values)
     ray_depth = samples.ray_depth.double().numpy()
     unit = float(np.median(ray_depth))
@@ -66,14 +69,14 @@ def fit_medium(samples: WaterSamples, settings: SeathruSettings, encoding: Encod
     frame = np.unique(samples.frame.numpy(), return_inverse=True)[1]
     chosen = _telling_rows(samples, z, settings)
     channels = []
-    for c in range(3):
+    for c in range(colour.shape[1]):
         pixels = Pixels(colour[:, c], colour.mean(1), z, frame, open_water[:, c])
         sightings = None
         if chosen is not None:
             rows, point = chosen
             sightings = Sightings(rows, z[rows], point, frame[rows], colour[rows, c])
         channels.append(fit_channel(pixels, sightings, settings))
-    return _medium_fit(channels, unit, ray_depth, settings, encoding)
+    return _medium_fit(channels * (3 // len(channels)), unit, ray_depth, settings, encoding)
 
 
 def _telling_rows(

@@ -150,7 +150,8 @@ def halved(view: View) -> View:
 
 def likely_edge(grey: Float[Tensor, "h w"]) -> float:
     """A change of grey that makes a depth edge likely: 0.8 of the contrast that windows of 9 pixels usually have."""
-    mean, square = (torch.nn.functional.avg_pool2d(g[None, None], 9, stride=4) for g in (grey, grey * grey))
+    window = min(9, *grey.shape)
+    mean, square = (torch.nn.functional.avg_pool2d(g[None, None], window, stride=4) for g in (grey, grey * grey))
     return max(2 / 255, 0.8 * float((square - mean * mean).clamp(min=0).sqrt().median()))
 
 

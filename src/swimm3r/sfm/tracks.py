@@ -6,6 +6,7 @@ track averages the positions its depth maps give, and the ray depths of its sigh
 centres to that one position: errors of single depth maps do not pass for differences in distance.
 """
 
+from collections.abc import Iterator
 from dataclasses import dataclass
 
 import torch
@@ -39,23 +40,34 @@ def fuse_depth(
     Pictures and depth maps pass through the bounded caches of `frames` and `rec`; held are one bit per pixel and frame
     and the tracks found so far.
     """
-    cameras = rec.cameras
     usable = [i for i, name in enumerate(rec.names) if name in rec.depth]
-    overlap = frame_overlap(rec, usable)
-    stride = _seed_stride(rec, usable, settings)
-    free = {i: torch.ones(cameras.height * cameras.width, dtype=torch.bool) for i in usable}
     pieces: list[DenseTracks] = []
     count = 0
-    for done, i in enumerate(usable):
-        progress("fusing depth", done, len(usable))
-        piece = _tracks_from(i, _neighbours(overlap, i, usable, settings), rec, frames, free, stride, settings)
+    for piece in _by_frame(rec, frames, usable, _seed_stride(rec, usable, settings), settings, progress):
         pieces.append(DenseTracks(piece.xyz, piece.track + count, *list(vars(piece).values())[2:]))
         count += len(piece.xyz)
-    progress("fusing depth", len(usable), len(usable))
     if not pieces:
         none = torch.zeros(0)
         return DenseTracks(none.reshape(0, 3), none.long(), none.long(), none.long(), none, none)
     return DenseTracks(*(torch.cat(parts) for parts in zip(*(vars(p).values() for p in pieces), strict=True)))
+
+
+def count_tracks(rec: Reconstruction, frames: Frames, settings: TrackSettings, progress: Progress = silent) -> int:
+    """How many dense tracks there are in all, where every pixel of known depth may start one; none is held."""
+    usable = [i for i, name in enumerate(rec.names) if name in rec.depth]
+    return sum(len(piece.xyz) for piece in _by_frame(rec, frames, usable, 1, settings, progress))
+
+
+def _by_frame(
+    rec: Reconstruction, frames: Frames, usable: list[int], stride: int, settings: TrackSettings, progress: Progress
+) -> Iterator[DenseTracks]:
+    """The tracks that start in each frame, numbered from 0 in each."""
+    overlap = frame_overlap(rec, usable)
+    free = {i: torch.ones(rec.cameras.height * rec.cameras.width, dtype=torch.bool) for i in usable}
+    for done, i in enumerate(usable):
+        progress("fusing depth", done, len(usable))
+        yield _tracks_from(i, _neighbours(overlap, i, usable, settings), rec, frames, free, stride, settings)
+    progress("fusing depth", len(usable), len(usable))
 
 
 def frame_overlap(rec: Reconstruction, usable: list[int]) -> Float[Tensor, "f f"]:

@@ -13,7 +13,8 @@ import numpy as np
 import torch
 
 from swimm3r.frames import Frames
-from swimm3r.io.colmap import from_pycolmap, to_pycolmap
+from swimm3r.io.atomic import DRAFT
+from swimm3r.io.colmap import from_pycolmap, silence_log, to_pycolmap
 from swimm3r.progress import Progress, silent
 from swimm3r.reconstruction import Points, Reconstruction, Tracks, colmap_model
 from swimm3r.sfm import colmap
@@ -31,7 +32,7 @@ def triangulate(
     """
     import pycolmap
 
-    pycolmap.logging.minloglevel = pycolmap.logging.Level.ERROR.value
+    silence_log()
     order = [frames.index(name) for name in rec.names]
     placed, threads = frames.select(order), os.cpu_count() or 1
     table = colmap_model(rec)
@@ -50,7 +51,7 @@ def triangulate(
     options.extract_colors = False
     options.num_threads = 1  # the same sums in the same order
     options.random_seed = 0
-    with tempfile.TemporaryDirectory(dir=folder, prefix=".triangulation.") as scratch:
+    with tempfile.TemporaryDirectory(dir=folder, prefix=DRAFT) as scratch:
         progress("triangulating points", 0, 1)
         found = pycolmap.triangulate_points(model, str(store.path), str(folder), scratch, options=options)
         progress("triangulating points", 1, 1)

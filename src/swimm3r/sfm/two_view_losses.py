@@ -3,13 +3,14 @@
     l_regr  = |X / s - X* / s*|                    per pixel of both views, all points in the frame of camera 1
     s       = mean |X| over the known pixels of both views; where lengths are metres, s* stands for both
     L_conf  = mean(C l_regr - 0.2 log C)           per view, the views added
-    l_match = -log(e_ii / sum_k e_ki) - log(e_ii / sum_k e_ik),      e_ik = exp(D1_i . D2_k / T)
+    l_match = -log(e_ii / sum_k e_ki) - log(e_ii / sum_k e_ik),      e_ik = exp(D1_i . D2_k / T), each share >= 1e-8
     L_match = mean(Q l_match - 10 log Q),          Q: mean of both descriptors' confidence
     L       = L_conf + 0.075 L_match
 
 The published weights come from these; here they make the small teacher of `benchmarks/learning`.
 """
 
+import math
 from dataclasses import dataclass
 
 import torch
@@ -24,6 +25,9 @@ _MATCHING_ALPHA = 10.0  # of log Q
 _SKY_ERROR = 2.0
 _TEMPERATURE = 0.05
 _LEAST = 1e-8
+LEAST_SHARE = 1e-8
+"""What each share e_ii / sum is at least: a match rarer than this costs no more, and teaches nothing. As the reference
+has it; 0 has no bound."""
 
 
 @dataclass(frozen=True)
@@ -92,14 +96,20 @@ def pointmap_loss(
     return total
 
 
-def matching_errors(first: Float[Tensor, "b n d"], second: Float[Tensor, "b n d"]) -> Float[Tensor, "b n"]:
+def matching_errors(
+    first: Float[Tensor, "b n d"], second: Float[Tensor, "b n d"], least_share: float = LEAST_SHARE
+) -> Float[Tensor, "b n"]:
     """l_match of n rows that belong together, each against all others (InfoNCE, both ways)."""
     similarity = first @ second.mT / _TEMPERATURE
     own = similarity.diagonal(dim1=1, dim2=2)
-    return (similarity.logsumexp(1) - own) + (similarity.logsumexp(2) - own)
+    most = -math.log(least_share) if least_share > 0 else math.inf
+    columns, rows = ((similarity.logsumexp(dim) - own).clamp(max=most) for dim in (1, 2))
+    return columns + rows
 
 
-def matching_loss(predicted: tuple[Descriptors, Descriptors], matches: TrueMatches) -> Float[Tensor, ""]:
+def matching_loss(
+    predicted: tuple[Descriptors, Descriptors], matches: TrueMatches, least_share: float = LEAST_SHARE
+) -> Float[Tensor, ""]:
     """L_match over the valid rows of a batch; the others only stand among the wrong answers."""
     rows, confidences = [], []
     for view, index in zip(predicted, (matches.index1, matches.index2), strict=True):
@@ -109,7 +119,7 @@ def matching_loss(predicted: tuple[Descriptors, Descriptors], matches: TrueMatch
     confidence = (0.5 * (confidences[0] + confidences[1]))[matches.valid]
     if len(confidence) == 0:
         return confidence.sum()
-    error = matching_errors(rows[0], rows[1])[matches.valid]
+    error = matching_errors(rows[0], rows[1], least_share)[matches.valid]
     return (error * confidence - _MATCHING_ALPHA * confidence.log()).mean()
 
 
@@ -119,6 +129,7 @@ def two_view_loss(
     truth: tuple[TruePoints, TruePoints],
     matches: TrueMatches,
     metric: Bool[Tensor, " b"],
+    least_share: float = LEAST_SHARE,
 ) -> Float[Tensor, ""]:
     """L of a batch of pairs in one direction."""
-    return pointmap_loss(points, truth, metric) + MATCHING_WEIGHT * matching_loss(descriptors, matches)
+    return pointmap_loss(points, truth, metric) + MATCHING_WEIGHT * matching_loss(descriptors, matches, least_share)

@@ -10,10 +10,11 @@ from swimm3r.progress import Progress, silent
 from swimm3r.reconstruction import Caution, Reconstruction
 from swimm3r.sfm.backdrop import Backdrop
 from swimm3r.sfm.predicted_water import PredictedWater, dive_fit, predicted_pictures
-from swimm3r.sfm.restore import restored_cloud, restored_pictures
+from swimm3r.sfm.restore import restored_cloud, restored_pictures, shown_gains
 from swimm3r.sfm.seathru import fit_medium
 from swimm3r.sfm.settings import SfmSettings
 from swimm3r.sfm.tracks import fuse_depth
+from swimm3r.sfm.water_plausibility import attenuation_is_a_guess, water_cautions
 from swimm3r.sfm.water_samples import gather_samples
 
 
@@ -42,16 +43,22 @@ def with_water(
     except InputError as failure:
         caution = Caution(f"The water was not estimated: {failure.what}.", f"Try: {failure.hint}")
         return replace(rec, cautions=(*rec.cautions, caution))
-    medium_at = None if predicted is None else predicted.at
-    cloud = restored_cloud(rec, frames, tracks, stored, settings.restore, progress, medium_at)
-    rec = replace(rec, medium=stored, medium_linear=linear, cloud=cloud)
+    if predicted is None:
+        cloud = restored_cloud(rec, frames, tracks, stored, settings.restore, progress)
+    else:
+        eps_inv = predicted.head.min_transmittance
+        cloud = restored_cloud(rec, frames, tracks, stored, settings.restore, progress, predicted.at, eps_inv)
+    doubts = water_cautions(stored, grey=samples.grey, predicted=predicted is not None)
+    rec = replace(rec, medium=stored, medium_linear=linear, cloud=cloud, cautions=(*rec.cautions, *doubts))
     pictures = (
         restored_pictures(rec, frames, settings.restore, progress)
         if predicted is None
-        else predicted_pictures(rec, frames, predicted, progress)
+        else predicted_pictures(rec, frames, predicted, progress, shown_gains(rec, settings.restore))
     )
     backdrop = Backdrop(rec, frames)
     for i, picture in pictures:
-        images.write_rgb(folder / "restored" / f"{rec.names[i]}.png", picture.shown.numpy())
+        shown = frames.image(frames.index(rec.names[i])) if attenuation_is_a_guess(stored) else picture.shown
+        images.write_rgb(folder / "restored" / f"{rec.names[i]}.png", shown.numpy())
+        images.write_rgb_16(folder / "restored_physical" / f"{rec.names[i]}.png", picture.clear.numpy())
         backdrop.add(i, picture)
     return replace(rec, backdrop=backdrop.points())

@@ -169,10 +169,14 @@ def _largest_Binf(I: np.ndarray, z: np.ndarray) -> float:
     return float(np.clip(1.2 * np.quantile(I[far], 0.98), 0.02, 1.0))
 
 
+def _log_transmittance(x: np.ndarray, z: np.ndarray) -> np.ndarray:
+    """ln T_D at depths z: finite where T_D itself underflows, at many times the median depth."""
+    return -np.exp(x[LOG_BETA_D] + x[SLOPE] * z) * z
+
+
 def _attenuations(x: np.ndarray, z: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     """T_D and B at depths z."""
-    T_D = np.exp(-np.exp(x[LOG_BETA_D] + x[SLOPE] * z) * z)
-    return T_D, x[BINF] * -np.expm1(-np.exp(x[LOG_BETA_B]) * z)
+    return np.exp(_log_transmittance(x, z)), x[BINF] * -np.expm1(-np.exp(x[LOG_BETA_B]) * z)
 
 
 def _points(T_D: np.ndarray, direct: np.ndarray, point: np.ndarray, weight: np.ndarray) -> np.ndarray:
@@ -225,10 +229,11 @@ def _prior_residuals(x: np.ndarray, evidence: _Evidence, settings: SeathruSettin
     dark = (bins.dark - B - x[DARK] * T_D) / settings.dark_std
     if not evidence.alone:
         dark = np.where(dark < 0, 3.0 * dark, np.sqrt(2 * (np.sqrt(1 + dark.clip(0) ** 2) - 1)))
-    T_D, B = _attenuations(x, bins.z_mean)
+    _, B = _attenuations(x, bins.z_mean)
     floor = settings.dark_std
     direct = np.logaddexp(0.0, (bins.mean - B) / floor) * floor  # a soft max(., 0)
-    average = (np.log(direct) - x[LOG_MEAN] - np.log(T_D)) / np.hypot(settings.average_std, floor / direct)
+    expected = x[LOG_MEAN] + _log_transmittance(x, bins.z_mean)
+    average = (np.log(direct) - expected) / np.hypot(settings.average_std, floor / direct)
     single = [
         x[DARK] / 0.003 if evidence.alone else (x[DARK] - settings.dark_reflectance) / settings.dark_reflectance_std,
         (x[LOG_MEAN] + np.log(settings.lsac_f)) / settings.mean_reflectance_std,

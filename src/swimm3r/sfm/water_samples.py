@@ -21,6 +21,9 @@ from swimm3r.sfm.depth_filling import fill_z_depth
 from swimm3r.sfm.settings import SeathruSettings
 from swimm3r.sfm.tracks import DenseTracks, cubes, ray_depth_map, shared_rays
 
+_ONE_STEP = 1.5 / 255  # difference between channels that rounding leaves in a grey picture
+_COLOURED = 0.001  # share of the pixels of a grey clip that may have a colour: a logo, a time stamp
+
 
 @dataclass(frozen=True)
 class WaterSamples:
@@ -31,6 +34,12 @@ class WaterSamples:
     frame: Int[Tensor, " n"]  # which picture: errors are shared within one
     track: Int[Tensor, " n"]  # which patch of surface; -1 for pixels on their own
     open_water: Float[Tensor, "m 3"]  # pixels beyond every surface; empty where the frames show none
+
+    @property
+    def grey(self) -> bool:
+        """Whether the three channels are one: equal up to rounding, in all but a few pixels."""
+        spread = self.I.amax(-1) - self.I.amin(-1)
+        return len(spread) > 0 and float((spread > _ONE_STEP).float().mean()) <= _COLOURED
 
 
 def gather_samples(

@@ -14,12 +14,10 @@ from swimm3r.sfm.water import with_water
 
 def reconstruct(frames: Frames, settings: ColmapSettings, folder: Path, progress: Progress = silent) -> Reconstruction:
     """Poses first, and saved at once: what comes after reads them from there when an interrupted run goes on."""
-    if (folder / "reconstruction.json").is_file():
-        rec = reconstruction.load(folder)
-    else:
-        rec = colmap.reconstruct(frames, settings, folder, progress)
-        reconstruction.save(rec, folder)
+    if not (folder / "reconstruction.json").is_file():
+        reconstruction.save(colmap.reconstruct(frames, settings, folder, progress), frames, folder)
+    rec = reconstruction.load(folder, frames)  # also where it was just made: the same bits as after an interruption
     estimate_depth(rec, frames, settings.depth, progress)
     rec = with_water(rec, frames, settings, folder, progress)
-    reconstruction.save(rec, folder)
+    reconstruction.save(rec, frames, folder)
     return rec

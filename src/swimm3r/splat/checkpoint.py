@@ -5,31 +5,55 @@ the recipe, its settings, the metric flag, the working unit and when the clip be
 frames' poses where they were refined. A checkpoint adds the optimiser's moments and the step.
 """
 
-import json
-from dataclasses import asdict, dataclass, fields, is_dataclass
+from collections.abc import Mapping
+from dataclasses import asdict, dataclass
 from pathlib import Path
-from typing import Any, get_type_hints
+from typing import Any, cast
 
-from safetensors import SafetensorError, safe_open
-from safetensors.torch import save_file
 from torch import Tensor
 
-from swimm3r.errors import InputError
-from swimm3r.io.atomic import atomic_path
+from swimm3r.cameras import check_poses
+from swimm3r.io.damage import Remedy, guard
+from swimm3r.io.safe_names import check_names
+from swimm3r.io.tensor_file import TensorFile, read_tensors, write_tensors
+from swimm3r.settings_document import from_document, to_document
 from swimm3r.splat.pose_codes import RefinedPoses
 from swimm3r.splat.rendering import SplatMap
-from swimm3r.splat.settings import RECIPES, recipe_of, settings_of
-from swimm3r.splat.state import parts_of
+from swimm3r.splat.settings import RECIPES, Recipe, recipe_of, settings_of
+from swimm3r.splat.state import parts_of, primitives_from
 
 SCHEMA = 1
 
 
 @dataclass(frozen=True)
-class Stored:
-    """The tensors of a file and its header."""
+class StateHeader:
+    """The header of a checkpoint."""
 
-    tensors: dict[str, Tensor]
-    about: dict[str, Any]
+    step: int
+    fingerprint: str
+
+    def __post_init__(self) -> None:
+        if self.step < 0:
+            raise ValueError(f"steps count from 0, got {self.step}")
+
+
+@dataclass(frozen=True)
+class _MapHeader:
+    recipe: str
+    settings: dict[str, Any]
+    metric: bool
+    length: float
+    span: tuple[float, float] = (0.0, 1.0)  # static maps of earlier versions have none
+    frames: tuple[str, ...] | None = None  # whose poses were refined
+
+    def __post_init__(self) -> None:
+        if self.recipe not in RECIPES:
+            raise ValueError(f"its recipe is {self.recipe!r}, and known are {', '.join(RECIPES)}")
+        if self.length <= 0:
+            raise ValueError(f"its working unit is {self.length:g}")
+        if self.span[0] > self.span[1]:
+            raise ValueError(f"its clip ends before it begins: {list(self.span)}")
+        check_names(self.frames or ())
 
 
 def save_map(path: Path, scene: SplatMap) -> None:
@@ -37,8 +61,9 @@ def save_map(path: Path, scene: SplatMap) -> None:
     tensors = {f"primitives.{name}": values for name, values in scene.primitives._asdict().items()}
     tensors |= {f"field.{name}": values for name, values in scene.field.state_dict().items()}
     about = {
+        "schema": SCHEMA,
         "recipe": recipe_of(scene.settings),
-        "settings": asdict(scene.settings),
+        "settings": to_document(scene.settings),
         "metric": scene.metric,
         "length": scene.length,
         "span": scene.span,
@@ -46,72 +71,53 @@ def save_map(path: Path, scene: SplatMap) -> None:
     if scene.poses is not None:
         tensors["poses.cam2world"] = scene.poses.cam2world
         about["frames"] = scene.poses.names
-    write(path, Stored(tensors, about))
+    write_tensors(path, tensors, about)
 
 
 def load_map(path: Path) -> SplatMap:
     """Read what `save_map` wrote. Raises InputError for a file that is damaged or of another kind."""
-    stored = read(path)
-    about = stored.about
-    if about.get("recipe") not in RECIPES:
-        raise _foreign(path, f"its recipe is {about.get('recipe')!r}, and known are {', '.join(RECIPES)}")
-    try:
-        settings = settings_from(settings_of(about["recipe"]), about["settings"])
-        parts = parts_of(settings)
-        field, kind = parts.field, parts.primitives
-        field.load_state_dict(
-            {k.removeprefix("field."): v for k, v in stored.tensors.items() if k.startswith("field.")}
-        )
-        primitives = kind(*(stored.tensors[f"primitives.{name}"] for name in kind._fields))
-        if {len(values) for values in primitives} != {len(primitives.xyz)}:
-            raise ValueError("its primitives' parts are of different lengths")
-    except (KeyError, TypeError, ValueError, RuntimeError) as error:
-        raise _foreign(path, str(error).splitlines()[0]) from error
-    start, end = about.get("span", (0.0, 1.0))  # static maps of earlier versions have none
-    poses = RefinedPoses(tuple(about["frames"]), stored.tensors["poses.cam2world"]) if "frames" in about else None
-    field.requires_grad_(False)
-    return SplatMap(primitives, field, settings, about["metric"], about["length"], (start, end), poses)
-
-
-def write(path: Path, stored: Stored) -> None:
-    """Tensors and header in one file, whole or not at all."""
-    tensors = {name: values.detach().cpu().contiguous() for name, values in stored.tensors.items()}
-    with atomic_path(path) as draft:
-        save_file(tensors, draft, {"swimm3r": json.dumps({"schema": SCHEMA, **stored.about}, sort_keys=True)})
-
-
-def read(path: Path) -> Stored:
-    """Read what `write` wrote. Raises InputError for a file that is missing, damaged or of another kind."""
-    try:
-        with safe_open(path, "pt") as file:
-            header = file.metadata() or {}
-            if "swimm3r" not in header:
-                raise _foreign(path, "it has no Swimm3R header")
-            about = json.loads(header["swimm3r"])
-            schema = about.get("schema")
-            if isinstance(schema, int) and schema > SCHEMA:
-                raise InputError(
-                    f"{path} was written by a newer Swimm3R: its schema is {schema}, this version reads {SCHEMA}.",
-                    cause="the map was trained elsewhere, with a later version",
-                    hint="update Swimm3R here, or train the map again",
-                )
-            if schema != SCHEMA:
-                raise _foreign(path, f"its schema is {schema}, this version reads {SCHEMA}")
-            return Stored({name: file.get_tensor(name) for name in file.keys()}, about)  # noqa: SIM118
-    except (OSError, SafetensorError, ValueError) as error:
-        raise _foreign(path, str(error)) from error
-
-
-def settings_from(kind: type, values: dict[str, Any]) -> Any:
-    """A settings dataclass from its `asdict`, nested ones by their annotations."""
-    hints = get_type_hints(kind)
-    nested = {f.name: hints[f.name] for f in fields(kind) if is_dataclass(hints[f.name])}
-    return kind(**{k: settings_from(nested[k], v) if k in nested else v for k, v in values.items()})
-
-
-def _foreign(path: Path, why: str) -> InputError:
-    return InputError(
-        f"{path} is not a map that can be read: {why}.",
+    remedy = Remedy(
+        f"remove {path.parent}; the swimm3r command that trained the map trains it again",
         cause="the file is damaged, of another version, or of another program",
-        hint="train the map again",
+        fault="is not a map that can be read",
     )
+    stored = read_tensors(path, _MapHeader, remedy, SCHEMA)
+    about = stored.about
+    with guard(path, remedy):
+        settings = from_document(about.settings, settings_of(cast(Recipe, about.recipe)))
+        parts = parts_of(settings)
+        field, primitives = parts.field, primitives_from(stored.tensors, parts.primitives, "primitives.")
+        try:
+            field.load_state_dict(
+                {k.removeprefix("field."): v for k, v in stored.tensors.items() if k.startswith("field.")}
+            )
+        except RuntimeError as error:  # torch on missing names and other shapes
+            raise ValueError(" ".join(str(error).split())) from error
+        poses = None
+        if about.frames is not None:
+            poses = RefinedPoses(about.frames, _poses(stored.tensors, len(about.frames)))
+    field.requires_grad_(False)
+    return SplatMap(primitives, field, settings, about.metric, about.length, about.span, poses)
+
+
+def write_state(path: Path, tensors: Mapping[str, Tensor], header: StateHeader) -> None:
+    """Write a checkpoint, whole or not at all."""
+    write_tensors(path, tensors, {"schema": SCHEMA, **asdict(header)})
+
+
+def read_state(path: Path) -> TensorFile[StateHeader]:
+    """Read what `write_state` wrote. Raises InputError for a file that is damaged or of another kind."""
+    return read_tensors(path, StateHeader, state_remedy(path), SCHEMA)
+
+
+def state_remedy(path: Path) -> Remedy:
+    """Advice for a checkpoint that training cannot go on from."""
+    return Remedy(f"remove {path.parent}; the same command then trains from the start")
+
+
+def _poses(tensors: Mapping[str, Tensor], count: int) -> Tensor:
+    cam2world = tensors["poses.cam2world"]
+    if cam2world.shape != (count, 4, 4):
+        raise ValueError(f"poses.cam2world has the shape {tuple(cam2world.shape)} for {count} frames")
+    check_poses(cam2world)
+    return cam2world

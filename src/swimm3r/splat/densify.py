@@ -1,7 +1,11 @@
-"""Primitives move to where they are needed: relocation, growth and noise (MCMC-GS; for Beta kernels uwbs.md 1.8, 5).
+"""Primitives move to where they are needed: relocation, growth and noise (MCMC-GS; for Beta kernels as UBS has it).
 
-A primitive of opacity o that is replaced by n copies in its place gives each 1 - (1 - o)^(1/n): together they block as
-much light as before, for any kernel, without touching scale or exponent.
+    o' = 1 - (1 - o)^(1/n)
+
+is the opacity of each of the n copies that replace a primitive of opacity o; scale and exponent stay (UBS). Where the
+kernel is v, 1 at its centre and 0 at its rim, they let (1 - o' v)^n of the light pass instead of 1 - o v. The two are
+equal at centre and rim; in between the copies block more, for n = 2 by o'^2 v (1 - v). No o', scale and exponent mend
+that for all v at once, as (1 - (1 - o v)^(1/n)) / o' is not a Beta kernel.
 """
 
 from dataclasses import dataclass
@@ -30,7 +34,7 @@ class Densified:
 
 
 def shared_opacity(opacity: Float[Tensor, "*n"], copies: Float[Tensor, "*n"], least: float) -> Float[Tensor, "*n"]:
-    """Opacity of each of `copies` primitives that take the place of one."""
+    """Opacity of each of `copies` primitives that take the place of one and block as much light at its centre."""
     return (1 - (1 - opacity) ** (1 / copies)).clamp(least, _LARGEST)
 
 

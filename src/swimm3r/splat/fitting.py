@@ -10,6 +10,7 @@ import torch
 
 from swimm3r import devices
 from swimm3r.devices import CPU
+from swimm3r.errors import UsageError
 from swimm3r.frames import Frames
 from swimm3r.progress import Progress, silent
 from swimm3r.reconstruction import Reconstruction
@@ -23,7 +24,7 @@ from swimm3r.splat.rendering import SplatMap
 from swimm3r.splat.settings import McmcGsSettings, SeaSplatSettings, SplatSettings, UwbsSettings, WaterSplattingSettings
 from swimm3r.splat.site import Site, path_radius
 from swimm3r.splat.state import in_scene_units
-from swimm3r.splat.views import TrainingViews, working_scale
+from swimm3r.splat.views import TrainingViews, median_z_depth, working_scale
 
 
 def train(
@@ -34,11 +35,12 @@ def train(
     progress: Progress = silent,
     device: torch.device = CPU,
 ) -> SplatMap:
-    """Train a map in `folder`: checkpoint/, metrics.jsonl, and at the end map.safetensors and the refined cameras.json.
+    """Train a map in `folder`: checkpoint/, metrics.jsonl, and at the end map.safetensors and the refined poses.
 
-    Both are in the scene's own unit; cameras.json is not written where poses are held.
+    All are in the scene's own unit; cameras.json and trajectory.tum are not written where poses are held.
     """
     scale = working_scale(rec, settings)
+    _check_near(settings, scale * median_z_depth(rec))
     views = TrainingViews(rec, frames, settings, scale)
     stations = training_stations(rec, views.names, views.cameras, scale) if settings.poses.enabled else None
     radius = path_radius(rec, scale, settings.working_depth)
@@ -49,10 +51,21 @@ def train(
     poses = None
     if stations is not None and final.poses is not None:
         poses = stations.refined(final.poses)
-        write_refined(folder / "cameras.json", rec, poses)
+        write_refined(folder, rec, frames, poses)
     scene = SplatMap(primitives, field, settings, rec.metric, 1 / scale, frames.span, poses)
     checkpoint.save_map(folder / "map.safetensors", scene)
     return scene
+
+
+def _check_near(settings: SplatSettings, median_depth: float) -> None:
+    """Raise UsageError where half of the scene would not be drawn; the depth is in working units."""
+    if settings.render.near >= median_depth:
+        raise UsageError(
+            f"the near plane ({settings.render.near:g}) lies behind half of the scene, whose median depth is"
+            f" {median_depth:g} working units",
+            cause="it was given in another unit than metres, or than thirds of the median depth",
+            hint="leave --splat.render.near out for the default",
+        )
 
 
 def _recipe(settings: SplatSettings, site: Site) -> training.Recipe:

@@ -5,79 +5,95 @@ units (`settings.py`). Every peer starts from the cloud, and from as many primit
 """
 
 from dataclasses import dataclass, field
-from typing import Literal
+from typing import Annotated, Literal
 
+from swimm3r.settings import (
+    Cadence,
+    Count,
+    DecayingRate,
+    LongSideOrOwn,
+    MapSize,
+    NotNegative,
+    Opacity,
+    Positive,
+    PositiveShare,
+    Range,
+    Rate,
+    Seed,
+    Settings,
+    Share,
+)
 from swimm3r.splat.scene_settings import MediumFieldSettings, TrainingPoseSettings
 
 
 @dataclass(frozen=True)
-class GaussianInitialSettings:
+class GaussianInitialSettings(Settings):
     """The Gaussians that training starts from."""
 
-    primitives: int = 400_000
+    primitives: MapSize = 400_000
     """Points of the cloud and its backdrop that become primitives, one per voxel."""
-    backdrop: float = 0.2
+    backdrop: Share = 0.2
     """Largest share of them that lies on ground whose depth is a guess."""
     colours: Literal["restored", "raw"] = "raw"
     """As filmed, or without the water for maps that have one."""
-    harmonics: int = 3
+    harmonics: Annotated[int, Range(0, 3)] = 3
     """Degree of the colours' spherical harmonics."""
-    scale: float = 1.0
+    scale: Annotated[float, Range(1e-3, 1e3)] = 1.0
     """In root mean square distances to the 3 nearest neighbours."""
-    opacity: float = 0.1
+    opacity: Opacity = 0.1
 
 
 @dataclass(frozen=True)
-class GaussianRenderSettings:
+class GaussianRenderSettings(Settings):
     """How a Gaussian meets a camera."""
 
     depth: Literal["ray", "z"] = "z"
     """The depth that attenuates: along the ray, or along the optical axis as the peers have it."""
-    alpha_min: float = 1 / 255
+    alpha_min: Annotated[float, Range(0, 0.5)] = 1 / 255
     """Pairs fainter than this are skipped."""
-    near: float = 0.01
+    near: Annotated[float, Range(above=0, most=1e6)] = 0.01
     """Primitives nearer than this z depth are not drawn."""
     medium_depth_grad: Literal["full", "detach"] = "full"
     """Whether what the water takes and adds may move a primitive in depth."""
 
 
 @dataclass(frozen=True)
-class GaussianRates:
+class GaussianRates(Settings):
     """Of Adam (eps 1e-15); positions decay log-linearly over the run."""
 
-    xyz: float = 1.6e-4
+    xyz: DecayingRate = 1.6e-4
     """Times the scene's radius, as is its end."""
-    xyz_end: float = 1.6e-6
-    quaternion: float = 1e-3
-    scale: float = 5e-3
-    opacity: float = 5e-2
-    colour: float = 2.5e-3
-    harmonics: float = 1.25e-4
-    haste: float = 0.5
+    xyz_end: DecayingRate = 1.6e-6
+    quaternion: Rate = 1e-3
+    scale: Rate = 5e-3
+    opacity: Rate = 5e-2
+    colour: Rate = 2.5e-3
+    harmonics: Rate = 1.25e-4
+    haste: Annotated[float, Range(0, 4)] = 0.5
     """In runs shorter than the published one the rates of positions, rotations and colours grow with its length over
     theirs to this power, at most fourfold; 0 keeps them. UWBS's `fast` preset has rates raised by as much, and 400
     steps of Gaussian MCMC on ruie_green_rock gain 1.2 dB by it on frames held back."""
 
 
 @dataclass(frozen=True)
-class GaussianSettings:
+class GaussianSettings(Settings):
     """What all peers have."""
 
-    iterations: int = 30_000
-    long_side: int = 1600
+    iterations: Count = 30_000
+    long_side: LongSideOrOwn = 1600
     """Longer side of the training pictures, pixels; they are never enlarged."""
-    working_depth: float = 3.0
+    working_depth: Annotated[float, Range(1e-3, 1e6)] = 3.0
     """Median depth, working units, that a scene without metric scale is given while it is trained."""
-    max_primitives: int = 800_000
+    max_primitives: MapSize = 800_000
     initial: GaussianInitialSettings = field(default_factory=GaussianInitialSettings)
     render: GaussianRenderSettings = field(default_factory=GaussianRenderSettings)
     rates: GaussianRates = field(default_factory=GaussianRates)
-    degree_every: float = 1 / 30
+    degree_every: Cadence = 1 / 30
     """Share of the run between two degrees of the colours' harmonics."""
     poses: TrainingPoseSettings = field(default_factory=TrainingPoseSettings)
-    seed: int = 0
-    log_every: float = 0.005
-    checkpoint_every: float = 0.1
+    seed: Seed = 0
+    log_every: Cadence = 0.005
+    checkpoint_every: Cadence = 0.1
 
     @property
     def depth_confidence(self) -> float | None:
@@ -86,28 +102,28 @@ class GaussianSettings:
 
 
 @dataclass(frozen=True)
-class McmcSettings:
+class McmcSettings(Settings):
     """Relocation, growth and noise (3DGS-MCMC), with its regularisers."""
 
-    begin: float = 1 / 60  # 500 of 30,000
-    end: float = 5 / 6  # 25,000 of 30,000
-    every: float = 1 / 300  # 100 of 30,000
-    min_every: int = 20
+    begin: Share = 1 / 60  # 500 of 30,000
+    end: Share = 5 / 6  # 25,000 of 30,000
+    every: Cadence = 1 / 300  # 100 of 30,000
+    min_every: Count = 20
     """Fewest steps between two rounds, whatever `every` says; growth is made up for."""
-    growth: float = 1.05
+    growth: Annotated[float, Range(1, 2)] = 1.05
     """Per round at `every`."""
-    dead_opacity: float = 0.005
-    noise: float = 5e5
+    dead_opacity: Opacity = 0.005
+    noise: NotNegative = 5e5
     """Times the positions' learning rate, with every step."""
 
 
 @dataclass(frozen=True)
-class McmcWeights:
+class McmcWeights(Settings):
     """Of the losses, all the run."""
 
-    ssim: float = 0.2
-    opacity: float = 0.01
-    scale: float = 0.01
+    ssim: Share = 0.2
+    opacity: NotNegative = 0.01
+    scale: NotNegative = 0.01
 
 
 @dataclass(frozen=True)
@@ -123,36 +139,36 @@ class McmcGsSettings(GaussianSettings):
 
 
 @dataclass(frozen=True)
-class AbsGradSettings:
+class AbsGradSettings(Settings):
     """Multiplication by absolute gradients, culls, and cuts of the opacities (WaterSplatting)."""
 
-    begin: float = 1 / 30  # 500 of 15,000
-    end: float = 2 / 3  # 10,000 of 15,000
-    every: float = 1 / 150  # 100 of 15,000
-    min_every: int = 40
+    begin: Share = 1 / 30  # 500 of 15,000
+    end: Share = 2 / 3  # 10,000 of 15,000
+    every: Cadence = 1 / 150  # 100 of 15,000
+    min_every: Count = 40
     """Fewest steps between two rounds, whatever `every` says: a round needs its views."""
-    pull: float = 8e-4
+    pull: NotNegative = 8e-4
     """Least mean gradient of a projected centre, in half pictures."""
-    large: float = 1e-3
+    large: NotNegative = 1e-3
     """Scale from which on a Gaussian is split instead of doubled, in radii of the cameras' path."""
-    least_opacity: float = 0.5
+    least_opacity: Share = 0.5
     """Fainter Gaussians are culled by a round,"""
-    least_opacity_late: float = 0.1
+    least_opacity_late: Share = 0.1
     """and these after the last."""
-    largest: float = 10.0
+    largest: Positive = 10.0
     """Scale above which they are culled, in radii of the cameras' path."""
-    reset_every: float = 1 / 30  # 500 of 15,000
+    reset_every: Share = 1 / 30  # 500 of 15,000
     """Share of the run between two cuts of the opacities; 0 for none."""
-    reset_opacity: float = 0.5
+    reset_opacity: Opacity = 0.5
     """What they are cut to."""
 
 
 @dataclass(frozen=True)
-class RelativeWeights:
+class RelativeWeights(Settings):
     """Of reg-L1 and reg-SSIM."""
 
-    ssim: float = 0.2
-    floor: float = 1e-3
+    ssim: Share = 0.2
+    floor: PositiveShare = 1e-3
     """Added to the rendered value that errors are divided by."""
 
 
@@ -160,85 +176,85 @@ class RelativeWeights:
 class WaterSplattingSettings(GaussianSettings):
     """Gaussians in water that a network knows for every direction."""
 
-    iterations: int = 15_000
+    iterations: Count = 15_000
     initial: GaussianInitialSettings = field(default_factory=lambda: GaussianInitialSettings(colours="restored"))
     medium: MediumFieldSettings = field(
         default_factory=lambda: MediumFieldSettings(layers=1, activation="sigmoid", biases=False, begin=0.0)
     )
-    medium_rate: float = 1e-3
-    medium_rate_end: float = 1.5e-4
+    medium_rate: DecayingRate = 1e-3
+    medium_rate_end: DecayingRate = 1.5e-4
     rates: GaussianRates = field(default_factory=lambda: GaussianRates(xyz_end=5e-5))
     weights: RelativeWeights = field(default_factory=RelativeWeights)
     densify: AbsGradSettings = field(default_factory=AbsGradSettings)
-    degree_every: float = 1 / 15
-    first_divisor: int = 4
+    degree_every: Cadence = 1 / 15
+    first_divisor: Annotated[int, Range(1, 64)] = 4
     """By how much the training pictures are smaller at first,"""
-    double_every: float = 0.2  # 3,000 of 15,000
+    double_every: Cadence = 0.2  # 3,000 of 15,000
     """and the share of the run after which they double."""
 
 
 @dataclass(frozen=True)
-class GradientSettings:
+class GradientSettings(Settings):
     """Multiplication by gradients, culls, and cuts of the opacities (3DGS)."""
 
-    begin: float = 1 / 60  # 500 of 30,000
-    end: float = 0.5  # 15,000 of 30,000
-    every: float = 1 / 300  # 100 of 30,000
-    min_every: int = 40
+    begin: Share = 1 / 60  # 500 of 30,000
+    end: Share = 0.5  # 15,000 of 30,000
+    every: Cadence = 1 / 300  # 100 of 30,000
+    min_every: Count = 40
     """Fewest steps between two rounds, whatever `every` says: a round needs its views."""
-    pull: float = 2e-4
+    pull: NotNegative = 2e-4
     """Least mean gradient of a projected centre, in half pictures."""
-    large: float = 0.01
+    large: NotNegative = 0.01
     """Scale from which on a Gaussian is split instead of doubled, in radii of the cameras' path."""
-    least_opacity: float = 0.005
+    least_opacity: Share = 0.005
     """Fainter Gaussians are culled,"""
-    largest: float = 0.1
+    largest: Positive = 0.1
     """and, after the first cut, those of larger scales, in radii of the cameras' path,"""
-    largest_radius: float = 20.0
+    largest_radius: Positive = 20.0
     """or of larger radius in a training picture, pixels."""
-    reset_every: float = 0.1  # 3,000 of 30,000
+    reset_every: Share = 0.1  # 3,000 of 30,000
     """Share of the run between two cuts of the opacities; 0 for none."""
-    reset_opacity: float = 0.01
+    reset_opacity: Opacity = 0.01
     """What they are cut to."""
 
 
 @dataclass(frozen=True)
-class SeaSplatWeights:
+class SeaSplatWeights(Settings):
     """Of the losses; those on J, and the dark channel's, begin with the water."""
 
-    ssim: float = 0.2
-    far: float = 1.0
+    ssim: Share = 0.2
+    far: NotNegative = 1.0
     """Of the error in proportion to depth."""
-    background: float = 0.01
+    background: NotNegative = 0.01
     """Of what covers pixels that have the colour of the open water."""
-    background_distance: float = 0.2 * 3**0.5
+    background_distance: Positive = 0.2 * 3**0.5
     """Largest distance in RGB of a colour that counts as such."""
-    smooth_depth: float = 2.0
-    grey: float = 0.1
-    saturation: float = 2.0
-    saturated: float = 0.7
+    smooth_depth: NotNegative = 2.0
+    grey: NotNegative = 0.1
+    saturation: NotNegative = 2.0
+    saturated: NotNegative = 0.7
     """Clear colours are to be darker than this."""
-    dark: float = 1.0
+    dark: NotNegative = 1.0
     """Of the light left when the backscatter is taken away,"""
-    negative: float = 1000.0
+    negative: NotNegative = 1000.0
     """and of backscatter beyond the picture, in units of the former."""
 
 
 @dataclass(frozen=True)
-class SceneWaterSettings:
+class SceneWaterSettings(Settings):
     """When the water comes, and how often it learns."""
 
-    begin: float = 1 / 3  # 10,000 of 30,000
+    begin: Share = 1 / 3  # 10,000 of 30,000
     """Share of the run before which there is a background instead."""
-    rate: float = 1e-2
+    rate: Rate = 1e-2
     """Of Adam, for water and background."""
-    first_burst: float = 1 / 30
+    first_burst: Annotated[float, Range(0, 10)] = 1 / 30
     """Steps of the water alone when it comes, 1,000, as a share of the run, which does not count them;"""
-    colour_burst: float = 1 / 15
+    colour_burst: Annotated[float, Range(0, 10)] = 1 / 15
     """then of the colours alone, 2,000."""
-    every: float = 1 / 300
+    every: Cadence = 1 / 300
     """Share of the run between two more bursts of the water, 100 steps,"""
-    burst: float = 0.5
+    burst: Annotated[float, Range(0, 10)] = 0.5
     """and how long they are, 50 steps, as a share of that."""
 
 

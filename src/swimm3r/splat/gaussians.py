@@ -87,7 +87,7 @@ def initial_gaussians(
 ) -> GaussianPrimitives:
     """Gaussians on the cloud that every recipe starts from, round and of one colour from all sides.
 
-    Raises ValueError for fewer than 4 points.
+    Raises InputError for fewer than 4 points.
     """
     start = starting_points(rec, settings)
     n = len(start.xyz)

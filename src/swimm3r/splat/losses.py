@@ -1,4 +1,4 @@
-"""The terms of Eq. uwbs_total, each a mean; `recipes.uwbs` weighs and adds them. Pictures are channels first."""
+"""The terms of Eq. 18, each a mean; `recipes.uwbs` weighs and adds them. Pictures are channels first."""
 
 from dataclasses import dataclass
 from typing import Any
@@ -13,11 +13,12 @@ from swimm3r.splat import ssim_cpu
 from swimm3r.splat.primitives import BetaPrimitives
 
 _NEAREST = 1e-3  # of the scene's unit: the least depth whose inverse is taken
+_LEAST_WEIGHT = 1e-12  # of a picture's edge-aware weights together, below which none of its depths counts
 
 
 @dataclass(frozen=True)
 class Photometric:
-    """Eq. 3dgs_loss and its two parts; the parts are for the record."""
+    """Eq. 14 and its two parts; the parts are for the record."""
 
     loss: Float[Tensor, ""]
     l1: float | Tensor
@@ -27,7 +28,7 @@ class Photometric:
 def photometric(
     render: Float[Tensor, "3 h w"], target: Float[Tensor, "3 h w"], seen: Bool[Tensor, "h w"], ssim_weight: float
 ) -> Photometric:
-    """(1 - w) L1 + w (1 - SSIM) (Eq. 3dgs_loss), SSIM zero-padded; pixels not `seen` count as matched."""
+    """(1 - w) L1 + w (1 - SSIM) (Eq. 14), SSIM zero-padded; pixels not `seen` count as matched."""
     target = torch.where(seen, target, render.detach())
     if render.device.type != "cpu" or render.dtype != torch.float32:
         l1, ssim = (render - target).abs().mean(), mean_ssim(render, target)
@@ -71,17 +72,17 @@ def mean_ssim(x: Float[Tensor, "3 h w"], y: Float[Tensor, "3 h w"]) -> Float[Ten
 
 
 def mean_opacity(p: BetaPrimitives) -> Float[Tensor, ""]:
-    """L_opa (Eq. mcmc_reg): what keeps primitives that explain nothing from living on."""
+    """L_opa (Eq. 15): what keeps primitives that explain nothing from living on."""
     return torch.sigmoid(p.opacity).mean()
 
 
 def mean_scale(p: BetaPrimitives, ubs_bug: bool = False) -> Float[Tensor, ""]:
-    """L_scale (Eq. mcmc_reg), of the spatial scales of all primitives; UBS's slip takes all of three primitives."""
+    """L_scale (Eq. 15), of the spatial scales of all primitives; UBS's slip takes all of three primitives."""
     return softplus(p.scale[:3] if ubs_bug else p.scale[:, :3]).mean()
 
 
 def oversize(p: BetaPrimitives, radius: Float[Tensor, " n"], limit: float) -> Float[Tensor, ""]:
-    """L_rad (Eq. radius_reg): mean spatial scale of the primitives whose radius exceeds `limit` pixels, 0 for none."""
+    """L_rad (Eq. 17): mean spatial scale of the primitives whose radius exceeds `limit` pixels, 0 for none."""
     large = (radius > limit)[:, None]
     if large.device.type == "cpu" and not bool(large.any()):  # a GPU would have to be waited for
         return p.scale.new_zeros(())
@@ -89,25 +90,34 @@ def oversize(p: BetaPrimitives, radius: Float[Tensor, " n"], limit: float) -> Fl
     return scales.sum() / (3 * large.sum()).clamp(min=1)
 
 
-def depth_error(
-    images: RasterOutput,
-    z_depth: Float[Tensor, "h w"],
-    weight: Float[Tensor, "h w"],
-    least_alpha: float,
-) -> Float[Tensor, ""]:
-    """L_depth (Eq. depth_reg): mean of w log(1 + |1/D^ - 1/D|) over pixels of known depth that the map covers.
+def edge_weight(rgb: Float[Tensor, "3 h w"], scale: float) -> Float[Tensor, "h w"]:
+    """w_n of Eq. 13 before it is normalised: mean of e^(-scale |dI/dx|) and e^(-scale |dI/dy|), 1 where I is flat.
 
-    D^ is the expected depth. `weight` is the edge-aware weight, 0 where the prior is unknown.
+    |dI| is the mean over the channels of the absolute difference to the next pixel.
     """
-    covered = images.alpha.detach() > least_alpha
+    right = torch.nn.functional.pad(rgb.diff(dim=2).abs().mean(0), (0, 1))
+    down = torch.nn.functional.pad(rgb.diff(dim=1).abs().mean(0), (0, 0, 0, 1))
+    return (torch.exp(-scale * right) + torch.exp(-scale * down)) / 2
+
+
+def depth_error(
+    images: RasterOutput, z_depth: Float[Tensor, "h w"], weight: Float[Tensor, "h w"], least_alpha: float
+) -> Float[Tensor, ""]:
+    """L_depth (Eq. 13): sum of w_n log(1 + |1/D^ - 1/D|) over the pixels of known depth that the map covers.
+
+    D^ is the expected depth, `z_depth` D (0 = unknown). The weights are normalised to a sum of 1 over those pixels; the
+    paper prints a sum beside means and so leaves their sum open.
+    """
+    counted = (z_depth > 0) & (images.alpha.detach() > least_alpha)
+    w = torch.where(counted, weight, 0.0)
     inverse = images.alpha / images.z_depth.clamp(min=_NEAREST * least_alpha)
     off = torch.log1p((inverse - 1 / z_depth.clamp(min=_NEAREST)).abs())
-    return (weight * covered * off).sum() / ((weight > 0) & covered).sum().clamp(min=1)
+    return (w * off).sum() / w.sum().clamp(min=_LEAST_WEIGHT)
 
 
-def uncovered(images: RasterOutput, weight: Float[Tensor, "h w"]) -> Float[Tensor, ""]:
+def uncovered(images: RasterOutput, z_depth: Float[Tensor, "h w"]) -> Float[Tensor, ""]:
     """Mean of 1 - alpha over the pixels where a surface is known to be; 0 where none is known."""
-    known = weight > 0
+    known = z_depth > 0
     return torch.where(known, 1 - images.alpha, 0.0).sum() / known.sum().clamp(min=1)
 
 

@@ -19,8 +19,18 @@ from jaxtyping import Float, Int
 from torch import Tensor, nn
 
 from swimm3r.cameras import Cameras, directions
-from swimm3r.geometry import fundamental_from_poses, pose_from, rotation_from_6d, symmetric_epipolar_error
+from swimm3r.errors import InputError
+from swimm3r.frames import Frames
+from swimm3r.geometry import (
+    Similarity,
+    best_similarity,
+    fundamental_from_poses,
+    pose_from,
+    rotation_from_6d,
+    symmetric_epipolar_error,
+)
 from swimm3r.io import cameras_json
+from swimm3r.io.trajectory import write_tum
 from swimm3r.reconstruction import Reconstruction
 from swimm3r.splat.scene_settings import TrainingPoseSettings
 
@@ -137,20 +147,39 @@ def as_mapped(rec: Reconstruction, poses: RefinedPoses | None) -> Reconstruction
     """The reconstruction with its cameras where the map's training left them; as it is where they were held."""
     if poses is None:
         return rec
+    if unknown := set(poses.names) - set(rec.names):
+        raise InputError(
+            f"the map was trained on {min(unknown)}, which the reconstruction does not hold",
+            cause="map and reconstruction are of different runs, or one of them was edited",
+            hint="remove RUN/splat; the swimm3r command that trained the map trains it again",
+        )
     cam2world = rec.cameras.cam2world.clone()
     cam2world[[rec.index(name) for name in poses.names]] = poses.cam2world.to(cam2world)
     return replace(rec, cameras=replace(rec.cameras, cam2world=cam2world))
 
 
-def write_refined(path: Path, rec: Reconstruction, poses: RefinedPoses) -> None:
-    """The refined poses with the frames' own lenses, as cameras.json."""
+def axes_of_map(rec: Reconstruction, poses: RefinedPoses | None) -> Similarity | None:
+    """The similarity from the reconstruction's axes to those of a map, whose training cameras may have moved together.
+
+    None where they were held, or where they do not determine it.
+    """
+    if poses is None:
+        return None
+    before = rec.cameras.cam2world[[rec.index(name) for name in poses.names]].double()
+    return best_similarity(before, poses.cam2world.to(before))
+
+
+def write_refined(folder: Path, rec: Reconstruction, frames: Frames, poses: RefinedPoses) -> None:
+    """Write the refined poses with the frames' own lenses: cameras.json and trajectory.tum."""
+    times = frames.times_of(poses.names)
+    write_tum(folder / "trajectory.tum", times, poses.cam2world.numpy())
     lenses = rec.cameras[[rec.index(name) for name in poses.names]]
     units = "metres" if rec.metric else "scene units"
     cameras_json.write_cameras(
-        path,
+        folder / "cameras.json",
         cameras_json.CameraTable(
             poses.names, lenses.width, lenses.height, lenses.model,
-            lenses.K.numpy(), lenses.distortion.numpy(), poses.cam2world.numpy(), units,
+            lenses.K.numpy(), lenses.distortion.numpy(), poses.cam2world.numpy(), units, times,
         ),
     )  # fmt: skip
 

@@ -21,7 +21,7 @@ from swimm3r.splat.primitives import select
 from swimm3r.splat.projection import Primitives, pinhole, project
 from swimm3r.splat.rendering import SplatMap, in_scene_units, memory_for_views, pictures
 from swimm3r.splat.settings import PoseRefinementSettings
-from swimm3r.splat.views import pinhole_canvas, undistorted
+from swimm3r.splat.views import undistorted
 
 _DARK = 0.01  # sum of R, G, B below which a pixel is not looked at
 _SMALLEST = 60  # pixels of the longer side, below which a picture no longer tells a pose
@@ -53,8 +53,9 @@ def refine_pose(
     """
     settings = settings or PoseRefinementSettings()
     delta = torch.zeros(9, requires_grad=True)
-    sides = sizes(settings, max(camera.width, camera.height))
-    looks = [_Look(scene, camera, picture, mask, replace(settings, long_side=side), time) for side in sides]
+    whole = camera.pinhole(scene.settings.long_side)
+    sides = sizes(settings, max(whole.width, whole.height))
+    looks = [_Look(scene, camera, picture, mask, settings, side, time) for side in sides]
     with torch.no_grad():
         start = float(looks[-1].loss(delta))
     done = 0
@@ -84,10 +85,11 @@ class _Look:
         picture: Float[Tensor, "h w 3"],
         mask: Bool[Tensor, "h w"],
         settings: PoseRefinementSettings,
+        long_side: int,
         time: float | None,
     ) -> None:
         self._scene, self._now = scene, scene.moment(time)
-        self._canvas = pinhole_canvas(camera, settings.long_side)
+        self._canvas = camera.pinhole(long_side)
         target, seen = undistorted(picture, mask, camera, self._canvas)
         self._target, self._wanted = target.to(scene.device), edges(target, seen, settings).to(scene.device)
         self._units = in_scene_units(scene.settings, scene.length)
@@ -106,8 +108,8 @@ class _Look:
 
 
 def sizes(settings: PoseRefinementSettings, long_side: int) -> list[int]:
-    """Longer sides that a picture of this longer side is looked at, in turn."""
-    largest = min(settings.long_side, long_side)
+    """Longer sides of the pictures that are compared in turn; `long_side` is the map's own."""
+    largest = min(settings.long_side or long_side, long_side)
     return [largest >> k for k in range(settings.halvings, 0, -1) if largest >> k >= _SMALLEST] + [largest]
 
 

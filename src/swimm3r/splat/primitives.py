@@ -17,6 +17,7 @@ from torch import Tensor
 from torch.nn.functional import softplus
 
 from swimm3r.cameras import Cameras, project
+from swimm3r.errors import InputError
 from swimm3r.reconstruction import DenseCloud, Reconstruction
 from swimm3r.splat.gaussian_settings import GaussianInitialSettings
 from swimm3r.splat.settings import InitialSettings
@@ -76,7 +77,7 @@ def rescaled(p: BetaPrimitives, factor: float) -> BetaPrimitives:
 def initial_primitives(rec: Reconstruction, settings: InitialSettings, rng: torch.Generator) -> BetaPrimitives:
     """Primitives on the restored cloud and its backdrop, D = 6; on the sparse points, raw colours, without a cloud.
 
-    Raises ValueError for fewer than 4 points.
+    Raises InputError for fewer than 4 points.
     """
     start = starting_points(rec, settings)
     xyz, n = start.xyz, len(start.xyz)
@@ -118,10 +119,14 @@ class StartingPoints:
 
 
 def starting_points(rec: Reconstruction, settings: InitialSettings | GaussianInitialSettings) -> StartingPoints:
-    """The cloud and its backdrop, one point per voxel. Raises ValueError for fewer than 4 points."""
+    """The cloud and its backdrop, one point per voxel. Raises InputError for fewer than 4 points."""
     xyz, rgb = _sampled(rec, settings)
     if len(xyz) < 4:
-        raise ValueError(f"a map starts from at least 4 points, got {len(xyz)}")
+        raise InputError(
+            f"a map starts from at least 4 points, and the reconstruction has {len(xyz)} in different places",
+            cause="hardly any depth was found, or the model came without points",
+            hint="more frames of the same place, or another reconstruction",
+        )
     distances, _ = KDTree(xyz.numpy()).query(xyz.numpy(), k=4)
     spacing = torch.from_numpy(distances[:, 1:]).square().mean(-1).sqrt()
     # doubled points would be points of no size
@@ -146,31 +151,36 @@ def _sampled(
 def voxel_sample(points: Float[Tensor, "p 3"], target: int) -> Int[Tensor, " n"]:
     """One point per occupied voxel, the nearest to its voxel's mean; the edge is bisected until about `target` remain.
 
-    All points where there are no more than `target`, none for 0; within 1 % of it where the points allow.
+    All points where there are no more than `target`, none for 0; within 1 % of it where the points allow, else more.
     """
     if target == 0:
         return torch.zeros(0, dtype=torch.int64)
     if len(points) <= target:
         return torch.arange(len(points))
-    origin = points.amin(0)
-    extent = float((points.amax(0) - origin).max())
+    extent = float((points.amax(0) - points.amin(0)).max())
     low, high = extent * 1e-6, extent
-    voxel = torch.zeros(len(points), dtype=torch.int64)
     for _ in range(40):
         edge = (low * high) ** 0.5
-        cell = ((points - origin) / edge).long()
-        size = cell.amax(0) + 1
-        _, voxel = torch.unique((cell[:, 0] * size[1] + cell[:, 1]) * size[2] + cell[:, 2], return_inverse=True)
+        voxel = _voxels(points, edge)
         found = int(voxel.max()) + 1
         if abs(found - target) <= 0.01 * target:
             break
         low, high = (edge, high) if found > target else (low, edge)
+    else:
+        voxel = _voxels(points, low)
     count = torch.bincount(voxel)
     mean = torch.zeros(len(count), 3, dtype=points.dtype).index_add_(0, voxel, points) / count[:, None]
     distance = (points - mean[voxel]).square().sum(-1)
     order = torch.argsort(distance, stable=True)
     nearest_first = order[torch.argsort(voxel[order], stable=True)]
     return nearest_first[count.cumsum(0) - count]
+
+
+def _voxels(points: Float[Tensor, "p 3"], edge: float) -> Int[Tensor, " p"]:
+    """The number of each point's voxel, counted over the occupied ones."""
+    cell = ((points - points.amin(0)) / edge).long()
+    size = cell.amax(0) + 1
+    return torch.unique((cell[:, 0] * size[1] + cell[:, 1]) * size[2] + cell[:, 2], return_inverse=True)[1]
 
 
 def mean_directions(xyz: Float[Tensor, "n 3"], rec: Reconstruction, max_views: int) -> Float[Tensor, "n 3"]:

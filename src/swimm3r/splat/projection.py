@@ -64,7 +64,9 @@ def pinhole(camera: Cameras, dtype: torch.dtype = torch.float32) -> Pinhole:
     if len(camera) != 1:
         raise ValueError(f"a map is rendered for one camera at a time, got {len(camera)}")
     if camera.distortion.numel() and bool(camera.distortion.any()):
-        raise ValueError(f"a map is rendered for pinhole cameras, got {camera.model} with distortion; undistort first")
+        raise ValueError(
+            f"a map is rendered for pinhole cameras, got {camera.model} with distortion; camera.pinhole() leaves it out"
+        )
     R = camera.cam2world[0, :3, :3].mT
     centre = camera.cam2world[0, :3, 3]
     K = camera.K[0].tolist()

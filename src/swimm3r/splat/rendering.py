@@ -43,7 +43,7 @@ class RenderOutput:
 
     rgb: Float[Tensor, "h w 3"]  # as the camera sees it
     clear: Float[Tensor, "h w 3"]  # J, without the water: the colour of what covers a pixel; black where nothing does
-    veil: Float[Tensor, "h w 3"]  # Binf V, the light of the water alone (Eq. ugs_veil)
+    backscatter: Float[Tensor, "h w 3"]  # Binf V, the light of the water alone (Eq. ugs_veil)
     z_depth: Float[Tensor, "h w"]  # expected, scene units; 0 where nothing is
     alpha: Float[Tensor, "h w"]
     medium: Medium  # per pixel, [h, w, 3], per scene unit of ray depth
@@ -156,10 +156,10 @@ def surface_colour(images: RasterOutput) -> Float[Tensor, "3 h w"]:
     return images.clear / images.alpha.clamp(min=_COVERED)
 
 
-Settings = TypeVar("Settings", bound=SplatSettings)
+OfMethod = TypeVar("OfMethod", bound=SplatSettings)
 
 
-def in_scene_units(settings: Settings, length: float) -> Settings:
+def in_scene_units(settings: OfMethod, length: float) -> OfMethod:
     """Settings whose lengths are scene units instead of working units."""
     return replace(settings, render=replace(settings.render, near=settings.render.near * length))
 
@@ -181,20 +181,20 @@ def render(scene: SplatMap, camera: Cameras, time: float | None = None) -> Rende
             images, medium = drawing.images, medium_at_pixels(drawing.grid, view.height, view.width)
             seen = drawing.projection.primitives
             black = seen._replace(color=torch.zeros_like(seen.color))
-            veil = rasterize(
+            backscatter = rasterize(
                 black, drawing.maps, view.height, view.width,
                 alpha_min=settings.render.alpha_min, kernel=drawing.projection.kernel,
             ).rgb  # fmt: skip
         case SceneWater():
             images = draw(scene.primitives, NO_WATER, view, settings, now).images
             over = layer(scene.field, relative_depth(images))
-            medium, veil = _as_coefficients(scene.field, over, images, view), over.backscatter
+            medium, backscatter = _as_coefficients(scene.field, over, images, view), over.backscatter
             images = images._replace(rgb=seen_through(images.clear, over))
     there = camera.cam2world.device
     return RenderOutput(
         rgb=images.rgb.permute(1, 2, 0).to(there),
         clear=surface_colour(images).permute(1, 2, 0).to(there),
-        veil=veil.permute(1, 2, 0).to(there),
+        backscatter=backscatter.permute(1, 2, 0).to(there),
         z_depth=expected_z_depth(images).to(there),
         alpha=images.alpha.to(there),
         medium=Medium(

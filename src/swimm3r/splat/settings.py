@@ -5,8 +5,25 @@ or, where the reconstruction has no scale, a third of its median depth (`working
 """
 
 from dataclasses import dataclass, field, replace
-from typing import Any, Literal, TypeVar, get_args
+from typing import Annotated, Any, Literal, TypeVar, get_args
 
+from swimm3r.settings import (
+    Cadence,
+    Count,
+    CountOrZero,
+    DecayingRate,
+    LongSideOrOwn,
+    MapSize,
+    NotNegative,
+    Opacity,
+    Positive,
+    PositiveShare,
+    Range,
+    Rate,
+    Seed,
+    Settings,
+    Share,
+)
 from swimm3r.splat.gaussian_settings import (
     GaussianSettings,
     McmcGsSettings,
@@ -17,14 +34,14 @@ from swimm3r.splat.scene_settings import MediumFieldSettings, TrainingPoseSettin
 
 
 @dataclass(frozen=True)
-class RenderSettings:
+class RenderSettings(Settings):
     """How a primitive meets a camera."""
 
     depth: Literal["ray", "z"] = "ray"
     """The depth that attenuates: along the ray (exact), or along the optical axis as WaterSplatting and UBS have it."""
-    alpha_min: float = 1 / 255
+    alpha_min: Annotated[float, Range(0, 0.5)] = 1 / 255
     """Pairs fainter than this are skipped; 0 for parity with the papers, which skip nothing."""
-    near: float = 0.01
+    near: Annotated[float, Range(above=0, most=1e6)] = 0.01
     """Primitives nearer than this z depth are not drawn."""
     covariance: Literal["symmetric", "upper"] = "symmetric"
     """The conditional covariance is not symmetric: its mean with its transpose, or its upper triangle as UBS has it."""
@@ -35,104 +52,109 @@ class RenderSettings:
 
 
 @dataclass(frozen=True)
-class InitialSettings:
+class InitialSettings(Settings):
     """The primitives and the water that training starts from."""
 
-    primitives: int = 400_000
+    primitives: MapSize = 400_000
     """Points of the restored cloud and its backdrop that become primitives, one per voxel."""
-    backdrop: float = 0.2
+    backdrop: Share = 0.2
     """Largest share of them that lies on ground whose depth is a guess; 0 starts on measured points alone."""
     directions: Literal["mean", "uniform"] = "mean"
     """Mean of the conditioned direction: that of the frames which see the point, or drawn from a cube as UBS does,
     which hides 9 of 10 primitives in any one view."""
-    view_exponent: float = 0.0
+    view_exponent: Annotated[float, Range(-20, 10)] = 0.0
     """Stored exponent of the conditioned directions: how fast a primitive fades seen from elsewhere, as 4 exp of it."""
-    time_exponent: float = 0.0
+    time_exponent: Annotated[float, Range(-20, 10)] = 0.0
     """The same of time, in dynamic maps."""
-    time_scale: float = 4.0
+    time_scale: Annotated[float, Range(1e-3, 1e3)] = 4.0
     """Scale of a primitive in time, in lengths of the clip; its mean time is drawn from all of the clip (UBS). UBS's 1
     lets still ground fade away from that moment: 4 is worth 0.2 dB on the synthetic dive with the fish."""
-    scale: float = 1.0
+    scale: Annotated[float, Range(1e-3, 1e3)] = 1.0
     """Spatial scale, in root mean square distances to the 3 nearest neighbours."""
-    opacity: float = 0.5
+    opacity: Opacity = 0.5
     colours: Literal["restored", "raw"] = "restored"
     """Without the water, or as filmed for maps that have none."""
-    max_views: int = 64
+    max_views: Count = 64
     """Frames asked whether they see a point."""
 
 
 @dataclass(frozen=True)
-class LearningRates:
+class LearningRates(Settings):
     """Of Adam (eps 1e-15), UBS's values; positions and the medium decay log-linearly over the run."""
 
-    xyz: float = 1.6e-4
+    xyz: DecayingRate = 1.6e-4
     """Times the scene's radius, as is its end."""
-    xyz_end: float = 1.6e-6
-    query_mean: float = 1e-3
-    rgb: float = 1e-3
-    opacity: float = 5e-2
-    beta: float = 1e-3
-    scale: float = 5e-3
-    lower: float = 1e-3
-    medium: float = 1e-3
-    medium_end: float = 1.5e-4
-    settle: float = 1.0
+    xyz_end: DecayingRate = 1.6e-6
+    query_mean: Rate = 1e-3
+    rgb: Rate = 1e-3
+    opacity: Rate = 5e-2
+    beta: Rate = 1e-3
+    scale: Rate = 5e-3
+    lower: Rate = 1e-3
+    medium: DecayingRate = 1e-3
+    medium_end: DecayingRate = 1.5e-4
+    settle: PositiveShare = 1.0
     """Share that the other rates have fallen to at the end of the run, log-linearly from `settle_begin` on; UBS holds
     them, and at rates high enough for a short run the primitives then never come to rest."""
-    settle_begin: float = 0.5
+    settle_begin: Annotated[float, Range(0, below=1)] = 0.5
 
 
 @dataclass(frozen=True)
-class LossWeights:
-    """Eq. uwbs_total."""
+class LossWeights(Settings):
+    """Of the objective, Eq. 18, and of four terms beyond it."""
 
-    ssim: float = 0.2
-    opacity: float = 0.01
-    scale: float = 0.01
-    mcmc_begin: float = 0.025
+    ssim: Share = 0.2
+    opacity: NotNegative = 0.01
+    scale: NotNegative = 0.01
+    mcmc_begin: Share = 0.025
     """Share of the run before which opacity and scale are not regularised: UBS's window, MCMC-GS has 0 to 1."""
-    mcmc_end: float = 0.5
+    mcmc_end: Share = 0.5
     ubs_scale_reg_bug: bool = False
     """Regularise all scales of the first three primitives, as UBS's code does, instead of the spatial ones of all."""
-    depth: float = 0.1
-    medium_smoothness: float = 1.0
-    medium_prior: float = 0.01
+    depth: NotNegative = 0.1
+    depth_edges: NotNegative = 10.0
+    """Gradient scale k of the depth term's weights, the mean of e^(-k |dI/dx|) and e^(-k |dI/dy|) in pixel values per
+    pixel, normalised to a sum of 1. 0 counts all pixels alike; the paper names no scale."""
+    medium_smoothness: NotNegative = 1.0
+    medium_prior: NotNegative = 0.01
     """Of the deviation from the reconstruction's water in its standard deviations; 0 is the paper's objective.
     Colours and water can trade places in a map, and without it they do."""
-    radius: float = 0.1
-    max_radius: float = 256.0
-    """Projected radius, pixels of a 1280 pixel wide picture, beyond which a primitive counts as veil."""
-    coverage: float = 0.05
+    radius: NotNegative = 0.1
+    max_radius: Positive = 256.0
+    """Projected radius, pixels of a picture `max_radius_width` wide, beyond which a primitive counts as veil."""
+    max_radius_width: CountOrZero = 1280
+    """Width in pixels that `max_radius` refers to; 0 is that of the training pictures."""
+    coverage: NotNegative = 0.05
     """Of the light that passes a surface whose depth is known; 0 is the paper's objective. A map may leave a surface
     half transparent and let the veil behind it fill in; its clear colours are then dark."""
-    open_water: float = 0.025
+    open_water: NotNegative = 0.025
     """Of what is drawn over pixels that look past every surface; 0 is the paper's objective. Painted on primitives,
     open water is part of the scene: in clear pictures it glares."""
-    gamut: float = 1.0
+    gamut: NotNegative = 1.0
     """Of the squared excess of clear colours over 0..1; 0 is the paper's objective. Where the water leaves little of a
     channel nearly any value of it explains the pictures, and Adam, whose steps know no scale, lets it stray."""
-    depth_confidence: float = 0.3
+    depth_confidence: NotNegative = 0.3
     """Least confidence of a depth that regularises."""
-    depth_alpha: float = 0.5
+    depth_alpha: Share = 0.5
     """Least alpha of a pixel whose depth is regularised."""
 
 
 @dataclass(frozen=True)
-class DensifySettings:
+class DensifySettings(Settings):
     """Relocation, growth and noise of the primitives (MCMC-GS, for Beta kernels as UBS has it)."""
 
-    max_primitives: int = 800_000
-    begin: float = 0.025  # 500 of 20,000
-    end: float = 0.5  # 10,000 of 20,000
-    every: float = 0.005  # 100 of 20,000
-    min_every: int = 20
+    max_primitives: MapSize = 800_000
+    begin: Share = 0.025  # 500 of 20,000
+    end: Share = 0.5  # 10,000 of 20,000
+    every: Cadence = 0.005  # 100 of 20,000
+    min_every: Count = 20
     """Fewest steps between two rounds, whatever `every` says; growth is made up for."""
-    growth: float = 1.02
+    growth: Annotated[float, Range(1, 2)] = 1.02
     """Per round at `every`."""
-    dead_opacity: float = 0.005
-    noise: float = 1e6
+    dead_opacity: Opacity = 0.005
+    noise: NotNegative = 1e6
     """Rate times the positions' learning rate in static maps; UBS's."""
-    noise_dynamic: float = 1e6
+    noise_dynamic: NotNegative = 1e6
     """In dynamic ones; UBS has 1, with which still ground is 0.6 dB worse on the synthetic dive."""
     noise_gate: Literal["sigmoid", "power"] = "sigmoid"
     """How noise fades with opacity o: as 1 / (1 + exp(100 (o - dead_opacity))) (MCMC-GS), or as (1 - o)^100 (UBS)."""
@@ -141,30 +163,30 @@ class DensifySettings:
 
 
 @dataclass(frozen=True)
-class MoverSettings:
+class MoverSettings(Settings):
     """Primitives born where a frame shows what a still scene cannot, in dynamic maps (beyond the paper)."""
 
-    at: float = 0.2
+    at: Share = 0.2
     """Share of the run after which the frames are searched for what moves; 0 leaves it to the densification."""
-    contrast: float = 3.0
+    contrast: NotNegative = 3.0
     """How much more a pixel must be off in one frame, from map and other frames, than its ground is in those."""
-    least: float = 0.04
+    least: Share = 0.04
     """And by how much at least, pixel values, with the texture of both averaged out."""
-    nearness: float = 0.85
+    nearness: PositiveShare = 0.85
     """Distance from the camera assumed where the course does not tell, as a share of the ground's behind it."""
-    duration: float = 3.0
+    duration: Positive = 3.0
     """Scale in time, in intervals between training frames."""
-    share: float = 0.15
+    share: Share = 0.15
     """Of the largest number of primitives, born at most."""
 
 
 @dataclass(frozen=True)
-class SggSettings:
+class SggSettings(Settings):
     """Scattering-aware geometric gradients (Alg. 1); names the readings of what the paper leaves open."""
 
     enabled: bool = True
-    end: float = 0.5  # tau_c, 10,000 of 20,000
-    residual: float = 0.15
+    end: Share = 0.5  # tau_c, 10,000 of 20,000
+    residual: Share = 0.15
     """eta: share of the exact gradient that an uncertain centre keeps."""
     split: Literal["clear", "direct"] = "clear"
     """What counts as geometry: the light without water, or the light that arrives, attenuated ("direct")."""
@@ -173,20 +195,20 @@ class SggSettings:
     isolated: Literal["branch", "exact"] = "branch"
     """The depth loss's own gradient: from the adjoint's depth branch, which takes alpha as given, or by a second
     backward pass."""
-    largest_step: float = 2.0
+    largest_step: Annotated[float, Range(1)] = 2.0
     """c_max: bound of the multiplier of Adam's step."""
 
 
 @dataclass(frozen=True)
-class UwbsSettings:
+class UwbsSettings(Settings):
     """Underwater Beta Splatting; static, or with primitives and water that depend on the time, too."""
 
     dynamic: bool = False
     """Condition primitives on time besides direction (D = 7), and let the water change with it."""
-    iterations: int = 20_000
-    long_side: int = 1600
+    iterations: Count = 20_000
+    long_side: LongSideOrOwn = 1600
     """Longer side of the training pictures, pixels; they are never enlarged."""
-    working_depth: float = 3.0
+    working_depth: Annotated[float, Range(1e-3, 1e6)] = 3.0
     """Median depth, working units, that a scene without metric scale is given while it is trained."""
     initial: InitialSettings = field(default_factory=InitialSettings)
     render: RenderSettings = field(default_factory=RenderSettings)
@@ -197,9 +219,9 @@ class UwbsSettings:
     movers: MoverSettings = field(default_factory=MoverSettings)
     sgg: SggSettings = field(default_factory=SggSettings)
     poses: TrainingPoseSettings = field(default_factory=TrainingPoseSettings)
-    seed: int = 0
-    log_every: float = 0.005
-    checkpoint_every: float = 0.1
+    seed: Seed = 0
+    log_every: Cadence = 0.005
+    checkpoint_every: Cadence = 0.1
 
     @property
     def depth_confidence(self) -> float | None:
@@ -208,20 +230,20 @@ class UwbsSettings:
 
 
 @dataclass(frozen=True)
-class PoseRefinementSettings:
+class PoseRefinementSettings(Settings):
     """A camera refined against a frozen map (3R-GS's protocol for test frames, with the paper's 300 steps)."""
 
-    steps: int = 300
-    rate: float = 8e-4
+    steps: CountOrZero = 300
+    rate: Rate = 8e-4
     """Of Adam, for a rotation in the 6D form and a translation in working units; decays to 1 %."""
-    long_side: int = 240
-    """Longer side of the picture the pose is refined on."""
-    halvings: int = 2
+    long_side: LongSideOrOwn = 240
+    """Longer side of the picture the pose is refined on, pixels; at most, and for 0, that of the training pictures."""
+    halvings: Annotated[int, Range(0, 16)] = 2
     """How often that picture is halved at first; the smaller ones share half of the steps. A pose that starts 9 px off
     (of 400) is found from a quarter of the size, and not from the whole: on ruie_green_rock 24.0 instead of 20.2 dB."""
-    edge: float = 4.0
+    edge: NotNegative = 4.0
     """Pixels count whose gradient exceeds this many medians."""
-    min_edges: float = 0.01
+    min_edges: Share = 0.01
     """Share of the picture below which every pixel counts instead."""
 
 

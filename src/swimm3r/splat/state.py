@@ -2,14 +2,15 @@
 
 import copy
 import dataclasses
+from collections.abc import Mapping
 from dataclasses import dataclass
-from typing import Any, Generic, TypeVar
+from typing import Any, Generic, TypeVar, get_type_hints
 
 import torch
 from torch import Tensor
 
 from swimm3r.splat import gaussians, primitives
-from swimm3r.splat.gaussians import GaussianPrimitives
+from swimm3r.splat.gaussians import GaussianPrimitives, harmonics_of_degree
 from swimm3r.splat.medium_field import MediumField, in_unit
 from swimm3r.splat.optimiser import Moments, fresh
 from swimm3r.splat.pose_codes import PoseCodes
@@ -90,18 +91,51 @@ def stored(state: State) -> dict[str, Tensor]:
 
 
 def restored(tensors: dict[str, Tensor], settings: SplatSettings, cameras: int) -> State[Any, Any]:
-    """The inverse of `stored`; `cameras` are those whose poses are refined, 0 where they are held."""
+    """The inverse of `stored`; `cameras` are those whose poses are refined, 0 where they are held.
+
+    Raises KeyError or ValueError for tensors that are not of such a state.
+    """
     parts = parts_of(settings)
     poses = PoseCodes(cameras, settings.poses) if cameras else None
-    p: Any = parts.primitives(*(tensors[f"parameter.{name}"] for name in parts.primitives._fields))
+    p: Any = primitives_from(tensors, parts.primitives, "parameter.")
     parameters = parameters_of(p, parts.field, poses)
     with torch.no_grad():
         for name, parameter in parameters.items():
-            parameter.copy_(tensors[f"parameter.{name}"])
+            values = tensors[f"parameter.{name}"]
+            shapes = {tensors[f"{kind}.{name}"].shape for kind in ("parameter", "first", "second")}
+            if shapes != {parameter.shape} or tensors[f"steps.{name}"].dim():
+                raise ValueError(f"{name} or its moments are not of the shape {tuple(parameter.shape)}")
+            parameter.copy_(values)
     moments = {k: Moments(tensors[f"first.{k}"], tensors[f"second.{k}"], tensors[f"steps.{k}"]) for k in parameters}
     memory = {k.removeprefix("memory."): t for k, t in tensors.items() if k.startswith("memory.")}
     field: Any = parts.field
     return State(p, field, poses, moments, memory)
+
+
+def primitives_from(tensors: Mapping[str, Tensor], kind: type[Primitives], prefix: str) -> Primitives:
+    """The primitives among a file's tensors. Raises KeyError or ValueError where their parts do not fit each other."""
+    p: Any = kind(*(tensors[prefix + name] for name in kind._fields))
+    for name, hint in get_type_hints(kind, include_extras=True).items():
+        if not isinstance(getattr(p, name), hint):
+            raise ValueError(f"{prefix}{name} has the shape {tuple(getattr(p, name).shape)}")
+    if {len(values) for values in p} != {len(p.xyz)}:
+        raise ValueError("its primitives' parts are of different lengths")
+    if not len(p.xyz):
+        raise ValueError("it holds no primitives")
+    if not _fit_together(p):
+        raise ValueError(f"its primitives' parts are {', '.join(str(tuple(v.shape[1:])) for v in p)} numbers wide")
+    return p
+
+
+def _fit_together(p: Primitives) -> bool:
+    match p:
+        case BetaPrimitives():
+            conditioned = p.query_mean.shape[1]  # direction; in dynamic maps time, too
+            D = 3 + conditioned
+            widths = p.beta.shape[1], p.scale.shape[1], p.lower.shape[1]
+            return conditioned in (3, 4) and widths == (1 + conditioned, D, D * (D - 1) // 2)
+        case GaussianPrimitives():
+            return p.harmonics.shape[1] in {harmonics_of_degree(degree) for degree in range(4)}
 
 
 def in_scene_units(state: State, length: float) -> tuple[Primitives, Water]:

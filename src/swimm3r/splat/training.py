@@ -4,7 +4,6 @@ A recipe brings the step itself. Everything random is drawn from the seed and th
 and a run that was interrupted ends with the same bits as one that was not (at the same number of threads).
 """
 
-import json
 import logging
 import time
 from dataclasses import dataclass
@@ -14,7 +13,8 @@ from typing import Any, Protocol, runtime_checkable
 import torch
 from torch import Tensor
 
-from swimm3r.io.atomic import write_text
+from swimm3r.io import metrics_log
+from swimm3r.io.damage import guard
 from swimm3r.progress import Progress
 from swimm3r.splat import checkpoint
 from swimm3r.splat.settings import SplatSettings
@@ -94,12 +94,10 @@ def run(recipe: Recipe, schedule: Schedule, folder: Path, progress: Progress) ->
             row = {"step": step} | {name: float(total) / count for name, (total, count) in sums.items()}
             row["seconds_per_step"] = (time.perf_counter() - started) / (step - first)
             row["cpu_seconds_per_step"] = (time.process_time() - cpu_started) / (step - first)
-            with metrics.open("a", encoding="utf-8") as file:
-                file.write(json.dumps(row) + "\n")
+            metrics_log.append_row(metrics, row)
             sums = {}
         if step % schedule.checkpoint_every == 0 or last:
-            about = {"step": step, "fingerprint": schedule.fingerprint}
-            checkpoint.write(path, checkpoint.Stored(stored(state), about))
+            checkpoint.write_state(path, stored(state), checkpoint.StateHeader(step, schedule.fingerprint))
     progress("training the map", schedule.iterations, schedule.iterations)
     return state
 
@@ -109,15 +107,13 @@ def _resume(recipe: Recipe, path: Path, metrics: Path, schedule: Schedule) -> tu
     done = 0
     state = None
     if path.is_file():
-        kept = checkpoint.read(path)
-        if kept.about.get("fingerprint") == schedule.fingerprint:
-            state = restored(kept.tensors, recipe.settings, recipe.site.refined_cameras)
-            done = kept.about["step"]
+        kept = checkpoint.read_state(path)
+        if kept.about.fingerprint == schedule.fingerprint:
+            with guard(path, checkpoint.state_remedy(path)):
+                state = restored(kept.tensors, recipe.settings, recipe.site.refined_cameras)
+            done = kept.about.step
             log.info("going on from step %d", done)
         else:
             log.warning("%s belongs to a training with other settings or input; starting anew", path)
-    if metrics.is_file():
-        rows = metrics.read_text(encoding="utf-8").splitlines()
-        whole = [row for row in rows if row.endswith("}") and json.loads(row)["step"] <= done]
-        write_text(metrics, "".join(row + "\n" for row in whole))
+    metrics_log.drop_rows_after(metrics, done)
     return (recipe.start(), 0) if state is None else (state, done)

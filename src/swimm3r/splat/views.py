@@ -31,8 +31,7 @@ class View:
     camera: Cameras  # one pinhole, working units
     rgb: Float[Tensor, "3 h w"]
     seen: Bool[Tensor, "h w"]
-    z_depth: Float[Tensor, "h w"]  # working units, 0 = unknown
-    depth_weight: Float[Tensor, "h w"]  # edge-aware, 0 where the depth is unknown or doubtful
+    z_depth: Float[Tensor, "h w"]  # working units, 0 = unknown or doubtful
     open_water: Bool[Tensor, "h w"]  # looks past every surface; nowhere where depth is not read
     time: Float[Tensor, ""] | None = None  # of the clip, 0..1; static maps do not ask
 
@@ -43,7 +42,6 @@ class View:
             rgb=self.rgb.to(device),
             seen=self.seen.to(device),
             z_depth=self.z_depth.to(device),
-            depth_weight=self.depth_weight.to(device),
             open_water=self.open_water.to(device),
             time=None if self.time is None else self.time.to(device),
         )
@@ -76,44 +74,41 @@ class TrainingViews:
     @property
     def cameras(self) -> Cameras:
         """The views' pinhole cameras, working units."""
-        canvases = pinhole_canvas(
-            self.rec.cameras[[self.rec.index(name) for name in self.names]], self.settings.long_side
-        )
-        return _in_working_units(canvases, self.scale)
+        lenses = self.rec.cameras[[self.rec.index(name) for name in self.names]]
+        return _in_working_units(lenses.pinhole(self.settings.long_side), self.scale)
 
     def __getitem__(self, k: int) -> View:
         name = self.names[k]
         i = self.rec.index(name)
         lens = self.rec.cameras[i]
-        canvas = pinhole_canvas(lens, self.settings.long_side)
+        canvas = lens.pinhole(self.settings.long_side)
 
         def make() -> tuple[np.ndarray, ...]:
             f = self.frames.index(name)
             rgb, seen = undistorted(self.frames.image(f), self.frames.mask(f), lens, canvas)
             stored = (rgb * 255).round().to(torch.uint8).permute(2, 0, 1).contiguous().numpy()
-            z_depth, weight, open_water = self._depth(name, lens, canvas, rgb, seen)
-            return stored, seen.numpy(), z_depth.half().numpy(), weight.half().numpy(), open_water.numpy()
+            z_depth, open_water = self._depth(name, lens, canvas, rgb, seen)
+            return stored, seen.numpy(), z_depth.half().numpy(), open_water.numpy()
 
-        rgb, seen, z_depth, weight, open_water = self._cache.get(name, make)
+        rgb, seen, z_depth, open_water = self._cache.get(name, make)
         return View(
             name,
             _in_working_units(canvas, self.scale),
             torch.from_numpy(rgb.astype(np.float32)) / 255,
             torch.from_numpy(seen.copy()),
             torch.from_numpy(z_depth.astype(np.float32)),
-            torch.from_numpy(weight.astype(np.float32)),
             torch.from_numpy(open_water.copy()),
             self._times[name],
         )
 
     def _depth(
         self, name: str, lens: Cameras, canvas: Cameras, rgb: Float[Tensor, "h w 3"], seen: Bool[Tensor, "h w"]
-    ) -> tuple[Float[Tensor, "h w"], Float[Tensor, "h w"], Bool[Tensor, "h w"]]:
-        """Depth, its weight, and where there is none to be known because the picture shows open water."""
+    ) -> tuple[Float[Tensor, "h w"], Bool[Tensor, "h w"]]:
+        """Depth, and where there is none to be known because the picture shows open water."""
         least = self.settings.depth_confidence
         if least is None or name not in self.rec.depth:
             nothing = torch.zeros(canvas.height, canvas.width)
-            return nothing, nothing, nothing > 0
+            return nothing, nothing > 0
         depth = self.rec.depth[name]
         column, row, _ = _grid(_key(lens), _key(canvas))
         row = np.clip(row.round().astype(np.int64), 0, lens.height - 1)
@@ -123,7 +118,7 @@ class TrainingViews:
         z_depth = torch.where(known, z_depth * self.scale, 0.0)
         fit = self.rec.medium
         open_water = sea_share(rgb, z_depth, None if fit is None else fit.medium.Binf) > 0.5
-        return z_depth, torch.where(known, edge_weight(rgb), 0.0), open_water & seen
+        return z_depth, open_water & seen
 
 
 def smaller(view: View, divisor: int) -> View:
@@ -134,7 +129,7 @@ def smaller(view: View, divisor: int) -> View:
     rgb = interpolate(view.rgb[None], (height, width), mode="area")[0]
     seen = interpolate(view.seen[None, None].float(), (height, width), mode="area")[0, 0] > 0.999
     nothing = view.rgb.new_zeros(height, width)
-    return View(view.name, resized(view.camera, width, height), rgb, seen, nothing, nothing, nothing > 0, view.time)
+    return View(view.name, resized(view.camera, width, height), rgb, seen, nothing, nothing > 0, view.time)
 
 
 def _in_working_units(cameras: Cameras, scale: float) -> Cameras:
@@ -147,13 +142,6 @@ def moment(span: tuple[float, float], time: float) -> Float[Tensor, ""]:
     """A time in seconds of a clip that lasts from span[0] to span[1], as maps take it: 0..1."""
     start, end = span
     return torch.tensor((time - start) / (end - start) if end > start else 0.0)
-
-
-def pinhole_canvas(lens: Cameras, long_side: int) -> Cameras:
-    """The camera of a frame without its distortion, and no larger than `long_side`; 0 keeps the frame's size."""
-    scale = min(1.0, long_side / max(lens.width, lens.height)) if long_side else 1.0
-    small = resized(lens, max(2, round(lens.width * scale)), max(2, round(lens.height * scale)))
-    return replace(small, distortion=small.distortion[:, :0], model="PINHOLE")
 
 
 def undistorted(
@@ -173,13 +161,6 @@ def undistorted(
         rgb = cv2.remap(rgb, column, row, cv2.INTER_LINEAR, borderMode=cv2.BORDER_REPLICATE)
         usable = cv2.remap(usable, column, row, cv2.INTER_LINEAR) * inside
     return torch.from_numpy(rgb), torch.from_numpy(usable > 0.999)
-
-
-def edge_weight(rgb: Float[Tensor, "h w 3"]) -> Float[Tensor, "h w"]:
-    """w_n of Eq. depth_reg: e^-|dI/dx| + e^-|dI/dy| of the channel means: depth is free to step where colour does."""
-    right = torch.nn.functional.pad(rgb.diff(dim=1).abs().mean(-1), (0, 1))
-    down = torch.nn.functional.pad(rgb.diff(dim=0).abs().mean(-1), (0, 0, 0, 1))
-    return torch.exp(-right) + torch.exp(-down)
 
 
 def working_scale(rec: Reconstruction, settings: SplatSettings) -> float:

@@ -12,6 +12,7 @@ On disk: images/NAME, and truth/ as `ground_truth` reads it, with masks/NAME.png
 import json
 from dataclasses import asdict, dataclass
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import torch
@@ -24,6 +25,7 @@ from swimm3r.errors import InputError
 from swimm3r.ground_truth import FOLDER
 from swimm3r.io import cameras_json, images
 from swimm3r.io.atomic import atomic_path, write_text
+from swimm3r.io.damage import Remedy, guard
 from swimm3r.medium import Medium, add_water, srgb_from_linear
 from swimm3r.progress import Progress, silent
 from swimm3r.synthetic import disturbances
@@ -108,18 +110,13 @@ def make_dive(settings: DiveSettings) -> Dive:
 def write_dive(settings: DiveSettings, folder: Path, progress: Progress = silent) -> None:
     """Render a dive into a folder: images/ and truth/; one that is there already, whole, is left alone.
 
-    truth/dive.json, written last, holds the settings. Raises InputError where another dive's pictures lie there.
+    truth/dive.json holds the settings, and once the dive is whole says so. Raises InputError where anything else lies
+    in the folder, another dive, too.
     """
-    record, described = folder / FOLDER / "dive.json", json.dumps(asdict(settings), indent=2) + "\n"
-    if record.is_file() and record.read_text(encoding="utf-8") == described:
+    record, described = folder / FOLDER / "dive.json", json.loads(json.dumps(asdict(settings)))
+    if _is_whole(folder, record, described):
         return
-    strangers = {path.name for path in (folder / "images").glob("*")} - set(_names(settings))
-    if strangers:
-        raise InputError(
-            f"{folder / 'images'} holds pictures that are not of this dive, {min(strangers)} for one",
-            cause="a dive of other settings was written there before",
-            hint="an empty or a new folder",
-        )
+    write_text(record, json.dumps({**described, "whole": False}, indent=2) + "\n")
     dive, truth = make_dive(settings), folder / FOLDER
     for i, name in enumerate(dive.names):
         progress("rendering", i, len(dive))
@@ -149,8 +146,30 @@ def write_dive(settings: DiveSettings, folder: Path, progress: Progress = silent
             units="metres",
         ),
     )
-    write_text(record, described)
+    write_text(record, json.dumps({**described, "whole": True}, indent=2) + "\n")
     progress("rendering", len(dive), len(dive))
+
+
+def _is_whole(folder: Path, record: Path, described: dict[str, Any]) -> bool:
+    """Whether the dive lies in the folder already; false of a part of it, and of an empty folder."""
+    if not record.is_file():
+        if folder.is_dir() and any(folder.iterdir()):
+            raise _holds_others(folder)
+        return False
+    with guard(record, Remedy("remove the folder, or give another one")):
+        found = json.loads(record.read_text(encoding="utf-8"))
+    whole = found.pop("whole", True) if isinstance(found, dict) else True
+    if found != described:
+        raise _holds_others(folder)
+    return whole is True
+
+
+def _holds_others(folder: Path) -> InputError:
+    return InputError(
+        f"{folder} holds other things than this dive",
+        cause="a dive of other settings was written there before, or the folder is somebody else's",
+        hint="an empty or a new folder",
+    )
 
 
 def water(settings: DiveSettings) -> Medium:

@@ -37,19 +37,22 @@ def directory() -> Path:
 def directories() -> list[Path]:
     """Where weights are looked for, in turn."""
     given = os.environ.get("SWIMM3R_WEIGHTS_DIR")
-    cache = os.environ.get("SWIMM3R_CACHE")
-    if not cache:
-        cache = Path(os.environ.get("XDG_CACHE_HOME") or Path.home() / ".cache") / "swimm3r"
-    return [*([Path(given)] if given else []), Path(cache) / "weights"]
+    return [*([Path(given)] if given else []), cache_folder() / "weights"]
+
+
+def cache_folder() -> Path:
+    """Where files are kept that can be had again."""
+    given = os.environ.get("SWIMM3R_CACHE")
+    return Path(given) if given else Path(os.environ.get("XDG_CACHE_HOME") or Path.home() / ".cache") / "swimm3r"
 
 
 def find(name: str, explicit: Path | None = None, manifest: tuple[Weights, ...] = MANIFEST) -> Path | None:
     """Where the weights lie, or None. Never touches the network.
 
-    Raises WeightsError for an explicit path without a file, and for a file of the wrong size.
+    Raises WeightsError for an explicit path without a file, a folder that cannot be read, and a file of the wrong size.
     """
     if explicit is not None:
-        if not explicit.is_file():
+        if not _is_there(explicit):
             raise WeightsError(
                 f"there are no weights at {explicit}",
                 cause="the path is mistyped, or is a folder",
@@ -60,10 +63,22 @@ def find(name: str, explicit: Path | None = None, manifest: tuple[Weights, ...] 
     for weights in (wanted, *(w for w in manifest if w.serves_as == name)):
         for folder in directories():
             path = folder / weights.filename
-            if path.is_file():
+            if _is_there(path):
                 check_size(path, weights)
                 return path
     return None
+
+
+def _is_there(path: Path) -> bool:
+    """Whether a file is there. Raises WeightsError where the folder does not let anybody look."""
+    try:
+        return path.is_file()
+    except OSError as error:
+        raise WeightsError(
+            f"{path.parent} cannot be looked into ({error.strerror})",
+            cause="the folder of weights belongs to somebody else, or its disk is not there",
+            hint="chmod u+rx on it, or $SWIMM3R_WEIGHTS_DIR with a folder of your own",
+        ) from error
 
 
 def require(name: str, explicit: Path | None = None, manifest: tuple[Weights, ...] = MANIFEST) -> Path:

@@ -494,3 +494,18 @@ def test_thinned_matches_are_spread_over_all_pairs(small: Dive, tmp_path: Path, 
     assert len(rec.matches.i) <= 900
     assert len({(int(a), int(b)) for a, b in zip(rec.matches.i, rec.matches.j, strict=True)}) == 9
     assert errors(rec, small)[0] < 0.5
+
+
+def test_capped_points_and_dropped_matches_are_still_counted(
+    small: Dive, finished: tuple[Reconstruction, Path], tmp_path: Path, take: Callable[[ExactNetwork], None]
+):
+    whole, folder = finished
+    assert whole.points_found == len(whole.points.xyz)
+    take(small.network())
+    capped = swimm3r.reconstruct(small.frames, replace(small.settings, max_points=100), tmp_path)
+    assert len(capped.points.xyz) == 100
+    assert reconstruction.load(tmp_path).points_found == capped.points_found == whole.points_found
+    handed = reconstruction.unfiltered_matches(folder, whole)
+    assert len(handed.i) >= len(whole.matches.i)
+    kept = set(zip(whole.matches.i.tolist(), map(tuple, whole.matches.xy_i.tolist()), strict=True))
+    assert kept <= set(zip(handed.i.tolist(), map(tuple, handed.xy_i.tolist()), strict=True))

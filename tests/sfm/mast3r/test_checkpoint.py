@@ -69,6 +69,33 @@ def test_trunk_takes_the_asked_precision_and_the_heads_stay_exact(small_network:
     assert set(kinds.values()) == {torch.bfloat16}
 
 
+@pytest.mark.parametrize("text", ["[" * 100_000 + "]" * 100_000, "{", "[]", "\udcff"])
+def test_a_damaged_config_beside_the_file_is_refused_by_name(small_network: Mast3r, tmp_path: Path, text: str):
+    checkpoint.save(small_network, tmp_path / "n.safetensors")
+    (tmp_path / "config.json").write_bytes(text.encode("utf-8", "surrogateescape"))
+    with pytest.raises(WeightsError, match=r"config\.json"):
+        checkpoint.load(tmp_path / "n.safetensors")
+
+
+@pytest.mark.parametrize(
+    ("key", "odd"),
+    [
+        ("patch_embed.proj.weight", (4,)),
+        ("patch_embed.proj.weight", (0, 3, 16, 16)),
+        ("decoder_embed.weight", ()),
+        ("downstream_head1.head_local_features.fc2.weight", (3,)),
+        ("downstream_head1.dpt.scratch.layer1_rn.weight", (5,)),
+    ],
+)
+def test_tensors_of_odd_shapes_are_refused_by_name(
+    state: dict[str, torch.Tensor], tmp_path: Path, key: str, odd: tuple[int, ...]
+):
+    state = {k: v for k, v in state.items() if ".layer_rn." not in k}
+    save_file(state | {key: torch.zeros(odd)}, tmp_path / "n.safetensors")
+    with pytest.raises(WeightsError, match=key.replace(".", r"\.")):
+        checkpoint.load(tmp_path / "n.safetensors")
+
+
 def test_published_constructor_call_is_read_without_running_it():
     arguments = checkpoint.parse_arguments(PUBLISHED_CALL)
     assert arguments["enc_num_heads"] == 16

@@ -9,7 +9,7 @@ import sys
 from collections.abc import Callable
 from dataclasses import astuple, replace
 from pathlib import Path
-from types import ModuleType
+from types import ModuleType, SimpleNamespace
 
 import numpy as np
 import pytest
@@ -20,6 +20,7 @@ from swimm3r.cli.train_sfm import Recipe
 from swimm3r.datasets import PairSettings, make_pairs, read_tree
 from swimm3r.errors import InputError, UsageError, WeightsError
 from swimm3r.io.images import write_rgb
+from swimm3r.medium import Medium
 from swimm3r.sfm import adapter_file
 from swimm3r.sfm.adapter_file import Base, fingerprint
 from swimm3r.sfm.mast3r import checkpoint
@@ -29,7 +30,7 @@ from swimm3r.sfm.student import Student, new_student
 from swimm3r.sfm.training.data import PairData, split_data
 from swimm3r.sfm.training.job import retrieved_pairs, train_sfm
 from swimm3r.sfm.training.loop import Workers, batch_size, learning_rate, pairs_of_step, train
-from swimm3r.sfm.training.scores import score
+from swimm3r.sfm.training.scores import score, water_error
 from swimm3r.sfm.training.settings import RECIPES, TrainSettings
 from swimm3r.sfm.training.state import Rows
 from swimm3r.sfm.training.teacher_cache import TeacherCache
@@ -153,6 +154,8 @@ def test_killed_and_started_again_it_ends_with_the_same_bits(
     died = subprocess.run(command, capture_output=True, text=True, env={**os.environ, "OMP_NUM_THREADS": "1"})
     assert died.returncode == -signal.SIGKILL, died.stderr[-2000:]
     assert [row["step"] for row in rows(cut)] == [1, 2, 3]
+    with (cut / "metrics.jsonl").open("a") as torn:
+        torn.write('{"step": 3, "validation": {"loss": 0.5}')
     resumed = train(network, BASE, eight, none, settings, cut, nothing)
     expected, found = learned(whole), learned(resumed)
     assert expected.keys() == found.keys()
@@ -334,7 +337,9 @@ def test_the_recipes_are_the_papers_system_its_ablations_and_dark3r():
         ablated = RECIPES[f"without-{name}"].objective
         assert ablated == replace(full.objective, **{name: 0.0})
     assert RECIPES["without-augmentation"] == replace(full, water_probability=0.0)
-    assert not RECIPES["distillation-only"].objective.physics
+    alone = RECIPES["distillation-only"]
+    assert not alone.objective.physics
+    assert alone == replace(full, objective=alone.objective, water_probability=0.0)
     dark = RECIPES["dark3r"].objective
     assert (dark.clean, dark.physics) == (0.3, False)
 
@@ -446,9 +451,68 @@ def test_validation_knows_pose_depth_and_restoration_of_a_dive(network: Mast3r, 
     student = new_student(network, SETTINGS.lora, ObjectiveSettings(), 0).eval()
     with torch.no_grad():
         scores = score(student, eight)
+    error = scores.pop("water_error")
     assert set(scores) == {"depth_absrel", "rotation_deg", "translation_deg", "restored_psnr", "raw_psnr", "loss"}
     assert all(v is not None and np.isfinite(v) for v in scores.values())
+    assert set(error) == {"Binf", "beta_D", "beta_B"}
+    assert all(len(values) == 3 and min(values) > 0 for values in error.values())
     student.adapters.detach()
+
+
+def test_the_heads_water_is_held_against_water_that_is_known(
+    network: Mast3r, eight: PairData, monkeypatch: pytest.MonkeyPatch
+):
+    student = new_student(network, SETTINGS.lora, ObjectiveSettings(), 0).eval()
+    media = []
+    for index in range(len(eight)):
+        drawn = eight.item(index, 1.0, torch.Generator().manual_seed(index)).drawn[0]
+        off = torch.tensor([1.0, 1.2, 0.5])[:, None] * drawn
+        media.append(Medium(*(value.expand(2, 48, 64, 3) for value in off)))
+    answers = iter(media)
+    monkeypatch.setattr(student, "water", lambda encoded: SimpleNamespace(at=lambda ray_depth: next(answers)))
+    with torch.no_grad():
+        error = water_error(student, eight)
+    assert error is not None
+    for name, share in (("Binf", 0.0), ("beta_D", 0.2), ("beta_B", 0.5)):
+        assert error[name] == pytest.approx([share] * 3, abs=1e-5)
+    student.head = None
+    assert water_error(student, eight) is None
+    student.adapters.detach()
+
+
+def test_the_adapter_says_how_far_its_head_was_off_and_what_it_divided_by(
+    network: Mast3r, eight: PairData, none: PairData, tmp_path: Path
+):
+    def validated(student: Student, data: PairData) -> dict:
+        return {"loss": 1.0, "water_error": {"Binf": [0.1] * 3, "beta_D": [0.2] * 3, "beta_B": [0.3] * 3}}
+
+    settings = replace(SETTINGS, epochs=1, objective=ObjectiveSettings(min_transmittance=0.2))
+    path = train(network, BASE, eight, eight, settings, tmp_path / "held out", validated)
+    facts = adapter_file.head_facts(path)
+    assert facts.min_transmittance == 0.2
+    assert facts.error is not None
+    torch.testing.assert_close(facts.error.beta_D, torch.full((3,), 0.2))
+    path = train(network, BASE, eight, none, settings, tmp_path / "nothing held out", validated)
+    assert adapter_file.head_facts(path).error is None
+
+
+@pytest.mark.parametrize(
+    "header",
+    [
+        "[" * 100_000 + "]" * 100_000,
+        "[]",
+        '{"schema": 1, "base": 1}',
+        '{"schema": 1, "base": {"name": "x", "sha256": "0", "licence": ""}, "peft": {}, '
+        '"objective": {"min_transmittance": "x"}, "trained": {}}',
+    ],
+)
+def test_an_adapters_header_that_is_not_ours_is_refused_by_name(network: Mast3r, tmp_path: Path, header: str):
+    from safetensors.torch import save_file
+
+    path = tmp_path / "odd.safetensors"
+    save_file({"x": torch.zeros(1)}, path, metadata={"swimm3r": header})
+    with pytest.raises(WeightsError, match=r"odd\.safetensors cannot be used as an adapter"):
+        adapter_file.load(path, network)
 
 
 def test_training_without_a_clean_picture_anywhere_says_so(network: Mast3r, tmp_path: Path):

@@ -120,7 +120,10 @@ def test_only_training_shots_with_a_clean_picture_are_trained_on(tmp_path: Path)
         replace(two, split="test"), replace(two, clean=None), replace(two, raw=None, depth=None),
     ):  # fmt: skip
         assert trainable([replace(sequence, shots=(one, other))], pair) == []
-    assert len(trainable([replace(sequence, shots=(one, replace(two, raw=None)))], pair)) == 1
+    in_air = [replace(sequence, shots=(one, replace(two, raw=None)))]
+    assert len(trainable(in_air, pair)) == 1
+    assert trainable(in_air, pair, augmented=False) == []  # nothing else gives such a shot its raw picture
+    assert len(trainable([sequence], pair, augmented=False)) == 1
 
 
 def test_validation_pairs_are_never_trained_on(tmp_path: Path):

@@ -35,7 +35,7 @@ def view(picture: torch.Tensor) -> View:
     pose = torch.eye(4, dtype=torch.float64)[None]
     camera = Cameras(K, torch.zeros(1, 0, dtype=torch.float64), pose, SCALE * WIDTH, SCALE * HEIGHT)
     nothing = torch.zeros(SCALE * HEIGHT, SCALE * WIDTH)
-    return View("", camera, picture[:3], nothing == 0, nothing, nothing, nothing > 0)
+    return View("", camera, picture[:3], nothing == 0, nothing, nothing > 0)
 
 
 HERE = (30.0, 24.0)

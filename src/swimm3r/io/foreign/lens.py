@@ -18,8 +18,10 @@ def nearest_opencv(
 ) -> np.ndarray:
     """k1, k2, p1, p2 of a lens given as a map of points (x, y) at z = 1; exact where it is one of that kind.
 
-    Raises InputError where the nearest one is more than half a pixel away.
+    Raises ValueError where K is no camera's, InputError where the nearest lens is more than half a pixel away.
     """
+    if not (np.isfinite(K).all() and min(K[0, 0], K[1, 1], width, height) > 0):
+        raise ValueError(f"its lens has focal lengths of {K[0, 0]:g} and {K[1, 1]:g} in pictures of {width}x{height}")
     u, v = np.meshgrid(np.linspace(0, width, _SAMPLES), np.linspace(0, height, _SAMPLES))
     x, y = ((u - K[0, 2]) / K[0, 0]).ravel(), ((v - K[1, 2]) / K[1, 1]).ravel()
     r2 = x * x + y * y

@@ -9,6 +9,7 @@ Poses are in the chunk's inner unit; the scale of its transform, or of the camer
 and orientation on the globe are left out: coordinates of millions of metres would cost the points their millimetres.
 """
 
+import math
 import xml.etree.ElementTree as ET
 from pathlib import Path, PurePosixPath
 
@@ -22,7 +23,10 @@ _NAMES = ("f", "cx", "cy", "b1", "b2", "k1", "k2", "k3", "k4", "p1", "p2")
 
 def read(path: Path) -> ForeignModel:
     """Poses, lens and scale of the placed cameras of the first chunk. Raises ValueError for a file that is not one."""
-    chunk = ET.fromstring(path.read_bytes()).find("chunk")
+    try:
+        chunk = ET.fromstring(path.read_bytes()).find("chunk")
+    except ET.ParseError as error:
+        raise ValueError(str(error)) from error
     if chunk is None:
         raise ValueError("it holds no Metashape chunk")
     sensors = {sensor.get("id"): sensor for sensor in chunk.iterfind("sensors/sensor")}
@@ -33,12 +37,15 @@ def read(path: Path) -> ForeignModel:
         transform = camera.findtext("transform")
         if transform is None:  # not placed
             continue
-        kind, size, k, coefficients = _lens(sensors[camera.get("sensor_id")])
+        label, sensor = camera.get("label") or "", sensors.get(camera.get("sensor_id"))
+        if sensor is None:
+            raise ValueError(f"the camera {label} has a sensor that is not in it")
+        kind, size, k, coefficients = _lens(sensor)
         scale = whole if whole is not None else scales.get(camera.get("component_id"))
         pose = np.array(transform.split(), np.float64).reshape(4, 4)
         pose[:3, 3] *= 1.0 if scale is None else scale
         metric = metric and scale is not None
-        names.append(PurePosixPath(str(camera.get("label")).replace("\\", "/")).name)
+        names.append(PurePosixPath(label.replace("\\", "/")).name)
         K.append(k)
         distortion.append(coefficients)
         poses.append(pose)
@@ -56,7 +63,17 @@ def read(path: Path) -> ForeignModel:
 
 def _scale(element: ET.Element) -> float | None:
     text = element.findtext("transform/scale")
-    return None if text is None else float(text)
+    scale = None if text is None else _number(text)
+    if scale is not None and scale <= 0:
+        raise ValueError(f"its scale is {scale:g}")
+    return scale
+
+
+def _number(text: str) -> float:
+    value = float(text)
+    if not math.isfinite(value):
+        raise ValueError(f"it has {text} where a finite number is expected")
+    return value
 
 
 def _lens(sensor: ET.Element) -> tuple[str, tuple[int, int], np.ndarray, np.ndarray]:
@@ -67,12 +84,14 @@ def _lens(sensor: ET.Element) -> tuple[str, tuple[int, int], np.ndarray, np.ndar
     calibration = (adjusted or calibrations)[0]
     resolution = calibration.find("resolution")
     if resolution is None:
-        raise KeyError("resolution")
+        raise ValueError("a calibration has no resolution")
     width, height = int(resolution.attrib["width"]), int(resolution.attrib["height"])
-    value = {name: float(calibration.findtext(name) or 0) for name in _NAMES}
+    value = {name: _number(calibration.findtext(name) or "0") for name in _NAMES}
     K = np.array(
         [[value["f"] + value["b1"], 0, width / 2 + value["cx"]], [0, value["f"], height / 2 + value["cy"]], [0, 0, 1]]
     )
+    if not min(K[0, 0], K[1, 1]) > 0:
+        raise ValueError(f"the sensor {sensor.get('label')} has a focal length of {value['f']:g} px")
     k = tuple(value[f"k{i}"] for i in (1, 2, 3, 4))
     p1, p2, skew = value["p1"], value["p2"], value["b2"] / K[0, 0]
     kind = calibration.get("type", sensor.get("type", "frame"))

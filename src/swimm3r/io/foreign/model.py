@@ -1,15 +1,22 @@
 """One record for what other programs say about a set of pictures, and which reader takes which file."""
 
-import json
 from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
 
+from swimm3r.cameras import cameras_of, check_lens
 from swimm3r.errors import InputError
-from swimm3r.io import colmap
+from swimm3r.io import colmap, json_file
 from swimm3r.io.cameras_json import read_cameras
 from swimm3r.io.colmap import ColmapModel
+from swimm3r.io.damage import Remedy, guard
+
+REMEDY = Remedy(
+    "a COLMAP model, transforms.json, Metashape cameras.xml, OpenMVG sfm_data.json, VGGT predictions.npz, cameras.json",
+    cause="the file is damaged, or of another program or version",
+    fault="cannot be read as a reconstruction",
+)
 
 
 @dataclass(frozen=True)
@@ -40,34 +47,30 @@ def read_foreign(path: Path) -> ForeignModel:
 
     Raises InputError for anything else and for a damaged file.
     """
+    found = _file(path)
+    with guard(found or path, REMEDY):
+        foreign = _read(found) if found else ForeignModel("COLMAP model", colmap.read_model(path))
+        check_lens(cameras_of(foreign.model))
+        return foreign
+
+
+def _read(path: Path) -> ForeignModel:
     from swimm3r.io.foreign import metashape, nerfstudio, openmvg, vggt
 
-    found = _file(path)
-    if found is None:
-        return ForeignModel("COLMAP model", colmap.read_model(path))
-    try:
-        match found.suffix.lower():
-            case ".xml":
-                return metashape.read(found)
-            case ".npz":
-                return vggt.read(found)
-            case _:
-                document = json.loads(found.read_text(encoding="utf-8"))
-                if not isinstance(document, dict):
-                    raise ValueError("a JSON object was expected")
-                if "sfm_data_version" in document:
-                    return openmvg.read(found, document)
-                if any("c2w" in frame for frame in document.get("frames", [])):
-                    return _own(found)
-                return nerfstudio.read(found, document)
-    except (KeyError, ValueError, TypeError, IndexError, SyntaxError) as error:  # SyntaxError: XML's ParseError
-        what = f"it has no {error}" if isinstance(error, KeyError) else str(error).splitlines()[0]
-        raise InputError(
-            f"{found} cannot be read as a reconstruction: {what[:200]}",
-            cause="the file is damaged, or of another program or version",
-            hint="a COLMAP model, transforms.json, Metashape cameras.xml, OpenMVG sfm_data.json, VGGT predictions.npz,"
-            " cameras.json",
-        ) from error
+    match path.suffix.lower():
+        case ".xml":
+            return metashape.read(path)
+        case ".npz":
+            return vggt.read(path)
+    document = json_file.decode(path.read_bytes())
+    if not isinstance(document, dict):
+        raise ValueError("a JSON object is expected")
+    if "sfm_data_version" in document:
+        return openmvg.read(document)
+    frames = document.get("frames")
+    if isinstance(frames, list) and any(isinstance(frame, dict) and "c2w" in frame for frame in frames):
+        return _own(path)
+    return nerfstudio.read(path, document)
 
 
 def without_points(
@@ -78,8 +81,7 @@ def without_points(
     distortion: np.ndarray,
     cam2world: np.ndarray,
 ) -> ColmapModel:
-    """A model of poses alone. Raises InputError for names that lead out of their folder."""
-    colmap.check_names(names)
+    """A model of poses alone."""
     none = np.zeros(0, np.int64)
     return ColmapModel(
         names=names,

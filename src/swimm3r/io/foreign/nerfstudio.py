@@ -5,15 +5,17 @@ Poses are camera to world with OpenGL's camera axes (x right, y up, z backwards)
 back. The cloud of `ply_file_path` is in the file's world; it has no sightings.
 """
 
-import json
 import math
+from dataclasses import dataclass, fields, replace
 from pathlib import Path, PurePosixPath
 from typing import Any
 
 import numpy as np
 
-from swimm3r.io.foreign.model import ForeignModel, one_size, read_foreign, without_points
+from swimm3r.io.foreign.model import REMEDY, ForeignModel, one_size, read_foreign, without_points
+from swimm3r.io.json_file import read_json, structure
 from swimm3r.io.ply import read_points
+from swimm3r.io.safe_names import check_name
 
 _FLIP = np.diag([1.0, -1.0, -1.0, 1.0])
 _MODELS = {
@@ -21,38 +23,79 @@ _MODELS = {
 }  # fmt: skip
 
 
+@dataclass(frozen=True)
+class _Lens:
+    """Intrinsics of one frame, or of the clip."""
+
+    w: float | None = None
+    h: float | None = None
+    camera_model: str | None = None
+    fl_x: float | None = None
+    fl_y: float | None = None
+    camera_angle_x: float | None = None
+    camera_angle_y: float | None = None
+    cx: float | None = None
+    cy: float | None = None
+    k1: float | None = None
+    k2: float | None = None
+    k3: float | None = None
+    k4: float | None = None
+    p1: float | None = None
+    p2: float | None = None
+
+
+_Row = tuple[float, float, float, float]
+
+
+@dataclass(frozen=True, kw_only=True)
+class _Frame(_Lens):
+    file_path: str
+    transform_matrix: tuple[_Row, _Row, _Row, _Row]
+
+
+@dataclass(frozen=True, kw_only=True)
+class _Document(_Lens):
+    frames: tuple[_Frame, ...]
+    applied_transform: tuple[_Row, ...] | None = None
+    applied_scale: float = 1.0
+    ply_file_path: str | None = None
+
+    def __post_init__(self) -> None:
+        if not self.frames:
+            raise ValueError("it names no frames")
+        if self.applied_scale <= 0:
+            raise ValueError(f"its applied_scale is {self.applied_scale:g}")
+        if self.applied_transform is not None and len(self.applied_transform) not in (3, 4):
+            raise ValueError(f"its applied_transform has {len(self.applied_transform)} rows")
+
+
 def read(path: Path, document: dict[str, Any]) -> ForeignModel:
-    """Poses, lens and cloud. Raises InputError, ValueError or KeyError for a file that is not one."""
-    frames = [{**document, **frame} for frame in document["frames"]]  # intrinsics may be the clip's or the frame's
-    if not frames:
-        raise ValueError("it names no frames")
-    kinds = {_kind(frame) for frame in frames}
+    """Poses, lens and cloud. Raises InputError or ValueError for a file that is not one."""
+    file = structure(document, _Document)
+    lenses = [_of_frame(frame, file) for frame in file.frames]
+    kinds = {_kind(lens) for lens in lenses}
     if len(kinds) > 1:
         raise ValueError(f"it mixes camera models: {', '.join(sorted(kinds))}")
     kind = kinds.pop()
-    if any(frame.get("k3") or frame.get("k4") for frame in frames) and kind == "OPENCV":
+    if any(lens.k3 or lens.k4 for lens in lenses) and kind == "OPENCV":
         raise ValueError("its OPENCV lens has k3 or k4, which that model does not have")
-    names = tuple(PurePosixPath(str(frame["file_path"]).replace("\\", "/")).name for frame in frames)
-    if len(set(names)) < len(names):  # then the folders tell them apart
-        names = tuple(str(PurePosixPath(str(frame["file_path"]).removeprefix("./"))) for frame in frames)
-    K = np.stack([_K(frame) for frame in frames])
-    distortion = np.array([[float(frame.get(k) or 0) for k in _MODELS[kind]] for frame in frames]).reshape(
-        len(frames), -1
-    )
-    poses = np.array([frame["transform_matrix"] for frame in frames], np.float64).reshape(-1, 4, 4) @ _FLIP
-    back, scale = _original_world(document)
+    poses = np.array([frame.transform_matrix for frame in file.frames]) @ _FLIP
+    back = _original_world(file)
     poses = back @ poses
-    poses[:, :3, 3] /= scale
-    size = one_size({(int(frame["w"]), int(frame["h"])) for frame in frames})
-    model = without_points(names, "PINHOLE" if not _MODELS[kind] else kind, size, K, distortion, poses)
-    cloud = document.get("ply_file_path")
-    if cloud is not None:
-        if PurePosixPath(cloud).is_absolute() or ".." in PurePosixPath(cloud).parts:
-            raise ValueError(f"its cloud lies outside its folder: {cloud}")
-        xyz, rgb = read_points(path.parent / cloud)
-        xyz = (xyz.astype(np.float64) @ back[:3, :3].T + back[:3, 3]) / scale
-        colours = (rgb * 255).round().astype(np.uint8)
-        model = type(model)(**{**vars(model), "xyz": xyz, "rgb": colours, "error": np.zeros(len(xyz))})
+    poses[:, :3, 3] /= file.applied_scale
+    model = without_points(
+        _names(file),
+        "PINHOLE" if not _MODELS[kind] else kind,
+        one_size({(int(_given(lens, "w")), int(_given(lens, "h"))) for lens in lenses}),
+        np.stack([_K(lens) for lens in lenses]),
+        np.array([[getattr(lens, k) or 0.0 for k in _MODELS[kind]] for lens in lenses]).reshape(len(lenses), -1),
+        poses,
+    )
+    if file.ply_file_path is not None:
+        check_name(file.ply_file_path)
+        xyz, rgb = read_points(path.parent / file.ply_file_path)
+        xyz = (xyz.astype(np.float64) @ back[:3, :3].T + back[:3, 3]) / file.applied_scale
+        model = replace(model, xyz=xyz, rgb=(rgb * 255).round().astype(np.uint8), error=np.zeros(len(xyz)))
     return ForeignModel("nerfstudio", model)
 
 
@@ -60,34 +103,59 @@ def pictures_folder(path: Path) -> Path:
     """Where the pictures of a transforms.json lie. Raises InputError for a file that is not one."""
     names = read_foreign(path).model.names
     file = path / "transforms.json" if path.is_dir() else path
-    first = PurePosixPath(json.loads(file.read_text(encoding="utf-8"))["frames"][0]["file_path"].replace("\\", "/"))
+    first = _relative(read_json(file, _Document, REMEDY).frames[0])
     # names with folders of their own are relative to the file, others to the one folder that all lie in
     return file.parent if any("/" in name for name in names) else file.parent / first.parent
 
 
-def _kind(frame: dict[str, Any]) -> str:
-    name = str(
-        frame.get("camera_model", "OPENCV" if any(frame.get(k) for k in ("k1", "k2", "p1", "p2")) else "PINHOLE")
-    )
+def _relative(frame: _Frame) -> PurePosixPath:
+    return PurePosixPath(frame.file_path.replace("\\", "/"))
+
+
+def _names(file: _Document) -> tuple[str, ...]:
+    paths = [_relative(frame) for frame in file.frames]
+    names = tuple(path.name for path in paths)
+    return names if len(set(names)) == len(names) else tuple(map(str, paths))  # then the folders tell them apart
+
+
+def _of_frame(frame: _Frame, file: _Document) -> _Lens:
+    """The intrinsics of a frame: its own, and the clip's where it has none."""
+
+    def value(name: str) -> Any:
+        own = getattr(frame, name)
+        return getattr(file, name) if own is None else own
+
+    return _Lens(**{field.name: value(field.name) for field in fields(_Lens)})
+
+
+def _given(lens: _Lens, name: str) -> float:
+    value = getattr(lens, name)
+    if value is None:
+        raise ValueError(f"there is no {name}")
+    return value
+
+
+def _kind(lens: _Lens) -> str:
+    name = lens.camera_model or ("OPENCV" if lens.k1 or lens.k2 or lens.p1 or lens.p2 else "PINHOLE")
     if name not in _MODELS:
         raise ValueError(f"its camera model is {name}; supported are {', '.join(_MODELS)}")
     return name
 
 
-def _K(frame: dict[str, Any]) -> np.ndarray:
-    width, height = float(frame["w"]), float(frame["h"])
-    if "fl_x" in frame:
-        fx = float(frame["fl_x"])
-        fy = float(frame.get("fl_y", fx))
+def _K(lens: _Lens) -> np.ndarray:
+    width, height = _given(lens, "w"), _given(lens, "h")
+    if lens.fl_x is not None:
+        fx = lens.fl_x
+        fy = fx if lens.fl_y is None else lens.fl_y
     else:
-        fx = width / 2 / math.tan(float(frame["camera_angle_x"]) / 2)
-        fy = height / 2 / math.tan(float(frame["camera_angle_y"]) / 2) if "camera_angle_y" in frame else fx
-    cx, cy = float(frame.get("cx", width / 2)), float(frame.get("cy", height / 2))
+        fx = width / 2 / math.tan(_given(lens, "camera_angle_x") / 2)
+        fy = fx if lens.camera_angle_y is None else height / 2 / math.tan(lens.camera_angle_y / 2)
+    cx, cy = (half if given is None else given for given, half in ((lens.cx, width / 2), (lens.cy, height / 2)))
     return np.array([[fx, 0, cx], [0, fy, cy], [0, 0, 1]])
 
 
-def _original_world(document: dict[str, Any]) -> tuple[np.ndarray, float]:
+def _original_world(file: _Document) -> np.ndarray:
     applied = np.eye(4)
-    if "applied_transform" in document:
-        applied[:3] = np.array(document["applied_transform"], np.float64)[:3]
-    return np.linalg.inv(applied), float(document.get("applied_scale", 1.0))
+    if file.applied_transform is not None:
+        applied[:3] = file.applied_transform[:3]
+    return np.linalg.inv(applied)

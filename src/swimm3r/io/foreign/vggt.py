@@ -7,27 +7,31 @@ of pictures resized to a width of 518 and to a height in whole patches of 14, of
 evenly. The file does not name its pictures: they are those of images/ in the order of their names.
 """
 
-import zipfile
 from pathlib import Path
 
 import numpy as np
 
 from swimm3r.errors import InputError
-from swimm3r.io.foreign.model import ForeignDepth, ForeignModel, one_size, without_points
+from swimm3r.io.array_file import Layout, read_arrays
+from swimm3r.io.foreign.model import REMEDY, ForeignDepth, ForeignModel, one_size, without_points
 from swimm3r.io.images import image_size
 
 _SIZE, _PATCH = 518, 14
+_LAYOUTS = {
+    "extrinsic": Layout("pictures 3 4"),
+    "intrinsic": Layout("pictures 3 3"),
+    "depth": Layout("pictures rows columns 1", finite=False),
+    "depth_conf": Layout("pictures rows columns"),
+    "images": Layout("pictures 3 rows columns"),
+}
 
 
 def read(path: Path) -> ForeignModel:
     """Poses, lens and dense depth. Raises InputError or ValueError where file and pictures do not belong together."""
-    try:
-        with np.load(path, allow_pickle=False) as stored:
-            extrinsic, intrinsic = (stored[name].astype(np.float64) for name in ("extrinsic", "intrinsic"))
-            depth, confidence = stored["depth"][..., 0].astype(np.float32), stored["depth_conf"].astype(np.float32)
-            images = stored["images"].astype(np.float32)
-    except zipfile.BadZipFile as error:
-        raise ValueError("it is not a whole npz archive") from error
+    stored = read_arrays(path, _LAYOUTS, REMEDY)
+    extrinsic, intrinsic = (stored[name].astype(np.float64) for name in ("extrinsic", "intrinsic"))
+    depth, confidence = stored["depth"][..., 0].astype(np.float32), stored["depth_conf"].astype(np.float32)
+    images = stored["images"].astype(np.float32)
     folder = path.parent / "images"
     pictures = sorted(p for p in folder.glob("*") if p.is_file()) if folder.is_dir() else []
     if len(pictures) != len(extrinsic):

@@ -20,7 +20,7 @@ from swimm3r.filters import LUMA
 from swimm3r.frames import Frames
 from swimm3r.progress import Progress, silent
 from swimm3r.reconstruction import Caution, DepthMap, DepthMaps, Matches, Reconstruction
-from swimm3r.sfm import aligned_depth, colmap, match_tracks, predicted_water
+from swimm3r.sfm import adapter_file, aligned_depth, colmap, match_tracks, predicted_water
 from swimm3r.sfm.alignment import Alignment, align, dense_z_depth
 from swimm3r.sfm.alignment_problem import AnchoredPair, Known
 from swimm3r.sfm.canonical import AnchoredFrame, anchors_of
@@ -47,9 +47,7 @@ def reconstruct(frames: Frames, settings: Mast3rSettings, folder: Path, progress
     or one that predicts no numbers, DeviceError, and RegistrationError where the frames do not hang together.
     """
     cache = settings.cache or folder / _FOLDER
-    if (folder / "reconstruction.json").is_file():
-        rec = reconstruction.load(folder)
-    else:
+    if not (folder / "reconstruction.json").is_file():
         graph = parse_graph(settings.graph)
         pictures = network_pictures(frames, settings)
         network = load_network(settings)
@@ -60,13 +58,15 @@ def reconstruct(frames: Frames, settings: Mast3rSettings, folder: Path, progress
             encodings = EncodingStore(network, pictures, cache / "encodings")
             read_water = _WaterReader(head, encodings, folder / _WATER)
         rec = _place(said, pictures, settings, folder, progress, read_water)
-        reconstruction.save(rec, folder)
+        reconstruction.save(rec, frames, folder)
+    rec = reconstruction.load(folder, frames)  # also where it was just made: the same bits as after an interruption
     if settings.adapter is None:
         rec = with_water(rec, frames, settings, folder, progress)
     else:
-        predicted = predicted_water.read(folder / _WATER, network_pictures(frames, settings))
+        facts = adapter_file.head_facts(settings.adapter)
+        predicted = predicted_water.read(folder / _WATER, network_pictures(frames, settings), facts)
         rec = with_water(rec, frames, settings, folder, progress, predicted)
-    reconstruction.save(rec, folder)
+    reconstruction.save(rec, frames, folder)
     if settings.cache is None:
         shutil.rmtree(cache, ignore_errors=True)
     return rec
@@ -101,24 +101,21 @@ def _place(
     aligned = _align(said, pairs, kept, pictures, settings, progress)
     lens, canvas = pictures.cameras(aligned.alignment.K, aligned.alignment.cam2world)
     matches = aligned.matches.select(match_tracks.consistent(aligned.matches, canvas, settings.max_error))
-    tracks = _tracks(matches, canvas, settings)
+    found = _tracks(matches, canvas, settings)
+    tracks = match_tracks.most_seen(found, settings.max_points)
+    reconstruction.write_unfiltered_matches(folder, _on_frames(aligned.matches, pictures))
     points, sightings = match_tracks.as_points(tracks, pictures.to_frame(tracks.xy + 0.5), lens, frames, kept)
     rec = Reconstruction(
         names=tuple(frames.names[f] for f in kept),
         cameras=lens,
         points=points,
         tracks=sightings,
-        matches=Matches(
-            matches.i,
-            matches.j,
-            pictures.to_frame(matches.xy_i + 0.5).float(),
-            pictures.to_frame(matches.xy_j + 0.5).float(),
-            matches.confidence,
-        ),
+        matches=_on_frames(matches, pictures),
         depth=DepthMaps(folder / "z_depth"),
         backend="mast3r" if settings.adapter is None else "swimm3r",
         metric=_is_metric(pictures, kept),
         cautions=tuple(cautions),
+        points_found=len(found.xyz),
     )
     if settings.bundle_adjustment:
         rec = colmap.bundle_adjust(rec)
@@ -128,6 +125,12 @@ def _place(
             before = said.frame_store.read(f).anchored.anchor_depth.clamp(min=1e-9)
             water.keep(f, rec.names[k], float((aligned.alignment.anchor_z_depth[k] / before).median().clamp(min=1e-9)))
     return rec
+
+
+def _on_frames(matches: FrameMatches, pictures: NetworkPictures) -> Matches:
+    """Matches of the network's pixels in pixels of the prepared frames."""
+    xy_i, xy_j = (pictures.to_frame(xy + 0.5).float() for xy in (matches.xy_i, matches.xy_j))
+    return Matches(matches.i, matches.j, xy_i, xy_j, matches.confidence)
 
 
 def _is_metric(pictures: NetworkPictures, kept: list[int]) -> bool:
@@ -250,7 +253,7 @@ def _tracks(matches: FrameMatches, canvas: Cameras, settings: Mast3rSettings) ->
     if len(matches):
         tracks = match_tracks.join(matches, canvas.width, canvas.height)
         errors = match_tracks.reprojection_errors(canvas, tracks.frame, tracks.xy + 0.5, tracks.xyz[tracks.point])
-        tracks = match_tracks.without(tracks, errors > settings.max_error, settings.max_points)
+        tracks = match_tracks.without(tracks, errors > settings.max_error)
         if len(tracks.xyz):
             return tracks
     raise RegistrationError(

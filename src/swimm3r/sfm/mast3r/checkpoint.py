@@ -18,7 +18,7 @@ from pathlib import Path
 from typing import Any
 
 import torch
-from safetensors import SafetensorError
+from safetensors import SafetensorError, safe_open
 from safetensors.torch import load_file, save_file
 from torch import Tensor
 
@@ -111,19 +111,22 @@ def infer_architecture(state: Mapping[str, Tensor], arguments: Mapping[str, Any]
     """Sizes of the network from its tensors; numbers of heads and the rotary base from the arguments, if given."""
     _require_mast3r(state)
 
-    def shape(key: str) -> torch.Size:
+    def shape(key: str, axes: int = 1) -> torch.Size:
         if key not in state:
             raise _wrong(f"the checkpoint has no tensor {key}")
-        return state[key].shape
+        found = state[key].shape
+        if len(found) < axes or min(found) < 1:
+            raise _wrong(f"{key} has shape {tuple(found)}, which no layer of the network has")
+        return found
 
     def depth(blocks: str) -> int:
         return 1 + max((int(key.split(".")[1]) for key in state if key.startswith(blocks + ".")), default=-1)
 
-    encoder_dim, _, patch, _ = shape("patch_embed.proj.weight")
+    encoder_dim, _, patch, *_ = shape("patch_embed.proj.weight", 4)
     decoder_dim = shape("decoder_embed.weight")[0]
     dpt = "downstream_head1.dpt."
-    local = shape("downstream_head1.head_local_features.fc2.weight")
-    inputs = [shape(f"{dpt}scratch.layer{i}_rn.weight") for i in (1, 2, 3, 4)]
+    local = shape("downstream_head1.head_local_features.fc2.weight", 2)
+    inputs = [shape(f"{dpt}scratch.layer{i}_rn.weight", 2) for i in (1, 2, 3, 4)]
     base = re.fullmatch(r"RoPE(\d+(?:\.\d+)?)", str(arguments.get("pos_embed", "RoPE100")))
     if base is None:
         raise _wrong(f"the checkpoint's position embedding is {arguments['pos_embed']!r}, not rotary")
@@ -154,16 +157,17 @@ def _read_safetensors(path: Path) -> tuple[dict[str, Tensor], dict[str, Any]]:
     if not beside.is_file():
         return state, _metadata_arguments(path)
     try:
-        arguments = json.loads(beside.read_text())
-    except ValueError as error:
+        arguments = json.loads(beside.read_text(encoding="utf-8"))
+    except (ValueError, RecursionError, OSError) as error:
         raise _damaged(beside, error) from error
-    return state, arguments if isinstance(arguments, dict) else {}
+    if not isinstance(arguments, dict):
+        raise _wrong(f"{beside} holds no settings of a network")
+    return state, arguments
 
 
 def _metadata_arguments(path: Path) -> dict[str, Any]:
-    with path.open("rb") as file:
-        size = int.from_bytes(file.read(8), "little")
-        metadata = json.loads(file.read(size)).get("__metadata__", {})
+    with safe_open(path, "pt") as file:
+        metadata = file.metadata() or {}
     return _arguments(path, metadata["model"]) if "model" in metadata else {}
 
 

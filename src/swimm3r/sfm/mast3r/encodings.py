@@ -15,6 +15,7 @@ from torch import Tensor
 
 from swimm3r import weights
 from swimm3r.io.atomic import atomic_path
+from swimm3r.io.damage import guard, remake
 from swimm3r.progress import Progress, silent
 from swimm3r.sfm import retrieval
 from swimm3r.sfm.mast3r.network import Encoded, Mast3r
@@ -48,7 +49,10 @@ class EncodingStore:
         """The encoding of frame i on the network's device."""
         path, frame = self.path(i), self.pictures.framing
         if path.is_file():
-            with safe_open(path, framework="pt") as stored:
+            with (
+                guard(path, remake(path)),
+                safe_open(path, "pt") as stored,
+            ):
                 tokens, positions = (
                     stored.get_tensor(name).to(self.network.device) for name in ("tokens", "positions")
                 )

@@ -18,6 +18,7 @@ from jaxtyping import Float
 from torch import Tensor
 
 from swimm3r.io.atomic import atomic_path
+from swimm3r.io.damage import guard, remake
 from swimm3r.sfm.alignment_problem import Predicted
 from swimm3r.sfm.canonical import AnchoredFrame, CanonicalSums, CanonicalView, add_pass, anchored_frame, canonical_view
 from swimm3r.sfm.matching import PixelMatches
@@ -75,7 +76,8 @@ class PairStore:
 
     def read(self, name_i: str, name_j: str) -> PairRecord:
         """A pair that is done."""
-        with np.load(self.path(name_i, name_j)) as stored:
+        path = self.path(name_i, name_j)
+        with guard(path, remake(path)), np.load(path, allow_pickle=False) as stored:
             arrays = {name: torch.from_numpy(stored[name]) for name in stored.files if not name.startswith("xy")}
             xy1, xy2 = (torch.from_numpy(stored[name].astype(np.int64)) for name in ("xy1", "xy2"))
         sides = [
@@ -139,7 +141,8 @@ class FrameStore:
 
     def read(self, i: int) -> FrameRecord:
         """A frame all of whose partners were added."""
-        with np.load(self._view_path(i)) as stored:
+        path = self._view_path(i)
+        with guard(path, remake(path)), np.load(path, allow_pickle=False) as stored:
             relative, confidence = (torch.from_numpy(stored[name]) for name in ("relative_depth", "confidence"))
             focal, mean = stored["focal_and_mean"].tolist()
             anchors = torch.from_numpy(stored["anchor_depth"])
@@ -154,7 +157,7 @@ class FrameStore:
         path = self._sums_path(i)
         if not path.is_file():
             return None
-        with np.load(path) as stored:
+        with guard(path, remake(path)), np.load(path, allow_pickle=False) as stored:
             arrays = [torch.from_numpy(stored[field.name]) for field in fields(CanonicalSums)[1:]]
             done = set(stored["done"].tolist())
         here = {p for p in self.partners[i] if self.names[p] in done}

@@ -14,17 +14,24 @@ from pathlib import Path
 from typing import Any
 
 import torch
-from safetensors import SafetensorError
 from safetensors.torch import load_file, save_file
 from torch import Tensor, nn
 
-from swimm3r.errors import WeightsError
+from swimm3r.errors import Swimm3rError, WeightsError
 from swimm3r.io.atomic import atomic_path, write_text
+from swimm3r.io.damage import Remedy, damaged, guard
+from swimm3r.io.json_file import read_json
 from swimm3r.sfm.mast3r.lora import Adapters
 
 _PREFIX = "base_model.model."
 _KEY = re.compile(re.escape(_PREFIX) + r"(.+)\.lora_([AB])\.weight")
 _CONFIG, _TENSORS = "adapter_config.json", "adapter_model.safetensors"
+_REMEDY = Remedy(
+    "an adapter trained by swimm3r train-sfm, or by PEFT on this network",
+    cause="it is damaged, or belongs to another network",
+    error=WeightsError,
+    fault="cannot be used as an adapter",
+)
 
 
 def write_peft(adapters: Adapters, folder: Path, base: str | None = None) -> None:
@@ -39,11 +46,9 @@ def read_peft(folder: Path, network: nn.Module) -> Adapters:
     for name in (_CONFIG, _TENSORS):
         if not (folder / name).is_file():
             raise _unfit(folder, f"it has no {name}")
-    try:
-        settings = json.loads((folder / _CONFIG).read_text(encoding="utf-8"))
+    settings = read_json(folder / _CONFIG, dict[str, Any], _REMEDY)
+    with guard(folder / _TENSORS, _REMEDY):
         stored = load_file(folder / _TENSORS)
-    except (ValueError, OSError, SafetensorError) as error:
-        raise _unfit(folder, str(error).splitlines()[0]) from error
     return attach_stored(stored, settings, network, folder)
 
 
@@ -127,9 +132,5 @@ def _require_plain(settings: Mapping[str, Any], source: Path) -> None:
             raise _unfit(source, f"it uses {name}, which is not supported")
 
 
-def _unfit(source: Path, why: str) -> WeightsError:
-    return WeightsError(
-        f"{source} cannot be used as an adapter: {why}",
-        cause="it is damaged, or belongs to another network",
-        hint="an adapter trained by swimm3r train-sfm, or by PEFT on this network",
-    )
+def _unfit(source: Path, why: str) -> Swimm3rError:
+    return damaged(source, why, _REMEDY)

@@ -1,59 +1,72 @@
 """Every number of the MASt3R front end, with its reason; torch-free, so that --help is instant."""
 
 from dataclasses import dataclass
-from typing import Literal
+from typing import Annotated, Literal
+
+from swimm3r.settings import (
+    Count,
+    CountOrZero,
+    NotNegative,
+    Positive,
+    PositiveShare,
+    Range,
+    Rate,
+    Seed,
+    Settings,
+    Share,
+)
 
 
 @dataclass(frozen=True)
-class Complete:
+class Complete(Settings):
     """Every frame with every other: n (n - 1) / 2 pairs."""
 
 
 @dataclass(frozen=True)
-class SlidingWindow:
+class SlidingWindow(Settings):
     """Every frame with the next few of an ordered sequence."""
 
-    size: int = 3
+    size: Count = 3
     cyclic: bool = False
     """The last frames pair with the first: for a path that closes on itself."""
 
 
 @dataclass(frozen=True)
-class LogWindow:
+class LogWindow(Settings):
     """Every frame with those 1, 2, 4, 8 ... frames away: long baselines at logarithmic cost."""
 
-    size: int = 3
+    size: Annotated[int, Range(1, 30)] = 3
     """How many powers of two, from 1 on."""
     cyclic: bool = False
 
 
 @dataclass(frozen=True)
-class OneReference:
+class OneReference(Settings):
     """One frame with every other."""
 
-    frame: int = 0
+    frame: CountOrZero = 0
 
 
 @dataclass(frozen=True)
-class Retrieval:
+class Retrieval(Settings):
     """Key frames far apart, all paired; every other frame with its nearest key frame; all with their most similar."""
 
-    key_frames: int = 20
-    neighbours: int = 10
+    key_frames: CountOrZero = 20
+    neighbours: CountOrZero = 10
     """Counted as the reference does: the frame itself is the first of them."""
-    seed: int = 0
+    seed: Seed = 0
     """Draws the first key frame."""
 
 
 @dataclass(frozen=True)
-class Video:
+class Video(Settings):
     """An ordered window for the path and the most similar far-away frames to close its loops."""
 
-    window: int = 4
+    window: CountOrZero = 4
     """At 2-5 frames per second a diver still sees half of the scene this many frames later."""
-    closures: int = 2
+    closures: CountOrZero = 2
     """Far-away partners per frame; two, because one may be a false friend."""
-    gap: int = 10
+    gap: CountOrZero = 10
     """Nearer frames than this are the window's business, not a loop."""
 
 
@@ -61,30 +74,30 @@ PairGraph = Complete | SlidingWindow | LogWindow | OneReference | Retrieval | Vi
 
 
 @dataclass(frozen=True)
-class MatchingSettings:
+class MatchingSettings(Settings):
     """Reciprocal matching of two descriptor maps (`sfm/matching.py`)."""
 
-    subsample: int = 8
+    subsample: Annotated[int, Range(1, 64)] = 8
     """One search starts in every cell of this many pixels; the sparse alignment's anchors have the same spacing."""
-    border: int = 3
+    border: CountOrZero = 3
     """Matches nearer to an image's edge than this many pixels are dropped: the network guesses there."""
 
 
 @dataclass(frozen=True)
-class AlignmentSettings:
+class AlignmentSettings(Settings):
     """Sparse global alignment (`sfm/alignment.py`); the defaults are MASt3R-SfM's where it says nothing else."""
 
-    subsample: int = 8
+    subsample: Annotated[int, Range(1, 64)] = 8
     """One depth per block of this many pixels is optimised; the rest of the block follows it."""
-    coarse_iterations: int = 300
+    coarse_iterations: CountOrZero = 300
     """Poses and scales, on distances in space."""
-    coarse_rate: float = 0.07
-    fine_iterations: int = 300
+    coarse_rate: Rate = 0.07
+    fine_iterations: CountOrZero = 300
     """Also focals, principal points and depths, on distances in the image."""
-    fine_rate: float = 0.01
+    fine_rate: Rate = 0.01
     intrinsics: Literal["free", "shared", "prior", "fixed"] = "free"
     """`prior` and `fixed` need known intrinsics; `prior` keeps them near, `fixed` does not move them."""
-    prior_weight: float = 10.0
+    prior_weight: NotNegative = 10.0
     """Of the squared relative deviation of focal and principal point, against a loss of about one pixel."""
     optimise_principal_point: bool = False
     """The reference does. But on a path without roll a shifted principal point and a turned camera look the same: on an
@@ -95,7 +108,7 @@ class AlignmentSettings:
     exponential_depth: bool = False
     tree: Literal["ward", "spanning"] = "ward"
     """What chain of frames conditions the poses: by clusters of well-matched frames, or by the most matches."""
-    confidence_threshold: float = 0.0
+    confidence_threshold: NotNegative = 0.0
     """Pairs without any match above it are aligned by their pointmaps instead; the reference's function has 5, its
     authors recommend 0."""
     parity: bool = False
@@ -104,7 +117,7 @@ class AlignmentSettings:
 
 
 @dataclass(frozen=True)
-class LoraSettings:
+class LoraSettings(Settings):
     """Which layers of the frozen network get a trained low-rank update (`sfm/mast3r/lora.py`)."""
 
     reading: Literal["A", "A2", "B", "C", "D"] = "A"
@@ -112,39 +125,39 @@ class LoraSettings:
     self-attention (2,584,576 trained numbers); A2: those of patch embedding and encoder; B: patch and decoder
     embedding; C: A with qkv and the decoder embedding; D: patch embedding, every layer of the encoder, decoder
     embedding. All of them adapt the four projections of the decoder's cross-attention."""
-    rank: int = 16
+    rank: Annotated[int, Range(1, 1024)] = 16
     """Of those layers (paper, implementation details)."""
-    cross_rank: int = 8
+    cross_rank: Annotated[int, Range(1, 1024)] = 8
     """Of the decoder's cross-attention projections."""
-    alpha_per_rank: float = 1.0
+    alpha_per_rank: Positive = 1.0
     """The update is alpha / rank times B A; the paper gives no alpha."""
 
 
 @dataclass(frozen=True)
-class ObjectiveSettings:
+class ObjectiveSettings(Settings):
     """What is minimised (`sfm/distill.py`); the defaults are the paper's, Eq. geom to stage1_objective."""
 
-    encoder: float = 0.5
-    decoder: float = 0.5
-    descriptors: float = 2.0
-    clean: float = 0.0
+    encoder: NotNegative = 0.5
+    decoder: NotNegative = 0.5
+    descriptors: NotNegative = 2.0
+    clean: NotNegative = 0.0
     """Weight of the same distances with the student on the clear pictures; Dark3R's 0.3, not in this paper."""
     reduction: Literal["mean", "token", "sum"] = "mean"
     """The paper writes squared norms without saying over what: mean over all elements; sum over channels and mean over
     tokens or pixels; or the sum, which makes the encoder's term thousands of times larger than the descriptors'."""
     decoder_levels: Literal["last", "all"] = "last"
     """The decoder's normalised output, or the outputs of all its blocks."""
-    forward: float = 1.0
-    inverse: float = 1.0
-    saturation: float = 1.0
-    anchor: float = 0.5
+    forward: NotNegative = 1.0
+    inverse: NotNegative = 1.0
+    saturation: NotNegative = 1.0
+    anchor: NotNegative = 0.5
     """Inside L_sat, of the veiling light's distance to the dim pixels' colour. It pulls Binf below the truth wherever
     the dimmest pixels are nearer than the open water; 0 leaves it out."""
-    anchor_quantile: float = 0.05
-    known_water: float = 0.0
+    anchor_quantile: Share = 0.05
+    known_water: NotNegative = 0.0
     """Weight of the head's mistake in T_D and B themselves, in pictures whose water the augmentation drew. Not in the
     paper: L_inv makes a head that is not sure err on the side of clear water, and this does not."""
-    min_transmittance: float = 0.05
+    min_transmittance: PositiveShare = 0.05
     """eps_inv of Eq. swimm3r_render_inverse; the paper gives none. At 1/20 a noise of 1/255 stays below 0.08."""
 
     @property

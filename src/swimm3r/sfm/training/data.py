@@ -143,12 +143,17 @@ class _ViewItem:
     drawn: Float[Tensor, "3 3"]
 
 
-def trainable(sequences: Items[Sequence], pairs: Items[Items[Pair]]) -> list[tuple[int, Pair]]:
-    """The pairs of the training shots that have what training needs: a clean picture, and a raw one or depth."""
+def trainable(sequences: Items[Sequence], pairs: Items[Items[Pair]], augmented: bool = True) -> list[tuple[int, Pair]]:
+    """The pairs of the training shots that have what training needs: a clean picture, and a raw one.
+
+    Where training is `augmented`, depth stands for the raw picture, which is then drawn.
+    """
     found = []
     for s, (sequence, own) in enumerate(zip(sequences, pairs, strict=True)):
         fit = [
-            shot.split == "train" and shot.clean is not None and (shot.raw is not None or shot.depth is not None)
+            shot.split == "train"
+            and shot.clean is not None
+            and (shot.raw is not None or (augmented and shot.depth is not None))
             for shot in sequence.shots
         ]
         found += [(s, pair) for pair in own if fit[pair.i] and fit[pair.j]]
@@ -156,14 +161,20 @@ def trainable(sequences: Items[Sequence], pairs: Items[Items[Pair]]) -> list[tup
 
 
 def split_data(
-    sequences: Items[Sequence], pairs: Items[Items[Pair]], size: int, validation: int, max_pairs: int, patch: int = 16
+    sequences: Items[Sequence],
+    pairs: Items[Items[Pair]],
+    size: int,
+    validation: int,
+    max_pairs: int,
+    patch: int = 16,
+    augmented: bool = True,
 ) -> tuple[PairData, PairData]:
     """Training and validation pairs, both spread evenly over all sequences. Raises InputError where none is trainable.
 
     At most a fifth of the pairs is held back. Validation pairs come from the same dives as the training pairs: they
     tell when training stops helping, not how it generalises, for which the data sets have test sequences.
     """
-    found = trainable(sequences, pairs)
+    found = trainable(sequences, pairs, augmented)
     held = set(_evenly(len(found), min(validation, len(found) // 5)))
     kept = [i for i in range(len(found)) if i not in held]
     if max_pairs:
@@ -171,7 +182,8 @@ def split_data(
     if not kept:
         raise InputError(
             "no pair of shots can be trained on",
-            cause="training needs a clean picture per shot, a raw one or depth, and two shots of one training sequence",
+            cause="training needs a clean picture per shot, a raw one (or, with the water augmentation, depth), and "
+            "two shots of one training sequence",
             hint="swimm3r datasets ROOT shows what was found",
         )
 

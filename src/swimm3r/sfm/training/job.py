@@ -57,7 +57,15 @@ def train_sfm(
             for s, own in zip(sequences, pairs, strict=True)
         ]
         pairs = [[*own, *more] for own, more in zip(pairs, found, strict=True)]
-    train, validation = split_data(sequences, pairs, settings.size, settings.validation, settings.max_pairs, patch)
+    train, validation = split_data(
+        sequences,
+        pairs,
+        settings.size,
+        settings.validation,
+        settings.max_pairs,
+        patch,
+        augmented=settings.water_probability > 0,
+    )
     return loop.train(network, base, train, validation, settings, folder, score, announce, progress)
 
 

@@ -14,13 +14,13 @@ the gradients; the losses are means over pairs, so the curve is that of one proc
 import hashlib
 import json
 import os
-import sys
 import time
 from collections.abc import Callable, Iterator
 from concurrent.futures import Future, ThreadPoolExecutor
 from contextlib import contextmanager, nullcontext
 from dataclasses import asdict, dataclass, replace
 from pathlib import Path
+from typing import Any
 
 import torch
 import torch.distributed as dist
@@ -28,6 +28,8 @@ from torch import Tensor
 from torch.nn.parallel import DistributedDataParallel
 
 from swimm3r.errors import InputError, UsageError
+from swimm3r.io.metrics_log import drop_rows_after
+from swimm3r.memory import MB, peak_mb
 from swimm3r.progress import Progress, silent
 from swimm3r.sfm import adapter_file
 from swimm3r.sfm.adapter_file import Base, trained_parameters
@@ -35,14 +37,14 @@ from swimm3r.sfm.mast3r.network import Mast3r
 from swimm3r.sfm.student import Student, new_student
 from swimm3r.sfm.training.data import PairData, PairItem
 from swimm3r.sfm.training.settings import TrainSettings
-from swimm3r.sfm.training.state import Rows, forget_rows_after, resume, write_state
+from swimm3r.sfm.training.state import Rows, resume, write_state
 from swimm3r.sfm.training.teacher_cache import TeacherCache
 
 _ORDER, _WATER = 1, 2  # purposes of randomness
 _TERMS = ("encoder", "decoder", "descriptors", "forward", "inverse", "overshoot", "anchor", "known_water", "clean")
 _LOADERS = 4  # threads that read and resize pictures while the network works
 
-Validate = Callable[[Student, PairData], dict[str, float | None]]
+Validate = Callable[[Student, PairData], dict[str, Any]]
 
 
 @dataclass(frozen=True)
@@ -65,7 +67,7 @@ class Estimate:
     steps: int
     trained: int  # numbers
     seconds_per_step: float
-    peak_mb: float  # of the device, or of the process where there is no accelerator
+    peak_mb: float | None  # of the device, or of the process where there is no accelerator; None where unknown
 
     @property
     def hours(self) -> float:
@@ -119,7 +121,7 @@ def _run(
     done = resume(student, optimiser, state, mark)
     if workers.first:
         folder.mkdir(parents=True, exist_ok=True)
-        forget_rows_after(metrics, done)
+        drop_rows_after(metrics, done)
         if done < total:
             announce(_estimate(student, data, settings, total, size, workers))
     model = _shared(student) if workers.count > 1 else student
@@ -142,12 +144,13 @@ def _run(
             if workers.first and (step % settings.log_every == 0 or ends_epoch):
                 rows.write(step)
             if workers.first and ends_epoch:
+                about: dict[str, Any] = {"step": step, "epoch": step // per_epoch, "settings": asdict(settings)}
                 if len(validation):
                     student.eval()
                     with torch.no_grad():
-                        rows.append({"step": step, "validation": validate(student, validation)})
+                        about["validation"] = validate(student, validation)
                     student.train()
-                about = {"step": step, "epoch": step // per_epoch, "settings": asdict(settings)}
+                    rows.append({"step": step, "validation": about["validation"]})
                 adapter_file.save(student, base, adapter, about)
             if workers.first and (step % settings.checkpoint_every == 0 or ends_epoch):
                 write_state(student, optimiser, state, {"step": step, "fingerprint": mark})
@@ -269,15 +272,10 @@ def _estimate(
     return Estimate(len(data), total, trained, seconds, _peak_mb(device))
 
 
-def _peak_mb(device: torch.device) -> float:
+def _peak_mb(device: torch.device) -> float | None:
     if device.type == "cuda":
-        return torch.cuda.max_memory_allocated(device) / 1e6
-    try:
-        import resource
-    except ImportError:  # Windows has none
-        return float("nan")
-    unit = 1e6 if sys.platform == "darwin" else 1e3  # bytes there, kilobytes elsewhere
-    return resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / unit
+        return torch.cuda.max_memory_allocated(device) / MB
+    return peak_mb()
 
 
 def _mean_over_workers(terms: dict[str, Tensor], workers: Workers) -> dict[str, float]:

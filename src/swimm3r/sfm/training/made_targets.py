@@ -10,7 +10,7 @@ halves, green and blue gain little. What is made stays within the training's fol
 
 import json
 from collections.abc import Sequence as Items
-from dataclasses import replace
+from dataclasses import dataclass, replace
 from pathlib import Path
 
 import torch
@@ -20,7 +20,9 @@ from torch import Tensor
 from swimm3r.datasets.sequences import Sequence, Shot, load
 from swimm3r.errors import InputError
 from swimm3r.io.atomic import write_text
+from swimm3r.io.damage import remake
 from swimm3r.io.images import write_rgb
+from swimm3r.io.json_file import read_json
 from swimm3r.medium import MediumFit, linear_from_srgb, remove_water
 from swimm3r.progress import Progress, silent
 from swimm3r.sfm.seathru import fit_medium
@@ -29,6 +31,15 @@ from swimm3r.sfm.training.data import nearest_known
 from swimm3r.sfm.water_samples import WaterSamples
 
 _MARK = "made.json"
+
+
+@dataclass(frozen=True)
+class _Mark:
+    """made.json, the last file of a folder of targets."""
+
+    pictures: tuple[str, ...]
+
+
 _KIND = "Sea-Thru"
 
 
@@ -71,7 +82,7 @@ def restored(raw: Float[Tensor, "h w 3"], z_depth: Float[Tensor, "h w"], water: 
 def _made(sequence: Sequence, folder: Path, progress: Progress) -> Sequence:
     names = [shot.name for shot in sequence.shots if shot.depth is not None]
     mark = folder / _MARK
-    if not (mark.is_file() and json.loads(mark.read_text(encoding="utf-8"))["pictures"] == names):
+    if not (mark.is_file() and list(read_json(mark, _Mark, remake(folder)).pictures) == names):
         try:
             water = scene_water(sequence, SeathruSettings())
         except InputError as error:  # one scene without water must not stop the training on all others

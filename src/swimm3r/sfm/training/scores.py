@@ -6,12 +6,15 @@
     restored_psnr      of the clear picture by the head's water at true ray depth, dB over the pixels of known depth
     raw_psnr           of the picture as taken: what restoration starts from
     loss               L_SfM
+    water_error        of the head's coefficients in water that the augmentation draws, and so is known: the 68th
+                       percentile of |estimate / truth - 1| over frames, one standard error, per coefficient and channel
 
 None where the pairs do not know the truth.
 """
 
 import math
 from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
 import torch
@@ -30,6 +33,8 @@ from swimm3r.sfm.training.data import PairData, PairItem, TwoViews
 
 _MIN_MATCHES = 8
 _LOST = 180.0  # degrees
+_ONE_STD = 0.683  # share of a normal distribution within one standard deviation
+_COEFFICIENTS = ("Binf", "beta_D", "beta_B")
 
 
 @dataclass(frozen=True)
@@ -38,7 +43,7 @@ class _PoseError:
     translation_deg: float
 
 
-def score(student: Student, data: PairData) -> dict[str, float | None]:
+def score(student: Student, data: PairData) -> dict[str, Any]:
     """The scores of a validation set; call it with gradients off."""
     found: dict[str, list[float]] = {
         name: [] for name in ("depth_absrel", "rotation_deg", "translation_deg", "restored_psnr", "raw_psnr", "loss")
@@ -48,7 +53,31 @@ def score(student: Student, data: PairData) -> dict[str, float | None]:
         for name, value in _score_pair(student, item, data.two_views(index)).items():
             found[name].append(value)
     median = ("rotation_deg", "translation_deg")
-    return {n: (float(np.median(v) if n in median else np.mean(v)) if v else None) for n, v in found.items()}
+    scores = {n: (float(np.median(v) if n in median else np.mean(v)) if v else None) for n, v in found.items()}
+    return {**scores, "water_error": water_error(student, data)}
+
+
+def water_error(student: Student, data: PairData) -> dict[str, list[float]] | None:
+    """Relative standard error of every coefficient of the head's water, R G B, where the augmentation draws water.
+
+    None without a head, and for a set none of whose pairs has both a clear image and depth.
+    """
+    if student.head is None:
+        return None
+    device = student.network.decoder_embed.weight.device
+    ratios = []  # [coefficient, channel] per frame
+    for index in range(len(data)):
+        item = data.item(index, 1.0, torch.Generator().manual_seed(index))
+        medium = student.water(student.network.encode(item.raw.to(device))).at(item.ray_depth.to(device))
+        for view in range(2):
+            known, drawn = item.valid[view], item.drawn[view]
+            if bool(known.any()) and bool(drawn.isfinite().all()):
+                read = [getattr(medium, name)[view].cpu()[known].median(0).values for name in _COEFFICIENTS]
+                ratios.append(torch.stack(read) / drawn.clamp(min=1e-6) - 1)
+    if not ratios:
+        return None
+    error = torch.stack(ratios).double().abs().quantile(_ONE_STD, dim=0)
+    return dict(zip(_COEFFICIENTS, error.tolist(), strict=True))
 
 
 def _score_pair(student: Student, item: PairItem, truth: TwoViews | None) -> dict[str, float]:

@@ -4,66 +4,49 @@ from dataclasses import dataclass, field, replace
 from typing import Literal
 
 from swimm3r.datasets.settings import PairSettings
-from swimm3r.errors import UsageError
+from swimm3r.settings import Count, CountOrZero, DecayingRate, NetworkSide, NotNegative, Seed, Settings, Share
 from swimm3r.sfm.mast3r.settings import LoraSettings, ObjectiveSettings
 
 
 @dataclass(frozen=True)
-class TrainSettings:
+class TrainSettings(Settings):
     """Distillation of the frozen network into its low-rank student, with the physics head (`sfm/training.py`)."""
 
     lora: LoraSettings = field(default_factory=LoraSettings)
     objective: ObjectiveSettings = field(default_factory=ObjectiveSettings)
     pairs: PairSettings = field(default_factory=PairSettings)
-    water_probability: float = 0.5
-    """p of the paper's parametric water-type augmentation."""
-    learning_rate: float = 5e-4
-    cool_down: float = 0.0
+    water_probability: Share = 0.5
+    """p of the paper's parametric water-type augmentation. 0 turns it off and leaves out images taken in air, which
+    have no raw image of their own."""
+    learning_rate: DecayingRate = 5e-4
+    cool_down: Share = 0.0
     """Share of the steps, at the end, in which the learning rate falls to 0 along a line; the paper names no
     schedule. Short trainings gain from it."""
-    weight_decay: float = 1e-4
-    epochs: int = 20
-    batch: int = 4
+    weight_decay: NotNegative = 1e-4
+    epochs: Count = 20
+    batch: Count = 4
     """Pairs per step, over all processes together."""
-    micro_batch: int = 0
+    micro_batch: CountOrZero = 0
     """Pairs per forward pass, their gradients added up to the batch; 0 is the whole batch. Less memory, same result."""
-    size: int = 512
+    size: NetworkSide = 512
     """Long side of the network's pictures, pixels."""
     precision: Literal["auto", "float32", "bfloat16"] = "auto"
     """Of the frozen trunk; adapters, heads and losses stay float32. auto: bfloat16 on a GPU."""
-    seed: int = 0
+    seed: Seed = 0
     """Decides adapters, head, order of the pairs and water."""
-    validation: int = 16
+    validation: CountOrZero = 16
     """Pairs drawn from the training sequences, never trained on, scored after each epoch; 0 for none."""
-    max_pairs: int = 0
+    max_pairs: CountOrZero = 0
     """Most pairs trained on, drawn evenly; 0 is no limit."""
-    log_every: int = 10
+    log_every: Count = 10
     """Steps between rows of metrics.jsonl, each the mean of its steps."""
     tensorboard: bool = False
     """Write the rows of metrics.jsonl for TensorBoard, too (pip install tensorboard)."""
-    teacher_cache_mb: int = 0
+    teacher_cache_mb: CountOrZero = 0
     """Disk for the teacher's features, so that it looks at each pair once: 20 MB per pair at 512 x 320. 0 computes them
     anew in each epoch."""
-    checkpoint_every: int = 200
+    checkpoint_every: Count = 200
     """Steps between states that an interrupted training goes on from; the end of an epoch is always one."""
-
-    def __post_init__(self) -> None:
-        positive = ("learning_rate", "epochs", "batch", "log_every", "checkpoint_every")
-        wrong = [name for name in positive if not getattr(self, name) > 0]
-        wrong += [
-            n
-            for n in ("weight_decay", "micro_batch", "validation", "max_pairs", "teacher_cache_mb")
-            if not getattr(self, n) >= 0
-        ]
-        wrong += [name for name in ("water_probability", "cool_down") if not 0 <= getattr(self, name) <= 1]
-        if self.size < 16:
-            wrong.append("size")
-        if wrong:
-            raise UsageError(
-                f"{wrong[0]} cannot be {getattr(self, wrong[0])}",
-                cause="a slip in the command or the settings",
-                hint="leave it out for the default; swimm3r train-sfm --help shows them",
-            )
 
 
 def _without(*terms: Literal["forward", "inverse", "saturation"]) -> TrainSettings:
@@ -79,7 +62,8 @@ RECIPES: dict[str, TrainSettings] = {
     "without-inverse": _without("inverse"),
     "without-saturation": _without("saturation"),
     "without-augmentation": replace(TrainSettings(), water_probability=0.0),
-    "distillation-only": _without("forward", "inverse", "saturation"),
+    # its caption: "disables all physics losses and parametric water augmentation"
+    "distillation-only": replace(_without("forward", "inverse", "saturation"), water_probability=0.0),
     # Dark3R as a system of its own: three feature levels alike, the student also on clear pictures, no water
     "dark3r": TrainSettings(
         objective=ObjectiveSettings(

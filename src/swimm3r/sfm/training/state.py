@@ -1,19 +1,19 @@
 """A training's files while it runs: the state it goes on from and the rows of its metrics."""
 
-import json
 import logging
 import time
 from collections.abc import Iterator, Mapping
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
 import torch
-from safetensors import SafetensorError, safe_open
-from safetensors.torch import save_file
 from torch import Tensor
 
-from swimm3r.errors import InputError, UsageError
-from swimm3r.io.atomic import atomic_path, write_text
+from swimm3r.errors import UsageError
+from swimm3r.io import metrics_log
+from swimm3r.io.damage import Remedy, damaged
+from swimm3r.io.tensor_file import read_tensors, write_tensors
 from swimm3r.sfm.adapter_file import trained_parameters
 from swimm3r.sfm.student import Student
 
@@ -26,9 +26,13 @@ def write_state(student: Student, optimiser: torch.optim.Optimizer, path: Path, 
     for name, parameter in trained_parameters(student).items():
         stored[f"parameter/{name}"] = parameter
         stored |= {f"{key}/{name}": value for key, value in optimiser.state[parameter].items()}
-    stored = {key: value.detach().cpu().contiguous() for key, value in stored.items()}
-    with atomic_path(path) as draft:
-        save_file(stored, draft, {"swimm3r": json.dumps(about)})
+    write_tensors(path, stored, about)
+
+
+@dataclass(frozen=True)
+class _Header:
+    step: int
+    fingerprint: str
 
 
 def resume(student: Student, optimiser: torch.optim.Optimizer, path: Path, mark: str) -> int:
@@ -38,22 +42,27 @@ def resume(student: Student, optimiser: torch.optim.Optimizer, path: Path, mark:
     """
     if not path.is_file():
         return 0
-    try:
-        with safe_open(path, "pt") as file:
-            about = json.loads((file.metadata() or {})["swimm3r"])
-            stored = {name: file.get_tensor(name) for name in file.keys()}  # noqa: SIM118
-    except (OSError, SafetensorError, ValueError, KeyError) as error:
-        raise _foreign(path, str(error).splitlines()[0]) from error
-    if about["fingerprint"] != mark:
-        raise _foreign(path, "it is of a training with other settings, data or base weights")
+    kept_state = read_tensors(path, _Header, _remedy(path), None)
+    stored, about = kept_state.tensors, kept_state.about
+    if about.fingerprint != mark:
+        raise damaged(path, "it is of a training with other settings, data or base weights", _remedy(path))
     for name, parameter in trained_parameters(student).items():
+        _check_shapes(stored, name, parameter, path)
         parameter.data.copy_(stored[f"parameter/{name}"])
         kept = {k: stored[f"{k}/{name}"] for k in ("step", "exp_avg", "exp_avg_sq") if f"{k}/{name}" in stored}
         if kept:  # a parameter that never had a gradient has no moments
             moments = {k: v if k == "step" else v.to(parameter.device) for k, v in kept.items()}
             optimiser.state[parameter] = moments
-    log.info("going on from step %d", about["step"])
-    return int(about["step"])
+    log.info("going on from step %d", about.step)
+    return about.step
+
+
+def _check_shapes(stored: Mapping[str, Tensor], name: str, parameter: Tensor, path: Path) -> None:
+    """Raise InputError where a parameter or its moments are missing or of another shape."""
+    moments = [f"{key}/{name}" for key in ("exp_avg", "exp_avg_sq") if f"step/{name}" in stored]
+    for key in (f"parameter/{name}", *moments):
+        if key not in stored or stored[key].shape != parameter.shape:
+            raise damaged(path, f"{key} is not of the shape {tuple(parameter.shape)}", _remedy(path))
 
 
 class Rows:
@@ -85,8 +94,7 @@ class Rows:
 
     def append(self, row: dict[str, object]) -> None:
         """A row as given."""
-        with self._path.open("a", encoding="utf-8") as file:
-            file.write(json.dumps(row) + "\n")
+        metrics_log.append_row(self._path, row)
         if self._writer is not None:
             step = row["step"]
             for name, value in _flat(row):
@@ -115,17 +123,9 @@ def _tensorboard(folder: Path) -> Any:
     return SummaryWriter(str(folder))
 
 
-def forget_rows_after(metrics: Path, done: int) -> None:
-    """Rows of steps that will be done again, and a row cut off in the middle, are dropped."""
-    if metrics.is_file():
-        rows = metrics.read_text(encoding="utf-8").splitlines()
-        whole = [row for row in rows if row.endswith("}") and json.loads(row)["step"] <= done]
-        write_text(metrics, "".join(row + "\n" for row in whole))
-
-
-def _foreign(path: Path, why: str) -> InputError:
-    return InputError(
-        f"the training in {path.parent} cannot go on: {why}",
+def _remedy(path: Path) -> Remedy:
+    return Remedy(
+        f"another --out, or remove {path} to start anew",
         cause="the folder holds another training, or its state is damaged",
-        hint="another --out, or delete the folder to start anew",
+        fault="cannot go on",
     )

@@ -13,7 +13,7 @@ from dataclasses import dataclass
 
 import torch
 
-from swimm3r.splat import gaussian_mcmc, losses, training
+from swimm3r.splat import gaussian_mcmc, losses, schedule, training
 from swimm3r.splat.gaussian_settings import McmcGsSettings
 from swimm3r.splat.medium_field import MediumField
 from swimm3r.splat.optimiser import adam_step
@@ -53,7 +53,7 @@ class McmcGs:
             parameters = parameters_of(state.primitives, state.field, state.poses)
             rates = rates_of(self.site, settings, step, parameters)
             adam_step(parameters, gradients, state.moments, rates)
-            if self._densifies(step):
+            if schedule.has_round(settings.densify, step, settings.iterations):
                 state, counts = self._densified(state, step)
                 numbers |= counts
             rng = training.generator(settings.seed, step, 8)
@@ -61,18 +61,9 @@ class McmcGs:
             p.xyz.add_(gaussian_mcmc.noise(p, d.noise * rates["xyz"], d.dead_opacity, rng))
         return state, numbers
 
-    def _every(self) -> int:
-        d = self.settings.densify
-        return max(d.min_every, round(d.every * self.settings.iterations))
-
-    def _densifies(self, step: int) -> bool:
-        d, share = self.settings.densify, step / self.settings.iterations
-        return step % self._every() == 0 and d.begin < share <= d.end
-
     def _densified(self, state: InField, step: int) -> tuple[InField, dict[str, float]]:
         d, n = self.settings.densify, len(state.primitives.xyz)
-        growth = d.growth ** (self._every() / (d.every * self.settings.iterations))
-        target = max(n, min(self.settings.max_primitives, int(growth * n)))
+        target = schedule.grown(n, self.settings.max_primitives, d.growth, d, self.settings.iterations)
         rng = training.generator(self.settings.seed, step, 4)
         done = gaussian_mcmc.relocate_and_grow(state.primitives, target, d.dead_opacity, rng)
         rows = torch.arange(target, device=state.primitives.xyz.device)

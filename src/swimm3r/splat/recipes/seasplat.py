@@ -23,7 +23,7 @@ from torch import Tensor
 from torch.nn.functional import relu, smooth_l1_loss
 
 from swimm3r.raster import RasterOutput
-from swimm3r.splat import gradient_densify, losses, training
+from swimm3r.splat import gradient_densify, losses, schedule, training
 from swimm3r.splat.gaussian_settings import SeaSplatSettings, SeaSplatWeights
 from swimm3r.splat.gaussians import GaussianPrimitives
 from swimm3r.splat.optimiser import Moments, adam_step, fresh
@@ -130,7 +130,7 @@ class SeaSplat:
         """Multiply and cull, and cut opacities back, each on its cadence."""
         d, p, moments, memory = self.settings.densify, state.primitives, state.moments, state.memory
         cut_every = self._share(d.reset_every) if d.reset_every else self.settings.iterations
-        if step % max(d.min_every, self._share(d.every)) == 0:
+        if step % schedule.steps_between(d, self.settings.iterations) == 0:
             rng = training.generator(self.settings.seed, step, 4)
             large, most = d.large * self.site.radius, self.settings.max_primitives
             done = gradient_densify.multiply(p, memory, d.pull, large, most, rng)

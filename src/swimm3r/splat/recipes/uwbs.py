@@ -1,4 +1,4 @@
-"""Underwater Beta Splatting: the objective of Eq. uwbs_total, its schedule, and one step of it.
+"""Underwater Beta Splatting: the objective of Eq. 18, its schedule, and one step of it.
 
 L = L_3DGS + lambda_opa L_opa + lambda_scale L_scale + lambda_depth L_depth + lambda_smooth L_smooth + lambda_rad L_rad
 
@@ -10,13 +10,13 @@ from collections.abc import Collection
 from dataclasses import dataclass
 
 import torch
-from jaxtyping import Float, Int
+from jaxtyping import Float
 from torch import Tensor
 
 from swimm3r.devices import CPU
 from swimm3r.medium import Medium, MediumFit
 from swimm3r.reconstruction import Reconstruction
-from swimm3r.splat import densify, losses, training
+from swimm3r.splat import densify, losses, schedule, training
 from swimm3r.splat.gradients import differentiate
 from swimm3r.splat.medium_field import (
     WaterPrior,
@@ -41,13 +41,12 @@ _HORIZON_STD = 0.2  # of the open water's colour around the scene's mean colour,
 
 
 @dataclass(frozen=True)
-class _Round:
-    """A round of densification in the middle of a step."""
+class _Adjoint:
+    """What one view asks of the parameters."""
 
-    state: State
-    gradients: dict[str, Tensor]
-    stale: Int[Tensor, " m"]  # rows that are not what the gradient was taken of
-    counts: dict[str, float]
+    gradients: dict[str, Tensor]  # by the names of `parameters_of`
+    multiplier: Float[Tensor, " n"] | None  # of the centers' displacement (Alg. 1); None for Adam's own
+    numbers: training.Numbers
 
 
 @dataclass(frozen=True)
@@ -74,11 +73,20 @@ class Uwbs:
         return first_state(p, field, self.site.codes(settings.poses, training.generator(settings.seed, 0, 6)))
 
     def step(self, state: State, view: View, step: int) -> tuple[State, training.Numbers]:
-        """One view: forward, adjoint, densification on its cadence, Adam."""
-        settings, share = self.settings, step / self.settings.iterations
+        """One view: forward and adjoint, densification on its cadence, Adam."""
         if self._looks_for_movers(step):
             state = self._with_movers(state, step)
-        parameters = parameters_of(state.primitives, state.field, state.poses)
+        adjoint = self._adjoint(state, view, step)
+        rates = self._rates(step, adjoint.gradients)
+        if schedule.has_round(self.settings.densify, step, self.settings.iterations):
+            state, adjoint = self._densified(state, adjoint, step, rates["xyz"])
+        clip_field(adjoint.gradients)
+        self._descend(state, adjoint, rates, step)
+        return state, adjoint.numbers
+
+    def _adjoint(self, state: State, view: View, step: int) -> _Adjoint:
+        """Gradients of the objective and the epipolar error in one view; the centers' by Alg. 1 while it lasts."""
+        settings, share = self.settings, step / self.settings.iterations
         p = BetaPrimitives(*(values.detach().requires_grad_() for values in state.primitives))
         filtered = settings.sgg.enabled and share <= settings.sgg.end
         sight = self.site.sight(view, state.poses)
@@ -90,52 +98,36 @@ class Uwbs:
         if off is not None:
             total = total + settings.poses.epipolar * off.to(total)
             numbers |= {"epipolar_px": off}
-        leaves = [*p, *state.field.parameters(), *(state.poses.parameters() if state.poses else ())]
-        multiplier = None
-        if filtered:
-            sgg = differentiate(total, loss.depth, leaves, p, drawing, sight, settings)
-            gradients = dict(zip(parameters, sgg.gradients, strict=True))
-            gradients["xyz"] = gradients["xyz"] + sgg.xyz
-            multiplier = sgg.multiplier
-            pulled = sgg.uncertainty > 0
-            numbers |= {"medium_uncertainty": sgg.uncertainty.sum() / pulled.sum().clamp(min=1)}
-        else:
-            found = torch.autograd.grad(total, leaves, materialize_grads=True)
-            gradients = dict(zip(parameters, found, strict=True))
-        rates = self._rates(step, parameters)
-        if self._densifies(step):
-            round_ = self._densified(state, gradients, step, rates["xyz"])
-            state, gradients = round_.state, round_.gradients
-            numbers |= round_.counts
-            if multiplier is not None:
-                multiplier = _extended(multiplier, len(state.primitives.xyz) - len(multiplier))
-                multiplier[round_.stale] = 1
-        clip_field(gradients)
-        with torch.no_grad():
-            parameters = parameters_of(state.primitives, state.field, state.poses)
-            before = None if multiplier is None else parameters["xyz"].clone()
-            held = ways(state.primitives) if settings.dynamic and settings.movers.at else None
-            adam_step(parameters, gradients, state.moments, rates)
-            if held is not None:  # each frame would bend them to its own moment, and what is between would be lost
-                for name, values in held.values.items():
-                    parameters[name][held.rows] = values
-            if multiplier is not None and before is not None:
-                parameters["xyz"].sub_(before).mul_(multiplier[:, None]).add_(before)
-            if settings.densify.noise_cadence == "step":
-                rng = training.generator(settings.seed, step, 8)
-                parameters["xyz"].add_(self._noise(state.primitives, rates["xyz"], rng))
-        return state, numbers
+        leaves = parameters_of(p, state.field, state.poses)
+        if not filtered:
+            found = torch.autograd.grad(total, [*leaves.values()], materialize_grads=True)
+            return _Adjoint(dict(zip(leaves, found, strict=True)), None, numbers)
+        sgg = differentiate(total, loss.depth, [*leaves.values()], p, drawing, sight, settings)
+        gradients = dict(zip(leaves, sgg.gradients, strict=True))
+        gradients["xyz"] = gradients["xyz"] + sgg.xyz
+        pulled = sgg.uncertainty > 0
+        numbers |= {"medium_uncertainty": sgg.uncertainty.sum() / pulled.sum().clamp(min=1)}
+        return _Adjoint(gradients, sgg.multiplier, numbers)
+
+    @torch.no_grad()
+    def _descend(self, state: State, adjoint: _Adjoint, rates: dict[str, float], step: int) -> None:
+        """Adam's step in place, the centers' displacement multiplied (Alg. 1), and noise where every step has it."""
+        parameters = parameters_of(state.primitives, state.field, state.poses)
+        xyz, multiplier = parameters["xyz"], adjoint.multiplier
+        before = None if multiplier is None else xyz.clone()
+        held = ways(state.primitives) if self.settings.dynamic and self.settings.movers.at else None
+        adam_step(parameters, adjoint.gradients, state.moments, rates)
+        if held is not None:  # each frame would bend them to its own moment, and what is between would be lost
+            for name, values in held.values.items():
+                parameters[name][held.rows] = values
+        if multiplier is not None and before is not None:
+            xyz.sub_(before).mul_(multiplier[:, None]).add_(before)
+        if self.settings.densify.noise_cadence == "step":
+            rng = training.generator(self.settings.seed, step, 8)
+            xyz.add_(self._noise(state.primitives, rates["xyz"], rng))
 
     def _regularised(self, share: float) -> bool:
         return self.settings.weights.mcmc_begin < share <= self.settings.weights.mcmc_end
-
-    def _every(self) -> int:
-        d = self.settings.densify
-        return max(d.min_every, round(d.every * self.settings.iterations))
-
-    def _densifies(self, step: int) -> bool:
-        d, share = self.settings.densify, step / self.settings.iterations
-        return step % self._every() == 0 and d.begin < share <= d.end
 
     def _looks_for_movers(self, step: int) -> bool:
         return self.settings.dynamic and step == round(self.settings.movers.at * self.settings.iterations)
@@ -175,36 +167,39 @@ class Uwbs:
         strength = d.noise_dynamic if self.settings.dynamic else d.noise
         return densify.noise(p, strength * rate, d, self.settings.render.rotation, rng)
 
-    def _densified(self, state: State, gradients: dict[str, Tensor], step: int, rate: float) -> _Round:
+    @torch.no_grad()
+    def _densified(self, state: State, adjoint: _Adjoint, step: int, rate: float) -> tuple[State, _Adjoint]:
         """Relocation and growth, then noise; rows that start anew get no gradient of this step."""
         d = self.settings.densify
         n = len(state.primitives.xyz)
-        growth = d.growth ** (self._every() / (d.every * self.settings.iterations))
-        target = max(n, min(round((1 - self._kept_free(step)) * d.max_primitives), int(growth * n)))
+        most = round((1 - self._kept_free(step)) * d.max_primitives)
+        target = schedule.grown(n, most, d.growth, d, self.settings.iterations)
         rng = training.generator(self.settings.seed, step, 4)
-        with torch.no_grad():
-            done = densify.relocate_and_grow(state.primitives, target, d.dead_opacity, rng)
-            p = done.primitives
-            if d.noise_cadence == "round":
-                p = p._replace(xyz=p.xyz + self._noise(p, rate, rng))
-            moments, gradients = dict(state.moments), dict(gradients)
-            appended = len(p.xyz) - n
-            rows = torch.arange(len(done.source), device=done.source.device)
-            stale = torch.cat([done.restarted, (done.source != rows).nonzero()[:, 0]]).unique()
-            for name in BetaPrimitives._fields:
-                m = moments[name]
-                first, second = _extended(m.first, appended), _extended(m.second, appended)
-                gradient = _extended(gradients[name], appended)
-                first[done.restarted], second[done.restarted] = 0, 0  # as UBS: sources and copies, not the slots reused
-                gradient[stale] = 0
-                moments[name], gradients[name] = Moments(first, second, m.steps), gradient
+        done = densify.relocate_and_grow(state.primitives, target, d.dead_opacity, rng)
+        p = done.primitives
+        if d.noise_cadence == "round":
+            p = p._replace(xyz=p.xyz + self._noise(p, rate, rng))
+        moments, gradients, multiplier = dict(state.moments), dict(adjoint.gradients), adjoint.multiplier
+        appended = len(p.xyz) - n
+        rows = torch.arange(len(done.source), device=done.source.device)
+        stale = torch.cat([done.restarted, (done.source != rows).nonzero()[:, 0]]).unique()
+        for name in BetaPrimitives._fields:
+            m = moments[name]
+            first, second = _extended(m.first, appended), _extended(m.second, appended)
+            gradient = _extended(gradients[name], appended)
+            first[done.restarted], second[done.restarted] = 0, 0  # as UBS: sources and copies, not the slots reused
+            gradient[stale] = 0
+            moments[name], gradients[name] = Moments(first, second, m.steps), gradient
+        if multiplier is not None:
+            multiplier = _extended(multiplier, appended)
+            multiplier[stale] = 1
         counts = {"relocated": float(done.relocated), "added": float(done.added)}
-        return _Round(State(p, state.field, state.poses, moments), gradients, stale, counts)
+        return State(p, state.field, state.poses, moments), _Adjoint(gradients, multiplier, adjoint.numbers | counts)
 
 
 @dataclass(frozen=True)
 class Objective:
-    """Eq. uwbs_total for one view."""
+    """Eq. 18 for one view."""
 
     total: Float[Tensor, ""]
     depth: Float[Tensor, ""]  # the depth regulariser as it stands in the total
@@ -219,15 +214,17 @@ def objective(
     prior: WaterPrior | None,
     regularised: bool,
 ) -> Objective:
-    """Eq. uwbs_total. Opacity and scale count only while `regularised`."""
+    """Eq. 18 and the terms beyond it. Opacity and scale count only while `regularised`."""
     w = settings.weights
     photo = losses.photometric(drawing.images.rgb, view.rgb, view.seen, w.ssim)
-    depth_error = losses.depth_error(drawing.images, view.z_depth, view.depth_weight, w.depth_alpha)
+    edges = losses.edge_weight(view.rgb, w.depth_edges)
+    depth_error = losses.depth_error(drawing.images, view.z_depth, edges, w.depth_alpha)
     smooth = smoothness(drawing.grid)
-    open_share = losses.uncovered(drawing.images, view.depth_weight)
+    open_share = losses.uncovered(drawing.images, view.z_depth)
     on_water = losses.drawn_on_water(drawing.images, view.open_water)
     outside = losses.outside_gamut(p, drawing.projection.radius)
-    large = losses.oversize(p, drawing.projection.radius, w.max_radius * view.camera.width / 1280)
+    shrunk = view.camera.width / w.max_radius_width if w.max_radius_width else 1.0
+    large = losses.oversize(p, drawing.projection.radius, w.max_radius * shrunk)
     depth = w.depth * depth_error
     total = photo.loss + depth + w.medium_smoothness * smooth + w.radius * large
     total = total + w.coverage * open_share + w.open_water * on_water + w.gamut * outside

@@ -20,7 +20,7 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
-from swimm3r.splat import gradient_densify, losses, training
+from swimm3r.splat import gradient_densify, losses, schedule, training
 from swimm3r.splat.gaussian_settings import WaterSplattingSettings
 from swimm3r.splat.medium_field import initial_field
 from swimm3r.splat.optimiser import adam_step, log_linear
@@ -77,13 +77,12 @@ class WaterSplatting:
         return max(1, self.settings.first_divisor >> doublings)
 
     def _every(self) -> int:
-        d = self.settings.densify
-        return max(d.min_every, round(d.every * self.settings.iterations))
+        return schedule.steps_between(self.settings.densify, self.settings.iterations)
 
     def _period(self) -> int:
         """Steps from one cut of the opacities to the next; all of the run where there is none."""
         d = self.settings.densify
-        return self._every() * round(d.reset_every / d.every) if d.reset_every else self.settings.iterations
+        return self._every() * max(1, round(d.reset_every / d.every)) if d.reset_every else self.settings.iterations
 
     def _round(self, state: InField, step: int) -> InField:
         """Multiply and cull; cut opacities back on their cadence."""

@@ -1,0 +1,80 @@
+"""Keys of results that are kept on disk: another key wherever anything that decided the result is another.
+
+A result is decided by its settings, by the content of the files it was made from (weights among them, or that there
+were none) and by the code that made it. The code counts as its statements: comments, docstrings and the modules that
+only show results leave a key as it is, so that kept results survive an edit that cannot have changed them.
+"""
+
+import ast
+import json
+from dataclasses import asdict, is_dataclass
+from functools import cache, lru_cache
+from hashlib import file_digest, sha256
+from importlib.metadata import version
+from pathlib import Path
+from typing import Any
+
+_ONLY_SHOWS = ("cli", "report", "export")
+_LENGTH = 32  # hexadecimal digits
+
+
+def cache_key(*parts: object) -> str:
+    """The key of a result that these decided: plain values, paths (as they are written), dataclasses of such."""
+    text = json.dumps([_plain(part) for part in parts], sort_keys=True)
+    return sha256(text.encode()).hexdigest()[:_LENGTH]
+
+
+def content_digest(path: Path | None) -> str | None:
+    """Of a file's bytes, or of all files below a folder with their names; None where there is nothing."""
+    if path is None or not path.exists():
+        return None
+    if path.is_file():
+        stat = path.stat()
+        return _file_digest(path.resolve(), stat.st_size, stat.st_mtime_ns)
+    files = sorted(p for p in path.rglob("*") if p.is_file())
+    return cache_key(*([file.relative_to(path).as_posix(), content_digest(file)] for file in files))
+
+
+@cache
+def code_version() -> str:
+    """Of the statements of this package, as they lie on disk."""
+    package = Path(__file__).parents[1]
+    digest = sha256(version("swimm3r").encode())
+    for path in sorted(package.rglob("*.py")):
+        if path.relative_to(package).parts[0] not in _ONLY_SHOWS:
+            digest.update(path.relative_to(package).as_posix().encode())
+            digest.update(statements(path.read_text(encoding="utf-8")).encode())
+    return digest.hexdigest()[:_LENGTH]
+
+
+def statements(source: str) -> str:
+    """Python source without what does not run: comments, layout, docstrings."""
+    tree = ast.parse(source)
+    for node in ast.walk(tree):
+        body = getattr(node, "body", None)
+        if isinstance(body, list):
+            node.body = [line for line in body if not _is_text(line)]  # pyright: ignore[reportAttributeAccessIssue]
+    return ast.dump(tree)
+
+
+@lru_cache(maxsize=4096)
+def _file_digest(path: Path, size: int, changed: int) -> str:
+    with path.open("rb") as file:
+        return file_digest(file, "sha256").hexdigest()[:_LENGTH]
+
+
+def _is_text(node: Any) -> bool:
+    return isinstance(node, ast.Expr) and isinstance(node.value, ast.Constant) and isinstance(node.value.value, str)
+
+
+def _plain(value: object) -> object:
+    """What JSON can hold, dataclasses with the names of their types: two of the same fields are not the same."""
+    if is_dataclass(value) and not isinstance(value, type):
+        return {type(value).__name__: _plain(asdict(value))}
+    if isinstance(value, dict):
+        return {str(name): _plain(inner) for name, inner in value.items()}
+    if isinstance(value, list | tuple):
+        return [_plain(inner) for inner in value]
+    if isinstance(value, Path):
+        return str(value)
+    return value

@@ -1,0 +1,73 @@
+"""The README's Python is run as it is printed."""
+
+import re
+from collections.abc import Callable
+from dataclasses import replace
+from importlib.metadata import version
+from pathlib import Path
+
+import numpy as np
+import pytest
+import torch
+
+import swimm3r
+from swimm3r.io.images import read_rgb
+from swimm3r.splat.projection import pinhole
+from swimm3r.splat.settings import DensifySettings, InitialSettings, MediumFieldSettings, UwbsSettings
+
+README = Path(__file__).parents[1] / "README.md"
+
+
+def snippets() -> list[str]:
+    return re.findall(r"^```python\n(.*?)^```", README.read_text(encoding="utf-8"), re.MULTILINE | re.DOTALL)
+
+
+@pytest.fixture
+def beside_a_dive(tmp_path: Path, write_video: Callable[..., Path], monkeypatch: pytest.MonkeyPatch) -> Path:
+    """A folder with dive.mp4, ten frames of 240x160, where the fast preset's map is a tiny one."""
+    swimm3r.write_dive(swimm3r.DiveSettings(frames=10, width=240, height=160), tmp_path / "dive")
+    pictures = [read_rgb(path) for path in sorted((tmp_path / "dive" / "images").iterdir())]
+    write_video(tmp_path / "dive.mp4", pictures, times=[i / 5 for i in range(len(pictures))])
+    tiny = UwbsSettings(
+        iterations=40,
+        long_side=120,
+        initial=InitialSettings(primitives=1500),
+        densify=DensifySettings(max_primitives=2000),
+        medium=MediumFieldSettings(hidden=16),
+    )
+    monkeypatch.setitem(swimm3r.PRESETS, "fast", replace(swimm3r.PRESETS["fast"], splat=tiny))
+    monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path / "cache"))
+    monkeypatch.chdir(tmp_path)
+    return tmp_path
+
+
+def test_the_readmes_python_runs_as_printed(beside_a_dive: Path):
+    (snippet,) = snippets()
+    names: dict = {}
+    exec(compile(snippet, str(README), "exec"), names)
+    out, camera = names["out"], names["camera"]
+    assert isinstance(camera, swimm3r.Cameras)
+    assert out.rgb.shape == (camera.height, camera.width, 3) == (160, 240, 3)
+    for part in re.findall(r"out\.(\w+)", snippet):
+        assert getattr(out, part) is not None
+    assert names["pose"].shape == (4, 4)
+    assert torch.isfinite(names["pose"]).all()
+    np.testing.assert_allclose(names["pose"][:3, :3] @ names["pose"][:3, :3].mT, np.eye(3), atol=1e-5)
+
+
+def test_every_public_name_loads():
+    for name in swimm3r.__all__:
+        assert getattr(swimm3r, name) is not None
+    assert set(swimm3r.__all__) == set(swimm3r._HOME)
+
+
+def test_a_camera_with_distortion_is_refused_with_what_to_do():
+    K, pose = torch.tensor([[[9.0, 0, 4], [0, 9, 3], [0, 0, 1]]]), torch.eye(4)[None].double()
+    lens = swimm3r.Cameras(K, torch.tensor([[0.1]]), pose, 8, 6, "SIMPLE_RADIAL")
+    with pytest.raises(ValueError, match=r"camera\.pinhole\(\)"):
+        pinhole(lens)
+    pinhole(lens.pinhole())
+
+
+def test_the_version_is_that_of_the_distribution():
+    assert swimm3r.__version__ == version("swimm3r")
