@@ -48,6 +48,6 @@ def test_each_variant_lacks_exactly_its_parts(tiny: UwbsSettings):
     assert baseline.seed == full.seed != VARIANTS[0].settings(tiny, 0).seed
 
 
-def test_a_folder_without_structure_from_motion_is_refused(tmp_path: Path, tiny: UwbsSettings):
-    with pytest.raises(InputError, match="no finished structure from motion"):
+def test_another_folder_is_refused(tmp_path: Path, tiny: UwbsSettings):
+    with pytest.raises(InputError, match="is no run folder"):
         ablate([tmp_path], tmp_path / "out", tiny, 1)

@@ -231,7 +231,8 @@ def _prior_residuals(x: np.ndarray, evidence: _Evidence, settings: SeathruSettin
         dark = np.where(dark < 0, 3.0 * dark, np.sqrt(2 * (np.sqrt(1 + dark.clip(0) ** 2) - 1)))
     _, B = _attenuations(x, bins.z_mean)
     floor = settings.dark_std
-    direct = np.logaddexp(0.0, (bins.mean - B) / floor) * floor  # a soft max(., 0)
+    excess = ((bins.mean - B) / floor).clip(-500.0)  # exp(-500) still is a number
+    direct = np.logaddexp(0.0, excess) * floor  # a soft max(., 0)
     expected = x[LOG_MEAN] + _log_transmittance(x, bins.z_mean)
     average = (np.log(direct) - expected) / np.hypot(settings.average_std, floor / direct)
     single = [

@@ -61,10 +61,10 @@ def test_another_picture_mask_size_or_network_is_another_encoding(
     images.write_rgb(tmp_path / "mask.png", np.zeros((48, 64, 3), np.uint8))
     masked = frames.select([0])
     masked = replace(masked, frames=(replace(masked.frames[0], mask=tmp_path / "mask.png"),))
-    smaller = replace(SETTINGS, size=32)
+    other = replace(SETTINGS, size=SETTINGS.size + 16)
     keys = {store.key(0), store.key(1)}
     keys.add(EncodingStore(small_network, network_pictures(masked, SETTINGS), tmp_path).key(0))
-    keys.add(EncodingStore(small_network, network_pictures(frames, smaller), tmp_path).key(0))
+    keys.add(EncodingStore(small_network, network_pictures(frames, other), tmp_path).key(0))
     before = fingerprint(small_network)
     bias = small_network.enc_norm.bias
     bias.data[3] += 1e-3
