@@ -16,12 +16,12 @@ from pathlib import Path
 import torch
 
 from swimm3r.bench import tables
-from swimm3r.bench.ablation_uwbs import COLUMNS
 from swimm3r.bench.cells import Cell, Place, Scores, kept_cell
 from swimm3r.bench.map_scores import map_scores, trained
-from swimm3r.held_out import FirstPose
-from swimm3r.presets import PRESETS
-from swimm3r.run import FinishedSfm, open_finished_sfm
+from swimm3r.bench.protocols.ablation_uwbs import COLUMNS
+from swimm3r.pipeline.held_out import FirstPose
+from swimm3r.pipeline.presets import PRESETS
+from swimm3r.pipeline.run import FinishedSfm, open_finished_sfm
 from swimm3r.splat.settings import PoseRefinementSettings, SggSettings, UwbsSettings
 
 TERMS = ("medium_prior", "coverage", "open_water", "gamut")

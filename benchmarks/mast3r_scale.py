@@ -28,14 +28,14 @@ def peak_mb() -> float:
 def run_one(count: int, memory_mb: int, max_matches: int) -> dict[str, float]:
     import torch
 
-    from swimm3r.frames import Frame, Frames
     from swimm3r.io import images
-    from swimm3r.sfm.mast3r import backend
+    from swimm3r.scene.frames import Frame, Frames
+    from swimm3r.sfm.backends import mast3r as mast3r_backend
+    from swimm3r.sfm.features.pair_graph import parse_graph
     from swimm3r.sfm.mast3r.network import Architecture, Mast3r
-    from swimm3r.sfm.mast3r.pair_run import look_at_pairs
-    from swimm3r.sfm.mast3r.pictures import network_pictures
     from swimm3r.sfm.mast3r.settings import MatchingSettings
-    from swimm3r.sfm.pairs import parse_graph
+    from swimm3r.sfm.mast3r_sfm.network_frames import network_pictures
+    from swimm3r.sfm.mast3r_sfm.run_pairs import look_at_pairs
     from swimm3r.sfm.settings import Mast3rSettings
 
     torch.manual_seed(0)
@@ -78,7 +78,7 @@ def run_one(count: int, memory_mb: int, max_matches: int) -> dict[str, float]:
         before, began = peak_mb(), time.process_time()
         said = look_at_pairs(network, pictures, parse_graph("video"), settings, folder / "cache")
         looked, looked_peak = time.process_time(), peak_mb()
-        rec = backend._place(said, pictures, settings, folder, lambda *_: None)
+        rec = mast3r_backend._place(said, pictures, settings, folder, lambda *_: None)
         done = time.process_time()
         return {
             "frames": count,

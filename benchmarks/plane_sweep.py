@@ -20,10 +20,11 @@ import numpy as np
 import torch
 
 from swimm3r.cameras import project, unproject
-from swimm3r.frames import Frame, Frames
-from swimm3r.io import cameras_json, colmap, images
-from swimm3r.reconstruction import DepthMaps, Matches, Points, Reconstruction, Tracks, cameras_of
-from swimm3r.sfm.plane_sweep import estimate_depth
+from swimm3r.io import cameras_json, images
+from swimm3r.io.colmap import model as colmap
+from swimm3r.scene.frames import Frame, Frames
+from swimm3r.scene.reconstruction import DepthMaps, Matches, Points, Reconstruction, Tracks, cameras_of
+from swimm3r.sfm.plane_sweep.estimate import estimate_depth
 from swimm3r.sfm.settings import PlaneSweepSettings
 
 

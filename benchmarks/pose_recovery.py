@@ -16,16 +16,17 @@ from pathlib import Path
 
 import torch
 
-from swimm3r import held_out, reconstruction
 from swimm3r.evaluate.poses import absolute_pose_errors
 from swimm3r.geometry import pose_from, so3_exp
-from swimm3r.ground_truth import FOLDER, GroundTruth, read_ground_truth
+from swimm3r.pipeline import held_out
+from swimm3r.pipeline.presets import PRESETS
 from swimm3r.prepare import load_frames
-from swimm3r.presets import PRESETS
-from swimm3r.reconstruction import Reconstruction
+from swimm3r.scene import reconstruction
+from swimm3r.scene.ground_truth import FOLDER, GroundTruth, read_ground_truth
+from swimm3r.scene.reconstruction import Reconstruction
 from swimm3r.splat import train
-from swimm3r.splat.pose_codes import as_mapped, spread_of
 from swimm3r.splat.settings import PoseRefinementSettings, TrainingPoseSettings, UwbsSettings
+from swimm3r.splat.training_poses import as_mapped, spread_of
 
 
 def disturbed(rec: Reconstruction, degrees: float, share: float) -> Reconstruction:

@@ -14,9 +14,9 @@ import numpy as np
 import torch
 
 from swimm3r.medium import Medium, add_water, backscatter, transmittances
-from swimm3r.sfm.seathru import fit_medium
+from swimm3r.sfm.medium.samples import WaterSamples
+from swimm3r.sfm.medium.seathru import fit_medium
 from swimm3r.sfm.settings import SeathruSettings
-from swimm3r.sfm.water_samples import WaterSamples
 
 FAMILIES = {  # the paper's intervals of Binf
     "cyan": ((0.02, 0.08), (0.30, 0.50), (0.30, 0.45)),

@@ -15,8 +15,8 @@ from pathlib import Path
 import torch
 
 from swimm3r.evaluate.images import psnr
-from swimm3r.presets import PRESETS
-from swimm3r.run import FinishedSfm, open_finished_sfm
+from swimm3r.pipeline.presets import PRESETS
+from swimm3r.pipeline.run import FinishedSfm, open_finished_sfm
 from swimm3r.splat import train
 from swimm3r.splat.settings import (
     LearningRates,

@@ -22,15 +22,15 @@ import torch
 from raster import SIZES, Size, workload
 from swimm3r.cameras import Cameras
 from swimm3r.raster import MediumMaps, rasterize
-from swimm3r.splat.medium_field import grid_of, initial_field, medium_at_pixels, per_z_depth
-from swimm3r.splat.optimiser import adam_step
-from swimm3r.splat.primitives import BetaPrimitives, inverse_softplus
-from swimm3r.splat.projection import pinhole, project
+from swimm3r.splat.medium.field import grid_of, initial_field, medium_at_pixels, per_z_depth
+from swimm3r.splat.optimizer import adam_step
+from swimm3r.splat.primitives.beta import BetaPrimitives, inverse_softplus
+from swimm3r.splat.projection.dispatch import pinhole, project
 from swimm3r.splat.recipes import uwbs
 from swimm3r.splat.rendering import Drawing
 from swimm3r.splat.settings import UwbsSettings
-from swimm3r.splat.site import Site
-from swimm3r.splat.state import first_state, parameters_of
+from swimm3r.splat.training.scene import Site
+from swimm3r.splat.training.state import first_state, parameters_of
 from swimm3r.splat.views import View
 
 

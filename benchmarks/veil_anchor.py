@@ -12,8 +12,8 @@ from tyro import cli
 
 from swimm3r import water_types
 from swimm3r.medium import Medium, add_water, backscatter, transmittances
-from swimm3r.sfm.distill import physics_terms
 from swimm3r.sfm.mast3r.settings import ObjectiveSettings
+from swimm3r.sfm.student.losses import physics_terms
 from swimm3r.synthetic import DiveSettings, make_dive
 
 Frames = tuple[torch.Tensor, torch.Tensor, torch.Tensor]

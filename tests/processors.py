@@ -17,12 +17,12 @@ ROOT = Path(__file__).parents[1]
 DELICATE = (  # chains of searches and optimizations, where the last digit can decide
     "tests/test_run.py",
     "tests/localization",
-    "tests/sfm/test_colmap.py",
-    "tests/sfm/test_plane_sweep.py",
-    "tests/sfm/test_seathru.py",
-    "tests/sfm/test_alignment.py",
-    "tests/splat/test_poses.py",
-    "tests/splat/test_seasplat.py",
+    "tests/sfm/colmap/test_poses.py",
+    "tests/sfm/plane_sweep/test_estimate.py",
+    "tests/sfm/medium/test_seathru.py",
+    "tests/sfm/alignment/test_optimize.py",
+    "tests/splat/test_pose_refinement.py",
+    "tests/splat/recipes/test_seasplat.py",
     "tests/splat/test_end_to_end.py",
     "tests/raster",
 )

@@ -77,9 +77,9 @@ def test_every_module_has_a_row():
 def test_a_planted_violation_is_seen_in_every_form_of_import():
     path = PACKAGE / "io" / "planted.py"
     for line in (
-        "import swimm3r.sfm.colmap",
+        "import swimm3r.sfm.colmap.poses",
         "from swimm3r import run",
-        "from swimm3r.frames import Frames",
+        "from swimm3r.scene.frames import Frames",
         "from ..report import page",
         "from .. import cli",
         "def f():\n    from swimm3r.sfm import tracks",

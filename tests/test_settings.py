@@ -16,13 +16,13 @@ import numpy as np
 import pytest
 
 import swimm3r
-from swimm3r.bench.ablation_uwbs import ablate
-from swimm3r.bench.render import compare_renderers
+from swimm3r.bench.protocols.ablation_uwbs import ablate
+from swimm3r.bench.protocols.render import compare_renderers
 from swimm3r.cli.main import main
 from swimm3r.errors import InputError, UsageError
-from swimm3r.frame_settings import FrameSettings
-from swimm3r.presets import PRESETS, RunSettings, from_yaml, to_yaml
-from swimm3r.renders import render_run
+from swimm3r.pipeline.presets import PRESETS, RunSettings, from_yaml, to_yaml
+from swimm3r.pipeline.renders import render_run
+from swimm3r.scene.settings import FrameSettings
 from swimm3r.settings import NotEmpty, Positive, Range, SettingError, Settings, declarations, ranges_of
 from swimm3r.settings_document import from_document, to_document
 from swimm3r.sfm.settings import FeatureSettings, MappingSettings
@@ -30,7 +30,7 @@ from swimm3r.splat.settings import LearningRates, UwbsSettings
 
 PACKAGE = Path(swimm3r.__file__).parent
 FILES = sorted({*PACKAGE.rglob("*settings.py"), PACKAGE / "presets.py"} - {PACKAGE / "settings.py"})
-ELSEWHERE = ("swimm3r.sfm.retrieval",)
+ELSEWHERE = ("swimm3r.sfm.features.asmk",)
 
 
 def settings_classes() -> list[type[Settings]]:

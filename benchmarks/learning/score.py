@@ -31,25 +31,25 @@ from views import Shots, read_shots, true_partners
 from swimm3r.cameras import Cameras, pixel_grid
 from swimm3r.datasets import PairSettings
 from swimm3r.evaluate.underwater import water_scores_from_views
-from swimm3r.frames import Frame, Frames
 from swimm3r.geometry import relative_poses, rotation_angle
 from swimm3r.io import images
-from swimm3r.io.colmap import read_model
+from swimm3r.io.colmap.model import read_model
 from swimm3r.io.depth import read_depth
 from swimm3r.medium import Medium, MediumFit
-from swimm3r.reconstruction import DepthMap, DepthMaps, Matches, Points, Reconstruction, Tracks, cameras_of
-from swimm3r.sfm import adapter_file
-from swimm3r.sfm.colmap import absolute_pose
+from swimm3r.scene.frames import Frame, Frames
+from swimm3r.scene.reconstruction import DepthMap, DepthMaps, Matches, Points, Reconstruction, Tracks, cameras_of
+from swimm3r.sfm.colmap.poses import absolute_pose
+from swimm3r.sfm.distillation.pairs import depth_to_network
+from swimm3r.sfm.distillation.validation import absolute_relative
 from swimm3r.sfm.mast3r import checkpoint
+from swimm3r.sfm.mast3r.matching import nearest
 from swimm3r.sfm.mast3r.network import Encoded, Mast3r
 from swimm3r.sfm.mast3r.preprocess import K_to_network, framing, to_network
-from swimm3r.sfm.matching import nearest
-from swimm3r.sfm.physics_head import PhysicsHead, ray_depth_of
-from swimm3r.sfm.predicted_water import FrameReading, summed_up
-from swimm3r.sfm.seathru import estimate_medium
+from swimm3r.sfm.medium.from_head import FrameReading, summed_up
+from swimm3r.sfm.medium.seathru import estimate_medium
 from swimm3r.sfm.settings import SeathruSettings
-from swimm3r.sfm.training.data import depth_to_network
-from swimm3r.sfm.training.scores import absolute_relative
+from swimm3r.sfm.student import adapter_file
+from swimm3r.sfm.student.physics_head import PhysicsHead, ray_depth_of
 
 _GRID = 4  # pixels between the seeds of the recall
 _TOLERANCE = 1 / 32  # of the picture's width

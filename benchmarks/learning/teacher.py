@@ -15,10 +15,16 @@ import torch
 from torch import Tensor, nn
 from views import Shots, draw_matches, read_shots, stacked
 
-from swimm3r.io.atomic import atomic_path
+from swimm3r.io.files.atomic import atomic_path
+from swimm3r.sfm.distillation.two_view_losses import (
+    MATCHING_WEIGHT,
+    TrueMatches,
+    TruePoints,
+    matching_loss,
+    pointmap_loss,
+)
 from swimm3r.sfm.mast3r import checkpoint
 from swimm3r.sfm.mast3r.network import Architecture, Encoded, Mast3r
-from swimm3r.sfm.two_view_losses import MATCHING_WEIGHT, TrueMatches, TruePoints, matching_loss, pointmap_loss
 
 SMALL = Architecture(
     encoder_dim=128,

@@ -12,9 +12,9 @@ from swimm3r.cameras import Cameras, directions, image_directions, pixel_grid, p
 from swimm3r.datasets import PairSettings, load, make_pairs, read_tree
 from swimm3r.datasets.sequences import Sequence
 from swimm3r.geometry import relative_poses
+from swimm3r.sfm.distillation.pairs import depth_to_network
+from swimm3r.sfm.distillation.two_view_losses import TrueMatches
 from swimm3r.sfm.mast3r.preprocess import K_to_network, framing, to_network
-from swimm3r.sfm.training.data import depth_to_network
-from swimm3r.sfm.two_view_losses import TrueMatches
 
 _SAME = 0.03  # relative difference of depth up to which two pixels show one point
 

@@ -16,19 +16,19 @@ from typing import TYPE_CHECKING
 if TYPE_CHECKING:
     from swimm3r.cameras import Cameras
     from swimm3r.errors import Swimm3rError
-    from swimm3r.frame_settings import FrameSettings
-    from swimm3r.frames import Frames
     from swimm3r.localization import localize
     from swimm3r.localization.settings import LocalizationSettings
     from swimm3r.medium import Medium, MediumFit, add_water, remove_water
+    from swimm3r.pipeline.presets import PRESETS, RunSettings
+    from swimm3r.pipeline.run import run_pipeline
     from swimm3r.prepare import read_frames
-    from swimm3r.presets import PRESETS, RunSettings
-    from swimm3r.reconstruction import Reconstruction
-    from swimm3r.run import run_pipeline
+    from swimm3r.scene.frames import Frames
+    from swimm3r.scene.reconstruction import Reconstruction
+    from swimm3r.scene.settings import FrameSettings
     from swimm3r.sfm import reconstruct
     from swimm3r.sfm.settings import ColmapSettings, Mast3rSettings
     from swimm3r.splat import train
-    from swimm3r.splat.checkpoint import load_map
+    from swimm3r.splat.map_file import load_map
     from swimm3r.splat.rendering import SplatMap
     from swimm3r.splat.settings import (
         McmcGsSettings,
@@ -46,9 +46,9 @@ if TYPE_CHECKING:
 
 _HOME = {
     "Cameras": "cameras",
-    "Frames": "frames",
+    "Frames": "scene.frames",
     "Swimm3rError": "errors",
-    "FrameSettings": "frame_settings",
+    "FrameSettings": "scene.settings",
     "LocalizationSettings": "localization.settings",
     "localize": "localization",
     "Medium": "medium",
@@ -56,10 +56,10 @@ _HOME = {
     "add_water": "medium",
     "remove_water": "medium",
     "read_frames": "prepare",
-    "PRESETS": "presets",
-    "RunSettings": "presets",
-    "Reconstruction": "reconstruction",
-    "run_pipeline": "run",
+    "PRESETS": "pipeline.presets",
+    "RunSettings": "pipeline.presets",
+    "Reconstruction": "scene.reconstruction",
+    "run_pipeline": "pipeline.run",
     "reconstruct": "sfm",
     "ColmapSettings": "sfm.settings",
     "Mast3rSettings": "sfm.settings",
@@ -72,7 +72,7 @@ _HOME = {
     "watersplatting": "splat.settings",
     "mcmc_gs": "splat.settings",
     "threers_gs": "splat.settings",
-    "load_map": "splat.checkpoint",
+    "load_map": "splat.map_file",
     "train": "splat",
     "ubs": "splat.settings",
     "uwbs": "splat.settings",

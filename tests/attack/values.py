@@ -15,7 +15,7 @@ BAD = {float: ("nan", "inf", "-1e30"), int: ("-1000000", "1e300", "nan")}
 
 def cases(fixture: Fixture) -> Iterator[Case]:
     """The settings of `run`, then the arguments of single commands."""
-    from swimm3r.presets import PRESETS
+    from swimm3r.pipeline.presets import PRESETS
 
     fast = PRESETS["fast"]
     groups = {"": fast.frames, "splat": fast.splat, "test": fast.test}

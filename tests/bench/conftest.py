@@ -6,13 +6,13 @@ from pathlib import Path
 import pytest
 import torch
 
-from swimm3r import reconstruction
 from swimm3r.cameras import pixel_grid, unproject
-from swimm3r.frame_settings import FrameSettings
-from swimm3r.ground_truth import FOLDER, read_ground_truth
+from swimm3r.pipeline.presets import PRESETS, to_yaml
 from swimm3r.prepare import read_frames
-from swimm3r.presets import PRESETS, to_yaml
-from swimm3r.reconstruction import DepthMap, DepthMaps, Matches, Points, Reconstruction, Tracks
+from swimm3r.scene import reconstruction
+from swimm3r.scene.ground_truth import FOLDER, read_ground_truth
+from swimm3r.scene.reconstruction import DepthMap, DepthMaps, Matches, Points, Reconstruction, Tracks
+from swimm3r.scene.settings import FrameSettings
 from swimm3r.splat.settings import (
     DensifySettings,
     InitialSettings,

@@ -56,6 +56,8 @@ def test_the_table_names_the_preset_it_was_taken_under(
     options: list[str], named: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ):
     cells = [Cell("dive", "baseline", 0, {"psnr": 20.0})]
-    monkeypatch.setattr("swimm3r.bench.ablation_uwbs.ablate", lambda *_: Table("ablation", "T", cells, columns("psnr")))
+    monkeypatch.setattr(
+        "swimm3r.bench.protocols.ablation_uwbs.ablate", lambda *_: Table("ablation", "T", cells, columns("psnr"))
+    )
     main(["bench", "ablation-uwbs", "dive", "--out", str(tmp_path), *options])
     assert f"1 scene, 1 seed, {named}" in capsys.readouterr().out

@@ -54,7 +54,7 @@ def test_ctrl_c_is_exit_130_and_says_that_nothing_is_lost(
     def interrupted(*_: object, **__: object) -> None:
         raise KeyboardInterrupt
 
-    monkeypatch.setattr("swimm3r.run.run_pipeline", interrupted)
+    monkeypatch.setattr("swimm3r.pipeline.run.run_pipeline", interrupted)
     code, message = outcome(capsys, "run", str(tmp_path), "--out", str(tmp_path / "run"))
     assert code == 130
     assert "goes on from here" in message
@@ -69,7 +69,7 @@ def test_running_out_of_memory_is_exit_5_with_advice(
     def exhausted(*_: object, **__: object) -> None:
         raise error
 
-    monkeypatch.setattr("swimm3r.run.run_pipeline", exhausted)
+    monkeypatch.setattr("swimm3r.pipeline.run.run_pipeline", exhausted)
     code, message = outcome(capsys, "run", str(tmp_path), "--out", str(tmp_path / "run"))
     assert code == 5
     assert "memory" in message
@@ -109,7 +109,7 @@ def test_a_recipe_and_a_transforms_json_reach_the_pipeline(tmp_path: Path, monke
     }  # fmt: skip
     (tmp_path / "transforms.json").write_text(json.dumps(document))
     asked = []
-    monkeypatch.setattr("swimm3r.run.run_pipeline", lambda *given, **_: asked.append(given) or {})
+    monkeypatch.setattr("swimm3r.pipeline.run.run_pipeline", lambda *given, **_: asked.append(given) or {})
     monkeypatch.setattr("swimm3r.cli.run.print_summary", lambda *_: None)
     for recipe in RECIPES:
         main(["splat", "--transforms", str(tmp_path / "transforms.json"), "--recipe", recipe, "--out", "run"])
@@ -165,7 +165,7 @@ def test_a_wrong_path_is_noticed_before_frames_are_prepared(
     (tmp_path / "dive").mkdir()
     for i in range(3):
         write_rgb(tmp_path / "dive" / f"{i}.png", np.random.default_rng(i).random((24, 32, 3)))
-    monkeypatch.setattr("swimm3r.run.read_frames", lambda *_, **__: pytest.fail("frames were prepared"))
+    monkeypatch.setattr("swimm3r.pipeline.run.read_frames", lambda *_, **__: pytest.fail("frames were prepared"))
     command, expected = WRONG_PATHS[wrong]
     given = [word.format(dive=tmp_path / "dive", nowhere=tmp_path / "nowhere.json") for word in command]
     code, message = outcome(capsys, *given, "--out", str(tmp_path / "run"))

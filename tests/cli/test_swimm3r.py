@@ -6,10 +6,10 @@ from pathlib import Path
 import pytest
 import torch
 
-from swimm3r import reconstruction
 from swimm3r.cli.main import main
 from swimm3r.io import medium_json
-from swimm3r.io.damage import remake
+from swimm3r.io.files.damage import remake
+from swimm3r.scene import reconstruction
 from swimm3r.sfm.mast3r import checkpoint
 from swimm3r.sfm.mast3r.network import Architecture, Mast3r
 from swimm3r.synthetic import DiveSettings, write_dive

@@ -11,15 +11,7 @@ from scipy.ndimage import gaussian_filter
 from skimage.metrics import peak_signal_noise_ratio, structural_similarity
 
 from swimm3r.evaluate import NotComputed, summary_entries
-from swimm3r.evaluate.images import (
-    as_8_bit,
-    blur4_psnr,
-    mean_view_scores,
-    psnr,
-    sharpness,
-    ssim,
-    view_scores,
-)
+from swimm3r.evaluate.images import as_8_bit, blur4_psnr, mean_view_scores, psnr, sharpness, ssim, view_scores
 
 
 def textured(seed: int = 0, side: int = 48) -> torch.Tensor:

@@ -9,14 +9,7 @@ from PIL import Image
 from skimage.color import rgb2lab
 
 from swimm3r.evaluate import NotComputed
-from swimm3r.evaluate.underwater import (
-    _lab_from_srgb,
-    clear_psnr,
-    uciqe,
-    uiqm,
-    water_scores,
-    water_scores_from_views,
-)
+from swimm3r.evaluate.underwater import _lab_from_srgb, clear_psnr, uciqe, uiqm, water_scores, water_scores_from_views
 from swimm3r.medium import AttenuationCurve, Medium, MediumFit, add_water, remove_water
 
 # name: UICM, UISM, UIConM, UIQM, UIQM after 256 x 256 bicubic, UCIQE (README of the vectors)

@@ -16,9 +16,9 @@ from swimm3r.export.gaussians import (
     write_ply,
 )
 from swimm3r.raster import Primitives2D, rasterize
-from swimm3r.splat.gaussians import GaussianPrimitives, seen_colour
-from swimm3r.splat.medium_field import initial_field
-from swimm3r.splat.primitives import BetaPrimitives, inverse_softplus
+from swimm3r.splat.medium.field import initial_field
+from swimm3r.splat.primitives.beta import BetaPrimitives, inverse_softplus
+from swimm3r.splat.primitives.gaussian import GaussianPrimitives, seen_colour
 from swimm3r.splat.rendering import SplatMap
 from swimm3r.splat.settings import MediumFieldSettings, UwbsSettings, mcmc_gs
 

@@ -6,14 +6,14 @@ import pytest
 import torch
 
 from swimm3r.cameras import Cameras, project
-from swimm3r.frames import Frame, Frames
 from swimm3r.geometry import pose_from, relative_poses, rotation_angle, so3_exp
 from swimm3r.io.images import write_rgb
+from swimm3r.localization.interpolation import between, neighbours, pose_from_neighbours
 from swimm3r.localization.landmarks import Landmarks, landmarks_of, locate
-from swimm3r.localization.neighbours import between, neighbours, pose_from_neighbours
-from swimm3r.reconstruction import DepthMaps, Matches, Points, Reconstruction, Tracks
+from swimm3r.scene.frames import Frame, Frames
+from swimm3r.scene.reconstruction import DepthMaps, Matches, Points, Reconstruction, Tracks
+from swimm3r.sfm.features.sift import extract_features
 from swimm3r.sfm.settings import FeatureSettings
-from swimm3r.sfm.sift import extract_features
 
 SETTINGS = FeatureSettings(count=600)
 

@@ -8,10 +8,10 @@ import torch
 from torch import Tensor
 
 from swimm3r.cameras import Cameras, image_directions, ray_depth_from_z
-from swimm3r.frames import Frame, Frames
 from swimm3r.io import images
 from swimm3r.medium import Medium, add_water
-from swimm3r.reconstruction import DepthMap, DepthMaps, Matches, Points, Reconstruction, Tracks
+from swimm3r.scene.frames import Frame, Frames
+from swimm3r.scene.reconstruction import DepthMap, DepthMaps, Matches, Points, Reconstruction, Tracks
 
 HEIGHT, WIDTH, FOCAL = 72, 96, 80.0
 

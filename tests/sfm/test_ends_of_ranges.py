@@ -12,20 +12,14 @@ import torch
 
 from swimm3r.errors import InputError
 from swimm3r.medium import AttenuationCurve, Medium, MediumFit
-from swimm3r.reconstruction import DepthMaps, Reconstruction
+from swimm3r.scene.reconstruction import DepthMaps, Reconstruction
 from swimm3r.settings import Range, Settings, declarations, ranges_of
-from swimm3r.sfm.plane_sweep import estimate_depth
-from swimm3r.sfm.restore import restore_picture, restored_cloud
-from swimm3r.sfm.seathru import estimate_medium
-from swimm3r.sfm.settings import (
-    FeatureSettings,
-    PlaneSweepSettings,
-    RestoreSettings,
-    SeathruSettings,
-    TrackSettings,
-)
-from swimm3r.sfm.sift import extract_features
-from swimm3r.sfm.tracks import fuse_depth, shared_rays
+from swimm3r.sfm.features.sift import extract_features
+from swimm3r.sfm.medium.dense_tracks import fuse_depth, shared_rays
+from swimm3r.sfm.medium.restore import restore_picture, restored_cloud
+from swimm3r.sfm.medium.seathru import estimate_medium
+from swimm3r.sfm.plane_sweep.estimate import estimate_depth
+from swimm3r.sfm.settings import FeatureSettings, PlaneSweepSettings, RestoreSettings, SeathruSettings, TrackSettings
 
 FEW = SeathruSettings(max_pixels=2000, max_observations=2000, start_observations=300, reweightings=2, min_samples=100)
 SMALL = PlaneSweepSettings(long_side=48, sources=2, planes=32, rounds=1, threads=1)

@@ -1,70 +1,92 @@
-"""Dense tracks: where they are, which pixels they hold, and what must not be merged."""
-
-from dataclasses import replace
+"""Tracks from matches: who belongs together, who is thrown out."""
 
 import torch
 
-from swimm3r.reconstruction import DepthMap, DepthMaps
-from swimm3r.sfm.settings import TrackSettings
-from swimm3r.sfm.tracks import cubes, frame_overlap, fuse_depth
+from swimm3r.cameras import Cameras, project
+from swimm3r.sfm.tracks import FrameMatches, consistent, join, most_seen, reprojection_errors, without
+
+WIDTH, HEIGHT = 40, 30
 
 
-def test_tracks_of_a_flat_seafloor_lie_on_it(dive):
-    tracks = fuse_depth(dive.rec, dive.frames, TrackSettings())
-    assert len(tracks.xyz) > 1000
-    assert tracks.xyz[:, 2].abs().max() < 1e-4
+def matches(*rows: tuple[int, tuple[int, int], int, tuple[int, int], float]) -> FrameMatches:
+    i, xy_i, j, xy_j, confidence = zip(*rows, strict=True)
+    xyz = torch.arange(3.0 * len(rows)).reshape(-1, 3)
+    return FrameMatches(*(torch.tensor(column) for column in (i, j, xy_i, xy_j, confidence)), xyz)
 
 
-def test_ray_depth_is_the_distance_from_the_camera_to_the_fused_point(dive):
-    tracks = fuse_depth(dive.rec, dive.frames, TrackSettings())
-    centres = dive.rec.cameras.centres.float()
-    expected = (tracks.xyz[tracks.track] - centres[tracks.frame]).norm(dim=-1)
-    torch.testing.assert_close(tracks.ray_depth, expected, atol=1e-5, rtol=1e-5)
+def sightings(tracks) -> set[frozenset[tuple[int, int, int]]]:
+    rows = list(zip(tracks.point.tolist(), tracks.frame.tolist(), tracks.xy.tolist(), strict=True))
+    return {frozenset((f, *xy) for p, f, xy in rows if p == point) for point in range(len(tracks.xyz))}
 
 
-def test_a_pixel_belongs_to_at_most_one_track(dive):
-    tracks = fuse_depth(dive.rec, dive.frames, TrackSettings())
-    pixels = tracks.frame * dive.frames.width * dive.frames.height + tracks.pixel
-    assert len(pixels.unique()) == len(pixels)
+def test_matches_that_share_a_pixel_are_one_track():
+    found = join(
+        matches(
+            (0, (1, 2), 1, (3, 4), 1.0),
+            (1, (3, 4), 2, (5, 6), 1.0),
+            (0, (9, 9), 2, (8, 8), 1.0),
+            (1, (4, 3), 2, (6, 5), 1.0),
+        ),
+        WIDTH,
+        HEIGHT,
+    )
+    assert sightings(found) == {
+        frozenset({(0, 1, 2), (1, 3, 4), (2, 5, 6)}),
+        frozenset({(0, 9, 9), (2, 8, 8)}),
+        frozenset({(1, 4, 3), (2, 6, 5)}),
+    }
 
 
-def test_every_known_pixel_of_a_small_dive_is_in_a_track(dive):
-    tracks = fuse_depth(dive.rec, dive.frames, TrackSettings())
-    assert len(tracks.pixel) == len(dive.frames) * dive.frames.width * dive.frames.height
+def test_a_track_that_comes_back_to_a_frame_keeps_the_surer_pixel():
+    found = join(
+        matches((0, (1, 1), 1, (2, 2), 1.0), (1, (2, 2), 2, (3, 3), 2.0), (0, (5, 5), 2, (3, 3), 3.0)), WIDTH, HEIGHT
+    )
+    assert sightings(found) == {frozenset({(0, 5, 5), (1, 2, 2), (2, 3, 3)})}
 
 
-def test_points_are_seen_from_several_heights(dive):
-    tracks = fuse_depth(dive.rec, dive.frames, TrackSettings())
-    length = torch.bincount(tracks.track)
-    assert length.max() >= 5
-    assert (length >= 2).float().mean() > 0.3
+def test_the_point_is_the_mean_of_its_matches_by_confidence():
+    found = join(matches((0, (1, 1), 1, (2, 2), 1.0), (1, (2, 2), 2, (3, 3), 3.0)), WIDTH, HEIGHT)
+    torch.testing.assert_close(found.xyz, torch.tensor([[2.25, 3.25, 4.25]], dtype=torch.float64))
 
 
-def test_depths_that_disagree_are_not_merged(dive, tmp_path):
-    moved = DepthMaps(tmp_path)
-    for k, name in enumerate(dive.rec.names):
-        depth = dive.rec.depth[name]
-        moved.write(name, DepthMap(depth.z_depth * 1.06**k, depth.confidence))
-    tracks = fuse_depth(replace(dive.rec, depth=moved), dive.frames, TrackSettings(tolerance=0.02))
-    assert torch.bincount(tracks.track).max() == 1
+def test_points_left_in_one_frame_are_dropped_and_the_most_seen_stay():
+    found = join(
+        matches(
+            (0, (1, 1), 1, (2, 2), 1.0),
+            (1, (2, 2), 2, (3, 3), 1.0),
+            (0, (7, 7), 1, (8, 8), 1.0),
+            (0, (9, 9), 1, (6, 6), 1.0),
+        ),
+        WIDTH,
+        HEIGHT,
+    )
+    bad = (found.frame == 0) & (found.xy == torch.tensor([7, 7])).all(1)
+    kept = without(found, bad)
+    assert sightings(kept) == {frozenset({(0, 1, 1), (1, 2, 2), (2, 3, 3)}), frozenset({(0, 9, 9), (1, 6, 6)})}
+    assert sightings(most_seen(kept, 10)) == sightings(kept)
+    assert sightings(most_seen(kept, 1)) == {frozenset({(0, 1, 1), (1, 2, 2), (2, 3, 3)})}
 
 
-def test_fewer_tracks_are_started_where_memory_is_bounded(dive):
-    every = fuse_depth(dive.rec, dive.frames, TrackSettings())
-    few = fuse_depth(dive.rec, dive.frames, TrackSettings(max_tracks=2000))
-    assert len(few.xyz) <= 2000 < len(every.xyz)
+def camera_pair() -> Cameras:
+    K = torch.tensor([[30.0, 0, 20], [0, 30, 15], [0, 0, 1]], dtype=torch.float64).repeat(2, 1, 1)
+    pose = torch.eye(4, dtype=torch.float64).repeat(2, 1, 1)
+    pose[1, 0, 3] = 0.3
+    return Cameras(K, torch.zeros(2, 0), pose, WIDTH, HEIGHT)
 
 
-def test_a_frame_farther_away_sees_all_that_a_near_one_sees(dive):
-    overlap = frame_overlap(dive.rec, list(range(len(dive.rec.names))))
-    assert overlap[0, -1] == 1.0
-    assert overlap[-1, 0] < 0.2
-    assert (overlap.diagonal() == 0).all()
+def test_reprojection_errors_are_pixels_and_infinite_behind_the_camera():
+    cameras = camera_pair()
+    xyz = torch.tensor([[0.1, 0.2, 2.0], [0.1, 0.2, -2.0]], dtype=torch.float64)
+    xy = project(cameras[1], xyz[None])[0][0] + torch.tensor([3.0, 4.0])
+    errors = reprojection_errors(cameras, torch.tensor([1, 1]), xy, xyz)
+    torch.testing.assert_close(errors[0], torch.tensor(5.0, dtype=torch.float64))
+    assert errors[1] == torch.inf
 
 
-def test_points_share_a_cube_only_if_it_is_the_same_cube():
-    xyz = torch.tensor([[0.1, 0.1, 0.1], [0.9, 0.2, 0.3], [1.1, 0.2, 0.3], [-0.1, 0.1, 0.1], [0.1, 0.1, 0.1]])
-    which, count = cubes(xyz, torch.tensor([1.0, 1.0, 1.0, 1.0, 2.0]))
-    assert which[0] == which[1]
-    assert len(which[[0, 2, 3, 4]].unique()) == 4
-    assert count.sum() == len(xyz)
+def test_a_match_must_fit_in_both_frames():
+    cameras = camera_pair()
+    xyz = torch.tensor([[0.1, 0.2, 2.0], [0.1, 0.2, 2.0]], dtype=torch.float64)
+    uv = project(cameras, xyz.expand(2, 2, 3))[0].floor().long()
+    off = uv[1] + torch.tensor([[0, 0], [9, 0]])
+    found = FrameMatches(torch.zeros(2).long(), torch.ones(2).long(), uv[0], off, torch.ones(2), xyz)
+    assert consistent(found, cameras, 1.5).tolist() == [True, False]

@@ -8,12 +8,12 @@ import pytest
 import torch
 
 from swimm3r.cameras import Cameras
-from swimm3r.frames import Frame, Frames
 from swimm3r.io.images import write_rgb
 from swimm3r.medium import AttenuationCurve, Medium, MediumFit
-from swimm3r.reconstruction import DenseCloud, DepthMap, DepthMaps, Matches, Points, Reconstruction, Tracks
-from swimm3r.splat.medium_field import initial_field
-from swimm3r.splat.primitives import BetaPrimitives, inverse_softplus
+from swimm3r.scene.frames import Frame, Frames
+from swimm3r.scene.reconstruction import DenseCloud, DepthMap, DepthMaps, Matches, Points, Reconstruction, Tracks
+from swimm3r.splat.medium.field import initial_field
+from swimm3r.splat.primitives.beta import BetaPrimitives, inverse_softplus
 from swimm3r.splat.rendering import SplatMap
 from swimm3r.splat.settings import MediumFieldSettings, UwbsSettings
 

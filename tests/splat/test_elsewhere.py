@@ -10,9 +10,9 @@ import torch
 from tests.splat.elsewhere import DEVICE, Elsewhere, Pretended, held, waits
 
 from swimm3r.evaluate.images import psnr
-from swimm3r.splat import fitting
-from swimm3r.splat.checkpoint import load_map
-from swimm3r.splat.poses import refine_pose
+from swimm3r.splat import train_map
+from swimm3r.splat.map_file import load_map
+from swimm3r.splat.pose_refinement import refine_pose
 from swimm3r.splat.recipes import uwbs
 from swimm3r.splat.rendering import mean_water
 from swimm3r.splat.settings import (
@@ -24,11 +24,11 @@ from swimm3r.splat.settings import (
     UwbsSettings,
     with_recipe,
 )
-from swimm3r.splat.site import Site
+from swimm3r.splat.training.scene import Site
 from swimm3r.splat.views import TrainingViews
 
 pytest.importorskip("warp", reason="warp-lang is not installed: maps were not trained on a pretended device")
-from swimm3r.raster import warp_gpu
+from swimm3r.raster.cuda import backend as cuda_backend
 
 SIZE = UwbsSettings(
     iterations=12,
@@ -44,13 +44,13 @@ on_the_processor = pytest.mark.usefixtures("warp_on_the_processor")
 
 @pytest.fixture
 def warp_on_the_processor(monkeypatch: pytest.MonkeyPatch) -> None:
-    launch = warp_gpu._launch
+    launch = cuda_backend._launch
 
     def unwrapped(kernel, bins, tensors) -> None:
         assert all(isinstance(t, Elsewhere) for t in tensors)
         launch(kernel, bins, [held(t) for t in tensors])
 
-    monkeypatch.setattr(warp_gpu, "_launch", unwrapped)
+    monkeypatch.setattr(cuda_backend, "_launch", unwrapped)
 
 
 def losses(folder: Path) -> list[float]:
@@ -61,9 +61,9 @@ def losses(folder: Path) -> list[float]:
 @pytest.mark.parametrize("recipe", RECIPES)
 def test_every_recipe_trains_elsewhere_as_on_the_processor(recipe: Recipe, tiny_dive, tmp_path):
     settings = with_recipe(SIZE, recipe)
-    here = fitting.train(tiny_dive.rec, tiny_dive.frames, settings, tmp_path / "here")
+    here = train_map.train(tiny_dive.rec, tiny_dive.frames, settings, tmp_path / "here")
     with Pretended():
-        there = fitting.train(tiny_dive.rec, tiny_dive.frames, settings, tmp_path / "there", device=DEVICE)
+        there = train_map.train(tiny_dive.rec, tiny_dive.frames, settings, tmp_path / "there", device=DEVICE)
         assert there.device == DEVICE
         seen = there.render(tiny_dive.cameras[1], tiny_dive.frames.frames[1].time)
     assert losses(tmp_path / "there") == pytest.approx(losses(tmp_path / "here"), rel=0.03)
@@ -106,9 +106,9 @@ def test_an_interrupted_training_goes_on_elsewhere(tiny_dive, tmp_path):
             raise StoppedError
 
     with pytest.raises(StoppedError):
-        fitting.train(tiny_dive.rec, tiny_dive.frames, settings, tmp_path, stop)
+        train_map.train(tiny_dive.rec, tiny_dive.frames, settings, tmp_path, stop)
     with Pretended():
-        scene = fitting.train(tiny_dive.rec, tiny_dive.frames, settings, tmp_path, device=DEVICE)
+        scene = train_map.train(tiny_dive.rec, tiny_dive.frames, settings, tmp_path, device=DEVICE)
     assert scene.device == DEVICE
     assert len(losses(tmp_path)) == 12
 
@@ -141,7 +141,7 @@ def test_the_pretence_sees_tensors_in_two_places():
 @pytest.mark.parametrize("recipe", RECIPES)
 def test_every_recipe_trains_on_the_gpu_as_on_the_processor(recipe: Recipe, tiny_dive, tmp_path):
     settings = with_recipe(SIZE, recipe)
-    fitting.train(tiny_dive.rec, tiny_dive.frames, settings, tmp_path / "here")
-    there = fitting.train(tiny_dive.rec, tiny_dive.frames, settings, tmp_path / "there", device=torch.device("cuda"))
+    train_map.train(tiny_dive.rec, tiny_dive.frames, settings, tmp_path / "here")
+    there = train_map.train(tiny_dive.rec, tiny_dive.frames, settings, tmp_path / "there", device=torch.device("cuda"))
     assert losses(tmp_path / "there") == pytest.approx(losses(tmp_path / "here"), rel=0.03)
     assert there.render(tiny_dive.cameras[1], tiny_dive.frames.frames[1].time).rgb.device.type == "cpu"

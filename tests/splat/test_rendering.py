@@ -8,8 +8,8 @@ import torch
 from swimm3r.cameras import Cameras, image_directions, ray_depth_from_z
 from swimm3r.errors import DeviceError
 from swimm3r.medium import add_water
-from swimm3r.splat.poses import RefinedPose, refine_pose
-from swimm3r.splat.primitives import select
+from swimm3r.splat.pose_refinement import RefinedPose, refine_pose
+from swimm3r.splat.primitives.beta import select
 from swimm3r.splat.rendering import SplatMap
 
 

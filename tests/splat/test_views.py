@@ -7,9 +7,9 @@ import torch
 
 from swimm3r.cameras import Cameras, image_directions
 from swimm3r.errors import InputError
-from swimm3r.frames import Frame, Frames
 from swimm3r.io.images import write_rgb
-from swimm3r.reconstruction import DepthMap, DepthMaps
+from swimm3r.scene.frames import Frame, Frames
+from swimm3r.scene.reconstruction import DepthMap, DepthMaps
 from swimm3r.splat.settings import UwbsSettings
 from swimm3r.splat.views import TrainingViews, median_z_depth, undistorted, working_scale
 

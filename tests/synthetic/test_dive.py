@@ -6,9 +6,9 @@ import torch
 
 from swimm3r.cameras import directions, pixel_grid, project, unproject
 from swimm3r.errors import InputError, UsageError
-from swimm3r.ground_truth import read_ground_truth
 from swimm3r.io import images
 from swimm3r.medium import add_water
+from swimm3r.scene.ground_truth import read_ground_truth
 from swimm3r.synthetic import Coefficients, DiveSettings, make_dive, write_dive
 from swimm3r.synthetic.disturbances import swimming
 from swimm3r.synthetic.dive import water

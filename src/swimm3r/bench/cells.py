@@ -24,8 +24,8 @@ from typing import Any
 from swimm3r.bench.settings import JobSettings
 from swimm3r.errors import DeviceError, Swimm3rError, UsageError, WeightsError
 from swimm3r.evaluate import NotComputed, summary_entries
-from swimm3r.io.atomic import write_text
-from swimm3r.io.cache_key import cache_key, code_version
+from swimm3r.io.files.atomic import write_text
+from swimm3r.io.files.cache_key import cache_key, code_version
 from swimm3r.progress import Progress, silent
 
 Scores = Mapping[str, float | NotComputed]

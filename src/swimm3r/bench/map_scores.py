@@ -2,20 +2,21 @@
 
 from pathlib import Path
 
-from swimm3r import devices, held_out
+from swimm3r import devices
 from swimm3r.bench.cells import Scores
 from swimm3r.evaluate import NotComputed
 from swimm3r.io import images
-from swimm3r.io.metrics_log import read_rows
+from swimm3r.io.files.metrics_log import read_rows
 from swimm3r.io.view_names import view_stems
+from swimm3r.pipeline import held_out
+from swimm3r.pipeline.run import FinishedSfm
+from swimm3r.pipeline.summary import truth_section
 from swimm3r.progress import Progress, silent
-from swimm3r.run import FinishedSfm
 from swimm3r.splat import train
-from swimm3r.splat.checkpoint import load_map
+from swimm3r.splat.map_file import load_map
 from swimm3r.splat.rendering import SplatMap
 from swimm3r.splat.settings import PoseRefinementSettings, SplatSettings
 from swimm3r.splat.views import undistorted
-from swimm3r.summary import truth_section
 
 
 def trained(sfm: FinishedSfm, settings: SplatSettings, folder: Path, progress: Progress = silent) -> SplatMap:

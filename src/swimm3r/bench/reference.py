@@ -18,14 +18,14 @@ from pathlib import Path
 from swimm3r.cameras import Cameras
 from swimm3r.errors import InputError, RegistrationError
 from swimm3r.evaluate import NotComputed
-from swimm3r.frames import Frames
-from swimm3r.ground_truth import GroundTruth, read_ground_truth
 from swimm3r.io import cameras_json
-from swimm3r.io.atomic import write_text
-from swimm3r.io.cache_key import cache_key, code_version
+from swimm3r.io.files.atomic import write_text
+from swimm3r.io.files.cache_key import cache_key, code_version
+from swimm3r.pipeline.run import FinishedSfm
 from swimm3r.progress import Progress, silent
-from swimm3r.run import FinishedSfm
-from swimm3r.sfm import colmap
+from swimm3r.scene.frames import Frames
+from swimm3r.scene.ground_truth import GroundTruth, read_ground_truth
+from swimm3r.sfm.colmap import poses
 from swimm3r.sfm.settings import ColmapSettings
 
 
@@ -79,7 +79,7 @@ def whole_clip(
     settings = replace(settings, mapping=replace(settings.mapping, method="auto"))
     failed = ""
     try:
-        found = colmap.reconstruct(everything, settings, folder / "work", progress, lens)
+        found = poses.reconstruct(everything, settings, folder / "work", progress, lens)
     except RegistrationError as error:
         failed = f"no reference: {error.what}"
     else:

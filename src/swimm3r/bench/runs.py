@@ -8,17 +8,17 @@ from swimm3r.bench.settings import IMPORTED
 from swimm3r.bench.sfm_methods import on_model
 from swimm3r.datasets import layouts
 from swimm3r.errors import InputError
-from swimm3r.frames import Frames
 from swimm3r.io.images import image_size
 from swimm3r.io.video import Video
+from swimm3r.pipeline.presets import RunSettings
+from swimm3r.pipeline.run import FinishedSfm, open_finished_sfm, run_pipeline
 from swimm3r.prepare import check_source
-from swimm3r.prepare.stills import pictures_of
-from swimm3r.presets import RunSettings
+from swimm3r.prepare.image_folder import pictures_of
 from swimm3r.progress import Progress, silent
-from swimm3r.run import FinishedSfm, open_finished_sfm, run_pipeline
-from swimm3r.run_folder import is_run, open_run
+from swimm3r.scene.frames import Frames
+from swimm3r.scene.run_folder import is_run, open_run
+from swimm3r.sfm.distillation.settings import RECIPES
 from swimm3r.sfm.settings import ColmapModelSettings, ColmapSettings, Mast3rSettings
-from swimm3r.sfm.training.settings import RECIPES
 
 PICTURES = ("images_wb", "images")  # folders named so lend their clip no name
 POSES_REFINED = " + poses"

@@ -6,18 +6,19 @@ from pathlib import Path
 
 import torch
 
-from swimm3r import reconstruction, weights
+from swimm3r import weights
 from swimm3r.bench.settings import SfmMethod, SfmMethods
 from swimm3r.evaluate import NotComputed
 from swimm3r.evaluate.matches import match_scores
 from swimm3r.evaluate.poses import pose_scores
-from swimm3r.frames import Frames
-from swimm3r.ground_truth import GroundTruth
+from swimm3r.pipeline.summary import match_errors
 from swimm3r.progress import Progress
-from swimm3r.reconstruction import Matches, Reconstruction
+from swimm3r.scene import reconstruction
+from swimm3r.scene.frames import Frames
+from swimm3r.scene.ground_truth import GroundTruth
+from swimm3r.scene.reconstruction import Matches, Reconstruction
+from swimm3r.sfm.medium.dense_tracks import count_tracks
 from swimm3r.sfm.settings import ColmapModelSettings, ColmapSettings, Mast3rSettings, SfmSettings, TrackSettings
-from swimm3r.sfm.tracks import count_tracks
-from swimm3r.summary import match_errors
 
 
 def settings_for(

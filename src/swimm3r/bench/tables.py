@@ -16,7 +16,7 @@ from swimm3r.bench.cells import Cell
 from swimm3r.bench.scores import Column
 from swimm3r.bench.statistics import Row, number, rows
 from swimm3r.evaluate import NotComputed, summary_entries
-from swimm3r.io.atomic import write_text
+from swimm3r.io.files.atomic import write_text
 
 _ARROW = {"high": " ↑", "low": " ↓", "neither": ""}
 _BY_SCENE = 3  # columns of the table by scene

@@ -8,12 +8,12 @@ from typing import TYPE_CHECKING, Annotated
 from tyro.conf import Positional, arg, subcommand
 
 from swimm3r.bench.settings import ABLATION, JobSettings, Seeds, SfmMethods
-from swimm3r.cli.console import drawn_progress
-from swimm3r.cli.ranges import with_ranges
-from swimm3r.frame_settings import FrameSettings
+from swimm3r.cli.terminal.console import drawn_progress
+from swimm3r.cli.terminal.ranges import with_ranges
 from swimm3r.localization.settings import GS_CPR, LocalizationSettings
-from swimm3r.presets import MAST3R_PRESETS, PRESETS, Preset, RunSettings
+from swimm3r.pipeline.presets import MAST3R_PRESETS, PRESETS, Preset, RunSettings
 from swimm3r.progress import Progress
+from swimm3r.scene.settings import FrameSettings
 from swimm3r.settings import Count
 from swimm3r.sfm.settings import ColmapSettings, Mast3rSettings
 from swimm3r.splat.settings import RECIPES, PoseRefinementSettings, Recipe, UwbsSettings
@@ -57,7 +57,7 @@ def command_for_preset(name: Preset) -> Callable:
             test: how the test frames' poses are refined.
             jobs: scenes in parallel.
         """
-        from swimm3r.bench.ablation_uwbs import ablate
+        from swimm3r.bench.protocols.ablation_uwbs import ablate
 
         kept = (splat, test) == (full, defaults.test)
         _show(out, lambda progress: ablate(runs, out, splat, seeds, test, jobs, progress), _preset(preset, kept))
@@ -101,7 +101,7 @@ def command_for_preset(name: Preset) -> Callable:
         """
         from swimm3r.bench import reference
         from swimm3r.bench.cells import check_choice
-        from swimm3r.bench.render import compare_renderers
+        from swimm3r.bench.protocols.render import compare_renderers
         from swimm3r.bench.runs import made_runs
 
         def run(progress: Progress) -> "Table":
@@ -141,7 +141,7 @@ def command_for_preset(name: Preset) -> Callable:
             mast3r: how the network's methods work.
             jobs: clips in parallel.
         """
-        from swimm3r.bench.sfm import compare_sfm
+        from swimm3r.bench.protocols.sfm import compare_sfm
 
         settings = RunSettings(frames, colmap, defaults.splat, defaults.test)
         kept = (frames, colmap, mast3r) == (as_filmed, found_poses, MAST3R_PRESETS[name])
@@ -178,7 +178,7 @@ def command_for_preset(name: Preset) -> Callable:
             mast3r: how the network's methods work.
             jobs: sequences in parallel.
         """
-        from swimm3r.bench.flsea import compare_on_flsea
+        from swimm3r.bench.protocols.flsea import compare_on_flsea
 
         _show(
             out,
@@ -213,7 +213,7 @@ def command_for_preset(name: Preset) -> Callable:
             mast3r: how the network's methods work.
             jobs: sequences in parallel.
         """
-        from swimm3r.bench.flsea import compare_on_flsea
+        from swimm3r.bench.protocols.flsea import compare_on_flsea
 
         given = SfmMethods(ABLATION, adapters)
         _show(
@@ -259,7 +259,7 @@ def restoration(
         out: where pictures side by side and the tables go: restoration.md, .csv, .json and .tex.
         jobs: scenes in parallel.
     """
-    from swimm3r.bench.restoration import score_restoration
+    from swimm3r.bench.protocols.restoration import score_restoration
 
     _show(out, lambda progress: score_restoration(runs, out, jobs, progress))
 
@@ -286,7 +286,7 @@ def localisation(
         settings: the protocol; SIFT where no MASt3R weights are here.
         jobs: scenes in parallel.
     """
-    from swimm3r.bench.localisation import localise
+    from swimm3r.bench.protocols.localization import localise
 
     _show(out, lambda progress: localise(runs, out, settings, maps, references, jobs, progress))
 
@@ -298,8 +298,8 @@ def _preset(name: Preset, kept: bool) -> str:
 
 def _show(out: Path, protocol: "Callable[[Progress], Table]", preset: str = "") -> None:
     from swimm3r.bench import tables
-    from swimm3r.io.folder_lock import folder_lock
-    from swimm3r.io.outputs import output_folder
+    from swimm3r.io.files.folder_lock import folder_lock
+    from swimm3r.io.files.outputs import output_folder
 
     with output_folder(out), folder_lock(out), drawn_progress() as progress:
         table = protocol(progress)

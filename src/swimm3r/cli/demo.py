@@ -7,8 +7,8 @@ from typing import Annotated
 
 from tyro.conf import arg
 
-from swimm3r.cli.console import drawn_progress, print_next, print_summary
-from swimm3r.presets import PRESETS
+from swimm3r.cli.terminal.console import drawn_progress, print_next, print_summary
+from swimm3r.pipeline.presets import PRESETS
 from swimm3r.splat.settings import Recipe, UwbsSettings, with_recipe
 from swimm3r.synthetic.settings import DiveSettings
 
@@ -30,9 +30,9 @@ def demo(
     size = PRESETS["fast"].splat
     assert isinstance(size, UwbsSettings)
     settings = replace(PRESETS["default"], splat=with_recipe(size, recipe))
-    from swimm3r.io.outputs import output_folder
-    from swimm3r.run import run_pipeline
-    from swimm3r.run_folder import check_vacant
+    from swimm3r.io.files.outputs import output_folder
+    from swimm3r.pipeline.run import run_pipeline
+    from swimm3r.scene.run_folder import check_vacant
     from swimm3r.synthetic import write_dive
 
     out = Path(os.path.abspath(out))

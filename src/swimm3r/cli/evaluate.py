@@ -4,7 +4,7 @@ from pathlib import Path
 
 from tyro.conf import Positional
 
-from swimm3r.cli.console import drawn_progress, print_summary
+from swimm3r.cli.terminal.console import drawn_progress, print_summary
 from swimm3r.settings import CountOrZero
 
 
@@ -24,7 +24,7 @@ def evaluate(
         reference: a cameras.json with poses to compare with.
         steps: of refinement for each test frame's pose; as in the run where not given.
     """
-    from swimm3r.run import evaluate_run
+    from swimm3r.pipeline.run import evaluate_run
 
     with drawn_progress() as progress:
         summary = evaluate_run(run, steps=steps, reference=reference, progress=progress)

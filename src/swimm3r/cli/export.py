@@ -16,8 +16,8 @@ def export(run: Positional[Path], /, ply: Path | None = None, time: ClipSecond |
         time: second of the clip that a dynamic map is exported at; half way where none is given.
     """
     from swimm3r.export.gaussians import export_run
-    from swimm3r.io.outputs import output_file
-    from swimm3r.run_folder import open_run
+    from swimm3r.io.files.outputs import output_file
+    from swimm3r.scene.run_folder import open_run
 
     open_run(run, "splat")
     with output_file(ply or run / "splat" / "gaussians.ply", "--ply") as path:

@@ -5,7 +5,7 @@ from pathlib import Path
 from rich.table import Table
 from tyro.conf import Positional
 
-from swimm3r.cli.console import drawn_progress, outcome_console
+from swimm3r.cli.terminal.console import drawn_progress, outcome_console
 from swimm3r.localization.settings import LocalizationSettings
 
 
@@ -26,11 +26,11 @@ def localize(
         out: where poses.json, poses.tum and the match pictures go; RUN/localization otherwise.
         settings: the protocol.
     """
-    from swimm3r.io.outputs import output_folder
+    from swimm3r.io.files.outputs import output_folder
     from swimm3r.localization.batch import localize_run
     from swimm3r.localization.settings import with_checkpoint_of
-    from swimm3r.presets import from_yaml
-    from swimm3r.run_folder import open_run
+    from swimm3r.pipeline.presets import from_yaml
+    from swimm3r.scene.run_folder import open_run
 
     open_run(run, "splat")
     settings = with_checkpoint_of(settings, from_yaml(run / "settings.yaml").sfm)

@@ -13,24 +13,24 @@ from typing import TypeVar
 import tyro
 
 from swimm3r.cli import bench
-from swimm3r.cli.console import MessagePrinter
 from swimm3r.cli.datasets import datasets
 from swimm3r.cli.demo import demo
 from swimm3r.cli.doctor import doctor
 from swimm3r.cli.evaluate import evaluate
 from swimm3r.cli.export import export
 from swimm3r.cli.localize import localize
-from swimm3r.cli.ranges import settings_with_ranges, with_ranges
 from swimm3r.cli.render import render
 from swimm3r.cli.report import report
 from swimm3r.cli.run import commands_for_settings, held_settings
+from swimm3r.cli.terminal.console import MessagePrinter
+from swimm3r.cli.terminal.ranges import settings_with_ranges, with_ranges
 from swimm3r.cli.train_sfm import command_for_recipe
 from swimm3r.cli.weights import weights
 from swimm3r.errors import InputError, StorageError, Swimm3rError, UsageError
 from swimm3r.memory import out_of_memory
-from swimm3r.presets import PRESETS
-from swimm3r.run_settings import starting_settings
-from swimm3r.sfm.training.settings import RECIPES as SFM_RECIPES
+from swimm3r.pipeline.presets import PRESETS
+from swimm3r.pipeline.run_settings import starting_settings
+from swimm3r.sfm.distillation.settings import RECIPES as SFM_RECIPES
 from swimm3r.splat.settings import RECIPES as MAP_RECIPES
 from swimm3r.weights.store import cache_folder
 

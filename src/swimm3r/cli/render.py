@@ -4,7 +4,7 @@ from pathlib import Path
 
 from tyro.conf import Positional
 
-from swimm3r.cli.console import drawn_progress
+from swimm3r.cli.terminal.console import drawn_progress
 from swimm3r.settings import ClipSecond, CountOrZero, LongSideOrOwn
 
 
@@ -28,10 +28,10 @@ def render(
         flight: film a flight of this many pictures along the cameras, too: OUT/flythrough.mp4.
         time: second of the clip that a dynamic map is shown at; each camera's, else its frame's, where none is given.
     """
-    from swimm3r.io.outputs import output_folder
-    from swimm3r.presets import from_yaml
-    from swimm3r.renders import render_run
-    from swimm3r.run_folder import open_run
+    from swimm3r.io.files.outputs import output_folder
+    from swimm3r.pipeline.presets import from_yaml
+    from swimm3r.pipeline.renders import render_run
+    from swimm3r.scene.run_folder import open_run
 
     open_run(run, "splat")
     restore = from_yaml(run / "settings.yaml").sfm.restore

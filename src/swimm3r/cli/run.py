@@ -11,11 +11,11 @@ from typing import Annotated, Literal
 
 from tyro.conf import Positional, arg
 
-from swimm3r.cli.console import drawn_progress, print_next, print_summary
+from swimm3r.cli.terminal.console import drawn_progress, print_next, print_summary
 from swimm3r.errors import UsageError
-from swimm3r.frame_settings import FrameSettings
-from swimm3r.presets import Preset, RunSettings, from_yaml
-from swimm3r.run_folder import is_run, read_run
+from swimm3r.pipeline.presets import Preset, RunSettings, from_yaml
+from swimm3r.scene.run_folder import is_run, read_run
+from swimm3r.scene.settings import FrameSettings
 from swimm3r.sfm.settings import ColmapModelSettings, Mast3rSettings, SfmSettings
 from swimm3r.splat.settings import MapDevice, PoseRefinementSettings, Recipe, recipe_of
 
@@ -128,7 +128,7 @@ def commands_for_settings(defaults: RunSettings) -> dict[str, Callable]:
             test: how the test frames' poses are refined.
         """
         if transforms is not None and images is None:
-            from swimm3r.io.foreign.nerfstudio import pictures_folder
+            from swimm3r.io.imports.nerfstudio import pictures_folder
 
             images = pictures_folder(transforms)
         models = [model for model in (colmap, transforms) if model is not None]
@@ -216,7 +216,7 @@ def _pipeline(
                 hint="--out with a folder that does not exist yet",
             )
         source, out = Path(read_run(source).input.path), source
-    from swimm3r.run import run_pipeline
+    from swimm3r.pipeline.run import run_pipeline
 
     with drawn_progress() as progress:
         summary = run_pipeline(

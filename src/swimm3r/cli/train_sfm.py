@@ -9,8 +9,8 @@ from typing import Annotated, Literal
 
 from tyro.conf import Positional, arg
 
-from swimm3r.cli.console import drawn_progress, print_next
-from swimm3r.sfm.training.settings import RECIPES, TrainSettings
+from swimm3r.cli.terminal.console import drawn_progress, print_next
+from swimm3r.sfm.distillation.settings import RECIPES, TrainSettings
 
 Recipe = Literal[
     "swimm3r",
@@ -49,10 +49,10 @@ def command_for_recipe(name: str) -> Callable:
             device: where the network runs.
             settings: every number of the training.
         """
-        from swimm3r.io.folder_lock import folder_lock
-        from swimm3r.io.outputs import output_folder
-        from swimm3r.sfm.training.job import train_sfm as run
-        from swimm3r.sfm.training.loop import Estimate
+        from swimm3r.io.files.folder_lock import folder_lock
+        from swimm3r.io.files.outputs import output_folder
+        from swimm3r.sfm.distillation.loop import Estimate
+        from swimm3r.sfm.distillation.train import train_sfm as run
 
         def announce(e: Estimate) -> None:
             memory = "" if e.peak_mb is None else f", {e.peak_mb:.0f} MB"

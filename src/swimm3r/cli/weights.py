@@ -6,7 +6,7 @@ from typing import Annotated
 from tyro.conf import Positional, arg, subcommand
 
 from swimm3r import weights as store
-from swimm3r.cli.console import drawn_progress
+from swimm3r.cli.terminal.console import drawn_progress
 from swimm3r.errors import WeightsError
 
 

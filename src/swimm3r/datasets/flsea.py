@@ -12,7 +12,7 @@ import numpy as np
 
 from swimm3r.datasets.layouts import Folder, by_stem, counted, depth_maps, pictures
 from swimm3r.datasets.sequences import Lens, Sequence, Shot, Skipped
-from swimm3r.io import colmap
+from swimm3r.io.colmap import model as colmap
 
 REGIONS = {
     "canyons": ("flatiron", "horse_canyon", "tiny_canyon", "u_canyon"),

@@ -7,7 +7,7 @@ from pathlib import Path
 
 from swimm3r.io import depth as depth_files
 from swimm3r.io import images
-from swimm3r.io.stills import natural_key
+from swimm3r.io.image_folder import natural_key
 
 
 @dataclass(frozen=True)

@@ -11,7 +11,7 @@ from pathlib import Path
 
 from swimm3r.datasets.layouts import Folder, pictures
 from swimm3r.datasets.sequences import Lens, Sequence, Shot, Skipped
-from swimm3r.io import colmap
+from swimm3r.io.colmap import model as colmap
 
 _TEST_EVERY = 8
 

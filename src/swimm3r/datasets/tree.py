@@ -4,17 +4,17 @@ import os
 from collections.abc import Callable
 from pathlib import Path
 
-from swimm3r.datasets import flsea, posed_scenes, seathru, triples
+from swimm3r.datasets import flsea, paired_folders, posed_scenes, seathru
 from swimm3r.datasets.layouts import Folder, counted, folder
 from swimm3r.datasets.sequences import Sequence, Skipped, Survey
 from swimm3r.errors import InputError
 
 _Reader = Callable[[Folder], tuple[Sequence | None, list[Skipped]]]
 _LAYOUTS: tuple[tuple[Callable[[Folder], bool], _Reader], ...] = (
-    (triples.is_dive, triples.read_dive),
+    (paired_folders.is_dive, paired_folders.read_dive),
     (flsea.is_sequence, flsea.read_sequence),
     (seathru.is_scene, seathru.read_scene),
-    (triples.is_triples, triples.read_triples),
+    (paired_folders.is_triples, paired_folders.read_triples),
     (posed_scenes.is_scene, posed_scenes.read_scene),
 )
 

@@ -24,16 +24,16 @@ from swimm3r.geometry import quaternion_from_rotation
 from swimm3r.io import cameras_json
 from swimm3r.io.ply import write_vertices
 from swimm3r.raster import ALPHA_MAX, ALPHA_MIN, RasterOutput, rasterize
-from swimm3r.run_folder import open_run
+from swimm3r.scene.run_folder import open_run
 from swimm3r.settings import ClipSecond, accepted
-from swimm3r.splat.checkpoint import load_map
-from swimm3r.splat.conditioning import Conditioned, condition, queries, symmetric
-from swimm3r.splat.gaussians import coloured, covariance
-from swimm3r.splat.primitives import BetaPrimitives, select
-from swimm3r.splat.projection import pinhole, project, project_conditioned
+from swimm3r.splat.map_file import load_map
+from swimm3r.splat.primitives.beta import BetaPrimitives, select
+from swimm3r.splat.primitives.gaussian import coloured, covariance
+from swimm3r.splat.primitives.spherical_harmonics import Y_00
+from swimm3r.splat.projection.conditioning import Conditioned, condition, queries, symmetric
+from swimm3r.splat.projection.dispatch import pinhole, project, project_conditioned
 from swimm3r.splat.rendering import SplatMap, in_scene_units
 from swimm3r.splat.settings import RenderSettings
-from swimm3r.splat.spherical import Y_00
 
 _CONDON_SHORTLEY = [(-1.0) ** m for degree in (1, 2, 3) for m in range(-degree, degree + 1)]
 _ASKED = 64  # cameras, spread over the dive, that say which way a primitive is looked at

@@ -15,10 +15,10 @@ from pathlib import Path
 import numpy as np
 
 from swimm3r.cameras import cameras_of, check_cameras, check_lens
-from swimm3r.io.atomic import write_text
-from swimm3r.io.damage import Remedy, guard
-from swimm3r.io.json_file import read_json
-from swimm3r.io.safe_names import check_names
+from swimm3r.io.files.atomic import write_text
+from swimm3r.io.files.damage import Remedy, guard
+from swimm3r.io.files.json_file import read_json
+from swimm3r.io.files.safe_names import check_names
 
 _REMEDY = Remedy(
     "see docs/conventions.md for the layout; RUN/sfm/cameras.json of any run is an example",

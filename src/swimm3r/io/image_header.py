@@ -19,7 +19,7 @@ from PIL import BmpImagePlugin, Image, ImageFile, JpegImagePlugin, PngImagePlugi
 
 from swimm3r import memory
 from swimm3r.errors import InputError
-from swimm3r.io.regular_file import require_regular_file
+from swimm3r.io.files.regular_file import require_regular_file
 
 DAMAGED = (OSError, ValueError, IndexError, KeyError, SyntaxError, struct.error, zlib.error, tifffile.TiffFileError)
 TRANSPOSED = (5, 6, 7, 8)  # orientations that swap width and height

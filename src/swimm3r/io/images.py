@@ -12,7 +12,7 @@ import numpy as np
 import tifffile
 from jaxtyping import Bool, Float, UInt8, UInt16
 
-from swimm3r.io.atomic import atomic_path
+from swimm3r.io.files.atomic import atomic_path
 from swimm3r.io.image_header import (
     DAMAGED,
     TRANSPOSED,

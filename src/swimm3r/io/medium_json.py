@@ -6,9 +6,9 @@ from pathlib import Path
 
 import torch
 
-from swimm3r.io.atomic import write_text
-from swimm3r.io.damage import Remedy
-from swimm3r.io.json_file import read_json
+from swimm3r.io.files.atomic import write_text
+from swimm3r.io.files.damage import Remedy
+from swimm3r.io.files.json_file import read_json
 from swimm3r.medium import AttenuationCurve, Encoding, Estimator, Medium, MediumFit
 
 

@@ -5,8 +5,8 @@ from pathlib import Path
 import numpy as np
 from jaxtyping import Float, Float32
 
-from swimm3r.io.atomic import atomic_path
-from swimm3r.io.damage import Remedy, guard
+from swimm3r.io.files.atomic import atomic_path
+from swimm3r.io.files.damage import Remedy, guard
 
 _REMEDY = Remedy(
     "save it as binary PLY with colours, in CloudCompare or MeshLab for example",

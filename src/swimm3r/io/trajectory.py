@@ -8,7 +8,7 @@ import torch
 from jaxtyping import Float
 
 from swimm3r.geometry import quaternion_from_rotation
-from swimm3r.io.atomic import write_text
+from swimm3r.io.files.atomic import write_text
 
 
 def write_tum(path: Path, times: Sequence[float], cam2world: Float[np.ndarray, "c 4 4"]) -> None:

@@ -15,7 +15,7 @@ import numpy as np
 from jaxtyping import UInt8
 
 from swimm3r.errors import InputError
-from swimm3r.io.regular_file import require_regular_file
+from swimm3r.io.files.regular_file import require_regular_file
 
 if TYPE_CHECKING:
     import av

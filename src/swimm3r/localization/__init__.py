@@ -7,9 +7,9 @@ if TYPE_CHECKING:
     from torch import Tensor
 
     from swimm3r.cameras import Cameras
-    from swimm3r.frames import Frames
     from swimm3r.localization.settings import LocalizationSettings
-    from swimm3r.reconstruction import Reconstruction
+    from swimm3r.scene.frames import Frames
+    from swimm3r.scene.reconstruction import Reconstruction
     from swimm3r.splat.rendering import SplatMap
 
 
@@ -28,7 +28,7 @@ def localize(
     poses take their place. `lens` is the picture's camera (its pose unused), by default that of the reconstruction;
     `time`, seconds of the clip, is the moment at which a dynamic map is shown.
     """
-    from swimm3r.localization.protocol import Localizer
+    from swimm3r.localization.localizer import Localizer
 
     localizer = Localizer(scene, rec, frames, settings)
     return localizer.in_axes_of_sfm(localizer.locate(image, lens=lens, time=time).cam2world)

@@ -15,19 +15,20 @@ import torch
 from jaxtyping import Bool, Float, UInt8
 from torch import Tensor
 
-from swimm3r import devices, reconstruction
+from swimm3r import devices
 from swimm3r.cameras import Cameras, cameras_of
 from swimm3r.errors import InputError, RegistrationError
 from swimm3r.io import cameras_json, images
-from swimm3r.io.atomic import write_text
+from swimm3r.io.files.atomic import write_text
 from swimm3r.io.image_header import read_header
 from swimm3r.io.trajectory import write_tum
-from swimm3r.localization.protocol import STAGES, Evidence, Localization, Localizer
+from swimm3r.localization.localizer import STAGES, Evidence, Localization, Localizer
 from swimm3r.localization.settings import LocalizationSettings
 from swimm3r.prepare import load_frames
 from swimm3r.progress import Progress, silent
-from swimm3r.run_folder import open_run
-from swimm3r.splat.checkpoint import load_map
+from swimm3r.scene import reconstruction
+from swimm3r.scene.run_folder import open_run
+from swimm3r.splat.map_file import load_map
 
 _LINES = 60  # inliers drawn, spread over all of them
 

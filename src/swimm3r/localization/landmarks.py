@@ -14,12 +14,12 @@ from scipy.spatial import KDTree
 from torch import Tensor
 
 from swimm3r.cameras import Cameras
-from swimm3r.frames import Frames
-from swimm3r.io.colmap import silence_log
-from swimm3r.reconstruction import Reconstruction
-from swimm3r.sfm.colmap import absolute_pose
+from swimm3r.io.colmap.model import silence_log
+from swimm3r.scene.frames import Frames
+from swimm3r.scene.reconstruction import Reconstruction
+from swimm3r.sfm.colmap.poses import absolute_pose
+from swimm3r.sfm.features.sift import extract_features, match_descriptors, unit_descriptors
 from swimm3r.sfm.settings import FeatureSettings
-from swimm3r.sfm.sift import extract_features, match_descriptors, unit_descriptors
 
 MIN_INLIERS = 12
 """Landmarks that agree on a pose before it is believed: 6 of them fix it, and strangers agree on a few more."""

@@ -13,16 +13,16 @@ from jaxtyping import Bool, Float
 from torch import Tensor
 
 from swimm3r import weights
-from swimm3r.io.colmap import silence_log
+from swimm3r.io.colmap.model import silence_log
 from swimm3r.localization.settings import LocalizationSettings
-from swimm3r.sfm import retrieval, vlad
+from swimm3r.sfm.features import asmk, vlad
+from swimm3r.sfm.features.sift import extract_features, match_descriptors, unit_descriptors
 from swimm3r.sfm.mast3r.inference import ViewPrediction, predict_pair
+from swimm3r.sfm.mast3r.matching import DescriptorMap, match_views
 from swimm3r.sfm.mast3r.network import Encoded, Mast3r
-from swimm3r.sfm.mast3r.pair_run import load_network
 from swimm3r.sfm.mast3r.preprocess import Framing, framing, mask_to_network, pixels_to_picture, to_network
-from swimm3r.sfm.matching import DescriptorMap, match_views
+from swimm3r.sfm.mast3r_sfm.run_pairs import load_network
 from swimm3r.sfm.settings import Mast3rSettings
-from swimm3r.sfm.sift import extract_features, match_descriptors, unit_descriptors
 
 Pixels = Float[Tensor, "m 2"]  # of pictures as they were described, centres at +0.5
 Likeness = Callable[[Any], Float[Tensor, " k"]]  # of a described picture to each reference
@@ -121,8 +121,8 @@ class Mast3rMatcher:
         """Cosines of the tokens' summed deviations from the references' mean token."""
         sample = names[:: -(-len(names) // _SAMPLE)]
         mean = torch.stack([_tokens(described(name)).mean(0) for name in sample]).mean(0)
-        known = torch.stack([retrieval.global_descriptor(_tokens(described(name)) - mean) for name in names])
-        return lambda query: known @ retrieval.global_descriptor(_tokens(query) - mean)
+        known = torch.stack([asmk.global_descriptor(_tokens(described(name)) - mean) for name in names])
+        return lambda query: known @ asmk.global_descriptor(_tokens(query) - mean)
 
     def match(self, a: _Seen, b: _Seen) -> tuple[Pixels, Pixels]:
         """Reciprocal nearest descriptors of both passes."""

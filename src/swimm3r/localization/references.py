@@ -8,8 +8,8 @@ from jaxtyping import Bool, Float
 from torch import Tensor
 
 from swimm3r.cameras import Cameras, directions
-from swimm3r.frames import Frames
-from swimm3r.reconstruction import Reconstruction
+from swimm3r.scene.frames import Frames
+from swimm3r.scene.reconstruction import Reconstruction
 from swimm3r.splat.rendering import SplatMap
 
 

@@ -3,11 +3,11 @@
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from swimm3r.frame_settings import FrameSettings
 from swimm3r.progress import Progress, silent
+from swimm3r.scene.settings import FrameSettings
 
 if TYPE_CHECKING:
-    import swimm3r.frames
+    import swimm3r.scene.frames
 
 __all__ = ["check_source", "load_frames", "read_frames"]
 
@@ -18,23 +18,23 @@ def read_frames(
     folder: Path | None = None,
     progress: Progress = silent,
     **changes: Any,
-) -> "swimm3r.frames.Frames":
+) -> "swimm3r.scene.frames.Frames":
     """The frames of a video or a folder of stills, prepared into `folder`.
 
     Without a folder they go into the user's cache and are found there the next time. `changes` replace single settings:
     `read_frames("dive.mp4", fps=2)`. What `folder` held of an earlier preparation is replaced. Raises InputError on
     what cannot be used, and OSError where the disk refuses; then nothing is left behind.
     """
-    from swimm3r.prepare import reading
+    from swimm3r.prepare import frames_folder
 
-    return reading.read_frames(source, settings, folder, progress, **changes)
+    return frames_folder.read_frames(source, settings, folder, progress, **changes)
 
 
-def load_frames(folder: Path) -> "swimm3r.frames.Frames":
+def load_frames(folder: Path) -> "swimm3r.scene.frames.Frames":
     """What `read_frames` prepared in a folder. Raises InputError where that is not whole."""
-    from swimm3r.prepare import reading
+    from swimm3r.prepare import frames_folder
 
-    return reading.load_frames(folder)
+    return frames_folder.load_frames(folder)
 
 
 def check_source(source: Path) -> Path:
@@ -42,6 +42,6 @@ def check_source(source: Path) -> Path:
 
     Cheap, and writes nothing. Raises InputError where a source is plainly none of them, or cannot be read.
     """
-    from swimm3r.prepare import reading
+    from swimm3r.prepare import frames_folder
 
-    return reading.check_source(source)
+    return frames_folder.check_source(source)

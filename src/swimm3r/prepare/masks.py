@@ -7,9 +7,9 @@ import numpy as np
 from jaxtyping import Bool
 
 from swimm3r.errors import InputError
-from swimm3r.frame_settings import FrameSettings
-from swimm3r.io import images, stills
-from swimm3r.prepare.pictures import Dive, Picture, some_names
+from swimm3r.io import image_folder, images
+from swimm3r.prepare.candidates import Dive, Picture, some_names
+from swimm3r.scene.settings import FrameSettings
 
 FOLDER = "masks"  # of the prepared ones, within the folder of the frames
 
@@ -65,7 +65,7 @@ def _find(dive: Dive, settings: FrameSettings) -> tuple[dict[Path, Path], list[P
     found: dict[Path, Path] = {}
     masks: set[Path] = set()
     for folder in folders:
-        within = stills.MaskFolder(folder, dive.files, [other for other in folders if other != folder])
+        within = image_folder.MaskFolder(folder, dive.files, [other for other in folders if other != folder])
         masks.update(within.paths)
         for original in dive.originals:
             mask = within.mask_of(original)

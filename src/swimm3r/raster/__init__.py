@@ -164,16 +164,16 @@ class _Rasterize(torch.autograd.Function):
 def _kernels(backend: Backend) -> ModuleType:
     """A fast back end, imported when first used: Numba and Warp take half a second each."""
     if backend == "numba":
-        from swimm3r.raster import numba_cpu
+        from swimm3r.raster.cpu import backend as cpu_backend
 
-        return numba_cpu
+        return cpu_backend
     try:
-        from swimm3r.raster import warp_gpu
+        from swimm3r.raster.cuda import backend as cuda_backend
     except ModuleNotFoundError as error:
         if error.name != "warp":
             raise
         raise devices.without_warp("move the tensors to the CPU") from error
-    return warp_gpu
+    return cuda_backend
 
 
 def _zeros(p: Primitives2D) -> SggBuffers:

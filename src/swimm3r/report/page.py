@@ -10,18 +10,18 @@ import jinja2
 import numpy as np
 import torch
 
-from swimm3r import reconstruction
-from swimm3r.frames import Frames
 from swimm3r.io import images
-from swimm3r.io.atomic import write_text
-from swimm3r.io.damage import Remedy, damaged, first_line, guard
+from swimm3r.io.files.atomic import write_text
+from swimm3r.io.files.damage import Remedy, damaged, first_line, guard
 from swimm3r.io.view_names import view_stems
 from swimm3r.medium import MediumFit, backscatter, transmittances
 from swimm3r.prepare import load_frames
-from swimm3r.reconstruction import Reconstruction
 from swimm3r.report import charts
-from swimm3r.run_folder import open_run
-from swimm3r.sfm.water_plausibility import any_determined, attenuation_is_a_guess
+from swimm3r.scene import reconstruction
+from swimm3r.scene.frames import Frames
+from swimm3r.scene.reconstruction import Reconstruction
+from swimm3r.scene.run_folder import open_run
+from swimm3r.sfm.medium.plausibility import any_determined, attenuation_is_a_guess
 
 _SHOWN_FRAMES = 8
 _SHOWN_TESTS = 4

@@ -9,18 +9,18 @@ from swimm3r.progress import Progress, silent
 from swimm3r.sfm.settings import ColmapModelSettings, ColmapSettings, Mast3rSettings, SfmSettings
 
 if TYPE_CHECKING:
-    import swimm3r.frames
-    import swimm3r.reconstruction
+    import swimm3r.scene.frames
+    import swimm3r.scene.reconstruction
 
 __all__ = ["ColmapModelSettings", "ColmapSettings", "Mast3rSettings", "SfmSettings", "reconstruct"]
 
 
 def reconstruct(
-    frames: "swimm3r.frames.Frames",
+    frames: "swimm3r.scene.frames.Frames",
     settings: SfmSettings | None = None,
     folder: Path | None = None,
     progress: Progress = silent,
-) -> "swimm3r.reconstruction.Reconstruction":
+) -> "swimm3r.scene.reconstruction.Reconstruction":
     """Cameras, points, dense depth, water and restored cloud of a set of frames, of which only `frames.train` is used.
 
     Works in `folder` (a new temporary one by default) and goes on from what an interrupted call left there.
@@ -37,14 +37,14 @@ def reconstruct(
     folder = folder or Path(mkdtemp(prefix="swimm3r-sfm-"))
     match settings:
         case ColmapSettings():
-            from swimm3r.sfm import weights_free
+            from swimm3r.sfm.backends import colmap as colmap_backend
 
-            return weights_free.reconstruct(frames, settings, folder, progress)
+            return colmap_backend.reconstruct(frames, settings, folder, progress)
         case Mast3rSettings():
-            from swimm3r.sfm.mast3r import backend
+            from swimm3r.sfm.backends import mast3r as mast3r_backend
 
-            return backend.reconstruct(frames, settings, folder, progress)
+            return mast3r_backend.reconstruct(frames, settings, folder, progress)
         case ColmapModelSettings():
-            from swimm3r.sfm import importers
+            from swimm3r.sfm.backends import imported as imported_backend
 
-            return importers.reconstruct(frames, settings, folder, progress)
+            return imported_backend.reconstruct(frames, settings, folder, progress)

@@ -24,7 +24,7 @@ from swimm3r.sfm.mast3r.settings import AlignmentSettings, MatchingSettings
 
 @dataclass(frozen=True)
 class PlaneSweepSettings(Settings):
-    """Dense depth of posed frames (`sfm/plane_sweep.py`)."""
+    """Dense depth of posed frames (`sfm/plane_sweep/estimate.py`)."""
 
     long_side: LongSide = 640
     """Pixels of the longer side at which depth is computed; larger frames get it upsampled along their edges."""
@@ -60,7 +60,7 @@ class PlaneSweepSettings(Settings):
 
 @dataclass(frozen=True)
 class TrackSettings(Settings):
-    """Pixels of several depth maps grouped into surface points (`sfm/tracks.py`)."""
+    """Pixels of several depth maps grouped into surface points (`sfm/medium/dense_tracks.py`)."""
 
     tolerance: Share = 0.02
     """Relative difference in z depth up to which two frames show the same point."""
@@ -74,7 +74,7 @@ class TrackSettings(Settings):
 
 @dataclass(frozen=True)
 class RestoreSettings(Settings):
-    """Pictures and points with the water removed (`sfm/restore.py`). Values are 0..1."""
+    """Pictures and points with the water removed (`sfm/medium/restore.py`). Values are 0..1."""
 
     noise: PositiveShare = 0.01
     """Standard deviation of a pixel: sensor and compression."""
@@ -95,7 +95,7 @@ class RestoreSettings(Settings):
 
 @dataclass(frozen=True)
 class SeathruSettings(Settings):
-    """The water from pictures and depth (`sfm/seathru.py`). Values are 0..1, standard deviations without unit."""
+    """The water from pictures and depth (`sfm/medium/seathru.py`). Values are 0..1, standard deviations without unit."""
 
     tracks: TrackSettings = field(default_factory=TrackSettings)
     max_pixels: Count = 300_000
@@ -155,7 +155,7 @@ class SeathruSettings(Settings):
 
 @dataclass(frozen=True)
 class FeatureSettings(Settings):
-    """SIFT and its matching (`sfm/sift.py`)."""
+    """SIFT and its matching (`sfm/features/sift.py`)."""
 
     count: Annotated[int, Range(1, 1_000_000)] = 2048
     """Most keypoints of a frame; one with two orientations counts once."""
@@ -173,7 +173,7 @@ class FeatureSettings(Settings):
 
 @dataclass(frozen=True)
 class MappingSettings(Settings):
-    """From verified matches to cameras and points (`sfm/mapping.py`)."""
+    """From verified matches to cameras and points (`sfm/colmap/mapping.py`)."""
 
     method: Literal["auto", "incremental", "global"] = "auto"
     """Auto places clips below `global_from` frames both ways and keeps what explains more; above, globally (GLOMAP)."""

@@ -1,212 +1,141 @@
-"""Dense tracks: the pixels of many depth maps that show the same piece of surface.
+"""Tracks from two-view matches: pixels of many frames that are joined by matches show one point.
 
-A pixel's point is looked up in the other frames; it belongs to the same track where that frame's depth map agrees
-(|z_j - z| <= tolerance * z) and the colours do not contradict. Every pixel is in at most one track. The position of a
-track averages the positions its depth maps give, and the ray depths of its sightings are the distances from the camera
-centres to that one position: errors of single depth maps do not pass for differences in distance.
+Matches are edges between (frame, pixel) nodes; a track is a connected component (union-find), with one pixel per frame:
+where a chain of matches comes back to a frame at another pixel, the more confident one stays. Before and after, what
+does not reproject within a bound is dropped: a single wrong match would join two points.
 """
 
-from collections.abc import Iterator
+from collections.abc import Sequence
 from dataclasses import dataclass
 
+import numpy as np
 import torch
-from jaxtyping import Bool, Float, Int
+from jaxtyping import Bool, Float, Int64
+from scipy.sparse import coo_array
+from scipy.sparse.csgraph import connected_components
 from torch import Tensor
 
-from swimm3r.cameras import Cameras, directions, image_directions, project, ray_depth_from_z
-from swimm3r.frames import Frames
-from swimm3r.progress import Progress, silent
-from swimm3r.reconstruction import Reconstruction
-from swimm3r.sfm.settings import TrackSettings
+from swimm3r.cameras import Cameras, project
+from swimm3r.scene.frames import Frames
+from swimm3r.scene.reconstruction import Points, Tracks
 
 
 @dataclass(frozen=True)
-class DenseTracks:
-    """n surface points and their o sightings; sightings of one track stand together."""
+class FrameMatches:
+    """Matches of all pairs of frames, one row each."""
 
-    xyz: Float[Tensor, "n 3"]  # world
-    track: Int[Tensor, " o"]  # index into xyz
-    frame: Int[Tensor, " o"]  # index into Reconstruction.names
-    pixel: Int[Tensor, " o"]  # row-major index in the prepared frame
-    ray_depth: Float[Tensor, " o"]  # from that frame's camera centre to xyz
-    confidence: Float[Tensor, " o"]  # of that frame's depth map
+    i: Int64[Tensor, " m"]
+    j: Int64[Tensor, " m"]
+    xy_i: Int64[Tensor, "m 2"]  # whole pixels
+    xy_j: Int64[Tensor, "m 2"]
+    confidence: Float[Tensor, " m"]
+    xyz: Float[Tensor, "m 3"]  # where an alignment puts the point
 
+    def __len__(self) -> int:
+        return len(self.i)
 
-def fuse_depth(
-    rec: Reconstruction, frames: Frames, settings: TrackSettings, progress: Progress = silent
-) -> DenseTracks:
-    """The dense tracks of the frames that have a depth map; at most about `settings.max_tracks`.
-
-    Pictures and depth maps pass through the bounded caches of `frames` and `rec`; held are one bit per pixel and frame
-    and the tracks found so far.
-    """
-    usable = [i for i, name in enumerate(rec.names) if name in rec.depth]
-    pieces: list[DenseTracks] = []
-    count = 0
-    for piece in _by_frame(rec, frames, usable, _seed_stride(rec, usable, settings), settings, progress):
-        pieces.append(DenseTracks(piece.xyz, piece.track + count, *list(vars(piece).values())[2:]))
-        count += len(piece.xyz)
-    if not pieces:
-        none = torch.zeros(0)
-        return DenseTracks(none.reshape(0, 3), none.long(), none.long(), none.long(), none, none)
-    return DenseTracks(*(torch.cat(parts) for parts in zip(*(vars(p).values() for p in pieces), strict=True)))
+    def select(self, rows: Tensor) -> "FrameMatches":
+        """Some of the matches."""
+        return FrameMatches(*(value[rows] for value in vars(self).values()))
 
 
-def count_tracks(rec: Reconstruction, frames: Frames, settings: TrackSettings, progress: Progress = silent) -> int:
-    """How many dense tracks there are in all, where every pixel of known depth may start one; none is held."""
-    usable = [i for i, name in enumerate(rec.names) if name in rec.depth]
-    return sum(len(piece.xyz) for piece in _by_frame(rec, frames, usable, 1, settings, progress))
+@dataclass(frozen=True)
+class MatchTracks:
+    """p points and their o sightings, at most one per frame; sightings of one point stand together."""
+
+    xyz: Float[Tensor, "p 3"]
+    point: Int64[Tensor, " o"]
+    frame: Int64[Tensor, " o"]
+    xy: Int64[Tensor, "o 2"]
 
 
-def _by_frame(
-    rec: Reconstruction, frames: Frames, usable: list[int], stride: int, settings: TrackSettings, progress: Progress
-) -> Iterator[DenseTracks]:
-    """The tracks that start in each frame, numbered from 0 in each."""
-    overlap = frame_overlap(rec, usable)
-    free = {i: torch.ones(rec.cameras.height * rec.cameras.width, dtype=torch.bool) for i in usable}
-    for done, i in enumerate(usable):
-        progress("fusing depth", done, len(usable))
-        yield _tracks_from(i, _neighbours(overlap, i, usable, settings), rec, frames, free, stride, settings)
-    progress("fusing depth", len(usable), len(usable))
+def reprojection_errors(
+    cameras: Cameras, frame: Int64[Tensor, " m"], xy: Float[Tensor, "m 2"], xyz: Float[Tensor, "m 3"]
+) -> Float[Tensor, " m"]:
+    """Pixels between sightings and the projections of their points, each in its own camera; infinite behind it."""
+    order = torch.argsort(frame, stable=True)
+    bounds = torch.searchsorted(frame[order], torch.arange(len(cameras) + 1))
+    errors = torch.full((len(frame),), torch.inf, dtype=torch.float64)
+    for k in range(len(cameras)):
+        rows = order[bounds[k] : bounds[k + 1]]
+        uv, z = project(cameras[k], xyz[rows].double()[None])
+        distance = torch.linalg.vector_norm(uv[0] - xy[rows].double(), dim=-1)
+        errors[rows] = torch.where(z[0] > 0, distance, torch.inf)
+    return errors
 
 
-def frame_overlap(rec: Reconstruction, usable: list[int]) -> Float[Tensor, "f f"]:
-    """The share of frame i's surface (rows) that lies inside frame j's picture (columns); 0 on the diagonal.
-
-    Seen from the depth maps on a grid of 12 x 16 pixels, occlusion aside.
-    """
-    cameras = rec.cameras
-    shares = torch.zeros(len(cameras), len(cameras))
-    rows = torch.linspace(0, cameras.height - 1, 12).long()
-    columns = torch.linspace(0, cameras.width - 1, 16).long()
-    grid = torch.stack(torch.meshgrid(columns + 0.5, rows + 0.5, indexing="xy"), -1).reshape(1, -1, 2).double()
-    for i in usable:
-        z = rec.depth[rec.names[i]].z_depth[rows][:, columns].reshape(-1).double()
-        if not (z > 0).any():
-            continue
-        camera = cameras[i]
-        seen = directions(camera, grid[:, z > 0]) * z[z > 0][None, :, None]
-        xyz = seen @ camera.cam2world[:, :3, :3].mT + camera.cam2world[:, None, :3, 3]
-        uv, ahead = project(cameras, xyz.expand(len(cameras), -1, -1))
-        shares[i] = (_inside(uv, cameras) & (ahead > 0)).double().mean(-1).float()
-        shares[i, i] = 0
-    return shares
+def consistent(matches: FrameMatches, cameras: Cameras, max_error: float) -> Bool[Tensor, " m"]:
+    """Which matches lie within `max_error` of their point in both frames; cameras are of the matches' pixel grid."""
+    ends = ((matches.i, matches.xy_i), (matches.j, matches.xy_j))
+    errors = [reprojection_errors(cameras, frame, xy + 0.5, matches.xyz) for frame, xy in ends]
+    return torch.maximum(*errors) <= max_error
 
 
-def shared_rays(cameras: Cameras) -> list[Float[Tensor, "h w 3"]]:
-    """`image_directions` of every camera; cameras of one lens share one tensor."""
-    rays: dict[bytes, Tensor] = {}
-    result = []
-    for i in range(len(cameras)):
-        lens = cameras.K[i].numpy().tobytes() + cameras.distortion[i].numpy().tobytes()
-        if lens not in rays:
-            rays[lens] = image_directions(cameras[i]).float()
-        result.append(rays[lens])
-    return result
+def join(matches: FrameMatches, width: int, height: int) -> MatchTracks:
+    """The connected components of matches over pictures of one size."""
+    pixels = width * height
+    ends = [
+        f * pixels + xy[:, 1] * width + xy[:, 0] for f, xy in ((matches.i, matches.xy_i), (matches.j, matches.xy_j))
+    ]
+    nodes, index = torch.unique(torch.cat(ends), return_inverse=True)
+    first, second = index.unflatten(0, (2, -1)).numpy()
+    graph = coo_array((np.ones(len(first), np.int8), (first, second)), shape=(len(nodes), len(nodes)))
+    count, label = connected_components(graph, directed=False)
+    track = torch.from_numpy(label.astype(np.int64))
+    weight = matches.confidence.double().clamp(min=1e-6)
+    best = torch.zeros(len(nodes), dtype=torch.float64)
+    best.scatter_reduce_(0, index, weight.repeat(2), "amax")
+    total = torch.zeros(count, dtype=torch.float64).index_add_(0, track[index[: len(matches)]], weight)
+    xyz = torch.zeros(count, 3, dtype=torch.float64)
+    xyz.index_add_(0, track[index[: len(matches)]], matches.xyz.double() * weight[:, None])
+    frame = nodes // pixels
+    # by track, then frame, then confidence downwards: the first of each (track, frame) stays
+    order = torch.from_numpy(np.lexsort((-best.numpy(), frame.numpy(), track.numpy())))
+    place = torch.stack([track[order], frame[order]], -1)
+    fresh = torch.ones(len(order), dtype=torch.bool)
+    fresh[1:] = (place[1:] != place[:-1]).any(-1)
+    kept = order[fresh]
+    pixel = nodes[kept] % pixels
+    xy = torch.stack([pixel % width, pixel // width], -1)
+    return MatchTracks(xyz / total[:, None], track[kept], frame[kept], xy)
 
 
-def _inside(uv: Float[Tensor, "*points 2"], cameras: Cameras) -> Bool[Tensor, "*points"]:
-    size = torch.tensor([cameras.width, cameras.height]).to(uv)
-    return ((uv >= 0) & (uv < size)).all(-1)
+def without(tracks: MatchTracks, dropped: Bool[Tensor, " o"]) -> MatchTracks:
+    """Without some sightings, then without points seen in fewer than 2 frames."""
+    seen = torch.bincount(tracks.point[~dropped], minlength=len(tracks.xyz))
+    return _selected(tracks, torch.nonzero(seen >= 2)[:, 0], ~dropped)
 
 
-def _neighbours(overlap: Float[Tensor, "f f"], i: int, usable: list[int], settings: TrackSettings) -> list[int]:
-    """Other frames that see enough of the surface of frame i: half the best, half evenly from the rest.
-
-    The rest look from farther away or closer: sightings that tell most about the water.
-    """
-    known = set(usable)
-    order = [j for j in torch.argsort(overlap[i], descending=True, stable=True).tolist() if j in known]
-    order = [j for j in order if overlap[i, j] > settings.min_overlap]
-    best, rest = order[: settings.max_views // 2], order[settings.max_views // 2 :]
-    step = max(1, -(-len(rest) // (settings.max_views - len(best)))) if rest else 1
-    return best + rest[::step]
+def most_seen(tracks: MatchTracks, most: int) -> MatchTracks:
+    """At most so many points, those that are seen in most frames first."""
+    if len(tracks.xyz) <= most:
+        return tracks
+    seen = torch.bincount(tracks.point, minlength=len(tracks.xyz))
+    chosen = torch.argsort(seen, descending=True, stable=True)[:most].sort().values
+    return _selected(tracks, chosen, torch.ones(len(tracks.point), dtype=torch.bool))
 
 
-def _seed_stride(rec: Reconstruction, usable: list[int], settings: TrackSettings) -> int:
-    """Grid step of the pixels that start tracks, so that tracks and memory stay bounded."""
-    probes = usable[:: max(1, len(usable) // 8)]
-    if not probes:
-        return 1
-    known = sum(int((rec.depth[rec.names[i]].z_depth > 0).sum()) for i in probes) / len(probes) * len(usable)
-    return max(1, round((known / settings.max_tracks) ** 0.5))
+def _selected(tracks: MatchTracks, points: Int64[Tensor, " k"], sightings: Bool[Tensor, " o"]) -> MatchTracks:
+    """Some of the points with some of their sightings."""
+    number = torch.full((len(tracks.xyz),), -1)
+    number[points] = torch.arange(len(points))
+    kept = sightings & (number[tracks.point] >= 0)
+    return MatchTracks(tracks.xyz[points], number[tracks.point[kept]], tracks.frame[kept], tracks.xy[kept])
 
 
-def _tracks_from(
-    i: int,
-    neighbours: list[int],
-    rec: Reconstruction,
-    frames: Frames,
-    free: dict[int, Tensor],
-    stride: int,
-    settings: TrackSettings,
-) -> DenseTracks:
-    """The tracks that start at the free pixels of frame i; what they take is struck off `free`."""
-    cameras, names = rec.cameras, rec.names
-    depth = rec.depth[names[i]]
-    z_map = depth.z_depth.reshape(-1)
-    lattice = torch.zeros(cameras.height, cameras.width, dtype=torch.bool)
-    lattice[stride // 2 :: stride, stride // 2 :: stride] = True
-    usable = frames.mask(frames.index(names[i])).reshape(-1)
-    seeds = torch.nonzero(lattice.reshape(-1) & (z_map > 0) & free[i] & usable)[:, 0]
-    free[i][seeds] = False
-    start = _unproject(cameras[i], seeds, z_map[seeds])
-    colour = frames.image(frames.index(names[i])).reshape(-1, 3)[seeds]
-    confidence = depth.confidence.reshape(-1)[seeds]
-    weight = confidence.double().clamp(min=0.01)
-    total, position = weight.clone(), start * weight[:, None]
-    sightings = [(torch.arange(len(seeds)), torch.full_like(seeds, i), seeds, confidence)]
-    for j in neighbours if len(seeds) else []:
-        uv, z = project(cameras[j], start[None])
-        uv, z = uv[0], z[0]
-        candidates = torch.nonzero(_inside(uv, cameras) & (z > 0))[:, 0]
-        pixel = uv[candidates, 1].long() * cameras.width + uv[candidates, 0].long()
-        other = rec.depth[names[j]]
-        z_other = other.z_depth.reshape(-1)[pixel].double()
-        index = frames.index(names[j])
-        change = (frames.image(index).reshape(-1, 3)[pixel] - colour[candidates]).abs().amax(-1)
-        agrees = (z_other > 0) & ((z_other - z[candidates]).abs() <= settings.tolerance * z[candidates])
-        agrees &= free[j][pixel] & frames.mask(index).reshape(-1)[pixel] & (change < settings.max_colour_change)
-        candidates, pixel, z_other = candidates[agrees], pixel[agrees], z_other[agrees]
-        first = torch.full((cameras.height * cameras.width,), len(seeds))
-        first.scatter_reduce_(0, pixel, candidates, "amin")  # two points in one pixel: the first keeps it
-        alone = first[pixel] == candidates
-        candidates, pixel, z_other = candidates[alone], pixel[alone], z_other[alone]
-        free[j][pixel] = False
-        centre = cameras.centres[j]
-        seen = centre + (start[candidates] - centre) * (z_other / z[candidates])[:, None]
-        trust = other.confidence.reshape(-1)[pixel]
-        position.index_add_(0, candidates, seen * trust.double().clamp(min=0.01)[:, None])
-        total.index_add_(0, candidates, trust.double().clamp(min=0.01))
-        sightings.append((candidates, torch.full_like(pixel, j), pixel, trust))
-    xyz = position / total[:, None]
-    track, frame, pixel, confidence = (torch.cat(part) for part in zip(*sightings, strict=True))
-    order = torch.argsort(track, stable=True)
-    track, frame = track[order], frame[order]
-    ray_depth = torch.linalg.vector_norm(xyz[track] - cameras.centres[frame], dim=-1)
-    return DenseTracks(xyz.float(), track, frame, pixel[order], ray_depth.float(), confidence[order])
-
-
-def _unproject(camera: Cameras, pixel: Int[Tensor, " n"], z_depth: Float[Tensor, " n"]) -> Float[Tensor, "n 3"]:
-    """World points of the centres of row-major pixels, float64."""
-    uv = torch.stack([pixel % camera.width + 0.5, pixel // camera.width + 0.5], -1).double()
-    seen = directions(camera, uv[None])[0] * z_depth.double()[:, None]
-    return seen @ camera.cam2world[0, :3, :3].mT + camera.cam2world[0, :3, 3]
-
-
-def ray_depth_map(z_depth: Float[Tensor, "h w"], rays: Float[Tensor, "h w 3"]) -> Float[Tensor, "h w"]:
-    """Ray depth of a depth map, 0 where nothing is known or the lens model has no ray."""
-    return torch.nan_to_num(ray_depth_from_z(z_depth, rays), nan=0.0)
-
-
-def cubes(xyz: Float[Tensor, "n 3"], size: Float[Tensor, "#n"]) -> tuple[Int[Tensor, " n"], Int[Tensor, " k"]]:
-    """Which cube of the world's grid (edge `size`, may differ per point) holds each point; number of points per cube.
-
-    Cubes are told apart by a 64-bit mix of their indices: two of a million collide with a chance of 3e-8.
-    """
-    edge = size.double()
-    cell = torch.floor(xyz.double() / edge[:, None]).long()
-    mixed = cell @ torch.tensor([6364136223846793005, 3935559000370003845, 2862933555777941757])
-    mixed = mixed * 2685821657736338717 ^ (mixed >> 29) ^ (edge.log2() * 1024).long()
-    _, which, count = torch.unique(mixed, return_inverse=True, return_counts=True)
-    return which, count
+def as_points(
+    tracks: MatchTracks, xy: Float[Tensor, "o 2"], cameras: Cameras, frames: Frames, order: Sequence[int]
+) -> tuple[Points, Tracks]:
+    """Points with colours and errors, and their tracks; `xy` and cameras are of the prepared frames, of which
+    `frames.image(order[k])` is the k-th."""
+    error = reprojection_errors(cameras, tracks.frame, xy, tracks.xyz[tracks.point])
+    seen = torch.bincount(tracks.point, minlength=len(tracks.xyz)).clamp(min=1)
+    mean = torch.zeros(len(tracks.xyz), dtype=torch.float64).index_add_(0, tracks.point, error) / seen
+    colour = torch.zeros(len(tracks.xyz), 3)
+    x = xy[:, 0].long().clamp(0, frames.width - 1)
+    y = xy[:, 1].long().clamp(0, frames.height - 1)
+    for k, i in enumerate(order):
+        rows = tracks.frame == k
+        colour.index_add_(0, tracks.point[rows], frames.image(i)[y[rows], x[rows]])
+    points = Points(tracks.xyz, colour / seen[:, None], mean)
+    return points, Tracks(tracks.point, tracks.frame, xy.double())

@@ -8,16 +8,16 @@ from swimm3r.progress import Progress, silent
 from swimm3r.splat.settings import MapDevice, SplatSettings, UwbsSettings
 
 if TYPE_CHECKING:
-    import swimm3r.frames
-    import swimm3r.reconstruction
+    import swimm3r.scene.frames
+    import swimm3r.scene.reconstruction
     import swimm3r.splat.rendering
 
 __all__ = ["SplatSettings", "UwbsSettings", "train"]
 
 
 def train(
-    reconstruction: "swimm3r.reconstruction.Reconstruction",
-    frames: "swimm3r.frames.Frames",
+    reconstruction: "swimm3r.scene.reconstruction.Reconstruction",
+    frames: "swimm3r.scene.frames.Frames",
     settings: SplatSettings | None = None,
     folder: Path | None = None,
     progress: Progress = silent,
@@ -30,8 +30,8 @@ def train(
     Raises InputError where no training frame is registered, DeviceError where `device` is not here.
     """
     from swimm3r import devices
-    from swimm3r.splat import fitting
+    from swimm3r.splat import train_map
 
     folder = folder or Path(mkdtemp(prefix="swimm3r-splat-"))
     place = devices.for_maps(device)
-    return fitting.train(reconstruction, frames, settings or UwbsSettings(), folder, progress, place)
+    return train_map.train(reconstruction, frames, settings or UwbsSettings(), folder, progress, place)

@@ -23,7 +23,7 @@ from swimm3r.settings import (
     Settings,
     Share,
 )
-from swimm3r.splat.scene_settings import MediumFieldSettings, TrainingPoseSettings
+from swimm3r.splat.shared_settings import MediumFieldSettings, TrainingPoseSettings
 
 
 @dataclass(frozen=True)

@@ -14,7 +14,7 @@ from swimm3r.cameras import Cameras
 from swimm3r.medium import Medium
 from swimm3r.raster import MediumMaps, RasterOutput, SggBuffers, rasterize
 from swimm3r.splat.gaussian_settings import GaussianSettings
-from swimm3r.splat.medium_field import (
+from swimm3r.splat.medium.field import (
     NO_WATER,
     FieldGrid,
     MediumField,
@@ -23,10 +23,10 @@ from swimm3r.splat.medium_field import (
     per_z_depth,
     ray_lengths,
 )
-from swimm3r.splat.pose_codes import RefinedPoses
-from swimm3r.splat.projection import Pinhole, Primitives, Projection, pinhole, project
-from swimm3r.splat.scene_water import SceneWater, WaterLayer, layer, relative_depth, seen_through
+from swimm3r.splat.medium.seasplat import SceneWater, WaterLayer, layer, relative_depth, seen_through
+from swimm3r.splat.projection.dispatch import Pinhole, Primitives, Projection, pinhole, project
 from swimm3r.splat.settings import SplatSettings, UwbsSettings
+from swimm3r.splat.training_poses import RefinedPoses
 from swimm3r.splat.views import moment
 
 _SEEN = 1e-3  # alpha below which a pixel has no depth

@@ -24,13 +24,8 @@ from swimm3r.settings import (
     Settings,
     Share,
 )
-from swimm3r.splat.gaussian_settings import (
-    GaussianSettings,
-    McmcGsSettings,
-    SeaSplatSettings,
-    WaterSplattingSettings,
-)
-from swimm3r.splat.scene_settings import MediumFieldSettings, TrainingPoseSettings
+from swimm3r.splat.gaussian_settings import GaussianSettings, McmcGsSettings, SeaSplatSettings, WaterSplattingSettings
+from swimm3r.splat.shared_settings import MediumFieldSettings, TrainingPoseSettings
 
 
 @dataclass(frozen=True)

@@ -16,10 +16,10 @@ from torch.nn.functional import interpolate
 
 from swimm3r.cameras import Cameras, distorted_grid, project, resized
 from swimm3r.errors import InputError
-from swimm3r.frames import Frames
-from swimm3r.io.cache import ArrayCache
-from swimm3r.open_water import sea_share
-from swimm3r.reconstruction import Reconstruction
+from swimm3r.imaging.open_water import sea_share
+from swimm3r.io.files.cache import ArrayCache
+from swimm3r.scene.frames import Frames
+from swimm3r.scene.reconstruction import Reconstruction
 from swimm3r.splat.settings import SplatSettings
 
 

@@ -22,15 +22,15 @@ from torch import Tensor
 from swimm3r import water_types
 from swimm3r.cameras import Cameras, directions, pixel_grid, ray_depth_from_z, resized
 from swimm3r.errors import InputError
-from swimm3r.ground_truth import FOLDER
 from swimm3r.io import cameras_json, images
-from swimm3r.io.atomic import atomic_path, write_text
-from swimm3r.io.damage import Remedy, guard
+from swimm3r.io.files.atomic import atomic_path, write_text
+from swimm3r.io.files.damage import Remedy, guard
 from swimm3r.medium import Medium, add_water, srgb_from_linear
 from swimm3r.progress import Progress, silent
+from swimm3r.scene.ground_truth import FOLDER
 from swimm3r.synthetic import disturbances
 from swimm3r.synthetic.path import camera_path
-from swimm3r.synthetic.render import SAMPLES, render
+from swimm3r.synthetic.render_frame import SAMPLES, render
 from swimm3r.synthetic.seafloor import Seafloor, make_seafloor
 from swimm3r.synthetic.settings import DiveSettings
 

@@ -23,7 +23,7 @@ from safetensors.torch import load_file, save_file
 from torch import Tensor
 
 from swimm3r.errors import WeightsError
-from swimm3r.io.atomic import atomic_path
+from swimm3r.io.files.atomic import atomic_path
 from swimm3r.sfm.mast3r.network import Architecture, Mast3r
 
 _ALIAS = re.compile(r"\.dpt\.scratch\.(?:layer([1-4])_rn|layer_rn\.([0-3]))\.")

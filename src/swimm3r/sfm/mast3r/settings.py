@@ -75,7 +75,7 @@ PairGraph = Complete | SlidingWindow | LogWindow | OneReference | Retrieval | Vi
 
 @dataclass(frozen=True)
 class MatchingSettings(Settings):
-    """Reciprocal matching of two descriptor maps (`sfm/matching.py`)."""
+    """Reciprocal matching of two descriptor maps (`sfm/mast3r/matching.py`)."""
 
     subsample: Annotated[int, Range(1, 64)] = 8
     """One search starts in every cell of this many pixels; the sparse alignment's anchors have the same spacing."""
@@ -85,7 +85,7 @@ class MatchingSettings(Settings):
 
 @dataclass(frozen=True)
 class AlignmentSettings(Settings):
-    """Sparse global alignment (`sfm/alignment.py`); the defaults are MASt3R-SfM's where it says nothing else."""
+    """Sparse global alignment (`sfm/alignment/optimize.py`); the defaults are MASt3R-SfM's where it says nothing else."""
 
     subsample: Annotated[int, Range(1, 64)] = 8
     """One depth per block of this many pixels is optimised; the rest of the block follows it."""
@@ -118,7 +118,7 @@ class AlignmentSettings(Settings):
 
 @dataclass(frozen=True)
 class LoraSettings(Settings):
-    """Which layers of the frozen network get a trained low-rank update (`sfm/mast3r/lora.py`)."""
+    """Which layers of the frozen network get a trained low-rank update (`sfm/student/lora.py`)."""
 
     reading: Literal["A", "A2", "B", "C", "D"] = "A"
     """What the paper's "patch embedding and projection layers" are. A: the layers called `proj` of patch embedding and
@@ -135,7 +135,7 @@ class LoraSettings(Settings):
 
 @dataclass(frozen=True)
 class ObjectiveSettings(Settings):
-    """What is minimised (`sfm/distill.py`); the defaults are the paper's, Eq. geom to stage1_objective."""
+    """What is minimised (`sfm/student/losses.py`); the defaults are the paper's, Eq. geom to stage1_objective."""
 
     encoder: NotNegative = 0.5
     decoder: NotNegative = 0.5

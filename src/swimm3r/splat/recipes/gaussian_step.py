@@ -7,16 +7,16 @@ import torch
 from jaxtyping import Float, Int
 from torch import Tensor
 
-from swimm3r.splat import training
 from swimm3r.splat.gaussian_settings import GaussianSettings
-from swimm3r.splat.gaussians import GaussianPrimitives, initial_gaussians, rescaled, to_degree
-from swimm3r.splat.medium_field import NO_WATER, MediumField
-from swimm3r.splat.optimiser import Moments, log_linear
-from swimm3r.splat.pose_codes import pose_rate
-from swimm3r.splat.projection import Pinhole
+from swimm3r.splat.medium.field import NO_WATER, MediumField
+from swimm3r.splat.optimizer import Moments, log_linear
+from swimm3r.splat.primitives.gaussian import GaussianPrimitives, initial_gaussians, rescaled, to_degree
+from swimm3r.splat.projection.dispatch import Pinhole
 from swimm3r.splat.rendering import Drawing, draw
-from swimm3r.splat.site import Site
-from swimm3r.splat.state import POSES, State, parameters_of
+from swimm3r.splat.training import loop
+from swimm3r.splat.training.scene import Site
+from swimm3r.splat.training.state import POSES, State, parameters_of
+from swimm3r.splat.training_poses import pose_rate
 from swimm3r.splat.views import View
 
 # purposes of randomness (training.generator): 2 primitives, 3 water, 4 densification, 6 poses, 7 matches, 8 noise
@@ -44,7 +44,7 @@ class Look:
 
 def first_gaussians(site: Site, settings: GaussianSettings) -> GaussianPrimitives:
     """The Gaussians before step 1, in working units."""
-    p = initial_gaussians(site.rec, settings.initial, training.generator(settings.seed, 0, 2))
+    p = initial_gaussians(site.rec, settings.initial, loop.generator(settings.seed, 0, 2))
     return rescaled(p, site.scale)
 
 
@@ -63,9 +63,9 @@ def look(site: Site, state: State, view: View, settings: GaussianSettings, step:
 
 def with_matches(
     site: Site, state: State, loss: Float[Tensor, ""], settings: GaussianSettings, step: int
-) -> tuple[Float[Tensor, ""], training.Numbers]:
+) -> tuple[Float[Tensor, ""], loop.Numbers]:
     """The loss, with the epipolar error of the training poses while it takes part, and that for the record."""
-    rng = training.generator(settings.seed, step, 7)
+    rng = loop.generator(settings.seed, step, 7)
     off = site.epipolar_error(state.poses, settings.poses, step / settings.iterations, rng)
     if off is None:
         return loss, {}

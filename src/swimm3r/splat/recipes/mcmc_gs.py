@@ -13,14 +13,15 @@ from dataclasses import dataclass
 
 import torch
 
-from swimm3r.splat import gaussian_mcmc, losses, schedule, training
+from swimm3r.splat.densify import mcmc_gaussian, schedule
 from swimm3r.splat.gaussian_settings import McmcGsSettings
-from swimm3r.splat.medium_field import MediumField
-from swimm3r.splat.optimiser import adam_step
+from swimm3r.splat.medium.field import MediumField
+from swimm3r.splat.optimizer import adam_step
 from swimm3r.splat.recipes.gaussian_step import InField, first_gaussians, look, rates_of, with_matches, with_rows
-from swimm3r.splat.scene_settings import MediumFieldSettings
-from swimm3r.splat.site import Site
-from swimm3r.splat.state import State, first_state, parameters_of
+from swimm3r.splat.shared_settings import MediumFieldSettings
+from swimm3r.splat.training import loop, losses
+from swimm3r.splat.training.scene import Site
+from swimm3r.splat.training.state import State, first_state, parameters_of
 from swimm3r.splat.views import View
 
 
@@ -33,11 +34,11 @@ class McmcGs:
 
     def start(self) -> InField:
         """Small Gaussians on the cloud, coloured as filmed."""
-        codes = self.site.codes(self.settings.poses, training.generator(self.settings.seed, 0, 6))
+        codes = self.site.codes(self.settings.poses, loop.generator(self.settings.seed, 0, 6))
         no_water = MediumField(MediumFieldSettings(model="none"))
         return first_state(first_gaussians(self.site, self.settings), no_water, codes)
 
-    def step(self, state: InField, view: View, step: int) -> tuple[InField, training.Numbers]:
+    def step(self, state: InField, view: View, step: int) -> tuple[InField, loop.Numbers]:
         """One view: forward, adjoint, Adam, relocation and growth on their cadence, noise."""
         settings, w = self.settings, self.settings.weights
         seen = look(self.site, state, view, settings, step)
@@ -56,16 +57,16 @@ class McmcGs:
             if schedule.has_round(settings.densify, step, settings.iterations):
                 state, counts = self._densified(state, step)
                 numbers |= counts
-            rng = training.generator(settings.seed, step, 8)
+            rng = loop.generator(settings.seed, step, 8)
             p, d = state.primitives, settings.densify
-            p.xyz.add_(gaussian_mcmc.noise(p, d.noise * rates["xyz"], d.dead_opacity, rng))
+            p.xyz.add_(mcmc_gaussian.noise(p, d.noise * rates["xyz"], d.dead_opacity, rng))
         return state, numbers
 
     def _densified(self, state: InField, step: int) -> tuple[InField, dict[str, float]]:
         d, n = self.settings.densify, len(state.primitives.xyz)
         target = schedule.grown(n, self.settings.max_primitives, d.growth, d, self.settings.iterations)
-        rng = training.generator(self.settings.seed, step, 4)
-        done = gaussian_mcmc.relocate_and_grow(state.primitives, target, d.dead_opacity, rng)
+        rng = loop.generator(self.settings.seed, step, 4)
+        done = mcmc_gaussian.relocate_and_grow(state.primitives, target, d.dead_opacity, rng)
         rows = torch.arange(target, device=state.primitives.xyz.device)
         rows = rows.clamp(max=n - 1)  # the slots of the dead keep their memory, as gsplat has it
         moments = with_rows(state.moments, rows, done.restarted)

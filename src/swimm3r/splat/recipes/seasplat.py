@@ -23,14 +23,15 @@ from torch import Tensor
 from torch.nn.functional import relu, smooth_l1_loss
 
 from swimm3r.raster import RasterOutput
-from swimm3r.splat import gradient_densify, losses, schedule, training
+from swimm3r.splat.densify import adaptive, schedule
 from swimm3r.splat.gaussian_settings import SeaSplatSettings, SeaSplatWeights
-from swimm3r.splat.gaussians import GaussianPrimitives
-from swimm3r.splat.optimiser import Moments, adam_step, fresh
+from swimm3r.splat.medium.seasplat import SceneWater, initial_scene_water, layer, relative_depth, seen_through
+from swimm3r.splat.optimizer import Moments, adam_step, fresh
+from swimm3r.splat.primitives.gaussian import GaussianPrimitives
 from swimm3r.splat.recipes.gaussian_step import first_gaussians, look, rates_of, with_matches, with_rows
-from swimm3r.splat.scene_water import SceneWater, initial_scene_water, layer, relative_depth, seen_through
-from swimm3r.splat.site import Site
-from swimm3r.splat.state import FIELD, State, first_state, parameters_of
+from swimm3r.splat.training import loop, losses
+from swimm3r.splat.training.scene import Site
+from swimm3r.splat.training.state import FIELD, State, first_state, parameters_of
 from swimm3r.splat.views import View
 
 UnderWater = State[GaussianPrimitives, SceneWater]
@@ -49,11 +50,11 @@ class SeaSplat:
         """Faint Gaussians on the cloud, coloured as filmed."""
         seed = self.settings.seed
         p = first_gaussians(self.site, self.settings)
-        water = initial_scene_water(training.generator(seed, 0, 3))
-        codes = self.site.codes(self.settings.poses, training.generator(seed, 0, 6))
-        return first_state(p, water, codes, gradient_densify.nothing_seen(len(p.xyz)))
+        water = initial_scene_water(loop.generator(seed, 0, 3))
+        codes = self.site.codes(self.settings.poses, loop.generator(seed, 0, 6))
+        return first_state(p, water, codes, adaptive.nothing_seen(len(p.xyz)))
 
-    def step(self, state: UnderWater, view: View, step: int) -> tuple[UnderWater, training.Numbers]:
+    def step(self, state: UnderWater, view: View, step: int) -> tuple[UnderWater, loop.Numbers]:
         """Bursts where they are due, then one view: forward, adjoint, Adam, densification on its cadence."""
         settings, w, wet = self.settings, self.settings.weights, step > self._dry_steps()
         if step == self._dry_steps() + 1:
@@ -71,7 +72,7 @@ class SeaSplat:
             moving = {name: t for name, t in parameters.items() if not name.startswith(FIELD) or name in still}
             rates = rates_of(self.site, settings, step, parameters) | dict.fromkeys(still, settings.water.rate)
             adam_step(moving, gradients, state.moments, rates)
-            memory = gradient_densify.remembered(state.memory, gradients["mean2d"], seen.drawing.projection, seen.sight)
+            memory = adaptive.remembered(state.memory, gradients["mean2d"], seen.drawing.projection, seen.sight)
             state = State(state.primitives, state.field, state.poses, state.moments, memory)
             d, share = settings.densify, step / settings.iterations
             if d.begin < share <= d.end:
@@ -123,7 +124,7 @@ class SeaSplat:
 
     def _draws(self, step: int, purpose: int, count: float) -> list[int]:
         """Some views, drawn anew each time."""
-        rng = training.generator(self.settings.seed, step, purpose)
+        rng = loop.generator(self.settings.seed, step, purpose)
         return torch.randint(len(self.site.views), (max(1, round(count)),), generator=rng).tolist()
 
     def _round(self, state: UnderWater, step: int) -> UnderWater:
@@ -131,20 +132,20 @@ class SeaSplat:
         d, p, moments, memory = self.settings.densify, state.primitives, state.moments, state.memory
         cut_every = self._share(d.reset_every) if d.reset_every else self.settings.iterations
         if step % schedule.steps_between(d, self.settings.iterations) == 0:
-            rng = training.generator(self.settings.seed, step, 4)
+            rng = loop.generator(self.settings.seed, step, 4)
             large, most = d.large * self.site.radius, self.settings.max_primitives
-            done = gradient_densify.multiply(p, memory, d.pull, large, most, rng)
+            done = adaptive.multiply(p, memory, d.pull, large, most, rng)
             q = done.primitives
             fit = torch.sigmoid(q.opacity) >= d.least_opacity
             if step > cut_every:
                 fit &= q.scale.amax(-1).exp() <= d.largest * self.site.radius
                 fit &= memory["radius"][done.source] <= d.largest_radius
             if int(fit.sum()) >= 4:
-                done = gradient_densify.only(done, fit)
+                done = adaptive.only(done, fit)
             p, moments = done.primitives, with_rows(moments, done.source, done.restarted)
-            memory = gradient_densify.nothing_seen(len(p.xyz), p.xyz.device)
+            memory = adaptive.nothing_seen(len(p.xyz), p.xyz.device)
         if d.reset_every and step % cut_every == 0:
-            p, moments = gradient_densify.dimmed(p, moments, d.reset_opacity)
+            p, moments = adaptive.dimmed(p, moments, d.reset_opacity)
         return State(p, state.field, state.poses, moments, memory)
 
 
@@ -153,7 +154,7 @@ class Objective:
     """The losses of one view."""
 
     total: Float[Tensor, ""]
-    numbers: training.Numbers  # unweighted, for the record
+    numbers: loop.Numbers  # unweighted, for the record
 
 
 def objective(images: RasterOutput, water: SceneWater, view: View, w: SeaSplatWeights, wet: bool) -> Objective:

@@ -15,10 +15,11 @@ from torch import Tensor
 
 from swimm3r.devices import CPU
 from swimm3r.medium import Medium, MediumFit
-from swimm3r.reconstruction import Reconstruction
-from swimm3r.splat import densify, losses, schedule, training
-from swimm3r.splat.gradients import differentiate
-from swimm3r.splat.medium_field import (
+from swimm3r.scene.reconstruction import Reconstruction
+from swimm3r.splat.densify import mcmc_beta, schedule
+from swimm3r.splat.dynamic.linear_motion import ways
+from swimm3r.splat.dynamic.spawn import born
+from swimm3r.splat.medium.field import (
     WaterPrior,
     deviation,
     initial_field,
@@ -26,15 +27,15 @@ from swimm3r.splat.medium_field import (
     water_prior,
     with_expected_horizon,
 )
-from swimm3r.splat.moving.births import born
-from swimm3r.splat.moving.travel import ways
-from swimm3r.splat.optimiser import Moments, adam_step, log_linear
-from swimm3r.splat.pose_codes import pose_rate
-from swimm3r.splat.primitives import BetaPrimitives, initial_primitives, rescaled, with_time
+from swimm3r.splat.optimizer import Moments, adam_step, log_linear
+from swimm3r.splat.primitives.beta import BetaPrimitives, initial_primitives, rescaled, with_time
 from swimm3r.splat.rendering import Drawing, draw
 from swimm3r.splat.settings import UwbsSettings
-from swimm3r.splat.site import Site
-from swimm3r.splat.state import FIELD, POSES, State, clip_field, first_state, parameters_of
+from swimm3r.splat.training import loop, losses
+from swimm3r.splat.training.scene import Site
+from swimm3r.splat.training.sgg import differentiate
+from swimm3r.splat.training.state import FIELD, POSES, State, clip_field, first_state, parameters_of
+from swimm3r.splat.training_poses import pose_rate
 from swimm3r.splat.views import View
 
 _HORIZON_STD = 0.2  # of the open water's colour around the scene's mean colour, as structure from motion assumes
@@ -46,7 +47,7 @@ class _Adjoint:
 
     gradients: dict[str, Tensor]  # by the names of `parameters_of`
     multiplier: Float[Tensor, " n"] | None  # of the centers' displacement (Alg. 1); None for Adam's own
-    numbers: training.Numbers
+    numbers: loop.Numbers
 
 
 @dataclass(frozen=True)
@@ -60,19 +61,19 @@ class Uwbs:
     def start(self) -> State:
         """Primitives on the cloud, and the reconstruction's water in every direction."""
         settings, rec, scale = self.settings, self.site.rec, self.site.scale
-        p = initial_primitives(rec, settings.initial, training.generator(settings.seed, 0, 2))
+        p = initial_primitives(rec, settings.initial, loop.generator(settings.seed, 0, 2))
         if settings.dynamic:
-            p = with_time(p, settings.initial, training.generator(settings.seed, 0, 5))
+            p = with_time(p, settings.initial, loop.generator(settings.seed, 0, 5))
         p = rescaled(p, scale)
         medium = None
         water = measured_water(rec)
         if water is not None:
             fit = water.medium
             medium = Medium(fit.Binf, fit.beta_D / scale, fit.beta_B / scale)
-        field = initial_field(medium, settings.medium, training.generator(settings.seed, 0, 3), settings.dynamic)
-        return first_state(p, field, self.site.codes(settings.poses, training.generator(settings.seed, 0, 6)))
+        field = initial_field(medium, settings.medium, loop.generator(settings.seed, 0, 3), settings.dynamic)
+        return first_state(p, field, self.site.codes(settings.poses, loop.generator(settings.seed, 0, 6)))
 
-    def step(self, state: State, view: View, step: int) -> tuple[State, training.Numbers]:
+    def step(self, state: State, view: View, step: int) -> tuple[State, loop.Numbers]:
         """One view: forward and adjoint, densification on its cadence, Adam."""
         if self._looks_for_movers(step):
             state = self._with_movers(state, step)
@@ -93,7 +94,7 @@ class Uwbs:
         drawing = draw(p, state.field, sight, settings, view.time, sgg=filtered)
         loss = objective(p, drawing, view, settings, self.prior, self._regularised(share))
         numbers, total = loss.numbers | {"primitives": float(len(p.xyz))}, loss.total
-        rng = training.generator(settings.seed, step, 7)
+        rng = loop.generator(settings.seed, step, 7)
         off = self.site.epipolar_error(state.poses, settings.poses, share, rng)
         if off is not None:
             total = total + settings.poses.epipolar * off.to(total)
@@ -123,7 +124,7 @@ class Uwbs:
         if multiplier is not None and before is not None:
             xyz.sub_(before).mul_(multiplier[:, None]).add_(before)
         if self.settings.densify.noise_cadence == "step":
-            rng = training.generator(self.settings.seed, step, 8)
+            rng = loop.generator(self.settings.seed, step, 8)
             xyz.add_(self._noise(state.primitives, rates["xyz"], rng))
 
     def _regularised(self, share: float) -> bool:
@@ -139,7 +140,7 @@ class Uwbs:
 
     def _with_movers(self, state: State, step: int) -> State:
         """Primitives for what moves, behind the others; their optimiser starts anew."""
-        rng = training.generator(self.settings.seed, step, 9)
+        rng = loop.generator(self.settings.seed, step, 9)
         here = state.to(CPU)  # where the pictures are looked at
         fresh_ones = born(here.primitives, here.field, self.site.views, self.settings, rng).to(self.site.device)
         moments = dict(state.moments)
@@ -165,7 +166,7 @@ class Uwbs:
     def _noise(self, p: BetaPrimitives, rate: float, rng: torch.Generator) -> Float[Tensor, "n 3"]:
         d = self.settings.densify
         strength = d.noise_dynamic if self.settings.dynamic else d.noise
-        return densify.noise(p, strength * rate, d, self.settings.render.rotation, rng)
+        return mcmc_beta.noise(p, strength * rate, d, self.settings.render.rotation, rng)
 
     @torch.no_grad()
     def _densified(self, state: State, adjoint: _Adjoint, step: int, rate: float) -> tuple[State, _Adjoint]:
@@ -174,8 +175,8 @@ class Uwbs:
         n = len(state.primitives.xyz)
         most = round((1 - self._kept_free(step)) * d.max_primitives)
         target = schedule.grown(n, most, d.growth, d, self.settings.iterations)
-        rng = training.generator(self.settings.seed, step, 4)
-        done = densify.relocate_and_grow(state.primitives, target, d.dead_opacity, rng)
+        rng = loop.generator(self.settings.seed, step, 4)
+        done = mcmc_beta.relocate_and_grow(state.primitives, target, d.dead_opacity, rng)
         p = done.primitives
         if d.noise_cadence == "round":
             p = p._replace(xyz=p.xyz + self._noise(p, rate, rng))
@@ -203,7 +204,7 @@ class Objective:
 
     total: Float[Tensor, ""]
     depth: Float[Tensor, ""]  # the depth regulariser as it stands in the total
-    numbers: training.Numbers  # the terms unweighted, for the record
+    numbers: loop.Numbers  # the terms unweighted, for the record
 
 
 def objective(

@@ -20,13 +20,14 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
-from swimm3r.splat import gradient_densify, losses, schedule, training
+from swimm3r.splat.densify import adaptive, schedule
 from swimm3r.splat.gaussian_settings import WaterSplattingSettings
-from swimm3r.splat.medium_field import initial_field
-from swimm3r.splat.optimiser import adam_step, log_linear
+from swimm3r.splat.medium.field import initial_field
+from swimm3r.splat.optimizer import adam_step, log_linear
 from swimm3r.splat.recipes.gaussian_step import InField, first_gaussians, look, rates_of, with_matches, with_rows
-from swimm3r.splat.site import Site
-from swimm3r.splat.state import FIELD, State, clip_field, first_state, parameters_of
+from swimm3r.splat.training import loop, losses
+from swimm3r.splat.training.scene import Site
+from swimm3r.splat.training.state import FIELD, State, clip_field, first_state, parameters_of
 from swimm3r.splat.views import View, smaller
 
 
@@ -41,11 +42,11 @@ class WaterSplatting:
         """Faint Gaussians on the cloud, and a network at random."""
         seed = self.settings.seed
         p = first_gaussians(self.site, self.settings)
-        field = initial_field(None, self.settings.medium, training.generator(seed, 0, 3))
-        codes = self.site.codes(self.settings.poses, training.generator(seed, 0, 6))
-        return first_state(p, field, codes, gradient_densify.nothing_seen(len(p.xyz)))
+        field = initial_field(None, self.settings.medium, loop.generator(seed, 0, 3))
+        codes = self.site.codes(self.settings.poses, loop.generator(seed, 0, 6))
+        return first_state(p, field, codes, adaptive.nothing_seen(len(p.xyz)))
 
-    def step(self, state: InField, view: View, step: int) -> tuple[InField, training.Numbers]:
+    def step(self, state: InField, view: View, step: int) -> tuple[InField, loop.Numbers]:
         """One view at the resolution this step has come to: forward, adjoint, Adam, densification on its cadence."""
         settings = self.settings
         view = smaller(view, self._divisor(step))
@@ -63,9 +64,7 @@ class WaterSplatting:
             water = log_linear(settings.medium_rate, settings.medium_rate_end, step / settings.iterations)
             rates = dict.fromkeys((name for name in parameters if name.startswith(FIELD)), water)
             adam_step(parameters, gradients, state.moments, rates | rates_of(self.site, settings, step, parameters))
-            memory = gradient_densify.remembered(
-                state.memory, seen.drawing.sgg.full_abs, seen.drawing.projection, seen.sight
-            )
+            memory = adaptive.remembered(state.memory, seen.drawing.sgg.full_abs, seen.drawing.projection, seen.sight)
             state = State(state.primitives, state.field, state.poses, state.moments, memory)
             if step % self._every() == 0 and step > settings.densify.begin * settings.iterations:
                 state = self._round(state, step)
@@ -91,20 +90,20 @@ class WaterSplatting:
         growing = step < d.end * self.settings.iterations
         waits = min(len(self.site.views) + self._every(), self._period() // 2) if d.reset_every else 0
         if not growing or since > waits:
-            done = gradient_densify.unchanged(p)
+            done = adaptive.unchanged(p)
             if growing:
-                rng = training.generator(self.settings.seed, step, 4)
+                rng = loop.generator(self.settings.seed, step, 4)
                 large = d.large * self.site.radius
-                done = gradient_densify.multiply(p, memory, d.pull, large, self.settings.max_primitives, rng)
+                done = adaptive.multiply(p, memory, d.pull, large, self.settings.max_primitives, rng)
             q = done.primitives
             fit = torch.sigmoid(q.opacity) >= (d.least_opacity if growing else d.least_opacity_late)
             fit &= q.scale.amax(-1).exp() <= d.largest * self.site.radius
             if int(fit.sum()) >= 4:
-                done = gradient_densify.only(done, fit)
+                done = adaptive.only(done, fit)
             p, moments = done.primitives, with_rows(moments, done.source, done.restarted)
-            memory = gradient_densify.nothing_seen(len(p.xyz), p.xyz.device)
+            memory = adaptive.nothing_seen(len(p.xyz), p.xyz.device)
         if growing and d.reset_every and since == self._every():
-            p, moments = gradient_densify.dimmed(p, moments, d.reset_opacity)
+            p, moments = adaptive.dimmed(p, moments, d.reset_opacity)
         return State(p, state.field, state.poses, moments, memory)
 
 

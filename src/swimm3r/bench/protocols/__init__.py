@@ -1,0 +1,1 @@
+"""The tables of the paper and our own: one protocol per file."""

@@ -1,0 +1,155 @@
+"""How maps show the frames they never saw: structure from motion x renderer (the paper's Tab. quantitative_comparison).
+
+Every recipe is trained on the same reconstruction and frames. A test frame's pose comes from the structure from motion
+of all frames, brought into the reconstruction's axes by the similarity of the training cameras, and is then refined on
+each frozen map from the same start: the paper's route, after 3R-GS, but that the cameras' orientations count, too.
+Poses that somebody else found of all frames can take the place of our own structure from motion of them.
+"""
+
+from collections.abc import Mapping, Sequence
+from dataclasses import replace
+from functools import partial
+from pathlib import Path
+
+from swimm3r.bench import reference
+from swimm3r.bench.cells import Cell, Place, Scores, check_choice, kept_cell, over_scenes, scene_folder
+from swimm3r.bench.inputs import lpips_weights, reconstruction_of
+from swimm3r.bench.map_scores import map_scores, trained
+from swimm3r.bench.pictures import Panel, stored, write_grid
+from swimm3r.bench.runs import POSES_REFINED, Clip, clips_of
+from swimm3r.bench.scores import columns
+from swimm3r.bench.settings import JobSettings, Seeds
+from swimm3r.bench.tables import Table
+from swimm3r.evaluate import NotComputed
+from swimm3r.io.view_names import view_stems
+from swimm3r.pipeline import held_out
+from swimm3r.pipeline.run import FinishedSfm
+from swimm3r.progress import Progress, silent
+from swimm3r.scene.ground_truth import GroundTruth
+from swimm3r.settings import accepted
+from swimm3r.splat.settings import PoseRefinementSettings, Recipe, SplatSettings, UwbsSettings, with_recipe
+
+COLUMNS = columns(
+    "psnr", "ssim_3dgs", "lpips_vgg", "sharpness", "blur4_psnr", "clear_psnr", "T_D_abs", "B_abs",
+    "from_reference_pct", "train_cpu_seconds",
+)  # fmt: skip
+_SEEDS_APART = 1_000
+
+
+def compare_renderers(
+    runs: Sequence[Path],
+    out: Path,
+    recipes: Sequence[Recipe],
+    base: UwbsSettings,
+    seeds: int = 1,
+    poses: bool = False,
+    test: PoseRefinementSettings | None = None,
+    against: str | None = None,
+    references: Path | None = None,
+    how: JobSettings | None = None,
+    progress: Progress = silent,
+) -> Table:
+    """Every recipe at the size and length of `base` on every run; `poses` adds them all with training poses refined.
+
+    Differences are from `against`, by default the first recipe, within the same structure from motion. `references`
+    holds NAME.json (a cameras.json) of all frames of every clip, in the place of our own. Raises UsageError for no
+    recipe, no seed, or an `against` that is not among the recipes, and InputError for a clip without its reference.
+    """
+    check_choice("recipes", recipes, against)
+    accepted("seeds", seeds, Seeds)
+    clips = clips_of(runs)
+    reference.required(references, [clip.name for clip in clips])
+    work = partial(
+        _cells_of_clip,
+        out=out,
+        recipes=tuple(recipes),
+        base=base,
+        seeds=seeds,
+        blocks=(False, True) if poses else (False,),
+        test=test or PoseRefinementSettings(),
+        references=references,
+    )
+    cells = over_scenes(clips, work, out, how or JobSettings(), progress)
+    title = "Test frames rendered, by structure from motion and renderer"
+    return Table("render", title, cells, COLUMNS, against or recipes[0])
+
+
+def _cells_of_clip(
+    clip: Clip,
+    /,
+    *,
+    out: Path,
+    recipes: Sequence[Recipe],
+    base: UwbsSettings,
+    seeds: int,
+    blocks: Sequence[bool],
+    test: PoseRefinementSettings,
+    references: Path | None,
+    progress: Progress,
+) -> list[Cell]:
+    first = clip.runs[0].open()
+    truth = reference.given(references, clip.name)
+    if truth is None:
+        truth = reference.of_clip(first, scene_folder(out / "references", clip.name), progress)
+    cells: list[Cell] = []
+    shown: dict[str, Path] = {}
+    for run in clip.runs:
+        sfm = run.open()
+        start: dict[str, held_out.FirstPose] = {}
+        for seed in range(seeds):
+            as_it_comes: dict[SplatSettings, tuple[Cell, Path]] = {}
+            for refined in blocks:
+                for recipe in recipes:
+                    settings = settings_for(base, recipe, refined, seed)
+                    place = Place(clip.name, f"{run.sfm}{POSES_REFINED if refined else ''} / {recipe}", seed)
+                    if refined and settings in as_it_comes:  # it refines poses of its own accord
+                        cell, folder = as_it_comes[settings]
+                        cell = replace(cell, method=place.method)
+                    else:
+                        made_from = [reconstruction_of(run.folder, sfm), settings]
+                        scored_by = [test, reference.digest(truth), lpips_weights(), [c.score for c in COLUMNS]]
+                        make = partial(_scores, sfm=sfm, settings=settings, test=test, truth=truth, start=start)
+                        cell = kept_cell(out, place, made_from, partial(make, progress=progress), scored_by)
+                        folder = place.folder(out)
+                        as_it_comes[settings] = cell, folder
+                    cells.append(cell)
+                    shown.setdefault(place.method, folder / "test")
+    stems = view_stems(first.frames.names)
+    for name in first.frames.test.names:
+        _side_by_side(out / "pictures" / clip.name, stems[name], shown)
+    return cells
+
+
+def settings_for(base: UwbsSettings, recipe: Recipe, refined: bool, seed: int) -> SplatSettings:
+    """A recipe at the size and length of `base`, its training poses refined where asked."""
+    settings = with_recipe(base, recipe)
+    settings = replace(settings, seed=settings.seed + _SEEDS_APART * seed)
+    return replace(settings, poses=replace(settings.poses, enabled=True)) if refined else settings
+
+
+def _scores(
+    folder: Path,
+    *,
+    sfm: FinishedSfm,
+    settings: SplatSettings,
+    test: PoseRefinementSettings,
+    truth: GroundTruth | NotComputed,
+    start: dict[str, held_out.FirstPose],
+    progress: Progress,
+) -> Scores:
+    if not start:  # the same for every renderer
+        known = None if isinstance(truth, NotComputed) else truth
+        features = sfm.settings.sfm.features
+        start.update(held_out.first_poses(sfm.rec, sfm.frames, features, known, progress))
+    scene = trained(sfm, settings, folder, progress)
+    return map_scores(sfm, scene, start, folder, test, progress)
+
+
+def _side_by_side(out: Path, stem: str, shown: Mapping[str, Path]) -> None:
+    """OUT/STEM.png, a row per structure from motion: the frame, then colours and depth of each map."""
+    rows: dict[str, list[Panel]] = {}
+    for method, pictures in shown.items():
+        sfm, recipe = method.split(" / ")
+        row = rows.setdefault(sfm, [stored(f"{sfm}: test frame", pictures / f"{stem}_target.png")])
+        row += [stored(recipe, pictures / f"{stem}_rgb.png"), stored("depth", pictures / f"{stem}_z_depth.png")]
+    write_grid(out / f"{stem}.png", list(rows.values()))

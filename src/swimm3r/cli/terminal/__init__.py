@@ -1,0 +1,1 @@
+"""The terminal: tables and messages, remaining time, ranges of options."""

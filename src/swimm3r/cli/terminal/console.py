@@ -1,0 +1,193 @@
+"""What the command line draws: progress with time left, the outcome in a few lines, and what to do next."""
+
+import logging
+import shlex
+import sys
+import time
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
+from pathlib import Path
+from typing import Any
+
+from rich.console import Console
+from rich.progress import BarColumn, MofNCompleteColumn, TaskID, TextColumn, TimeElapsedColumn
+from rich.progress import Progress as Bars
+from rich.table import Table
+
+from swimm3r.cli.terminal.pace import Clock, Pace, WorkClock, compilation_watched
+from swimm3r.progress import Progress
+
+_LINE_EVERY_S = 10.0  # in logs, where a bar cannot be redrawn
+_COMPILING = "compiling kernels (first run only)"
+_UNWRAPPED = 1000  # columns of what is piped into a file: nobody's window ends there
+
+
+class MessagePrinter(logging.Handler):
+    """Prints messages to what stderr is at that moment: above the bars, while any are drawn."""
+
+    def emit(self, record: logging.LogRecord) -> None:
+        print(self.format(record), file=sys.stderr, flush=True)
+
+
+@contextmanager
+def drawn_progress() -> Iterator[Progress]:
+    """A `Progress` that draws one bar per step of work with its estimated time left, or prints lines into a log."""
+    console = Console(stderr=True)
+    clock = WorkClock()
+    if not console.is_terminal:
+        with _compilation_told(clock, _once_in_a_while(lambda: _print_line(_COMPILING)), lambda: None):
+            yield lines(clock)
+        return
+    columns = (
+        TextColumn("{task.description:<28}"),
+        BarColumn(),
+        MofNCompleteColumn(),
+        TimeElapsedColumn(),
+        TextColumn("{task.fields[left]}"),
+    )
+    with Bars(*columns, console=console) as bars:
+        compiling = bars.add_task(_COMPILING, total=None, visible=False, left="")
+        with _compilation_told(
+            clock, lambda: bars.update(compiling, visible=True), lambda: bars.update(compiling, visible=False)
+        ):
+            yield _bars(bars, clock)
+
+
+def lines(clock: Clock) -> Progress:
+    """A `Progress` for logs: a line when a step begins, one every ten seconds, and one when it is done."""
+    paces: dict[str, Pace] = {}
+    said: dict[str, float] = {}
+    ended: dict[str, int] = {}
+
+    def say(what: str, done: int, total: int, /) -> None:
+        if done == total == ended.get(what):
+            return  # it was over at once, again
+        ended[what] = done if done == total else -1
+        pace = paces.setdefault(what, Pace(clock))
+        before = pace.round
+        left = pace.reach(done, total)
+        now = time.monotonic()
+        if done < total and pace.round == before and now - said[what] < _LINE_EVERY_S:
+            return
+        said[what] = now
+        about = "" if left is None else f", about {left:.0f} s left"
+        _print_line(f"{_title(what, pace)} {done}/{total} ({pace.seconds:.0f} s{about})")
+
+    return say
+
+
+def _bars(bars: Bars, clock: Clock) -> Progress:
+    paces: dict[str, Pace] = {}
+    tasks: dict[str, TaskID] = {}
+
+    def draw(what: str, done: int, total: int, /) -> None:
+        pace = paces.setdefault(what, Pace(clock))
+        before = pace.round
+        left = pace.reach(done, total)
+        about = "" if left is None else f"{_duration(left)} left"
+        if what not in tasks:
+            tasks[what] = bars.add_task(what, total=total, left="")
+        elif pace.round > before:
+            bars.reset(tasks[what])
+        bars.update(tasks[what], description=_title(what, pace), completed=done, total=total, left=about)
+
+    return draw
+
+
+def _title(what: str, pace: Pace) -> str:
+    return what if pace.round == 1 else f"{what}, round {pace.round}"
+
+
+def _duration(seconds: float) -> str:
+    minutes, seconds = divmod(round(seconds), 60)
+    hours, minutes = divmod(minutes, 60)
+    return f"{hours}:{minutes:02d}:{seconds:02d}"
+
+
+def _print_line(line: str) -> None:
+    print(line, file=sys.stderr, flush=True)
+
+
+def _once_in_a_while(say: Callable[[], Any]) -> Callable[[], None]:
+    """The same at most every ten seconds."""
+    last = -_LINE_EVERY_S
+
+    def maybe() -> None:
+        nonlocal last
+        if time.monotonic() - last >= _LINE_EVERY_S:
+            say()
+        last = time.monotonic()
+
+    return maybe
+
+
+@contextmanager
+def _compilation_told(clock: WorkClock, begin: Callable[[], Any], end: Callable[[], Any]) -> Iterator[None]:
+    def began() -> None:
+        clock.stop()
+        begin()
+
+    def ended() -> None:
+        clock.go_on()
+        end()
+
+    with compilation_watched(began, ended):
+        yield
+
+
+def outcome_console() -> Console:
+    """Where outcomes are printed: as wide as the terminal, and unwrapped where they are piped into a file."""
+    console = Console(markup=False, highlight=False)
+    return console if console.is_terminal else Console(markup=False, highlight=False, width=_UNWRAPPED)
+
+
+def print_summary(summary: dict, folder: Path) -> None:
+    """The outcome of a run: what was registered, the water, what to be careful about, and where the report is."""
+    console = outcome_console()
+    taken = summary.get("input", {})
+    if "frames" in taken:
+        masks = f", {taken['masks']['used']} with a mask" if taken.get("masks", {}).get("used") else ""
+        console.print(
+            f"{taken['frames']} frames of {taken['width']}x{taken['height']} ({taken['train']} for training,"
+            f" {taken['test']} for testing{masks})"
+        )
+    sfm = summary.get("sfm")
+    if sfm:
+        console.print(
+            f"Registered {sfm['registered']} of {sfm['frames']} frames, {sfm['points']:,} points, "
+            + ("" if sfm["reprojection_px"] is None else f"reprojection error {sfm['reprojection_px']:.2f} px")
+        )
+    water = summary.get("medium", {}).get("sfm")
+    if water:
+        table = Table("water", "R", "G", "B", title=f"betas {water['unit']}, {water['encoding']} values")
+        for name in ("Binf", "beta_D", "beta_B"):
+            cells = (
+                f"{value:.3f}" if known else f"({value:.3f})"
+                for value, known in zip(water[name], water["identifiable"][name], strict=True)
+            )
+            table.add_row(name, *cells)
+        console.print(table)
+        console.print("In brackets: not determined by these frames.", style="dim")
+    test = summary.get("test")
+    if test:
+        console.print(
+            f"{test['views']} test frames: PSNR {_shown(test['psnr'], 1)} dB"
+            f" (if blurred by 4 px: {_shown(test['blur4_psnr'], 1)}), SSIM {test['ssim']:.3f},"
+            f" sharpness {_shown(test['sharpness'], 2)}"
+        )
+    for name, other in summary.get("other_protocols", {}).items():
+        scores = other["test"]
+        console.print(f"By the protocol {name}: PSNR {_shown(scores['psnr'], 1)} dB, SSIM {scores['ssim']:.3f}")
+    for caution in summary.get("cautions", []):
+        console.print("!", f"{caution['what']} {caution['advice']}".strip(), style="yellow")
+    if (folder / "report.html").is_file():
+        console.print(f"Report: {folder / 'report.html'}")
+
+
+def print_next(what: str, *command: object) -> None:
+    """The next command, as it can be copied into a shell."""
+    outcome_console().print(f"Next, {what}: swimm3r {shlex.join(str(word) for word in command)}")
+
+
+def _shown(value: float | None, digits: int) -> str:
+    return "-" if value is None else f"{value:.{digits}f}"

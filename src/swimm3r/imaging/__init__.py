@@ -1,0 +1,1 @@
+"""Image processing that needs no scene: filters, open-water regions, depth completion."""

@@ -1,0 +1,237 @@
+"""COLMAP models on disk <-> arrays: cameras, poses, points and tracks of registered pictures.
+
+COLMAP's pixel grid is ours: the centre of the first pixel is (0.5, 0.5). It stores world-to-camera; here poses are
+cam2world. A pinhole or radial lens that `cameras` does not name is the same lens written as OPENCV with zeros:
+
+    SIMPLE_PINHOLE f cx cy -> PINHOLE        RADIAL k1 k2 -> OPENCV k1 k2 0 0
+"""
+
+from dataclasses import dataclass
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+import numpy as np
+
+from swimm3r.cameras import cameras_of, check_cameras
+from swimm3r.errors import InputError
+from swimm3r.io.colmap.integrity import damaged_file
+from swimm3r.io.files.atomic import atomic_folder
+from swimm3r.io.files.damage import Remedy, first_line, guard
+from swimm3r.io.files.safe_names import check_names
+
+if TYPE_CHECKING:
+    import pycolmap
+
+_FILES = ("cameras", "images", "points3D")
+_REMEDY = Remedy(
+    "open it with COLMAP itself, or write it again with its model_converter",
+    cause="a file is truncated or was written by an incompatible version",
+    fault="is not a readable COLMAP model",
+)
+_NOT_FOUND = Remedy(
+    "give the folder that COLMAP wrote, for example my_dive/sparse/0",
+    cause="cameras, images and points3D (.bin or .txt) are not all in it, nor in its 0/ or sparse/0/",
+)
+_FOCALS = {"SIMPLE_PINHOLE": 1, "SIMPLE_RADIAL": 1, "RADIAL": 1, "PINHOLE": 2, "OPENCV": 2, "OPENCV_FISHEYE": 2}
+
+
+def silence_log() -> None:
+    """Have COLMAP report errors alone, and to stderr rather than into files of the folder for temporary files."""
+    import pycolmap
+
+    pycolmap.logging.minloglevel = pycolmap.logging.Level.ERROR.value
+    pycolmap.logging.logtostderr = True
+
+
+@dataclass(frozen=True)
+class ColmapModel:
+    """Registered pictures of one size under one camera model, in the order of their COLMAP image ids.
+
+    Raises ValueError where an index points nowhere or a number is none.
+    """
+
+    names: tuple[str, ...]
+    model: str  # PINHOLE, SIMPLE_RADIAL, OPENCV or OPENCV_FISHEYE
+    width: int
+    height: int
+    K: np.ndarray  # [c, 3, 3] pixels
+    distortion: np.ndarray  # [c, d]
+    cam2world: np.ndarray  # [c, 4, 4]
+    xyz: np.ndarray  # [p, 3]
+    rgb: np.ndarray  # [p, 3] uint8
+    error: np.ndarray  # [p] mean reprojection error, pixels
+    track_point: np.ndarray  # [o] index into the points
+    track_frame: np.ndarray  # [o] index into names
+    track_xy: np.ndarray  # [o, 2] pixels
+
+    def __post_init__(self) -> None:
+        check_names(self.names)
+        if not len(self.names) == len(self.K) == len(self.distortion) == len(self.cam2world):
+            raise ValueError("each picture has one name, one lens and one pose")
+        check_cameras(cameras_of(self))
+        if not (np.isfinite(self.xyz).all() and np.isfinite(self.track_xy).all()) or np.isnan(self.error).any():
+            raise ValueError("positions of points and of their sightings are finite numbers")
+        for index, length, what in (
+            (self.track_point, len(self.xyz), "points"),
+            (self.track_frame, len(self.names), "pictures"),
+        ):
+            if len(index) and not 0 <= int(index.min()) <= int(index.max()) < length:
+                raise ValueError(f"its tracks point beyond its {length} {what}")
+
+
+def read_model(folder: Path, remedy: Remedy | None = None) -> ColmapModel:
+    """Read the binary or text model in `folder`, `folder/0`, `folder/sparse` or `folder/sparse/0`, the first found.
+
+    Raises InputError where there is none, or one that mixes picture sizes or has a lens `cameras` cannot express.
+    """
+    import pycolmap
+
+    found = find_model(folder, remedy or _NOT_FOUND)
+    with guard(found, remedy or _REMEDY):
+        if (damaged := damaged_file(found)) is not None:  # pycolmap would hang on some of them
+            raise ValueError(f"{damaged} is not whole")
+        try:
+            model = pycolmap.Reconstruction(str(found))
+        except RuntimeError as error:  # pycolmap on a damaged file
+            raise ValueError(first_line(error)) from error
+        return from_pycolmap(model)
+
+
+def find_model(folder: Path, remedy: Remedy = _NOT_FOUND) -> Path:
+    """The folder that holds the model's files. Raises InputError where none does."""
+    for candidate in (folder, folder / "0", folder / "sparse", folder / "sparse" / "0"):
+        for suffix in (".bin", ".txt"):
+            if all((candidate / f"{name}{suffix}").is_file() for name in _FILES):
+                return candidate
+    raise remedy.error(f"{folder} holds no COLMAP model", cause=remedy.cause, hint=remedy.hint)
+
+
+def write_model(folder: Path, model: ColmapModel) -> None:
+    """Write a binary model; the folder appears, or is replaced, only once it is whole."""
+    reconstruction = to_pycolmap(model)
+    with atomic_folder(folder) as draft:
+        reconstruction.write_binary(str(draft))
+
+
+def from_pycolmap(model: "pycolmap.Reconstruction") -> ColmapModel:
+    """The arrays of a pycolmap reconstruction. Raises InputError as `read_model` does."""
+    images = [model.image(i) for i in sorted(model.reg_image_ids())]
+    if not images:
+        raise InputError(
+            "the COLMAP model has no registered pictures",
+            cause="its reconstruction did not start, or its images file is empty",
+            hint="use another sub-model (sparse/0, sparse/1, ...)",
+        )
+    names = tuple(image.name for image in images)
+    cameras = [model.cameras[image.camera_id] for image in images]
+    sizes = sorted({(camera.width, camera.height) for camera in cameras})
+    if len(sizes) > 1:
+        raise InputError(
+            f"the COLMAP model mixes picture sizes: {', '.join(f'{w}x{h}' for w, h in sizes)}",
+            cause="pictures of several cameras or crops were reconstructed together",
+            hint="reconstruct the pictures of one size, or resize them first",
+        )
+    lens = _common_lens({camera.model.name for camera in cameras})
+    intrinsics = [_intrinsics(camera, lens) for camera in cameras]
+    cam2world = np.tile(np.eye(4), (len(images), 1, 1))
+    for pose, image in zip(cam2world, images, strict=True):
+        world2cam = image.cam_from_world()
+        if not np.linalg.norm(world2cam.rotation.quat) > 0.5:  # zero would be taken for no rotation
+            raise ValueError(f"the rotation of {image.name} is a quaternion of zeros")
+        pose[:3] = world2cam.inverse().matrix()
+
+    points = [model.points3D[i] for i in sorted(model.point3D_ids())]
+    frame_of = {image.image_id: frame for frame, image in enumerate(images)}
+    seen = {image.image_id: np.array([p.xy for p in image.points2D]).reshape(-1, 2) for image in images}
+    observations = [
+        (row, frame_of[element.image_id], element.image_id, element.point2D_idx)
+        for row, point in enumerate(points)
+        for element in point.track.elements
+        if element.image_id in frame_of
+    ]
+    return ColmapModel(
+        names=names,
+        model=lens,
+        width=sizes[0][0],
+        height=sizes[0][1],
+        K=np.stack([K for K, _ in intrinsics]),
+        distortion=np.stack([distortion for _, distortion in intrinsics]),
+        cam2world=cam2world,
+        xyz=np.array([point.xyz for point in points], np.float64).reshape(-1, 3),
+        rgb=np.array([point.color for point in points], np.uint8).reshape(-1, 3),
+        error=np.array([point.error for point in points], np.float64),
+        track_point=np.array([row for row, _, _, _ in observations], np.int64),
+        track_frame=np.array([frame for _, frame, _, _ in observations], np.int64),
+        track_xy=np.array([seen[image][k] for _, _, image, k in observations], np.float64).reshape(-1, 2),
+    )
+
+
+def to_pycolmap(model: ColmapModel) -> "pycolmap.Reconstruction":
+    """The pycolmap reconstruction of the arrays: one camera if all frames share intrinsics, else one per frame."""
+    import pycolmap
+
+    out = pycolmap.Reconstruction()
+    shared = bool(np.ptp(model.K, axis=0).max() == 0 and np.all(np.ptp(model.distortion, axis=0) == 0))
+    for i in range(1 if shared else len(model.names)):
+        out.add_camera_with_trivial_rig(_camera(model, i))
+
+    order = np.argsort(model.track_frame, kind="stable")
+    starts = np.searchsorted(model.track_frame[order], np.arange(len(model.names) + 1))
+    point2d = np.empty(len(order), np.int64)
+    for i, name in enumerate(model.names):
+        rows = order[starts[i] : starts[i + 1]]
+        point2d[rows] = np.arange(len(rows))
+        image = pycolmap.Image(
+            name=name, keypoints=model.track_xy[rows], camera_id=1 if shared else i + 1, image_id=i + 1
+        )
+        world2cam = np.linalg.inv(model.cam2world[i])
+        out.add_image_with_trivial_frame(
+            image, pycolmap.Rigid3d(pycolmap.Rotation3d(world2cam[:3, :3]), world2cam[:3, 3])
+        )
+    by_point = np.argsort(model.track_point, kind="stable")
+    starts = np.searchsorted(model.track_point[by_point], np.arange(len(model.xyz) + 1))
+    for p, (xyz, rgb, error) in enumerate(zip(model.xyz, model.rgb, model.error, strict=True)):
+        track = pycolmap.Track()
+        for row in by_point[starts[p] : starts[p + 1]]:
+            track.add_element(int(model.track_frame[row]) + 1, int(point2d[row]))
+        point = pycolmap.Point3D()
+        point.xyz, point.color, point.error, point.track = xyz, rgb, error, track
+        out.add_point3D_with_id(p + 1, point)
+    return out
+
+
+def _common_lens(models: set[str]) -> str:
+    unknown = models - set(_FOCALS)
+    if unknown or ("OPENCV_FISHEYE" in models and len(models) > 1):
+        raise InputError(
+            f"the COLMAP model has lenses that cannot be read together: {', '.join(sorted(models))}",
+            cause=f"readable are {', '.join(sorted(_FOCALS))}, fisheye not mixed with others",
+            hint="undistort the pictures first (colmap image_undistorter), which leaves PINHOLE cameras",
+        )
+    if models <= {"SIMPLE_PINHOLE", "PINHOLE"}:
+        return "PINHOLE"
+    return models.pop() if len(models) == 1 and "RADIAL" not in models else "OPENCV"
+
+
+def _intrinsics(camera: "pycolmap.Camera", lens: str) -> tuple[np.ndarray, np.ndarray]:
+    focals = _FOCALS[camera.model.name]
+    f, c, k = camera.params[:focals], camera.params[focals : focals + 2], camera.params[focals + 2 :]
+    K = np.array([[f[0], 0, c[0]], [0, f[-1], c[1]], [0, 0, 1]])
+    length = {"PINHOLE": 0, "SIMPLE_RADIAL": 1, "OPENCV": 4, "OPENCV_FISHEYE": 4}[lens]
+    return K, np.concatenate([k, np.zeros(length - len(k))])
+
+
+def _camera(model: ColmapModel, i: int) -> "pycolmap.Camera":
+    import pycolmap
+
+    K, distortion, lens = model.K[i], model.distortion[i], model.model
+    if lens == "SIMPLE_RADIAL" and K[0, 0] != K[1, 1]:  # after an uneven resize; COLMAP's has one focal length
+        lens, distortion = "OPENCV", np.concatenate([distortion, np.zeros(3)])
+    focal = [K[0, 0]] if lens == "SIMPLE_RADIAL" else [K[0, 0], K[1, 1]]
+    return pycolmap.Camera(
+        model=lens,
+        width=model.width,
+        height=model.height,
+        params=np.array([*focal, K[0, 2], K[1, 2], *distortion]),
+        camera_id=i + 1,
+    )

@@ -1,0 +1,66 @@
+"""Tensors under their names in a safetensors file, everything else as a JSON record in its header."""
+
+import json
+from collections.abc import Mapping
+from dataclasses import dataclass
+from pathlib import Path
+from types import GenericAlias
+from typing import Any, Generic, TypeVar
+
+import torch
+from safetensors import safe_open
+from safetensors.torch import save_file
+from torch import Tensor
+
+from swimm3r.io.files.atomic import atomic_path
+from swimm3r.io.files.damage import Remedy, guard
+from swimm3r.io.files.json_file import decode, structure
+
+_KEY = "swimm3r"
+T = TypeVar("T")
+
+
+@dataclass(frozen=True)
+class TensorFile(Generic[T]):
+    """The tensors of a file and the record in its header."""
+
+    tensors: dict[str, Tensor]
+    about: T
+
+
+def write_tensors(path: Path, tensors: Mapping[str, Tensor], about: Mapping[str, Any]) -> None:
+    """Write tensors and header, whole or not at all."""
+    stored = {name: values.detach().cpu().contiguous() for name, values in tensors.items()}
+    with atomic_path(path) as draft:
+        save_file(stored, draft, {_KEY: json.dumps(about, sort_keys=True)})
+
+
+def read_tensors(path: Path, kind: type[T] | GenericAlias, remedy: Remedy, schema: int | None) -> TensorFile[T]:
+    """Finite tensors, and the header as a record of `json_file`; its `schema` must be the one given, if any.
+
+    Raises the remedy's error, which names the file and the fault.
+    """
+    with guard(path, remedy):
+        path.open("rb").close()  # the operating system's own word on a file that is missing or a folder
+        with safe_open(path, "pt") as file:
+            header = file.metadata() or {}
+            if _KEY not in header:
+                raise ValueError("it has no Swimm3R header")
+            document = decode(header[_KEY])
+            if schema is not None:
+                _check_schema(document, schema)
+            about = structure(document, kind)
+            tensors = {name: file.get_tensor(name) for name in file.keys()}  # noqa: SIM118
+        for name, values in tensors.items():
+            if values.is_floating_point() and not bool(torch.isfinite(values).all()):
+                raise ValueError(f"{name} has values that are not finite")
+        return TensorFile(tensors, about)
+
+
+def _check_schema(document: Any, known: int) -> None:
+    found = document.get("schema") if isinstance(document, dict) else None
+    if found == known:
+        return
+    newer = isinstance(found, int) and found > known
+    by_whom = "it was written by a newer Swimm3R: " if newer else ""
+    raise ValueError(f"{by_whom}its schema is {found}, this version reads {known}")

@@ -1,0 +1,259 @@
+"""How well a map shows the frames it never saw: where they were taken, how the map looks from there, the scores.
+
+A frame's first pose comes from a reference where one is given, else from its matches with points of the reconstruction,
+else from its neighbours in time. Then it is refined on the frozen map (`splat.poses`), for a score should be about the
+map and not about a pose that is a pixel off. Scores count the pixels that the lens shows and the mask admits, on the
+pinhole canvas of the training size.
+"""
+
+from collections import Counter
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+from pathlib import Path
+from typing import Literal
+
+import torch
+from jaxtyping import Bool, Float
+from torch import Tensor
+
+from swimm3r import weights
+from swimm3r.cameras import Cameras, distorted_grid, project, resized
+from swimm3r.evaluate import NotComputed
+from swimm3r.evaluate.images import ViewScores, as_8_bit, blur4_psnr, mean_view_scores, psnr, view_scores
+from swimm3r.evaluate.lpips import Lpips, load_lpips
+from swimm3r.geometry import best_similarity
+from swimm3r.io.view_names import view_stems
+from swimm3r.localization.interpolation import neighbours, pose_from_neighbours
+from swimm3r.localization.landmarks import landmarks_of, locate
+from swimm3r.pipeline.renders import look_of, write_view
+from swimm3r.progress import Progress, silent
+from swimm3r.scene.frames import Frames
+from swimm3r.scene.ground_truth import GroundTruth
+from swimm3r.scene.reconstruction import Reconstruction
+from swimm3r.sfm.settings import FeatureSettings, RestoreSettings
+from swimm3r.splat.pose_refinement import refine_pose
+from swimm3r.splat.rendering import SplatMap
+from swimm3r.splat.settings import PoseRefinementSettings
+from swimm3r.splat.training_poses import axes_of_map
+from swimm3r.splat.views import undistorted
+
+Source = Literal["reference", "2D-3D matches", "neighbours"]
+_GAP = 0.03  # of the picture's width: gaps in the cloud up to this size are closed where coverage is asked
+_WITNESSES = 6  # registered frames, the nearest in time, that a held-out frame is matched with
+
+
+@dataclass(frozen=True)
+class FirstPose:
+    """Where a frame's refinement starts."""
+
+    cam2world: Float[Tensor, "4 4"]
+    source: Source
+
+
+@dataclass(frozen=True)
+class HeldOutView:
+    """One frame that training did not see, as the map shows it."""
+
+    name: str
+    time: float  # seconds of the clip
+    lens: Cameras  # the frame's own camera, its pose refined
+    canvas: Cameras  # its pinhole at the training size
+    window: "Window"  # of the canvas that was rendered and scored
+    source: Source
+    scores: ViewScores
+    covered: "CoveredScores"
+
+
+@dataclass(frozen=True)
+class CoveredScores:
+    """The scores where some training frame saw what this frame shows; a map cannot know the rest."""
+
+    share: float  # of the pixels
+    psnr: float | NotComputed  # dB
+    blur4_psnr: float | NotComputed  # dB
+
+
+def first_poses(
+    rec: Reconstruction,
+    frames: Frames,
+    features: FeatureSettings,
+    reference: GroundTruth | None = None,
+    progress: Progress = silent,
+) -> dict[str, FirstPose]:
+    """A pose of every test frame in the axes and unit of the reconstruction."""
+    known = {} if reference is None else reference_poses(rec, reference)
+    landmarks = landmarks_of(rec, frames, features)
+    poses = {}
+    for done, frame in enumerate(frames.test):
+        progress("placing test frames", done, len(frames.test))
+        if frame.name in known:
+            poses[frame.name] = FirstPose(known[frame.name], "reference")
+            continue
+        near = neighbours(rec, frames, frame.name, _WITNESSES)
+        f, lens = frames.index(frame.name), rec.cameras[rec.index(near[0])]
+        located = locate(frames.image(f), frames.mask(f), lens, [landmarks(name) for name in near], features)
+        if located is None:
+            poses[frame.name] = FirstPose(pose_from_neighbours(rec, frames, frame.name), "neighbours")
+        else:
+            poses[frame.name] = FirstPose(located.cam2world, "2D-3D matches")
+    progress("placing test frames", len(frames.test), len(frames.test))
+    return poses
+
+
+def reference_poses(rec: Reconstruction, reference: GroundTruth) -> dict[str, Float[Tensor, "4 4"]]:
+    """The reference's poses in the reconstruction's axes and unit; none where the frames they share do not align."""
+    place = {name: i for i, name in enumerate(reference.names)}
+    shared = [name for name in rec.names if name in place]
+    theirs = reference.cameras.cam2world[[place[name] for name in shared]].double()
+    ours = rec.cameras.cam2world[[rec.index(name) for name in shared]].double()
+    to_ours = best_similarity(theirs, ours)
+    if to_ours is None:
+        return {}
+    moved = to_ours.poses(reference.cameras.cam2world.double())
+    return {name: moved[i] for name, i in place.items()}
+
+
+def in_axes_of(scene: SplatMap, rec: Reconstruction, poses: dict[str, FirstPose]) -> dict[str, FirstPose]:
+    """The reconstruction's poses in the axes and unit of the map, whose training cameras may have moved together."""
+    to_map = axes_of_map(rec, scene.poses)
+    if to_map is None:
+        return poses
+    return {name: replace(pose, cam2world=to_map.poses(pose.cam2world.double())) for name, pose in poses.items()}
+
+
+def score_views(
+    scene: SplatMap,
+    rec: Reconstruction,
+    frames: Frames,
+    poses: dict[str, FirstPose],
+    folder: Path,
+    settings: PoseRefinementSettings | None = None,
+    restore: RestoreSettings | None = None,
+    progress: Progress = silent,
+) -> list[HeldOutView]:
+    """Refine, render and score each frame of `poses`; its images go to `folder` (`renders.write_view`).
+
+    The clear ones look like the frames that `restore` made.
+    """
+    perceptual = published_lpips()
+    views, stems = [], view_stems(frames.names)
+    look = look_of(scene, rec, restore)
+    for done, (name, first) in enumerate(poses.items()):
+        progress("scoring test frames", done, len(poses))
+        f = frames.index(name)
+        lens = rec.cameras[rec.index(neighbours(rec, frames, name, 1)[0])]
+        lens = replace(lens, cam2world=first.cam2world[None].to(lens.cam2world))
+        time = frames.frames[f].time
+        lens = refine_pose(scene, lens, frames.image(f), frames.mask(f), settings, time=time).camera
+        canvas = lens.pinhole(scene.settings.long_side)
+        window = visible_window(lens, canvas)
+        target, seen = (
+            part[window.rows, window.columns] for part in undistorted(frames.image(f), frames.mask(f), lens, canvas)
+        )
+        camera = cut(canvas, window)
+        out = scene.render(camera, time)
+        write_view(folder, stems[name], out, camera, look)
+        scores = view_scores(out.rgb, target, perceptual, seen)
+        covered = covered_scores(out.rgb, target, seen, covered_by_training(rec, camera))
+        views.append(HeldOutView(name, time, lens, canvas, window, first.source, scores, covered))
+    progress("scoring test frames", len(poses), len(poses))
+    return views
+
+
+def protocol(views: Sequence[HeldOutView], settings: PoseRefinementSettings) -> str:
+    """In words, how the poses of the scored frames came about."""
+    counts = Counter(view.source for view in views)
+    starts = ", ".join(f"{count} from {source}" for source, count in counts.items())
+    return f"every 8th frame; poses {starts}, refined {settings.steps} steps on the frozen map"
+
+
+def mean_scores(views: Sequence[HeldOutView]) -> ViewScores:
+    """The scores averaged over frames."""
+    return mean_view_scores([view.scores for view in views])
+
+
+def covered_by_training(rec: Reconstruction, canvas: Cameras) -> Bool[Tensor, "h w"]:
+    """The pixels of a view into which measured points of the reconstruction fall, small gaps closed.
+
+    It asks the reconstruction, not the map: a map that leaves holes is not excused for them. The backdrop, whose depth
+    is a guess, does not count.
+    """
+    import cv2
+
+    xyz = rec.points.xyz if rec.cloud is None else rec.cloud.xyz
+    pixels, z = project(canvas, xyz[None].double())
+    inside = (z[0] > 0) & (pixels[0] > 0).all(-1) & (pixels[0] < torch.tensor([canvas.width, canvas.height])).all(-1)
+    column, row = pixels[0][inside].long().unbind(-1)
+    hit = torch.zeros(canvas.height, canvas.width, dtype=torch.uint8)
+    hit[row, column] = 1
+    reach = max(3, round(_GAP * canvas.width)) | 1
+    kernel = cv2.getStructuringElement(cv2.MORPH_ELLIPSE, (reach, reach))
+    border = reach  # closing must not eat into the picture's edge
+    padded = cv2.copyMakeBorder(hit.numpy(), border, border, border, border, cv2.BORDER_REFLECT)
+    closed = cv2.morphologyEx(padded, cv2.MORPH_CLOSE, kernel)[border:-border, border:-border]
+    return torch.from_numpy(closed.copy()) > 0
+
+
+def covered_scores(
+    render: Float[Tensor, "h w 3"],
+    target: Float[Tensor, "h w 3"],
+    seen: Bool[Tensor, "h w"],
+    covered: Bool[Tensor, "h w"],
+) -> CoveredScores:
+    """PSNR, and that of mere blurring, over the covered pixels; both pictures as their 8-bit files show them."""
+    counted = seen & covered
+    share = float(counted.sum() / seen.sum())
+    if not bool(counted.any()):
+        nothing = NotComputed("no training frame saw what the test frames show")
+        return CoveredScores(share, nothing, nothing)
+    render, target = as_8_bit(render), as_8_bit(target)
+    return CoveredScores(share, psnr(render[counted], target[counted]), blur4_psnr(target, counted))
+
+
+def mean_covered(views: Sequence[HeldOutView]) -> CoveredScores:
+    """Means over frames, those without a covered pixel left out of the PSNRs."""
+
+    def mean(values: list[float | NotComputed]) -> float | NotComputed:
+        numbers = [v for v in values if not isinstance(v, NotComputed)]
+        return sum(numbers) / len(numbers) if numbers else values[0]
+
+    scores = [view.covered for view in views]
+    share = sum(s.share for s in scores) / len(scores)
+    return CoveredScores(share, mean([s.psnr for s in scores]), mean([s.blur4_psnr for s in scores]))
+
+
+@dataclass(frozen=True)
+class Window:
+    """A rectangle of a canvas: rows and columns."""
+
+    rows: slice
+    columns: slice
+
+
+def visible_window(lens: Cameras, canvas: Cameras) -> Window:
+    """The part of a lens's pinhole canvas that its picture fills, cut straight."""
+    shown = distorted_grid(resized(lens, canvas.width, canvas.height), canvas)[1]
+    top, bottom, left, right = 0, canvas.height, 0, canvas.width
+    while True:
+        part = shown[top:bottom, left:right]
+        # the side that misses the most of its length goes first; a hole inside is no matter of borders
+        missing = [float((~edge).float().mean()) for edge in (part[0], part[-1], part[:, 0], part[:, -1])]
+        worst = missing.index(max(missing))
+        if missing[worst] == 0 or min(part.shape) <= 16:
+            return Window(slice(top, bottom), slice(left, right))
+        top, bottom = top + (worst == 0), bottom - (worst == 1)
+        left, right = left + (worst == 2), right - (worst == 3)
+
+
+def cut(canvas: Cameras, window: Window) -> Cameras:
+    """The cameras of a window of a pinhole canvas."""
+    K = canvas.K.clone()
+    K[:, 0, 2] -= window.columns.start
+    K[:, 1, 2] -= window.rows.start
+    height, width = (part.stop - part.start for part in (window.rows, window.columns))
+    return replace(canvas, K=K, width=width, height=height)
+
+
+def published_lpips() -> Lpips | NotComputed:
+    """LPIPS where its two weight files are on this computer."""
+    return load_lpips(weights.find("vgg16"), weights.find("lpips-vgg"))

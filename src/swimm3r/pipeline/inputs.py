@@ -1,0 +1,42 @@
+"""The files that a run is given, looked into before any work is done on them."""
+
+from pathlib import Path
+
+from swimm3r import weights
+from swimm3r.io.imports.record import read_foreign
+from swimm3r.pipeline.presets import RunSettings
+from swimm3r.prepare import check_source
+from swimm3r.prepare.masks import check_masks
+from swimm3r.scene.ground_truth import FOLDER, GroundTruth, read_ground_truth
+from swimm3r.sfm.settings import ColmapModelSettings, ColmapSettings, Mast3rSettings
+
+
+def check_inputs(source: Path, settings: RunSettings, reference: Path | None = None) -> None:
+    """Raise the error of the first input that cannot be used: InputError, WeightsError or UsageError.
+
+    A model is read whole, which takes seconds where preparing frames takes minutes.
+    """
+    check_source(source)
+    check_masks(settings.frames)
+    truth_of(source, reference)
+    match settings.sfm:
+        case ColmapModelSettings(model=model):
+            read_foreign(model)
+        case Mast3rSettings(graph=graph, weights=given, adapter=adapter):
+            from swimm3r.sfm.features.pair_graph import parse_graph
+            from swimm3r.sfm.student import adapter_file
+
+            parse_graph(graph)
+            weights.require("mast3r", given)
+            if adapter is not None:
+                adapter_file.describe(adapter)
+        case ColmapSettings():
+            pass
+
+
+def truth_of(source: Path, reference: Path | None) -> GroundTruth | None:
+    """What is known for certain of a clip: the reference where one is given, else what a synthetic dive brings."""
+    if reference is not None:
+        return read_ground_truth(reference)
+    beside = source / FOLDER
+    return read_ground_truth(beside) if beside.is_dir() else None

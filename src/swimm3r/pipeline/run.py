@@ -1,0 +1,246 @@
+"""The pipeline over a run folder: prepare -> sfm -> splat -> eval, each stage resumable, its record in summary.json.
+
+A stage is reused when its settings and everything before it are unchanged (a hash, the stage's `key`); one that was cut
+short goes on from what it left on disk; one whose settings changed is refused or moved away, never removed
+(`run_record`).
+"""
+
+import json
+import os
+import platform
+from dataclasses import asdict, dataclass, replace
+from hashlib import sha256
+from importlib.metadata import version
+from pathlib import Path
+
+from swimm3r import devices
+from swimm3r.io.files.atomic import write_text
+from swimm3r.pipeline import held_out
+from swimm3r.pipeline import summary as sections
+from swimm3r.pipeline.inputs import check_inputs, truth_of
+from swimm3r.pipeline.presets import RunSettings, from_yaml, to_yaml
+from swimm3r.pipeline.run_record import RunRecord, open_record, stage_keys
+from swimm3r.pipeline.scoring import MappedRun, Protocol, film_flight, score_map, score_restored_frames, start_poses
+from swimm3r.prepare import check_source, load_frames, read_frames
+from swimm3r.progress import Progress, silent
+from swimm3r.report import write_report
+from swimm3r.scene import reconstruction
+from swimm3r.scene.frames import Frames
+from swimm3r.scene.ground_truth import GroundTruth
+from swimm3r.scene.reconstruction import Reconstruction
+from swimm3r.scene.run_folder import open_run
+from swimm3r.sfm import reconstruct
+from swimm3r.splat import train
+from swimm3r.splat.map_file import load_map
+from swimm3r.splat.settings import MapDevice
+
+
+def run_pipeline(
+    source: Path,
+    folder: Path,
+    settings: RunSettings | None = None,
+    *,
+    redo: bool = False,
+    reference: Path | None = None,
+    last_stage: str = "eval",
+    map_device: MapDevice = "auto",
+    progress: Progress = silent,
+) -> dict:
+    """Run the stages up to `last_stage` and return the summary (layout: docs/conventions.md).
+
+    Without `settings` the run goes by those that the folder holds, a new one by the defaults. Stages made with other
+    settings are refused, or with `redo` moved to `folder`/old and made again. `reference` is a cameras.json to score
+    against; a synthetic dive brings its own truth. `map_device` is where the map is trained and rendered. Raises the
+    errors of its stages (`swimm3r.errors`), UsageError where settings differ, the folder cannot be written to or
+    another process works in it, and InputError where it belongs to another input.
+    """
+    check_source(source)
+    devices.for_maps(map_device)  # before there is a folder, and minutes of structure from motion
+    with open_record(folder, source, fingerprint_of(source, folder), redo=redo) as record:
+        settings, reference = record.settle(settings, reference, last_stage)
+        check_inputs(source, settings, reference)
+        record.make_room(settings, reference)
+        record.write()
+        write_text(folder / "settings.yaml", to_yaml(settings))
+        write_text(folder / "versions.json", json.dumps(_versions(), indent=2) + "\n")
+        _make_stages(record, source, settings, reference, last_stage, map_device, progress)
+        summary = record.write()
+        if last_stage == "eval":
+            write_report(folder)
+        return summary
+
+
+def _make_stages(
+    record: RunRecord,
+    source: Path,
+    settings: RunSettings,
+    reference: Path | None,
+    last_stage: str,
+    map_device: MapDevice,
+    progress: Progress,
+) -> None:
+    """Make or reuse the stages one after another. What a stage hands on is read from disk, to the last bit as a resumed
+    run finds it.
+    """
+    folder = record.folder
+    keys = stage_keys(record.summary["input"]["fingerprint"], settings, reference)
+    truth = truth_of(source, reference)
+    frames = record.stage(
+        "prepare",
+        keys["prepare"],
+        make=lambda: read_frames(source, settings.frames, folder / "prepare", progress),
+        reuse=lambda: load_frames(folder / "prepare"),
+    )
+    record.summary["input"] |= {
+        "frames": len(frames),
+        "train": len(frames.train),
+        "test": len(frames.test),
+        "width": frames.width,
+        "height": frames.height,
+        "gray": frames.gray,
+        "masks": {"used": sum(frame.mask is not None for frame in frames), "unused": frames.unused_masks},
+    }
+    record.add({"cautions": [{"what": what, "advice": ""} for what in frames.cautions]})
+    if last_stage == "prepare":
+        return
+
+    record.stage(
+        "sfm", keys["sfm"], make=lambda: reconstruct(frames, settings.sfm, folder / "sfm", progress), reuse=lambda: None
+    )
+    rec = reconstruction.load(folder / "sfm", frames)
+    record.add(sections.sfm_sections(rec, frames, reconstruction.unfiltered_matches(folder / "sfm", rec)))
+    if last_stage == "sfm":
+        return
+
+    record.stage(
+        "splat",
+        keys["splat"],
+        make=lambda: train(rec, frames, settings.splat, folder / "splat", progress, map_device),
+        reuse=lambda: None,
+    )
+    scene = load_map(folder / "splat" / "map.safetensors").to(devices.for_maps(map_device))
+    record.add(sections.splat_sections(scene, rec, frames, folder / "splat"))
+    if last_stage == "splat":
+        return
+
+    run = MappedRun(folder, frames, rec, scene, settings)
+    _own_scores(record, run, Protocol(settings.test, reference), truth, progress, reuse=True)
+
+
+@dataclass(frozen=True)
+class FinishedSfm:
+    """A run folder as its map's training finds it."""
+
+    frames: Frames
+    rec: Reconstruction
+    settings: RunSettings
+    truth: GroundTruth | None
+    key: str  # another one where anything before the map is another
+
+    def first_poses(self, progress: Progress = silent) -> dict[str, held_out.FirstPose]:
+        """Where the test frames' refinement starts, in the reconstruction's axes."""
+        return start_poses(self.rec, self.frames, self.settings, self.truth, progress)
+
+
+def open_finished_sfm(folder: Path, reference: Path | None = None) -> FinishedSfm:
+    """Read a run folder up to its map. Raises InputError where structure from motion is not finished."""
+    run = open_run(folder, "sfm")
+    frames = load_frames(folder / "prepare")
+    return FinishedSfm(
+        frames,
+        reconstruction.load(folder / "sfm", frames),
+        from_yaml(folder / "settings.yaml"),
+        truth_of(Path(run.input.path), reference),
+        run.stages["sfm"].key,
+    )
+
+
+def evaluate_run(
+    folder: Path,
+    *,
+    steps: int | None = None,
+    reference: Path | None = None,
+    progress: Progress = silent,
+) -> dict:
+    """Score a finished run again, its test frames' poses found anew, and return the summary.
+
+    With other `steps` of pose refinement or another `reference` than the run's own, the scores stand beside its own, in
+    "other_protocols", and the views in RUN/renders/protocols. Raises InputError where the run has no map yet.
+    """
+    before = open_run(folder, "splat")
+    settings, source = from_yaml(folder / "settings.yaml"), Path(before.input.path)
+    scored = before.stages.get("eval")
+    own = Protocol(settings.test, None if scored is None or scored.reference is None else Path(scored.reference))
+    asked = Protocol(
+        settings.test if steps is None else replace(settings.test, steps=steps), reference or own.reference
+    )
+    with open_record(folder, source, before.input.fingerprint) as record:
+        record.summary |= before.sections
+        scene = load_map(folder / "splat" / "map.safetensors").to(devices.for_maps())
+        frames = load_frames(folder / "prepare")
+        run = MappedRun(folder, frames, reconstruction.load(folder / "sfm", frames), scene, settings)
+        truth = truth_of(source, asked.reference)
+        if beside := asked.key_beside(own):
+            record.add_protocol(beside, _other_scores(run, asked, truth, f"renders/protocols/{beside}", progress))
+        else:
+            _own_scores(record, run, asked, truth, progress)
+        summary = record.write()
+        write_report(folder)
+        return summary
+
+
+def _own_scores(
+    record: RunRecord,
+    run: MappedRun,
+    own: Protocol,
+    truth: GroundTruth | None,
+    progress: Progress,
+    *,
+    reuse: bool = False,
+) -> None:
+    """The last stage, by the run's own protocol; scores of before are reused or replaced whole."""
+
+    def make() -> None:
+        scores = score_map(run, own.test, truth, run.folder / "renders" / "test", progress)
+        film_flight(run, progress)
+        restored = {"sfm": score_restored_frames(run, progress), **(scores["restored"] or {})}
+        record.summary |= {**scores, "restored": restored}
+
+    reference = None if own.reference is None else str(own.reference)
+    key = stage_keys(record.summary["input"]["fingerprint"], run.settings, own.reference)["eval"]
+    record.stage("eval", key, make, record.keep_scores if reuse else None, reference=reference)
+
+
+def _other_scores(
+    run: MappedRun, asked: Protocol, truth: GroundTruth | None, views: str, progress: Progress
+) -> dict[str, object]:
+    """An entry of the section "other_protocols"."""
+    return {
+        "settings": asdict(asked.test),
+        "reference": None if asked.reference is None else str(asked.reference),
+        "views": views,
+        **score_map(run, asked.test, truth, run.folder / views, progress),
+    }
+
+
+def fingerprint_of(source: Path, folder: Path) -> str:
+    """What tells one input from another: names, sizes and times of its files, not where it lies.
+
+    A run folder inside the input is no part of it.
+    """
+    files, own = [source], os.path.realpath(folder)
+    if source.is_dir():
+        # Path.is_file raises where it may not look
+        files = sorted(p for p in source.rglob("*") if os.path.isfile(p) and not p.resolve().is_relative_to(own))
+    digest = sha256()
+    for path in files:
+        stat = path.stat()
+        digest.update(
+            f"{path.relative_to(source.parent)}|{stat.st_size}|{stat.st_mtime_ns}\n".encode(errors="surrogateescape")
+        )
+    return digest.hexdigest()[:16]
+
+
+def _versions() -> dict[str, str]:
+    packages = ("swimm3r", "torch", "numpy", "scipy", "numba", "pycolmap", "opencv-python-headless", "av")
+    return {"python": platform.python_version(), "platform": platform.platform()} | {p: version(p) for p in packages}

@@ -1,0 +1,300 @@
+"""A run folder while it is written: its lock, summary.json and log.jsonl kept current, and what makes room in old/.
+
+A finished or half-finished stage whose settings are others now is never removed: the run is refused with the list of
+what differs, or, where the caller says so, the stage moves to RUN/old/N with everything that was made from it.
+"""
+
+import json
+import logging
+import os
+import shutil
+import time
+from collections.abc import Callable, Iterator, Sequence
+from contextlib import ExitStack, contextmanager
+from hashlib import sha256
+from pathlib import Path
+from typing import Any, TypeVar
+
+from swimm3r.errors import DeviceError, InputError, StorageError, Swimm3rError, UsageError
+from swimm3r.io.files.atomic import remove_drafts, write_text
+from swimm3r.io.files.folder_lock import folder_lock
+from swimm3r.io.files.outputs import check_file, output_folder
+from swimm3r.memory import available_mb, peak_mb
+from swimm3r.pipeline.presets import RunSettings, from_yaml
+from swimm3r.pipeline.run_settings import differences, settings_by_stage, with_stages_of
+from swimm3r.scene.run_folder import MARKERS, SCHEMA, STAGES, RunFolder, StageRecord, check_vacant, is_run, read_run
+
+log = logging.getLogger(__name__)
+Result = TypeVar("Result")
+
+_SCORES = ("test", "restored", "truth")  # the sections that the last stage makes
+_OTHERS = "other_protocols"  # scores by other protocols than the run's own, by their names
+_FILES = ("settings.yaml", "versions.json", "log.jsonl", "summary.json", "report.html")
+_CONTENTS = {  # what a stage leaves, and what later commands make of it
+    "prepare": ("prepare",),
+    "sfm": ("sfm",),
+    "splat": ("splat", "renders", "localization"),
+    "eval": ("renders/test", "renders/protocols", "renders/flythrough.mp4"),
+}
+_TITLES = {
+    "prepare": "frames",
+    "sfm": "structure from motion, depth and water",
+    "splat": "map",
+    "eval": "scores, flight and report",
+}
+_SPARE_BYTES = 64 << 20  # below this a stage is not begun: COLMAP's database does not survive a full disk
+_SPARE_MB = 500.0  # of memory; with less, OpenBLAS ends the process, which nothing in it can catch
+
+
+@contextmanager
+def open_record(folder: Path, source: Path, fingerprint: str, *, redo: bool = False) -> "Iterator[RunRecord]":
+    """Make or open a run folder of an input and hold it; litter of killed processes is removed.
+
+    A new folder goes again where the input is refused. Raises UsageError where `folder` cannot be written to or
+    another process is at work there, InputError where it holds something else or a run of another input.
+    """
+    with ExitStack() as held:
+        held.enter_context(output_folder(folder))
+        check_vacant(folder)
+        held.enter_context(folder_lock(folder))
+        for name in _FILES:
+            check_file(folder / name)
+        remove_drafts(folder)
+        is_new = not is_run(folder)
+        try:
+            yield RunRecord(folder, source, fingerprint, redo)
+        except Swimm3rError:
+            if is_new and not (folder / MARKERS["prepare"]).exists():
+                for name in _FILES:  # there is nothing in them that a corrected input could go on from
+                    (folder / name).unlink(missing_ok=True)
+            raise
+
+
+class RunRecord:
+    """summary.json and log.jsonl of a run folder, kept current on disk."""
+
+    def __init__(self, folder: Path, source: Path, fingerprint: str, redo: bool = False) -> None:
+        self.folder = folder
+        self._count = 0  # of the stages to come, where it is known
+        self._redo = redo
+        before = self._found(fingerprint)
+        sections = {} if before is None else before.sections
+        self.summary: dict[str, Any] = {
+            "schema": SCHEMA,
+            "input": {"path": str(source.resolve()), "fingerprint": fingerprint},
+            "stages": dict(sections.get("stages", {})),
+        }
+        self._scores_before = {name: sections[name] for name in _SCORES if name in sections}
+        if _OTHERS in sections:
+            self.summary[_OTHERS] = dict(sections[_OTHERS])
+        self._log("opened", process=os.getpid(), input=str(source))
+
+    def settle(
+        self, settings: RunSettings | None, reference: Path | None, last_stage: str
+    ) -> tuple[RunSettings, Path | None]:
+        """Decide what the run goes by: given settings, else those the folder holds, else the defaults.
+
+        Settings of stages after the last one are the folder's own, where it has any; so is a reference not given.
+        """
+        self._count = STAGES.index(last_stage) + 1
+        held = self._held(settings is None)
+        chosen = settings or held or RunSettings()
+        if held is not None:
+            chosen = with_stages_of(chosen, held, STAGES[self._count :])
+        scored = self._stage("eval")
+        if reference is None and scored is not None and scored.reference:
+            reference = Path(scored.reference)
+        return chosen, reference
+
+    def make_room(self, settings: RunSettings, reference: Path | None) -> None:
+        """Have no stage in the folder that was made with other settings than these.
+
+        Raises UsageError where there is one and the record was not opened with `redo`, which moves it to old/.
+        """
+        keys = stage_keys(self.summary["input"]["fingerprint"], settings, reference)
+        made = {name: record for name in STAGES if (record := self._stage(name)) is not None}
+        changed = [name for name, record in made.items() if record.key != keys[name]]
+        if not changed:
+            return
+        held = self._held(False)
+        listed = [] if held is None else differences(held, settings, list(made))
+        scored = made.get("eval")
+        if scored is not None and scored.reference != _text(reference):
+            listed.append(f"reference: {scored.reference} -> {reference}")
+        if held is not None and not listed:
+            # the settings are the same: another version of the program names or hashes them in another way
+            log.warning("%s was made by another version; its finished stages are kept", self.folder)
+            for name in changed:
+                self.summary["stages"][name]["key"] = keys[name]
+            return
+        superseded = STAGES[STAGES.index(changed[0]) :]
+        if not self._redo:
+            raise _superseded(self.folder, [name for name in made if name in superseded], listed)
+        target = _set_aside(self.folder, superseded)
+        self._log("moved", stages=list(superseded), to=str(target.relative_to(self.folder)))
+        for stage in superseded:
+            self.summary["stages"].pop(stage, None)
+        self.summary.pop(_OTHERS, None)
+        self.write()
+
+    def add(self, found: dict[str, object]) -> None:
+        """Sections for the summary; what a section already holds of an earlier stage stays."""
+        for name, section in found.items():
+            before = self.summary.get(name)
+            if isinstance(before, dict) and isinstance(section, dict):
+                section = {**before, **section}
+            self.summary[name] = section
+
+    def add_protocol(self, name: str, scores: dict[str, object]) -> None:
+        """Scores by another protocol than the run's own."""
+        self.summary[_OTHERS] = {**self.summary.get(_OTHERS, {}), name: scores}
+        self._log("scored", protocol=name)
+
+    def keep_scores(self) -> None:
+        """The sections of the last stage as the summary had them."""
+        self.add(self._scores_before)
+
+    def stage(
+        self, name: str, key: str, make: Callable[[], Result], reuse: Callable[[], Result] | None = None, **facts: Any
+    ) -> Result:
+        """Do a stage, or reuse it where it is done with the same key and is still there; `facts` go to its record."""
+        if self._count:
+            log.info("Stage %d of %d: %s", STAGES.index(name) + 1, self._count, _TITLES[name])
+        before = self._stage(name)
+        if reuse and before is not None and (before.key, before.status) == (key, "done") and self._is_there(name):
+            self._log("reused", stage=name)
+            return reuse()
+        self._check_space()
+        self._check_memory(name)
+        self.summary["stages"][name] = {"status": "running", "key": key, **facts}
+        self.write()
+        self._log("started", stage=name)
+        wall, cpu = time.perf_counter(), time.process_time()
+        try:
+            result = make()
+        except BaseException as error:
+            self._check_space(error)  # before the log, which a full disk would not take either
+            self._log("stopped", stage=name, error=f"{type(error).__name__}: {error}")
+            raise
+        peak = peak_mb()
+        self.summary["stages"][name] = {
+            "seconds": round(time.perf_counter() - wall, 2),
+            "cpu_seconds": round(time.process_time() - cpu, 2),
+            "peak_mb": None if peak is None else round(peak),
+            "status": "done",
+            "key": key,
+            **facts,
+        }
+        self.write()
+        self._log("done", stage=name, **self.summary["stages"][name])
+        return result
+
+    def write(self) -> dict:
+        """Bring summary.json up to date and return it."""
+        write_text(self.folder / "summary.json", json.dumps(self.summary, indent=2) + "\n")
+        return self.summary
+
+    def _found(self, fingerprint: str) -> RunFolder | None:
+        """The run that the folder holds; None of a new one."""
+        if not is_run(self.folder):
+            return None
+        try:
+            run = read_run(self.folder)
+        except InputError:
+            if not self._redo:
+                raise
+            _set_aside(self.folder, STAGES)
+            return None
+        if run.input.fingerprint != fingerprint:
+            raise InputError(
+                f"{self.folder} holds a run of another input ({run.input.path})",
+                cause="the same --out was given for two inputs, or the input's files changed since",
+                hint="another --out, or remove that folder",
+            )
+        return run
+
+    def _held(self, needed: bool) -> RunSettings | None:
+        """The settings in the folder; None where there are none, or none that can be read and none are needed."""
+        path = self.folder / "settings.yaml"
+        if not path.is_file():
+            return None
+        try:
+            return from_yaml(path)
+        except InputError:
+            if needed:
+                raise
+            return None
+
+    def _stage(self, name: str) -> StageRecord | None:
+        found = self.summary["stages"].get(name)
+        if found is None:
+            return None
+        return StageRecord(found["status"], found["key"], found.get("reference"))
+
+    def _is_there(self, name: str) -> bool:
+        return (self.folder / MARKERS[name]).exists()
+
+    def _check_space(self, error: BaseException | None = None) -> None:
+        """Raise StorageError where too little space is left; `error` is what the lack of it may have caused."""
+        free = shutil.disk_usage(self.folder).free
+        if free < _SPARE_BYTES:
+            raise StorageError(
+                f"only {free / 1e6:.0f} MB are left on the disk of {self.folder}",
+                cause="the disk is full or over quota",
+                hint="free some space or choose another --out; the same command then goes on from here",
+            ) from error
+
+    def _check_memory(self, name: str) -> None:
+        free = available_mb()
+        if free is not None and free < _SPARE_MB:
+            raise DeviceError(
+                f"only {free:.0f} MB of memory are left, too little to begin the stage {name}",
+                cause="other programs hold the computer's memory, or a limit is set (ulimit -v)",
+                hint=f"leave this command {_SPARE_MB:.0f} MB and more; the same command then goes on from here",
+            )
+
+    def _log(self, event: str, **details: object) -> None:
+        line = json.dumps({"time": time.strftime("%Y-%m-%dT%H:%M:%S%z"), "event": event, **details})
+        with (self.folder / "log.jsonl").open("a", encoding="utf-8") as file:
+            file.write(line + "\n")
+
+
+def stage_keys(fingerprint: str, settings: RunSettings, reference: Path | None) -> dict[str, str]:
+    """What tells a stage's result from that of other settings: a hash of them and of everything before the stage."""
+    keys, before = {}, fingerprint
+    for stage, values in settings_by_stage(settings).items():
+        if stage == "eval":
+            values = {"reference": str(reference), "test": values}
+        text = json.dumps([stage, before, values], sort_keys=True, default=str)  # paths are all that JSON does not know
+        keys[stage] = before = sha256(text.encode()).hexdigest()[:16]
+    return keys
+
+
+def _set_aside(folder: Path, stages: Sequence[str]) -> Path:
+    """Move what stages made, with copies of the files that describe it, to old/1, old/2, ..."""
+    numbers = [int(path.name) for path in (folder / "old").glob("*") if path.name.isdecimal()]
+    target = folder / "old" / str(max(numbers, default=0) + 1)
+    target.mkdir(parents=True)
+    for name in ("settings.yaml", "versions.json", "summary.json", "report.html"):
+        if (folder / name).is_file():
+            shutil.copy2(folder / name, target / name)
+    for place in (place for stage in stages for place in _CONTENTS[stage]):
+        if (folder / place).exists():
+            (target / place).parent.mkdir(parents=True, exist_ok=True)
+            (folder / place).rename(target / place)
+    log.info("moved what was made before to %s", target)
+    return target
+
+
+def _text(path: Path | None) -> str | None:
+    return None if path is None else str(path)
+
+
+def _superseded(folder: Path, stages: list[str], listed: list[str]) -> UsageError:
+    shown = "".join(f"\n    {line}" for line in listed) or " (settings.yaml, which names them, cannot be read)"
+    return UsageError(
+        f"{folder} holds stages made with other settings ({', '.join(stages)}):{shown}",
+        cause="options or the preset are others than those the folder was made with",
+        hint=f"swimm3r run {folder} goes on with the folder's own; --redo moves these stages to {folder / 'old'} and"
+        " makes them again; or another --out",
+    )

@@ -1,0 +1,68 @@
+"""The settings that a run goes by: those given, those its folder holds, and how the two differ; torch-free."""
+
+from dataclasses import asdict, replace
+from pathlib import Path
+from typing import Any
+
+from swimm3r.pipeline.presets import MAST3R_PRESETS, PRESETS, Preset, RunSettings
+from swimm3r.sfm.settings import Mast3rSettings
+from swimm3r.splat.settings import Recipe, UwbsSettings, recipe_of, with_recipe
+
+_PARTS = {"prepare": "frames", "sfm": "sfm", "splat": "splat", "eval": "test"}  # of RunSettings, by the stage they make
+
+
+def settings_by_stage(settings: RunSettings) -> dict[str, dict[str, Any]]:
+    """Every setting by name, under the stage that it decides."""
+    return {
+        "prepare": asdict(settings.frames),
+        "sfm": {type(settings.sfm).__name__: asdict(settings.sfm)},
+        "splat": asdict(settings.splat),
+        "eval": asdict(settings.test),
+    }
+
+
+def with_stages_of(settings: RunSettings, other: RunSettings, stages: tuple[str, ...]) -> RunSettings:
+    """The settings with those of some stages taken from others."""
+    return replace(settings, **{_PARTS[stage]: getattr(other, _PARTS[stage]) for stage in stages})
+
+
+def differences(old: RunSettings, new: RunSettings, stages: list[str]) -> list[str]:
+    """What differs in the settings of some stages, by the names in settings.yaml: "splat.iterations: 2000 -> 5000"."""
+    lines = []
+    for part in (_PARTS[stage] for stage in stages):
+        before, after = getattr(old, part), getattr(new, part)
+        if type(before) is not type(after):
+            lines.append(f"{part}.kind: {type(before).__name__} -> {type(after).__name__}")
+            continue
+        was, will = _flat(asdict(before), part), _flat(asdict(after), part)
+        lines += [f"{name}: {was[name]} -> {will[name]}" for name in was if was[name] != will[name]]
+    return lines
+
+
+def starting_settings(
+    preset: Preset | None, backend: str | None, recipe: Recipe | None, held: RunSettings | None
+) -> RunSettings:
+    """The defaults of a command's options: those of a named preset, else those that the run folder holds.
+
+    Where there is neither, they are those of `default`. A back end or a recipe other than theirs comes with what the
+    preset (or `default`) sets for it.
+    """
+    named = PRESETS[preset or "default"]
+    base = named if preset is not None or held is None else held
+    sfm, splat = base.sfm, base.splat
+    if backend is not None and (backend == "colmap") == isinstance(sfm, Mast3rSettings):
+        sfm = named.sfm if backend == "colmap" else MAST3R_PRESETS[preset or "default"]
+    if recipe is not None and recipe_of(splat) != recipe:
+        assert isinstance(named.splat, UwbsSettings)
+        splat = with_recipe(named.splat, recipe)
+    return replace(base, sfm=sfm, splat=splat)
+
+
+def _flat(values: dict[str, Any], under: str) -> dict[str, Any]:
+    flat = {}
+    for name, value in values.items():
+        if isinstance(value, dict):
+            flat |= _flat(value, f"{under}.{name}")
+        else:
+            flat[f"{under}.{name}"] = str(value) if isinstance(value, Path) else value
+    return flat

@@ -1,0 +1,115 @@
+"""The last stage: a run's map rendered and scored on its test frames, and the flight along the dive.
+
+A protocol is where the poses of the test frames come from and how they are refined. The run's own is that of its
+settings and its reference; scores by any other stand beside its own, never in their place.
+"""
+
+import re
+from dataclasses import asdict, dataclass
+from hashlib import sha256
+from pathlib import Path
+
+from swimm3r.io.imports.record import read_foreign
+from swimm3r.io.view_names import view_stems
+from swimm3r.pipeline import held_out
+from swimm3r.pipeline import summary as sections
+from swimm3r.pipeline.presets import RunSettings
+from swimm3r.pipeline.renders import look_of, write_flythrough
+from swimm3r.pipeline.restored_scores import restored_section
+from swimm3r.progress import Progress, silent
+from swimm3r.scene.frames import Frames
+from swimm3r.scene.ground_truth import GroundTruth
+from swimm3r.scene.reconstruction import Reconstruction
+from swimm3r.sfm.imported.match_frames import model_cameras
+from swimm3r.sfm.settings import ColmapModelSettings
+from swimm3r.splat.rendering import SplatMap
+from swimm3r.splat.settings import PoseRefinementSettings
+from swimm3r.splat.training_poses import as_mapped
+
+_FLIGHT = 90  # pictures of the fly-through
+
+
+@dataclass(frozen=True)
+class Protocol:
+    """How the test frames are placed before they are scored."""
+
+    test: PoseRefinementSettings
+    reference: Path | None = None  # a cameras.json that poses start at and are compared with
+
+    def key_beside(self, own: "Protocol") -> str:
+        """What differs from a run's own protocol, fit for a folder's name: steps-20; empty where nothing does."""
+        parts = [
+            f"{name.replace('_', '-')}-{value}"
+            for name, value in asdict(self.test).items()
+            if value != getattr(own.test, name)
+        ]
+        if self.reference != own.reference:
+            digest = sha256(str(self.reference).encode()).hexdigest()[:8]
+            parts.append("no-reference" if self.reference is None else f"reference-{self.reference.stem}-{digest}")
+        return re.sub(r"[^\w.-]+", "-", "_".join(parts))
+
+
+@dataclass(frozen=True)
+class MappedRun:
+    """A run folder with a finished map."""
+
+    folder: Path
+    frames: Frames
+    rec: Reconstruction
+    scene: SplatMap
+    settings: RunSettings
+
+
+def start_poses(
+    rec: Reconstruction, frames: Frames, settings: RunSettings, truth: GroundTruth | None, progress: Progress = silent
+) -> dict[str, held_out.FirstPose]:
+    """Where the test frames' refinement starts, in the reconstruction's axes: at the truth's poses where it has them.
+
+    Without a truth, at those of the model that the reconstruction was imported from.
+    """
+    if truth is None and isinstance(settings.sfm, ColmapModelSettings):
+        names, cameras = model_cameras(frames, read_foreign(settings.sfm.model).model)
+        truth = GroundTruth(names, cameras, metric=False)
+    return held_out.first_poses(rec, frames, settings.sfm.features, truth, progress)
+
+
+def score_map(
+    run: MappedRun, test: PoseRefinementSettings, truth: GroundTruth | None, into: Path, progress: Progress = silent
+) -> dict[str, dict | None]:
+    """The sections "test", "restored" (of the map) and "truth" by a protocol; the views it renders go to `into`."""
+    frames, rec, scene, restore = run.frames, run.rec, run.scene, run.settings.sfm.restore
+    poses = held_out.in_axes_of(scene, rec, start_poses(rec, frames, run.settings, truth, progress))
+    views = held_out.score_views(scene, rec, frames, poses, into, test, restore, progress)
+    stems = view_stems(frames.names)
+    physical, shown = ([into / f"{stems[v.name]}_{kind}.png" for v in views] for kind in ("clear_physical", "clear"))
+    return {
+        "test": sections.test_section(views, test),
+        "restored": {"splat": restored_section(physical, shown, progress)},
+        "truth": sections.truth_section(rec, frames, truth, scene, views, progress) if truth else None,
+    }
+
+
+def score_restored_frames(run: MappedRun, progress: Progress = silent) -> dict[str, object]:
+    """The entry "sfm" of the section "restored"."""
+    physical, shown = (
+        [run.folder / "sfm" / folder / f"{name}.png" for name in run.rec.names]
+        for folder in ("restored_physical", "restored")
+    )
+    return restored_section(physical, shown, progress)
+
+
+def film_flight(run: MappedRun, progress: Progress = silent) -> None:
+    """Write RUN/renders/flythrough.mp4, at the size the map was trained at."""
+    scene, path = run.scene, as_mapped(run.rec, run.scene.poses)
+    lens = path.cameras[0]
+    canvas = lens.pinhole(scene.settings.long_side)
+    write_flythrough(
+        run.folder / "renders" / "flythrough.mp4",
+        scene,
+        held_out.cut(canvas, held_out.visible_window(lens, canvas)),
+        path.cameras.cam2world,
+        run.frames.times_of(path.names),
+        _FLIGHT,
+        look_of(scene, run.rec, run.settings.sfm.restore),
+        progress,
+    )

@@ -1,0 +1,103 @@
+"""What preparing a video and preparing stills share: the records, the sharpness measure, the size."""
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import TypeVar
+
+import numpy as np
+from jaxtyping import UInt8, UInt16
+
+from swimm3r.io.files.safe_names import shown_name
+from swimm3r.io.images import Rgb
+
+STEP = "preparing frames"  # what progress calls it
+GREY_SIDE = 960  # pixels; sharpness is judged on a copy of this size, so that it compares across cameras
+BLANK = 1.0  # standard deviation of an 8-bit grey copy below which a frame shows nothing: lens cap, fade, slate
+
+Item = TypeVar("Item")
+
+
+@dataclass(frozen=True)
+class Picture:
+    """A picture already written into the draft folder."""
+
+    name: str
+    original: Path  # relative name by which its mask is looked up
+    size: tuple[int, int]  # of the original, upright
+    time: float
+    sharpness: float
+    gray: bool  # three equal channels
+
+
+@dataclass(frozen=True)
+class Dive:
+    """What was written into the draft folder, and what there is to say about it."""
+
+    pictures: list[Picture]
+    ordered: bool
+    cautions: list[str]
+    mask_folders: list[Path]
+    originals: list[Path]  # what a mask may belong to, frames left out included
+    files: frozenset[Path] = frozenset()  # the originals of stills where they lie: no masks, whatever their names
+
+
+def sharpness(grey: UInt8[np.ndarray, "h w"]) -> float:
+    """Variance of the Laplacian (Pech-Pacheco et al. 2000); larger is sharper, comparable within one scene."""
+    import cv2
+
+    return float(cv2.Laplacian(grey, cv2.CV_16S).var(dtype=np.float64))
+
+
+def small_grey(picture: Rgb) -> UInt8[np.ndarray, "h w"]:
+    """The copy on which sharpness is judged."""
+    import cv2
+
+    small = scaled_down(picture, GREY_SIDE)
+    if small.dtype == np.uint16:
+        small = (small >> 8).astype(np.uint8)
+    return cv2.cvtColor(small, cv2.COLOR_RGB2GRAY)
+
+
+def is_gray(picture: Rgb) -> bool:
+    """Whether the three channels are equal, but for the rounding of JPEG and video in one pixel of a thousand."""
+    small = scaled_down(picture, GREY_SIDE).astype(np.int32)
+    spread = small.max(axis=2) - small.min(axis=2)
+    rounding = 2 if picture.dtype == np.uint8 else 2 * 257
+    return float((spread <= rounding).mean()) >= 0.999
+
+
+def scaled_down(
+    picture: Rgb, long_side: int
+) -> UInt8[np.ndarray, "rows columns 3"] | UInt16[np.ndarray, "rows columns 3"]:
+    """A picture of at most `long_side` pixels along its longer side; 0 keeps it."""
+    import cv2
+
+    target = target_size((picture.shape[1], picture.shape[0]), long_side)
+    if picture.shape[1::-1] == target:
+        return picture
+    return cv2.resize(picture, target, interpolation=cv2.INTER_AREA)
+
+
+def target_size(size: tuple[int, int], long_side: int) -> tuple[int, int]:
+    """Width and height after scaling down; 0 keeps them."""
+    scale = min(1.0, long_side / max(size)) if long_side else 1.0
+    return max(1, round(size[0] * scale)), max(1, round(size[1] * scale))
+
+
+def thinned(items: Sequence[Item], most: int) -> list[Item]:
+    """At most so many, spread evenly, the first and the last among them."""
+    if not most or len(items) <= most:
+        return list(items)
+    return [items[i] for i in np.linspace(0, len(items) - 1, most).round().astype(int)]
+
+
+def blank_caution(count: int, of: str) -> str:
+    """What to say about frames without contents."""
+    return f"{count} {of} show nothing (black, or one even colour) and were left out."
+
+
+def some_names(paths: Sequence[Path], root: Path, most: int = 3) -> str:
+    """The first names, and how many more."""
+    names = [path.relative_to(root).as_posix() if path.is_relative_to(root) else path.name for path in paths[:most]]
+    return ", ".join(map(shown_name, names)) + (f" and {len(paths) - most} more" if len(paths) > most else "")

@@ -1,0 +1,260 @@
+"""From a source to a complete folder of frames, and back from the folder.
+
+The folder appears when it is complete, and not before. frames.json holds name, time, split, sharpness and mask of each
+frame, and width, height, ordered, gray, masks (how many are used and unused), source and cautions of them all.
+"""
+
+import json
+import logging
+import os
+import shutil
+from collections.abc import Iterator
+from contextlib import contextmanager, suppress
+from dataclasses import asdict, dataclass, replace
+from hashlib import sha256
+from pathlib import Path
+from typing import Any, Literal
+
+from swimm3r.errors import InputError
+from swimm3r.io import images
+from swimm3r.io.files.atomic import DRAFT, write_text
+from swimm3r.io.files.damage import guard, remake
+from swimm3r.io.files.json_file import read_json
+from swimm3r.io.files.safe_names import check_name, check_names, shown_name
+from swimm3r.io.video import Video
+from swimm3r.prepare.candidates import Dive, target_size
+from swimm3r.prepare.image_folder import only_video, pictures_of, prepare_stills
+from swimm3r.prepare.masks import check_masks, prepare_masks
+from swimm3r.prepare.video import prepare_clip
+from swimm3r.progress import Progress, silent
+from swimm3r.scene.frames import Frame, Frames
+from swimm3r.scene.settings import FrameSettings
+
+log = logging.getLogger(__name__)
+
+TEST_EVERY = 8  # index % 8 == 0 is held back, as the paper and 3DGS count
+LEAST = 3  # frames: the first is held back for testing, and depth takes two
+
+
+def read_frames(
+    source: str | Path,
+    settings: FrameSettings | None = None,
+    folder: Path | None = None,
+    progress: Progress = silent,
+    **changes: Any,
+) -> Frames:
+    """See `swimm3r.prepare.read_frames`."""
+    settings = replace(settings or FrameSettings(), **changes)
+    check_masks(settings)
+    given, source = Path(source), check_source(Path(source))
+    if source != given:
+        log.info("%s holds no pictures and one video, which is taken: %s", given, source.name)
+    if folder is None:
+        folder = _cache_folder(source, settings)
+        if (folder / "frames.json").is_file():
+            return load_frames(folder)
+    with _whole_folder(folder) as draft:
+        if source.is_dir():
+            dive = prepare_stills(source, draft, settings, progress, leave_out=[folder, folder.parent])
+        else:
+            dive = prepare_clip(source, draft, settings, progress)
+        _write_frames(dive, draft, source, settings)
+    return load_frames(folder)
+
+
+@dataclass(frozen=True)
+class _Entry:
+    """A frame in frames.json."""
+
+    name: str
+    time: float
+    sharpness: float
+    split: Literal["train", "test"]
+    mask: str | None = None
+
+
+@dataclass(frozen=True)
+class _Masks:
+    unused: int = 0
+
+
+@dataclass(frozen=True)
+class _Document:
+    """frames.json."""
+
+    width: int
+    height: int
+    ordered: bool
+    frames: tuple[_Entry, ...]
+    cautions: tuple[str, ...] = ()
+    gray: bool = False
+    masks: _Masks = _Masks()
+
+    def __post_init__(self) -> None:
+        if min(self.width, self.height) < 1:
+            raise ValueError(f"frames have a size in whole pixels, got {self.width}x{self.height}")
+        if not self.frames:
+            raise ValueError("it names no frames")
+        check_names(entry.name for entry in self.frames)
+
+
+def load_frames(folder: Path) -> Frames:
+    """What `read_frames` prepared in a folder. Raises InputError where that is not whole."""
+    path, remedy = folder / "frames.json", remake(folder)
+    document = read_json(path, _Document, remedy)
+    with guard(path, remedy):
+        frames = tuple(
+            Frame(
+                name=entry.name,
+                path=_inside(folder, entry.name),
+                time=entry.time,
+                sharpness=entry.sharpness,
+                split=entry.split,
+                mask=_inside(folder, entry.mask) if entry.mask else None,
+            )
+            for entry in document.frames
+        )
+    return Frames(
+        frames,
+        document.width,
+        document.height,
+        document.ordered,
+        document.cautions,
+        gray=document.gray,
+        unused_masks=document.masks.unused,
+    )
+
+
+def check_source(source: Path) -> Path:
+    """See `swimm3r.prepare.check_source`."""
+    try:
+        return _checked(source)
+    except OSError as error:
+        raise InputError(
+            f"{shown_name(source)} cannot be read: {error.strerror}",
+            cause="it belongs to another user, lies in a folder that may not be entered, or its name is too long",
+            hint="check the name; change the permissions (chmod -R u+rX FOLDER), or copy it to a folder of your own",
+        ) from error
+
+
+def _checked(source: Path) -> Path:
+    if source.is_dir():
+        video = only_video(source)
+        if video is None:
+            pictures_of(source)
+            return source
+        source = video
+    elif not source.exists():
+        raise InputError(
+            f"there is no {source}",
+            cause="a slip in the name, or a disk that is not mounted",
+            hint="give the path of a video, or of a folder with pictures",
+        )
+    elif source.suffix.lower() in images.SUFFIXES:
+        raise InputError(
+            f"{source} is a single picture",
+            cause="one picture shows no depth",
+            hint="give the folder that holds the pictures of the dive",
+        )
+    Video(source)
+    return source
+
+
+def _write_frames(dive: Dive, draft: Path, source: Path, settings: FrameSettings) -> None:
+    """Masks and frames.json; frames.json is the last file of the folder."""
+    cautions = list(dive.cautions)
+    size = target_size(dive.pictures[0].size, settings.long_side) if dive.pictures else (0, 0)
+    masks = prepare_masks(dive, draft, size, settings, cautions)
+    kept = [picture for picture in dive.pictures if picture.name not in masks.covered]
+    if masks.covered:
+        if not kept:
+            raise InputError(
+                f"the masks leave nothing: every one of {len(masks.covered)} frames is wholly masked out",
+                cause="the masks are the wrong way round; here 0 means leave out, anything else means use",
+                hint="invert the masks, or run without them",
+            )
+        cautions.append(f"{len(masks.covered)} frames were left out because their masks cover them wholly.")
+    if len(kept) < LEAST:
+        raise InputError(
+            f"{source} gives {len(kept)} usable frame{'s' * (len(kept) != 1)}, and at least {LEAST} are needed",
+            cause=" ".join(cautions) or "the clip is too short, or the pictures are too few",
+            hint="more pictures with overlap, a longer clip, or a larger fps",
+        )
+    gray = all(picture.gray for picture in kept)
+    if gray:
+        cautions.append(
+            "The frames are gray: their three channels are equal. The water's coefficients are those of one channel, "
+            "and removing the water restores contrast, not color."
+        )
+    document = {
+        "schema": 1,
+        "source": str(source.resolve()),
+        "width": size[0],
+        "height": size[1],
+        "ordered": dive.ordered,
+        "gray": gray,
+        "masks": {"used": sum(picture.name in masks.places for picture in kept), "unused": masks.unused},
+        "cautions": cautions,
+        "frames": [
+            {
+                "name": picture.name,
+                "time": round(picture.time, 6),
+                "split": "test" if i % TEST_EVERY == 0 else "train",
+                "sharpness": round(picture.sharpness, 3),
+                "mask": masks.places.get(picture.name),
+            }
+            for i, picture in enumerate(kept)
+        ],
+    }
+    _remove_all_but(draft, {entry[key] for entry in document["frames"] for key in ("name", "mask") if entry[key]})
+    write_text(draft / "frames.json", json.dumps(document, indent=1) + "\n")
+
+
+def _inside(folder: Path, name: str) -> Path:
+    """The file of that name in the folder. Names come from a file: they must not lead out of it."""
+    check_name(name)
+    path = folder / name
+    if not path.is_file():
+        raise ValueError(f"{name} is missing")
+    return path
+
+
+def _remove_all_but(folder: Path, names: set[str]) -> None:
+    """Drop what was written for frames that were left out in the end."""
+    for path in folder.rglob("*"):
+        if path.is_file() and path.relative_to(folder).as_posix() not in names:
+            path.unlink()
+
+
+@contextmanager
+def _whole_folder(folder: Path) -> Iterator[Path]:
+    """A draft that takes the place of `folder` if the block succeeds, and leaves no trace if not."""
+    if folder.exists() and any(folder.iterdir()) and not (folder / "frames.json").is_file():
+        raise InputError(
+            f"{folder} is not empty and holds no prepared frames",
+            cause="the folder is used for something else",
+            hint="a folder that does not exist yet",
+        )
+    missing = [parent for parent in folder.parents if not parent.exists()]
+    draft = folder.with_name(f"{DRAFT}{folder.name}")
+    shutil.rmtree(draft, ignore_errors=True)  # left by a run that was killed
+    draft.mkdir(parents=True)
+    try:
+        yield draft
+        if folder.exists():
+            shutil.rmtree(folder)
+        draft.rename(folder)
+    except BaseException:
+        shutil.rmtree(draft, ignore_errors=True)
+        with suppress(OSError):  # somebody else has put something there meanwhile
+            for parent in missing:
+                parent.rmdir()
+        raise
+
+
+def _cache_folder(source: Path, settings: FrameSettings) -> Path:
+    """Where frames go that were given no folder: the same source and settings find them again."""
+    files = sorted(path for path in source.rglob("*") if os.path.isfile(path)) if source.is_dir() else [source]
+    stats = [(str(path.resolve()), path.stat().st_size, path.stat().st_mtime_ns) for path in files]
+    key = sha256(repr((stats, sorted(asdict(settings).items()))).encode()).hexdigest()[:16]
+    return Path(os.environ.get("XDG_CACHE_HOME") or Path.home() / ".cache") / "swimm3r" / "frames" / key

@@ -1,0 +1,110 @@
+"""A video -> one frame of each bin of 1/fps seconds; only the best frame of the current bin is in memory."""
+
+from collections.abc import Iterator
+from itertools import groupby
+from math import ceil, inf
+from pathlib import Path
+from typing import Literal
+
+from swimm3r.errors import InputError
+from swimm3r.io import images
+from swimm3r.io.video import Video, VideoFrame
+from swimm3r.prepare.candidates import (
+    BLANK,
+    GREY_SIDE,
+    STEP,
+    Dive,
+    Picture,
+    blank_caution,
+    is_gray,
+    scaled_down,
+    sharpness,
+    thinned,
+)
+from swimm3r.progress import Progress
+from swimm3r.scene.settings import FrameSettings
+
+
+def prepare_clip(source: Path, draft: Path, settings: FrameSettings, progress: Progress) -> Dive:
+    """Write the frames of a video into `draft`, in one pass. Raises InputError."""
+    video = Video(source)
+    end = settings.end if settings.end is not None else inf
+    last = min(end, video.seconds if video.seconds is not None else inf)
+    rate = settings.fps or inf
+    if settings.max_frames and last < inf:
+        rate = min(rate, settings.max_frames / max(last - settings.start, 1e-3))
+    expected = ceil((last - settings.start) * video.rate) if last < inf else 0
+    seen = 0
+    reached = 0.0
+
+    def watched() -> Iterator[VideoFrame]:
+        nonlocal seen, reached
+        for frame in video.frames(settings.start, end):
+            progress(STEP, seen, max(expected, seen))
+            seen, reached = seen + 1, frame.time
+            yield frame
+
+    def bin_of(frame: VideoFrame) -> int:
+        return int((frame.time - settings.start) * rate + 1e-6) if rate < inf else seen
+
+    pictures: list[Picture] = []
+    blank = 0
+    for _, bin_frames in groupby(watched(), bin_of):
+        best = _best(bin_frames, settings.pick)
+        if best is None:
+            blank += 1
+            continue
+        frame, sharp = best
+        name = f"frame_{len(pictures):06d}.png"
+        rgb = scaled_down(frame.rgb(), settings.long_side)
+        images.write_rgb(draft / name, rgb)
+        pictures.append(Picture(name, Path(name), (video.width, video.height), frame.time, sharp, is_gray(rgb)))
+    progress(STEP, max(seen, 1), max(seen, 1))
+
+    if not seen:
+        raise InputError(
+            f"{source} has no frames from second {settings.start:g} on",
+            cause="the video is shorter than that, or cut off",
+            hint="a smaller start",
+        )
+    cautions = [blank_caution(blank, "times of the video")] if blank else []
+    cautions += _cautions(video, last, reached)
+    mask_folders = [settings.masks] if settings.masks is not None else []
+    kept = thinned(pictures, settings.max_frames)
+    return Dive(kept, True, cautions, mask_folders, [picture.original for picture in pictures])
+
+
+def _cautions(video: Video, last: float, reached: float) -> list[str]:
+    """What is wrong with a video that was read up to second `reached` and should last until `last`."""
+    name, cautions = video.path.name, []
+    if video.damaged:
+        cautions.append(
+            f"{video.damaged} damaged packets of {name} were passed over; frames are missing or smeared there. "
+            "Copy the video again if the original is whole."
+        )
+    if last < inf and last - reached > max(1.0, 0.02 * last, 2 / video.rate):
+        cautions.append(
+            f"{name} should last {last:.1f} s, but ends at {reached:.1f} s: it is cut off or damaged. "
+            "What decoded is used; copy it again if the original is longer."
+        )
+    if video.interlaced:
+        cautions.append(
+            f"{name} is interlaced, which tears moving pictures into combs. "
+            "Deinterlace it first: ffmpeg -i IN -vf bwdif OUT.mp4"
+        )
+    return cautions
+
+
+def _best(frames: Iterator[VideoFrame], pick: Literal["sharpest", "uniform"]) -> tuple[VideoFrame, float] | None:
+    """The frame to take of a bin with its sharpness; None where all show nothing."""
+    best: tuple[VideoFrame, float] | None = None
+    for frame in frames:
+        if best and pick == "uniform":
+            continue
+        grey = frame.grey(GREY_SIDE)
+        if grey.std() < BLANK:
+            continue
+        sharp = sharpness(grey)
+        if best is None or sharp > best[1]:
+            best = (frame, sharp)
+    return best

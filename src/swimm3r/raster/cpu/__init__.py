@@ -1,0 +1,1 @@
+"""The rasterizer in compiled loops for the CPU."""

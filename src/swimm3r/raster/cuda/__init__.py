@@ -1,0 +1,1 @@
+"""The rasterizer for CUDA devices, in NVIDIA Warp."""

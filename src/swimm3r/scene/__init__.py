@@ -1,0 +1,1 @@
+"""The records of a scene, frames and reconstruction, and the folder of a run that holds them."""

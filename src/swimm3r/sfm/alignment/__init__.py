@@ -1,0 +1,1 @@
+"""Global alignment of pairwise pointmaps: poses, intrinsics and depth of all frames."""

@@ -1,0 +1,1 @@
+"""The ways from frames to a reconstruction: COLMAP, MASt3R, or another program's result."""

@@ -1,0 +1,321 @@
+"""Structure from motion by the MASt3R network: pictures -> pairs -> matches and canonical views -> alignment -> record.
+
+Everything slow lies on disk as soon as it is known (`encodings`, `pair_store`), under names that are hashes of what it
+was made from: a killed run goes on, and nothing stale is used. Memory is bounded for any number of frames: one pair's
+maps, a fixed budget of encodings and sums, and at most `max_matches` matches.
+"""
+
+import shutil
+from dataclasses import dataclass, replace
+from pathlib import Path
+
+import torch
+from jaxtyping import Float
+from torch import Tensor
+
+from swimm3r.cameras import Cameras, project
+from swimm3r.errors import RegistrationError
+from swimm3r.imaging.filters import LUMA
+from swimm3r.progress import Progress, silent
+from swimm3r.scene import reconstruction
+from swimm3r.scene.frames import Frames
+from swimm3r.scene.reconstruction import Caution, DepthMap, DepthMaps, Matches, Reconstruction
+from swimm3r.sfm import tracks as match_tracks
+from swimm3r.sfm.alignment import depth_cleaning
+from swimm3r.sfm.alignment.canonical import AnchoredFrame, anchors_of
+from swimm3r.sfm.alignment.optimize import Alignment, align, dense_z_depth
+from swimm3r.sfm.alignment.problem import AnchoredPair, Known
+from swimm3r.sfm.colmap import poses as colmap
+from swimm3r.sfm.features.pair_graph import groups, parse_graph
+from swimm3r.sfm.mast3r.matching import PixelMatches
+from swimm3r.sfm.mast3r_sfm.encodings import EncodingStore
+from swimm3r.sfm.mast3r_sfm.network_frames import NetworkPictures, network_pictures
+from swimm3r.sfm.mast3r_sfm.pair_store import PairRecord
+from swimm3r.sfm.mast3r_sfm.run_pairs import Said, load_network, look_at_pairs, put_on
+from swimm3r.sfm.medium import from_head
+from swimm3r.sfm.medium.apply import with_water
+from swimm3r.sfm.plane_sweep.views import on_frame_grid
+from swimm3r.sfm.settings import Mast3rSettings
+from swimm3r.sfm.student import adapter_file
+from swimm3r.sfm.student.physics_head import PhysicsHead
+from swimm3r.sfm.tracks import FrameMatches, MatchTracks
+
+_WATER = "water"  # of what the physics head read, in the working folder
+_FOLDER = "mast3r"  # of what is kept until the run is done, in the working folder
+
+
+def reconstruct(frames: Frames, settings: Mast3rSettings, folder: Path, progress: Progress = silent) -> Reconstruction:
+    """Cameras, points, matches, dense depth, water and restored cloud of the frames that hang together.
+
+    Raises UsageError for settings that contradict each other, WeightsError for a missing, damaged or wrong checkpoint
+    or one that predicts no numbers, DeviceError, and RegistrationError where the frames do not hang together.
+    """
+    cache = settings.cache or folder / _FOLDER
+    if not (folder / "reconstruction.json").is_file():
+        graph = parse_graph(settings.graph)
+        pictures = network_pictures(frames, settings)
+        network = load_network(settings)
+        head = None if settings.adapter is None else put_on(network, settings.adapter, settings)
+        said = look_at_pairs(network, pictures, graph, settings, cache, progress)
+        read_water = None
+        if head is not None:
+            encodings = EncodingStore(network, pictures, cache / "encodings")
+            read_water = _WaterReader(head, encodings, folder / _WATER)
+        rec = _place(said, pictures, settings, folder, progress, read_water)
+        reconstruction.save(rec, frames, folder)
+    rec = reconstruction.load(folder, frames)  # also where it was just made: the same bits as after an interruption
+    if settings.adapter is None:
+        rec = with_water(rec, frames, settings, folder, progress)
+    else:
+        facts = adapter_file.head_facts(settings.adapter)
+        predicted = from_head.read(folder / _WATER, network_pictures(frames, settings), facts)
+        rec = with_water(rec, frames, settings, folder, progress, predicted)
+    reconstruction.save(rec, frames, folder)
+    if settings.cache is None:
+        shutil.rmtree(cache, ignore_errors=True)
+    return rec
+
+
+@dataclass(frozen=True)
+class _WaterReader:
+    """Reads each frame's water from its encoding and keeps it."""
+
+    head: PhysicsHead
+    encodings: EncodingStore
+    folder: Path
+
+    def keep(self, f: int, name: str, scale: float) -> None:
+        """The water of frame `f`; `scale` is the reconstruction's unit per metre of the network."""
+        with torch.no_grad():
+            maps = self.head(self.encodings[f])
+        from_head.write(maps, scale, self.folder, name)
+
+
+def _place(
+    said: Said,
+    pictures: NetworkPictures,
+    settings: Mast3rSettings,
+    folder: Path,
+    progress: Progress,
+    water: _WaterReader | None = None,
+) -> Reconstruction:
+    """The aligned record, without water; depth maps are written on the way."""
+    frames = pictures.frames
+    pairs, kept, cautions = _joined_frames(said, frames, settings)
+    aligned = _align(said, pairs, kept, pictures, settings, progress)
+    lens, canvas = pictures.cameras(aligned.alignment.K, aligned.alignment.cam2world)
+    matches = aligned.matches.select(match_tracks.consistent(aligned.matches, canvas, settings.max_error))
+    found = _tracks(matches, canvas, settings)
+    tracks = match_tracks.most_seen(found, settings.max_points)
+    reconstruction.write_unfiltered_matches(folder, _on_frames(aligned.matches, pictures))
+    points, sightings = match_tracks.as_points(tracks, pictures.to_frame(tracks.xy + 0.5), lens, frames, kept)
+    rec = Reconstruction(
+        names=tuple(frames.names[f] for f in kept),
+        cameras=lens,
+        points=points,
+        tracks=sightings,
+        matches=_on_frames(matches, pictures),
+        depth=DepthMaps(folder / "z_depth"),
+        backend="mast3r" if settings.adapter is None else "swimm3r",
+        metric=_is_metric(pictures, kept),
+        cautions=tuple(cautions),
+        points_found=len(found.xyz),
+    )
+    if settings.bundle_adjustment:
+        rec = colmap.bundle_adjust(rec)
+    _write_depth(rec, said, kept, pairs, aligned.alignment, pictures, settings, progress)
+    if water is not None:
+        for k, f in enumerate(kept):
+            before = said.frame_store.read(f).anchored.anchor_depth.clamp(min=1e-9)
+            water.keep(f, rec.names[k], float((aligned.alignment.anchor_z_depth[k] / before).median().clamp(min=1e-9)))
+    return rec
+
+
+def _on_frames(matches: FrameMatches, pictures: NetworkPictures) -> Matches:
+    """Matches of the network's pixels in pixels of the prepared frames."""
+    xy_i, xy_j = (pictures.to_frame(xy + 0.5).float() for xy in (matches.xy_i, matches.xy_j))
+    return Matches(matches.i, matches.j, xy_i, xy_j, matches.confidence)
+
+
+def _is_metric(pictures: NetworkPictures, kept: list[int]) -> bool:
+    """Two known camera centres settle the unit; the network's own metres nobody measured."""
+    poses = pictures.poses
+    return poses is not None and poses.metric and int(poses.posed[kept].sum()) >= 2
+
+
+def _joined_frames(
+    said: Said, frames: Frames, settings: Mast3rSettings
+) -> tuple[dict[tuple[int, int], PairRecord], list[int], list[Caution]]:
+    """The pairs that match, each with what is known of it, and the frames they join."""
+    n = len(frames)
+    records = {pair: said.pair_store.read(*(said.names[f] for f in pair)) for pair in said.pairs}
+    most = max((len(record.matches.confidence) for record in records.values()), default=0)
+    if most == 0:
+        raise RegistrationError(
+            f"not one pixel of the {n} frames matches between any two of them",
+            cause="the frames show different places, or open water only",
+            hint="a clip with the bottom in view and more overlap",
+        )
+    found = {pair: record for pair, record in records.items() if len(record.matches.confidence) >= settings.min_matches}
+    parts = groups(n, list(found))
+    kept = sorted(parts[0])
+    if len(kept) < max(2, settings.min_share * n):
+        sizes = ", ".join(str(len(part)) for part in parts[:5]) + (" ..." if len(parts) > 5 else "")
+        raise RegistrationError(
+            f"the frames fall into {len(parts)} groups without enough matches between them, of {sizes} frames",
+            cause="a cut in the clip, or a stretch of open water",
+            hint="take the longest stretch only, more frames per second, or a graph with more pairs (--graph)",
+        )
+    cautions = []
+    if len(kept) < n:
+        cautions.append(
+            Caution(
+                f"{n - len(kept)} of {n} frames match no other and are left out.",
+                "They are blurred, show open water, or overlap too little with the rest: raise --fps, or swim slower.",
+            )
+        )
+    number = {f: k for k, f in enumerate(kept)}
+    joined = {(number[i], number[j]): record for (i, j), record in found.items() if i in number}
+    share = max(settings.min_matches, settings.max_matches // len(joined))
+    return {pair: _thinned(record, share) for pair, record in joined.items()}, kept, cautions
+
+
+def _thinned(record: PairRecord, most: int) -> PairRecord:
+    m = record.matches
+    if len(m.confidence) <= most:
+        return record
+    rows = torch.randperm(len(m.confidence), generator=torch.Generator().manual_seed(0))[:most].sort().values
+    return replace(record, matches=PixelMatches(m.xy1[rows], m.xy2[rows], m.confidence[rows]))
+
+
+@dataclass(frozen=True)
+class _Aligned:
+    alignment: Alignment
+    matches: FrameMatches
+
+
+def _align(
+    said: Said,
+    pairs: dict[tuple[int, int], PairRecord],
+    kept: list[int],
+    pictures: NetworkPictures,
+    settings: Mast3rSettings,
+    progress: Progress,
+) -> _Aligned:
+    """The alignment of the kept frames; canonical views are read one at a time."""
+    alignment = settings.alignment
+    anchored: list[AnchoredFrame] = []
+    hung: dict[tuple[int, int], tuple[Tensor, Tensor]] = {}  # (pair, side): anchors and relative depths
+    touching: list[list[tuple[int, int]]] = [[] for _ in kept]
+    for number, (i, j) in enumerate(pairs):
+        touching[i].append((number, 0))
+        touching[j].append((number, 1))
+    records = list(pairs.values())
+    for k, f in enumerate(kept):
+        frame = said.frame_store.read(f)
+        anchored.append(frame.anchored)
+        for number, side in touching[k]:
+            xy = (records[number].matches.xy1, records[number].matches.xy2)[side]
+            hung[number, side] = anchors_of(frame.view, xy, alignment.subsample)
+    anchored_pairs = []
+    for number, ((i, j), record) in enumerate(pairs.items()):
+        (anchor_i, relative_i), (anchor_j, relative_j) = hung[number, 0], hung[number, 1]
+        m = record.matches
+        anchored_pairs.append(
+            AnchoredPair(
+                i,
+                j,
+                m.xy1,
+                m.xy2,
+                anchor_i,
+                anchor_j,
+                relative_i,
+                relative_j,
+                m.confidence,
+                record.i_in_j,
+                record.j_in_i,
+            )
+        )
+    if pictures.lens.model != "PINHOLE":  # its distortion belongs to its focal length
+        alignment = replace(alignment, intrinsics="fixed")
+    known = Known(K=None if pictures.K is None else pictures.K.repeat(len(kept), 1, 1))
+    if pictures.poses is not None:
+        known = replace(known, cam2world=pictures.poses.cam2world[kept], posed=pictures.poses.posed[kept])
+    found = align(anchored, anchored_pairs, alignment, known, progress)
+    matches = FrameMatches(
+        torch.cat([torch.full_like(p.anchor_i, p.i) for p in anchored_pairs]),
+        torch.cat([torch.full_like(p.anchor_j, p.j) for p in anchored_pairs]),
+        torch.cat([p.xy_i for p in anchored_pairs]),
+        torch.cat([p.xy_j for p in anchored_pairs]),
+        torch.cat([p.confidence for p in anchored_pairs]),
+        found.points,
+    )
+    return _Aligned(found, matches)
+
+
+def _tracks(matches: FrameMatches, canvas: Cameras, settings: Mast3rSettings) -> MatchTracks:
+    if len(matches):
+        tracks = match_tracks.join(matches, canvas.width, canvas.height)
+        errors = match_tracks.reprojection_errors(canvas, tracks.frame, tracks.xy + 0.5, tracks.xyz[tracks.point])
+        tracks = match_tracks.without(tracks, errors > settings.max_error)
+        if len(tracks.xyz):
+            return tracks
+    raise RegistrationError(
+        f"after the alignment no match lies within {settings.max_error:g} pixels of its point",
+        cause="the matches contradict each other: what moves fills the view, or the weights are not MASt3R's",
+        hint="mask out what moves (--masks), or swimm3r weights verify mast3r",
+    )
+
+
+def _write_depth(
+    rec: Reconstruction,
+    said: Said,
+    kept: list[int],
+    pairs: dict[tuple[int, int], PairRecord],
+    found: Alignment,
+    pictures: NetworkPictures,
+    settings: Mast3rSettings,
+    progress: Progress,
+) -> None:
+    """Depth maps on the grid of the prepared frames."""
+    _, canvas = pictures.cameras(found.K, rec.cameras.cam2world)
+    neighbours: list[list[int]] = [[] for _ in kept]
+    for i, j in pairs:
+        neighbours[i].append(j)
+        neighbours[j].append(i)
+
+    def dense(k: int) -> tuple[Float[Tensor, "h w"], Float[Tensor, "h w"]]:
+        view = said.frame_store.read(kept[k]).view
+        z_depth = dense_z_depth(
+            found.anchor_z_depth[k], view.relative_depth, float(found.focal_before[k]), float(found.K[k, 0, 0]),
+            settings.alignment.subsample,
+        )  # fmt: skip
+        if settings.bundle_adjustment:  # which moved the points
+            z_depth = z_depth * _scale_to_points(z_depth, rec, canvas[k], k)
+        return z_depth, view.confidence
+
+    def finish(k: int, z_depth: Float[Tensor, "h w"], confidence: Float[Tensor, "h w"]) -> None:
+        f = kept[k]
+        mask = pictures.mask(f)
+        usable = (confidence >= settings.min_confidence) & (z_depth > 0)
+        usable = usable if mask is None else usable & mask
+        inverse = torch.where(usable, 1 / z_depth.clamp(min=1e-12), 0.0)
+        share = torch.where(usable, depth_cleaning.confidence_share(confidence), 0.0)
+        grey = (pictures.image(f).permute(1, 2, 0) / 2 + 0.5) @ LUMA
+        q, share = on_frame_grid(inverse, share, grey, pictures.frames.image(f), rec.cameras[k], canvas[k])
+        known = (q > 0) & pictures.frames.mask(f)
+        z = torch.where(known, 1 / q.clamp(min=1e-12), 0.0)
+        rec.depth.write(rec.names[k], DepthMap(z, torch.where(known, share, 0.0)))
+
+    depth_cleaning.cleaned(range(len(kept)), neighbours, canvas, dense, settings.memory_mb << 20, finish, progress)
+
+
+def _scale_to_points(z_depth: Float[Tensor, "h w"], rec: Reconstruction, canvas: Cameras, k: int) -> float:
+    """How much farther the sparse points of frame k are than its depth map says."""
+    mine = rec.tracks.point[rec.tracks.frame == k]
+    uv, z = project(canvas, rec.points.xyz[mine].double()[None])
+    column, row = uv[0].nan_to_num(-1, -1, -1).clamp(-1, max(z_depth.shape)).floor().long().unbind(-1)
+    seen = (z[0] > 0) & (column >= 0) & (column < canvas.width) & (row >= 0) & (row < canvas.height)
+    if not seen.any():
+        return 1.0
+    return float((z[0][seen] / z_depth[row[seen], column[seen]]).median())

@@ -1,0 +1,301 @@
+"""Poses and sparse points without weights: SIFT, verified matches, incremental or global mapping, one lens per clip.
+
+`database.db` in the working folder keeps features and matches, so a killed run goes on from it; seeds are fixed, so it
+ends where an undisturbed one does. Poses are free in scale and place: nothing here is metric.
+"""
+
+import itertools
+import os
+import shutil
+from collections.abc import Iterator
+from contextlib import contextmanager
+from dataclasses import replace
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+import numpy as np
+import torch
+from jaxtyping import Bool, Float
+from torch import Tensor
+
+from swimm3r.cameras import Cameras, cameras_of
+from swimm3r.errors import InputError, RegistrationError, StorageError
+from swimm3r.io.colmap.model import ColmapModel, from_pycolmap, silence_log, to_pycolmap
+from swimm3r.io.files.atomic import atomic_path
+from swimm3r.progress import Progress, silent
+from swimm3r.scene.frames import Frames
+from swimm3r.scene.reconstruction import Caution, DepthMaps, Matches, Points, Reconstruction, Tracks, colmap_model
+from swimm3r.sfm.colmap import calibration, mapping
+from swimm3r.sfm.colmap.plausibility import implausible
+from swimm3r.sfm.features import vlad
+from swimm3r.sfm.features.database import FeatureDatabase, fill_features, match_pairs, start_database
+from swimm3r.sfm.features.sift import unit_descriptors
+from swimm3r.sfm.settings import ColmapSettings
+
+if TYPE_CHECKING:
+    import pycolmap
+
+_NONE, _NOWHERE = np.zeros(0), np.zeros((0, 2))  # what is joined where no pair matches
+
+
+def reconstruct(
+    frames: Frames,
+    settings: ColmapSettings,
+    folder: Path,
+    progress: Progress = silent,
+    lens: Cameras | None = None,
+) -> Reconstruction:
+    """Cameras, points, tracks and matches of the frames that can be placed; depth maps are for others to fill.
+
+    `lens` (one camera, its pose unused) is held where it is given; else the settings say what is known of it. Raises
+    InputError for fewer than 2 frames and RegistrationError where too few can be placed.
+    """
+
+    if len(frames) < 2:
+        raise InputError(
+            f"structure from motion needs at least 2 frames, got {len(frames)}",
+            cause="the clip is too short or the sampling too coarse",
+            hint="a longer clip or a higher --fps",
+        )
+    silence_log()
+    threads = settings.threads or os.cpu_count() or 1
+    if lens is None:
+        camera = calibration.first_camera(frames.width, frames.height, settings)
+    else:
+        camera, settings = _lens(lens), replace(settings, intrinsics="fixed")
+        camera.camera_id, camera.has_prior_focal_length = 1, True
+    with _full_disk_said_plainly(folder):
+        store = start_database(folder, frames, camera, settings.features)
+        fill_features(store, frames, settings.features, threads, progress)
+        pairs = choose_pairs(store, frames, settings)
+        match_pairs(store, pairs, settings.features, threads, progress)
+        for leftover in folder.glob(".mapping.*"):  # of a killed run
+            shutil.rmtree(leftover)
+        # mapping writes lenses, and matches of frames left over, into a copy: the database holds what all runs agree on
+        working = FeatureDatabase(folder / "mapping.db", len(frames))
+        try:
+            with atomic_path(working.path) as draft:
+                shutil.copyfile(store.path, draft)
+            model, sizes, cautions = _map(working, frames, pairs, settings, progress)
+            rec = _record(model, working, frames, folder)
+            found = implausible(rec, working, frames)
+        finally:
+            working.path.unlink(missing_ok=True)
+    cautions += _registration_cautions(len(rec.names), sizes, frames)
+    if settings.housing == "flat":
+        cautions.append(
+            Caution(
+                "The flat port is only approximated, by a longer focal length and radial distortion.",
+                "Expect distances that drift towards the corners; a dome port or a calibration in water is better.",
+            )
+        )
+    return replace(rec, cautions=(*found, *cautions))
+
+
+def choose_pairs(store: FeatureDatabase, frames: Frames, settings: ColmapSettings) -> list[tuple[int, int]]:
+    """The pairs of frames worth matching, (i < j), sorted."""
+    n = len(frames)
+    if settings.pairs == "exhaustive" or (settings.pairs == "auto" and n <= settings.exhaustive_to):
+        return list(itertools.combinations(range(n), 2))
+    with store.open() as database:
+        described = [unit_descriptors(database.read_descriptors(i + 1).data) for i in range(n)]
+    alike = vlad.similarity(described, torch.Generator().manual_seed(0))
+    if not frames.ordered and settings.pairs == "auto":
+        return vlad.alike_pairs(alike, 5 * settings.loops)
+    steps = {*range(1, settings.overlap + 1), *(2**k for k in range(settings.overlap.bit_length(), 8))}
+    near = {(i, i + step) for i in range(n) for step in steps if i + step < n}
+    return sorted(near | set(vlad.alike_pairs(alike, settings.loops, apart=settings.overlap)))
+
+
+def absolute_pose(
+    points2d: Float[Tensor, "n 2"], points3d: Float[Tensor, "n 3"], camera: Cameras, max_error: float = 4.0
+) -> tuple[Float[Tensor, "4 4"], Bool[Tensor, " n"]] | None:
+    """cam2world of one camera from pixels of known points (PnP with RANSAC), and its inliers; None where there is none.
+
+    Only the intrinsics of `camera` (one) are used; `max_error` is in pixels.
+    """
+    import pycolmap
+
+    options = pycolmap.AbsolutePoseEstimationOptions()
+    options.ransac.max_error = max_error
+    options.ransac.random_seed = 0
+    lens = _lens(camera)
+    found = pycolmap.estimate_and_refine_absolute_pose(
+        points2d.double().numpy(), points3d.double().numpy(), lens, estimation_options=options
+    )
+    if found is None:
+        return None
+    pose = torch.eye(4, dtype=torch.float64)
+    pose[:3] = torch.from_numpy(found["cam_from_world"].inverse().matrix())
+    return pose, torch.from_numpy(np.asarray(found["inlier_mask"], bool))
+
+
+def bundle_adjust(rec: Reconstruction, *, lens: bool = False) -> Reconstruction:
+    """The same frames and tracks with poses and points that reproject best, and the lens too where asked."""
+    import pycolmap
+
+    options = pycolmap.BundleAdjustmentOptions()
+    options.refine_focal_length = options.refine_extra_params = lens
+    options.print_summary = False
+    options.ceres.loss_function_type = pycolmap.LossFunctionType.SOFT_L1
+    options.ceres.solver_options.num_threads = 1  # as in mapping: the same sums in the same order
+    model = to_pycolmap(colmap_model(rec))
+    pycolmap.bundle_adjustment(model, options)
+    model.update_point_3d_errors()
+    table = from_pycolmap(model)
+    return replace(
+        rec,
+        cameras=cameras_of(table),
+        points=replace(rec.points, xyz=torch.from_numpy(table.xyz), error=torch.from_numpy(table.error)),
+        tracks=Tracks(*(torch.from_numpy(a) for a in (table.track_point, table.track_frame, table.track_xy))),
+    )
+
+
+@contextmanager
+def _full_disk_said_plainly(folder: Path) -> Iterator[None]:
+    try:
+        yield
+    except RuntimeError as error:  # what pycolmap makes of SQLite's complaint
+        if "disk" not in str(error):
+            raise
+        raise StorageError(
+            f"the database in {folder} could not be written ({str(error).splitlines()[-1][:200]})",
+            cause="the disk is full or read-only",
+            hint="free some space, or choose another --out, and run the same command again: it goes on from here",
+        ) from error
+
+
+def _map(
+    store: FeatureDatabase,
+    frames: Frames,
+    pairs: list[tuple[int, int]],
+    settings: ColmapSettings,
+    progress: Progress,
+) -> "tuple[pycolmap.Reconstruction, list[int], list[Caution]]":
+    n, threads = len(frames), settings.threads or os.cpu_count() or 1
+    models = mapping.map_frames(store, settings, progress)
+    if not models:
+        raise _too_few(0, n, settings)
+    model = models[0]
+    if model.num_reg_images() < n:
+        placed = {i - 1 for i in model.reg_image_ids()}
+        again = [(i, j) for i, j in pairs if i not in placed or j not in placed]
+        looser = replace(settings.features, max_ratio=settings.mapping.retry_ratio)
+        match_pairs(store, again, looser, threads, progress, again=True)
+        model = calibration.refine(store, model, settings, progress).model  # a better lens places more
+        model = mapping.place_leftovers(store, model, settings, progress)
+        model = mapping.replace_misplaced(store, model, settings, progress)
+    sizes = [model.num_reg_images(), *(m.num_reg_images() for m in models[1:])]
+    thin = model.compute_mean_observations_per_reg_image() < settings.mapping.thin_points
+    share = settings.mapping.thin_share if thin else settings.mapping.min_share
+    if sizes[0] < max(min(settings.mapping.min_frames, n), share * n):
+        raise _too_few(sizes[0], n, settings)
+    mapped = calibration.refine(store, model, settings, progress)
+    cautions = []
+    if not mapped.refined and settings.intrinsics != "fixed":
+        camera = mapped.model.cameras[1]
+        cautions.append(
+            Caution(
+                f"The lens could not be calibrated from this clip; {camera.focal_length_x:.0f} px was assumed as its"
+                " focal length.",
+                "Shapes may be stretched in depth. Give --focal and --k1 of the camera, calibrated in water.",
+            )
+        )
+    return mapped.model, sizes, cautions
+
+
+def _record(model: "pycolmap.Reconstruction", store: FeatureDatabase, frames: Frames, folder: Path) -> Reconstruction:
+    table = from_pycolmap(model)
+    index = [int(name) for name in table.names]
+    table = replace(table, names=tuple(frames.names[i] for i in index))
+    return Reconstruction(
+        names=table.names,
+        cameras=cameras_of(table),
+        points=Points(torch.from_numpy(table.xyz), _colours(table, frames, index), torch.from_numpy(table.error)),
+        tracks=Tracks(*(torch.from_numpy(a) for a in (table.track_point, table.track_frame, table.track_xy))),
+        matches=verified_matches(store, index),
+        depth=DepthMaps(folder / "z_depth"),
+        backend="colmap",
+    )
+
+
+def _colours(table: ColmapModel, frames: Frames, index: list[int]) -> Float[Tensor, "p 3"]:
+    total = torch.zeros(len(table.xyz), 3)
+    point, frame = torch.from_numpy(table.track_point), torch.from_numpy(table.track_frame)
+    x = torch.from_numpy(table.track_xy[:, 0]).long().clamp(0, frames.width - 1)
+    y = torch.from_numpy(table.track_xy[:, 1]).long().clamp(0, frames.height - 1)
+    for row, i in enumerate(index):
+        seen = frame == row
+        total.index_add_(0, point[seen], frames.image(i)[y[seen], x[seen]])
+    return total / torch.bincount(point, minlength=len(total)).clamp(min=1)[:, None]
+
+
+def verified_matches(store: FeatureDatabase, index: list[int]) -> Matches:
+    """The verified matches among the database's frames of these numbers; `index[k]` is frame k of the result."""
+    row_of = {i: row for row, i in enumerate(index)}
+    i, j, xy_i, xy_j = [], [], [], []
+    with store.open() as database:
+        xy = {k: database.read_keypoints(k + 1)[:, :2].astype(np.float64) for k in index}
+        for a, b in itertools.combinations(sorted(index), 2):
+            if not database.exists_two_view_geometry(a + 1, b + 1):
+                continue
+            rows = np.asarray(database.read_two_view_geometry(a + 1, b + 1).inlier_matches, np.int64).reshape(-1, 2)
+            i.append(np.full(len(rows), row_of[a]))
+            j.append(np.full(len(rows), row_of[b]))
+            xy_i.append(xy[a][rows[:, 0]])
+            xy_j.append(xy[b][rows[:, 1]])
+    first, second = (torch.from_numpy(np.concatenate([_NONE, *side]).astype(np.int64)) for side in (i, j))
+    return Matches(
+        i=first,
+        j=second,
+        xy_i=torch.from_numpy(np.concatenate([_NOWHERE, *xy_i])).float(),
+        xy_j=torch.from_numpy(np.concatenate([_NOWHERE, *xy_j])).float(),
+        confidence=torch.ones(len(first)),
+    )
+
+
+def _lens(camera: Cameras) -> "pycolmap.Camera":
+    import pycolmap
+
+    if len(camera) != 1:
+        raise ValueError(f"one camera is expected, got {len(camera)}")
+    K, k = camera.K[0].double(), camera.distortion[0].double().tolist()
+    name = camera.model
+    if name == "SIMPLE_RADIAL" and K[0, 0] != K[1, 1]:
+        name, k = "OPENCV", [*k, 0.0, 0.0, 0.0]
+    focal = [K[0, 0]] if name == "SIMPLE_RADIAL" else [K[0, 0], K[1, 1]]
+    params = np.array([*map(float, focal), float(K[0, 2]), float(K[1, 2]), *k])
+    return pycolmap.Camera(model=name, width=camera.width, height=camera.height, params=params)
+
+
+def _registration_cautions(placed: int, sizes: list[int], frames: Frames) -> list[Caution]:
+    if placed == len(frames):
+        return []
+    left = len(frames) - placed
+    others = [size for size in sizes[1:] if size >= 3]
+    if others:
+        parts = " + ".join(str(size) for size in (placed, *others))
+        return [
+            Caution(
+                f"The frames fall into parts that did not join ({parts} of {len(frames)}); only the largest is used.",
+                "Record lines that overlap by half, cross them with one line, and keep a slow turn between them; "
+                "a higher --fps helps where the parts follow each other.",
+            )
+        ]
+    return [
+        Caution(
+            f"{left} of {len(frames)} frames could not be placed and are left out.",
+            "They are blurred, show open water, or overlap too little with the rest: raise --fps, or swim slower.",
+        )
+    ]
+
+
+def _too_few(placed: int, frames: int, settings: ColmapSettings) -> RegistrationError:
+    return RegistrationError(
+        f"only {placed} of {frames} frames could be placed relative to each other"
+        + (", and on too few points to be trusted" if placed > settings.mapping.min_share * frames else ""),
+        cause="the frames share too little that stands still: open water, moving animals or divers fill the view, "
+        "visibility is too poor, or the camera moved too fast or only turned",
+        hint="film reef, rock or wreck slowly, from several sides, with 60 % overlap and within 3 m; "
+        "mask out what moves (--masks); give a part of the clip where the bottom is in view; or raise --fps",
+    )

@@ -1,0 +1,73 @@
+"""Points for cameras that somebody else placed: SIFT matches, triangulated where the given poses put them.
+
+For files that name poses and no sightings (transforms.json, cameras.xml): without points nobody knows where depth is to
+be looked for. Poses and lenses stay as they are.
+"""
+
+import os
+import tempfile
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import torch
+
+from swimm3r.io.colmap.model import from_pycolmap, silence_log, to_pycolmap
+from swimm3r.io.files.atomic import DRAFT
+from swimm3r.progress import Progress, silent
+from swimm3r.scene.frames import Frames
+from swimm3r.scene.reconstruction import Points, Reconstruction, Tracks, colmap_model
+from swimm3r.sfm.colmap import poses
+from swimm3r.sfm.features.database import fill_features, match_pairs, start_database
+from swimm3r.sfm.settings import ColmapSettings, FeatureSettings
+from swimm3r.sfm.tracks import MatchTracks, as_points
+
+
+def triangulate(
+    rec: Reconstruction, frames: Frames, settings: FeatureSettings, folder: Path, progress: Progress = silent
+) -> Reconstruction:
+    """The reconstruction with the points that its frames' matches agree on, after those it has, and with the matches.
+
+    `folder` keeps features and matches (`feature_database`); the reconstruction may come out without any new point.
+    """
+    import pycolmap
+
+    silence_log()
+    order = [frames.index(name) for name in rec.names]
+    placed, threads = frames.select(order), os.cpu_count() or 1
+    table = colmap_model(rec)
+    bare = replace(
+        table, names=tuple(f"{i:06d}" for i in range(len(rec.names))),
+        xyz=np.zeros((0, 3)), rgb=np.zeros((0, 3), np.uint8), error=np.zeros(0),
+        track_point=table.track_point[:0], track_frame=table.track_frame[:0], track_xy=table.track_xy[:0],
+    )  # fmt: skip
+    model = to_pycolmap(bare)
+    camera = to_pycolmap(bare).cameras[1]
+    camera.has_prior_focal_length = True
+    store = start_database(folder, placed, camera, settings)
+    fill_features(store, placed, settings, threads, progress)
+    match_pairs(store, poses.choose_pairs(store, placed, ColmapSettings()), settings, threads, progress)
+    options = pycolmap.IncrementalPipelineOptions()
+    options.extract_colors = False
+    options.num_threads = 1  # the same sums in the same order
+    options.random_seed = 0
+    with tempfile.TemporaryDirectory(dir=folder, prefix=DRAFT) as scratch:
+        progress("triangulating points", 0, 1)
+        found = pycolmap.triangulate_points(model, str(store.path), str(folder), scratch, options=options)
+        progress("triangulating points", 1, 1)
+    made = from_pycolmap(found)
+    rows = np.array([int(name) for name in made.names])
+    tracks = MatchTracks(
+        torch.from_numpy(made.xyz),
+        torch.from_numpy(made.track_point),
+        torch.from_numpy(rows[made.track_frame].astype(np.int64)),
+        torch.from_numpy(made.track_xy).long(),
+    )
+    points, sightings = as_points(tracks, torch.from_numpy(made.track_xy), rec.cameras, frames, order)
+    old = rec.points
+    return replace(
+        rec,
+        points=Points(*(torch.cat([getattr(p, n) for p in (old, points)]) for n in ("xyz", "rgb", "error"))),
+        tracks=Tracks(sightings.point + len(old.xyz), sightings.frame, sightings.xy),
+        matches=poses.verified_matches(store, list(range(len(rec.names)))),
+    )

@@ -1,0 +1,1 @@
+"""SIFT features, image retrieval and the graph of image pairs."""

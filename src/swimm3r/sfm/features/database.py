@@ -1,0 +1,204 @@
+"""COLMAP's database of one dive: keypoints per frame, verified matches per pair; what is in it is not computed again.
+
+Frames stand in it as 000000, 000001, ... in the order of `Frames`, all of one camera. Two-view geometry is verified by
+fundamental matrix and homography as long as nobody knows the focal length, so that matches outlive any guess of it.
+
+Nothing is written in COLMAP's transactions: one that meets a full disk aborts the process. Instead the last write of a
+frame (keypoints) and of a pair (two-view geometry) says that it is complete.
+"""
+
+import json
+import logging
+import sqlite3
+from collections.abc import Iterator, Sequence
+from concurrent.futures import ThreadPoolExecutor
+from contextlib import closing, contextmanager
+from dataclasses import asdict, dataclass
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+import numpy as np
+import torch
+from jaxtyping import Float
+from torch import Tensor
+
+from swimm3r.io.files.atomic import write_text
+from swimm3r.progress import Progress, silent
+from swimm3r.scene.frames import Frames
+from swimm3r.sfm.features.sift import Features, extract_features, match_descriptors, unit_descriptors
+from swimm3r.sfm.settings import FeatureSettings
+
+if TYPE_CHECKING:
+    import pycolmap
+
+log = logging.getLogger(__name__)
+
+MIN_INLIERS = 15  # of a pair; COLMAP's limit, below it chance agrees with some geometry
+_HINT_OF_OVERLAP = 8  # matches
+_BATCH = 32  # frames or pairs worked on together: what a killed run loses
+_HELD = 200  # frames in memory while matching: 0.3 GB
+
+
+@dataclass(frozen=True)
+class FeatureDatabase:
+    """A database file and the number of its frames; image i of `Frames` has id i + 1."""
+
+    path: Path
+    frames: int
+
+    @contextmanager
+    def open(self) -> "Iterator[pycolmap.Database]":
+        """The open database."""
+        import pycolmap
+
+        database = pycolmap.Database.open(str(self.path))
+        try:
+            yield database
+        finally:
+            database.close()
+
+
+def start_database(
+    folder: Path, frames: Frames, camera: "pycolmap.Camera", settings: FeatureSettings
+) -> FeatureDatabase:
+    """The database in `folder`, new unless the one there was made of the same frames with the same settings."""
+    import pycolmap
+
+    path, about = folder / "database.db", folder / "database.json"
+    content = {
+        "frames": [[frame.name, round(frame.sharpness, 3), str(frame.mask)] for frame in frames],
+        "size": [frames.width, frames.height],
+        "features": asdict(settings),
+        "camera": camera.model.name if camera.has_prior_focal_length else "unknown",
+        "params": camera.params.tolist() if camera.has_prior_focal_length else [],
+    }
+    out = FeatureDatabase(path, len(frames))
+    described = json.dumps(content)
+    if path.is_file() and about.is_file() and about.read_bytes() == described.encode():
+        if _is_whole(path, len(frames)):
+            with out.open() as database:
+                database.update_camera(camera)
+            return out
+        log.warning("%s is damaged: features and matches are found again", path)
+    folder.mkdir(parents=True, exist_ok=True)
+    about.unlink(missing_ok=True)
+    for leftover in folder.glob("database.db*"):
+        leftover.unlink()
+    with out.open() as database:
+        camera_id = database.write_camera(camera, use_camera_id=True)
+        sensor = pycolmap.sensor_t(pycolmap.SensorType.CAMERA, camera_id)
+        rig = pycolmap.Rig()
+        rig.add_ref_sensor(sensor)
+        rig_id = database.write_rig(rig)
+        for i in range(len(frames)):
+            image = pycolmap.Image(name=f"{i:06d}", camera_id=camera_id, image_id=i + 1)
+            database.write_image(image, use_image_id=True)
+            frame = pycolmap.Frame()
+            frame.rig_id = rig_id
+            frame.add_data_id(pycolmap.data_t(sensor, i + 1))
+            database.write_frame(frame)
+    write_text(about, described)
+    return out
+
+
+def _is_whole(path: Path, frames: int) -> bool:
+    """Whether a file is a database that SQLite finds no fault with, of so many frames."""
+    try:
+        with closing(sqlite3.connect(path)) as database:
+            (verdict,) = database.execute("PRAGMA quick_check(1)").fetchone()
+            (found,) = database.execute("SELECT COUNT(*) FROM images").fetchone()
+    except sqlite3.DatabaseError:
+        return False
+    return verdict == "ok" and found == frames
+
+
+def fill_features(
+    store: FeatureDatabase, frames: Frames, settings: FeatureSettings, threads: int, progress: Progress = silent
+) -> None:
+    """Extract the keypoints of the frames that have none yet."""
+    import pycolmap
+
+    with store.open() as database:
+        missing = [i for i in range(store.frames) if not database.exists_keypoints(i + 1)]
+    done = store.frames - len(missing)
+
+    def extract(i: int) -> tuple[int, Features]:
+        return i, extract_features(frames.image(i), frames.mask(i), settings)
+
+    progress("finding features", done, store.frames)
+    for start in range(0, len(missing), _BATCH):
+        with ThreadPoolExecutor(threads) as pool, store.open() as database:
+            for i, found in pool.map(extract, missing[start : start + _BATCH]):
+                described = pycolmap.FeatureDescriptors(pycolmap.FeatureExtractorType.SIFT, found.descriptors)
+                if not database.exists_descriptors(i + 1):
+                    database.write_descriptors(i + 1, described)
+                database.write_keypoints(i + 1, found.keypoints)
+                done += 1
+                progress("finding features", done, store.frames)
+
+
+def match_pairs(
+    store: FeatureDatabase,
+    pairs: Sequence[tuple[int, int]],
+    settings: FeatureSettings,
+    threads: int,
+    progress: Progress = silent,
+    *,
+    again: bool = False,
+) -> None:
+    """Match and verify the pairs (i < j) that have not been looked at yet; `again`: all, keeping the better."""
+    import pycolmap
+
+    verification = pycolmap.TwoViewGeometryOptions()
+    verification.min_num_inliers = MIN_INLIERS
+    verification.ransac.random_seed = 0
+    what = "matching the frames left over" if again else "matching frames"
+    with store.open() as database:
+        camera = database.read_camera(1)
+        if again:  # pairs without even a few matches at the first look have nothing in common
+            missing = [(i, j) for i, j in pairs if len(database.read_matches(i + 1, j + 1)) >= _HINT_OF_OVERLAP]
+        else:
+            missing = [(i, j) for i, j in pairs if not database.exists_two_view_geometry(i + 1, j + 1)]
+    done = len(pairs) - len(missing)
+    held: dict[int, tuple[np.ndarray, Float[Tensor, "n 128"]]] = {}
+
+    def match(pair: tuple[int, int]) -> "tuple[np.ndarray, pycolmap.TwoViewGeometry]":
+        (xy_i, d_i), (xy_j, d_j) = held[pair[0]], held[pair[1]]
+        matches = match_descriptors(d_i, d_j, settings.max_ratio).numpy().astype(np.uint32)
+        if len(matches) < MIN_INLIERS:
+            return matches, pycolmap.TwoViewGeometry()
+        return matches, pycolmap.estimate_two_view_geometry(camera, xy_i, camera, xy_j, matches, verification)
+
+    torch_threads = torch.get_num_threads()
+    torch.set_num_threads(1)  # pairs are the parallel unit
+    try:
+        progress(what, done, len(pairs))
+        for start in range(0, len(missing), _BATCH):
+            batch = missing[start : start + _BATCH]
+            with ThreadPoolExecutor(threads) as pool, store.open() as database:
+                _hold_features(held, {i for pair in batch for i in pair}, database)
+                for (i, j), (matches, geometry) in zip(batch, pool.map(match, batch), strict=True):
+                    if again:
+                        old = database.read_two_view_geometry(i + 1, j + 1)
+                        if len(old.inlier_matches) < len(geometry.inlier_matches):
+                            database.update_two_view_geometry(i + 1, j + 1, geometry)
+                    else:
+                        if not database.exists_matches(i + 1, j + 1):
+                            database.write_matches(i + 1, j + 1, matches)
+                        database.write_two_view_geometry(i + 1, j + 1, geometry)
+                    done += 1
+                    progress(what, done, len(pairs))
+    finally:
+        torch.set_num_threads(torch_threads)
+
+
+def _hold_features(
+    held: dict[int, tuple[np.ndarray, Float[Tensor, "n 128"]]], needed: set[int], database: "pycolmap.Database"
+) -> None:
+    """Load what is needed; drop what is not while there is too much."""
+    for i in needed - held.keys():
+        keypoints = database.read_keypoints(i + 1)[:, :2].astype(np.float64)
+        held[i] = keypoints, unit_descriptors(database.read_descriptors(i + 1).data)
+    for i in list(held):
+        if len(held) > _HELD and i not in needed:
+            del held[i]

@@ -1,0 +1,1 @@
+"""Reconstructions of other programs, matched to our frames."""

@@ -1,0 +1,121 @@
+"""Every frame encoded once, whatever number of pairs it is in: on disk keyed by content, and which frames look alike.
+
+A file is named by a hash of the picture as the network sees it and of the network's own weights, so that no file can be
+stale: another picture or another checkpoint is another name.
+"""
+
+from hashlib import blake2b, sha256
+from pathlib import Path
+
+import torch
+from jaxtyping import Bool, Float
+from safetensors import safe_open
+from safetensors.torch import save_file
+from torch import Tensor
+
+from swimm3r import weights
+from swimm3r.io.files.atomic import atomic_path
+from swimm3r.io.files.damage import guard, remake
+from swimm3r.progress import Progress, silent
+from swimm3r.sfm.features import asmk
+from swimm3r.sfm.mast3r.network import Encoded, Mast3r
+from swimm3r.sfm.mast3r_sfm.network_frames import NetworkPictures
+
+_SAMPLED_FRAMES = 64  # for the mean token
+_USABLE = 0.5  # share of a patch
+
+
+class EncodingStore:
+    """Encodings of frames, made on first use and read from disk from then on."""
+
+    def __init__(self, network: Mast3r, pictures: NetworkPictures, folder: Path) -> None:
+        self.network = network
+        self.pictures = pictures
+        self.folder = folder
+        self.network_key = fingerprint(network)
+        self._keys: dict[int, str] = {}
+
+    def key(self, i: int) -> str:
+        """The name of frame i: its picture and the network."""
+        if i not in self._keys:
+            self._keys[i] = sha256(f"{self.pictures.digest(i)} {self.network_key}".encode()).hexdigest()[:24]
+        return self._keys[i]
+
+    def path(self, i: int) -> Path:
+        """Where the encoding of frame i is kept."""
+        return self.folder / f"{self.key(i)}.safetensors"
+
+    def __getitem__(self, i: int) -> Encoded:
+        """The encoding of frame i on the network's device."""
+        path, frame = self.path(i), self.pictures.framing
+        if path.is_file():
+            with (
+                guard(path, remake(path)),
+                safe_open(path, "pt") as stored,
+            ):
+                tokens, positions = (
+                    stored.get_tensor(name).to(self.network.device) for name in ("tokens", "positions")
+                )
+            return Encoded(tokens, positions, frame.network_height, frame.network_width)
+        with torch.no_grad():  # not inference_mode: its tensors could never meet a gradient
+            encoded = self.network.encode(self.pictures.image(i)[None].to(self.network.device))
+        with atomic_path(path) as draft:
+            kept = {"tokens": encoded.tokens, "positions": encoded.positions}
+            save_file({name: value.cpu().contiguous() for name, value in kept.items()}, draft)
+        return encoded
+
+    def fill(self, progress: Progress = silent) -> None:
+        """Encode every frame that is not on disk yet."""
+        missing = [i for i in range(len(self.pictures.frames)) if not self.path(i).is_file()]
+        for done, i in enumerate(missing):
+            progress("encoding frames", done, len(missing))
+            self[i]
+        progress("encoding frames", len(missing), len(missing))
+
+
+def fingerprint(network: Mast3r) -> str:
+    """A hash of all weights and of the precision they run in."""
+    digest = blake2b(digest_size=12)
+    for name, value in network.named_parameters():
+        digest.update(f"{name} {tuple(value.shape)} {value.dtype}".encode())
+        digest.update(value.detach().cpu().contiguous().view(torch.uint8).numpy().data)
+    return digest.hexdigest()
+
+
+def frame_similarity(store: EncodingStore, method: str = "cosine", progress: Progress = silent) -> Float[Tensor, "n n"]:
+    """How alike frames look to the encoder; rows ask. Frames are read one at a time.
+
+    `cosine` compares sums of the tokens' deviations from the dive's mean token, each weighted by its length; `asmk`
+    (with the published whitening and codebook, else WeightsError) aggregates them by visual words.
+    """
+    n = len(store.pictures.frames)
+    if method == "asmk":
+        whitening = asmk.load_whitening(weights.require("mast3r-retrieval"))
+        codebook = asmk.load_codebook(weights.require("mast3r-codebook"))
+        settings = asmk.AsmkSettings()
+        features = []
+        for i in range(n):
+            progress("describing frames", i, n)
+            features.append(asmk.strongest(asmk.whiten(_tokens(store, i), whitening), settings.features))
+        return asmk.asmk_similarity(features, codebook, settings, progress).float()
+    sampled = range(0, n, -(-n // _SAMPLED_FRAMES))
+    mean = torch.stack([_tokens(store, i).mean(0) for i in sampled]).nanmean(0)
+    described = []
+    for i in range(n):
+        progress("describing frames", i, n)
+        described.append(asmk.global_descriptor(_tokens(store, i) - mean))
+    progress("describing frames", n, n)
+    return asmk.cosine_similarity(torch.stack(described))
+
+
+def _tokens(store: EncodingStore, i: int) -> Float[Tensor, "k c"]:
+    """The tokens of the patches of frame i that are not masked, float32, on the CPU."""
+    tokens = store[i].tokens[0].float().cpu()
+    mask = store.pictures.mask(i)
+    return tokens if mask is None else tokens[_usable_patches(mask, len(tokens))]
+
+
+def _usable_patches(mask: Bool[Tensor, "h w"], count: int) -> Bool[Tensor, " count"]:
+    patch = round((mask.numel() / count) ** 0.5)
+    share = torch.nn.functional.avg_pool2d(mask.float()[None, None], patch)
+    return share.flatten() >= _USABLE

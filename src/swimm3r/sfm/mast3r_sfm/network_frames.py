@@ -1,0 +1,189 @@
+"""The frames of a dive as the network sees them: without distortion, at its size; and every pixel's way back.
+
+prepared frame (its lens) -> undistorted, same K (pinhole) -> resized and cropped (`preprocess`)
+"""
+
+from dataclasses import dataclass, replace
+from functools import cached_property
+from hashlib import sha256
+from pathlib import Path
+
+import torch
+from jaxtyping import Bool, Float
+from torch import Tensor
+
+from swimm3r.cameras import DISTORTION_PARAMETERS, Cameras, directions, project
+from swimm3r.errors import InputError, UsageError
+from swimm3r.io.imports.record import read_foreign
+from swimm3r.scene.frames import Frames
+from swimm3r.sfm.imported.match_frames import model_cameras
+from swimm3r.sfm.mast3r.preprocess import (
+    Framing,
+    K_to_network,
+    K_to_picture,
+    framing,
+    mask_to_network,
+    pixels_to_network,
+    pixels_to_picture,
+    remove_distortion,
+    to_network,
+)
+from swimm3r.sfm.settings import Mast3rSettings
+
+_SAME_LENS = 0.01  # pixels, or of a distortion
+_ASSUMED = 0.75  # focal length over width of an unknown lens; only says how to write K, nothing is computed with it
+
+
+@dataclass(frozen=True)
+class KnownPoses:
+    """Where frames were, for those that the user's file names."""
+
+    cam2world: Float[Tensor, "n 4 4"]  # float64; anything for the others
+    posed: Bool[Tensor, " n"]
+    metric: bool  # whether they are in metres
+
+
+@dataclass(frozen=True)
+class NetworkPictures:
+    """Pictures, masks and intrinsics of frames that share one lens; pictures are made one at a time."""
+
+    frames: Frames
+    lens: Cameras  # one camera of the prepared frames
+    known: bool  # whether the lens's K is
+    framing: Framing
+    poses: "KnownPoses | None" = None
+
+    def image(self, i: int) -> Float[Tensor, "3 H W"]:
+        """Frame i in -1..1."""
+        return to_network(self._undistorted(i)[0], self.framing)
+
+    def mask(self, i: int) -> Bool[Tensor, "H W"] | None:
+        """Which pixels of frame i may be used; None: all."""
+        if self.frames.frames[i].mask is None and self.lens.model == "PINHOLE":
+            return None
+        return mask_to_network(self._undistorted(i)[1], self.framing)
+
+    def digest(self, i: int) -> str:
+        """What tells frame i, as the network sees it, from any other picture."""
+        frame = self.frames.frames[i]
+        parts = [frame.path.read_bytes(), repr(self.framing).encode()]
+        if frame.mask is not None:
+            parts.append(frame.mask.read_bytes())
+        if self.lens.model != "PINHOLE":
+            parts += [self.lens.K.numpy().tobytes(), self.lens.distortion.numpy().tobytes(), self.lens.model.encode()]
+        return sha256(b"".join(sha256(part).digest() for part in parts)).hexdigest()[:24]
+
+    @cached_property
+    def K(self) -> Float[Tensor, "3 3"] | None:
+        """Known intrinsics in the network's pixels, centres at +0.5; None where the lens is not known."""
+        return K_to_network(self.lens.K[0].double(), self.framing) if self.known else None
+
+    def cameras(self, K: Float[Tensor, "n 3 3"], cam2world: Float[Tensor, "n 4 4"]) -> tuple[Cameras, Cameras]:
+        """From K in the network's pixels: cameras of the prepared frames, distorted as they are, and the network's."""
+        flat = torch.zeros(len(K), 0, dtype=torch.float64)
+        canvas = Cameras(K, flat, cam2world, self.framing.network_width, self.framing.network_height)
+        original = self.lens.K.double().repeat(len(K), 1, 1)
+        if self.lens.model == "PINHOLE":
+            original = K_to_picture(K, self.framing)
+        lens = replace(self.lens, K=original, distortion=self.lens.distortion.repeat(len(K), 1), cam2world=cam2world)
+        return lens, canvas
+
+    def to_frame(self, xy: Float[Tensor, "m 2"]) -> Float[Tensor, "m 2"]:
+        """Pixels of the network's picture (centres at +0.5) -> of the prepared frame, distorted as it is."""
+        straight = pixels_to_picture(xy.double(), self.framing)
+        if self.lens.model == "PINHOLE":
+            return straight
+        pinhole = replace(self.lens, model="PINHOLE", distortion=self.lens.distortion[:, :0])
+        rays = directions(pinhole, straight[None])
+        return project(replace(self.lens, cam2world=torch.eye(4, dtype=torch.float64)[None]), rays)[0][0]
+
+    def from_frame(self, xy: Float[Tensor, "m 2"]) -> Float[Tensor, "m 2"]:
+        """The inverse of `to_frame`; NaN where the lens has no ray."""
+        straight = xy.double()
+        if self.lens.model != "PINHOLE":
+            K = self.lens.K[0].double()
+            straight = directions(self.lens, straight[None])[0, :, :2] @ K[:2, :2].T + K[:2, 2]
+        return pixels_to_network(straight, self.framing)
+
+    def _undistorted(self, i: int) -> tuple[Tensor, Tensor]:
+        picture, mask, _ = remove_distortion(self.frames.image(i), self.frames.mask(i), self.lens)
+        return picture, mask
+
+
+def network_pictures(frames: Frames, settings: Mast3rSettings) -> NetworkPictures:
+    """Raises UsageError where the lens settings contradict themselves, InputError for pictures too narrow."""
+    try:
+        frame = framing(frames.width, frames.height, settings.size, settings.square_ok)
+    except ValueError as error:
+        raise InputError(
+            str(error),
+            cause="panoramas and strips are no pictures of a camera",
+            hint="pictures up to 16 times as wide as high",
+        ) from error
+    if settings.known is not None:
+        lens, poses = _from_file(frames, settings, settings.known)
+        return NetworkPictures(frames, lens, True, frame, poses)
+    lens = _lens(frames.width, frames.height, settings)
+    return NetworkPictures(frames, lens, settings.focal is not None, frame)
+
+
+def _from_file(frames: Frames, settings: Mast3rSettings, path: Path) -> tuple[Cameras, KnownPoses]:
+    """Lens and poses of a file of known cameras."""
+    given = [name for name in ("focal", "k1", "k2", "k3", "k4", "p1", "p2") if getattr(settings, name) is not None]
+    if given or settings.bundle_adjustment:
+        other = given[0] if given else "bundle-adjustment"
+        raise UsageError(
+            f"--known and --{other} contradict each other",
+            cause="the file says where frames were and through which lens, and that is held",
+            hint=f"leave out one of the two{'' if given else ': bundle adjustment would move the poses'}",
+        )
+    foreign = read_foreign(path)
+    names, cameras = model_cameras(frames, foreign.model)
+    if not names:
+        raise InputError(
+            f"none of the {len(frames)} frames is in {path}",
+            cause=f"it is of other pictures; it names {', '.join(foreign.model.names[:3])}, ...",
+            hint="its names must be those of the prepared frames, with or without suffix",
+        )
+    intrinsics = torch.cat([cameras.K.flatten(1), cameras.distortion], dim=1)
+    if float((intrinsics - intrinsics[:1]).abs().max()) > _SAME_LENS:
+        raise InputError(
+            f"the frames in {path} have different intrinsics",
+            cause="they were calibrated one by one, or come from several cameras",
+            hint="one lens for all frames: calibrate them together",
+        )
+    cam2world = torch.eye(4, dtype=torch.float64).repeat(len(frames), 1, 1)
+    rows = [frames.index(name) for name in names]
+    cam2world[rows] = cameras.cam2world
+    posed = torch.zeros(len(frames), dtype=torch.bool)
+    posed[rows] = True
+    origin = torch.eye(4, dtype=torch.float64)[None]
+    return replace(cameras[0], cam2world=origin), KnownPoses(cam2world, posed, foreign.metric)
+
+
+def _lens(width: int, height: int, settings: Mast3rSettings) -> Cameras:
+    names = DISTORTION_PARAMETERS[settings.camera]
+    given = [k for k in ("k1", "k2", "k3", "k4", "p1", "p2") if getattr(settings, k) is not None]
+    if foreign := sorted(set(given) - set(names)):
+        raise UsageError(
+            f"{settings.camera} has no {', '.join(foreign)}",
+            cause=f"its distortion is {', '.join(names) or 'none'}",
+            hint="choose the camera model that the numbers were calibrated with (--camera)",
+        )
+    focal = settings.focal
+    if focal is None and settings.camera != "PINHOLE":
+        raise UsageError(
+            f"a lens with distortion ({settings.camera}) must be known before the network sees its pictures",
+            cause="--camera was given without --focal",
+            hint="add --focal and the distortion of a calibration, or leave --camera at PINHOLE",
+        )
+    if focal is not None and not 0.1 * width < focal < 20 * width:
+        raise UsageError(
+            f"a focal length of {focal:g} px does not fit pictures {width} px wide",
+            cause="it may be in millimetres, or belong to another picture size",
+            hint="give it in pixels of the prepared frames: millimetres / sensor width in millimetres * picture width",
+        )
+    f = _ASSUMED * width if focal is None else focal
+    K = torch.tensor([[[f, 0, width / 2], [0, f, height / 2], [0, 0, 1]]], dtype=torch.float64)
+    k = torch.tensor([[getattr(settings, name) or 0.0 for name in names]], dtype=torch.float64)
+    return Cameras(K, k, torch.eye(4, dtype=torch.float64)[None], width, height, settings.camera)

@@ -1,0 +1,216 @@
+"""What the network said, on disk and no larger than needed: matches per pair, one canonical view per frame.
+
+Pointmaps are 6 MB each and every pair has four, so none is kept: they are added to their frame's running sums
+(`canonical`) and forgotten. Sums of frames whose pairs are not all done are held in memory up to a bound, then on disk;
+they carry the names of the partners already added, so that a killed run adds nothing twice and leaves nothing out.
+"""
+
+import time
+from collections import OrderedDict
+from collections.abc import Sequence
+from dataclasses import dataclass, fields
+from hashlib import sha256
+from pathlib import Path
+
+import numpy as np
+import torch
+from jaxtyping import Float
+from torch import Tensor
+
+from swimm3r.io.files.atomic import atomic_path
+from swimm3r.io.files.damage import guard, remake
+from swimm3r.sfm.alignment.canonical import (
+    AnchoredFrame,
+    CanonicalSums,
+    CanonicalView,
+    add_pass,
+    anchored_frame,
+    canonical_view,
+)
+from swimm3r.sfm.alignment.problem import Predicted
+from swimm3r.sfm.mast3r.matching import PixelMatches
+
+_FLUSH_SECONDS = 60.0  # of work that a kill may cost
+
+
+@dataclass(frozen=True)
+class PairRecord:
+    """What is kept of a pair; predicted anchors only where its matches are too weak for the alignment."""
+
+    matches: PixelMatches
+    i_in_j: Predicted | None = None
+    j_in_i: Predicted | None = None
+
+
+@dataclass(frozen=True)
+class FrameRecord:
+    """What is kept of a frame once all its pairs are done."""
+
+    anchored: AnchoredFrame
+    view: CanonicalView  # its points are not kept: zero
+
+
+class PairStore:
+    """Matches of pairs, by the names of both frames."""
+
+    def __init__(self, folder: Path, settings_key: str) -> None:
+        self.folder = folder
+        self.settings_key = settings_key  # of everything but the frames that decides the matches
+
+    def path(self, name_i: str, name_j: str) -> Path:
+        """Where the record of a pair is kept."""
+        return self.folder / f"{_short(name_i, name_j, self.settings_key)}.npz"
+
+    def has(self, name_i: str, name_j: str) -> bool:
+        """Whether a pair is done."""
+        return self.path(name_i, name_j).is_file()
+
+    def write(self, name_i: str, name_j: str, record: PairRecord) -> None:
+        """Keep a pair."""
+        m = record.matches
+        arrays = {
+            "xy1": m.xy1.cpu().numpy().astype(np.uint16),
+            "xy2": m.xy2.cpu().numpy().astype(np.uint16),
+            "confidence": m.confidence.float().cpu().numpy(),
+        }
+        for side in ("i_in_j", "j_in_i"):
+            predicted = getattr(record, side)
+            if predicted is not None:
+                arrays[f"{side}_points"] = predicted.points.float().cpu().numpy()
+                arrays[f"{side}_confidence"] = predicted.confidence.float().cpu().numpy()
+        with atomic_path(self.path(name_i, name_j)) as draft:
+            np.savez(draft, **arrays)
+
+    def read(self, name_i: str, name_j: str) -> PairRecord:
+        """A pair that is done."""
+        path = self.path(name_i, name_j)
+        with guard(path, remake(path)), np.load(path, allow_pickle=False) as stored:
+            arrays = {name: torch.from_numpy(stored[name]) for name in stored.files if not name.startswith("xy")}
+            xy1, xy2 = (torch.from_numpy(stored[name].astype(np.int64)) for name in ("xy1", "xy2"))
+        sides = [
+            Predicted(arrays[f"{side}_points"], arrays[f"{side}_confidence"]) if f"{side}_points" in arrays else None
+            for side in ("i_in_j", "j_in_i")
+        ]
+        return PairRecord(PixelMatches(xy1, xy2, arrays["confidence"]), *sides)
+
+
+class FrameStore:
+    """Running sums of frames until all their partners have been added, then their canonical views."""
+
+    def __init__(
+        self,
+        folder: Path,
+        names: Sequence[str],
+        partners: Sequence[set[int]],
+        max_bytes: int,
+        subsample: int = 8,
+        pixel_centre: float = 0.5,
+    ) -> None:
+        self.folder = folder
+        self.names = names
+        self.partners = partners
+        self.subsample, self.pixel_centre = subsample, pixel_centre
+        self._max_bytes = max_bytes
+        self._held: OrderedDict[int, tuple[CanonicalSums, set[int]]] = OrderedDict()
+        self._unsaved: set[int] = set()
+        self._finished: set[int] = set()
+        self._saved_at = time.monotonic()
+
+    def has(self, i: int, partner: int) -> bool:
+        """Whether the pass of frame i with a partner has been added."""
+        if i in self._finished or self._view_path(i).is_file():
+            self._finished.add(i)
+            return True
+        sums = self._sums(i)
+        return sums is not None and partner in sums[1]
+
+    def add(self, i: int, partner: int, points: Float[Tensor, "h w 3"], confidence: Float[Tensor, "h w"]) -> None:
+        """Add a pass of frame i, once. Raises WeightsError for a pointmap that is not finite."""
+        if self.has(i, partner):
+            return
+        sums, done = self._sums(i) or (None, set())
+        self._held[i] = (add_pass(sums, points, confidence, self.subsample), done | {partner})
+        self._held.move_to_end(i)
+        self._unsaved.add(i)
+        if self._held[i][1] >= self.partners[i]:
+            self._finish(i)
+        while len(self._held) > 1 and sum(_bytes(s) for s, _ in self._held.values()) > self._max_bytes:
+            self._save(next(iter(self._held)))
+            self._held.popitem(last=False)
+        if time.monotonic() - self._saved_at > _FLUSH_SECONDS:
+            self.flush()
+
+    def flush(self) -> None:
+        """Write what is only in memory."""
+        for i in list(self._unsaved):
+            self._save(i)
+        self._saved_at = time.monotonic()
+
+    def read(self, i: int) -> FrameRecord:
+        """A frame all of whose partners were added."""
+        path = self._view_path(i)
+        with guard(path, remake(path)), np.load(path, allow_pickle=False) as stored:
+            relative, confidence = (torch.from_numpy(stored[name]) for name in ("relative_depth", "confidence"))
+            focal, mean = stored["focal_and_mean"].tolist()
+            anchors = torch.from_numpy(stored["anchor_depth"])
+        view = CanonicalView(torch.zeros(1, 1, 1).expand(*confidence.shape, 3), relative, confidence)
+        height, width = confidence.shape
+        return FrameRecord(AnchoredFrame(height, width, focal, anchors, mean), view)
+
+    def _sums(self, i: int) -> tuple[CanonicalSums, set[int]] | None:
+        if i in self._held:
+            self._held.move_to_end(i)
+            return self._held[i]
+        path = self._sums_path(i)
+        if not path.is_file():
+            return None
+        with guard(path, remake(path)), np.load(path, allow_pickle=False) as stored:
+            arrays = [torch.from_numpy(stored[field.name]) for field in fields(CanonicalSums)[1:]]
+            done = set(stored["done"].tolist())
+        here = {p for p in self.partners[i] if self.names[p] in done}
+        self._held[i] = (CanonicalSums(len(done), *arrays), here)
+        return self._held[i]
+
+    def _save(self, i: int) -> None:
+        if i not in self._unsaved:
+            return
+        sums, done = self._held[i]
+        arrays = {field.name: getattr(sums, field.name).numpy() for field in fields(sums)[1:]}
+        with atomic_path(self._sums_path(i)) as draft:
+            np.savez(draft, done=np.array([self.names[p] for p in sorted(done)]), **arrays)
+        self._unsaved.discard(i)
+
+    def _finish(self, i: int) -> None:
+        sums, _ = self._held.pop(i)
+        self._unsaved.discard(i)
+        view = canonical_view(sums, self.subsample)
+        frame = anchored_frame(view, self.subsample, self.pixel_centre)
+        with atomic_path(self._view_path(i)) as draft:
+            np.savez(
+                draft,
+                relative_depth=view.relative_depth.numpy(),
+                confidence=view.confidence.numpy(),
+                anchor_depth=frame.anchor_depth.numpy(),
+                focal_and_mean=np.array([frame.focal, frame.confidence]),
+            )
+        self._sums_path(i).unlink(missing_ok=True)
+        self._finished.add(i)
+
+    def _view_path(self, i: int) -> Path:
+        return self.folder / f"{self._name(i)}.view.npz"
+
+    def _sums_path(self, i: int) -> Path:
+        return self.folder / f"{self._name(i)}.sums.npz"
+
+    def _name(self, i: int) -> str:
+        """Of the frame and everything it is averaged over."""
+        others = sorted(self.names[p] for p in self.partners[i])
+        return _short(self.names[i], *others, f"{self.subsample} {self.pixel_centre}")
+
+
+def _bytes(sums: CanonicalSums) -> int:
+    return sum(value.nbytes for value in vars(sums).values() if isinstance(value, Tensor))
+
+
+def _short(*parts: str) -> str:
+    return sha256("\n".join(parts).encode()).hexdigest()[:24]

@@ -1,0 +1,212 @@
+"""Dense tracks: the pixels of many depth maps that show the same piece of surface.
+
+A pixel's point is looked up in the other frames; it belongs to the same track where that frame's depth map agrees
+(|z_j - z| <= tolerance * z) and the colours do not contradict. Every pixel is in at most one track. The position of a
+track averages the positions its depth maps give, and the ray depths of its sightings are the distances from the camera
+centres to that one position: errors of single depth maps do not pass for differences in distance.
+"""
+
+from collections.abc import Iterator
+from dataclasses import dataclass
+
+import torch
+from jaxtyping import Bool, Float, Int
+from torch import Tensor
+
+from swimm3r.cameras import Cameras, directions, image_directions, project, ray_depth_from_z
+from swimm3r.progress import Progress, silent
+from swimm3r.scene.frames import Frames
+from swimm3r.scene.reconstruction import Reconstruction
+from swimm3r.sfm.settings import TrackSettings
+
+
+@dataclass(frozen=True)
+class DenseTracks:
+    """n surface points and their o sightings; sightings of one track stand together."""
+
+    xyz: Float[Tensor, "n 3"]  # world
+    track: Int[Tensor, " o"]  # index into xyz
+    frame: Int[Tensor, " o"]  # index into Reconstruction.names
+    pixel: Int[Tensor, " o"]  # row-major index in the prepared frame
+    ray_depth: Float[Tensor, " o"]  # from that frame's camera centre to xyz
+    confidence: Float[Tensor, " o"]  # of that frame's depth map
+
+
+def fuse_depth(
+    rec: Reconstruction, frames: Frames, settings: TrackSettings, progress: Progress = silent
+) -> DenseTracks:
+    """The dense tracks of the frames that have a depth map; at most about `settings.max_tracks`.
+
+    Pictures and depth maps pass through the bounded caches of `frames` and `rec`; held are one bit per pixel and frame
+    and the tracks found so far.
+    """
+    usable = [i for i, name in enumerate(rec.names) if name in rec.depth]
+    pieces: list[DenseTracks] = []
+    count = 0
+    for piece in _by_frame(rec, frames, usable, _seed_stride(rec, usable, settings), settings, progress):
+        pieces.append(DenseTracks(piece.xyz, piece.track + count, *list(vars(piece).values())[2:]))
+        count += len(piece.xyz)
+    if not pieces:
+        none = torch.zeros(0)
+        return DenseTracks(none.reshape(0, 3), none.long(), none.long(), none.long(), none, none)
+    return DenseTracks(*(torch.cat(parts) for parts in zip(*(vars(p).values() for p in pieces), strict=True)))
+
+
+def count_tracks(rec: Reconstruction, frames: Frames, settings: TrackSettings, progress: Progress = silent) -> int:
+    """How many dense tracks there are in all, where every pixel of known depth may start one; none is held."""
+    usable = [i for i, name in enumerate(rec.names) if name in rec.depth]
+    return sum(len(piece.xyz) for piece in _by_frame(rec, frames, usable, 1, settings, progress))
+
+
+def _by_frame(
+    rec: Reconstruction, frames: Frames, usable: list[int], stride: int, settings: TrackSettings, progress: Progress
+) -> Iterator[DenseTracks]:
+    """The tracks that start in each frame, numbered from 0 in each."""
+    overlap = frame_overlap(rec, usable)
+    free = {i: torch.ones(rec.cameras.height * rec.cameras.width, dtype=torch.bool) for i in usable}
+    for done, i in enumerate(usable):
+        progress("fusing depth", done, len(usable))
+        yield _tracks_from(i, _neighbours(overlap, i, usable, settings), rec, frames, free, stride, settings)
+    progress("fusing depth", len(usable), len(usable))
+
+
+def frame_overlap(rec: Reconstruction, usable: list[int]) -> Float[Tensor, "f f"]:
+    """The share of frame i's surface (rows) that lies inside frame j's picture (columns); 0 on the diagonal.
+
+    Seen from the depth maps on a grid of 12 x 16 pixels, occlusion aside.
+    """
+    cameras = rec.cameras
+    shares = torch.zeros(len(cameras), len(cameras))
+    rows = torch.linspace(0, cameras.height - 1, 12).long()
+    columns = torch.linspace(0, cameras.width - 1, 16).long()
+    grid = torch.stack(torch.meshgrid(columns + 0.5, rows + 0.5, indexing="xy"), -1).reshape(1, -1, 2).double()
+    for i in usable:
+        z = rec.depth[rec.names[i]].z_depth[rows][:, columns].reshape(-1).double()
+        if not (z > 0).any():
+            continue
+        camera = cameras[i]
+        seen = directions(camera, grid[:, z > 0]) * z[z > 0][None, :, None]
+        xyz = seen @ camera.cam2world[:, :3, :3].mT + camera.cam2world[:, None, :3, 3]
+        uv, ahead = project(cameras, xyz.expand(len(cameras), -1, -1))
+        shares[i] = (_inside(uv, cameras) & (ahead > 0)).double().mean(-1).float()
+        shares[i, i] = 0
+    return shares
+
+
+def shared_rays(cameras: Cameras) -> list[Float[Tensor, "h w 3"]]:
+    """`image_directions` of every camera; cameras of one lens share one tensor."""
+    rays: dict[bytes, Tensor] = {}
+    result = []
+    for i in range(len(cameras)):
+        lens = cameras.K[i].numpy().tobytes() + cameras.distortion[i].numpy().tobytes()
+        if lens not in rays:
+            rays[lens] = image_directions(cameras[i]).float()
+        result.append(rays[lens])
+    return result
+
+
+def _inside(uv: Float[Tensor, "*points 2"], cameras: Cameras) -> Bool[Tensor, "*points"]:
+    size = torch.tensor([cameras.width, cameras.height]).to(uv)
+    return ((uv >= 0) & (uv < size)).all(-1)
+
+
+def _neighbours(overlap: Float[Tensor, "f f"], i: int, usable: list[int], settings: TrackSettings) -> list[int]:
+    """Other frames that see enough of the surface of frame i: half the best, half evenly from the rest.
+
+    The rest look from farther away or closer: sightings that tell most about the water.
+    """
+    known = set(usable)
+    order = [j for j in torch.argsort(overlap[i], descending=True, stable=True).tolist() if j in known]
+    order = [j for j in order if overlap[i, j] > settings.min_overlap]
+    best, rest = order[: settings.max_views // 2], order[settings.max_views // 2 :]
+    step = max(1, -(-len(rest) // (settings.max_views - len(best)))) if rest else 1
+    return best + rest[::step]
+
+
+def _seed_stride(rec: Reconstruction, usable: list[int], settings: TrackSettings) -> int:
+    """Grid step of the pixels that start tracks, so that tracks and memory stay bounded."""
+    probes = usable[:: max(1, len(usable) // 8)]
+    if not probes:
+        return 1
+    known = sum(int((rec.depth[rec.names[i]].z_depth > 0).sum()) for i in probes) / len(probes) * len(usable)
+    return max(1, round((known / settings.max_tracks) ** 0.5))
+
+
+def _tracks_from(
+    i: int,
+    neighbours: list[int],
+    rec: Reconstruction,
+    frames: Frames,
+    free: dict[int, Tensor],
+    stride: int,
+    settings: TrackSettings,
+) -> DenseTracks:
+    """The tracks that start at the free pixels of frame i; what they take is struck off `free`."""
+    cameras, names = rec.cameras, rec.names
+    depth = rec.depth[names[i]]
+    z_map = depth.z_depth.reshape(-1)
+    lattice = torch.zeros(cameras.height, cameras.width, dtype=torch.bool)
+    lattice[stride // 2 :: stride, stride // 2 :: stride] = True
+    usable = frames.mask(frames.index(names[i])).reshape(-1)
+    seeds = torch.nonzero(lattice.reshape(-1) & (z_map > 0) & free[i] & usable)[:, 0]
+    free[i][seeds] = False
+    start = _unproject(cameras[i], seeds, z_map[seeds])
+    colour = frames.image(frames.index(names[i])).reshape(-1, 3)[seeds]
+    confidence = depth.confidence.reshape(-1)[seeds]
+    weight = confidence.double().clamp(min=0.01)
+    total, position = weight.clone(), start * weight[:, None]
+    sightings = [(torch.arange(len(seeds)), torch.full_like(seeds, i), seeds, confidence)]
+    for j in neighbours if len(seeds) else []:
+        uv, z = project(cameras[j], start[None])
+        uv, z = uv[0], z[0]
+        candidates = torch.nonzero(_inside(uv, cameras) & (z > 0))[:, 0]
+        pixel = uv[candidates, 1].long() * cameras.width + uv[candidates, 0].long()
+        other = rec.depth[names[j]]
+        z_other = other.z_depth.reshape(-1)[pixel].double()
+        index = frames.index(names[j])
+        change = (frames.image(index).reshape(-1, 3)[pixel] - colour[candidates]).abs().amax(-1)
+        agrees = (z_other > 0) & ((z_other - z[candidates]).abs() <= settings.tolerance * z[candidates])
+        agrees &= free[j][pixel] & frames.mask(index).reshape(-1)[pixel] & (change < settings.max_colour_change)
+        candidates, pixel, z_other = candidates[agrees], pixel[agrees], z_other[agrees]
+        first = torch.full((cameras.height * cameras.width,), len(seeds))
+        first.scatter_reduce_(0, pixel, candidates, "amin")  # two points in one pixel: the first keeps it
+        alone = first[pixel] == candidates
+        candidates, pixel, z_other = candidates[alone], pixel[alone], z_other[alone]
+        free[j][pixel] = False
+        centre = cameras.centres[j]
+        seen = centre + (start[candidates] - centre) * (z_other / z[candidates])[:, None]
+        trust = other.confidence.reshape(-1)[pixel]
+        position.index_add_(0, candidates, seen * trust.double().clamp(min=0.01)[:, None])
+        total.index_add_(0, candidates, trust.double().clamp(min=0.01))
+        sightings.append((candidates, torch.full_like(pixel, j), pixel, trust))
+    xyz = position / total[:, None]
+    track, frame, pixel, confidence = (torch.cat(part) for part in zip(*sightings, strict=True))
+    order = torch.argsort(track, stable=True)
+    track, frame = track[order], frame[order]
+    ray_depth = torch.linalg.vector_norm(xyz[track] - cameras.centres[frame], dim=-1)
+    return DenseTracks(xyz.float(), track, frame, pixel[order], ray_depth.float(), confidence[order])
+
+
+def _unproject(camera: Cameras, pixel: Int[Tensor, " n"], z_depth: Float[Tensor, " n"]) -> Float[Tensor, "n 3"]:
+    """World points of the centres of row-major pixels, float64."""
+    uv = torch.stack([pixel % camera.width + 0.5, pixel // camera.width + 0.5], -1).double()
+    seen = directions(camera, uv[None])[0] * z_depth.double()[:, None]
+    return seen @ camera.cam2world[0, :3, :3].mT + camera.cam2world[0, :3, 3]
+
+
+def ray_depth_map(z_depth: Float[Tensor, "h w"], rays: Float[Tensor, "h w 3"]) -> Float[Tensor, "h w"]:
+    """Ray depth of a depth map, 0 where nothing is known or the lens model has no ray."""
+    return torch.nan_to_num(ray_depth_from_z(z_depth, rays), nan=0.0)
+
+
+def cubes(xyz: Float[Tensor, "n 3"], size: Float[Tensor, "#n"]) -> tuple[Int[Tensor, " n"], Int[Tensor, " k"]]:
+    """Which cube of the world's grid (edge `size`, may differ per point) holds each point; number of points per cube.
+
+    Cubes are told apart by a 64-bit mix of their indices: two of a million collide with a chance of 3e-8.
+    """
+    edge = size.double()
+    cell = torch.floor(xyz.double() / edge[:, None]).long()
+    mixed = cell @ torch.tensor([6364136223846793005, 3935559000370003845, 2862933555777941757])
+    mixed = mixed * 2685821657736338717 ^ (mixed >> 29) ^ (edge.log2() * 1024).long()
+    _, which, count = torch.unique(mixed, return_inverse=True, return_counts=True)
+    return which, count

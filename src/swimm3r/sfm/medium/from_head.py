@@ -1,0 +1,198 @@
+"""The water of a dive as the physics head read it: kept per frame, laid over prepared frames, summed up for the dive.
+
+    folder/NAME.npz     Binf [3], beta_B [3], and a, b, c, d of beta_D(z) = a e^{bz} + c e^{dz} per 8 x 8 network pixels
+
+in the reconstruction's unit: the head speaks of the network's metres, the alignment scales each frame, and the water
+with it. The dive's fit is the median over frames; its curve is one exponential through the frames' beta_D at the depths
+they see.
+
+That frames agree is no sign that they are right: a head that always says the same agrees with itself. A coefficient's
+standard deviation is therefore the head's own error, measured on held-out pairs whose water was known (`HeadFacts`),
+and the frames' spread, added in squares; it counts as identifiable where that is small. Without a measured error
+nothing is identifiable, and every standard deviation is as large as the coefficient itself.
+"""
+
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+import torch
+from jaxtyping import Float, Int
+from torch import Tensor
+from torch.nn import functional as F
+
+from swimm3r.errors import InputError
+from swimm3r.imaging.depth_completion import fill_z_depth
+from swimm3r.imaging.open_water import sea_share
+from swimm3r.io.files.atomic import atomic_path
+from swimm3r.io.files.damage import guard, remake
+from swimm3r.medium import AttenuationCurve, Medium, MediumFit, remove_water
+from swimm3r.progress import Progress, silent
+from swimm3r.scene.frames import Frames
+from swimm3r.scene.reconstruction import Reconstruction
+from swimm3r.sfm.mast3r_sfm.network_frames import NetworkPictures
+from swimm3r.sfm.medium.dense_tracks import ray_depth_map, shared_rays
+from swimm3r.sfm.medium.restore import RestoredPicture
+from swimm3r.sfm.settings import SeathruSettings
+from swimm3r.sfm.student.physics_head import HeadFacts, WaterMaps
+
+_CELL = 8  # network pixels; the head's maps are smooth over 16
+_SAMPLES = 2_000  # pixels of each frame that the dive's curve is fitted to
+_UNMEASURED = 1.0  # relative error of a head whose error nobody has measured
+
+
+@dataclass(frozen=True)
+class FrameWater:
+    """What the head reads in one frame, in the reconstruction's unit."""
+
+    Binf: Float[Tensor, "3"]
+    beta_B: Float[Tensor, "3"]
+    curve: Float[Tensor, "12 hc wc"]  # a, b, c, d of three channels each, on the network's picture in cells
+
+    def at(self, ray_depth: Float[Tensor, " n"], place: Float[Tensor, "n 2"]) -> Medium:
+        """The medium of pixels; `place` is where they are in the network's picture, -1..1 from edge to edge."""
+        grid = place.to(self.curve)[None, None]
+        # outside of the network's crop the edge stands in
+        sampled = F.grid_sample(self.curve[None], grid, padding_mode="border", align_corners=False)[0, :, 0].T
+        beta_D = AttenuationCurve(*sampled.split(3, dim=-1)).at(ray_depth)
+        return Medium(self.Binf.expand_as(beta_D), beta_D, self.beta_B.expand_as(beta_D))
+
+
+@dataclass(frozen=True)
+class FrameReading:
+    """What one frame tells about the dive's water, at some of its pixels of known depth, at least one."""
+
+    Binf: Float[Tensor, "3"]
+    beta_B: Float[Tensor, "3"]
+    ray_depth: Float[Tensor, " n"]
+    beta_D: Float[Tensor, "n 3"]
+
+
+@dataclass(frozen=True)
+class PredictedWater:
+    """The water of all frames of a reconstruction, read from disk frame by frame."""
+
+    folder: Path
+    place: Float[Tensor, "pixels 2"]  # of the prepared frames' pixels in the network's picture, -1..1
+    head: HeadFacts
+
+    def frame(self, name: str) -> FrameWater:
+        """The water of a frame."""
+        path = self.folder / f"{name}.npz"
+        with guard(path, remake(self.folder.parent)), np.load(path, allow_pickle=False) as stored:
+            return FrameWater(*(torch.from_numpy(stored[key]) for key in ("Binf", "beta_B", "curve")))
+
+    def at(self, name: str, pixel: Int[Tensor, " n"], ray_depth: Float[Tensor, " n"]) -> Medium:
+        """The medium of some pixels of a frame, row-major indices in the prepared frame."""
+        return self.frame(name).at(ray_depth, self.place[pixel])
+
+
+def write(maps: WaterMaps, scale: float, folder: Path, name: str) -> None:
+    """Keeps a frame's water; `scale` is the reconstruction's unit per metre of the network in this frame."""
+    scaled = maps.rescaled(scale)
+    curve = torch.cat(list(vars(scaled.curve).values()), dim=-1).permute(0, 3, 1, 2)
+    cells = F.avg_pool2d(curve.float(), _CELL)[0]
+    with atomic_path(folder / f"{name}.npz") as draft:
+        np.savez(
+            draft, Binf=scaled.Binf[0].cpu().numpy(), beta_B=scaled.beta_B[0].cpu().numpy(), curve=cells.cpu().numpy()
+        )
+
+
+def read(folder: Path, pictures: NetworkPictures, head: HeadFacts) -> PredictedWater | None:
+    """What `write` kept of a head in a folder; None where there is none, because the adapter has no head."""
+    if not folder.is_dir():
+        return None
+    frames, frame = pictures.frames, pictures.framing
+    rows, columns = torch.arange(frames.height) + 0.5, torch.arange(frames.width) + 0.5
+    pixels = torch.cartesian_prod(rows, columns).flip(-1).double()
+    size = torch.tensor([frame.network_width, frame.network_height])
+    place = (2 * pictures.from_frame(pixels) / size - 1).nan_to_num(0.0).float()
+    return PredictedWater(folder, place, head)
+
+
+def dive_fit(water: PredictedWater, rec: Reconstruction, settings: SeathruSettings) -> MediumFit:
+    """One water for the dive, on values as stored. Raises InputError where no frame has any depth."""
+    rays = shared_rays(rec.cameras)
+    readings = []
+    for i, name in enumerate(rec.names):
+        if name not in rec.depth:
+            continue
+        z = ray_depth_map(rec.depth[name].z_depth, rays[i]).flatten()
+        pixel = torch.nonzero(z > 0)[:, 0]
+        if not len(pixel):
+            continue
+        pixel = pixel[:: max(1, len(pixel) // _SAMPLES)]
+        own = water.frame(name)
+        readings.append(FrameReading(own.Binf, own.beta_B, z[pixel], own.at(z[pixel], water.place[pixel]).beta_D))
+    if not readings:
+        raise InputError(
+            "no frame has any depth to read the water at",
+            cause="the dense depth stage found almost no surface",
+            hint="clearer or slower footage",
+        )
+    return summed_up(readings, settings, water.head.error)
+
+
+def summed_up(readings: Sequence[FrameReading], settings: SeathruSettings, error: Medium | None = None) -> MediumFit:
+    """The water that frames, at least one, agree on best: medians, and one exponential through their beta_D.
+
+    `error` is the head's relative standard error per coefficient and channel, None where it was never measured.
+    """
+    z = torch.cat([r.ray_depth for r in readings]).double()
+    beta_D = torch.cat([r.beta_D for r in readings]).double()
+    middle = z.median()
+    level, slope = _exponential(z / middle, beta_D)
+    curve = AttenuationCurve(level.float(), (slope / middle).float(), torch.zeros(3), torch.zeros(3))
+    per_frame = {
+        "Binf": torch.stack([r.Binf for r in readings]),
+        "beta_D": torch.stack([r.beta_D.median(0).values for r in readings]),
+        "beta_B": torch.stack([r.beta_B for r in readings]),
+    }
+    # from the median absolute deviation, as of a normal distribution
+    spread = {k: 1.4826 * (v - v.median(0).values).abs().median(0).values for k, v in per_frame.items()}
+    medium = Medium(per_frame["Binf"].median(0).values, curve.at(middle.float()), per_frame["beta_B"].median(0).values)
+    relative = Medium(*(torch.full((3,), _UNMEASURED) for _ in per_frame)) if error is None else error
+    std = {k: (spread[k] ** 2 + (getattr(relative, k) * getattr(medium, k)) ** 2).sqrt() for k in spread}
+    known = {k: std[k] < settings.identifiable_std * getattr(medium, k) for k in std}
+    low, high = torch.quantile(z[:: max(1, len(z) // 1_000_000)], torch.tensor([0.002, 0.998]).double()).tolist()
+    return MediumFit(medium, curve, Medium(**std), known, (low, high), "srgb", "physics head")
+
+
+def predicted_pictures(
+    rec: Reconstruction,
+    frames: Frames,
+    water: PredictedWater,
+    progress: Progress = silent,
+    gains: Float[Tensor, "3"] | None = None,
+) -> Iterator[tuple[int, RestoredPicture]]:
+    """Every frame with depth, by its place in `rec`: the inverse of Eq. 3, clamped, by the frame's own water.
+
+    Unknown depth is filled in along the edges; open water keeps the colour it has. `gains` balance the images as shown.
+    """
+    rays = shared_rays(rec.cameras)
+    for i, name in enumerate(rec.names):
+        progress("restoring pictures", i, len(rec.names))
+        depth = rec.depth[name]
+        if not bool((depth.z_depth > 0).any()):
+            continue
+        image = frames.image(frames.index(name))
+        own = water.frame(name)
+        sea = sea_share(image, depth.z_depth, own.Binf)
+        ray_depth = ray_depth_map(fill_z_depth(image, depth, sea), rays[i])
+        z = ray_depth.flatten()
+        J = remove_water(image.reshape(-1, 3), z, own.at(z, water.place), water.head.min_transmittance)
+        J = J.clamp(0, 1).reshape(image.shape)
+        balanced = J if gains is None else (J * gains).clamp(0, 1)
+        clear, shown = (surface + sea[..., None] * (image - surface) for surface in (J, balanced))
+        yield i, RestoredPicture(clear, shown, ray_depth, sea)
+    progress("restoring pictures", len(rec.names), len(rec.names))
+
+
+def _exponential(z: Float[Tensor, " n"], beta: Float[Tensor, "n 3"]) -> tuple[Float[Tensor, "3"], Float[Tensor, "3"]]:
+    """Level and slope of beta = level e^{slope z}, slope <= 0, by least squares of the logarithm."""
+    log_beta = beta.clamp(min=1e-9).log()
+    centred = z - z.mean()
+    slope = (centred[:, None] * log_beta).sum(0) / centred.square().sum().clamp(min=1e-12)
+    slope = slope.clamp(max=0.0)
+    return torch.exp(log_beta.mean(0) - slope * z.mean()), slope

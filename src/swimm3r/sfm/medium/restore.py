@@ -1,0 +1,255 @@
+"""Pictures and points as they would look without the water: the inverse of Eq. 2, kept from amplifying noise.
+
+    D = I - B(z),   J = D / T_D(z)
+
+Where T_D is small the quotient is noise, so per channel with s = T_D:
+
+    detail    J = S + s^2 / (s^2 + (noise / texture)^2) (J - S)     S: local linear fit of D / s to I's brightness
+    colour    J = w J + (1 - w) k G,  w = s^2 / (s^2 + (veil_error / colour_error)^2)
+              G: the channels weighted by how well they see; k: this channel's share of colour where it does see
+    horizon   in open water, and where no channel sees (max w -> 0), the picture's own veil remains
+
+Near the camera all weights are 1 and J is the plain inverse. Nothing is stretched; white balance serves the eye alone,
+and only where the frames say which colours the water took (`water_plausibility`).
+"""
+
+from collections.abc import Callable, Iterator
+from dataclasses import dataclass
+
+import numpy as np
+import torch
+from jaxtyping import Bool, Float, Int
+from torch import Tensor
+
+from swimm3r.imaging.depth_completion import fill_z_depth
+from swimm3r.imaging.filters import LUMA, blur, local_linear
+from swimm3r.imaging.open_water import sea_share
+from swimm3r.medium import (
+    Medium,
+    MediumFit,
+    backscatter,
+    linear_from_srgb,
+    remove_water,
+    srgb_from_linear,
+    transmittances,
+)
+from swimm3r.progress import Progress, silent
+from swimm3r.scene.frames import Frames
+from swimm3r.scene.reconstruction import DenseCloud, DepthMap, Reconstruction
+from swimm3r.sfm.medium.dense_tracks import DenseTracks, cubes, ray_depth_map, shared_rays
+from swimm3r.sfm.medium.plausibility import any_determined
+from swimm3r.sfm.settings import RestoreSettings
+
+MediumOfPixels = Callable[[str, Int[Tensor, " n"], Float[Tensor, " n"]], Medium]  # frame, pixels, ray depth
+
+_MAX_TINT = 1.0  # times the other channels, for blurred colours at a guessed distance
+_NEARLY_ALL = 0.95  # of the surfaces at known distance
+
+
+@dataclass(frozen=True)
+class RestoredPicture:
+    """One whole picture without its water, as stored values in 0..1."""
+
+    clear: Float[Tensor, "h w 3"]
+    shown: Float[Tensor, "h w 3"]  # white-balanced for the eye where asked for
+    ray_depth: Float[Tensor, "h w"]  # of the surface; filled in along the edges where the depth map has gaps
+    sea: Float[Tensor, "h w"]  # 0..1, how surely there is open water and no surface; it keeps the colour it has
+
+
+def restored_pictures(
+    rec: Reconstruction, frames: Frames, settings: RestoreSettings, progress: Progress = silent
+) -> Iterator[tuple[int, RestoredPicture]]:
+    """Every registered frame with some known depth, by its place in `rec`; needs the medium and the cloud."""
+    assert rec.medium is not None
+    gains = shown_gains(rec, settings)
+    rays = shared_rays(rec.cameras)
+    for i, name in enumerate(rec.names):
+        progress("restoring pictures", i, len(rec.names))
+        depth = rec.depth[name]
+        if bool((depth.z_depth > 0).any()):
+            yield i, restore_picture(frames.image(frames.index(name)), depth, rays[i], rec.medium, settings, gains)
+    progress("restoring pictures", len(rec.names), len(rec.names))
+
+
+def restore_picture(
+    image: Float[Tensor, "h w 3"],
+    depth: DepthMap,
+    rays: Float[Tensor, "h w 3"],
+    fit: MediumFit,
+    settings: RestoreSettings | None = None,
+    gains: Float[Tensor, "3"] | None = None,
+) -> RestoredPicture:
+    """The whole picture without its water; unknown depth is filled in along the edges.
+
+    `rays` are the directions of the pixels with z = 1 (`cameras.image_directions`). `gains` (`display_gains`) colour
+    surfaces and not the open water behind them, which keeps the colour the diver saw.
+    """
+    settings = settings or RestoreSettings()
+    veil = srgb_from_linear(fit.medium.Binf) if fit.encoding == "linear" else fit.medium.Binf
+    sea = sea_share(image, depth.z_depth, veil)
+    z_depth = fill_z_depth(image, depth, sea)
+    ray_depth = ray_depth_map(z_depth, rays)
+    I = linear_from_srgb(image) if fit.encoding == "linear" else image
+    path = _not_beyond_white(I, ray_depth, depth.z_depth == 0, fit)
+    medium = fit.at(path)
+    T_D, _ = transmittances(path, medium)
+    direct = I - backscatter(path, medium)
+    J = _without_noise(direct, T_D, I @ LUMA, settings)
+    stored = srgb_from_linear(J.clamp(min=0)) if fit.encoding == "linear" else J
+    clear = horizon(stored, T_D, image, sea, settings).clamp(0, 1)
+    shown = clear if gains is None else horizon(stored * gains, T_D, image, sea, settings).clamp(0, 1)
+    return RestoredPicture(clear, shown, ray_depth, sea)
+
+
+def restored_cloud(
+    rec: Reconstruction,
+    frames: Frames,
+    tracks: DenseTracks,
+    fit: MediumFit,
+    settings: RestoreSettings | None = None,
+    progress: Progress = silent,
+    medium_at: MediumOfPixels | None = None,
+    min_transmittance: float = 0.05,
+) -> DenseCloud:
+    """The tracks as points: raw and restored colours averaged over the sightings, thinned by voxels.
+
+    Restored colours are weighted by confidence and mean T_D squared, the inverse variance of an amplified colour.
+    `medium_at` gives each pixel its own water in the place of the dive's, in the encoding of `fit`, and
+    `min_transmittance` bounds what is divided by (eps_inv).
+    """
+    settings = settings or RestoreSettings()
+    n = len(tracks.xyz)
+    raw, restored = torch.zeros(n, 3), torch.zeros(n, 3)
+    raw_weight, restored_weight = torch.zeros(n, 1), torch.zeros(n, 3)
+    order = torch.argsort(tracks.frame, stable=True)
+    bounds = torch.searchsorted(tracks.frame[order], torch.arange(len(rec.names) + 1))
+    for i, name in enumerate(rec.names):
+        progress("restoring points", i, len(rec.names))
+        mine = order[bounds[i] : bounds[i + 1]]
+        if len(mine) == 0:
+            continue
+        I = frames.image(frames.index(name)).reshape(-1, 3)[tracks.pixel[mine]]
+        light = linear_from_srgb(I) if fit.encoding == "linear" else I
+        z, trust = tracks.ray_depth[mine], tracks.confidence[mine, None].clamp(min=0.01)
+        medium = fit.at(z) if medium_at is None else medium_at(name, tracks.pixel[mine], z)
+        T_D, _ = transmittances(z, medium)
+        weight = trust * T_D.clamp(min=0.01) ** 2
+        raw.index_add_(0, tracks.track[mine], I * trust)
+        raw_weight.index_add_(0, tracks.track[mine], trust)
+        restored.index_add_(0, tracks.track[mine], remove_water(light, z, medium, min_transmittance) * weight)
+        restored_weight.index_add_(0, tracks.track[mine], weight)
+    progress("restoring points", len(rec.names), len(rec.names))
+    J = restored / restored_weight.clamp(min=1e-12)
+    if fit.encoding == "linear":
+        J = srgb_from_linear(J.clamp(min=0))
+    cloud = DenseCloud(tracks.xyz, (raw / raw_weight.clamp(min=1e-12)).clamp(0, 1), J.clamp(0, 1))
+    return _thinned(cloud, settings.max_points)
+
+
+def shown_gains(rec: Reconstruction, settings: RestoreSettings) -> Float[Tensor, "3"]:
+    """White balance of a dive's clear pictures (`display_gains`).
+
+    Ones where nobody asked for it, and where the frames determine nothing of the water: neutral greys would pass for
+    the true colours of surfaces.
+    """
+    if rec.cloud is None or rec.medium is None or not settings.white_balance or not any_determined(rec.medium):
+        return torch.ones(3)
+    return display_gains(rec.cloud.restored)
+
+
+def display_gains(restored: Float[Tensor, "n 3"]) -> Float[Tensor, "3"]:
+    """Gains that make a dive's restored colours grey, between 0.5 and 2; brightness stays.
+
+    The inverse of the water gives surfaces under the light that reaches their depth, which is tinted. The tint is the
+    6-norm of the colours (Finlayson & Trezzi 2004): bright surfaces count most, weeds and shade hardly. This is for
+    pictures to look at and nothing else: it is no part of J.
+    """
+    seen = restored[(restored < 0.99).all(-1)].double()
+    if len(seen) == 0:
+        return torch.ones(3)
+    tint = (seen.clamp(min=0) ** 6).mean(0) ** (1 / 6)
+    return (tint.mean() / tint.clamp(min=0.01)).clamp(0.5, 2.0).float()
+
+
+def _not_beyond_white(
+    I: Float[Tensor, "h w 3"], ray_depth: Float[Tensor, "h w"], guessed: Bool[Tensor, "h w"], fit: MediumFit
+) -> Float[Tensor, "h w"]:
+    """Ray depth, shortened where it is a guess until the blurred J is a colour that surfaces have.
+
+    That is below 0.9, and in the channel that the water takes first not far above the others (nor more than nearly all
+    surfaces of known depth are): too long a path shows as a glare of that channel first, mostly red.
+    """
+    first = int(fit.medium.beta_D.argmax())
+    reach = 0.01 * max(I.shape[:2])
+    blurred = blur(I, reach)
+    smooth, far = blurred[guessed], ray_depth[guessed]
+
+    def tint(J: Float[Tensor, "n 3"]) -> Float[Tensor, " n"]:
+        others = torch.cat([J[:, :first], J[:, first + 1 :]], dim=-1).amax(-1)
+        return torch.where(others > 0, J[:, first] / others.clamp(min=1e-6), torch.inf)
+
+    measured = tint(remove_water(blurred[~guessed], ray_depth[~guessed], fit.at(ray_depth[~guessed])))
+    measured = measured[measured.isfinite()].numpy()
+    most = max(_MAX_TINT, float(np.quantile(measured, _NEARLY_ALL))) if len(measured) else _MAX_TINT
+    shortened = torch.zeros_like(far)
+    for trial in torch.linspace(0.05, 1.0, 20):
+        J = remove_water(smooth, trial * far, fit.at(trial * far))
+        shortened = torch.where((J.amax(-1) < 0.9) & (tint(J) < most), trial, shortened)
+    share = torch.ones_like(ray_depth)
+    share[guessed] = shortened
+    return torch.where(guessed, ray_depth * blur(share[..., None], reach)[..., 0], ray_depth)
+
+
+def _without_noise(
+    direct: Float[Tensor, "h w 3"],
+    T_D: Float[Tensor, "h w 3"],
+    brightness: Float[Tensor, "h w"],
+    settings: RestoreSettings,
+) -> Float[Tensor, "h w 3"]:
+    """D / T_D with detail and then colour held back where T_D does not carry them."""
+    floor = settings.veil_error / settings.colour_error
+    J = direct / T_D.clamp(min=floor / 2)
+    smooth = local_linear(brightness, J, T_D**2 + 1e-6, settings.window * max(brightness.shape) / 2, settings.noise**2)
+    J = smooth + T_D**2 / (T_D**2 + (settings.noise / settings.texture) ** 2) * (J - smooth)
+    sees = T_D**2 / (T_D**2 + floor**2)
+    weight = sees**2
+    grey = (weight * J).sum(-1, keepdim=True) / weight.sum(-1, keepdim=True).clamp(min=1e-6)
+    well = weight.prod(-1, keepdim=True) * ((J > 0) & (J < 1)).all(-1, keepdim=True)
+    share = (well * J).sum((0, 1)) + 1e-3
+    share = share / share.mean()
+    used = (weight * share).sum(-1, keepdim=True) / weight.sum(-1, keepdim=True).clamp(min=1e-6)
+    return sees * J + (1 - sees) * share * grey / used.clamp(min=1e-3)
+
+
+def horizon(
+    surface: Float[Tensor, "h w 3"],
+    T_D: Float[Tensor, "h w 3"],
+    image: Float[Tensor, "h w 3"],
+    sea: Float[Tensor, "h w"],
+    settings: RestoreSettings,
+) -> Float[Tensor, "h w 3"]:
+    """The veil itself, as `image` has it, where there is no surface (`sea`, 0..1) or no channel that sees it."""
+    floor = settings.veil_error / settings.colour_error
+    best = T_D.amax(-1, keepdim=True)
+    sees = best**2 / (best**2 + floor**2) * (1 - sea[..., None])
+    return sees * surface + (1 - sees) * image
+
+
+def _thinned(cloud: DenseCloud, count: int) -> DenseCloud:
+    """One averaged point per voxel, with voxels just large enough to leave at most `count`."""
+    n = len(cloud.xyz)
+    if n <= count:
+        return cloud
+    low, high = (torch.quantile(cloud.xyz[:: max(1, n // 100_000)], q, dim=0) for q in (0.02, 0.98))
+    size = float((high - low).amax()) / max(1.0, count**0.5)
+    while True:
+        which, number = cubes(cloud.xyz, torch.tensor([size]))
+        if len(number) <= count:
+            break
+        size *= max(1.05, (len(number) / count) ** 0.4)
+
+    def average(x: Tensor) -> Tensor:
+        total = torch.zeros(len(number), 3, dtype=torch.float64).index_add_(0, which, x.double())
+        return (total / number[:, None]).float()
+
+    return DenseCloud(average(cloud.xyz), average(cloud.raw), average(cloud.restored))

@@ -1,0 +1,146 @@
+"""The pixels from which the water is fitted: drawn from every training frame of a dive, with their ray depths.
+
+Single pixels serve the dark envelope and the averages. For the decay of colour differences the dense tracks are grouped
+into patches, cubes some pixels wide as seen from afar, and a sighting is the mean colour of one patch in one frame. A
+patch is the same piece of surface from every distance and slant; a single pixel is not, and the contrast it loses by
+averaging over more surface would pass for attenuation.
+"""
+
+from dataclasses import dataclass
+
+import torch
+from jaxtyping import Bool, Float, Int
+from torch import Tensor
+
+from swimm3r.imaging.depth_completion import fill_z_depth
+from swimm3r.imaging.filters import blur
+from swimm3r.imaging.open_water import open_water_mask
+from swimm3r.progress import Progress, silent
+from swimm3r.scene.frames import Frames
+from swimm3r.scene.reconstruction import DepthMap, Reconstruction
+from swimm3r.sfm.medium.dense_tracks import DenseTracks, cubes, ray_depth_map, shared_rays
+from swimm3r.sfm.settings import SeathruSettings
+
+_ONE_STEP = 1.5 / 255  # difference between channels that rounding leaves in a grey picture
+_COLOURED = 0.001  # share of the pixels of a grey clip that may have a colour: a logo, a time stamp
+
+
+@dataclass(frozen=True)
+class WaterSamples:
+    """Pixels of a dive with known distance, pooled over its frames."""
+
+    I: Float[Tensor, "n 3"]  # as stored, 0..1
+    ray_depth: Float[Tensor, " n"]  # > 0
+    frame: Int[Tensor, " n"]  # which picture: errors are shared within one
+    track: Int[Tensor, " n"]  # which patch of surface; -1 for pixels on their own
+    open_water: Float[Tensor, "m 3"]  # pixels beyond every surface; empty where the frames show none
+
+    @property
+    def grey(self) -> bool:
+        """Whether the three channels are one: equal up to rounding, in all but a few pixels."""
+        spread = self.I.amax(-1) - self.I.amin(-1)
+        return len(spread) > 0 and float((spread > _ONE_STEP).float().mean()) <= _COLOURED
+
+
+def gather_samples(
+    rec: Reconstruction, frames: Frames, tracks: DenseTracks, settings: SeathruSettings, progress: Progress = silent
+) -> WaterSamples:
+    """Samples of every frame that has a depth map."""
+    patches = _patches(rec, tracks, settings)
+    rays = shared_rays(rec.cameras)
+    usable = [i for i, name in enumerate(rec.names) if name in rec.depth]
+    per_frame = max(1, settings.max_pixels // max(1, len(usable)))
+    order = torch.argsort(tracks.frame, stable=True)
+    bounds = torch.searchsorted(tracks.frame[order], torch.arange(len(rec.names) + 1))
+    parts: list[tuple[Tensor, Tensor, Tensor, Tensor]] = []
+    water: list[Tensor] = []
+    for done, i in enumerate(usable):
+        progress("sampling the water", done, len(usable))
+        index = frames.index(rec.names[i])
+        image, mask = frames.image(index), frames.mask(index)
+        ray_depth, sea = _ray_depth_nearby(image, rec.depth[rec.names[i]], rays[i])
+        pixels = torch.nonzero((ray_depth.reshape(-1) > 0) & mask.reshape(-1))[:, 0]
+        pixels = pixels[:: max(1, len(pixels) // per_frame)]
+        alone = torch.full_like(pixels, -1)
+        parts.append((image.reshape(-1, 3)[pixels], ray_depth.reshape(-1)[pixels], torch.full_like(pixels, i), alone))
+        seen = order[bounds[i] : bounds[i + 1]]
+        I, z, patch = _patch_means(image.reshape(-1, 3), tracks, seen, patches, settings)
+        parts.append((I, z, torch.full_like(patch, i), patch))
+        shown = image[sea & mask]
+        water.append(shown[:: max(1, len(shown) // settings.open_water_pixels)])
+    progress("sampling the water", len(usable), len(usable))
+    if not parts:
+        none = torch.zeros(0)
+        return WaterSamples(none.reshape(0, 3), none, none.long(), none.long(), none.reshape(0, 3))
+    I, ray_depth, frame, track = (torch.cat(p) for p in zip(*parts, strict=True))
+    return WaterSamples(I, ray_depth, frame, track, _plausible_water(torch.cat(water), I, ray_depth))
+
+
+def _ray_depth_nearby(
+    image: Float[Tensor, "h w 3"], depth: DepthMap, rays: Float[Tensor, "h w 3"]
+) -> tuple[Float[Tensor, "h w"], Bool[Tensor, "h w"]]:
+    """Ray depth, filled in around known pixels and 0 elsewhere; and open water.
+
+    Black things, which show the backscatter, rarely have texture enough for a depth of their own.
+    """
+    known = depth.z_depth > 0
+    if not known.any():
+        return torch.zeros_like(depth.z_depth), torch.zeros_like(known)
+    sea = open_water_mask(image, depth.z_depth)
+    filled = fill_z_depth(image, depth, sea.float())
+    reach = 0.02 * max(image.shape[:2])
+    near = (blur(known.float()[..., None], reach)[..., 0] > 0.1) & ~sea
+    return torch.where(near, ray_depth_map(filled, rays), 0.0), sea
+
+
+@dataclass(frozen=True)
+class _Patches:
+    """Tracks grouped by the cube they lie in."""
+
+    of_track: Int[Tensor, " n"]
+    size: Float[Tensor, " p"]  # edge of the cube
+    middle: Float[Tensor, "p 3"]  # mean of the patch's tracks
+
+
+def _patches(rec: Reconstruction, tracks: DenseTracks, settings: SeathruSettings) -> _Patches:
+    """Cubes about `patch_pixels` wide for the farthest sighting of a track, in steps of powers of two."""
+    n = len(tracks.xyz)
+    far = torch.zeros(n).scatter_reduce_(0, tracks.track, tracks.ray_depth, "amax")
+    focal = float(rec.cameras.K[:, 0, 0].median())
+    pixels = min(settings.patch_pixels, max(rec.cameras.width, rec.cameras.height) / 32)
+    size = 2.0 ** torch.round(torch.log2((pixels * far / focal).clamp(min=1e-12)))
+    of_track, count = cubes(tracks.xyz, size)
+    middle = torch.zeros(len(count), 3, dtype=torch.float64).index_add_(0, of_track, tracks.xyz.double())
+    edge = torch.zeros(len(count)).scatter_(0, of_track, size)
+    return _Patches(of_track, edge, (middle / count[:, None]).float())
+
+
+def _patch_means(
+    colours: Float[Tensor, "pixels 3"],
+    tracks: DenseTracks,
+    seen: Int[Tensor, " s"],
+    patches: _Patches,
+    settings: SeathruSettings,
+) -> tuple[Float[Tensor, "k 3"], Float[Tensor, " k"], Int[Tensor, " k"]]:
+    """Mean colour and ray depth of each patch one frame shows; patches shown in part only are left out."""
+    patch, which = torch.unique(patches.of_track[tracks.track[seen]], return_inverse=True)
+    count = torch.bincount(which, minlength=len(patch)).float()
+
+    def mean(x: Tensor) -> Tensor:
+        return torch.zeros(len(patch), x.shape[1]).index_add_(0, which, x) / count[:, None]
+
+    offset = (mean(tracks.xyz[tracks.track[seen]]) - patches.middle[patch]).norm(dim=-1) / patches.size[patch]
+    whole = (count >= settings.patch_sightings) & (offset < settings.patch_offset)
+    I, z = mean(colours[tracks.pixel[seen]]), mean(tracks.ray_depth[seen, None])[:, 0]
+    return I[whole], z[whole], patch[whole]
+
+
+def _plausible_water(
+    open_water: Float[Tensor, "m 3"], I: Float[Tensor, "n 3"], ray_depth: Float[Tensor, " n"]
+) -> Float[Tensor, "m 3"]:
+    """Drops what is darker than the dark envelope of the farthest tenth: veil grows with distance, shadow does not."""
+    if len(open_water) == 0 or len(I) == 0:
+        return open_water
+    far = ray_depth >= torch.quantile(ray_depth[:: max(1, len(ray_depth) // 100_000)], 0.9)
+    envelope = torch.quantile(I[far][:100_000], 0.02, dim=0)
+    return open_water[(open_water >= envelope - 0.02).all(-1)]

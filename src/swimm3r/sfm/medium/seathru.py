@@ -1,0 +1,154 @@
+"""The water of a dive from its pictures and their ray depths, without weights (after Sea-Thru, Akkaynak 2019).
+
+Per channel, an observation k of surface point t reads
+
+    I_k = J_t exp(-beta_D(z_k) z_k) + Binf (1 - exp(-beta_B z_k)),   z = ray depth,
+
+and one bounded least-squares problem finds Binf, beta_B and beta_D(z) = a exp(b z) from four kinds of evidence:
+
+    tracks      the same point seen from several distances; J_t is eliminated in closed form (variable projection), so
+                the decay of colour *differences* gives beta_D without any guess about the illuminant
+    dark        the darkest pixels of each range bin are B plus J' T_D with a small common J' (Sea-Thru's B(z))
+    average     the average colour of a range bin decays as T_D from 1 / f (local space average colour, f = 2): decides
+                only what the tracks leave open
+    open water  pixels that look past every surface show Binf; without any, Binf is not far from what is farthest
+
+`water_fit.py` holds the least squares. Depths enter in units of their median, so the fit commutes with any rescaling of
+the scene.
+"""
+
+import numpy as np
+import torch
+from torch import Tensor
+
+from swimm3r.errors import InputError
+from swimm3r.medium import AttenuationCurve, Encoding, Medium, MediumFit, linear_from_srgb
+from swimm3r.progress import Progress, silent
+from swimm3r.scene.frames import Frames
+from swimm3r.scene.reconstruction import Reconstruction
+from swimm3r.sfm.medium.channel_fit import (
+    BINF,
+    LOG_BETA_B,
+    LOG_BETA_D,
+    LOWER,
+    SLOPE,
+    ChannelFit,
+    Pixels,
+    Sightings,
+    fit_channel,
+)
+from swimm3r.sfm.medium.dense_tracks import fuse_depth
+from swimm3r.sfm.medium.samples import WaterSamples, gather_samples
+from swimm3r.sfm.settings import SeathruSettings
+
+
+def estimate_medium(
+    rec: Reconstruction,
+    frames: Frames,
+    settings: SeathruSettings,
+    encoding: Encoding,
+    progress: Progress = silent,
+) -> MediumFit:
+    """The water of a reconstructed dive. Who wants both encodings gathers once and calls `fit_medium` twice."""
+    tracks = fuse_depth(rec, frames, settings.tracks, progress)
+    return fit_medium(gather_samples(rec, frames, tracks, settings, progress), settings, encoding)
+
+
+def fit_medium(samples: WaterSamples, settings: SeathruSettings, encoding: Encoding) -> MediumFit:
+    """The water that explains the samples, on values as stored ("srgb") or in linear light.
+
+    Grey samples are one channel, which is fitted once and stands for all three. Raises InputError where fewer than
+    `settings.min_samples` pixels have a depth.
+    """
+    n = len(samples.ray_depth)
+    if n < settings.min_samples:
+        raise InputError(
+            f"the water cannot be estimated from {n} pixels with known depth",
+            cause="the dense depth stage found almost no surface",
+            hint=f"use clearer or slower footage; at least {settings.min_samples} pixels are needed",
+        )
+    values = [samples.I.double(), samples.open_water.double()]
+    if encoding == "linear":
+        values = [linear_from_srgb(v) for v in values]
+    if samples.grey:
+        values = [v.mean(1, keepdim=True) for v in values]
+    colour, open_water = (v.numpy() for v in values)
+    ray_depth = samples.ray_depth.double().numpy()
+    unit = float(np.median(ray_depth))
+    z = ray_depth / unit
+    frame = np.unique(samples.frame.numpy(), return_inverse=True)[1]
+    chosen = _telling_rows(samples, z, settings)
+    channels = []
+    for c in range(colour.shape[1]):
+        pixels = Pixels(colour[:, c], colour.mean(1), z, frame, open_water[:, c])
+        sightings = None
+        if chosen is not None:
+            rows, point = chosen
+            sightings = Sightings(rows, z[rows], point, frame[rows], colour[rows, c])
+        channels.append(fit_channel(pixels, sightings, settings))
+    return _medium_fit(channels * (3 // len(channels)), unit, ray_depth, settings, encoding)
+
+
+def _telling_rows(
+    samples: WaterSamples, z: np.ndarray, settings: SeathruSettings
+) -> tuple[np.ndarray, np.ndarray] | None:
+    """Rows and point numbers of the points with the largest ratio of depths, at most `max_observations` rows."""
+    track = samples.track.numpy()
+    exposed = ((samples.I.amin(-1) > settings.black) & (samples.I.amax(-1) < settings.saturated)).numpy()
+    rows = np.flatnonzero((track >= 0) & exposed)
+    if len(rows) == 0:
+        return None
+    _, point = np.unique(track[rows], return_inverse=True)
+    log_z = np.log(z[rows])
+    near, far = np.full(point.max() + 1, np.inf), np.full(point.max() + 1, -np.inf)
+    np.minimum.at(near, point, log_z)
+    np.maximum.at(far, point, log_z)
+    spread = far - near
+    order = np.argsort(-spread, kind="stable")
+    count = np.bincount(point)[order].cumsum()
+    chosen = np.zeros(len(order), dtype=bool)
+    chosen[order[(count <= settings.max_observations) & (spread[order] > np.log(settings.min_depth_ratio))]] = True
+    rows = rows[chosen[point]]
+    if chosen.sum() < settings.min_tracks:
+        return None
+    _, point = np.unique(track[rows], return_inverse=True)
+    return rows, point
+
+
+def _medium_fit(
+    channels: list[ChannelFit], unit: float, ray_depth: np.ndarray, settings: SeathruSettings, encoding: Encoding
+) -> MediumFit:
+    """From medians back to the scene's unit, with the flags."""
+    x = np.stack([c.x for c in channels])
+    std = settings.std_inflation * np.stack([np.sqrt(np.diag(c.covariance).clip(0)) for c in channels])
+    z_range = np.quantile(ray_depth, [0.002, 0.998])
+    beta_B = np.exp(x[:, LOG_BETA_B])
+    beta_D = np.exp(x[:, LOG_BETA_D] + x[:, SLOPE])  # at the median depth, 1 in these units
+    at_median = np.array([0, 0, 1.0, 1.0, 0, 0])
+    relative_D = settings.std_inflation * np.sqrt(
+        np.array([max(0.0, at_median @ c.covariance @ at_median) for c in channels])
+    )
+    relative = {
+        "Binf": std[:, BINF] / x[:, BINF].clip(1e-6),
+        "beta_D": relative_D,
+        "beta_B": std[:, LOG_BETA_B],
+    }
+    inside = (x[:, [BINF, LOG_BETA_B, LOG_BETA_D]] > LOWER[[BINF, LOG_BETA_B, LOG_BETA_D]] + 1e-3).all(-1)
+
+    def tensor(value: np.ndarray) -> Tensor:
+        return torch.from_numpy(np.asarray(value, dtype=np.float32))
+
+    return MediumFit(
+        medium=Medium(tensor(x[:, BINF]), tensor(beta_D / unit), tensor(beta_B / unit)),
+        curve=AttenuationCurve(
+            tensor(np.exp(x[:, LOG_BETA_D]) / unit), tensor(x[:, SLOPE] / unit), torch.zeros(3), torch.zeros(3)
+        ),
+        std=Medium(
+            tensor(std[:, BINF]), tensor(relative_D * beta_D / unit), tensor(std[:, LOG_BETA_B] * beta_B / unit)
+        ),
+        identifiable={
+            name: torch.from_numpy((value < settings.identifiable_std) & inside) for name, value in relative.items()
+        },
+        z_range=(float(z_range[0]), float(z_range[1])),
+        encoding=encoding,
+    )

@@ -1,0 +1,1 @@
+"""Dense depth by plane-sweep stereo from known poses."""

@@ -1,0 +1,268 @@
+"""Dense depth of posed frames without learned weights: a multi-view plane sweep and what survives a second opinion.
+
+For every frame: source views by baseline and shared points; a cost volume over planes even in inverse depth (1 - NCC,
+which neither contrast lost with distance nor veil added changes); semi-global smoothing (Hirschmueller 2008); slanted
+windows refined from neighbour to neighbour (Bleyer et al. 2011) at full size. Then, over all frames, a depth stays
+where it is well correlated, where moving it makes it worse, and where other frames' depths agree; open water and bare
+sand come out unknown (0), not invented. The work is done on undistorted pictures, the result lies on the frame's grid.
+"""
+
+import hashlib
+import os
+import shutil
+from collections.abc import Callable, Sequence
+from concurrent.futures import ThreadPoolExecutor, as_completed
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+import torch
+from jaxtyping import Float
+from torch import Tensor
+
+from swimm3r.cameras import Cameras
+from swimm3r.io.files.array_file import Layout, read_arrays
+from swimm3r.io.files.atomic import atomic_path, write_text
+from swimm3r.io.files.cache import ArrayCache
+from swimm3r.io.files.damage import remake
+from swimm3r.progress import Progress, silent
+from swimm3r.scene.frames import Frames
+from swimm3r.scene.reconstruction import DepthMap, DepthMaps, Reconstruction
+from swimm3r.sfm.plane_sweep import consistency, kernels
+from swimm3r.sfm.plane_sweep.views import (
+    View,
+    choose_sources,
+    depth_range,
+    halved,
+    likely_edge,
+    make_view,
+    on_frame_grid,
+    undistorted_cameras,
+)
+from swimm3r.sfm.settings import PlaneSweepSettings
+
+_RAW = ".raw"  # beside the finished maps: each frame's own opinion, removed once every frame is finished
+_RAW_LAYOUTS = {"inverse_depth": Layout("h w"), "correlation": Layout("h w")}
+_STAMP = ".made_from"  # of which cameras, points and settings the folder's maps were made
+_NEIGHBOURS = 8  # frames asked whether they agree
+_MOST_SOURCES = 16
+_REACH = np.arange(-3, 4)  # the slanted windows' pixels, along each axis
+_ASIDE = 2.5  # source pixels beside a match where it must be worse; nearer, small errors of the poses blur it
+
+
+@dataclass(frozen=True)
+class RawDepth:
+    """One frame's own opinion, before others are asked; 0 = unknown."""
+
+    inverse_depth: Float[Tensor, "h w"]  # 1 / z_depth
+    correlation: Float[Tensor, "h w"]  # NCC with the best half of the sources, 0..1
+
+
+def estimate_depth(
+    rec: Reconstruction, frames: Frames, settings: PlaneSweepSettings, progress: Progress = silent
+) -> DepthMaps:
+    """The depth maps of every registered frame, written to `rec.depth` on the frames' own pixel grid.
+
+    Maps of an interrupted call with the same cameras, points and settings are kept, others are made anew. A frame that
+    sees fewer than 8 points, or has no source views, gets a map without depth.
+    """
+    folder = rec.depth.folder
+    _claim(folder, _stamp(rec, frames, settings))
+    canvas = undistorted_cameras(rec.cameras, settings.long_side)
+    sources = choose_sources(rec, max(settings.sources, _NEIGHBOURS), settings.angle_deg)
+    pose_error = _pose_error(rec, canvas)
+    position = {name: k for k, name in enumerate(frames.names)}
+    views, raws = ArrayCache(max_bytes=256 << 20), ArrayCache(max_bytes=256 << 20)
+
+    def view(i: int) -> View:
+        def load() -> tuple[np.ndarray, ...]:
+            k = position[rec.names[i]]
+            made = make_view(frames.image(k), frames.mask(k), rec.cameras[i], canvas[i])
+            return made.grey.numpy(), made.detail.numpy(), made.seen.numpy()
+
+        grey, detail, seen = (torch.from_numpy(a.copy()) for a in views.get(i, load))
+        return View(grey, detail, seen, canvas.K[i], canvas[i].world2cam[0])
+
+    def raw_path(i: int) -> Path:
+        return folder / _RAW / f"{rec.names[i]}.npz"
+
+    def raw_of(i: int) -> RawDepth:
+        def load() -> tuple[np.ndarray, ...]:
+            stored = read_arrays(raw_path(i), _RAW_LAYOUTS, remake(folder))
+            return stored["inverse_depth"], stored["correlation"]
+
+        return RawDepth(*(torch.from_numpy(a.copy()) for a in raws.get(i, load)))
+
+    def sweep_one(i: int) -> None:
+        span, compared = depth_range(rec, i), sources[i][: settings.sources]
+        raw = RawDepth(torch.zeros(canvas.height, canvas.width), torch.zeros(canvas.height, canvas.width))
+        if span is not None and compared:
+            raw = sweep(view(i), [view(j) for j in compared], span, settings)
+        with atomic_path(raw_path(i)) as draft:
+            np.savez(draft, inverse_depth=raw.inverse_depth.numpy(), correlation=raw.correlation.numpy())
+
+    def agree_one(i: int) -> None:
+        fused = consistent(raw_of(i), [raw_of(j) for j in sources[i]], canvas[[i, *sources[i]]], pose_error, settings)
+        picture = frames.image(position[rec.names[i]])
+        q, confidence = on_frame_grid(
+            fused.inverse_depth, fused.correlation, view(i).grey, picture, rec.cameras[i], canvas[i]
+        )
+        usable = (q > 0) & frames.mask(position[rec.names[i]])
+        z_depth = torch.where(usable, 1 / q.clamp(min=1e-12), 0.0)
+        rec.depth.write(rec.names[i], DepthMap(z_depth, torch.where(usable, confidence, 0.0)))
+
+    todo = [i for i, name in enumerate(rec.names) if name not in rec.depth]
+    wanted = sorted({j for i in todo for j in (i, *sources[i])})
+    missing = [i for i in wanted if not raw_path(i).is_file()]
+    _each(sweep_one, missing, len(wanted), settings.threads, lambda done, total: progress("depth", done, total))
+    _each(
+        agree_one, todo, len(rec.names), settings.threads, lambda done, total: progress("depth agreement", done, total)
+    )
+    shutil.rmtree(folder / _RAW, ignore_errors=True)
+    return rec.depth
+
+
+def sweep(
+    reference: View, sources: Sequence[View], z_range: tuple[float, float], settings: PlaneSweepSettings
+) -> RawDepth:
+    """Depth of one view from the others, between two z depths; 0 where the pictures do not determine it."""
+    if not 1 <= len(sources) <= _MOST_SOURCES:
+        raise ValueError(f"a sweep takes 1 to {_MOST_SOURCES} sources, got {len(sources)}")
+    keep = (len(sources) + 1) // 2
+    noise, edge = settings.noise**2, likely_edge(reference.grey)
+    half, halves = halved(reference), [halved(source) for source in sources]
+    H, e = _transfers(half, halves)
+    planes = _planes(half.grey.shape, H, e, z_range, settings.planes)
+    volume = kernels.sweep_costs(
+        half.detail.numpy(), *_stacked(halves, settings.window), H, e, planes, settings.window, noise, keep
+    )
+    total = kernels.semi_global(volume, half.grey.numpy(), settings.smooth, 8 * settings.smooth, edge)
+    surface = kernels.doubled(kernels.best_plane(total, planes))
+
+    H, e = _transfers(reference, sources)
+    detail, seen = _stacked(sources, 1)
+    every = np.stack(np.meshgrid(_REACH, _REACH), -1).reshape(-1, 2).astype(np.float32)
+    chequered = every[np.abs(every).sum(1) % 2 == 0]  # half of the window judges as well as all of it
+    odd = every[(np.abs(every) % 2 == 1).all(1)]  # and a third finds as well
+    cost = peak = np.zeros(reference.grey.shape, np.float32)
+    for n in range(settings.rounds + 1):
+        offsets, step, reach = (odd, 0.5 if n else 1.0, (3, 1)[n % 2])
+        if n == settings.rounds:  # no more moves: how good is it, and does leaving it make it worse
+            offsets, step, reach = chequered, _ASIDE, 0
+        surface, cost, peak = kernels.refine(
+            reference.detail.numpy(), reference.grey.numpy(), reference.seen.numpy(), detail, seen, H, e, surface,
+            offsets, noise, edge, keep, settings.smooth_fine, step, reach,
+        )  # fmt: skip
+    q = np.ascontiguousarray(surface[..., 0])
+    cost, peak = _with_neighbours(cost), _with_neighbours(peak)
+    sure = (1 - cost >= settings.min_ncc) & (peak >= settings.min_peak * (cost + 0.03)) & (q > 0)
+    return RawDepth(torch.from_numpy(np.where(sure, q, 0)), torch.from_numpy(np.where(sure, 1 - cost, 0)))
+
+
+def consistent(
+    raw: RawDepth, others: Sequence[RawDepth], cameras: Cameras, pose_error: float, settings: PlaneSweepSettings
+) -> RawDepth:
+    """The depths that at least `settings.agreeing` other frames share, averaged with theirs; specks removed.
+
+    `cameras` are the frame's own and then those of the others; `pose_error` is the usual reprojection error, pixels.
+    The confidence, in place of `correlation`, is how far the NCC exceeds its threshold times how many agree (3 = 1).
+    """
+    if not others:
+        return RawDepth(torch.zeros_like(raw.inverse_depth), torch.zeros_like(raw.correlation))
+    (K, *Ks), (pose, *poses) = cameras.K.numpy(), cameras.world2cam.numpy()
+    there = [_transfer(K, pose, K_other, other) for K_other, other in zip(Ks, poses, strict=True)]
+    back = [_transfer(K_other, other, K, pose) for K_other, other in zip(Ks, poses, strict=True)]
+    fused, count = consistency.agreement(
+        raw.inverse_depth.numpy(), np.stack([other.inverse_depth.numpy() for other in others]),
+        np.stack([H for H, _ in there]), np.stack([e for _, e in there]),
+        np.stack([H for H, _ in back]), np.stack([e for _, e in back]), settings.tolerance, pose_error,
+    )  # fmt: skip
+    fused = consistency.without_specks(np.where(count >= settings.agreeing, fused, 0), 0.03, settings.speck)
+    above = (raw.correlation.numpy() - settings.min_ncc) / (1 - settings.min_ncc)
+    confidence = np.where(fused > 0, above.clip(0.05, 1) * np.minimum(count / 3, 1), 0).astype(np.float32)
+    return RawDepth(torch.from_numpy(fused), torch.from_numpy(confidence))
+
+
+def _with_neighbours(values: np.ndarray) -> np.ndarray:
+    """Means of 3 x 3 pixels: one pixel's correlation is a lottery where lines or grains are missing."""
+    padded = torch.nn.functional.pad(torch.from_numpy(values)[None, None], (1, 1, 1, 1), mode="replicate")
+    return torch.nn.functional.avg_pool2d(padded, 3, stride=1)[0, 0].numpy()
+
+
+def _pose_error(rec: Reconstruction, canvas: Cameras) -> float:
+    """The median reprojection error of the sparse points in canvas pixels, at most 1.5."""
+    error = rec.points.error[rec.points.error.isfinite()]
+    if not len(error):
+        return 0.0
+    return min(1.5, float(error.median() * canvas.K[0, 0, 0] / rec.cameras.K[0, 0, 0]))
+
+
+def _transfer(K: np.ndarray, pose: np.ndarray, K_there: np.ndarray, pose_there: np.ndarray) -> tuple:
+    """H and e that take a pixel index at inverse depth q to H x + q e in another view."""
+    half = np.array([[0, 0, 0.5], [0, 0, 0.5], [0, 0, 0]])  # pixel centres stand at +0.5, indices do not
+    there = pose_there @ np.linalg.inv(pose)
+    K_there = K_there - half
+    return K_there @ there[:3, :3] @ np.linalg.inv(K - half), K_there @ there[:3, 3]
+
+
+def _transfers(reference: View, sources: Sequence[View]) -> tuple[np.ndarray, np.ndarray]:
+    pairs = [
+        _transfer(*(t.double().numpy() for t in (reference.K, reference.world2cam, s.K, s.world2cam))) for s in sources
+    ]
+    return np.stack([H for H, _ in pairs]), np.stack([e for _, e in pairs])
+
+
+def _stacked(sources: Sequence[View], margin: int) -> tuple[np.ndarray, np.ndarray]:
+    """Pictures of the sources, and where a window of half width `margin` lies wholly in what they see."""
+    detail = torch.stack([s.detail for s in sources])
+    unseen = torch.stack([(~s.seen).float() for s in sources])[:, None]
+    near = torch.nn.functional.max_pool2d(unseen, 2 * margin + 1, stride=1, padding=margin)[:, 0]
+    return detail.numpy(), (near == 0).numpy()
+
+
+def _planes(shape: torch.Size, H: np.ndarray, e: np.ndarray, z_range: tuple[float, float], most: int) -> np.ndarray:
+    """Inverse depths from far to near, evenly spaced: one per pixel of the largest motion, 32 to `most` of them."""
+    near, far = z_range
+    h, w = shape
+    x = np.array([[0.5 * w, 0.5 * h, 1], [0, 0, 1], [w, 0, 1], [0, h, 1], [w, h, 1]])
+    ends = [x @ H.transpose(0, 2, 1) + q * e[:, None] for q in (1 / far, 1 / near)]
+    a, b = (p[..., :2] / np.maximum(p[..., 2:], 1e-3) for p in ends)
+    motion = float(np.median(np.linalg.norm(a - b, axis=-1), axis=1).max())
+    return np.linspace(1 / far, 1 / near, int(np.clip(np.ceil(motion), 32, most)))
+
+
+def _stamp(rec: Reconstruction, frames: Frames, settings: PlaneSweepSettings) -> str:
+    digest = hashlib.sha256(repr((settings, rec.names, rec.cameras.width, rec.cameras.height)).encode())
+    masks = [str(frame.mask) for frame in frames if frame.name in set(rec.names)]
+    digest.update(repr(masks).encode())
+    for tensor in (rec.cameras.K, rec.cameras.distortion, rec.cameras.cam2world, rec.points.xyz, rec.tracks.point):
+        digest.update(np.ascontiguousarray(tensor.numpy()).tobytes())
+    return digest.hexdigest()
+
+
+def _claim(folder: Path, stamp: str) -> None:
+    """Empty the folder of maps unless they were made from the same cameras, points and settings."""
+    path = folder / _STAMP
+    if path.is_file() and path.read_bytes() == stamp.encode():
+        return
+    shutil.rmtree(folder / _RAW, ignore_errors=True)
+    for stale in folder.rglob("*.npz"):
+        stale.unlink()
+    write_text(path, stamp)
+
+
+def _each(
+    work: Callable[[int], None], items: Sequence[int], total: int, threads: int, tell: Callable[[int, int], None]
+) -> None:
+    """Do the work for every item on several threads (the kernels release the interpreter); `tell` may stop it."""
+    done = total - len(items)
+    with ThreadPoolExecutor(threads or min(8, os.cpu_count() or 1)) as pool:
+        pending = [pool.submit(work, item) for item in items]
+        try:
+            for future in as_completed(pending):
+                future.result()
+                done += 1
+                tell(done, total)
+        except BaseException:
+            pool.shutdown(wait=True, cancel_futures=True)
+            raise

@@ -1,0 +1,234 @@
+"""What the plane sweep looks at: which frames to compare, how far to look, and undistorted pictures of one size.
+
+Sweeping needs straight epipolar lines, so the work is done on a pinhole canvas at working size; depth along the optical
+axis is the same number on both grids, and `on_frame_grid` reads it back at every pixel of the distorted frame.
+"""
+
+from dataclasses import dataclass
+from functools import lru_cache
+
+import numpy as np
+import torch
+from jaxtyping import Bool, Float
+from scipy import sparse
+from torch import Tensor
+
+from swimm3r.cameras import Cameras, directions, distort, image_directions, pixel_grid, project, resized
+from swimm3r.scene.reconstruction import Reconstruction
+from swimm3r.sfm.plane_sweep import consistency
+
+_FEWEST_POINTS = 8  # in a frame, to know its depth range
+_WIDEST = 2.5  # tangent of the half angle that undistorted pictures cover at most: 136 degrees
+_CANDIDATES = 40  # frames sharing most points that are considered as sources
+_SLOW = 12.0  # pixels at working size: what varies slower is no surface texture
+_FAST = 0.7  # pixels: what varies faster is noise, or the lines of interlaced video
+
+
+@dataclass(frozen=True)
+class View:
+    """A picture as the sweep sees it: grey, undistorted, at working size."""
+
+    grey: Float[Tensor, "h w"]
+    detail: Float[Tensor, "h w"]  # grey without what varies slowly: veil and vignetting move with the camera
+    seen: Bool[Tensor, "h w"]  # inside the picture and its mask
+    K: Float[Tensor, "3 3"]
+    world2cam: Float[Tensor, "4 4"]
+
+
+def choose_sources(rec: Reconstruction, count: int, angle_deg: float) -> list[list[int]]:
+    """For each frame the frames to compare it with, best first: each adds most to how well the shared points are seen.
+
+    A point counts by its triangulation angle (a bell around `angle_deg`, three times wider above), fully where both
+    frames track it, a quarter where it only falls into the picture, and less the better it is covered already.
+    """
+    xyz, centres = rec.points.xyz.double(), rec.cameras.centres.double()
+    frame, point = rec.tracks.frame.numpy(), rec.tracks.point.numpy()
+    seen = np.unique(np.stack([frame, point]), axis=1)
+    track = sparse.csr_matrix(
+        (np.ones(seen.shape[1], np.float32), (seen[0], seen[1])), (len(rec.names), max(len(xyz), 1))
+    )
+    chosen: list[list[int]] = []
+    for i in range(len(rec.names)):
+        mine = track[i].indices
+        shared = np.asarray(track[:, mine] @ np.ones(len(mine), np.float32))
+        shared[i] = 0
+        near_by = [int(j) for j in np.argsort(-shared, kind="stable")[:_CANDIDATES] if shared[j] > 0]
+        chosen.append([])
+        if not near_by:
+            continue
+        P = xyz[mine]
+        to_me = torch.nn.functional.normalize(centres[i] - P, dim=-1)
+        to_them = torch.nn.functional.normalize(centres[near_by][:, None] - P, dim=-1)
+        angle = torch.rad2deg(torch.arccos((to_me * to_them).sum(-1).clamp(-1, 1)))
+        width = torch.where(angle < angle_deg, 0.4 * angle_deg, 1.2 * angle_deg)
+        pixels, z = project(rec.cameras[near_by], P.expand(len(near_by), -1, -1))
+        inside = (z > 0) & ((pixels > 0) & (pixels < torch.tensor([rec.cameras.width, rec.cameras.height]))).all(-1)
+        both = torch.from_numpy(track[near_by][:, mine].toarray() > 0)
+        weight = torch.exp(-0.5 * ((angle - angle_deg) / width) ** 2)
+        weight = weight * torch.where(both, 1.0, torch.where(inside, 0.25, 0.0))
+        covered = torch.zeros(len(mine), dtype=torch.float64)
+        for _ in range(min(count, len(near_by))):
+            gain = (weight / (0.5 + covered)).sum(-1)
+            best = int(gain.argmax())
+            if gain[best] <= 0:
+                break
+            chosen[i].append(near_by[best])
+            covered = covered + weight[best]
+            weight[best] = 0
+    return chosen
+
+
+def depth_range(rec: Reconstruction, i: int) -> tuple[float, float] | None:
+    """The z depths to search in frame i, from its points with a margin; None where it sees too few.
+
+    The far end lies well behind the points: open water holds none, and what stands in it may still be matched.
+    """
+    mine = torch.unique(rec.tracks.point[rec.tracks.frame == i])
+    z = project(rec.cameras[i], rec.points.xyz[mine][None])[1]
+    z = z[z > 0].numpy()
+    if len(z) < _FEWEST_POINTS:
+        return None
+    low, high = np.quantile(z, [0.01, 0.99])
+    return float(low) / 1.4, float(high) * 2.5
+
+
+def undistorted_cameras(cameras: Cameras, long_side: int) -> Cameras:
+    """Pinhole cameras of one common, even size that cover what the frames show, `long_side` setting the scale."""
+    scale = min(1.0, long_side / max(cameras.width, cameras.height))
+    work = resized(cameras, max(2, round(cameras.width * scale)), max(2, round(cameras.height * scale)))
+    lenses, which = _lenses(work)
+    border = _border(work.width, work.height)[None]
+    extents = []
+    for k in range(len(lenses)):
+        rays = directions(lenses[k], border)[0, :, :2]
+        rays = rays[rays.isfinite().all(-1)].clamp(-_WIDEST, _WIDEST)
+        extents.append(torch.cat([rays.amin(0), rays.amax(0)]))
+    extent = torch.stack(extents)
+    focal = torch.stack([lenses.K[:, 0, 0], lenses.K[:, 1, 1]], -1).to(extent)
+    size = ((extent[:, 2:] - extent[:, :2]) * focal).amax(0).tolist()
+    width, height = (2 * int(np.ceil(s / 2 - 1e-3)) for s in size)
+    K = torch.zeros(len(lenses), 3, 3, dtype=torch.float64)
+    K[:, 0, 0], K[:, 1, 1], K[:, 2, 2] = focal[:, 0], focal[:, 1], 1
+    K[:, :2, 2] = -extent[:, :2] * focal
+    return Cameras(K[which], cameras.distortion[:, :0], cameras.cam2world, width, height)
+
+
+def make_view(picture: Float[Tensor, "h w 3"], mask: Bool[Tensor, "h w"], lens: Cameras, canvas: Cameras) -> View:
+    """A frame undistorted onto the canvas; `lens` and `canvas` are its own camera and its pinhole one."""
+    import cv2
+
+    grey = (picture @ torch.tensor([0.299, 0.587, 0.114])).numpy()
+    scale = float(canvas.K[0, 0, 0] / lens.K[0, 0, 0])
+    if scale < 1:  # smaller first, by area, so that nothing aliases
+        size = (max(2, round(lens.width * scale)), max(2, round(lens.height * scale)))
+        grey = cv2.resize(grey, size, interpolation=cv2.INTER_AREA)
+        usable = cv2.resize(mask.numpy().astype(np.float32), size, interpolation=cv2.INTER_AREA) > 0.999
+        lens = resized(lens, *size)
+    else:
+        usable = mask.numpy()
+    u, v, inside = _distorted_grid(_key(lens), _key(canvas))
+    grey = cv2.remap(grey, u, v, cv2.INTER_LINEAR, borderMode=cv2.BORDER_REPLICATE)
+    seen = inside & (cv2.remap(usable.astype(np.float32), u, v, cv2.INTER_LINEAR) > 0.999)
+    share = cv2.GaussianBlur(seen.astype(np.float32), (0, 0), _SLOW, borderType=cv2.BORDER_REFLECT)
+    slow = cv2.GaussianBlur(np.where(seen, grey, 0), (0, 0), _SLOW, borderType=cv2.BORDER_REFLECT)
+    fine = cv2.GaussianBlur(grey, (0, 0), _FAST)
+    detail = np.where(seen, fine - slow / np.maximum(share, 1e-6), 0).astype(np.float32)
+    return View(
+        torch.from_numpy(grey), torch.from_numpy(detail), torch.from_numpy(seen), canvas.K[0], canvas.world2cam[0]
+    )
+
+
+def halved(view: View) -> View:
+    """The view at half its size; its sides are even."""
+
+    def mean(values: Tensor) -> Tensor:
+        return torch.nn.functional.avg_pool2d(values[None, None].float(), 2)[0, 0]
+
+    K = torch.diag(torch.tensor([0.5, 0.5, 1.0], dtype=view.K.dtype)) @ view.K
+    return View(mean(view.grey), mean(view.detail), mean(view.seen) > 0.999, K, view.world2cam)
+
+
+def likely_edge(grey: Float[Tensor, "h w"]) -> float:
+    """A change of grey that makes a depth edge likely: 0.8 of the contrast that windows of 9 pixels usually have."""
+    window = min(9, *grey.shape)
+    mean, square = (torch.nn.functional.avg_pool2d(g[None, None], window, stride=4) for g in (grey, grey * grey))
+    return max(2 / 255, 0.8 * float((square - mean * mean).clamp(min=0).sqrt().median()))
+
+
+def on_frame_grid(
+    values: Float[Tensor, "h w"],
+    also: Float[Tensor, "h w"],
+    guide: Float[Tensor, "h w"],
+    picture: Float[Tensor, "fh fw 3"],
+    lens: Cameras,
+    canvas: Cameras,
+) -> tuple[Float[Tensor, "fh fw"], Float[Tensor, "fh fw"]]:
+    """`values` and `also` of the canvas at the pixels of the frame, along the edges of the picture; 0 = unknown."""
+    u, v = _canvas_grid(_key(lens), _key(canvas))
+    wanted = (picture @ torch.tensor([0.299, 0.587, 0.114])).numpy().ravel()
+    out, read = consistency.look_up(values.numpy(), also.numpy(), guide.numpy(), u, v, wanted, likely_edge(guide), 0.03)
+    shape = picture.shape[:2]
+    return torch.from_numpy(out.reshape(shape)), torch.from_numpy(read.reshape(shape))
+
+
+_Key = tuple[tuple[float, ...], tuple[float, ...], int, int, str]
+
+
+def _key(camera: Cameras) -> _Key:
+    K, distortion = camera.K[0].flatten().tolist(), camera.distortion[0].tolist()
+    return tuple(K), tuple(distortion), camera.width, camera.height, camera.model
+
+
+def _camera(key: _Key) -> Cameras:
+    K, distortion, width, height, model = key
+    return Cameras(
+        torch.tensor(K, dtype=torch.float64).reshape(1, 3, 3),
+        torch.tensor(distortion, dtype=torch.float64).reshape(1, -1),
+        torch.eye(4, dtype=torch.float64)[None],
+        width,
+        height,
+        model,
+    )
+
+
+@lru_cache(maxsize=4)  # one lens per clip as a rule
+def _distorted_grid(lens_key: _Key, canvas_key: _Key) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """For every canvas pixel its place in the frame (index coordinates), and whether the frame shows it."""
+    lens, canvas = _camera(lens_key), _camera(canvas_key)
+    rays = image_directions(canvas).double()[..., :2]
+    pixels = distort(rays, lens.distortion[:, None], lens.model) @ lens.K[0, :2, :2].T + lens.K[0, :2, 2]
+    border = directions(lens, _border(lens.width, lens.height)[None])[0, :, :2]
+    reach = torch.linalg.vector_norm(border[border.isfinite().all(-1)], dim=-1).max()
+    inside = ((pixels > 0) & (pixels < torch.tensor([lens.width, lens.height]))).all(-1)
+    inside &= torch.linalg.vector_norm(rays, dim=-1) <= reach * 1.001  # beyond, the lens model may fold back
+    u, v = (pixels - 0.5).float().numpy().transpose(2, 0, 1)
+    return np.ascontiguousarray(u), np.ascontiguousarray(v), inside.numpy()
+
+
+@lru_cache(maxsize=4)
+def _canvas_grid(lens_key: _Key, canvas_key: _Key) -> tuple[np.ndarray, np.ndarray]:
+    """For every pixel of the frame its place on the canvas (index coordinates), -9 where it has none."""
+    lens, canvas = _camera(lens_key), _camera(canvas_key)
+    grid = pixel_grid(lens.height, lens.width).double().reshape(1, -1, 2)
+    rays = directions(lens, grid)[0]
+    at = (rays @ canvas.K[0].T)[:, :2] - 0.5
+    u, v = torch.where(rays.isfinite().all(-1, keepdim=True), at, -9.0).numpy().T
+    return np.ascontiguousarray(u), np.ascontiguousarray(v)
+
+
+def _lenses(cameras: Cameras) -> tuple[Cameras, torch.Tensor]:
+    """The distinct intrinsics among cameras, and which each camera has."""
+    rows = torch.cat([cameras.K.flatten(1), cameras.distortion], -1)
+    unique, which = torch.unique(rows, dim=0, return_inverse=True)
+    first = [int((which == k).nonzero()[0]) for k in range(len(unique))]
+    return cameras[first], which
+
+
+def _border(width: int, height: int) -> Float[Tensor, "n 2"]:
+    """Points along the outline of a picture, and the middle lines, where a bulging lens reaches farthest."""
+    x = torch.linspace(0, width, 65, dtype=torch.float64)
+    y = torch.linspace(0, height, 65, dtype=torch.float64)
+    return torch.cat(
+        [torch.stack([x, torch.full_like(x, v)], -1) for v in (0, height)]
+        + [torch.stack([torch.full_like(y, u), y], -1) for u in (0, width)]
+    )

@@ -1,0 +1,1 @@
+"""The student network: MASt3R with low-rank adapters and the physics head, and its losses."""

@@ -1,0 +1,1 @@
+"""Densification: new primitives where they are needed, dead ones relocated or removed."""

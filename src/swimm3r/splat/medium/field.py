@@ -1,0 +1,217 @@
+"""The water as a field over ray directions: A_phi of Eq. ambient_medium.
+
+    (Binf, beta_B, beta_D)(u, t) = sigma_med[A_phi(SH(d(u)), gamma(t))]
+
+SH are the real spherical harmonics of degrees 0..3 of the pixel's unit ray in world axes. gamma(t), in dynamic maps
+alone, is a learned linear map of sines and cosines of octaves of t, 0..1 over the clip: it is defined at times that no
+training frame has. A_phi is a 1x1 convolutional network with ReLU hidden layers, sigma_med a sigmoid for Binf and a
+softplus for the betas, which are per unit of ray depth. The field is smooth, so it is evaluated on a grid of pixels and
+interpolated in between (stride 1 is exact).
+"""
+
+import math
+from dataclasses import dataclass, replace
+
+import torch
+from jaxtyping import Float
+from torch import Tensor, nn
+from torch.nn.functional import interpolate, sigmoid, softplus
+
+from swimm3r.medium import Medium, MediumFit
+from swimm3r.raster import MediumMaps
+from swimm3r.splat.primitives.beta import inverse_softplus
+from swimm3r.splat.primitives.spherical_harmonics import HARMONICS, spherical_harmonics
+from swimm3r.splat.projection.dispatch import Pinhole
+from swimm3r.splat.shared_settings import MediumFieldSettings
+
+
+class MediumField(nn.Module):
+    """The network, the unit it answers in, and the pixels between the directions it is asked for."""
+
+    length: Tensor  # scene units per working unit; betas are divided by it
+
+    def __init__(self, settings: MediumFieldSettings, dynamic: bool = False) -> None:
+        super().__init__()
+        self.stride = settings.stride
+        width = settings.time_features if dynamic else 0
+        self.gamma = nn.Linear(2 * settings.frequencies, width) if dynamic else None
+        activation = nn.ReLU if settings.activation == "relu" else nn.Sigmoid
+        layers, inputs = [], HARMONICS + width
+        for _ in range(settings.layers):
+            layers += [nn.Conv2d(inputs, settings.hidden, 1, bias=settings.biases), activation()]
+            inputs = settings.hidden
+        self.network = nn.Sequential(*layers, nn.Conv2d(inputs, 9, 1, bias=settings.biases))
+        if settings.model == "none":
+            self.gamma, self.network = None, nn.Sequential()
+        self.register_buffer("length", torch.ones(()))
+
+    @property
+    def is_clear(self) -> bool:
+        """Whether there is no water, wherever one looks."""
+        return not len(self.network)
+
+    def forward(
+        self, directions: Float[Tensor, "h w 3"], time: Float[Tensor, ""] | None = None
+    ) -> Float[Tensor, "9 h w"]:
+        """Binf, beta_B and beta_D, in this order, of unit directions in world axes, at a time in 0..1 of the clip."""
+        if self.is_clear:
+            return directions.new_zeros(9, *directions.shape[:2])
+        features = spherical_harmonics(directions)
+        if self.gamma is not None:
+            assert time is not None
+            octaves = math.pi * 2.0 ** torch.arange(self.gamma.in_features // 2).to(features)
+            angles = octaves * time.to(features)
+            now = self.gamma(torch.cat([angles.sin(), angles.cos()]))
+            features = torch.cat([features, now.expand(*features.shape[:2], -1)], -1)
+        raw = self.network(features.permute(2, 0, 1)[None])[0]
+        return torch.cat([sigmoid(raw[:3]), softplus(raw[3:]) / self.length])
+
+
+NO_WATER = MediumField(MediumFieldSettings(model="none"))
+"""Clear water before black."""
+
+
+@dataclass(frozen=True)
+class FieldGrid:
+    """The field on a grid of one camera's pixels, corners included."""
+
+    values: Float[Tensor, "9 gh gw"]
+    step: tuple[float, float]  # pixels between neighbours, down and right
+
+
+def initial_field(
+    medium: Medium | None, settings: MediumFieldSettings, rng: torch.Generator, dynamic: bool = False
+) -> MediumField:
+    """A field that is `medium` (coefficients per working unit) everywhere; without one, grey and thin water.
+
+    Without biases it cannot be, and begins at random.
+    """
+    field = MediumField(settings, dynamic)
+    if settings.model == "none":
+        return field
+    with torch.no_grad():
+        for layer in field.modules():
+            if isinstance(layer, nn.Conv2d | nn.Linear):
+                bound = 1 / math.sqrt(layer.weight.shape[1])  # torch's own default, but from our generator
+                layer.weight.uniform_(-bound, bound, generator=rng)
+                if layer.bias is not None:
+                    layer.bias.uniform_(-bound, bound, generator=rng)
+        if not settings.biases:
+            return field
+        grey = torch.full((3,), 0.5)
+        start = medium or Medium(grey, torch.full((3,), settings.prior), torch.full((3,), settings.prior))
+        last = field.network[-1]
+        assert isinstance(last, nn.Conv2d)
+        assert last.bias is not None
+        last.weight.zero_()  # the last layer learns first, from the medium as it is
+        betas = torch.cat([start.beta_B, start.beta_D]).float().clamp(min=1e-3)
+        last.bias.copy_(torch.cat([start.Binf.float().clamp(0.01, 0.99).logit(), inverse_softplus(betas)]))
+    return field
+
+
+def in_unit(field: MediumField, length: float) -> MediumField:
+    """The trained field itself, now in the scene's own unit, `length` of which are a working unit."""
+    field.length.fill_(length)
+    return field
+
+
+def grid_of(field: MediumField, view: Pinhole, stride: int, time: Float[Tensor, ""] | None = None) -> FieldGrid:
+    """The field on about every stride-th pixel of a view, at a time in 0..1; the pose may carry a gradient."""
+    rows, columns = (max(2, math.ceil((size - 1) / stride) + 1) for size in (view.height, view.width))
+    y = torch.linspace(0.5, view.height - 0.5, rows, device=view.R.device)
+    x = torch.linspace(0.5, view.width - 0.5, columns, device=view.R.device)
+    rays = torch.stack(
+        [
+            ((x - view.cx) / view.fx).expand(rows, columns),
+            ((y - view.cy) / view.fy)[:, None].expand(rows, columns),
+            torch.ones(rows, columns, device=view.R.device),
+        ],
+        -1,
+    )
+    directions = torch.nn.functional.normalize(rays @ view.R, dim=-1)  # R^T to the world
+    step = ((view.height - 1) / (rows - 1), (view.width - 1) / (columns - 1))
+    return FieldGrid(field(directions.to(field.length), time), step)
+
+
+def medium_at_pixels(grid: FieldGrid, height: int, width: int) -> MediumMaps:
+    """The field at every pixel, betas per unit of ray depth."""
+    if grid.values.shape[1:] != (height, width):
+        maps = interpolate(grid.values[None], (height, width), mode="bilinear", align_corners=True)[0]
+    else:
+        maps = grid.values
+    return MediumMaps(maps[:3], maps[3:6], maps[6:])
+
+
+def ray_lengths(view: Pinhole) -> Float[Tensor, "h w"]:
+    """Lengths of the pixels' rays at z = 1."""
+    x = (torch.arange(view.width, device=view.R.device) + 0.5 - view.cx) / view.fx
+    y = (torch.arange(view.height, device=view.R.device) + 0.5 - view.cy) / view.fy
+    return (1 + x * x + (y * y)[:, None]).sqrt()
+
+
+def per_z_depth(maps: MediumMaps, view: Pinhole) -> MediumMaps:
+    """Betas for a rasteriser that blends z depth: times the length of the pixel's ray at z = 1, which is exact."""
+    length = ray_lengths(view).to(maps.binf)
+    return MediumMaps(maps.binf, maps.beta_b * length, maps.beta_d * length)
+
+
+def with_expected_horizon(fit: MediumFit, colour: Float[Tensor, "3"], std: float) -> MediumFit:
+    """The fit with Binf drawn to `colour` (0..1, within `std`) by what it does not know; backscatter in range stays.
+
+    It stays as far as the new Binf can give it. Frames that never look far enough leave Binf open, and a map shows it
+    wherever no frame has looked.
+    """
+    spread = fit.std.Binf.square()
+    sure = std**2 / (std**2 + spread)
+    Binf = sure * fit.medium.Binf + (1 - sure) * colour.to(fit.medium.Binf)
+    z = math.sqrt(fit.z_range[0] * fit.z_range[1])
+    B = fit.medium.Binf * -torch.expm1(-fit.medium.beta_B * z)
+    beta_B = -torch.log1p(-(B / Binf.clamp(min=1e-6)).clamp(max=0.999)) / z
+    return replace(
+        fit,
+        medium=Medium(Binf, fit.medium.beta_D, beta_B),
+        std=replace(fit.std, Binf=(sure * spread).sqrt()),
+    )
+
+
+@dataclass(frozen=True)
+class WaterPrior:
+    """What the reconstruction knows about the water: Binf, then ln beta_B and ln beta_D, as the field orders them."""
+
+    mean: Float[Tensor, "9"]
+    std: Float[Tensor, "9"]
+
+
+def water_prior(fit: MediumFit, length: float, settings: MediumFieldSettings) -> WaterPrior:
+    """The prior of a fit for a field whose betas are per `length` scene units."""
+
+    def logs(name: str) -> tuple[Float[Tensor, "3"], Float[Tensor, "3"]]:
+        beta = getattr(fit.medium, name).double().clamp(min=1e-6)
+        return torch.log(beta * length), getattr(fit.std, name).double() / beta
+
+    mean_B, std_B = logs("beta_B")
+    mean_D, std_D = logs("beta_D")
+    std = torch.cat([fit.std.Binf.double(), std_B, std_D])
+    return WaterPrior(
+        torch.cat([fit.medium.Binf.double(), mean_B, mean_D]).float(), std.clamp(min=settings.least_std).float()
+    )
+
+
+def deviation(grid: FieldGrid, prior: WaterPrior) -> Float[Tensor, ""]:
+    """Mean pseudo-Huber deviation of the field from the prior, in its standard deviations d: 2 sqrt(1 + d^2) - 2.
+
+    It is d^2 near the prior and 2 |d| far from it: open water that is twice as bright to one side must stay possible.
+    """
+    here = torch.cat([grid.values[:3], grid.values[3:].clamp(min=1e-6).log()])
+    d = (here - prior.mean[:, None, None]) / prior.std[:, None, None]
+    return 2 * ((1 + d.square()).sqrt() - 1).mean()
+
+
+def smoothness(grid: FieldGrid) -> Float[Tensor, ""]:
+    """L_smooth (Eq. medium_smooth): mean absolute difference of neighbouring pixels, down plus right, of all nine maps.
+
+    Along an interpolated edge the differences between pixels add up to those between grid points, so those over the
+    step have the same mean wherever neighbouring edges slope the same way.
+    """
+    down, right = grid.values.diff(dim=1), grid.values.diff(dim=2)
+    return down.abs().mean() / grid.step[0] + right.abs().mean() / grid.step[1]

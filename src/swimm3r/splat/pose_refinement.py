@@ -1,0 +1,143 @@
+"""A camera's pose refined against a frozen map: the protocol that test frames are scored under (uwbs.md 4.2).
+
+    cam2world' = cam2world [R(w) | length v]
+
+with a 9-vector (v, w), zero at first, w added to the 6D form of the identity. The loss is the mean absolute difference
+to the picture over its edges: pixels whose Scharr gradient exceeds a few medians. It has a minimum within a few pixels
+only, so that smaller pictures are looked at first.
+"""
+
+from dataclasses import dataclass, replace
+
+import numpy as np
+import torch
+from jaxtyping import Bool, Float
+from torch import Tensor
+
+from swimm3r.cameras import Cameras
+from swimm3r.progress import Progress, silent
+from swimm3r.splat.primitives.beta import select
+from swimm3r.splat.projection.dispatch import Primitives, pinhole, project
+from swimm3r.splat.rendering import SplatMap, in_scene_units, memory_for_views, pictures
+from swimm3r.splat.settings import PoseRefinementSettings
+from swimm3r.splat.training_poses import moved
+from swimm3r.splat.views import undistorted
+
+_DARK = 0.01  # sum of R, G, B below which a pixel is not looked at
+_SMALLEST = 60  # pixels of the longer side, below which a picture no longer tells a pose
+_MARGIN = 0.25  # of the picture, within which primitives outside it are kept: the pose moves
+
+
+@dataclass(frozen=True)
+class RefinedPose:
+    """A camera after refinement, and how well it explains its picture."""
+
+    camera: Cameras  # as given, with another pose
+    start_loss: float  # mean absolute difference over the edges, 0..1
+    loss: float
+
+
+@memory_for_views
+def refine_pose(
+    scene: SplatMap,
+    camera: Cameras,
+    picture: Float[Tensor, "h w 3"],
+    mask: Bool[Tensor, "h w"],
+    settings: PoseRefinementSettings | None = None,
+    progress: Progress = silent,
+    time: float | None = None,
+) -> RefinedPose:
+    """The pose near `camera`'s from which the map looks most like the picture; the given one where none looks better.
+
+    `picture` and `mask` are the frame as prepared, distortion included; `time` is when it was taken, seconds.
+    """
+    settings = settings or PoseRefinementSettings()
+    delta = torch.zeros(9, requires_grad=True)
+    whole = camera.pinhole(scene.settings.long_side)
+    sides = sizes(settings, max(whole.width, whole.height))
+    looks = [_Look(scene, camera, picture, mask, settings, side, time) for side in sides]
+    with torch.no_grad():
+        start = float(looks[-1].loss(delta))
+    done = 0
+    for look, until in zip(looks, ends(settings.steps, len(looks)), strict=True):
+        adam = torch.optim.Adam([delta], lr=settings.rate)
+        for step in range(count := until - done):
+            progress("refining a pose", done + step, settings.steps)
+            adam.param_groups[0]["lr"] = settings.rate * 0.01 ** (step / count)
+            (delta.grad,) = torch.autograd.grad(look.loss(delta), [delta])
+            adam.step()
+        done = until
+    progress("refining a pose", settings.steps, settings.steps)
+    with torch.no_grad():
+        end, pose = float(looks[-1].loss(delta)), looks[-1].pose(delta)
+    if end < start:
+        return RefinedPose(replace(camera, cam2world=pose[None]), start, end)
+    return RefinedPose(camera, start, start)
+
+
+class _Look:
+    """A camera's picture at one size, and how far the map is from it where the camera has moved to."""
+
+    def __init__(
+        self,
+        scene: SplatMap,
+        camera: Cameras,
+        picture: Float[Tensor, "h w 3"],
+        mask: Bool[Tensor, "h w"],
+        settings: PoseRefinementSettings,
+        long_side: int,
+        time: float | None,
+    ) -> None:
+        self._scene, self._now = scene, scene.moment(time)
+        self._canvas = camera.pinhole(long_side)
+        target, seen = undistorted(picture, mask, camera, self._canvas)
+        self._target, self._wanted = target.to(scene.device), edges(target, seen, settings).to(scene.device)
+        self._units = in_scene_units(scene.settings, scene.length)
+        self._primitives = in_sight(scene, self._canvas, self._now)
+
+    def pose(self, delta: Float[Tensor, "9"]) -> Float[Tensor, "4 4"]:
+        """cam2world after the motion."""
+        return moved(self._canvas.cam2world[0], delta, self._scene.length)
+
+    def loss(self, delta: Float[Tensor, "9"]) -> Float[Tensor, ""]:
+        """Mean absolute difference over the edges."""
+        view = pinhole(replace(self._canvas, cam2world=self.pose(delta)[None])).to(self._scene.device)
+        rgb = pictures(self._primitives, self._scene.field, view, self._units, self._now).rgb
+        off = (rgb.permute(1, 2, 0) - self._target).abs().mean(-1)
+        return (off * self._wanted).sum() / self._wanted.sum()
+
+
+def sizes(settings: PoseRefinementSettings, long_side: int) -> list[int]:
+    """Longer sides of the pictures that are compared in turn; `long_side` is the map's own."""
+    largest = min(settings.long_side or long_side, long_side)
+    return [largest >> k for k in range(settings.halvings, 0, -1) if largest >> k >= _SMALLEST] + [largest]
+
+
+def ends(steps: int, count: int) -> list[int]:
+    """The steps after which each of the sizes is left: the smaller ones share the first half."""
+    return [steps * k // (2 * (count - 1)) for k in range(1, count)] + [steps]
+
+
+def edges(
+    target: Float[Tensor, "h w 3"], seen: Bool[Tensor, "h w"], settings: PoseRefinementSettings
+) -> Bool[Tensor, "h w"]:
+    """The pixels that tell a pose: strong gradients; every pixel where the picture has too few of them."""
+    import cv2
+
+    grey = target.mean(-1).numpy()
+    gradient = np.hypot(cv2.Scharr(grey, cv2.CV_32F, 1, 0), cv2.Scharr(grey, cv2.CV_32F, 0, 1))
+    usable = seen & (target.sum(-1) > _DARK)
+    strong = usable & torch.from_numpy(gradient > settings.edge * np.median(gradient))
+    return strong if int(strong.sum()) >= settings.min_edges * strong.numel() else usable
+
+
+def in_sight(scene: SplatMap, canvas: Cameras, now: Float[Tensor, ""] | None = None) -> Primitives:
+    """The primitives that a camera sees, or would after a small motion."""
+    with torch.no_grad():
+        view = pinhole(canvas).to(scene.device)
+        seen = project(scene.primitives, view, in_scene_units(scene.settings, scene.length).render, now)
+    size = torch.tensor([canvas.width, canvas.height]).to(seen.radius)
+    reach = seen.radius[:, None] + _MARGIN * size
+    at = seen.primitives.mean2d
+    near = ((at > -reach) & (at < size + reach)).all(-1) & (seen.primitives.depth > 0)
+    return select(scene.primitives, near)

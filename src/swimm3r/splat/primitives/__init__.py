@@ -1,0 +1,1 @@
+"""The primitives of a map: beta splats and Gaussians, and their spherical harmonics."""

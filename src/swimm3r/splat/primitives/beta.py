@@ -1,0 +1,212 @@
+"""Beta primitives: what one stores, its activations, and the set that training starts from (uwbs.md 1.1, 1.2, 1.6).
+
+    V = L L^T,   L = [[R diag(s_1..3), 0], [L21, L22]],   R = I + A,   A antisymmetric
+
+is a primitive's covariance over position and query q, the view direction (D = 6) or direction and time (D = 7). Stored
+values are before activation: opacity = sigmoid, exponent B = 4 exp, scales s = softplus, which is also L22's diagonal.
+"""
+
+from collections.abc import Iterable, Iterator
+from dataclasses import dataclass
+from typing import Any, NamedTuple, Protocol, TypeVar, runtime_checkable
+
+import torch
+from jaxtyping import Bool, Float, Int
+from scipy.spatial import KDTree
+from torch import Tensor
+from torch.nn.functional import softplus
+
+from swimm3r.cameras import Cameras, project
+from swimm3r.errors import InputError
+from swimm3r.scene.reconstruction import DenseCloud, Reconstruction
+from swimm3r.splat.gaussian_settings import GaussianInitialSettings
+from swimm3r.splat.settings import InitialSettings
+
+
+class BetaPrimitives(NamedTuple):
+    """n primitives over c conditioned dimensions, as trained; float32."""
+
+    xyz: Float[Tensor, "n 3"]  # world
+    query_mean: Float[Tensor, "n c"]  # mean direction camera -> primitive (not of unit length), then time
+    rgb: Float[Tensor, "n 3"]  # clear colour, not bounded
+    opacity: Float[Tensor, " n"]
+    beta: Float[Tensor, "n b"]  # 1 + c: spatial, then one per conditioned dimension
+    scale: Float[Tensor, "n d"]  # 3 + c
+    lower: Float[Tensor, "n l"]  # strict lower triangle: a01 a02 a12, then the rows from 3 on, left to right
+
+    @property
+    def dynamic(self) -> bool:
+        """Whether they change with time."""
+        return self.query_mean.shape[1] > 3
+
+    def to(self, device: torch.device) -> "BetaPrimitives":
+        """The same on a device."""
+        return BetaPrimitives(*(values.to(device) for values in self))
+
+
+@runtime_checkable  # so that the suite can check calls against it
+class Rows(Protocol):
+    """Primitives of any kind: tensors with a row for each."""
+
+    def __iter__(self) -> Iterator[Tensor]: ...
+
+    @classmethod
+    def _make(cls, iterable: Iterable[Tensor]) -> Any: ...
+
+
+OfKind = TypeVar("OfKind", bound=Rows)
+
+
+def select(p: OfKind, which: Int[Tensor, " m"] | Bool[Tensor, " n"]) -> OfKind:
+    """Some of the primitives."""
+    return p._make(values[which] for values in p)
+
+
+def inverse_softplus(y: Float[Tensor, "*n"]) -> Float[Tensor, "*n"]:
+    """x with softplus(x) = y > 0."""
+    return y + torch.log(-torch.expm1(-y))
+
+
+def rescaled(p: BetaPrimitives, factor: float) -> BetaPrimitives:
+    """The same primitives after every length was multiplied by `factor`; queries have no length."""
+    scale = p.scale.clone()
+    scale[:, :3] = inverse_softplus(softplus(p.scale[:, :3].double()) * factor).to(scale)
+    return p._replace(xyz=p.xyz * factor, scale=scale)
+
+
+def initial_primitives(rec: Reconstruction, settings: InitialSettings, rng: torch.Generator) -> BetaPrimitives:
+    """Primitives on the restored cloud and its backdrop, D = 6; on the sparse points, raw colours, without a cloud.
+
+    Raises InputError for fewer than 4 points.
+    """
+    start = starting_points(rec, settings)
+    xyz, n = start.xyz, len(start.xyz)
+    if settings.directions == "mean":
+        directions = mean_directions(xyz, rec, settings.max_views).float()
+    else:
+        directions = 2 * torch.rand(n, 3, generator=rng) - 1
+    scale = torch.cat([settings.scale * start.spacing[:, None].expand(-1, 3).float(), torch.ones(n, 3)], -1)
+    return BetaPrimitives(
+        xyz=xyz.float(),
+        query_mean=directions,
+        rgb=start.rgb,
+        opacity=torch.full((n,), settings.opacity).logit(),
+        beta=torch.tensor([0.0, *[settings.view_exponent] * 3]).repeat(n, 1),
+        scale=inverse_softplus(scale),
+        lower=1e-5 * torch.randn(n, 15, generator=rng),
+    )
+
+
+def with_time(p: BetaPrimitives, settings: InitialSettings, rng: torch.Generator) -> BetaPrimitives:
+    """D = 7 of D = 6: each primitive around a moment of its own, as UBS begins; nothing moves or turns yet."""
+    n = len(p.xyz)
+    spread = inverse_softplus(torch.full((n, 1), settings.time_scale))
+    return p._replace(
+        query_mean=torch.cat([p.query_mean, torch.rand(n, 1, generator=rng)], -1),
+        beta=torch.cat([p.beta, torch.full((n, 1), settings.time_exponent)], -1),
+        scale=torch.cat([p.scale, spread], -1),
+        lower=torch.cat([p.lower, 1e-5 * torch.randn(n, 6, generator=rng)], -1),
+    )
+
+
+@dataclass(frozen=True)
+class StartingPoints:
+    """Where primitives start, whatever their kind."""
+
+    xyz: Float[Tensor, "n 3"]  # float64
+    rgb: Float[Tensor, "n 3"]
+    spacing: Float[Tensor, " n"]  # root mean square distance to the 3 nearest neighbours, float64
+
+
+def starting_points(rec: Reconstruction, settings: InitialSettings | GaussianInitialSettings) -> StartingPoints:
+    """The cloud and its backdrop, one point per voxel. Raises InputError for fewer than 4 points."""
+    xyz, rgb = _sampled(rec, settings)
+    if len(xyz) < 4:
+        raise InputError(
+            f"a map starts from at least 4 points, and the reconstruction has {len(xyz)} in different places",
+            cause="hardly any depth was found, or the model came without points",
+            hint="more frames of the same place, or another reconstruction",
+        )
+    distances, _ = KDTree(xyz.numpy()).query(xyz.numpy(), k=4)
+    spacing = torch.from_numpy(distances[:, 1:]).square().mean(-1).sqrt()
+    # doubled points would be points of no size
+    return StartingPoints(xyz, rgb, spacing.clamp(min=1e-3 * float(spacing.median())))
+
+
+def _sampled(
+    rec: Reconstruction, settings: InitialSettings | GaussianInitialSettings
+) -> tuple[Float[Tensor, "n 3"], Float[Tensor, "n 3"]]:
+    """Positions, float64, and colours."""
+    if rec.cloud is None:
+        chosen = voxel_sample(rec.points.xyz.double(), settings.primitives)
+        return rec.points.xyz[chosen].double(), rec.points.rgb[chosen].float()
+    backdrop = DenseCloud(*(torch.zeros(0, 3),) * 3) if rec.backdrop is None else rec.backdrop
+    behind = voxel_sample(backdrop.xyz.double(), round(settings.backdrop * settings.primitives))
+    measured = voxel_sample(rec.cloud.xyz.double(), settings.primitives - len(behind))
+    xyz = torch.cat([rec.cloud.xyz[measured], backdrop.xyz[behind]]).double()
+    colours = (getattr(cloud, settings.colours)[rows] for cloud, rows in ((rec.cloud, measured), (backdrop, behind)))
+    return xyz, torch.cat([*colours]).float()
+
+
+def voxel_sample(points: Float[Tensor, "p 3"], target: int) -> Int[Tensor, " n"]:
+    """One point per occupied voxel, the nearest to its voxel's mean; the edge is bisected until about `target` remain.
+
+    All points where there are no more than `target`, none for 0; within 1 % of it where the points allow, else more.
+    """
+    if target == 0:
+        return torch.zeros(0, dtype=torch.int64)
+    if len(points) <= target:
+        return torch.arange(len(points))
+    extent = float((points.amax(0) - points.amin(0)).max())
+    low, high = extent * 1e-6, extent
+    for _ in range(40):
+        edge = (low * high) ** 0.5
+        voxel = _voxels(points, edge)
+        found = int(voxel.max()) + 1
+        if abs(found - target) <= 0.01 * target:
+            break
+        low, high = (edge, high) if found > target else (low, edge)
+    else:
+        voxel = _voxels(points, low)
+    count = torch.bincount(voxel)
+    mean = torch.zeros(len(count), 3, dtype=points.dtype).index_add_(0, voxel, points) / count[:, None]
+    distance = (points - mean[voxel]).square().sum(-1)
+    order = torch.argsort(distance, stable=True)
+    nearest_first = order[torch.argsort(voxel[order], stable=True)]
+    return nearest_first[count.cumsum(0) - count]
+
+
+def _voxels(points: Float[Tensor, "p 3"], edge: float) -> Int[Tensor, " p"]:
+    """The number of each point's voxel, counted over the occupied ones."""
+    cell = ((points - points.amin(0)) / edge).long()
+    size = cell.amax(0) + 1
+    return torch.unique((cell[:, 0] * size[1] + cell[:, 1]) * size[2] + cell[:, 2], return_inverse=True)[1]
+
+
+def mean_directions(xyz: Float[Tensor, "n 3"], rec: Reconstruction, max_views: int) -> Float[Tensor, "n 3"]:
+    """Mean of the unit directions, camera -> point, over the frames that see each point; over all where none does.
+
+    A frame sees a point that falls into its picture, not behind its depth map.
+    """
+    views = torch.linspace(0, len(rec.names) - 1, min(max_views, len(rec.names))).round().long().tolist()
+    total, everywhere, seen_by = torch.zeros_like(xyz), torch.zeros_like(xyz), xyz.new_zeros(len(xyz), 1)
+    for i in views:
+        camera = rec.cameras[i]
+        direction = torch.nn.functional.normalize(xyz - camera.centres[0].to(xyz), dim=-1)
+        seen = _sees(rec, camera, rec.names[i], xyz)[:, None]
+        total += torch.where(seen, direction, 0.0)
+        everywhere += direction
+        seen_by += seen
+    return torch.where(seen_by > 0, total / seen_by.clamp(min=1), everywhere / len(views))
+
+
+def _sees(rec: Reconstruction, camera: Cameras, name: str, xyz: Float[Tensor, "n 3"]) -> Bool[Tensor, " n"]:
+    pixels, z = project(camera, xyz[None])
+    pixels, z = pixels[0], z[0]
+    inside = (z > 0) & (pixels > 0).all(-1) & (pixels[:, 0] < camera.width) & (pixels[:, 1] < camera.height)
+    if name in rec.depth:
+        z_depth = rec.depth[name].z_depth
+        column, row = torch.where(inside[:, None], pixels, 0.0).long().unbind(-1)
+        surface = z_depth[row, column].to(z)
+        inside &= (surface == 0) | (z < 1.05 * surface)
+    return inside

@@ -1,0 +1,1 @@
+"""Primitives projected into a pinhole camera, as the rasterizer reads them."""

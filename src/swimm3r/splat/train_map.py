@@ -1,0 +1,95 @@
+"""From a reconstruction to a map: the recipe of the settings, its run, and the map in the scene's own unit."""
+
+import hashlib
+import json
+import math
+from dataclasses import asdict
+from pathlib import Path
+
+import torch
+
+from swimm3r import devices
+from swimm3r.devices import CPU
+from swimm3r.errors import UsageError
+from swimm3r.progress import Progress, silent
+from swimm3r.scene.frames import Frames
+from swimm3r.scene.reconstruction import Reconstruction
+from swimm3r.splat import map_file
+from swimm3r.splat.recipes.mcmc_gs import McmcGs
+from swimm3r.splat.recipes.seasplat import SeaSplat
+from swimm3r.splat.recipes.uwbs import Uwbs, known_water
+from swimm3r.splat.recipes.watersplatting import WaterSplatting
+from swimm3r.splat.rendering import SplatMap
+from swimm3r.splat.settings import McmcGsSettings, SeaSplatSettings, SplatSettings, UwbsSettings, WaterSplattingSettings
+from swimm3r.splat.training import loop
+from swimm3r.splat.training.scene import Site, path_radius
+from swimm3r.splat.training.state import in_scene_units
+from swimm3r.splat.training_poses import training_stations, write_refined
+from swimm3r.splat.views import TrainingViews, median_z_depth, working_scale
+
+
+def train(
+    rec: Reconstruction,
+    frames: Frames,
+    settings: SplatSettings,
+    folder: Path,
+    progress: Progress = silent,
+    device: torch.device = CPU,
+) -> SplatMap:
+    """Train a map in `folder`: checkpoint/, metrics.jsonl, and at the end map.safetensors and the refined poses.
+
+    All are in the scene's own unit; cameras.json and trajectory.tum are not written where poses are held.
+    """
+    scale = working_scale(rec, settings)
+    _check_near(settings, scale * median_z_depth(rec))
+    views = TrainingViews(rec, frames, settings, scale)
+    stations = training_stations(rec, views.names, views.cameras, scale) if settings.poses.enabled else None
+    radius = path_radius(rec, scale, settings.working_depth)
+    site = Site(rec, scale, radius, views, stations, device)
+    with devices.memory_for("this map", "fewer primitives, a smaller --splat.long-side, or --map-device cpu"):
+        final = loop.run(_recipe(settings, site), _schedule(settings, rec, views), folder, progress)
+    primitives, field = in_scene_units(final, 1 / scale)
+    poses = None
+    if stations is not None and final.poses is not None:
+        poses = stations.refined(final.poses)
+        write_refined(folder, rec, frames, poses)
+    scene = SplatMap(primitives, field, settings, rec.metric, 1 / scale, frames.span, poses)
+    map_file.save_map(folder / "map.safetensors", scene)
+    return scene
+
+
+def _check_near(settings: SplatSettings, median_depth: float) -> None:
+    """Raise UsageError where half of the scene would not be drawn; the depth is in working units."""
+    if settings.render.near >= median_depth:
+        raise UsageError(
+            f"the near plane ({settings.render.near:g}) lies behind half of the scene, whose median depth is"
+            f" {median_depth:g} working units",
+            cause="it was given in another unit than metres, or than thirds of the median depth",
+            hint="leave --splat.render.near out for the default",
+        )
+
+
+def _recipe(settings: SplatSettings, site: Site) -> loop.Recipe:
+    match settings:
+        case UwbsSettings():
+            return Uwbs(settings, site, known_water(site, settings))
+        case McmcGsSettings():
+            return McmcGs(settings, site)
+        case WaterSplattingSettings():
+            return WaterSplatting(settings, site)
+        case SeaSplatSettings():
+            return SeaSplat(settings, site)
+
+
+def _schedule(settings: SplatSettings, rec: Reconstruction, views: TrainingViews) -> loop.Schedule:
+    everything = [asdict(settings), views.names, views.times, rec.cameras.cam2world.tolist(), rec.cameras.K.tolist()]
+    if settings.poses.enabled:
+        everything.append(float(rec.matches.xy_i.double().sum() + rec.matches.xy_j.double().sum()))
+    digest = hashlib.sha256(json.dumps(everything, sort_keys=True).encode()).hexdigest()[:16]
+    return loop.Schedule(
+        iterations=settings.iterations,
+        log_every=max(1, math.ceil(settings.log_every * settings.iterations)),
+        checkpoint_every=max(1, math.ceil(settings.checkpoint_every * settings.iterations)),
+        seed=settings.seed,
+        fingerprint=digest,
+    )

@@ -1,0 +1,1 @@
+"""The training of a map: its scene, its loop, its losses and scene-guided gradients."""

@@ -1,0 +1,119 @@
+"""The training loop: which view when, the record of every few steps, checkpoints, and going on where it stopped.
+
+A recipe brings the step itself. Everything random is drawn from the seed and the step, so a state needs no generators,
+and a run that was interrupted ends with the same bits as one that was not (at the same number of threads).
+"""
+
+import logging
+import time
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any, Protocol, runtime_checkable
+
+import torch
+from torch import Tensor
+
+from swimm3r.io.files import metrics_log
+from swimm3r.io.files.damage import guard
+from swimm3r.progress import Progress
+from swimm3r.splat import map_file
+from swimm3r.splat.settings import SplatSettings
+from swimm3r.splat.training.scene import Site
+from swimm3r.splat.training.state import State, restored, stored
+from swimm3r.splat.views import View
+
+log = logging.getLogger(__name__)
+
+Numbers = dict[str, float | Tensor]
+"""What a step says for the record; tensors stay on their device until the record is written."""
+
+
+@runtime_checkable  # so that the suite can check calls against it
+class Recipe(Protocol):
+    """What a method brings to the loop: one scene's first state and every step."""
+
+    @property
+    def settings(self) -> SplatSettings:
+        """Every number of the method."""
+        ...
+
+    @property
+    def site(self) -> Site:
+        """The scene in working units, with the views to learn from."""
+        ...
+
+    def start(self) -> State:
+        """The state before step 1."""
+        ...
+
+    def step(self, state: Any, view: View, step: int) -> tuple[State, Numbers]:
+        """The state after training on one view, and the numbers of the step; steps count from 1."""
+        ...
+
+
+@dataclass(frozen=True)
+class Schedule:
+    """How long, and how often something is written."""
+
+    iterations: int
+    log_every: int
+    checkpoint_every: int
+    seed: int
+    fingerprint: str  # of settings and input: a checkpoint of another training is not continued
+
+
+def generator(seed: int, step: int, purpose: int) -> torch.Generator:
+    """The randomness of one purpose in one step."""
+    mixed = (seed * 1_000_003 + step) * 1_009 + purpose
+    return torch.Generator().manual_seed(mixed % (1 << 63))
+
+
+def view_of_step(step: int, views: int, seed: int) -> int:
+    """Each epoch visits every view once, in its own order; steps count from 1."""
+    epoch, place = divmod(step - 1, views)
+    return int(torch.randperm(views, generator=generator(seed, epoch, 1))[place])
+
+
+def run(recipe: Recipe, schedule: Schedule, folder: Path, progress: Progress) -> State:
+    """Train from the checkpoint in `folder`, if there is one of this training, else from the start."""
+    path, metrics = folder / "checkpoint" / "state.safetensors", folder / "metrics.jsonl"
+    folder.mkdir(parents=True, exist_ok=True)
+    state, done = _resume(recipe, path, metrics, schedule)
+    state = state.to(recipe.site.device)
+    started, cpu_started, first = time.perf_counter(), time.process_time(), done
+    sums: dict[str, tuple[float | Tensor, int]] = {}
+    for step in range(done + 1, schedule.iterations + 1):
+        progress("training the map", step - 1, schedule.iterations)
+        view = recipe.site.view(view_of_step(step, len(recipe.site.views), schedule.seed))
+        state, numbers = recipe.step(state, view, step)
+        for name, value in numbers.items():
+            total, count = sums.get(name, (0.0, 0))
+            sums[name] = total + (value.detach() if isinstance(value, Tensor) else value), count + 1
+        last = step == schedule.iterations
+        if step % schedule.log_every == 0 or last:
+            row = {"step": step} | {name: float(total) / count for name, (total, count) in sums.items()}
+            row["seconds_per_step"] = (time.perf_counter() - started) / (step - first)
+            row["cpu_seconds_per_step"] = (time.process_time() - cpu_started) / (step - first)
+            metrics_log.append_row(metrics, row)
+            sums = {}
+        if step % schedule.checkpoint_every == 0 or last:
+            map_file.write_state(path, stored(state), map_file.StateHeader(step, schedule.fingerprint))
+    progress("training the map", schedule.iterations, schedule.iterations)
+    return state
+
+
+def _resume(recipe: Recipe, path: Path, metrics: Path, schedule: Schedule) -> tuple[State, int]:
+    """The state to go on from, and its step; rows of metrics beyond it are dropped."""
+    done = 0
+    state = None
+    if path.is_file():
+        kept = map_file.read_state(path)
+        if kept.about.fingerprint == schedule.fingerprint:
+            with guard(path, map_file.state_remedy(path)):
+                state = restored(kept.tensors, recipe.settings, recipe.site.refined_cameras)
+            done = kept.about.step
+            log.info("going on from step %d", done)
+        else:
+            log.warning("%s belongs to a training with other settings or input; starting anew", path)
+    metrics_log.drop_rows_after(metrics, done)
+    return (recipe.start(), 0) if state is None else (state, done)

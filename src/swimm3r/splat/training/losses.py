@@ -1,0 +1,133 @@
+"""The terms of Eq. 18, each a mean; `recipes.uwbs` weighs and adds them. Pictures are channels first."""
+
+from dataclasses import dataclass
+from typing import Any
+
+import torch
+from jaxtyping import Bool, Float
+from torch import Tensor
+from torch.nn.functional import conv2d, softplus
+
+from swimm3r.raster import RasterOutput
+from swimm3r.splat.primitives.beta import BetaPrimitives
+from swimm3r.splat.training import ssim_cpu
+
+_NEAREST = 1e-3  # of the scene's unit: the least depth whose inverse is taken
+_LEAST_WEIGHT = 1e-12  # of a picture's edge-aware weights together, below which none of its depths counts
+
+
+@dataclass(frozen=True)
+class Photometric:
+    """Eq. 14 and its two parts; the parts are for the record."""
+
+    loss: Float[Tensor, ""]
+    l1: float | Tensor
+    ssim: float | Tensor
+
+
+def photometric(
+    render: Float[Tensor, "3 h w"], target: Float[Tensor, "3 h w"], seen: Bool[Tensor, "h w"], ssim_weight: float
+) -> Photometric:
+    """(1 - w) L1 + w (1 - SSIM) (Eq. 14), SSIM zero-padded; pixels not `seen` count as matched."""
+    target = torch.where(seen, target, render.detach())
+    if render.device.type != "cpu" or render.dtype != torch.float32:
+        l1, ssim = (render - target).abs().mean(), mean_ssim(render, target)
+        loss = (1 - ssim_weight) * l1 + ssim_weight * (1 - ssim)
+        return Photometric(loss, l1.detach(), ssim.detach())
+    l1, ssim, gradient = ssim_cpu.photometric(render, target, ssim_weight)
+    value = torch.tensor((1 - ssim_weight) * l1 + ssim_weight * (1 - ssim))
+    gradient = torch.where(seen, gradient, 0.0)
+    return Photometric(_KnownGradient.apply(render, value, gradient), l1, ssim)
+
+
+class _KnownGradient(torch.autograd.Function):
+    """A value whose gradient has been computed along with it."""
+
+    @staticmethod
+    def forward(ctx: Any, x: Tensor, value: Tensor, gradient: Tensor) -> Tensor:
+        ctx.save_for_backward(gradient)
+        return value.clone()
+
+    @staticmethod
+    @torch.autograd.function.once_differentiable
+    def backward(ctx: Any, *cotangents: Tensor) -> tuple[Tensor | None, ...]:
+        (gradient,) = ctx.saved_tensors
+        return cotangents[0] * gradient, None, None
+
+
+def mean_ssim(x: Float[Tensor, "3 h w"], y: Float[Tensor, "3 h w"]) -> Float[Tensor, ""]:
+    """Mean SSIM, 11 x 11 Gaussian window of sigma 1.5, zero padding, in torch operations: the oracle of `ssim_cpu`."""
+    offsets = torch.arange(ssim_cpu.WINDOW, dtype=x.dtype, device=x.device) - ssim_cpu.HALF
+    weights = torch.exp(-0.5 * (offsets / ssim_cpu.SIGMA) ** 2)
+    window = torch.outer(weights, weights)[None, None] / weights.sum() ** 2
+
+    def blur(v: Tensor) -> Tensor:
+        return conv2d(v[:, None], window, padding=ssim_cpu.HALF)[:, 0]
+
+    mx, my = blur(x), blur(y)
+    sx, sy, sxy = blur(x * x) - mx * mx, blur(y * y) - my * my, blur(x * y) - mx * my
+    C1, C2 = float(ssim_cpu.C1), float(ssim_cpu.C2)
+    S = (2 * mx * my + C1) * (2 * sxy + C2) / ((mx * mx + my * my + C1) * (sx + sy + C2))
+    return S.mean()
+
+
+def mean_opacity(p: BetaPrimitives) -> Float[Tensor, ""]:
+    """L_opa (Eq. 15): what keeps primitives that explain nothing from living on."""
+    return torch.sigmoid(p.opacity).mean()
+
+
+def mean_scale(p: BetaPrimitives, ubs_bug: bool = False) -> Float[Tensor, ""]:
+    """L_scale (Eq. 15), of the spatial scales of all primitives; UBS's slip takes all of three primitives."""
+    return softplus(p.scale[:3] if ubs_bug else p.scale[:, :3]).mean()
+
+
+def oversize(p: BetaPrimitives, radius: Float[Tensor, " n"], limit: float) -> Float[Tensor, ""]:
+    """L_rad (Eq. 17): mean spatial scale of the primitives whose radius exceeds `limit` pixels, 0 for none."""
+    large = (radius > limit)[:, None]
+    if large.device.type == "cpu" and not bool(large.any()):  # a GPU would have to be waited for
+        return p.scale.new_zeros(())
+    scales = torch.where(large, softplus(p.scale[:, :3]), 0.0)
+    return scales.sum() / (3 * large.sum()).clamp(min=1)
+
+
+def edge_weight(rgb: Float[Tensor, "3 h w"], scale: float) -> Float[Tensor, "h w"]:
+    """w_n of Eq. 13 before it is normalised: mean of e^(-scale |dI/dx|) and e^(-scale |dI/dy|), 1 where I is flat.
+
+    |dI| is the mean over the channels of the absolute difference to the next pixel.
+    """
+    right = torch.nn.functional.pad(rgb.diff(dim=2).abs().mean(0), (0, 1))
+    down = torch.nn.functional.pad(rgb.diff(dim=1).abs().mean(0), (0, 0, 0, 1))
+    return (torch.exp(-scale * right) + torch.exp(-scale * down)) / 2
+
+
+def depth_error(
+    images: RasterOutput, z_depth: Float[Tensor, "h w"], weight: Float[Tensor, "h w"], least_alpha: float
+) -> Float[Tensor, ""]:
+    """L_depth (Eq. 13): sum of w_n log(1 + |1/D^ - 1/D|) over the pixels of known depth that the map covers.
+
+    D^ is the expected depth, `z_depth` D (0 = unknown). The weights are normalised to a sum of 1 over those pixels; the
+    paper prints a sum beside means and so leaves their sum open.
+    """
+    counted = (z_depth > 0) & (images.alpha.detach() > least_alpha)
+    w = torch.where(counted, weight, 0.0)
+    inverse = images.alpha / images.z_depth.clamp(min=_NEAREST * least_alpha)
+    off = torch.log1p((inverse - 1 / z_depth.clamp(min=_NEAREST)).abs())
+    return (w * off).sum() / w.sum().clamp(min=_LEAST_WEIGHT)
+
+
+def uncovered(images: RasterOutput, z_depth: Float[Tensor, "h w"]) -> Float[Tensor, ""]:
+    """Mean of 1 - alpha over the pixels where a surface is known to be; 0 where none is known."""
+    known = z_depth > 0
+    return torch.where(known, 1 - images.alpha, 0.0).sum() / known.sum().clamp(min=1)
+
+
+def drawn_on_water(images: RasterOutput, open_water: Bool[Tensor, "h w"]) -> Float[Tensor, ""]:
+    """Mean of alpha over the pixels that look past every surface; 0 where none does."""
+    return torch.where(open_water, images.alpha, 0.0).sum() / open_water.sum().clamp(min=1)
+
+
+def outside_gamut(p: BetaPrimitives, radius: Float[Tensor, " n"]) -> Float[Tensor, ""]:
+    """Mean squared excess of clear colours over 0..1, of the primitives in view (`radius` > 0); 0 for none."""
+    in_view = (radius > 0)[:, None]
+    excess = p.rgb - p.rgb.detach().clamp(0, 1)
+    return torch.where(in_view, excess.square(), 0.0).sum() / (3 * in_view.sum()).clamp(min=1)

@@ -1,0 +1,157 @@
+"""What training changes, whatever the recipe, and what a map consists of."""
+
+import copy
+import dataclasses
+from collections.abc import Mapping
+from dataclasses import dataclass
+from typing import Any, Generic, TypeVar, get_type_hints
+
+import torch
+from torch import Tensor
+
+from swimm3r.splat.medium.field import MediumField, in_unit
+from swimm3r.splat.medium.seasplat import SceneWater
+from swimm3r.splat.optimizer import Moments, fresh
+from swimm3r.splat.primitives import beta, gaussian
+from swimm3r.splat.primitives.beta import BetaPrimitives
+from swimm3r.splat.primitives.gaussian import GaussianPrimitives, harmonics_of_degree
+from swimm3r.splat.projection.dispatch import Primitives
+from swimm3r.splat.rendering import Water
+from swimm3r.splat.settings import McmcGsSettings, SeaSplatSettings, SplatSettings, UwbsSettings, WaterSplattingSettings
+from swimm3r.splat.shared_settings import MediumFieldSettings
+from swimm3r.splat.training_poses import PoseCodes
+
+FIELD, POSES = "field.", "poses."
+P = TypeVar("P", BetaPrimitives, GaussianPrimitives)
+W = TypeVar("W", MediumField, SceneWater)
+
+
+@dataclass(frozen=True)
+class Parts:
+    """The kind of primitives, and a water whose values are still to come."""
+
+    primitives: type[Primitives]
+    field: Water
+
+
+def parts_of(settings: SplatSettings) -> Parts:
+    """What the maps of a recipe consist of."""
+    match settings:
+        case UwbsSettings():
+            return Parts(BetaPrimitives, MediumField(settings.medium, settings.dynamic))
+        case McmcGsSettings():
+            return Parts(GaussianPrimitives, MediumField(MediumFieldSettings(model="none")))
+        case WaterSplattingSettings():
+            return Parts(GaussianPrimitives, MediumField(settings.medium))
+        case SeaSplatSettings():
+            return Parts(GaussianPrimitives, SceneWater())
+
+
+@dataclass(frozen=True)
+class State(Generic[P, W]):
+    """Primitives, water and poses, the optimiser's memory of them, and what else a recipe remembers."""
+
+    primitives: P
+    field: W
+    poses: PoseCodes | None  # None where poses are held
+    moments: dict[str, Moments]  # of "xyz" ..., of the field's parameters by "field.*", of the poses' by "poses.*"
+    memory: dict[str, Tensor] = dataclasses.field(default_factory=dict)
+
+    def to(self, device: torch.device) -> "State[P, W]":
+        """The state on a device; the poses stay on the processor, where the matches are."""
+        moments = {
+            name: m if name.startswith(POSES) else Moments(*(t.to(device) for t in vars(m).values()))
+            for name, m in self.moments.items()
+        }
+        memory = {name: t.to(device) for name, t in self.memory.items()}
+        return State(self.primitives.to(device), copy.deepcopy(self.field).to(device), self.poses, moments, memory)
+
+
+def parameters_of(p: Primitives, field: Water, poses: PoseCodes | None = None) -> dict[str, Tensor]:
+    """Everything that is trained, by the names of `State.moments`."""
+    of_field: dict[str, Tensor] = {f"{FIELD}{name}": t for name, t in field.named_parameters()}
+    of_poses = {} if poses is None else {f"{POSES}{name}": t for name, t in poses.named_parameters()}
+    return {**p._asdict(), **of_field, **of_poses}
+
+
+def first_state(p: P, field: W, poses: PoseCodes | None, memory: dict[str, Tensor] | None = None) -> State[P, W]:
+    """The state before step 1."""
+    p = type(p)(*(values.contiguous() for values in p))
+    moments = {name: fresh(values) for name, values in parameters_of(p, field, poses).items()}
+    return State(p, field, poses, moments, memory or {})
+
+
+def stored(state: State) -> dict[str, Tensor]:
+    """Parameters by name; their moments after .first, .second and .steps; what else is remembered after .memory."""
+    parameters = parameters_of(state.primitives, state.field, state.poses)
+    tensors = {f"parameter.{name}": t for name, t in parameters.items()}
+    for name, m in state.moments.items():
+        tensors |= {f"first.{name}": m.first, f"second.{name}": m.second, f"steps.{name}": m.steps}
+    return tensors | {f"memory.{name}": t for name, t in state.memory.items()}
+
+
+def restored(tensors: dict[str, Tensor], settings: SplatSettings, cameras: int) -> State[Any, Any]:
+    """The inverse of `stored`; `cameras` are those whose poses are refined, 0 where they are held.
+
+    Raises KeyError or ValueError for tensors that are not of such a state.
+    """
+    parts = parts_of(settings)
+    poses = PoseCodes(cameras, settings.poses) if cameras else None
+    p: Any = primitives_from(tensors, parts.primitives, "parameter.")
+    parameters = parameters_of(p, parts.field, poses)
+    with torch.no_grad():
+        for name, parameter in parameters.items():
+            values = tensors[f"parameter.{name}"]
+            shapes = {tensors[f"{kind}.{name}"].shape for kind in ("parameter", "first", "second")}
+            if shapes != {parameter.shape} or tensors[f"steps.{name}"].dim():
+                raise ValueError(f"{name} or its moments are not of the shape {tuple(parameter.shape)}")
+            parameter.copy_(values)
+    moments = {k: Moments(tensors[f"first.{k}"], tensors[f"second.{k}"], tensors[f"steps.{k}"]) for k in parameters}
+    memory = {k.removeprefix("memory."): t for k, t in tensors.items() if k.startswith("memory.")}
+    field: Any = parts.field
+    return State(p, field, poses, moments, memory)
+
+
+def primitives_from(tensors: Mapping[str, Tensor], kind: type[Primitives], prefix: str) -> Primitives:
+    """The primitives among a file's tensors. Raises KeyError or ValueError where their parts do not fit each other."""
+    p: Any = kind(*(tensors[prefix + name] for name in kind._fields))
+    for name, hint in get_type_hints(kind, include_extras=True).items():
+        if not isinstance(getattr(p, name), hint):
+            raise ValueError(f"{prefix}{name} has the shape {tuple(getattr(p, name).shape)}")
+    if {len(values) for values in p} != {len(p.xyz)}:
+        raise ValueError("its primitives' parts are of different lengths")
+    if not len(p.xyz):
+        raise ValueError("it holds no primitives")
+    if not _fit_together(p):
+        raise ValueError(f"its primitives' parts are {', '.join(str(tuple(v.shape[1:])) for v in p)} numbers wide")
+    return p
+
+
+def _fit_together(p: Primitives) -> bool:
+    match p:
+        case BetaPrimitives():
+            conditioned = p.query_mean.shape[1]  # direction; in dynamic maps time, too
+            D = 3 + conditioned
+            widths = p.beta.shape[1], p.scale.shape[1], p.lower.shape[1]
+            return conditioned in (3, 4) and widths == (1 + conditioned, D, D * (D - 1) // 2)
+        case GaussianPrimitives():
+            return p.harmonics.shape[1] in {harmonics_of_degree(degree) for degree in range(4)}
+
+
+def in_scene_units(state: State, length: float) -> tuple[Primitives, Water]:
+    """What a map keeps of a finished state: primitives and water, `length` scene units to a working unit; no gradient.
+
+    SceneWater has no length.
+    """
+    p, field = state.primitives, state.field.requires_grad_(False)
+    moved = beta.rescaled(p, length) if isinstance(p, BetaPrimitives) else gaussian.rescaled(p, length)
+    return moved, in_unit(field, length) if isinstance(field, MediumField) else field
+
+
+def clip_field(gradients: dict[str, Tensor]) -> None:
+    """Hold the gradient of the water's network to a norm of 1e-3, in place (WaterSplatting)."""
+    of_field = [gradient for name, gradient in gradients.items() if name.startswith(FIELD)]
+    if of_field:
+        norm = torch.stack([g.norm() for g in of_field]).norm()
+        for g in of_field:
+            g.mul_((1e-3 / norm).clamp(max=1))

@@ -1,0 +1,137 @@
+"""Water that is not determined, or cannot be: it is said, and pictures do not pretend."""
+
+from dataclasses import replace
+from pathlib import Path
+
+import cv2
+import numpy as np
+import pytest
+import torch
+
+from swimm3r.io import images
+from swimm3r.medium import AttenuationCurve, Medium, MediumFit
+from swimm3r.scene.frames import Frames
+from swimm3r.scene.reconstruction import DenseCloud
+from swimm3r.sfm.medium import apply
+from swimm3r.sfm.medium.dense_tracks import fuse_depth
+from swimm3r.sfm.medium.plausibility import attenuation_is_a_guess, optical_depth, water_cautions
+from swimm3r.sfm.medium.restore import display_gains, restored_cloud, shown_gains
+from swimm3r.sfm.settings import ColmapSettings, RestoreSettings, TrackSettings
+
+
+def fit_of(medium: Medium, std: float, known: bool, z_range: tuple[float, float] = (1.0, 4.0)) -> MediumFit:
+    """A fit whose optical depth at the middle of the depths has this standard deviation in every channel."""
+    zero = torch.zeros(3)
+    of_beta = torch.full((3,), std / (z_range[0] * z_range[1]) ** 0.5)
+    flags = {name: torch.full((3,), known) for name in ("Binf", "beta_D", "beta_B")}
+    curve = AttenuationCurve(medium.beta_D, zero, zero, zero)
+    return MediumFit(medium, curve, Medium(zero, of_beta, zero), flags, z_range, "srgb")
+
+
+def said(fit: MediumFit, *, grey: bool = False) -> str:
+    return " ".join(caution.what for caution in water_cautions(fit, grey=grey))
+
+
+def test_water_that_is_determined_and_takes_red_first_raises_no_caution(teal):
+    assert water_cautions(fit_of(teal, 0.05, known=True), grey=False) == ()
+
+
+def test_the_optical_depth_does_not_depend_on_the_unit_of_length(teal):
+    longer = Medium(teal.Binf, teal.beta_D / 10, teal.beta_B / 10)
+    one, ten = fit_of(teal, 0.3, known=True), fit_of(longer, 0.3, known=True, z_range=(10.0, 40.0))
+    for a, b in zip(optical_depth(one), optical_depth(ten), strict=True):
+        torch.testing.assert_close(a, b)
+    torch.testing.assert_close(optical_depth(one)[0], 2 * teal.beta_D)
+    torch.testing.assert_close(optical_depth(one)[1], torch.full((3,), 0.3))
+
+
+def test_attenuation_that_is_a_guess_in_every_channel_is_said_with_its_size_and_advice(teal):
+    caution = water_cautions(fit_of(teal, 0.9, known=False), grey=False)[0]
+    assert "factor of up to 2.5" in caution.what
+    assert "as filmed" in caution.what
+    assert "near and from far" in caution.advice
+    assert "adapter" in water_cautions(fit_of(teal, 0.9, known=False), grey=False, predicted=True)[0].advice
+    one_known = fit_of(teal, 0.9, known=False)
+    one_known.std.beta_D[1] = 0.01
+    assert not attenuation_is_a_guess(one_known)
+
+
+def test_curves_without_a_determined_coefficient_are_said_to_give_no_true_colours(teal):
+    fit = fit_of(teal, 0.1, known=False)
+    assert not attenuation_is_a_guess(fit)
+    assert "not white-balanced" in said(fit)
+    assert "11% uncertain" in said(fit)
+    fit.identifiable["beta_D"][2] = True
+    assert said(fit) == ""
+
+
+@pytest.mark.parametrize("known", [True, False])
+def test_red_attenuated_least_is_implausible_in_every_natural_water(teal, known: bool):
+    odd = Medium(teal.Binf, torch.tensor([0.03, 0.04, 0.05]), teal.beta_B)
+    assert "red least" in said(fit_of(odd, 0.1, known=known))
+    coastal = Medium(teal.Binf, torch.tensor([0.3, 0.25, 0.6]), teal.beta_B)  # dissolved matter takes blue first
+    assert "red least" not in said(fit_of(coastal, 0.1, known=known))
+    assert "red least" not in said(fit_of(odd, 0.1, known=known), grey=True)
+
+
+def written(dive, fit: MediumFit, folder: Path, monkeypatch: pytest.MonkeyPatch) -> dict[str, np.ndarray]:
+    """The dive's frame 2 as filmed, physically restored and as shown, 0..1, where this is the water found."""
+    monkeypatch.setattr(apply, "fit_medium", lambda *_: fit)
+    monkeypatch.setattr(apply, "restored_cloud", lambda *given: tinted(restored_cloud(*given)))
+    apply.with_water(dive.rec, dive.frames, ColmapSettings(), folder)
+    name = f"{dive.rec.names[2]}.png"
+    physical = cv2.imread(str(folder / "restored_physical" / name), cv2.IMREAD_UNCHANGED)
+    assert physical is not None
+    return {
+        "filmed": dive.frames.image(2).numpy(),
+        "physical": physical[..., ::-1] / 65535,
+        "shown": images.read_rgb(folder / "restored" / name) / 255,
+    }
+
+
+def tinted(cloud: DenseCloud) -> DenseCloud:
+    """As under the light that reaches a few metres of depth."""
+    return replace(cloud, restored=cloud.restored * torch.tensor([0.6, 1.0, 0.9]))
+
+
+def test_where_attenuation_is_a_guess_frames_are_shown_as_filmed(dive, tmp_path: Path, monkeypatch):
+    found = written(dive, fit_of(dive.medium, 0.9, known=False), tmp_path, monkeypatch)
+    assert abs(found["shown"] - found["filmed"]).max() < 1 / 255
+    assert abs(found["physical"] - found["filmed"]).mean() > 0.02  # what a map starts on: the inverse of its water
+
+
+def test_where_nothing_of_the_water_is_determined_frames_are_not_balanced_to_neutral_greys(
+    dive, tmp_path: Path, monkeypatch
+):
+    unsure = written(dive, fit_of(dive.medium, 0.1, known=False), tmp_path, monkeypatch)
+    assert abs(unsure["shown"] - unsure["physical"]).max() < 1 / 255
+    assert abs(unsure["shown"] - unsure["filmed"]).mean() > 0.02
+    sure = written(dive, fit_of(dive.medium, 0.1, known=True), tmp_path, monkeypatch)
+    assert (sure["shown"] - sure["physical"])[..., 0].mean() > 0.02
+
+
+def test_gains_need_water_that_is_determined_and_somebody_who_wants_them(dive):
+    fit = fit_of(dive.medium, 0.1, known=True)
+    cloud = restored_cloud(dive.rec, dive.frames, fuse_depth(dive.rec, dive.frames, TrackSettings()), fit)
+    rec = replace(dive.rec, medium=fit, cloud=cloud)
+    torch.testing.assert_close(shown_gains(rec, RestoreSettings()), display_gains(cloud.restored))
+    assert torch.equal(shown_gains(rec, RestoreSettings(white_balance=False)), torch.ones(3))
+    unsure = replace(rec, medium=fit_of(dive.medium, 0.1, known=False))
+    assert torch.equal(shown_gains(unsure, RestoreSettings()), torch.ones(3))
+
+
+def test_a_grey_clip_is_called_grey_and_stays_grey(dive, tmp_path: Path):
+    grey = []
+    for i, frame in enumerate(dive.frames):
+        picture = dive.frames.image(i).mean(-1, keepdim=True).expand(-1, -1, 3)
+        images.write_rgb(tmp_path / frame.name, picture.numpy())
+        grey.append(replace(frame, path=tmp_path / frame.name))
+    frames = Frames(tuple(grey), dive.frames.width, dive.frames.height, ordered=True)
+    rec = apply.with_water(dive.rec, frames, ColmapSettings(), tmp_path)
+    assert [caution.what.startswith("The frames are grey") for caution in rec.cautions].count(True) == 1
+    assert rec.cloud is not None
+    assert rec.medium is not None
+    torch.testing.assert_close(rec.medium.medium.beta_D, rec.medium.medium.beta_D[:1].expand(3))
+    torch.testing.assert_close(rec.cloud.restored[:, 0], rec.cloud.restored[:, 2])
+    shown = images.read_rgb(tmp_path / "restored" / f"{rec.names[2]}.png").astype(int)
+    assert abs(shown[..., 0] - shown[..., 2]).max() <= 1

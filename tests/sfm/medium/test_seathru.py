@@ -1,0 +1,224 @@
+"""The water from pixels and depths: recovery, invariances, and honesty about what cannot be known."""
+
+from dataclasses import replace
+
+import cv2
+import numpy as np
+import pytest
+import torch
+
+from swimm3r.errors import InputError
+from swimm3r.medium import Medium, add_water, backscatter, rescale, srgb_from_linear, transmittances
+from swimm3r.sfm.medium import seathru
+from swimm3r.sfm.medium.channel_fit import fit_channel
+from swimm3r.sfm.medium.samples import WaterSamples
+from swimm3r.sfm.medium.seathru import estimate_medium, fit_medium
+from swimm3r.sfm.settings import SeathruSettings
+
+SETTINGS = SeathruSettings()
+
+
+def draw_samples(
+    medium: Medium,
+    *,
+    spread: float = 0.3,
+    gains: float = 0.0,
+    open_water: int = 0,
+    points: int = 1500,
+    encoding: str = "srgb",
+) -> WaterSamples:
+    """Points seen six times each from distances that differ by exp(+-spread), with pixel noise of 0.005."""
+    g = np.random.default_rng(5)
+    track, frame = np.repeat(np.arange(points), 6), np.tile(np.arange(24), points * 6 // 24)
+    place, view = g.normal(0, 0.5 * spread, points), spread * np.sin(np.arange(24) * 1.3)
+    z = 2.5 * np.exp(place[track] + view[frame])
+    grey = np.where(g.random(points) < 0.03, 0.0, g.uniform(0.1, 0.8, points))
+    J = torch.from_numpy((grey[:, None] * g.uniform(0.8, 1.2, (points, 3))).astype(np.float32))[track]
+    I = add_water(J, torch.from_numpy(z.astype(np.float32)), medium)
+    if encoding == "linear":
+        I = srgb_from_linear(I)
+    gain = torch.from_numpy(np.exp(gains * g.normal(0, 1, 24)).astype(np.float32))[frame]
+    I = (I * gain[:, None] + 0.005 * torch.from_numpy(g.normal(0, 1, I.shape).astype(np.float32))).clamp(0, 1)
+    sea = medium.Binf + 0.005 * torch.from_numpy(g.normal(0, 1, (open_water, 3)).astype(np.float32))
+    return WaterSamples(
+        I, torch.from_numpy(z.astype(np.float32)), torch.from_numpy(frame), torch.from_numpy(track), sea
+    )
+
+
+def errors(fit, medium, z) -> tuple[float, float]:
+    """Worst channel's mean absolute error of T_D and of B."""
+    found = fit.at(z)
+    T_D = (transmittances(z, found)[0] - transmittances(z, medium)[0]).abs().mean(0).max()
+    return float(T_D), float((backscatter(z, found) - backscatter(z, medium)).abs().mean(0).max())
+
+
+def test_the_water_is_recovered_from_points_seen_at_several_distances(teal):
+    samples = draw_samples(teal, open_water=1000)
+    T_D, B = errors(fit_medium(samples, SETTINGS, "srgb"), teal, samples.ray_depth)
+    assert T_D < 0.03
+    assert B < 0.015
+
+
+def test_exposure_that_changes_from_frame_to_frame_does_not_pass_for_water(teal):
+    samples = draw_samples(teal, gains=0.1, open_water=1000)
+    T_D, B = errors(fit_medium(samples, SETTINGS, "srgb"), teal, samples.ray_depth)
+    assert T_D < 0.05
+    assert B < 0.03
+
+
+def test_water_that_acts_on_linear_light_is_recovered_in_linear_light(teal):
+    samples = draw_samples(teal, encoding="linear")
+    fit = fit_medium(samples, SETTINGS, "linear")
+    T_D, B = errors(fit, teal, samples.ray_depth)
+    assert fit.encoding == "linear"
+    assert T_D < 0.05
+    assert B < 0.03
+
+
+def test_stretching_the_scene_divides_the_coefficients(teal):
+    samples = draw_samples(teal)
+    longer = WaterSamples(samples.I, samples.ray_depth * 8, samples.frame, samples.track, samples.open_water)
+    one, eight = (fit_medium(s, SETTINGS, "srgb") for s in (samples, longer))
+    expected = rescale(one, 8.0)
+    for name in ("Binf", "beta_D", "beta_B"):
+        torch.testing.assert_close(getattr(eight.medium, name), getattr(expected.medium, name), rtol=1e-3, atol=1e-5)
+        torch.testing.assert_close(getattr(eight.std, name), getattr(expected.std, name), rtol=1e-2, atol=1e-5)
+        assert torch.equal(eight.identifiable[name], one.identifiable[name])
+
+
+def test_the_same_samples_give_the_same_water(teal):
+    samples = draw_samples(teal)
+    a, b = (fit_medium(samples, SETTINGS, "srgb") for _ in range(2))
+    assert torch.equal(a.medium.beta_D, b.medium.beta_D)
+    assert torch.equal(a.std.Binf, b.std.Binf)
+
+
+def test_swapping_channels_swaps_the_coefficients(teal):
+    samples = draw_samples(teal)
+    swapped = WaterSamples(
+        samples.I.flip(-1), samples.ray_depth, samples.frame, samples.track, samples.open_water.flip(-1)
+    )
+    a, b = (fit_medium(s, SETTINGS, "srgb") for s in (samples, swapped))
+    torch.testing.assert_close(a.medium.beta_D, b.medium.beta_D.flip(-1), rtol=1e-4, atol=1e-6)
+
+
+def test_a_single_distance_identifies_no_attenuation(teal):
+    fit = fit_medium(draw_samples(teal, spread=0.004), SETTINGS, "srgb")
+    assert not fit.identifiable["beta_D"].any()
+    assert not fit.identifiable["beta_B"].any()
+
+
+def test_many_distances_identify_attenuation_and_what_is_identified_is_right(teal):
+    fit = fit_medium(draw_samples(teal, spread=0.4, open_water=1000), SETTINGS, "srgb")
+    assert fit.identifiable["beta_D"].all()
+    assert ((fit.medium.beta_D - teal.beta_D).abs() / teal.beta_D < 0.15).all()
+
+
+def test_open_water_settles_the_veiling_light(teal):
+    near = draw_samples(teal, spread=0.1)
+    shown = draw_samples(teal, spread=0.1, open_water=1000)
+    blind, seeing = (fit_medium(s, SETTINGS, "srgb") for s in (near, shown))
+    assert (seeing.std.Binf < blind.std.Binf).all()
+    assert ((seeing.medium.Binf - teal.Binf).abs() < 0.03).all()
+
+
+def test_backscatter_stays_below_the_dark_envelope_where_pixels_are_seen_once(teal):
+    tracked = draw_samples(teal)
+    samples = WaterSamples(
+        tracked.I, tracked.ray_depth, tracked.frame, torch.full_like(tracked.track, -1), tracked.open_water
+    )
+    B = backscatter(samples.ray_depth, fit_medium(samples, SETTINGS, "srgb").at(samples.ray_depth))
+    assert ((samples.I - B) < -0.03).float().mean() < 0.03
+
+
+def test_beta_D_is_the_curve_at_the_median_depth(teal):
+    samples = draw_samples(teal)
+    fit = fit_medium(samples, SETTINGS, "srgb")
+    middle = samples.ray_depth.double().median().float()
+    torch.testing.assert_close(fit.medium.beta_D, fit.curve.at(middle), rtol=1e-3, atol=1e-5)
+
+
+def test_surfaces_hundreds_of_times_as_far_as_the_rest_do_no_harm(teal):
+    """Where T_D is too small for a number; numerical warnings are errors here."""
+    near, g = draw_samples(teal, points=400), torch.Generator().manual_seed(0)
+    far = torch.linspace(100.0, 2000.0, 1000)
+    nothing = torch.zeros(len(far), dtype=torch.long)
+    samples = WaterSamples(
+        torch.cat([near.I, teal.Binf + 0.01 * torch.rand(len(far), 3, generator=g)]),
+        torch.cat([near.ray_depth, far]),
+        torch.cat([near.frame, nothing]),
+        torch.cat([near.track, nothing - 1]),
+        near.open_water,
+    )
+    T_D, B = errors(fit_medium(samples, SETTINGS, "srgb"), teal, near.ray_depth)
+    assert T_D < 0.05
+    assert B < 0.03
+
+
+def grey_copy(samples: WaterSamples) -> WaterSamples:
+    def grey(colours: torch.Tensor) -> torch.Tensor:
+        return colours.mean(-1, keepdim=True).expand_as(colours).contiguous()
+
+    return replace(samples, I=grey(samples.I), open_water=grey(samples.open_water))
+
+
+def test_of_a_grey_clip_one_channel_is_fitted_and_stands_for_all(teal, monkeypatch: pytest.MonkeyPatch):
+    fitted = []
+
+    def counted(*arguments):
+        fitted.append(arguments)
+        return fit_channel(*arguments)
+
+    monkeypatch.setattr(seathru, "fit_channel", counted)
+    samples = draw_samples(Medium(*(v.mean().expand(3) for v in vars(teal).values())), open_water=1000)
+    fit = fit_medium(grey_copy(samples), SETTINGS, "srgb")
+    assert len(fitted) == 1
+    for value in (fit.medium.Binf, fit.medium.beta_D, fit.medium.beta_B, fit.std.beta_D, fit.curve.a):
+        assert torch.equal(value, value[:1].expand(3))
+    assert torch.equal(fit.identifiable["beta_D"], torch.ones(3, dtype=torch.bool))
+    fit_medium(samples, SETTINGS, "srgb")
+    assert len(fitted) == 1 + 3
+
+
+def test_a_time_stamp_in_colour_leaves_a_clip_grey_and_a_tinted_clip_is_in_colour(teal):
+    samples = draw_samples(teal)
+    assert not samples.grey
+    stamped = grey_copy(samples)
+    assert stamped.grey
+    stamped.I[:3, 0] = 1.0
+    assert stamped.grey
+    assert not replace(stamped, I=stamped.I * torch.tensor([1.0, 0.97, 1.0])).grey
+
+
+def test_too_few_pixels_are_an_error_in_plain_words(teal):
+    samples = draw_samples(teal)
+    few = WaterSamples(*(value[:20] for value in vars(samples).values()))
+    with pytest.raises(InputError, match="20 pixels"):
+        fit_medium(few, SETTINGS, "srgb")
+
+
+def test_the_water_of_a_dive_is_estimated_from_its_frames(dive):
+    fit = estimate_medium(dive.rec, dive.frames, SETTINGS, "srgb")
+    T_D, B = errors(fit, dive.medium, torch.linspace(1.0, 4.0, 50))
+    assert T_D < 0.05
+    assert B < 0.03
+
+
+@pytest.mark.shared
+def test_backscatter_explains_the_darkest_pixels_of_real_frames(shared):
+    """Mean |I - B| over the darkest 1 % of each of 10 range bins, eight FLSea frames, each fitted alone."""
+    residuals = []
+    for path in sorted((shared / "data/flsea_samples/rgb").glob("*.tiff")):
+        picture = cv2.imread(str(path))[::4, ::4, ::-1].astype(np.float32) / 255
+        depth = cv2.imread(str(path.parents[1] / "depth" / f"{path.stem}_depth.tif"), cv2.IMREAD_UNCHANGED)[::4, ::4]
+        I, z = torch.from_numpy(picture[depth > 0]), torch.from_numpy(depth[depth > 0].astype(np.float32))
+        alone = torch.zeros(len(z), dtype=torch.long)
+        fit = fit_medium(WaterSamples(I, z, alone, alone - 1, torch.zeros(0, 3)), SETTINGS, "srgb")
+        edges = torch.linspace(float(z.quantile(0.002)), float(z.quantile(0.998)), 11)
+        bins = torch.bucketize(z, edges[1:-1])
+        for k in bins.unique():
+            inside = torch.nonzero(bins == k)[:, 0]
+            darkest = inside[I[inside].mean(-1).argsort()[: max(1, len(inside) // 100)]]
+            residuals.append((I[darkest] - backscatter(z[darkest], fit.at(z[darkest]))).abs().mean())
+    assert len(residuals) > 60
+    assert torch.stack(residuals).mean() < 0.02

@@ -1,0 +1,274 @@
+"""Depth by plane sweep on scenes whose depth is known in closed form: textured planes, pinhole and bent lenses."""
+
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+import torch
+from jaxtyping import Float
+from torch import Tensor
+
+from swimm3r.cameras import Cameras, image_directions, project, unproject
+from swimm3r.io import images
+from swimm3r.scene.frames import Frame, Frames
+from swimm3r.scene.reconstruction import DepthMaps, Matches, Points, Reconstruction, Tracks
+from swimm3r.sfm.plane_sweep.estimate import RawDepth, consistent, estimate_depth, sweep
+from swimm3r.sfm.plane_sweep.views import View, choose_sources, depth_range, make_view, undistorted_cameras
+from swimm3r.sfm.settings import PlaneSweepSettings
+
+WIDTH, HEIGHT = 128, 96
+MIDDLE = (slice(16, -16), slice(24, -24))  # what enough sources see
+SETTINGS = PlaneSweepSettings(sources=3, planes=48, threads=1, speck=16)
+FRONTAL, SLANTED = (0.0, 0.0, 4.0), (0.45, -0.3, 4.0)  # the plane Z = a X + b Y + c in world axes
+
+
+def texture(X: np.ndarray, Y: np.ndarray) -> np.ndarray:
+    """A smooth picture without repetition on a surface, from waves down to 6 pixels long."""
+    rng = np.random.default_rng(3)
+    value = np.zeros_like(X)
+    for _ in range(60):
+        length, angle, phase = rng.uniform(0.2, 0.8), *rng.uniform(0, 2 * np.pi, 2)
+        value += np.sin(2 * np.pi / length * (np.cos(angle) * X + np.sin(angle) * Y) + phase)
+    return 0.5 + 0.02 * value
+
+
+def dive(model: str = "PINHOLE", distortion: tuple[float, ...] = ()) -> Cameras:
+    """Five cameras 0.25 apart that look along +z."""
+    poses = torch.eye(4, dtype=torch.float64).repeat(5, 1, 1)
+    poses[:, 0, 3] = torch.tensor([-0.5, -0.25, 0.0, 0.25, 0.5])
+    poses[:, 1, 3] = torch.tensor([0.0, 0.1, 0.0, -0.1, 0.0])
+    K = torch.tensor([[110.0, 0, WIDTH / 2], [0, 110.0, HEIGHT / 2], [0, 0, 1]], dtype=torch.float64).repeat(5, 1, 1)
+    return Cameras(K, torch.tensor([distortion] * 5, dtype=torch.float64).reshape(5, -1), poses, WIDTH, HEIGHT, model)
+
+
+def z_of_plane(camera: Cameras, plane: tuple[float, float, float]) -> Float[Tensor, "h w"]:
+    """Exact z depth of Z = a X + b Y + c in an unrotated camera."""
+    a, b, c = plane
+    rays, centre = image_directions(camera), camera.centres[0]
+    return (a * centre[0] + b * centre[1] + c - centre[2]) / (1 - a * rays[..., 0] - b * rays[..., 1])
+
+
+def photograph(camera: Cameras, plane: tuple[float, float, float]) -> Float[Tensor, "h w 3"]:
+    """The textured plane as the camera sees it, without noise."""
+    points = image_directions(camera) * z_of_plane(camera, plane)[..., None] + camera.centres[0]
+    grey = torch.from_numpy(texture(points[..., 0].numpy(), points[..., 1].numpy())).float()
+    return grey.clamp(0, 1)[..., None].expand(-1, -1, 3).contiguous()
+
+
+def views_of(plane: tuple[float, float, float], change: tuple[float, float] = (1.0, 0.0)) -> list[View]:
+    """All views of the plane; every one but the middle has its brightness changed to gain * value + offset."""
+    cameras, everywhere = dive(), torch.ones(HEIGHT, WIDTH, dtype=torch.bool)
+    canvas = undistorted_cameras(cameras, 640)
+    views = []
+    for i in range(5):
+        gain, offset = (1.0, 0.0) if i == 2 else change
+        picture = gain * photograph(cameras[i], plane) + offset
+        views.append(make_view(picture, everywhere, cameras[i], canvas[i]))
+    return views
+
+
+def middle_depth(views: list[View], settings: PlaneSweepSettings = SETTINGS) -> RawDepth:
+    return sweep(views[2], [views[i] for i in (0, 1, 3, 4)], (2.0, 9.0), settings)
+
+
+def reconstruction(cameras: Cameras, plane: tuple[float, float, float], folder: Path) -> Reconstruction:
+    """Exact poses, and points of the plane tracked in every frame that shows them."""
+    y, x = torch.meshgrid(torch.arange(5.5, HEIGHT, 8), torch.arange(5.5, WIDTH, 8), indexing="ij")
+    xy = torch.stack([x, y], -1).reshape(1, -1, 2).double()
+    z = z_of_plane(cameras[2], plane)[xy[0, :, 1].long(), xy[0, :, 0].long()]
+    xyz = unproject(cameras[2], xy, z[None])[0]
+    pixels, _ = project(cameras, xyz.expand(5, -1, -1))
+    frame, point = ((pixels > 0) & (pixels < torch.tensor([WIDTH, HEIGHT]))).all(-1).nonzero(as_tuple=True)
+    none = torch.zeros(0, dtype=torch.long)
+    return Reconstruction(
+        tuple(f"{i}.png" for i in range(5)),
+        cameras,
+        Points(xyz, torch.zeros(len(xyz), 3), torch.zeros(len(xyz))),
+        Tracks(point, frame, pixels[frame, point]),
+        Matches(none, none, torch.zeros(0, 2), torch.zeros(0, 2), torch.zeros(0)),
+        DepthMaps(folder / "z_depth"),
+        "truth",
+    )
+
+
+def frames_on_disk(cameras: Cameras, plane: tuple[float, float, float], folder: Path) -> Frames:
+    made = []
+    for i in range(5):
+        path = folder / f"{i}.png"
+        images.write_rgb(path, photograph(cameras[i], plane).numpy())
+        made.append(Frame(path.name, path, float(i), 0.0, "train"))
+    return Frames(tuple(made), WIDTH, HEIGHT, ordered=True)
+
+
+def relative_error(found: Tensor, true: Tensor) -> Tensor:
+    known = found > 0
+    return ((found[known] - true[known]).abs() / true[known]).double()
+
+
+@pytest.mark.parametrize("plane", [FRONTAL, SLANTED])
+def test_depth_of_a_textured_plane_is_right_almost_everywhere(plane: tuple[float, float, float]):
+    raw = middle_depth(views_of(plane)).inverse_depth
+    error = relative_error(torch.where(raw > 0, 1 / raw, 0.0), z_of_plane(dive()[2], plane))
+    assert (raw > 0)[MIDDLE].double().mean() > 0.9
+    assert error.median() < 0.003
+    assert error.quantile(0.95) < 0.02
+
+
+def test_contrast_lost_and_light_added_in_the_sources_change_nothing():
+    noiseless = replace(SETTINGS, noise=1e-5)  # what is allowed for noise is an absolute amount
+    as_taken = middle_depth(views_of(SLANTED), noiseless).inverse_depth
+    faded = middle_depth(views_of(SLANTED, change=(0.6, 0.3)), noiseless).inverse_depth
+    both = (as_taken > 0) & (faded > 0)
+    assert both[MIDDLE].double().mean() > 0.9
+    assert ((as_taken - faded).abs() / as_taken)[both].quantile(0.95) < 0.001
+
+
+def test_the_same_views_give_the_same_depth_bit_for_bit():
+    views = views_of(SLANTED)
+    assert torch.equal(middle_depth(views).inverse_depth, middle_depth(views).inverse_depth)
+
+
+def test_open_water_stays_unknown():
+    generator = torch.Generator().manual_seed(0)
+    water = [
+        replace(view, detail=0.5 / 255 * torch.randn(HEIGHT, WIDTH, generator=generator)) for view in views_of(FRONTAL)
+    ]
+    assert (middle_depth(water).inverse_depth > 0).double().mean() < 0.01
+
+
+def test_a_depth_no_other_frame_shares_is_dropped_and_a_shared_one_stays():
+    cameras = dive()
+    canvas = undistorted_cameras(cameras, 640)
+    true = [1 / z_of_plane(cameras[i], SLANTED).float() for i in range(5)]
+    wrong = true[2].clone()
+    wrong[40:60, 40:80] *= 1.1
+    sure = torch.ones(HEIGHT, WIDTH)
+    others = [RawDepth(true[i], sure) for i in (0, 1, 3, 4)]
+    kept = consistent(RawDepth(wrong, sure), others, canvas[[2, 0, 1, 3, 4]], 0.5, SETTINGS)
+    assert (kept.inverse_depth[42:58, 42:78] == 0).all()
+    assert (kept.inverse_depth[10:30, 30:90] > 0).all()
+    assert (kept.correlation[kept.inverse_depth == 0] == 0).all()
+
+
+def test_frames_with_poor_poses_may_differ_by_what_the_poses_are_worth():
+    canvas = undistorted_cameras(dive(), 640)
+    true = [1 / z_of_plane(dive()[i], FRONTAL).float() for i in range(5)]
+    sure = torch.ones(HEIGHT, WIDTH)
+    others = [RawDepth(true[i], sure) for i in (0, 1, 3, 4)]
+    off = RawDepth(1.03 * true[2], sure)  # 0.2 and 0.4 pixels at the two baselines
+    strict = consistent(off, others, canvas[[2, 0, 1, 3, 4]], 0.1, SETTINGS).inverse_depth
+    lenient = consistent(off, others, canvas[[2, 0, 1, 3, 4]], 0.5, SETTINGS).inverse_depth
+    assert (strict[MIDDLE] == 0).all()
+    assert (lenient[MIDDLE] > 0).all()
+
+
+def test_sources_are_the_frames_with_the_better_baseline(tmp_path: Path):
+    rec = reconstruction(dive(), FRONTAL, tmp_path)  # 4 units away, 0.25 apart: 3.6 degrees a step
+    first = choose_sources(rec, 2, angle_deg=7.0)
+    assert first[0][0] == 2
+    assert first[4][0] == 2
+    assert set(first[2]) == {0, 4}
+
+
+def test_the_searched_depths_enclose_the_points_with_room_behind(tmp_path: Path):
+    rec = reconstruction(dive(), SLANTED, tmp_path)
+    z = project(rec.cameras[2], rec.points.xyz[None])[1]
+    near, far = depth_range(rec, 2) or (0.0, 0.0)
+    assert 0.5 * z.min() < near < z.min()
+    assert far > 1.5 * z.max()
+
+
+def test_a_frame_without_points_has_no_depth(tmp_path: Path):
+    cameras = dive()
+    rec = reconstruction(cameras, FRONTAL, tmp_path)
+    elsewhere = rec.tracks.frame != 4
+    rec = replace(
+        rec, tracks=Tracks(rec.tracks.point[elsewhere], rec.tracks.frame[elsewhere], rec.tracks.xy[elsewhere])
+    )
+    depth = estimate_depth(rec, frames_on_disk(cameras, FRONTAL, tmp_path), SETTINGS)
+    assert (depth["4.png"].z_depth == 0).all()
+    assert (depth["2.png"].z_depth > 0).double().mean() > 0.7
+
+
+def test_depth_lies_on_the_grid_of_a_distorted_frame(tmp_path: Path):
+    cameras = dive("OPENCV", (-0.12, 0.02, 0.001, -0.001))
+    rec = reconstruction(cameras, SLANTED, tmp_path)
+    depth = estimate_depth(rec, frames_on_disk(cameras, SLANTED, tmp_path), SETTINGS)
+    found = depth["2.png"]
+    error = relative_error(found.z_depth, z_of_plane(cameras[2], SLANTED))
+    assert found.z_depth.shape == (HEIGHT, WIDTH)
+    assert (found.z_depth > 0)[MIDDLE].double().mean() > 0.9
+    assert error.median() < 0.003
+    assert error.quantile(0.95) < 0.02
+    assert ((found.confidence > 0) == (found.z_depth > 0)).all()
+
+
+def test_depth_of_large_frames_is_computed_small_and_returned_large(tmp_path: Path):
+    cameras = dive()
+    rec = reconstruction(cameras, SLANTED, tmp_path)
+    found = estimate_depth(rec, frames_on_disk(cameras, SLANTED, tmp_path), replace(SETTINGS, long_side=80))["2.png"]
+    error = relative_error(found.z_depth, z_of_plane(cameras[2], SLANTED))
+    assert found.z_depth.shape == (HEIGHT, WIDTH)
+    assert (found.z_depth > 0).double().mean() > 0.6
+    assert error.median() < 0.01
+
+
+def test_masked_pixels_have_no_depth(tmp_path: Path):
+    cameras = dive()
+    rec = reconstruction(cameras, FRONTAL, tmp_path)
+    frames = frames_on_disk(cameras, FRONTAL, tmp_path)
+    usable = np.full((HEIGHT, WIDTH), True)
+    usable[30:60, 40:80] = False
+    images.write_mask(tmp_path / "masks" / "2.png", usable)
+    masked = tuple(replace(f, mask=tmp_path / "masks" / "2.png") if f.name == "2.png" else f for f in frames)
+    depth = estimate_depth(rec, replace(frames, frames=masked), SETTINGS)["2.png"].z_depth
+    assert (depth[30:60, 40:80] == 0).all()
+    assert (depth > 0).double().mean() > 0.5
+
+
+def test_an_interrupted_sweep_goes_on_where_it_stopped(tmp_path: Path):
+    cameras = dive()
+    frames = frames_on_disk(cameras, FRONTAL, tmp_path)
+    whole = estimate_depth(reconstruction(cameras, FRONTAL, tmp_path / "whole"), frames, SETTINGS)
+    rec = reconstruction(cameras, FRONTAL, tmp_path / "broken")
+
+    for stop_in, stop_at in (("depth", 2), ("depth agreement", 3)):
+
+        def power_cut(what: str, done: int, total: int, stop: tuple[str, int] = (stop_in, stop_at)) -> None:
+            if (what, done) == stop:
+                raise KeyboardInterrupt
+
+        with pytest.raises(KeyboardInterrupt):
+            estimate_depth(rec, frames, SETTINGS, power_cut)
+    seen: list[tuple[str, int]] = []
+    resumed = estimate_depth(rec, frames, SETTINGS, lambda what, done, total: seen.append((what, done)))
+    assert all(what == "depth agreement" and done > 3 for what, done in seen)
+    for name in rec.names:
+        assert torch.equal(resumed[name].z_depth, whole[name].z_depth)
+
+
+def test_maps_of_other_cameras_are_not_kept(tmp_path: Path):
+    cameras = dive()
+    frames = frames_on_disk(cameras, FRONTAL, tmp_path)
+    rec = reconstruction(cameras, FRONTAL, tmp_path)
+    estimate_depth(rec, frames, SETTINGS)
+    twice = replace(cameras, cam2world=cameras.cam2world.clone())
+    twice.cam2world[:, :3, 3] *= 2
+    larger = replace(rec, cameras=twice, points=replace(rec.points, xyz=rec.points.xyz * 2))
+    estimate_depth(larger, frames, SETTINGS)
+    with np.load(rec.depth.path("2.png")) as stored:
+        assert np.median(stored["z_depth"][stored["z_depth"] > 0]) == pytest.approx(8.0, rel=0.01)
+
+
+def test_progress_counts_every_frame_of_both_passes(tmp_path: Path):
+    cameras = dive()
+    told: list[tuple[str, int, int]] = []
+    estimate_depth(
+        reconstruction(cameras, FRONTAL, tmp_path),
+        frames_on_disk(cameras, FRONTAL, tmp_path),
+        SETTINGS,
+        lambda what, done, total: told.append((what, done, total)),
+    )
+    assert told == [(what, k, 5) for what in ("depth", "depth agreement") for k in range(1, 6)]
+    assert not (tmp_path / "z_depth" / ".raw").exists()

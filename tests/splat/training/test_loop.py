@@ -1,0 +1,183 @@
+"""The loop: it learns, it is exact about going on, and it writes what it says."""
+
+import copy
+import json
+from dataclasses import replace
+from pathlib import Path
+
+import pytest
+import torch
+
+from swimm3r.errors import UsageError
+from swimm3r.evaluate.images import psnr
+from swimm3r.splat import train
+from swimm3r.splat.map_file import load_map
+from swimm3r.splat.projection.dispatch import pinhole
+from swimm3r.splat.recipes import uwbs
+from swimm3r.splat.rendering import SplatMap, draw
+from swimm3r.splat.settings import (
+    DensifySettings,
+    InitialSettings,
+    LossWeights,
+    MediumFieldSettings,
+    SggSettings,
+    UwbsSettings,
+)
+from swimm3r.splat.training.loop import view_of_step
+from swimm3r.splat.training.scene import Site
+from swimm3r.splat.views import TrainingViews
+
+SETTINGS = UwbsSettings(
+    iterations=40,
+    initial=InitialSettings(primitives=500, scale=2.0),
+    densify=DensifySettings(max_primitives=700, min_every=4),
+    log_every=0.125,
+    checkpoint_every=0.25,
+)
+
+
+def equal(a: SplatMap, b: SplatMap) -> bool:
+    same = [torch.equal(x, y) for x, y in zip(a.primitives, b.primitives, strict=True)]
+    weights = a.field.state_dict(), b.field.state_dict()
+    return all(same) and all(torch.equal(weights[0][k], weights[1][k]) for k in weights[0])
+
+
+def rows(folder: Path) -> list[dict]:
+    return [json.loads(line) for line in (folder / "metrics.jsonl").read_text().splitlines()]
+
+
+class StoppedError(Exception):
+    pass
+
+
+def stop_at(step: int):
+    def progress(what: str, done: int, total: int, /) -> None:
+        if done == step:
+            raise StoppedError
+
+    return progress
+
+
+def test_training_brings_the_map_nearer_to_a_picture_it_has_not_seen(tiny_dive, tmp_path):
+    settings = replace(SETTINGS, iterations=150)
+    scene = train(tiny_dive.rec, tiny_dive.frames, settings, tmp_path)
+    logged = rows(tmp_path)
+    assert logged[-1]["l1"] < 0.5 * logged[0]["l1"]
+    held_out = psnr(scene.render(tiny_dive.cameras[0]).rgb, tiny_dive.frames.image(0))
+    assert held_out > 25
+
+
+def test_an_interrupted_training_ends_with_the_bits_of_one_that_was_not(tiny_dive, tmp_path):
+    whole = train(tiny_dive.rec, tiny_dive.frames, SETTINGS, tmp_path / "whole")
+    with pytest.raises(StoppedError):
+        train(tiny_dive.rec, tiny_dive.frames, SETTINGS, tmp_path / "cut", stop_at(27))
+    assert not (tmp_path / "cut/map.safetensors").exists()
+    with (tmp_path / "cut/metrics.jsonl").open("a") as torn:
+        torn.write('{"step": 30, "loss": {"l1": 0.5}')
+    resumed = train(tiny_dive.rec, tiny_dive.frames, SETTINGS, tmp_path / "cut")
+    assert equal(whole, resumed)
+    assert len(whole.primitives.xyz) > 500
+    steps = [[row["step"] for row in rows(tmp_path / name)] for name in ("whole", "cut")]
+    assert steps[0] == steps[1] == [5, 10, 15, 20, 25, 30, 35, 40]
+
+
+def test_a_checkpoint_of_other_settings_is_not_continued(tiny_dive, tmp_path):
+    short = replace(SETTINGS, iterations=8)
+    train(tiny_dive.rec, tiny_dive.frames, short, tmp_path / "a")
+    other = replace(short, seed=1)
+    anew = train(tiny_dive.rec, tiny_dive.frames, other, tmp_path / "a")
+    assert equal(anew, train(tiny_dive.rec, tiny_dive.frames, other, tmp_path / "b"))
+
+
+def test_a_map_comes_back_from_disk_as_it_was(tiny_dive, tmp_path):
+    scene = train(tiny_dive.rec, tiny_dive.frames, replace(SETTINGS, iterations=4), tmp_path)
+    stored = load_map(tmp_path / "map.safetensors")
+    assert equal(scene, stored)
+    assert stored.settings == scene.settings
+    assert stored.metric
+    view = tiny_dive.cameras[4]
+    assert torch.equal(scene.render(view).rgb, stored.render(view).rgb)
+
+
+def test_a_scene_in_another_unit_trains_to_the_same_map_in_that_unit(tiny_dive, tmp_path):
+    """Without metric scale the unit is arbitrary: the picture must not depend on it."""
+    rec = replace(tiny_dive.rec, metric=False)
+    few = replace(SETTINGS, iterations=10)
+    scene = train(rec, tiny_dive.frames, few, tmp_path / "one")
+    assert scene.length == pytest.approx(1, abs=0.1)  # the wall stands at about the working depth
+    view = tiny_dive.cameras[4]
+    metric = train(tiny_dive.rec, tiny_dive.frames, few, tmp_path / "metric")
+    assert psnr(scene.render(view).rgb, metric.render(view).rgb) > 35
+
+
+def test_the_water_waits_for_the_primitives(tiny_dive, tmp_path):
+    still = replace(SETTINGS, iterations=10, medium=MediumFieldSettings(begin=1.0))
+    moving = replace(SETTINGS, iterations=10, medium=MediumFieldSettings(begin=0.0))
+    water = [
+        train(tiny_dive.rec, tiny_dive.frames, settings, tmp_path / str(i)).render(tiny_dive.cameras[0]).medium.beta_D
+        for i, settings in enumerate((still, moving))
+    ]
+    known = tiny_dive.rec.medium.medium.beta_D.expand_as(water[0])
+    torch.testing.assert_close(water[0], known)
+    assert (water[1] - known).abs().max() > 1e-4
+
+
+def test_an_epoch_visits_every_view_once_and_each_in_its_own_order():
+    epochs = [[view_of_step(step, 7, seed=0) for step in range(1 + 7 * e, 8 + 7 * e)] for e in range(3)]
+    assert all(sorted(epoch) == list(range(7)) for epoch in epochs)
+    assert epochs[0] != epochs[1]
+
+
+def test_the_number_of_primitives_never_exceeds_the_cap(tiny_dive, tmp_path):
+    capped = replace(SETTINGS, densify=DensifySettings(max_primitives=510, min_every=4))
+    assert len(train(tiny_dive.rec, tiny_dive.frames, capped, tmp_path).primitives.xyz) == 510
+
+
+def test_the_objective_is_the_papers_sum_with_the_papers_weights(tiny_dive):
+    paper = UwbsSettings(weights=LossWeights(coverage=0.0, open_water=0.0, gamut=0.0, max_radius=100.0))
+    view = TrainingViews(tiny_dive.rec, tiny_dive.frames, paper, 1.0)[3]
+    p = tiny_dive.truth.primitives
+    p = p._replace(xyz=p.xyz + 0.05, scale=p.scale.clone())
+    p.scale[0] = 3.0  # larger than 100 px of a 1280 px wide picture
+    drawing = draw(p, tiny_dive.truth.field, pinhole(view.camera), paper)
+    found = uwbs.objective(p, drawing, view, paper, None, regularised=True)
+    n = {name: float(torch.as_tensor(value).detach()) for name, value in found.numbers.items()}
+    expected = 0.8 * n["l1"] + 0.2 * (1 - n["ssim"]) + 0.01 * n["opacity"] + 0.01 * n["scale"]
+    expected += 0.1 * n["depth"] + 1.0 * n["medium_smoothness"] + 0.1 * n["radius"]
+    assert float(found.total) == pytest.approx(expected, rel=1e-5)
+    assert min(n["depth"], n["radius"], n["l1"]) > 0
+    without = uwbs.objective(p, drawing, view, paper, None, regularised=False)
+    assert float(found.total - without.total) == pytest.approx(0.01 * (n["opacity"] + n["scale"]), rel=1e-3)
+
+
+def test_mcmc_noise_comes_with_every_step_where_asked(tiny_dive):
+    views = TrainingViews(tiny_dive.rec, tiny_dive.frames, SETTINGS, 1.0)
+    moved = {}
+    for cadence in ("round", "step"):
+        faint = replace(SETTINGS, iterations=1000, initial=InitialSettings(primitives=200, opacity=0.004))
+        settings = replace(faint, densify=DensifySettings(noise_cadence=cadence))
+        recipe = uwbs.Uwbs(settings, Site(tiny_dive.rec, 1.0, 1.0, views))
+        moved[cadence] = recipe.step(recipe.start(), views[3], 1)[0].primitives.xyz
+    assert (moved["round"] != moved["step"]).any(-1).float().mean() > 0.9
+
+
+def test_rates_settle_from_half_of_the_run_on(tiny_dive):
+    held = replace(SETTINGS, sgg=SggSettings(enabled=False), densify=DensifySettings(end=0.0))
+    views = TrainingViews(tiny_dive.rec, tiny_dive.frames, held, 1.0)
+    settling = replace(held, rates=replace(held.rates, settle=0.01))
+    start = uwbs.Uwbs(held, Site(tiny_dive.rec, 1.0, 1.0, views)).start()
+    for step, share in ((20, 1.0), (30, 0.1), (40, 0.01)):
+        moved = []
+        for settings in (held, settling):
+            recipe = uwbs.Uwbs(settings, Site(tiny_dive.rec, 1.0, 1.0, views))
+            after = recipe.step(copy.deepcopy(start), views[3], step)[0].primitives.opacity
+            moved.append((after - start.primitives.opacity).abs().max())
+        assert moved[0] > 0
+        torch.testing.assert_close(moved[1], share * moved[0], rtol=1e-4, atol=0)
+
+
+def test_a_near_plane_behind_the_scene_is_refused_before_training(tiny_dive, tmp_path):
+    settings = replace(SETTINGS, render=replace(SETTINGS.render, near=10.0))
+    with pytest.raises(UsageError, match="near plane"):
+        train(tiny_dive.rec, tiny_dive.frames, settings, tmp_path)
+    assert not any(tmp_path.iterdir())
