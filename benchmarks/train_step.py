@@ -25,7 +25,8 @@ from swimm3r.raster import MediumMaps, rasterize
 from swimm3r.splat.medium.field import grid_of, initial_field, medium_at_pixels, per_z_depth
 from swimm3r.splat.optimizer import adam_step
 from swimm3r.splat.primitives.beta import BetaPrimitives, inverse_softplus
-from swimm3r.splat.projection.dispatch import pinhole, project
+from swimm3r.splat.projection.dispatch import project
+from swimm3r.splat.projection.pinhole import pinhole
 from swimm3r.splat.recipes import uwbs
 from swimm3r.splat.rendering import Drawing
 from swimm3r.splat.settings import UwbsSettings

@@ -12,7 +12,7 @@ import torch
 
 import swimm3r
 from swimm3r.io.images import read_rgb
-from swimm3r.splat.projection.dispatch import pinhole
+from swimm3r.splat.projection.pinhole import pinhole
 from swimm3r.splat.settings import DensifySettings, InitialSettings, MediumFieldSettings, UwbsSettings
 
 README = Path(__file__).parents[1] / "README.md"

@@ -9,7 +9,8 @@ import torch
 from swimm3r.cameras import Cameras
 from swimm3r.raster import MediumMaps, RasterOutput, rasterize
 from swimm3r.splat.primitives.beta import BetaPrimitives
-from swimm3r.splat.projection.dispatch import Pinhole, pinhole, project
+from swimm3r.splat.projection.dispatch import project
+from swimm3r.splat.projection.pinhole import Pinhole, pinhole
 from swimm3r.splat.settings import RenderSettings
 
 Make = Callable[..., BetaPrimitives]

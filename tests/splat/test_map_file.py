@@ -13,8 +13,9 @@ from swimm3r.errors import InputError
 from swimm3r.io.files.damage import remake
 from swimm3r.io.files.tensor_file import read_tensors, write_tensors
 from swimm3r.settings_document import from_document, to_document
-from swimm3r.splat.map_file import StateHeader, load_map, read_state, save_map, write_state
+from swimm3r.splat.map_file import load_map, save_map
 from swimm3r.splat.settings import RenderSettings, UwbsSettings
+from swimm3r.splat.training.checkpoint import StateHeader, read_state, write_state
 from swimm3r.splat.training_poses import RefinedPoses
 
 

@@ -31,7 +31,9 @@ from swimm3r.splat.primitives.beta import BetaPrimitives, select
 from swimm3r.splat.primitives.gaussian import coloured, covariance
 from swimm3r.splat.primitives.spherical_harmonics import Y_00
 from swimm3r.splat.projection.conditioning import Conditioned, condition, queries, symmetric
-from swimm3r.splat.projection.dispatch import pinhole, project, project_conditioned
+from swimm3r.splat.projection.dispatch import project
+from swimm3r.splat.projection.pinhole import pinhole
+from swimm3r.splat.projection.plain import project_conditioned
 from swimm3r.splat.rendering import SplatMap, in_scene_units
 from swimm3r.splat.settings import RenderSettings
 

@@ -3,7 +3,7 @@
 from pathlib import Path
 
 from swimm3r import weights
-from swimm3r.io.imports.record import read_foreign
+from swimm3r.io.imports.read import read_foreign
 from swimm3r.pipeline.presets import RunSettings
 from swimm3r.prepare import check_source
 from swimm3r.prepare.masks import check_masks

@@ -9,7 +9,7 @@ from dataclasses import asdict, dataclass
 from hashlib import sha256
 from pathlib import Path
 
-from swimm3r.io.imports.record import read_foreign
+from swimm3r.io.imports.read import read_foreign
 from swimm3r.io.view_names import view_stems
 from swimm3r.pipeline import held_out
 from swimm3r.pipeline import summary as sections

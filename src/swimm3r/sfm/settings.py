@@ -95,7 +95,7 @@ class RestoreSettings(Settings):
 
 @dataclass(frozen=True)
 class SeathruSettings(Settings):
-    """The water from pictures and depth (`sfm/medium/seathru.py`). Values are 0..1, standard deviations without unit."""
+    """The water from images and depth (`sfm/medium/seathru.py`); values are 0..1, standard deviations without unit."""
 
     tracks: TrackSettings = field(default_factory=TrackSettings)
     max_pixels: Count = 300_000
@@ -299,7 +299,7 @@ class ColmapModelSettings(Settings):
 
     model: Path
     """The folder with cameras, images and points3D (.bin or .txt), or one above its sparse/0; or another program's file
-    (`io.foreign.model.read_foreign`)."""
+    (`swimm3r.io.imports.read.read_foreign`)."""
     features: FeatureSettings = field(default_factory=FeatureSettings)
     depth: PlaneSweepSettings = field(default_factory=PlaneSweepSettings)
     water: SeathruSettings = field(default_factory=SeathruSettings)

@@ -6,7 +6,7 @@ frames' poses where they were refined. A checkpoint adds the optimiser's moments
 """
 
 from collections.abc import Mapping
-from dataclasses import asdict, dataclass
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, cast
 
@@ -15,26 +15,15 @@ from torch import Tensor
 from swimm3r.cameras import check_poses
 from swimm3r.io.files.damage import Remedy, guard
 from swimm3r.io.files.safe_names import check_names
-from swimm3r.io.files.tensor_file import TensorFile, read_tensors, write_tensors
+from swimm3r.io.files.tensor_file import read_tensors, write_tensors
 from swimm3r.settings_document import from_document, to_document
+from swimm3r.splat.parts import parts_of
+from swimm3r.splat.primitives.kinds import primitives_from
 from swimm3r.splat.rendering import SplatMap
 from swimm3r.splat.settings import RECIPES, Recipe, recipe_of, settings_of
-from swimm3r.splat.training.state import parts_of, primitives_from
 from swimm3r.splat.training_poses import RefinedPoses
 
 SCHEMA = 1
-
-
-@dataclass(frozen=True)
-class StateHeader:
-    """The header of a checkpoint."""
-
-    step: int
-    fingerprint: str
-
-    def __post_init__(self) -> None:
-        if self.step < 0:
-            raise ValueError(f"steps count from 0, got {self.step}")
 
 
 @dataclass(frozen=True)
@@ -98,21 +87,6 @@ def load_map(path: Path) -> SplatMap:
             poses = RefinedPoses(about.frames, _poses(stored.tensors, len(about.frames)))
     field.requires_grad_(False)
     return SplatMap(primitives, field, settings, about.metric, about.length, about.span, poses)
-
-
-def write_state(path: Path, tensors: Mapping[str, Tensor], header: StateHeader) -> None:
-    """Write a checkpoint, whole or not at all."""
-    write_tensors(path, tensors, {"schema": SCHEMA, **asdict(header)})
-
-
-def read_state(path: Path) -> TensorFile[StateHeader]:
-    """Read what `write_state` wrote. Raises InputError for a file that is damaged or of another kind."""
-    return read_tensors(path, StateHeader, state_remedy(path), SCHEMA)
-
-
-def state_remedy(path: Path) -> Remedy:
-    """Advice for a checkpoint that training cannot go on from."""
-    return Remedy(f"remove {path.parent}; the same command then trains from the start")
 
 
 def _poses(tensors: Mapping[str, Tensor], count: int) -> Tensor:

@@ -17,7 +17,9 @@ from torch import Tensor
 from swimm3r.cameras import Cameras
 from swimm3r.progress import Progress, silent
 from swimm3r.splat.primitives.beta import select
-from swimm3r.splat.projection.dispatch import Primitives, pinhole, project
+from swimm3r.splat.primitives.kinds import Primitives
+from swimm3r.splat.projection.dispatch import project
+from swimm3r.splat.projection.pinhole import pinhole
 from swimm3r.splat.rendering import SplatMap, in_scene_units, memory_for_views, pictures
 from swimm3r.splat.settings import PoseRefinementSettings
 from swimm3r.splat.training_poses import moved

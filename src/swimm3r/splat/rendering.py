@@ -24,17 +24,16 @@ from swimm3r.splat.medium.field import (
     ray_lengths,
 )
 from swimm3r.splat.medium.seasplat import SceneWater, WaterLayer, layer, relative_depth, seen_through
-from swimm3r.splat.projection.dispatch import Pinhole, Primitives, Projection, pinhole, project
+from swimm3r.splat.parts import Water
+from swimm3r.splat.primitives.kinds import Primitives
+from swimm3r.splat.projection.dispatch import project
+from swimm3r.splat.projection.pinhole import Pinhole, Projection, pinhole
 from swimm3r.splat.settings import SplatSettings, UwbsSettings
 from swimm3r.splat.training_poses import RefinedPoses
 from swimm3r.splat.views import moment
 
 _SEEN = 1e-3  # alpha below which a pixel has no depth
 _COVERED = 0.5  # alpha from which on a pixel's clear colour is that of a surface
-
-
-Water = MediumField | SceneWater
-"""Either is in every primitive's way to a pixel, or over the finished picture."""
 
 
 @dataclass(frozen=True)

@@ -14,7 +14,8 @@ from swimm3r.io import images, ply
 from swimm3r.io.cameras_json import CameraTable, write_cameras
 from swimm3r.io.colmap import model as colmap
 from swimm3r.io.colmap.model import ColmapModel
-from swimm3r.io.imports.record import ForeignModel, read_foreign
+from swimm3r.io.imports.read import read_foreign
+from swimm3r.io.imports.record import ForeignModel
 
 WIDTH, HEIGHT, N = 400, 300, 4
 K = np.array([[310.0, 0, 203], [0, 308.0, 148], [0, 0, 1]])

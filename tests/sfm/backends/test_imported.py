@@ -12,7 +12,8 @@ from swimm3r.errors import InputError
 from swimm3r.io import images
 from swimm3r.io.cameras_json import CameraTable, write_cameras
 from swimm3r.io.colmap.model import ColmapModel
-from swimm3r.io.imports.record import ForeignDepth, ForeignModel, read_foreign
+from swimm3r.io.imports.read import read_foreign
+from swimm3r.io.imports.record import ForeignDepth, ForeignModel
 from swimm3r.scene import reconstruction
 from swimm3r.scene.frames import Frame, Frames
 from swimm3r.scene.reconstruction import Tracks

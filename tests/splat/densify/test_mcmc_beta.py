@@ -10,7 +10,7 @@ from swimm3r.splat.primitives.beta import BetaPrimitives
 from swimm3r.splat.projection.conditioning import rotation_block
 from swimm3r.splat.settings import DensifySettings
 
-VECTORS = Path(__file__).parents[1] / "data/uwbs_vectors.npz"
+VECTORS = Path(__file__).parents[2] / "data/uwbs_vectors.npz"
 
 
 def rng() -> torch.Generator:

@@ -20,7 +20,7 @@ from swimm3r.splat import train
 from swimm3r.splat.map_file import load_map
 from swimm3r.splat.medium.field import grid_of, initial_field
 from swimm3r.splat.primitives.beta import initial_primitives, with_time
-from swimm3r.splat.projection.dispatch import pinhole
+from swimm3r.splat.projection.pinhole import pinhole
 from swimm3r.splat.settings import (
     DensifySettings,
     InitialSettings,

@@ -18,7 +18,7 @@ from swimm3r.splat.medium.field import (
     water_prior,
     with_expected_horizon,
 )
-from swimm3r.splat.projection.dispatch import pinhole
+from swimm3r.splat.projection.pinhole import pinhole
 from swimm3r.splat.settings import MediumFieldSettings
 
 WATER = Medium(torch.tensor([0.1, 0.4, 0.5]), torch.tensor([0.4, 0.15, 0.1]), torch.tensor([0.3, 0.2, 0.25]))

@@ -26,9 +26,10 @@ from swimm3r.splat.primitives.gaussian import (
     to_degree,
 )
 from swimm3r.splat.primitives.spherical_harmonics import Y_00, spherical_harmonics
-from swimm3r.splat.projection.dispatch import Pinhole, pinhole, project
+from swimm3r.splat.projection.dispatch import project
+from swimm3r.splat.projection.pinhole import Pinhole, pinhole
 
-VECTORS = np.load(Path(__file__).parents[1] / "data" / "uwbs_vectors.npz")
+VECTORS = np.load(Path(__file__).parents[2] / "data" / "uwbs_vectors.npz")
 
 
 def gaussians(n: int, seed: int = 0) -> GaussianPrimitives:

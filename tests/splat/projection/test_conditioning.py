@@ -11,7 +11,7 @@ from swimm3r.splat.primitives.beta import BetaPrimitives
 from swimm3r.splat.projection.conditioning import condition, conditioned_in_view, factor, queries, rotation_block
 from swimm3r.splat.settings import RenderSettings
 
-VECTORS = Path(__file__).parents[1] / "data/uwbs_vectors.npz"
+VECTORS = Path(__file__).parents[2] / "data/uwbs_vectors.npz"
 
 
 @pytest.fixture(scope="module")

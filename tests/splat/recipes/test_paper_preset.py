@@ -10,7 +10,7 @@ from swimm3r.cameras import image_directions
 from swimm3r.cli.main import main
 from swimm3r.evaluate.images import ssim
 from swimm3r.pipeline.presets import MAST3R_PRESETS, PRESETS
-from swimm3r.splat.projection.dispatch import pinhole
+from swimm3r.splat.projection.pinhole import pinhole
 from swimm3r.splat.recipes import uwbs
 from swimm3r.splat.rendering import draw
 from swimm3r.splat.settings import UwbsSettings, with_recipe

@@ -8,7 +8,7 @@ import torch
 from swimm3r.splat.medium.field import grid_of, initial_field
 from swimm3r.splat.optimizer import Moments
 from swimm3r.splat.primitives.gaussian import GaussianPrimitives
-from swimm3r.splat.projection.dispatch import pinhole
+from swimm3r.splat.projection.pinhole import pinhole
 from swimm3r.splat.recipes.watersplatting import WaterSplatting, relative_photometric
 from swimm3r.splat.rendering import draw
 from swimm3r.splat.settings import UwbsSettings, watersplatting, with_recipe

@@ -12,7 +12,7 @@ from swimm3r.errors import UsageError
 from swimm3r.evaluate.images import psnr
 from swimm3r.splat import train
 from swimm3r.splat.map_file import load_map
-from swimm3r.splat.projection.dispatch import pinhole
+from swimm3r.splat.projection.pinhole import pinhole
 from swimm3r.splat.recipes import uwbs
 from swimm3r.splat.rendering import SplatMap, draw
 from swimm3r.splat.settings import (

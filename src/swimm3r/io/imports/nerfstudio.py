@@ -14,7 +14,7 @@ import numpy as np
 
 from swimm3r.io.files.json_file import read_json, structure
 from swimm3r.io.files.safe_names import check_name
-from swimm3r.io.imports.record import REMEDY, ForeignModel, one_size, read_foreign, without_points
+from swimm3r.io.imports.record import REMEDY, ForeignModel, one_size, without_points
 from swimm3r.io.ply import read_points
 
 _FLIP = np.diag([1.0, -1.0, -1.0, 1.0])
@@ -101,9 +101,9 @@ def read(path: Path, document: dict[str, Any]) -> ForeignModel:
 
 def pictures_folder(path: Path) -> Path:
     """Where the pictures of a transforms.json lie. Raises InputError for a file that is not one."""
-    names = read_foreign(path).model.names
     file = path / "transforms.json" if path.is_dir() else path
-    first = _relative(read_json(file, _Document, REMEDY).frames[0])
+    document = read_json(file, _Document, REMEDY)
+    names, first = _names(document), _relative(document.frames[0])
     # names with folders of their own are relative to the file, others to the one folder that all lie in
     return file.parent if any("/" in name for name in names) else file.parent / first.parent
 

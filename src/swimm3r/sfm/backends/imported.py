@@ -1,8 +1,8 @@
 """Poses and points that another program found, completed here: its files -> depth -> water -> restored cloud.
 
-Which files are read says `io.foreign.model.read_foreign`. Scale, intrinsics and points stay as they are; matches are
-the pairs of sightings of one point; where a file has neither sightings nor depth, points are triangulated at its poses
-(`triangulation`). Depth that comes with the file is taken, else it is swept.
+`swimm3r.io.imports.read` lists the files that are read. Scale, intrinsics and points stay as they are; matches are the
+pairs of observations of one point; where a file has neither observations nor depth, points are triangulated at its
+poses (`swimm3r.sfm.colmap.triangulation`). Depth that comes with the file is used, else it is swept.
 
 Frames that the model places but the split holds back take no part; their poses serve as reference (`model_frames`).
 """
@@ -16,7 +16,8 @@ import torch
 from swimm3r.cameras import Cameras, cameras_of
 from swimm3r.errors import InputError
 from swimm3r.io.colmap.model import ColmapModel
-from swimm3r.io.imports.record import ForeignModel, read_foreign
+from swimm3r.io.imports.read import read_foreign
+from swimm3r.io.imports.record import ForeignModel
 from swimm3r.progress import Progress, silent
 from swimm3r.scene import reconstruction
 from swimm3r.scene.frames import Frames

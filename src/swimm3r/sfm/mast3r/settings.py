@@ -85,7 +85,7 @@ class MatchingSettings(Settings):
 
 @dataclass(frozen=True)
 class AlignmentSettings(Settings):
-    """Sparse global alignment (`sfm/alignment/optimize.py`); the defaults are MASt3R-SfM's where it says nothing else."""
+    """Sparse global alignment (`sfm/alignment/`); the defaults are MASt3R-SfM's unless a line says otherwise."""
 
     subsample: Annotated[int, Range(1, 64)] = 8
     """One depth per block of this many pixels is optimised; the rest of the block follows it."""

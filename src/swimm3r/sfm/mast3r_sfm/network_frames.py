@@ -14,7 +14,7 @@ from torch import Tensor
 
 from swimm3r.cameras import DISTORTION_PARAMETERS, Cameras, directions, project
 from swimm3r.errors import InputError, UsageError
-from swimm3r.io.imports.record import read_foreign
+from swimm3r.io.imports.read import read_foreign
 from swimm3r.scene.frames import Frames
 from swimm3r.sfm.imported.match_frames import model_cameras
 from swimm3r.sfm.mast3r.preprocess import (

@@ -15,7 +15,7 @@ from swimm3r.devices import CPU
 from swimm3r.splat.optimizer import Moments
 from swimm3r.splat.primitives.beta import select
 from swimm3r.splat.primitives.gaussian import GaussianPrimitives, shape_factor
-from swimm3r.splat.projection.dispatch import Pinhole, Projection
+from swimm3r.splat.projection.pinhole import Pinhole, Projection
 
 _SHRINK = math.log(1.6)
 

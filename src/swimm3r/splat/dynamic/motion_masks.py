@@ -17,7 +17,7 @@ from torch.nn.functional import avg_pool2d, grid_sample, interpolate
 from swimm3r.cameras import Cameras, pixel_grid, project, resized, unproject
 from swimm3r.splat.medium.field import MediumField
 from swimm3r.splat.primitives.beta import BetaPrimitives
-from swimm3r.splat.projection.dispatch import pinhole
+from swimm3r.splat.projection.pinhole import pinhole
 from swimm3r.splat.rendering import draw, expected_z_depth
 from swimm3r.splat.settings import UwbsSettings
 from swimm3r.splat.views import TrainingViews, View

@@ -21,7 +21,7 @@ from swimm3r.medium import Medium, MediumFit
 from swimm3r.raster import MediumMaps
 from swimm3r.splat.primitives.beta import inverse_softplus
 from swimm3r.splat.primitives.spherical_harmonics import HARMONICS, spherical_harmonics
-from swimm3r.splat.projection.dispatch import Pinhole
+from swimm3r.splat.projection.pinhole import Pinhole
 from swimm3r.splat.shared_settings import MediumFieldSettings
 
 

@@ -57,7 +57,7 @@ from swimm3r.splat.projection.cpu_matrices import (
     product_bt,
     zero,
 )
-from swimm3r.splat.projection.dispatch import BLUR, Pinhole, Projection, ray_limits
+from swimm3r.splat.projection.pinhole import BLUR, Pinhole, Projection, ray_limits
 from swimm3r.splat.settings import RenderSettings
 
 # enters the kernel's signature, so that Numba's cache notices when what is inlined into it changes

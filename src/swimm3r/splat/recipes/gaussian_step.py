@@ -11,7 +11,7 @@ from swimm3r.splat.gaussian_settings import GaussianSettings
 from swimm3r.splat.medium.field import NO_WATER, MediumField
 from swimm3r.splat.optimizer import Moments, log_linear
 from swimm3r.splat.primitives.gaussian import GaussianPrimitives, initial_gaussians, rescaled, to_degree
-from swimm3r.splat.projection.dispatch import Pinhole
+from swimm3r.splat.projection.pinhole import Pinhole
 from swimm3r.splat.rendering import Drawing, draw
 from swimm3r.splat.training import loop
 from swimm3r.splat.training.scene import Site

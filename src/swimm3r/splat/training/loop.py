@@ -16,8 +16,8 @@ from torch import Tensor
 from swimm3r.io.files import metrics_log
 from swimm3r.io.files.damage import guard
 from swimm3r.progress import Progress
-from swimm3r.splat import map_file
 from swimm3r.splat.settings import SplatSettings
+from swimm3r.splat.training.checkpoint import StateHeader, read_state, state_remedy, write_state
 from swimm3r.splat.training.scene import Site
 from swimm3r.splat.training.state import State, restored, stored
 from swimm3r.splat.views import View
@@ -97,7 +97,7 @@ def run(recipe: Recipe, schedule: Schedule, folder: Path, progress: Progress) ->
             metrics_log.append_row(metrics, row)
             sums = {}
         if step % schedule.checkpoint_every == 0 or last:
-            map_file.write_state(path, stored(state), map_file.StateHeader(step, schedule.fingerprint))
+            write_state(path, stored(state), StateHeader(step, schedule.fingerprint))
     progress("training the map", schedule.iterations, schedule.iterations)
     return state
 
@@ -107,9 +107,9 @@ def _resume(recipe: Recipe, path: Path, metrics: Path, schedule: Schedule) -> tu
     done = 0
     state = None
     if path.is_file():
-        kept = map_file.read_state(path)
+        kept = read_state(path)
         if kept.about.fingerprint == schedule.fingerprint:
-            with guard(path, map_file.state_remedy(path)):
+            with guard(path, state_remedy(path)):
                 state = restored(kept.tensors, recipe.settings, recipe.site.refined_cameras)
             done = kept.about.step
             log.info("going on from step %d", done)

@@ -19,7 +19,8 @@ from torch import Tensor
 
 from swimm3r.raster import SggBuffers, rasterize
 from swimm3r.splat.primitives.beta import BetaPrimitives
-from swimm3r.splat.projection.dispatch import Pinhole, centre_gradients
+from swimm3r.splat.projection.dispatch import centre_gradients
+from swimm3r.splat.projection.pinhole import Pinhole
 from swimm3r.splat.rendering import Drawing
 from swimm3r.splat.settings import UwbsSettings
 

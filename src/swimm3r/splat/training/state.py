@@ -1,10 +1,9 @@
-"""What training changes, whatever the recipe, and what a map consists of."""
+"""The state of a training run, whatever the recipe: all that a step changes."""
 
 import copy
 import dataclasses
-from collections.abc import Mapping
 from dataclasses import dataclass
-from typing import Any, Generic, TypeVar, get_type_hints
+from typing import Any, Generic, TypeVar
 
 import torch
 from torch import Tensor
@@ -12,39 +11,17 @@ from torch import Tensor
 from swimm3r.splat.medium.field import MediumField, in_unit
 from swimm3r.splat.medium.seasplat import SceneWater
 from swimm3r.splat.optimizer import Moments, fresh
+from swimm3r.splat.parts import Water, parts_of
 from swimm3r.splat.primitives import beta, gaussian
 from swimm3r.splat.primitives.beta import BetaPrimitives
-from swimm3r.splat.primitives.gaussian import GaussianPrimitives, harmonics_of_degree
-from swimm3r.splat.projection.dispatch import Primitives
-from swimm3r.splat.rendering import Water
-from swimm3r.splat.settings import McmcGsSettings, SeaSplatSettings, SplatSettings, UwbsSettings, WaterSplattingSettings
-from swimm3r.splat.shared_settings import MediumFieldSettings
+from swimm3r.splat.primitives.gaussian import GaussianPrimitives
+from swimm3r.splat.primitives.kinds import Primitives, primitives_from
+from swimm3r.splat.settings import SplatSettings
 from swimm3r.splat.training_poses import PoseCodes
 
 FIELD, POSES = "field.", "poses."
 P = TypeVar("P", BetaPrimitives, GaussianPrimitives)
 W = TypeVar("W", MediumField, SceneWater)
-
-
-@dataclass(frozen=True)
-class Parts:
-    """The kind of primitives, and a water whose values are still to come."""
-
-    primitives: type[Primitives]
-    field: Water
-
-
-def parts_of(settings: SplatSettings) -> Parts:
-    """What the maps of a recipe consist of."""
-    match settings:
-        case UwbsSettings():
-            return Parts(BetaPrimitives, MediumField(settings.medium, settings.dynamic))
-        case McmcGsSettings():
-            return Parts(GaussianPrimitives, MediumField(MediumFieldSettings(model="none")))
-        case WaterSplattingSettings():
-            return Parts(GaussianPrimitives, MediumField(settings.medium))
-        case SeaSplatSettings():
-            return Parts(GaussianPrimitives, SceneWater())
 
 
 @dataclass(frozen=True)
@@ -110,32 +87,6 @@ def restored(tensors: dict[str, Tensor], settings: SplatSettings, cameras: int) 
     memory = {k.removeprefix("memory."): t for k, t in tensors.items() if k.startswith("memory.")}
     field: Any = parts.field
     return State(p, field, poses, moments, memory)
-
-
-def primitives_from(tensors: Mapping[str, Tensor], kind: type[Primitives], prefix: str) -> Primitives:
-    """The primitives among a file's tensors. Raises KeyError or ValueError where their parts do not fit each other."""
-    p: Any = kind(*(tensors[prefix + name] for name in kind._fields))
-    for name, hint in get_type_hints(kind, include_extras=True).items():
-        if not isinstance(getattr(p, name), hint):
-            raise ValueError(f"{prefix}{name} has the shape {tuple(getattr(p, name).shape)}")
-    if {len(values) for values in p} != {len(p.xyz)}:
-        raise ValueError("its primitives' parts are of different lengths")
-    if not len(p.xyz):
-        raise ValueError("it holds no primitives")
-    if not _fit_together(p):
-        raise ValueError(f"its primitives' parts are {', '.join(str(tuple(v.shape[1:])) for v in p)} numbers wide")
-    return p
-
-
-def _fit_together(p: Primitives) -> bool:
-    match p:
-        case BetaPrimitives():
-            conditioned = p.query_mean.shape[1]  # direction; in dynamic maps time, too
-            D = 3 + conditioned
-            widths = p.beta.shape[1], p.scale.shape[1], p.lower.shape[1]
-            return conditioned in (3, 4) and widths == (1 + conditioned, D, D * (D - 1) // 2)
-        case GaussianPrimitives():
-            return p.harmonics.shape[1] in {harmonics_of_degree(degree) for degree in range(4)}
 
 
 def in_scene_units(state: State, length: float) -> tuple[Primitives, Water]:
