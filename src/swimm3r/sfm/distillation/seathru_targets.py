@@ -1,8 +1,8 @@
 """Restored pictures for a data set that has none: Sea-Thru's water estimate per scene, once, kept and marked as made.
 
 Sea-Thru has linear images and metric depth, but no poses. Of the evidence that `sfm/medium/seathru.py` uses, dark
-pixels and the averages of each range are left; they determine the water only roughly: on made scenes the red channel's error
-halves, green and blue gain little. What is made stays within the training's folder, never beside the data:
+pixels and the averages of each range are left; they determine the water only roughly: on made scenes the red channel's
+error halves, green and blue gain little. What is made stays within the training's folder, never beside the data:
 
     FOLDER/SEQUENCE/NAME.png     the picture without water, 16 bits, in the encoding of the scene's own pictures
     FOLDER/SEQUENCE/made.json    what made it, from which pictures, and the water: written last
