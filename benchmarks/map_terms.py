@@ -16,7 +16,7 @@ from pathlib import Path
 import torch
 
 from swimm3r.bench import tables
-from swimm3r.bench.cells import Cell, Place, Scores, kept_cell
+from swimm3r.bench.cells import Place, Result, Scores, kept_cell
 from swimm3r.bench.map_scores import map_scores, trained
 from swimm3r.bench.protocols.ablation_uwbs import COLUMNS
 from swimm3r.pipeline.held_out import FirstPose
@@ -77,13 +77,13 @@ def main() -> None:
         iterations=a.iterations,
         long_side=a.long_side,
         initial=replace(fast.initial, primitives=a.primitives),
-        densify=replace(fast.densify, max_primitives=2 * a.primitives),
+        densify=replace(fast.densify, cap_max=2 * a.primitives),
         weights=best.weights,
         medium=best.medium,
         sgg=SggSettings(),
     )
     test = PoseRefinementSettings(steps=a.test_steps)
-    cells: list[Cell] = []
+    cells: list[Result] = []
     for run in a.runs:
         sfm = open_finished_sfm(run)
         poses = sfm.first_poses(lambda *_: None)

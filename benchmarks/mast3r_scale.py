@@ -1,9 +1,9 @@
-"""Memory and time of the MASt3R back end against the number of frames, with a tiny network on tiny pictures.
+"""Memory and time of the MASt3R back end against the number of frames, with a tiny network on tiny images.
 
     python benchmarks/mast3r_scale.py [--frames 50 100 200 400 800] [--memory-mb 16] [--max-matches 40000]
 
 Every size runs in a process of its own, so that its peak is its own; the peak before the first frame (PyTorch, network)
-is told beside it. The frames are crops along a line over one noise picture; weights are random, so poses mean nothing:
+is told beside it. The frames are crops along a line over one noise image; weights are random, so poses mean nothing:
 what is measured is the machinery. `held at once` is what the running sums of all frames would take in memory.
 """
 
@@ -34,8 +34,8 @@ def run_one(count: int, memory_mb: int, max_matches: int) -> dict[str, float]:
     from swimm3r.sfm.features.pair_graph import parse_graph
     from swimm3r.sfm.mast3r.network import Architecture, Mast3r
     from swimm3r.sfm.mast3r.settings import MatchingSettings
-    from swimm3r.sfm.mast3r_sfm.network_frames import network_pictures
-    from swimm3r.sfm.mast3r_sfm.run_pairs import look_at_pairs
+    from swimm3r.sfm.mast3r_sfm.network_frames import network_images
+    from swimm3r.sfm.mast3r_sfm.run_pairs import run_pairs
     from swimm3r.sfm.settings import Mast3rSettings
 
     torch.manual_seed(0)
@@ -74,11 +74,11 @@ def run_one(count: int, memory_mb: int, max_matches: int) -> dict[str, float]:
             path = folder / "frames" / f"{i:05d}.png"
             images.write_rgb(path, texture[:, 4 * i : 4 * i + WIDTH])
             found.append(Frame(path.name, path, float(i), 1.0, "train"))
-        pictures = network_pictures(Frames(tuple(found), WIDTH, HEIGHT, True), settings)
+        seen = network_images(Frames(tuple(found), WIDTH, HEIGHT, True), settings)
         before, began = peak_mb(), time.process_time()
-        said = look_at_pairs(network, pictures, parse_graph("video"), settings, folder / "cache")
+        said = run_pairs(network, seen, parse_graph("video"), settings, folder / "cache")
         looked, looked_peak = time.process_time(), peak_mb()
-        rec = mast3r_backend._place(said, pictures, settings, folder, lambda *_: None)
+        rec = mast3r_backend._place(said, seen, settings, folder, lambda *_: None)
         done = time.process_time()
         return {
             "frames": count,

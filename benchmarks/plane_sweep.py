@@ -1,4 +1,4 @@
-"""How good and how fast the plane sweep is, on clips whose depth is known; pictures of its depth maps on any clip.
+"""How good and how fast the plane sweep is, on clips whose depth is known; images of its depth maps on any clip.
 
     python benchmarks/plane_sweep.py CLIP [CLIP ...] [--every N] [--frames N] [--out DIR] [--set min_ncc=0.5 ...]
 
@@ -29,7 +29,7 @@ from swimm3r.sfm.settings import PlaneSweepSettings
 
 
 def frames_of(clip: Path, names: tuple[str, ...]) -> Frames:
-    """The pictures of a clip under their own names."""
+    """The images of a clip under their own names."""
     frames = tuple(Frame(name, clip / "images" / name, float(k), 0.0, "train") for k, name in enumerate(names))
     height, width = images.read_rgb(frames[0].path).shape[:2]
     return Frames(frames, width, height, ordered=True)
@@ -139,7 +139,7 @@ def score(rec: Reconstruction, clip: Path) -> dict[str, float]:
 
 
 def draw(rec: Reconstruction, frames: Frames, name: str, path: Path) -> None:
-    """Picture above, inverse depth (near = yellow) below, unknown black."""
+    """Image above, inverse depth (near = yellow) below, unknown black."""
     depth = rec.depth[name].z_depth.numpy()
     known = depth > 0
     inverse = np.where(known, 1 / np.where(known, depth, 1), 0)
@@ -148,9 +148,9 @@ def draw(rec: Reconstruction, frames: Frames, name: str, path: Path) -> None:
         (np.clip((inverse - low) / (high - low + 1e-12), 0, 1) * 255).astype(np.uint8), cv2.COLORMAP_TURBO
     )
     shown[~known] = 0
-    picture = (frames.image(frames.index(name)).numpy()[..., ::-1] * 255).astype(np.uint8)
+    image = (frames.image(frames.index(name)).numpy()[..., ::-1] * 255).astype(np.uint8)
     path.parent.mkdir(parents=True, exist_ok=True)
-    cv2.imwrite(str(path), np.concatenate([picture, shown], 1))
+    cv2.imwrite(str(path), np.concatenate([image, shown], 1))
 
 
 def main() -> None:

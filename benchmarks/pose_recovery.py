@@ -35,8 +35,8 @@ def disturbed(rec: Reconstruction, degrees: float, share: float) -> Reconstructi
     poses, n = rec.cameras.cam2world, len(rec.names)
     axis, way = torch.nn.functional.normalize(torch.randn(2, n, 3, generator=rng, dtype=torch.float64), dim=-1)
     R = poses[:, :3, :3] @ so3_exp(axis * torch.deg2rad(torch.tensor(degrees)))
-    centres = poses[:, :3, 3] + share * spread_of(poses) * way
-    return replace(rec, cameras=replace(rec.cameras, cam2world=pose_from(R, centres)))
+    centers = poses[:, :3, 3] + share * spread_of(poses) * way
+    return replace(rec, cameras=replace(rec.cameras, cam2world=pose_from(R, centers)))
 
 
 def errors(names: tuple[str, ...], cam2world: torch.Tensor, truth: GroundTruth) -> str:
@@ -61,7 +61,7 @@ def main() -> None:
     base = replace(
         base, iterations=a.iterations, long_side=a.long_side,
         initial=replace(base.initial, primitives=a.primitives),
-        densify=replace(base.densify, max_primitives=2 * a.primitives),
+        densify=replace(base.densify, cap_max=2 * a.primitives),
     )  # fmt: skip
     print("| run | disturbed by | poses | rotation before, deg | ATE | rotation after | ATE | test PSNR |")
     print("|---|---|---|---|---|---|---|---|")

@@ -1,4 +1,4 @@
-"""CPU time of the rasteriser: binning, forward, adjoint with all SGG buffers, on the three workloads of its design.
+"""CPU time of the rasterizer: binning, forward, adjoint with all SGG buffers, on the three workloads of its design.
 
     python benchmarks/raster.py [--sizes S M L] [--threads N] [--repeats N]
 

@@ -40,7 +40,7 @@ def variants(size: UwbsSettings) -> dict[str, SplatSettings]:
     assert isinstance(water, WaterSplattingSettings)
     assert isinstance(sea, SeaSplatSettings)
     slow = {
-        f"{name}, rates as published": replace(of, rates=replace(of.rates, haste=0.0))
+        f"{name}, rates as published": replace(of, rates=replace(of.rates, short_run_rate_exponent=0.0))
         for name, of in (("mcmc_gs", mcmc), ("watersplatting", water), ("seasplat", sea))
     }
     mcmc_first = replace(mcmc.initial, scale=mcmc_gs().initial.scale)
@@ -51,7 +51,7 @@ def variants(size: UwbsSettings) -> dict[str, SplatSettings]:
     return {
         "uwbs-static": size,
         "uwbs-static, rates as published": replace(size, rates=LearningRates()),
-        "uwbs-static, rates held to the end": replace(size, rates=replace(size.rates, settle=1.0)),
+        "uwbs-static, rates held to the end": replace(size, rates=replace(size.rates, final_rate_factor=1.0)),
         "mcmc_gs": mcmc,
         "mcmc_gs, first scale as published": replace(mcmc, initial=mcmc_first),
         "watersplatting": water,
@@ -100,7 +100,7 @@ def main() -> None:
         iterations=given.iterations,
         long_side=given.long_side,
         initial=replace(preset.initial, primitives=given.primitives),
-        densify=replace(preset.densify, max_primitives=2 * given.primitives),
+        densify=replace(preset.densify, cap_max=2 * given.primitives),
     )
     for name, settings in variants(size).items():
         if given.only and name not in given.only:

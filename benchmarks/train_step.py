@@ -1,12 +1,12 @@
-"""CPU time of a whole training step beside that of the rasteriser alone, part by part.
+"""CPU time of a whole training step beside that of the rasterizer alone, part by part.
 
     python benchmarks/train_step.py [--sizes S M L] [--threads N] [--repeats N]
 
 The primitives are those of benchmarks/raster.py, lifted into space so that one camera sees them all, with conditioning
 that does something. CPU-ms are process CPU time summed over threads, medians. The bar is a ratio of 1.5 at M. Where
 there is a GPU, rows follow in wall-clock milliseconds of it, the device waited for after every call, and, where gsplat
-can be built, one of its rasteriser (its projection included, 3D Gaussians of the same place, size and number, no water)
-beside the sum of our projection and rasteriser.
+can be built, one of its rasterizer (its projection included, 3D Gaussians of the same place, size and number, no water)
+beside the sum of our projection and rasterizer.
 """
 
 import argparse
@@ -30,7 +30,7 @@ from swimm3r.splat.projection.pinhole import pinhole
 from swimm3r.splat.recipes import uwbs
 from swimm3r.splat.rendering import Drawing
 from swimm3r.splat.settings import UwbsSettings
-from swimm3r.splat.training.scene import Site
+from swimm3r.splat.training.scene import TrainingScene
 from swimm3r.splat.training.state import first_state, parameters_of
 from swimm3r.splat.views import View
 
@@ -44,7 +44,7 @@ def camera(size: Size) -> Cameras:
 
 
 def lifted(size: Size) -> BetaPrimitives:
-    """Primitives in space that project to about the ellipses of the rasteriser's workload."""
+    """Primitives in space that project to about the ellipses of the rasterizer's workload."""
     p, _ = workload(size)
     rng = torch.Generator().manual_seed(2)
     n, K = size.primitives, camera(size).K[0].float()
@@ -115,7 +115,7 @@ def measure(size: Size, repeats: int, device: torch.device) -> dict[str, float]:
     rng = torch.Generator().manual_seed(1)
     height, width = size.height, size.width
     # reconstruction and views are read at the start only
-    recipe = uwbs.Uwbs(settings, Site(None, 1.0, 1.0, None, device=device))
+    recipe = uwbs.Uwbs(settings, TrainingScene(None, 1.0, 1.0, None, device=device))
     state = first_state(lifted(size), initial_field(None, settings.medium, rng), None).to(device)
     p, field = state.primitives, state.field
     prior = 1 + 9 * torch.rand(height, width, generator=rng)
@@ -171,7 +171,7 @@ def measure(size: Size, repeats: int, device: torch.device) -> dict[str, float]:
 
     def step(of: uwbs.Uwbs) -> Callable[[], None]:
         def one() -> None:
-            held["state"], _ = of.step(held["state"], view, 7_001)  # regularised, no round of densification
+            held["state"], _ = of.step(held["state"], view, 7_001)  # regularized, no round of densification
 
         return one
 
@@ -211,7 +211,7 @@ def main() -> None:
             found = (
                 "cannot be built here" if theirs is None else f"{theirs:.2f} ms, {theirs / ours:.2f} of our {ours:.2f}"
             )
-            print(f"gsplat's rasteriser at {name}: {found}")
+            print(f"gsplat's rasterizer at {name}: {found}")
 
 
 if __name__ == "__main__":

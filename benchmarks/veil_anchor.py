@@ -1,7 +1,7 @@
-"""What the physics losses themselves do to the water: L_sat's anchor and the floor under T_D, on exact pictures.
+"""What the physics losses themselves do to the water: L_sat's anchor and the floor under T_D, on exact images.
 
 Nothing is learned here. Frames of synthetic dives are seen through water of each family; Binf, beta_B and a constant
-beta_D minimise L_for + L_inv + L_sat by Adam from the head's start: as printed, without the anchor, and with a floor
+beta_D minimize L_for + L_inv + L_sat by Adam from the head's start: as printed, without the anchor, and with a floor
 eps_inv that is never reached.
 """
 
@@ -20,12 +20,12 @@ Frames = tuple[torch.Tensor, torch.Tensor, torch.Tensor]
 
 
 def fit(I: torch.Tensor, scene: Frames, settings: ObjectiveSettings, steps: int) -> Medium:
-    """The water that minimises the physics losses of frames of one dive: fields of shape [3]."""
+    """The water that minimizes the physics losses of frames of one dive: fields of shape [3]."""
     J, z, valid = scene
     start = torch.tensor([[-0.6] * 3, [-1.2] * 3, [-1.6] * 3])  # logit Binf, ln beta_D, ln beta_B
     x = start.clone().requires_grad_()
-    optimiser = torch.optim.Adam([x], lr=0.05)
-    schedule = torch.optim.lr_scheduler.CosineAnnealingLR(optimiser, steps)
+    optimizer = torch.optim.Adam([x], lr=0.05)
+    schedule = torch.optim.lr_scheduler.CosineAnnealingLR(optimizer, steps)
 
     def water() -> Medium:
         return Medium(torch.sigmoid(x[0]), x[1].exp(), x[2].exp())
@@ -35,16 +35,16 @@ def fit(I: torch.Tensor, scene: Frames, settings: ObjectiveSettings, steps: int)
         maps = Medium(*(v.expand_as(I) for v in (m.Binf, m.beta_D, m.beta_B)))
         terms = physics_terms(I, J, z, valid, maps, settings)
         loss = (terms.forward + terms.inverse + terms.overshoot + settings.anchor * terms.anchor).mean()
-        optimiser.zero_grad()
+        optimizer.zero_grad()
         loss.backward()
-        optimiser.step()
+        optimizer.step()
         schedule.step()
     with torch.no_grad():
         return water()
 
 
 def scene(seed: int, farther: float) -> Frames:
-    """Two frames of a dive, their depths stretched: clear pictures, ray depths, where they are known."""
+    """Two frames of a dive, their depths stretched: clear images, ray depths, where they are known."""
     dive = make_dive(DiveSettings(frames=8, width=60, height=40, seed=seed))
     frames = [dive.frame(i) for i in (1, 5)]
     z = torch.stack([f.ray_depth for f in frames]) * farther

@@ -59,10 +59,10 @@ def write_video() -> Callable[..., Path]:
             stream.pix_fmt, stream.codec_context.time_base = "yuv420p", tick
             for name, value in stream_options.items():
                 setattr(stream.codec_context, name, value)
-            for i, picture in enumerate(frames):
+            for i, image in enumerate(frames):
                 if i == 0:
-                    stream.height, stream.width = picture.shape[:2]
-                frame = av.VideoFrame.from_ndarray(np.ascontiguousarray(picture), "rgb24")
+                    stream.height, stream.width = image.shape[:2]
+                frame = av.VideoFrame.from_ndarray(np.ascontiguousarray(image), "rgb24")
                 frame.pts, frame.time_base = round((times[i] if times is not None else i / 30) / tick), tick
                 file.mux(stream.encode(frame))
             file.mux(stream.encode())

@@ -52,7 +52,7 @@ ROWS = {  # by package: a room or module imports only rooms of rows before its o
     ],
     "swimm3r.raster": [{"records"}, {"pairmath", "reference"}, {"cpu", "cuda"}],
     "swimm3r.bench": [
-        {"inputs", "memory", "pictures", "reference", "scores", "settings"},
+        {"inputs", "memory", "images", "reference", "scores", "settings"},
         {"cells", "sfm_methods"},
         {"map_scores", "runs", "statistics"},
         {"tables"},

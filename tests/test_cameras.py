@@ -64,12 +64,12 @@ def test_a_ray_the_lens_cannot_see_is_nan():
     assert directions(cameras[0], far_outside)[..., :2].isnan().all()
 
 
-def test_ray_depth_is_the_distance_from_the_centre():
+def test_ray_depth_is_the_distance_from_the_center():
     cameras = two_cameras("OPENCV")
     rays = image_directions(cameras[1])
     z = torch.full((300, 400), 2.0)
     points = unproject(cameras[1], pixel_grid(300, 400).reshape(1, -1, 2), z.reshape(1, -1))
-    distance = torch.linalg.vector_norm(points - cameras.centres[1].float(), dim=-1).reshape(300, 400)
+    distance = torch.linalg.vector_norm(points - cameras.centers[1].float(), dim=-1).reshape(300, 400)
     torch.testing.assert_close(ray_depth_from_z(z, rays), distance)
     torch.testing.assert_close(z_depth_from_ray(ray_depth_from_z(z, rays), rays), z)
 

@@ -154,7 +154,7 @@ def test_inverse_similarity_leads_back():
     torch.testing.assert_close(similarity.inverse().points(similarity.points(points)), points)
 
 
-def test_a_straight_track_is_refused_by_centres_and_aligned_by_orientations():
+def test_a_straight_track_is_refused_by_centers_and_aligned_by_orientations():
     truth, poses = some_similarity(), some_poses(8)
     poses[:, :3, 3] = torch.arange(8)[:, None] * torch.tensor([1.0, 2.0, -1.0]) + 5
     moved = truth.poses(poses)
@@ -197,9 +197,9 @@ def test_true_matches_have_no_epipolar_error():
     i, j, xy_i, xy_j = seen_by_two()
     F = fundamental_from_poses(i, j, K, K)
     assert epipolar_distances(F, xy_i, xy_j).max() < 1e-9
-    normalised = [torch.cat((xy, torch.ones(40, 1)), -1) @ torch.linalg.inv(K).mT for xy in (xy_i, xy_j)]
+    normalized = [torch.cat((xy, torch.ones(40, 1)), -1) @ torch.linalg.inv(K).mT for xy in (xy_i, xy_j)]
     E = essential_from_poses(i, j)
-    torch.testing.assert_close((normalised[1] * (normalised[0] @ E.mT)).sum(-1), torch.zeros(40).double())
+    torch.testing.assert_close((normalized[1] * (normalized[0] @ E.mT)).sum(-1), torch.zeros(40).double())
 
 
 def test_a_point_moved_across_its_epipolar_line_is_that_many_pixels_off():

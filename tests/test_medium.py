@@ -49,7 +49,7 @@ def test_transmittance_over_two_legs_is_the_product():
         torch.testing.assert_close(of_sum, of_a * of_b)
 
 
-def test_rescaling_lengths_leaves_the_picture_unchanged():
+def test_rescaling_lengths_leaves_the_image_unchanged():
     scaled = fit(2.5)
     z = torch.linspace(0.5, 4.0, 20)
     for here, there in zip(transmittances(z, fit().at(z)), transmittances(2.5 * z, scaled.at(2.5 * z)), strict=True):

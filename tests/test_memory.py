@@ -63,11 +63,15 @@ def from_a_fork() -> None:
     raise OSError(12, "Cannot allocate memory")
 
 
+def from_the_linker() -> None:
+    raise ImportError("/lib/_ckdtree.so: failed to map segment from shared object")
+
+
 @pytest.mark.parametrize(
-    "fail", [from_numpy, from_torch, from_the_interpreter, from_threads, from_pycolmap, from_a_fork]
+    "fail", [from_the_linker, from_numpy, from_torch, from_the_interpreter, from_threads, from_pycolmap, from_a_fork]
 )
 def test_running_out_of_memory_is_said_with_its_exit_code(fail):
-    with pytest.raises((MemoryError, RuntimeError, OSError)) as failure:
+    with pytest.raises((MemoryError, RuntimeError, OSError, ImportError)) as failure:
         fail()
     told = out_of_memory(failure.value)
     assert told is not None

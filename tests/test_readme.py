@@ -26,13 +26,13 @@ def snippets() -> list[str]:
 def beside_a_dive(tmp_path: Path, write_video: Callable[..., Path], monkeypatch: pytest.MonkeyPatch) -> Path:
     """A folder with dive.mp4, ten frames of 240x160, where the fast preset's map is a tiny one."""
     swimm3r.write_dive(swimm3r.DiveSettings(frames=10, width=240, height=160), tmp_path / "dive")
-    pictures = [read_rgb(path) for path in sorted((tmp_path / "dive" / "images").iterdir())]
-    write_video(tmp_path / "dive.mp4", pictures, times=[i / 5 for i in range(len(pictures))])
+    images = [read_rgb(path) for path in sorted((tmp_path / "dive" / "images").iterdir())]
+    write_video(tmp_path / "dive.mp4", images, times=[i / 5 for i in range(len(images))])
     tiny = UwbsSettings(
         iterations=40,
         long_side=120,
         initial=InitialSettings(primitives=1500),
-        densify=DensifySettings(max_primitives=2000),
+        densify=DensifySettings(cap_max=2000),
         medium=MediumFieldSettings(hidden=16),
     )
     monkeypatch.setitem(swimm3r.PRESETS, "fast", replace(swimm3r.PRESETS["fast"], splat=tiny))

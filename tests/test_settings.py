@@ -29,16 +29,14 @@ from swimm3r.sfm.settings import FeatureSettings, MappingSettings
 from swimm3r.splat.settings import LearningRates, UwbsSettings
 
 PACKAGE = Path(swimm3r.__file__).parent
-FILES = sorted({*PACKAGE.rglob("*settings.py"), PACKAGE / "presets.py"} - {PACKAGE / "settings.py"})
-ELSEWHERE = ("swimm3r.sfm.features.asmk",)
+FILES = sorted({*PACKAGE.rglob("*settings.py"), *PACKAGE.rglob("presets.py")} - {PACKAGE / "settings.py"})
+ELSEWHERE = tuple(PACKAGE.rglob("asmk.py"))
 
 
 def settings_classes() -> list[type[Settings]]:
     """Every settings record of the package."""
-    for path in FILES:
+    for path in (*FILES, *ELSEWHERE):
         importlib.import_module(".".join(["swimm3r", *path.relative_to(PACKAGE).with_suffix("").parts]))
-    for module in ELSEWHERE:
-        importlib.import_module(module)
 
     def below(kind: type[Settings]) -> Iterator[type[Settings]]:
         for one in kind.__subclasses__():

@@ -53,7 +53,7 @@ def family_of(water: Medium) -> Family | None:
     return fits[0] if len(fits) == 1 else None
 
 
-def test_half_of_the_pictures_get_water_and_every_family_is_drawn_as_often():
+def test_half_of_the_images_get_water_and_every_family_is_drawn_as_often():
     generator = torch.Generator().manual_seed(11)
     drawn = [draw(generator) for _ in range(2000)]
     given = [water for water in drawn if water is not None]

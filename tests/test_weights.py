@@ -94,8 +94,8 @@ def manifest(url: str, **changes) -> tuple[Weights, ...]:
         size=len(BODY),
         about_mb=1.05,
         sha256=hashlib.sha256(BODY).hexdigest(),
-        licence="free",
-        licence_url="http://example.invalid",
+        license="free",
+        license_url="http://example.invalid",
         non_commercial=False,
     )
     return (replace(plain, **changes),)
@@ -218,13 +218,13 @@ def test_forbidden_network_is_not_used(server: Server, home: Path, monkeypatch: 
     assert server.requests == []
 
 
-def test_non_commercial_weights_need_their_licence_accepted(server: Server, home: Path):
-    limited = manifest(server.url, non_commercial=True, licence="CC BY-NC 4.0")
+def test_non_commercial_weights_need_their_license_accepted(server: Server, home: Path):
+    limited = manifest(server.url, non_commercial=True, license="CC BY-NC 4.0")
     with pytest.raises(WeightsError, match=r"CC BY-NC 4\.0") as caught:
         weights.fetch("net", manifest=limited)
     assert "--accept-license" in caught.value.hint
     assert server.requests == []
-    assert weights.fetch("net", accept_licence=True, manifest=limited).is_file()
+    assert weights.fetch("net", accept_license=True, manifest=limited).is_file()
 
 
 def test_weights_without_a_published_checksum_are_trusted_on_first_use(
@@ -338,8 +338,8 @@ def test_manifest_tells_everything_a_user_must_know():
     for w in weights.MANIFEST:
         assert w.urls
         assert all(url.startswith("https://") for url in w.urls)
-        assert w.licence
-        assert w.licence_url.startswith("https://")
-        assert w.non_commercial == ("NC" in w.licence)
+        assert w.license
+        assert w.license_url.startswith("https://")
+        assert w.non_commercial == ("NC" in w.license)
         assert w.sha256 is None or len(w.sha256) in (8, 64)
         assert w.serves_as is None or w.serves_as in names

@@ -3,7 +3,7 @@
     python benchmarks/learning/dives.py OUT [--train 48] [--test 8] [--frames 24] [--air ../shared/data/air_office_a]
 
 Every dive has a seafloor of its own and water drawn from one of the paper's four families in turn; `--air` adds
-pictures taken in air with depth and poses, which get their water in training.
+images taken in air with depth and poses, which get their water in training.
 """
 
 import argparse

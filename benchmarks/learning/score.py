@@ -3,14 +3,14 @@
     python benchmarks/learning/score.py DIVES/test OUT/teacher.safetensors OUT/student/adapter.safetensors
         [--real ../shared/data/ruie_teal_rocks ...] [--flsea ../shared/data/flsea_samples] [--sea-thru]
 
-On held-back dives everything is compared with the truth; a row is one network on one kind of picture.
+On held-back dives everything is compared with the truth; a row is one network on one kind of image.
 
     recall     share of the true matches of a grid of pixels whose nearest descriptor is within 1/32 of the width
     AbsRel     of view 1's ray depth, medians made equal
     rotation, translation    degrees, medians: the second camera from its pointmap (PnP) against the true pose
     T_D, B     mean absolute errors over pixels and channels at true ray depth; `near`: of the lower half of each
-               picture, all that either method then sees, where the depth range is short. The head reads one picture
-               at a time, and `dive` is what `swimm3r sfm` makes of all its readings; Sea-Thru is given one picture,
+               image, all that either method then sees, where the depth range is short. The head reads one image
+               at a time, and `dive` is what `swimm3r sfm` makes of all its readings; Sea-Thru is given one image,
                or the whole dive at true poses
 
 On real clips with a COLMAP model, poses are compared with the model's; on FLSea's samples, depth with theirs.
@@ -52,7 +52,7 @@ from swimm3r.sfm.student import adapter_file
 from swimm3r.sfm.student.physics_head import PhysicsHead, ray_depth_of
 
 _GRID = 4  # pixels between the seeds of the recall
-_TOLERANCE = 1 / 32  # of the picture's width
+_TOLERANCE = 1 / 32  # of the image's width
 _LOST = 180.0
 _PARTS = {False: "all", True: "near"}
 _COEFFICIENTS = ("Binf", "beta_D", "beta_B")
@@ -72,9 +72,9 @@ class Looked:
 
 
 @torch.no_grad()
-def look(network: Mast3r, pictures: Tensor) -> Looked:
+def look(network: Mast3r, inputs: Tensor) -> Looked:
     """A pair [2, 3, h, w] in one direction."""
-    both = network.encode(pictures)
+    both = network.encode(inputs)
     one, two = (Encoded(both.tokens[k : k + 1], both.positions[k : k + 1], both.height, both.width) for k in (0, 1))
     views = network.decode(one, two)
     points = [network.pointmap(view, k).points[0] for k, view in enumerate(views, 1)]
@@ -111,14 +111,14 @@ def pose_error(said: Looked, cameras: Cameras, second_from_first: Tensor) -> tup
 
 
 def geometry_row(
-    network: Mast3r, dives: list[Shots], pictures: Callable[[Shots], Tensor], pairs: int
+    network: Mast3r, dives: list[Shots], inputs: Callable[[Shots], Tensor], pairs: int
 ) -> dict[str, float]:
     """Mean recall and AbsRel, median pose errors over evenly chosen pairs of the dives."""
     rows = []
     for shots in dives:
         chosen = np.linspace(0, len(shots.pairs) - 1, min(pairs, len(shots.pairs))).round().astype(int)
         for i, j in (shots.pairs[k] for k in chosen):
-            said = look(network, pictures(shots)[[i, j]])
+            said = look(network, inputs(shots)[[i, j]])
             known = shots.z_depth[i] > 0
             depth = absolute_relative(ray_depth_of(said.points[0])[known], shots.ray_depth[i][known])
             rows.append(
@@ -188,23 +188,23 @@ def of_dive(views: list[tuple[Tensor, Medium]]) -> list[tuple[Tensor, Medium]]:
 
 
 def head_rows(network: Mast3r, head: PhysicsHead, dives: list[Shots], truth: list[Medium]) -> WaterRows:
-    """Errors of the head, which sees one picture, whole or its lower half, and of each dive as a whole."""
+    """Errors of the head, which sees one image, whole or its lower half, and of each dive as a whole."""
     rows: dict[str, list[tuple[float, float]]] = {}
     for near, where in _PARTS.items():
         for shots, true in zip(dives, truth, strict=True):
             assert shots.raw is not None
             views = head_water(network, head, shots.raw, shots.ray_depth, near)
-            rows.setdefault(f"one picture, {where}", []).append(water_errors(views, true))
+            rows.setdefault(f"one image, {where}", []).append(water_errors(views, true))
             rows.setdefault(f"dive, {where}", []).append(water_errors(of_dive(views), true))
     return {name: np.mean(errors, 0) for name, errors in rows.items()}
 
 
 def sea_thru_rows(dives: list[Shots], truth: list[Medium]) -> WaterRows:
-    """Errors of Sea-Thru, from whole dives and from single pictures."""
+    """Errors of Sea-Thru, from whole dives and from single images."""
     rows: dict[str, list[tuple[float, float]]] = {}
     for shots, true in zip(dives, truth, strict=True):
         count = len(shots.z_depth)
-        given = {"dive": [range(count)], "one picture": [[k] for k in range(0, count, _ALONE)]}
+        given = {"dive": [range(count)], "one image": [[k] for k in range(0, count, _ALONE)]}
         for near, where in _PARTS.items():
             for what, choices in given.items():
                 for chosen in choices:
@@ -225,29 +225,29 @@ def real_row(network: Mast3r, clip: Path, size: int, step: int = 3) -> dict[str,
     order = sorted(range(len(model.names)), key=lambda k: model.names[k])
     rows = []
     for a, b in zip(order[::step], order[step::step], strict=False):
-        pictures = []
+        inputs = []
         for k in (a, b):
-            picture = images.read_rgb(clip / "images" / model.names[k])
-            pictures.append(to_network(torch.from_numpy(picture).float() / 255, frame))
+            image = images.read_rgb(clip / "images" / model.names[k])
+            inputs.append(to_network(torch.from_numpy(image).float() / 255, frame))
         pose = relative_poses(cameras.cam2world[b], cameras.cam2world[a])
-        rows.append(pose_error(look(network, torch.stack(pictures)), lens, pose))
+        rows.append(pose_error(look(network, torch.stack(inputs)), lens, pose))
     rotation, translation = np.median(np.array(rows), 0)
     return {"rotation": rotation, "translation": translation, "pairs": len(rows)}
 
 
 def flsea_row(network: Mast3r, folder: Path, size: int) -> dict[str, float]:
-    """AbsRel of single FLSea pictures, each paired with itself; their z depth stands for ray depth."""
+    """AbsRel of single FLSea images, each paired with itself; their z depth stands for ray depth."""
     errors = []
     for path in sorted((folder / "rgb").glob("*.tiff")) + sorted((folder / "rgb").glob("*.tif")):
-        picture = torch.from_numpy(images.read_rgb(path)).float() / 255
+        image = torch.from_numpy(images.read_rgb(path)).float() / 255
         number = "".join(c for c in path.stem if c.isdigit())
         depth = torch.from_numpy(read_depth(next((folder / "depth").glob(f"*{number}*"))))
-        frame = framing(picture.shape[1], picture.shape[0], size)
+        frame = framing(image.shape[1], image.shape[0], size)
         z = depth_to_network(depth.float(), frame)
-        seen = to_network(picture, frame)
+        seen = to_network(image, frame)
         found = ray_depth_of(look(network, torch.stack([seen, seen])).points[0])
         errors.append(absolute_relative(found[z > 0], z[z > 0]))
-    return {"AbsRel": float(np.mean(errors)), "pictures": len(errors)}
+    return {"AbsRel": float(np.mean(errors)), "images": len(errors)}
 
 
 def read_truth(folder: Path, dives: list[Shots]) -> list[Medium]:

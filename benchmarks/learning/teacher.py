@@ -1,8 +1,8 @@
-"""A small network of MASt3R's kind, trained from scratch on clear pictures: the teacher of the small experiment.
+"""A small network of MASt3R's kind, trained from scratch on clear images: the teacher of the small experiment.
 
     python benchmarks/learning/teacher.py DIVES/train OUT/teacher.safetensors [--steps 3000]
 
-Pairs are seen from either side, mirrored at random and with jittered colours. The same command goes on after an
+Pairs are seen from either side, mirrored at random and with jittered colors. The same command goes on after an
 interruption, from OUT/teacher.state.
 """
 
@@ -60,11 +60,11 @@ def new_network(architecture: Architecture, seed: int) -> Mast3r:
 
 
 def batch(shots: list[Shots], size: int, generator: torch.Generator) -> tuple[Tensor, tuple, TrueMatches]:
-    """Pictures [2, size, 3, h, w], the true points of both views, and their matches."""
+    """Images [2, size, 3, h, w], the true points of both views, and their matches."""
     number = int(torch.multinomial(torch.tensor([float(len(s.pairs)) for s in shots]), 1, generator=generator))
     shape = shots[number].clean.shape[1:]
     alike = [s for s in shots if s.clean.shape[1:] == shape]
-    pictures, points, valid, sky, rows = [], [], [], [], []
+    images, points, valid, sky, rows = [], [], [], [], []
     for _ in range(size):
         s = alike[int(torch.randint(len(alike), (1,), generator=generator))]
         i, j = s.pairs[int(torch.randint(len(s.pairs), (1,), generator=generator))]
@@ -78,7 +78,7 @@ def batch(shots: list[Shots], size: int, generator: torch.Generator) -> tuple[Te
             seen = [seen[0].flip(-1), seen[1].flip(2) * torch.tensor([-1.0, 1, 1]), seen[2].flip(-1)]
             width = shape[-1]
             index1, index2 = (k - 2 * (k % width) + width - 1 for k in (index1, index2))
-        pictures.append(seen[0])
+        images.append(seen[0])
         points.append(seen[1])
         valid.append(seen[2])
         sky.append(~seen[2] & (s.raw is not None))  # depth of a rendered dive misses nothing but open water
@@ -89,26 +89,24 @@ def batch(shots: list[Shots], size: int, generator: torch.Generator) -> tuple[Te
         )
         for v in (0, 1)
     )
-    return torch.stack(pictures, 1), truth, stacked(rows)
+    return torch.stack(images, 1), truth, stacked(rows)
 
 
-def _jittered(pictures: Tensor, generator: torch.Generator) -> Tensor:
-    """Brightness, contrast and saturation of each picture, -1..1."""
-    brightness, contrast, saturation = 1 + _JITTER * (
-        2 * torch.rand(3, len(pictures), 1, 1, 1, generator=generator) - 1
-    )
-    x = (pictures + 1) / 2 * brightness
+def _jittered(images: Tensor, generator: torch.Generator) -> Tensor:
+    """Brightness, contrast and saturation of each image, -1..1."""
+    brightness, contrast, saturation = 1 + _JITTER * (2 * torch.rand(3, len(images), 1, 1, 1, generator=generator) - 1)
+    x = (images + 1) / 2 * brightness
     x = (x - x.mean((1, 2, 3), keepdim=True)) * contrast + x.mean((1, 2, 3), keepdim=True)
     x = (x - x.mean(1, keepdim=True)) * saturation + x.mean(1, keepdim=True)
     return x.clamp(0, 1) * 2 - 1
 
 
 def losses(
-    network: Mast3r, pictures: Tensor, truth: tuple, matches: TrueMatches, least_share: float
+    network: Mast3r, images: Tensor, truth: tuple, matches: TrueMatches, least_share: float
 ) -> tuple[Tensor, Tensor]:
     """L_conf and L_match of a batch."""
-    both = network.encode(pictures.flatten(0, 1))
-    half = len(pictures[0])
+    both = network.encode(images.flatten(0, 1))
+    half = len(images[0])
     one, two = (
         Encoded(both.tokens[k], both.positions[k], both.height, both.width) for k in (slice(half), slice(half, None))
     )
@@ -137,12 +135,12 @@ def main() -> None:
     args = parser.parse_args()
     shots = read_shots(args.dives, args.size)
     network = new_network(SMALL, args.seed)
-    optimiser = torch.optim.AdamW(network.parameters(), lr=args.rate, betas=(0.9, 0.95), weight_decay=0.05)
+    optimizer = torch.optim.AdamW(network.parameters(), lr=args.rate, betas=(0.9, 0.95), weight_decay=0.05)
     state, done, spent = args.out.with_suffix(".state"), 0, 0.0
     if state.is_file():
         stored = torch.load(state, weights_only=True)
         network.load_state_dict(stored["network"])
-        optimiser.load_state_dict(stored["optimiser"])
+        optimizer.load_state_dict(stored["optimizer"])
         done, spent = stored["step"], stored["cpu_seconds"]
     count = sum(p.numel() for p in network.parameters())
     print(f"{count:,} parameters, {sum(len(s.pairs) for s in shots)} pairs of {len(shots)} sequences", flush=True)
@@ -150,13 +148,13 @@ def main() -> None:
     sums = torch.zeros(3)
     for step in range(done + 1, args.steps + 1):
         generator = torch.Generator().manual_seed(args.seed * 1_000_003 + step)
-        for group in optimiser.param_groups:
+        for group in optimizer.param_groups:
             group["lr"] = args.rate * min(1.0, step / _WARM_UP, (args.steps + 1 - step) / (_COOL_DOWN * args.steps))
         points, matching = losses(network, *batch(shots, args.batch, generator), args.least_share)
         (points + MATCHING_WEIGHT * matching).backward()
         nn.utils.clip_grad_norm_(network.parameters(), 1.0)
-        optimiser.step()
-        optimiser.zero_grad(set_to_none=True)
+        optimizer.step()
+        optimizer.zero_grad(set_to_none=True)
         sums += torch.stack([points.detach(), matching.detach(), torch.ones(())])
         if step % _STATE_EVERY == 0 or step == args.steps:
             now = spent + time.process_time()
@@ -164,7 +162,7 @@ def main() -> None:
             print(json.dumps({"step": step, "points": points, "matching": matching, "cpu_s": now}), flush=True)
             sums.zero_()
             with atomic_path(state) as draft:
-                kept = {"network": network.state_dict(), "optimiser": optimiser.state_dict()}
+                kept = {"network": network.state_dict(), "optimizer": optimizer.state_dict()}
                 torch.save({**kept, "step": step, "cpu_seconds": now}, draft)
             checkpoint.save(network, args.out)
 

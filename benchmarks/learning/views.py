@@ -21,13 +21,13 @@ _SAME = 0.03  # relative difference of depth up to which two pixels show one poi
 
 @dataclass(frozen=True)
 class Shots:
-    """One dive; its pictures share a lens."""
+    """One dive; its images share a lens."""
 
     name: str
     clean: Float[Tensor, "n 3 h w"]  # -1..1
     raw: Float[Tensor, "n 3 h w"] | None
     z_depth: Float[Tensor, "n h w"]  # m, 0 where unknown
-    cameras: Cameras  # of the network's pictures
+    cameras: Cameras  # of the network's images
     pairs: tuple[tuple[int, int], ...]
 
     @cached_property
@@ -82,7 +82,7 @@ def _in_memory(sequence: Sequence, size: int, settings: PairSettings) -> Shots:
 
 
 def true_partners(shots: Shots, i: int, j: int, xy: Float[Tensor, "m 2"]) -> tuple[Tensor, Bool[Tensor, " m"]]:
-    """Where pixels of shot i (centres at +0.5) are in shot j, and whether j sees the same surface there."""
+    """Where pixels of shot i (centers at +0.5) are in shot j, and whether j sees the same surface there."""
     height, width = shots.z_depth.shape[1:]
     column, row = xy.long().unbind(-1)
     z = shots.z_depth[i, row, column]

@@ -1,6 +1,6 @@
 """Cameras: intrinsics, distortion and poses of the frames of one clip; pixels <-> rays <-> points.
 
-Axes are OpenCV's (x right, y down, z forward); the centre of pixel (column, row) is (column + 0.5, row + 0.5). A
+Axes are OpenCV's (x right, y down, z forward); the center of pixel (column, row) is (column + 0.5, row + 0.5). A
 direction is written with z = 1, so a point is z_depth * direction, and ray_depth = z_depth * |direction|. Distortion
 follows COLMAP's models, for (x, y) on the plane z = 1, r^2 = x^2 + y^2 and theta = atan r:
 
@@ -72,8 +72,8 @@ class Cameras:
         return inverse
 
     @property
-    def centres(self) -> Float[Tensor, "c 3"]:
-        """Camera centres in the world."""
+    def centers(self) -> Float[Tensor, "c 3"]:
+        """Camera centers in the world."""
         return self.cam2world[:, :3, 3]
 
     def pinhole(self, long_side: int = 0) -> "Cameras":
@@ -114,12 +114,12 @@ def check_cameras(cameras: Cameras) -> None:
     """
     width, height, K = cameras.width, cameras.height, cameras.K
     if width < 1 or height < 1:
-        raise ValueError(f"pictures have a size in whole pixels, got {width}x{height}")
+        raise ValueError(f"images have a size in whole pixels, got {width}x{height}")
     _require(torch.isfinite(K).all((1, 2)), "intrinsics are finite numbers")
     low, high = (bound * max(width, height) for bound in _FOCAL)
-    focal, centre = K[:, [0, 1], [0, 1]], K[:, :2, 2]
+    focal, center = K[:, [0, 1], [0, 1]], K[:, :2, 2]
     _require(((focal > low) & (focal < high)).all(1), f"focal lengths are between {low:g} and {high:g} px")
-    _require((centre.abs() < _FARTHEST).all(1), "the principal point is near the picture")
+    _require((center.abs() < _FARTHEST).all(1), "the principal point is near the image")
     skewed = K - torch.diag_embed(torch.cat([focal, torch.ones_like(focal[:, :1])], 1))
     skewed[:, :2, 2] = 0
     _require((skewed == 0).all(2).all(1), "intrinsics have the form [[fx, 0, cx], [0, fy, cy], [0, 0, 1]]")
@@ -130,7 +130,7 @@ def check_cameras(cameras: Cameras) -> None:
 def check_poses(cam2world: Float[Tensor, "c 4 4"]) -> None:
     """Raise ValueError unless poses are finite, rigid and not mirrored."""
     _require(torch.isfinite(cam2world).all((1, 2)), "poses are finite numbers")
-    _require((cam2world[:, :3, 3].abs() < _FARTHEST).all(1), f"camera centres are within {_FARTHEST:g}")
+    _require((cam2world[:, :3, 3].abs() < _FARTHEST).all(1), f"camera centers are within {_FARTHEST:g}")
     R, eye = cam2world[:, :3, :3], torch.eye(4, dtype=cam2world.dtype)
     off = (R @ R.mT - eye[:3, :3]).abs().amax((1, 2))
     rigid = (off < _ORTHONORMAL) & (torch.linalg.det(R) > 0) & (cam2world[:, 3] == eye[3]).all(1)
@@ -138,7 +138,7 @@ def check_poses(cam2world: Float[Tensor, "c 4 4"]) -> None:
 
 
 def check_lens(cameras: Cameras) -> None:
-    """Raise ValueError where distortion folds or crumples the very middle of the picture, as no lens does."""
+    """Raise ValueError where distortion folds or crumples the very middle of the image, as no lens does."""
     if cameras.model == "PINHOLE":
         return
     angle = torch.arange(8) * (torch.pi / 4)
@@ -147,7 +147,7 @@ def check_lens(cameras: Cameras) -> None:
     pixels = K[:, None, :2, 2] + ring
     straight = directions(cameras, pixels)[..., :2]
     ratio = torch.linalg.vector_norm(straight * K[:, None, [0, 1], [0, 1]], dim=-1) / ring[0].norm()
-    _require(((ratio > 1 / _BEND) & (ratio < _BEND)).all(1), "the distortion is that of a lens in this picture")
+    _require(((ratio > 1 / _BEND) & (ratio < _BEND)).all(1), "the distortion is that of a lens in this image")
 
 
 def _require(holds: Bool[Tensor, " c"], what: str) -> None:
@@ -216,7 +216,7 @@ def undistort(
 
 
 def pixel_grid(height: int, width: int) -> Float[Tensor, "h w 2"]:
-    """The centres of all pixels, (x, y)."""
+    """The centers of all pixels, (x, y)."""
     y, x = torch.meshgrid(torch.arange(height) + 0.5, torch.arange(width) + 0.5, indexing="ij")
     return torch.stack([x, y], -1)
 
@@ -258,7 +258,7 @@ def image_directions(camera: Cameras) -> Float[Tensor, "h w 3"]:
 
 
 def distorted_grid(lens: Cameras, canvas: Cameras) -> tuple[Float[Tensor, "h w 2"], Bool[Tensor, "h w"]]:
-    """Where every pixel of a pinhole canvas lies in a lens's picture, to undistort it, and whether it shows there."""
+    """Where every pixel of a pinhole canvas lies in a lens's image, to undistort it, and whether it shows there."""
     rays = image_directions(canvas).double()[..., :2]
     pixels = distort(rays, lens.distortion[:, None], lens.model) @ lens.K[0, :2, :2].mT + lens.K[0, :2, 2]
     x, y = torch.linspace(0, lens.width, 65).double(), torch.linspace(0, lens.height, 65).double()
@@ -267,7 +267,7 @@ def distorted_grid(lens: Cameras, canvas: Cameras) -> tuple[Float[Tensor, "h w 2
     edge = directions(lens, outline[None])[0, :, :2]
     reach = torch.linalg.vector_norm(edge[edge.isfinite().all(-1)], dim=-1).max()
     shown = ((pixels > 0) & (pixels < torch.tensor([lens.width, lens.height]))).all(-1)
-    # beyond the farthest ray of the outline the lens model may fold back into the picture
+    # beyond the farthest ray of the outline the lens model may fold back into the image
     return pixels, shown & (torch.linalg.vector_norm(rays, dim=-1) <= reach * 1.001)
 
 
@@ -282,6 +282,6 @@ def z_depth_from_ray(ray_depth: Float[Tensor, "*pixels"], rays: Float[Tensor, "*
 
 
 def resized(cameras: Cameras, width: int, height: int) -> Cameras:
-    """The same cameras on pictures of another size; K scales per axis because pixel centres sit at +0.5."""
+    """The same cameras on images of another size; K scales per axis because pixel centers sit at +0.5."""
     scale = torch.diag(torch.tensor([width / cameras.width, height / cameras.height, 1.0])).to(cameras.K)
     return replace(cameras, K=scale @ cameras.K, width=width, height=height)

@@ -48,7 +48,7 @@ def for_maps(name: str = "auto") -> torch.device:
 def without_warp(instead: str) -> DeviceError:
     """What is said where a GPU was asked for and its kernels cannot be; `instead` does without."""
     return DeviceError(
-        "the GPU rasteriser needs NVIDIA Warp, which is not installed",
+        "the GPU rasterizer needs NVIDIA Warp, which is not installed",
         cause="Swimm3R was installed without its cuda extra",
         hint=f"pip install 'swimm3r[cuda]', or {instead}",
     )

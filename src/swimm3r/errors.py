@@ -33,7 +33,7 @@ class UsageError(Swimm3rError):
 
 
 class InputError(Swimm3rError):
-    """The video, the pictures, the masks or another input file cannot be used."""
+    """The video, the images, the masks or another input file cannot be used."""
 
     exit_code = 3
 

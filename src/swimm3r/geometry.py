@@ -1,6 +1,6 @@
 """Rotations, similarity alignment, relative poses and epipolar geometry.
 
-Conventions: OpenCV axes; poses are cam2world 4x4, x_world = R x_cam + C; quaternions wxyz; pixel centres at +0.5. The
+Conventions: OpenCV axes; poses are cam2world 4x4, x_world = R x_cam + C; quaternions wxyz; pixel centers at +0.5. The
 relative pose "i from j" is W_i W_j^-1 with W = cam2world^-1: it takes camera j's coordinates to camera i's. Epipolar
 geometry follows x_j^T F x_i = 0. Everything takes batch dimensions, keeps the dtype it is given and is differentiable.
 """
@@ -43,7 +43,7 @@ class Similarity:
 
 
 def rotation_from_quaternion(q: Float[Tensor, "*b 4"]) -> Float[Tensor, "*b 3 3"]:
-    """Rotation matrices of wxyz quaternions, which need not be normalised (but not be zero)."""
+    """Rotation matrices of wxyz quaternions, which need not be normalized (but not be zero)."""
     w, x, y, z = normalize(q, dim=-1).unbind(-1)
     rows = (
         torch.stack((1 - 2 * (y * y + z * z), 2 * (x * y - w * z), 2 * (x * z + w * y)), -1),
@@ -126,7 +126,7 @@ def skew(v: Float[Tensor, "*b 3"]) -> Float[Tensor, "*b 3 3"]:
 
 
 def pose_from(R: Float[Tensor, "*b 3 3"], t: Float[Tensor, "*b 3"]) -> Float[Tensor, "*b 4 4"]:
-    """4x4 of a rotation and a translation (for cam2world: the camera centre)."""
+    """4x4 of a rotation and a translation (for cam2world: the camera center)."""
     bottom = torch.tensor([0.0, 0.0, 0.0, 1.0], dtype=R.dtype, device=R.device).expand(*R.shape[:-2], 1, 4)
     return torch.cat((torch.cat((R, t[..., None]), -1), bottom), -2)
 
@@ -140,9 +140,9 @@ def invert_poses(poses: Float[Tensor, "*b 4 4"]) -> Float[Tensor, "*b 4 4"]:
 def relative_poses(
     cam2world_i: Float[Tensor, "*b 4 4"], cam2world_j: Float[Tensor, "*b 4 4"]
 ) -> Float[Tensor, "*b 4 4"]:
-    """W_i W_j^-1, from camera j's coordinates to camera i's; its translation is the centre of j seen from i."""
+    """W_i W_j^-1, from camera j's coordinates to camera i's; its translation is the center of j seen from i."""
     to_i = cam2world_i[..., :3, :3].mT
-    baseline = cam2world_j[..., :3, 3:] - cam2world_i[..., :3, 3:]  # exact zero for one centre, far from the origin too
+    baseline = cam2world_j[..., :3, 3:] - cam2world_i[..., :3, 3:]  # exact zero for one center, far from the origin too
     return pose_from(to_i @ cam2world_j[..., :3, :3], (to_i @ baseline).squeeze(-1))
 
 
@@ -170,30 +170,30 @@ def align_poses(source: Float[Tensor, "n 4 4"], target: Float[Tensor, "n 4 4"]) 
     """The similarity from `source` to `target` cam2world poses: turn from the orientations, then scale and shift.
 
     The rotation is the chordal mean of R_target R_source^T, so a straight track is enough, unlike for
-    `align_similarity`; scale and translation are the least-squares fit of the centres under it. Raises
-    DegenerateAlignmentError for fewer than 2 distinct centres, which hold no scale, and for tracks that run against
+    `align_similarity`; scale and translation are the least-squares fit of the centers under it. Raises
+    DegenerateAlignmentError for fewer than 2 distinct centers, which hold no scale, and for tracks that run against
     their orientations, where the best scale is not positive.
     """
-    rotations, centres = source[:, :3, :3], source[:, :3, 3]
-    target_rotations, target_centres = target[:, :3, :3], target[:, :3, 3]
+    rotations, centers = source[:, :3, :3], source[:, :3, 3]
+    target_rotations, target_centers = target[:, :3, :3], target[:, :3, 3]
     if len(source) < 2:
         raise DegenerateAlignmentError(f"the scale of a track needs at least 2 poses, got {len(source)}")
     R = mean_rotation(target_rotations @ rotations.mT)
-    from_mean = (centres - centres.mean(0)) @ R.mT
+    from_mean = (centers - centers.mean(0)) @ R.mT
     squared_spread = (from_mean**2).sum()
-    if squared_spread <= 1e-18 * (centres**2).sum():
-        raise DegenerateAlignmentError(f"the {len(source)} source centres are one spot, which holds no scale")
-    scale = (from_mean * (target_centres - target_centres.mean(0))).sum() / squared_spread
+    if squared_spread <= 1e-18 * (centers**2).sum():
+        raise DegenerateAlignmentError(f"the {len(source)} source centers are one spot, which holds no scale")
+    scale = (from_mean * (target_centers - target_centers.mean(0))).sum() / squared_spread
     if not scale > 0:
-        raise DegenerateAlignmentError(f"orientations and centres contradict each other: scale {scale.item():.3g}")
-    return Similarity(scale, R, target_centres.mean(0) - scale * (R @ centres.mean(0)))
+        raise DegenerateAlignmentError(f"orientations and centers contradict each other: scale {scale.item():.3g}")
+    return Similarity(scale, R, target_centers.mean(0) - scale * (R @ centers.mean(0)))
 
 
 def best_similarity(source: Float[Tensor, "n 4 4"], target: Float[Tensor, "n 4 4"]) -> Similarity | None:
-    """The similarity of the poses, of their centres where orientations contradict those, None where neither is fixed.
+    """The similarity of the poses, of their centers where orientations contradict those, None where neither is fixed.
 
-    A dive's centres alone leave its turn to a few percent of bending: on two reconstructions of ruie_cyan_slope the
-    orientations are 3.5 degrees apart under the similarity of the centres, 0.4 under that of the poses.
+    A dive's centers alone leave its turn to a few percent of bending: on two reconstructions of ruie_cyan_slope the
+    orientations are 3.5 degrees apart under the similarity of the centers, 0.4 under that of the poses.
     """
     try:
         return align_poses(source, target)
@@ -207,7 +207,7 @@ def best_similarity(source: Float[Tensor, "n 4 4"], target: Float[Tensor, "n 4 4
 def essential_from_poses(
     cam2world_i: Float[Tensor, "*b 4 4"], cam2world_j: Float[Tensor, "*b 4 4"]
 ) -> Float[Tensor, "*b 3 3"]:
-    """E = [t]x R of "j from i", so that x_j^T E x_i = 0 for normalised image points; of the baseline's length."""
+    """E = [t]x R of "j from i", so that x_j^T E x_i = 0 for normalized image points; of the baseline's length."""
     j_from_i = relative_poses(cam2world_j, cam2world_i)
     return skew(j_from_i[..., :3, 3]) @ j_from_i[..., :3, :3]
 
@@ -229,7 +229,7 @@ def epipolar_distances(
     """Distance of x_i from the line F^T x_j and of x_j from the line F x_i, pixels.
 
     No epsilon is added to the line normals: entries of F in pixels are about 1e-6, and the 1e-8 customary in other
-    code is not small beside their squares. NaN where F is zero: cameras with one centre have no epipolar lines.
+    code is not small beside their squares. NaN where F is zero: cameras with one center have no epipolar lines.
     """
     F = F / F.flatten(-2).norm(dim=-1)[..., None, None]
     x_i, x_j = (torch.cat((xy, torch.ones_like(xy[..., :1])), -1) for xy in (xy_i, xy_j))

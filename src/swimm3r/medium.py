@@ -2,7 +2,7 @@
 
     I = J * T_D + Binf * (1 - T_B),   T_D = exp(-beta_D * z),   T_B = exp(-beta_B * z)
 
-z is *ray* depth: the distance from the camera centre along the pixel's ray (see `cameras.ray_depth_from_z`), in metres
+z is *ray* depth: the distance from the camera center along the pixel's ray (see `cameras.ray_depth_from_z`), in metres
 when the reconstruction is metric, else in its own unit; the coefficients are per that unit. I and J are in the encoding
 the medium was fitted in.
 """
@@ -20,7 +20,7 @@ Estimator = Literal["Sea-Thru", "physics head"]
 
 @dataclass(frozen=True)
 class Medium:
-    """Colour of the open water and how fast light is lost in it, per RGB channel, for a scene or per pixel."""
+    """Color of the open water and how fast light is lost in it, per RGB channel, for a scene or per pixel."""
 
     Binf: Float[Tensor, "*#pixels 3"]  # veiling light, 0..1
     beta_D: Float[Tensor, "*#pixels 3"]  # attenuation of the scene's light, 1/unit of ray depth
@@ -84,7 +84,7 @@ def backscatter(ray_depth: Float[Tensor, "*pixels"], medium: Medium) -> Float[Te
 def add_water(
     J: Float[Tensor, "*pixels 3"], ray_depth: Float[Tensor, "*pixels"], medium: Medium
 ) -> Float[Tensor, "*pixels 3"]:
-    """The picture a camera takes through the water (Eq. 2)."""
+    """The image a camera takes through the water (Eq. 2)."""
     T_D, _ = transmittances(ray_depth, medium)
     return J * T_D + backscatter(ray_depth, medium)
 

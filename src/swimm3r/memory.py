@@ -18,6 +18,7 @@ _PHRASES = (  # libraries that name no type for it
     "cannot allocate memory",  # the operating system's words
     "can't start new thread",  # a thread's stack is memory, too
     "std::bad_alloc",  # pycolmap
+    "failed to map segment from shared object",  # the dynamic linker, of a library that is loaded late
     "insufficient memory",  # OpenCV
     "out of memory",  # CUDA
 )
@@ -69,7 +70,10 @@ def _left_in_container() -> float:
 def out_of_memory(error: BaseException) -> DeviceError | None:
     """The failure in the user's words where memory ran out, by its type or by the words of the library; else None."""
     is_memory = isinstance(error, MemoryError) or (isinstance(error, OSError) and error.errno == errno.ENOMEM)
-    is_library = isinstance(error, RuntimeError | OSError) or type(error).__module__.split(".")[0] in ("cv2", "av")
+    is_library = isinstance(error, RuntimeError | OSError | ImportError) or type(error).__module__.split(".")[0] in (
+        "cv2",
+        "av",
+    )
     text = str(error)
     if not is_memory and not (is_library and any(phrase in text.lower() for phrase in _PHRASES)):
         return None
@@ -77,7 +81,7 @@ def out_of_memory(error: BaseException) -> DeviceError | None:
     return DeviceError(
         "the computer's memory is too small for this" + (f" ({first})" if first else ""),
         cause="other programs hold much of it, a limit is set (ulimit -v, a container), or the frames are large",
-        hint="close other programs, or a smaller --long-side and --splat.densify.max-primitives, or --preset fast",
+        hint="close other programs, or a smaller --long-side and --splat.densify.cap-max, or --preset fast",
     )
 
 

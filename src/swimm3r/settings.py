@@ -106,9 +106,9 @@ Count = Annotated[int, Range(1)]
 CountOrZero = Annotated[int, Range(0)]
 Seed = Annotated[int, Range(0, 2**32 - 1)]
 Threads = Annotated[int, Range(0, 1024)]  # 0 is every core
-LongSide = Annotated[int, Range(32, 65_536)]  # pixels; smaller pictures hold no neighborhood that scores look at
-LongSideOrOwn = Annotated[int, Range(32, 65_536, or_zero=True)]  # 0 keeps pictures as they are
-NetworkSide = Annotated[int, Range(64, 4096)]  # pixels of the network's pictures; less leaves wide ones no patch
+LongSide = Annotated[int, Range(32, 65_536)]  # pixels; smaller images hold no neighborhood that scores look at
+LongSideOrOwn = Annotated[int, Range(32, 65_536, or_zero=True)]  # 0 keeps images as they are
+NetworkSide = Annotated[int, Range(64, 4096)]  # pixels of the network's images; less leaves wide ones no patch
 MapSize = Annotated[int, Range(4)]  # primitives; each has 3 neighbors
 ClipSecond = Annotated[float, Range(0, 1e6)]  # eleven days; beyond, containers cannot seek
 LensParameter = Annotated[float, Range(-100, 100)]  # of distortion

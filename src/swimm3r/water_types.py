@@ -47,7 +47,7 @@ def sample(family: Family, generator: torch.Generator) -> Medium:
 def draw(generator: torch.Generator, probability: float = 0.5) -> Medium | None:
     """With that probability one water of a family drawn evenly, else None: the augmentation of the paper.
 
-    `add_water` with it turns a clear picture into a student's; both frames of a pair take the same water.
+    `add_water` with it turns a clear image into a student's; both frames of a pair take the same water.
     """
     if torch.rand(1, generator=generator).item() >= probability:
         return None

@@ -21,7 +21,7 @@ from pathlib import Path
 
 SMALL = (  # settings that finish a run in seconds
     *("--preset", "fast", "--splat.iterations", "40", "--splat.initial.primitives", "1200"),
-    *("--splat.densify.max-primitives", "2000", "--test.steps", "2"),
+    *("--splat.densify.cap-max", "2000", "--test.steps", "2"),
 )
 _CRASHED = 1
 

@@ -21,6 +21,7 @@ COMMANDS: dict[str, tuple[str, ...]] = {
 }
 READ = (3,)  # damage that must be named
 MAYBE = (0, 3)  # damage that a command may not meet, or may repair
+IN_THE_WAY = (0, 2, 3)  # a folder where a file is to be written
 
 
 def cases(fixture: Fixture) -> Iterator[Case]:
@@ -52,7 +53,8 @@ def cases(fixture: Fixture) -> Iterator[Case]:
         kinds = damage.ANY | (damage.JSON_KINDS if path.endswith(".json") else {})
         for kind, change in kinds.items():
             for command in commands:
-                yield case(f"{Path(path).name}-{kind}", command, MAYBE, partial(_at, path, change))
+                codes = IN_THE_WAY if kind == "folder" else MAYBE
+                yield case(f"{Path(path).name}-{kind}", command, codes, partial(_at, path, change))
     for name, (path, change, commands) in _edits(depth).items():
         for command in commands:
             yield case(name, command, MAYBE, partial(_at, path, damage.edited(change)))
@@ -159,7 +161,7 @@ def _edits(depth: str) -> dict[str, tuple[str, Callable, tuple[str, ...]]]:
         "cameras-negative-focal": ("sfm/cameras.json", put("fx", value=-1), ("render",)),
         "medium-fit-number": ("sfm/medium.json", put("stored", value=3), ("report", "eval", "render")),
         "medium-empty-fit": ("sfm/medium.json", put("stored", value={}), ("report", "eval", "render")),
-        "reconstruction-cautions": ("sfm/reconstruction.json", put("cautions", value=[{"x": 1}]), ("report", "render")),
+        "reconstruction-warnings": ("sfm/reconstruction.json", put("warnings", value=[{"x": 1}]), ("report", "render")),
         "reconstruction-metric-text": ("sfm/reconstruction.json", put("metric", value="yes"), ("report", "render")),
         "reconstruction-backend-number": ("sfm/reconstruction.json", put("backend", value=1), ("report", "render")),
     }

@@ -82,7 +82,7 @@ def _png_header(width: int, height: int) -> bytes:
 
 
 def _images(fixture: Fixture) -> Iterator[Case]:
-    """One odd file among four good images: it is left out with a caution, or the folder is refused with its name."""
+    """One odd file among four good images: it is left out with a warning, or the folder is refused with its name."""
     ether = (0, 3)
 
     def among(make: Callable[[Path], object], folder: Path) -> None:
@@ -101,7 +101,7 @@ def _images(fixture: Fixture) -> Iterator[Case]:
         "dangling": lambda p: (p / "9.png").symlink_to("nowhere"),
         "loop-folder": lambda p: (p / "sub").symlink_to("."),
         "palette": lambda p: Image.open(p / "0001.png").convert("P").save(p / "0001.png"),
-        "grey": lambda p: Image.open(p / "0001.png").convert("L").save(p / "0001.png"),
+        "gray": lambda p: Image.open(p / "0001.png").convert("L").save(p / "0001.png"),
         "alpha": lambda p: Image.open(p / "0001.png").convert("RGBA").save(p / "0001.png"),
         "16-bit": lambda p: Image.fromarray(np.zeros((120, 160), np.uint16)).save(p / "9.png"),
         "cmyk": lambda p: Image.open(p / "0001.png").convert("CMYK").save(p / "9.jpg"),

@@ -35,7 +35,7 @@ def run(tmp_path_factory: pytest.TempPathFactory) -> Path:
     frames = read_frames(folder / "dive", FrameSettings(), out / "prepare")
     names = frames.train.names
     rows_of = [truth.names.index(name) for name in names]
-    cameras, depth, points, colours = truth.cameras[rows_of], DepthMaps(out / "sfm" / "z_depth"), [], []
+    cameras, depth, points, colors = truth.cameras[rows_of], DepthMaps(out / "sfm" / "z_depth"), [], []
     for k, name in enumerate(names):
         z = truth.z_depth(name)
         assert z is not None
@@ -44,10 +44,10 @@ def run(tmp_path_factory: pytest.TempPathFactory) -> Path:
         pixels = pixel_grid(_HEIGHT, _WIDTH).reshape(-1, 2)[None, sample]
         xyz = unproject(cameras[k], pixels, z.flatten()[None, sample])[0]
         points.append(xyz[z.flatten()[sample] > 0])
-        colours.append(frames.train.image(k).reshape(-1, 3)[sample][z.flatten()[sample] > 0])
+        colors.append(frames.train.image(k).reshape(-1, 3)[sample][z.flatten()[sample] > 0])
     xyz, none = torch.cat(points).double(), torch.zeros(0, dtype=torch.int64)
     rec = Reconstruction(
-        names, cameras, Points(xyz, torch.cat(colours), torch.zeros(len(xyz), dtype=torch.float64)),
+        names, cameras, Points(xyz, torch.cat(colors), torch.zeros(len(xyz), dtype=torch.float64)),
         Tracks(none, none, torch.zeros(0, 2, dtype=torch.float64)),
         Matches(none, none, torch.zeros(0, 2), torch.zeros(0, 2), torch.zeros(0)), depth, "truth", metric=True,
     )  # fmt: skip
@@ -68,7 +68,7 @@ def tiny() -> UwbsSettings:
         iterations=8,
         long_side=48,
         initial=InitialSettings(primitives=200),
-        densify=DensifySettings(max_primitives=220),
+        densify=DensifySettings(cap_max=220),
         medium=MediumFieldSettings(hidden=8),
     )
 

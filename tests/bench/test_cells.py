@@ -9,13 +9,13 @@ from types import SimpleNamespace
 import pytest
 
 from swimm3r.bench import cells
-from swimm3r.bench.cells import Cell, Place, Scores, kept_cell, over_scenes
+from swimm3r.bench.cells import Result, ResultKey, Scores, kept_cell, over_scenes
 from swimm3r.bench.settings import JobSettings
 from swimm3r.errors import InputError, UsageError, WeightsError
 from swimm3r.evaluate import NotComputed
 from swimm3r.progress import Progress
 
-PLACE = Place("reef", "colmap / + SGG", 2)
+PLACE = ResultKey("reef", "colmap / + SGG", 2)
 
 
 def test_a_cell_is_computed_once_for_what_it_depends_on(tmp_path: Path):
@@ -94,15 +94,15 @@ def test_a_method_without_its_weights_is_not_run_and_tried_again(tmp_path: Path)
         raise WeightsError("the weights 'mast3r' are not on this computer", cause="", hint="")
 
     cell = kept_cell(tmp_path, PLACE, 1, refuse)
-    assert cell == Cell("reef", PLACE.method, 2, {}, "the weights 'mast3r' are not on this computer")
+    assert cell == Result("reef", PLACE.method, 2, {}, "the weights 'mast3r' are not on this computer")
     assert kept_cell(tmp_path, PLACE, 1, lambda _: {"psnr": 1.0}).scores == {"psnr": 1.0}
 
 
-def names_lead_out(scene: str, /, *, out: Path, progress: Progress) -> list[Cell]:
+def names_lead_out(scene: str, /, *, out: Path, progress: Progress) -> list[Result]:
     (out / scene).touch()
     if scene == "b":
         raise InputError("b is damaged", cause="why", hint="try")
-    return [Cell(scene, "m", 0, {"x": float(ord(scene))})]
+    return [Result(scene, "m", 0, {"x": float(ord(scene))})]
 
 
 @pytest.mark.parametrize("jobs", [1, 2])
@@ -154,5 +154,5 @@ def test_a_cluster_gets_a_job_per_scene(tmp_path: Path, monkeypatch: pytest.Monk
 
 
 def test_names_of_scenes_stay_below_the_folder(tmp_path: Path):
-    assert Place("../../etc", "a/b").folder(tmp_path).is_relative_to(tmp_path)
-    assert ".." not in Place("../../etc", "..").folder(tmp_path).parts
+    assert ResultKey("../../etc", "a/b").folder(tmp_path).is_relative_to(tmp_path)
+    assert ".." not in ResultKey("../../etc", "..").folder(tmp_path).parts

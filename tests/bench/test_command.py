@@ -4,7 +4,7 @@ from pathlib import Path
 
 import pytest
 
-from swimm3r.bench.cells import Cell
+from swimm3r.bench.cells import Result
 from swimm3r.bench.scores import columns
 from swimm3r.bench.tables import Table
 from swimm3r.cli.main import main
@@ -23,7 +23,7 @@ def test_a_protocol_prints_its_table_and_writes_it(run: Path, tmp_path: Path, ca
     [
         (["render", "--out", "o"], 2, "nothing to measure"),
         (["render", "nowhere", "--out", "o"], 3, "there is no nowhere"),
-        (["localisation", "nowhere", "--out", "o"], 3, "there is no nowhere"),
+        (["localization", "nowhere", "--out", "o"], 3, "there is no nowhere"),
         (["flsea", "nowhere", "--out", "o"], 3, "no data set was found"),
         (["sfm", "nowhere", "--out", "o"], 3, "there is no nowhere"),
         (["restoration", "nowhere", "--out", "o", "--jobs", "0"], 2, "--jobs"),
@@ -55,7 +55,7 @@ def test_mistakes_end_with_a_message_and_the_documented_code(
 def test_the_table_names_the_preset_it_was_taken_under(
     options: list[str], named: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ):
-    cells = [Cell("dive", "baseline", 0, {"psnr": 20.0})]
+    cells = [Result("dive", "baseline", 0, {"psnr": 20.0})]
     monkeypatch.setattr(
         "swimm3r.bench.protocols.ablation_uwbs.ablate", lambda *_: Table("ablation", "T", cells, columns("psnr"))
     )

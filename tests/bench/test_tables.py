@@ -6,7 +6,7 @@ from pathlib import Path
 
 import pytest
 
-from swimm3r.bench.cells import Cell
+from swimm3r.bench.cells import Result
 from swimm3r.bench.scores import COLUMNS, columns
 from swimm3r.bench.statistics import mean_interval, rows
 from swimm3r.bench.tables import Table, latex, markdown, write
@@ -16,9 +16,9 @@ BASE = {("a", 0): 20.0, ("a", 1): 21.0, ("b", 0): 30.0, ("b", 1): 31.0}
 MISSING = NotComputed("no weights")
 
 
-def cells_with_a_gain(gain: float) -> list[Cell]:
-    cells = [Cell(scene, "peer", seed, {"psnr": v, "lpips_vgg": MISSING}) for (scene, seed), v in BASE.items()]
-    return cells + [Cell(s, "ours", seed, {"psnr": v + gain, "lpips_vgg": MISSING}) for (s, seed), v in BASE.items()]
+def cells_with_a_gain(gain: float) -> list[Result]:
+    cells = [Result(scene, "peer", seed, {"psnr": v, "lpips_vgg": MISSING}) for (scene, seed), v in BASE.items()]
+    return cells + [Result(s, "ours", seed, {"psnr": v + gain, "lpips_vgg": MISSING}) for (s, seed), v in BASE.items()]
 
 
 def test_differences_are_paired_by_scene_and_seed():
@@ -42,7 +42,7 @@ def test_the_interval_is_students():
 
 
 def test_what_is_missing_is_told_with_its_reason():
-    cells = [*cells_with_a_gain(0.1), Cell("a", "mast3r", 0, {}, "its weights are not here")]
+    cells = [*cells_with_a_gain(0.1), Result("a", "mast3r", 0, {}, "its weights are not here")]
     text = markdown(Table("t", "T", cells, columns("psnr", "lpips_vgg")))
     assert "| mast3r | not run |" in text
     assert "- a, mast3r: not run: its weights are not here" in text
@@ -61,13 +61,13 @@ def test_a_table_names_its_preset_wherever_one_has_a_say():
 
 
 def test_a_table_of_methods_that_were_not_run_still_has_its_columns():
-    text = markdown(Table("t", "T", [Cell("a", "mast3r", 0, {}, "no weights")], columns("psnr")))
+    text = markdown(Table("t", "T", [Result("a", "mast3r", 0, {}, "no weights")], columns("psnr")))
     assert "| method | cells | PSNR ↑ |" in text
     assert "| mast3r | not run | - |" in text
 
 
 def test_a_mean_over_fewer_cells_says_so():
-    cells = [*cells_with_a_gain(0.1), Cell("c", "ours", 0, {"psnr": MISSING})]
+    cells = [*cells_with_a_gain(0.1), Result("c", "ours", 0, {"psnr": MISSING})]
     assert "(4)" in next(
         line for line in markdown(Table("t", "T", cells, columns("psnr"))).splitlines() if "| ours | 5" in line
     )

@@ -86,9 +86,9 @@ def test_output_that_nobody_reads_on_is_no_fault():
 
 
 def test_a_folder_that_cannot_be_written_is_exit_7(capsys: pytest.CaptureFixture[str], tmp_path: Path):
-    (tmp_path / "pictures").mkdir()
-    (tmp_path / "pictures" / "a.png").write_bytes(b"")
-    code, message = outcome(capsys, "run", str(tmp_path / "pictures"), "--out", "/sys/run")
+    (tmp_path / "images").mkdir()
+    (tmp_path / "images" / "a.png").write_bytes(b"")
+    code, message = outcome(capsys, "run", str(tmp_path / "images"), "--out", "/sys/run")
     assert code == 7
     assert "/sys" in message
 
@@ -174,7 +174,7 @@ def test_a_wrong_path_is_noticed_before_frames_are_prepared(
     assert not (tmp_path / "run").exists()
 
 
-def test_a_wrong_lens_or_picture_is_noticed_before_the_map_is_read(tmp_path: Path):
+def test_a_wrong_lens_or_image_is_noticed_before_the_map_is_read(tmp_path: Path):
     with pytest.raises(InputError, match=r"lens\.json"):
         localize_run(tmp_path, lens=tmp_path / "lens.json")
     with pytest.raises(InputError, match=r"none\.png"):

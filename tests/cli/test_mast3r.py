@@ -169,7 +169,7 @@ def test_no_weights_at_all_is_exit_4_before_anything_is_prepared(
     [
         (("--graph", "vidoe"), "there is no pair graph 'vidoe'"),
         (("--focal", "2.8"), "a focal length of 2.8 px does not fit"),
-        (("--camera", "OPENCV"), "must be known before the network sees its pictures"),
+        (("--camera", "OPENCV"), "must be known before the network sees its images"),
         (("--alignment.intrinsics", "fixed"), "none are known"),
     ],
     ids=lambda value: value[0] if isinstance(value, tuple) else "",

@@ -72,7 +72,7 @@ def test_list_tells_what_is_here_and_what_is_not(capsys: pytest.CaptureFixture[s
 def test_path_is_alone_on_its_line_for_scripts(capsys: pytest.CaptureFixture[str], home: Path, small: Path):
     assert outcome(capsys, "path") == (0, f"{home}\n", "")
     assert outcome(capsys, "path", "mast3r-retrieval") == (0, f"{small}\n", "")
-    assert outcome(capsys, "get", "mast3r-retrieval") == (0, f"{small}\n", "")  # here already: no network, no licence
+    assert outcome(capsys, "get", "mast3r-retrieval") == (0, f"{small}\n", "")  # here already: no network, no license
 
 
 def test_verify_trusts_the_first_use_and_finds_a_later_change(capsys: pytest.CaptureFixture[str], small: Path):
@@ -93,7 +93,7 @@ def test_verify_takes_a_file_that_lies_elsewhere(capsys: pytest.CaptureFixture[s
     assert str(other) in outcome(capsys, "verify", "mast3r-retrieval", "--path", str(other))[1]
 
 
-def test_the_licence_is_accepted_by_nobody_else(capsys: pytest.CaptureFixture[str]):
+def test_the_license_is_accepted_by_nobody_else(capsys: pytest.CaptureFixture[str]):
     code, _, message = outcome(capsys, "get", "mast3r")
     assert code == 4
     assert "CC BY-NC-SA 4.0" in message

@@ -158,10 +158,10 @@ def test_what_does_not_pair_is_reported_and_what_others_added_is_left_alone(tmp_
     assert sequence.shots[0].depth is None
     assert sequence.shots[1].clean is None
     assert sorted(left.why for left in survey.skipped) == [
-        "a depth map without a picture", "a restored picture without a raw one",
+        "a depth map without an image", "a restored image without a raw one",
     ]  # fmt: skip
     told = describe(survey)
-    assert "1 picture without a depth map" in told
+    assert "1 image without a depth map" in told
     assert "red_sea/pier_path: FLSea-VI, 2 shots (2 raw, 1 clean, 1 depth)" in told
 
 
@@ -194,7 +194,7 @@ def test_real_frames_of_flsea_load_with_their_metric_depth(shared: Path):
 
 
 @pytest.mark.shared
-def test_real_pairs_of_raw_and_restored_pictures_are_found(shared: Path):
+def test_real_pairs_of_raw_and_restored_images_are_found(shared: Path):
     (sequence,) = read_tree(shared / "data" / "uieb_pairs").sequences
     assert len(sequence) == 9
     assert load(sequence, 3).clean.shape == load(sequence, 3).raw.shape
@@ -222,12 +222,12 @@ def test_sea_thru_of_kaggle_pairs_by_number_and_prefers_the_full_depth(tmp_path:
     assert load(found["D5"], 0).z_depth[[0, 0, 5, 5], [0, 7, 0, 7]].tolist() == [0, 2, 29, 0]  # nearest, 1..30 m
 
 
-def test_sea_thrus_linear_pictures_come_out_srgb_encoded(tmp_path: Path):
-    picture = rgb(bits=16)
-    write_rgb(tmp_path / "D1" / "linearPNG" / "T_S02951.png", picture)
+def test_sea_thrus_linear_images_come_out_srgb_encoded(tmp_path: Path):
+    image = rgb(bits=16)
+    write_rgb(tmp_path / "D1" / "linearPNG" / "T_S02951.png", image)
     tiff(tmp_path / "D1" / "depth" / "depthT_S02951.tif", metres())
     (sequence,) = read_tree(tmp_path).sequences
-    expected = srgb_from_linear(torch.from_numpy(picture.astype(np.float32) / 65535))
+    expected = srgb_from_linear(torch.from_numpy(image.astype(np.float32) / 65535))
     torch.testing.assert_close(load(sequence, 0).raw, expected)
     assert load(sequence, 0).clean is None
 
@@ -242,7 +242,7 @@ def test_sea_thru_of_the_authors_needs_its_raw_files_developed(tmp_path: Path):
     survey = read_tree(tmp_path)
     assert [s.name for s in survey.sequences] == ["3148_3248"]
     assert any("gamma 1" in left.why for left in survey.skipped)
-    tiff(tmp_path / "D3" / "T_S03647.tiff", rgb(bits=16))  # the other place where developed pictures lie
+    tiff(tmp_path / "D3" / "T_S03647.tiff", rgb(bits=16))  # the other place where developed images lie
     survey = read_tree(tmp_path)
     assert [len(s) for s in survey.sequences] == [1, 1]
     assert survey.skipped == ()
@@ -273,7 +273,7 @@ def test_an_undistorted_copy_is_a_scene_of_images_and_sparse(tmp_path: Path):
     assert [left.path.name for left in survey.skipped] == ["2.png"]
 
 
-def test_a_synthetic_dive_brings_clear_pictures_exact_depth_and_poses(tmp_path: Path):
+def test_a_synthetic_dive_brings_clear_images_exact_depth_and_poses(tmp_path: Path):
     write_dive(DiveSettings(frames=3, width=48, height=32, noise=0.0), tmp_path / "dive")
     (sequence,) = read_tree(tmp_path).sequences
     assert sequence.kind == "synthetic dive"
@@ -301,7 +301,7 @@ def test_a_folder_of_triples_pairs_by_name_and_reads_every_kind_of_depth(tmp_pat
     assert [left.path.name for left in survey.skipped] == ["lonely.png"]
 
 
-def test_pictures_taken_in_air_are_clean_ones_without_raw(tmp_path: Path):
+def test_images_taken_in_air_are_clean_ones_without_raw(tmp_path: Path):
     write_rgb(tmp_path / "clean" / "a.png", rgb())
     tiff(tmp_path / "depth_mm" / "a.tif", (1000 * metres()).astype(np.uint16))
     view = load(read_tree(tmp_path).sequences[0], 0)
@@ -336,7 +336,7 @@ def test_one_damaged_scene_does_not_hide_the_others(tmp_path: Path):
     assert survey.skipped[0].path.name == "bad"
 
 
-def test_a_picture_of_depth_is_no_depth(tmp_path: Path):
+def test_a_image_of_depth_is_no_depth(tmp_path: Path):
     write_rgb(tmp_path / "depth.png", rgb()[..., :1].repeat(3, 2))
     with pytest.raises(InputError, match="8 bits"):
         read_depth(tmp_path / "depth.png")

@@ -20,7 +20,7 @@ def textured(seed: int = 0, side: int = 48) -> torch.Tensor:
     return torch.from_numpy((smooth - smooth.min()) / (smooth.max() - smooth.min())).float()
 
 
-def picture(path) -> torch.Tensor:
+def image(path) -> torch.Tensor:
     return torch.from_numpy(np.asarray(Image.open(path).convert("RGB")).astype(np.float32) / 255)
 
 
@@ -28,7 +28,7 @@ def picture(path) -> torch.Tensor:
 def test_psnr_and_ssim_are_those_of_the_vectors(shared):
     folder = shared / "vectors/metrics"
     for pair, expected in json.loads((folder / "image_metrics.json").read_text()).items():
-        render, target = (picture(folder / name) for name in pair.split(" vs "))
+        render, target = (image(folder / name) for name in pair.split(" vs "))
         assert psnr(render, target) == pytest.approx(expected["psnr"], abs=1e-5)
         assert ssim(render, target) == pytest.approx(expected["ssim_3dgs_zero_pad"], abs=1e-5)
         assert ssim(render, target, "valid") == pytest.approx(expected["ssim_valid"], abs=1e-5)
@@ -55,7 +55,7 @@ def test_scikit_image_agrees():
     assert ssim(a, b, "valid") == pytest.approx(oracle[5:-5, 5:-5].mean(), abs=1e-7)
 
 
-def test_equal_pictures_are_equal_and_ssim_is_symmetric():
+def test_equal_images_are_equal_and_ssim_is_symmetric():
     a, b = textured(0), textured(1)
     assert ssim(a, a) == pytest.approx(1)
     assert psnr(a, a) == math.inf

@@ -57,7 +57,7 @@ def trusted(weights, monkeypatch):
         monkeypatch.setitem(module.SHA256, name, hashlib.sha256((folder / file).read_bytes()).hexdigest())
 
 
-def pictures() -> tuple[torch.Tensor, torch.Tensor]:
+def images() -> tuple[torch.Tensor, torch.Tensor]:
     a, b = torch.rand(2, 65, 70, 3, generator=torch.Generator().manual_seed(1))
     return a, b
 
@@ -67,7 +67,7 @@ def pictures() -> tuple[torch.Tensor, torch.Tensor]:
 @torch.no_grad()
 def test_distance_is_that_of_the_network_written_with_modules(weights, inputs):
     backbone, features, heads, folder = weights
-    a, b = pictures()
+    a, b = images()
     x = torch.stack((a, b)).permute(0, 3, 1, 2)
     x = x if inputs == "0..1" else 2 * x - 1
     x = (x - torch.tensor([-0.030, -0.088, -0.188]).view(3, 1, 1)) / torch.tensor([0.458, 0.448, 0.450]).view(3, 1, 1)
@@ -89,7 +89,7 @@ def test_distance_is_that_of_the_network_written_with_modules(weights, inputs):
 def test_views_carry_the_backbone_beside_the_number(weights):
     backbone, _, _, folder = weights
     model = load_lpips(folder / "trunk.pth", folder / "heads.pth", backbone)
-    scores = view_scores(*pictures(), model)
+    scores = view_scores(*images(), model)
     assert isinstance(scores.lpips, float)
     assert f"LPIPS {backbone}" in scores.variant
 
@@ -108,7 +108,7 @@ def test_weights_that_are_not_the_published_ones_are_refused(weights):
 
 
 @pytest.mark.usefixtures("trusted")
-def test_a_picture_too_small_for_the_trunk_is_refused(weights):
+def test_a_image_too_small_for_the_trunk_is_refused(weights):
     backbone, _, _, folder = weights
     model = load_lpips(folder / "trunk.pth", folder / "heads.pth", backbone)
     with pytest.raises(ValueError, match="32 pixels"):

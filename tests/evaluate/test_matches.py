@@ -13,10 +13,10 @@ K = torch.tensor([[[400.0, 0, 320], [0, 400, 240], [0, 0, 1]]]).double().repeat(
 def dive(pairs: int = 5, points: int = 30) -> tuple[torch.Tensor, ...]:
     """Cameras above a cloud of points, and the true matches of the first `pairs` pairs."""
     g = torch.Generator().manual_seed(2)
-    centres = torch.tensor([[0.0, 0, 0], [0.5, 0, 0], [1.0, 0.2, 0.1], [1.4, 0.6, 0.0]]).double()
-    poses = pose_from(so3_exp(0.1 * torch.randn(4, 3, generator=g).double()), centres)
+    centers = torch.tensor([[0.0, 0, 0], [0.5, 0, 0], [1.0, 0.2, 0.1], [1.4, 0.6, 0.0]]).double()
+    poses = pose_from(so3_exp(0.1 * torch.randn(4, 3, generator=g).double()), centers)
     world = torch.rand(points, 3, generator=g).double() * 2 + torch.tensor([-0.5, -1, 4.0])
-    x = torch.einsum("npc,ndc->npd", (world - centres[:, None]) @ poses[:, :3, :3], K)
+    x = torch.einsum("npc,ndc->npd", (world - centers[:, None]) @ poses[:, :3, :3], K)
     pixels = x[..., :2] / x[..., 2:]
     i, j = torch.triu_indices(4, 4, 1)[:, :pairs].repeat_interleave(points, dim=1)
     point = torch.arange(points).repeat(pairs)

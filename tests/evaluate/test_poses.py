@@ -21,8 +21,8 @@ from swimm3r.geometry import Similarity, invert_poses, pose_from, so3_exp
 
 def some_poses(n: int = 8, seed: int = 0) -> torch.Tensor:
     g = torch.Generator().manual_seed(seed)
-    turns, centres = torch.randn(2, n, 3, generator=g, dtype=torch.float64)
-    return pose_from(so3_exp(turns), centres)
+    turns, centers = torch.randn(2, n, 3, generator=g, dtype=torch.float64)
+    return pose_from(so3_exp(turns), centers)
 
 
 def some_similarity() -> Similarity:
@@ -166,7 +166,7 @@ def test_ate_is_the_scatter_that_no_similarity_explains():
     estimate = disturbed(poses, degrees=0.0, shift=0.01)
     errors = absolute_pose_errors(some_similarity().poses(estimate), poses)
     assert errors.ate == pytest.approx(0.01 * 3**0.5, rel=0.05)
-    assert errors.alignment == "centres"
+    assert errors.alignment == "centers"
 
 
 def test_absolute_rotation_error_is_how_far_each_frame_is_turned():
@@ -184,7 +184,7 @@ def test_a_straight_track_has_an_ate_and_its_rotation_error_does_not_explode():
     assert on_the_line.ate == pytest.approx(0, abs=1e-9)
     wavering = disturbed(poses, degrees=0.0, shift=0.02, seed=1)
     nearly = absolute_pose_errors(disturbed(wavering, degrees=0.1, shift=0.02), wavering)
-    assert nearly.alignment == "centres"
+    assert nearly.alignment == "centers"
     assert nearly.rotation_deg < 0.15
 
 

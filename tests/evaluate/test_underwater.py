@@ -23,7 +23,7 @@ Z = torch.linspace(0.5, 6, 40).reshape(5, 8)
 WATER = Medium(torch.tensor([0.1, 0.3, 0.4]), torch.tensor([0.6, 0.2, 0.15]), torch.tensor([0.5, 0.3, 0.2]))
 
 
-def picture(path) -> torch.Tensor:
+def image(path) -> torch.Tensor:
     return torch.from_numpy(np.asarray(Image.open(path).convert("RGB")).astype(np.float32) / 255)
 
 
@@ -44,7 +44,7 @@ def fit_of(medium: Medium) -> MediumFit:
 @pytest.mark.parametrize("name", PUBLISHED)
 def test_uiqm_is_that_of_the_vectors(shared, name):
     uicm, uism, uiconm, native, resized, _ = PUBLISHED[name]
-    rgb = picture(shared / "vectors/metrics" / name)
+    rgb = image(shared / "vectors/metrics" / name)
     score = uiqm(rgb)
     assert score.uicm == pytest.approx(uicm, abs=1e-3)
     assert score.uism == pytest.approx(uism, abs=1e-5)
@@ -57,7 +57,7 @@ def test_uiqm_is_that_of_the_vectors(shared, name):
 @pytest.mark.shared
 @pytest.mark.parametrize("name", PUBLISHED)
 def test_uciqe_is_that_of_the_vectors(shared, name):
-    assert uciqe(picture(shared / "vectors/metrics" / name)) == pytest.approx(PUBLISHED[name][-1], abs=1e-5)
+    assert uciqe(image(shared / "vectors/metrics" / name)) == pytest.approx(PUBLISHED[name][-1], abs=1e-5)
 
 
 def test_lab_is_that_of_scikit_image():
@@ -66,7 +66,7 @@ def test_lab_is_that_of_scikit_image():
     torch.testing.assert_close(_lab_from_srgb(rgb), torch.from_numpy(rgb2lab(rgb.numpy())), rtol=0, atol=1e-9)
 
 
-def test_flat_and_grey_pictures_have_finite_scores():
+def test_flat_and_gray_images_have_finite_scores():
     flat = torch.full((40, 40, 3), 0.4)
     assert uiqm(flat).uiqm == pytest.approx(0, abs=1e-9)
     assert uciqe(torch.zeros(20, 20, 3)) == 0
@@ -129,7 +129,7 @@ def test_linear_light_is_not_compared_with_stored_values():
         water_scores(replace(fit_of(WATER), encoding="linear"), [Z], WATER)
 
 
-def test_a_medium_that_varies_over_the_picture_is_scored_at_its_pixels():
+def test_a_medium_that_varies_over_the_image_is_scored_at_its_pixels():
     varying = Medium(*(v.expand(5, 8, 3).clone() for v in (WATER.Binf, WATER.beta_D, WATER.beta_B)))
     varying.Binf[:, :4] += 0.1
     scores = water_scores_from_views([(Z, varying)], WATER, fit_of(WATER).identifiable, WATER)
@@ -148,7 +148,7 @@ def test_clear_psnr_counts_only_channels_with_light_left():
     assert clear_psnr(restored, J, Z, WATER) == pytest.approx(20, abs=1e-4)
 
 
-def test_clear_psnr_is_of_the_picture_as_shown_and_of_known_pixels():
+def test_clear_psnr_is_of_the_image_as_shown_and_of_known_pixels():
     J = torch.full((5, 8, 3), 0.9)
     overshoot = J.clone()
     overshoot[0] = 7.0
@@ -160,7 +160,7 @@ def test_clear_psnr_is_of_the_picture_as_shown_and_of_known_pixels():
         clear_psnr(J * torch.nan, J, Z, WATER)
 
 
-def test_the_true_water_restores_the_clear_picture():
+def test_the_true_water_restores_the_clear_image():
     J = torch.rand(5, 8, 3, generator=torch.Generator().manual_seed(0))
     restored = remove_water(add_water(J, Z, WATER), Z, WATER)
     score = clear_psnr(restored, J, Z, WATER)

@@ -7,18 +7,20 @@ import pytest
 import torch
 
 from swimm3r.cameras import Cameras
+from swimm3r.errors import UsageError
 from swimm3r.export.gaussians import (
     Gaussians,
     clear_difference,
     clear_gaussians,
     draw_gaussians,
+    export_run,
     moment_matched,
     write_ply,
 )
 from swimm3r.raster import Primitives2D, rasterize
 from swimm3r.splat.medium.field import initial_field
 from swimm3r.splat.primitives.beta import BetaPrimitives, inverse_softplus
-from swimm3r.splat.primitives.gaussian import GaussianPrimitives, seen_colour
+from swimm3r.splat.primitives.gaussian import GaussianPrimitives, seen_color
 from swimm3r.splat.rendering import SplatMap
 from swimm3r.splat.settings import MediumFieldSettings, UwbsSettings, mcmc_gs
 
@@ -127,7 +129,7 @@ def test_the_wall_looks_like_itself_as_gaussians():
 
 
 def gaussian_wall() -> SplatMap:
-    """The wall in Gaussians whose colours change with the direction."""
+    """The wall in Gaussians whose colors change with the direction."""
     rng = torch.Generator().manual_seed(1)
     of, n = wall(600), 600
     assert isinstance(of.primitives, BetaPrimitives)
@@ -160,9 +162,16 @@ def test_viewers_see_the_harmonics_with_their_own_signs(tmp_path):
     v = np.frombuffer(body, [(name, "<f4") for name in names])
     eye = torch.tensor([0.4, -0.3, 0.1])
     x, y, z = torch.nn.functional.normalize(g.xyz - eye, dim=-1).numpy().T
-    expected = seen_colour(p, eye).numpy()
+    expected = seen_color(p, eye).numpy()
     for c in range(3):
         k = [v[f"f_rest_{15 * c + i}"] for i in range(3)]
         along = 0.4886025119029199 * (-y * k[0] + z * k[1] - x * k[2])
         seen = np.maximum(0.5 + 0.28209479177387814 * v[f"f_dc_{c}"] + along, 0)
         np.testing.assert_allclose(seen, expected[:, c], atol=1e-5)
+
+
+def test_a_file_of_another_kind_is_not_replaced(tmp_path):
+    (tmp_path / "notes.txt").write_text("mine")
+    with pytest.raises(UsageError, match="no PLY file"):
+        export_run(tmp_path / "run", tmp_path / "notes.txt")
+    assert (tmp_path / "notes.txt").read_text() == "mine"

@@ -66,11 +66,11 @@ def test_pixels_that_the_memory_cannot_hold_are_refused_and_not_decoded(tmp_path
 
 def test_a_mosaic_over_pillows_limit_is_read(tmp_path, monkeypatch):
     monkeypatch.setattr(Image, "MAX_IMAGE_PIXELS", 1000)  # Pillow refuses twice as many
-    picture = np.random.default_rng(0).integers(0, 255, (48, 64, 3), np.uint8)
+    image = np.random.default_rng(0).integers(0, 255, (48, 64, 3), np.uint8)
     for name in ("mosaic.png", "mosaic.tif", "mosaic.bmp"):
-        Image.fromarray(picture).save(tmp_path / name)
+        Image.fromarray(image).save(tmp_path / name)
         assert capture_time(tmp_path / name) is None
-        np.testing.assert_array_equal(read_rgb(tmp_path / name), picture)
+        np.testing.assert_array_equal(read_rgb(tmp_path / name), image)
 
 
 def test_what_exhausts_the_memory_after_all_is_an_input_error(tmp_path, monkeypatch):

@@ -1,4 +1,4 @@
-"""Pictures keep their bits, stand upright, and say which file is broken."""
+"""Images keep their bits, stand upright, and say which file is broken."""
 
 from pathlib import Path
 
@@ -23,12 +23,12 @@ def stored_with(path: Path, array: np.ndarray) -> Path:
     return path
 
 
-@pytest.mark.parametrize("picture", [RGB, RGB16], ids=["8 bit", "16 bit"])
+@pytest.mark.parametrize("image", [RGB, RGB16], ids=["8 bit", "16 bit"])
 @pytest.mark.parametrize("suffix", [".png", ".tiff"])
-def test_eight_and_sixteen_bits_survive(tmp_path, picture, suffix):
-    read = read_rgb(stored_with(tmp_path / f"p{suffix}", picture))
-    assert read.dtype == picture.dtype
-    np.testing.assert_array_equal(read, picture)
+def test_eight_and_sixteen_bits_survive(tmp_path, image, suffix):
+    read = read_rgb(stored_with(tmp_path / f"p{suffix}", image))
+    assert read.dtype == image.dtype
+    np.testing.assert_array_equal(read, image)
 
 
 @pytest.mark.parametrize("compression", [None, "zlib"])
@@ -62,7 +62,7 @@ def test_float_tiff_with_holes_is_refused(tmp_path):
 
 
 @pytest.mark.parametrize("suffix", [".png", ".tiff", ".bmp"])
-def test_grey_becomes_three_equal_channels(tmp_path, suffix):
+def test_gray_becomes_three_equal_channels(tmp_path, suffix):
     read = read_rgb(stored_with(tmp_path / f"p{suffix}", RGB[..., 0]))
     np.testing.assert_array_equal(read, RGB[..., [0, 0, 0]])
 
@@ -75,7 +75,7 @@ def test_alpha_is_dropped_and_not_mixed_in(tmp_path):
     np.testing.assert_array_equal(read_rgb(tmp_path / "la.png"), RGB[..., [0, 0, 0]])
 
 
-def test_palette_pictures_show_their_colours(tmp_path):
+def test_palette_images_show_their_colors(tmp_path):
     Image.fromarray(RGB).quantize(64).save(tmp_path / "p.png")
     assert np.abs(read_rgb(tmp_path / "p.png").astype(int) - RGB).mean() < 20
 
@@ -105,9 +105,9 @@ def test_every_orientation_stands_upright(tmp_path, orientation, suffix):
 
 
 def test_what_is_written_is_read_back(tmp_path):
-    for picture in (RGB, RGB16):
-        write_rgb(tmp_path / "deep" / "p.png", picture)
-        np.testing.assert_array_equal(read_rgb(tmp_path / "deep" / "p.png"), picture)
+    for image in (RGB, RGB16):
+        write_rgb(tmp_path / "deep" / "p.png", image)
+        np.testing.assert_array_equal(read_rgb(tmp_path / "deep" / "p.png"), image)
     write_rgb(tmp_path / "f.png", RGB / 255.0)
     np.testing.assert_array_equal(read_rgb(tmp_path / "f.png"), RGB)
     write_rgb(tmp_path / "f.png", np.full((2, 2, 3), [-1.0, 0.5, 9.0]))
@@ -121,7 +121,7 @@ def test_only_png_is_written(tmp_path):
 
 
 @pytest.mark.parametrize("suffix", [".png", ".jpg", ".tiff", ".bmp"])
-def test_a_cut_off_picture_names_its_file(tmp_path, suffix):
+def test_a_cut_off_image_names_its_file(tmp_path, suffix):
     noise = np.random.default_rng(0).integers(0, 255, (64, 64, 3), dtype=np.uint8)
     path = stored_with(tmp_path / f"broken{suffix}", noise)
     path.write_bytes(path.read_bytes()[: path.stat().st_size * 2 // 3])
@@ -130,7 +130,7 @@ def test_a_cut_off_picture_names_its_file(tmp_path, suffix):
 
 
 @pytest.mark.parametrize("content", [b"", b"a letter to a diver", b"%PDF-1.7 ...", b"II*\x00\x08\x00"])
-def test_what_is_no_picture_is_refused_by_name(tmp_path, content):
+def test_what_is_no_image_is_refused_by_name(tmp_path, content):
     path = tmp_path / "letter.jpg"
     path.write_bytes(content)
     for read in (read_rgb, read_mask, image_size):
@@ -138,7 +138,7 @@ def test_what_is_no_picture_is_refused_by_name(tmp_path, content):
             read(path)
 
 
-def test_a_missing_picture_is_refused_by_name(tmp_path):
+def test_a_missing_image_is_refused_by_name(tmp_path):
     with pytest.raises(InputError, match=r"none\.png"):
         read_rgb(tmp_path / "none.png")
 
@@ -149,7 +149,7 @@ def test_masks_are_usable_where_not_zero(tmp_path):
         "bool.png": usable.astype(np.uint8) * 255,
         "ones.png": usable.astype(np.uint8),
         "deep.png": usable.astype(np.uint16),
-        "colour.png": np.repeat(usable[..., None], 3, 2).astype(np.uint8) * [0, 0, 255],
+        "color.png": np.repeat(usable[..., None], 3, 2).astype(np.uint8) * [0, 0, 255],
         "alpha.png": np.dstack([usable * 255, usable * 255, usable * 255, np.full(usable.shape, 255)]),
     }.items():
         kept = stored if stored.dtype == np.uint16 else stored.astype(np.uint8)

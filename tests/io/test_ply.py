@@ -10,7 +10,7 @@ XYZ = np.random.default_rng(1).normal(size=(7, 3))
 RGB = np.linspace(0, 1, 21).reshape(7, 3)
 
 
-def test_points_return_in_place_and_colour(tmp_path):
+def test_points_return_in_place_and_color(tmp_path):
     write_points(tmp_path / "a" / "p.ply", XYZ, RGB)
     xyz, rgb = read_points(tmp_path / "a" / "p.ply")
     assert xyz.dtype == rgb.dtype == np.float32
@@ -54,7 +54,7 @@ def test_a_damaged_cloud_names_its_file(tmp_path, damage):
         read_points(tmp_path / "p.ply")
 
 
-def test_a_cloud_without_colours_is_refused(tmp_path):
+def test_a_cloud_without_colors_is_refused(tmp_path):
     (tmp_path / "p.ply").write_bytes(
         b"ply\nformat binary_little_endian 1.0\nelement vertex 0\n"
         b"property float x\nproperty float y\nproperty float z\nend_header\n"

@@ -61,17 +61,17 @@ def test_uneven_frame_rates_keep_their_times(tmp_path, write_video):
 @pytest.mark.parametrize(
     ("matrix", "quarter_turns_clockwise"), [((0, 1, -1, 0), 1), ((-1, 0, 0, -1), 2), ((0, -1, 1, 0), 3)]
 )
-def test_the_rotation_tag_turns_pictures_upright(tmp_path, write_video, matrix, quarter_turns_clockwise):
+def test_the_rotation_tag_turns_images_upright(tmp_path, write_video, matrix, quarter_turns_clockwise):
     """x' = a x + c y, y' = b x + d y with y down (QuickTime): (0, 1, -1, 0) sends right to down, clockwise."""
     path = write_video(tmp_path / "dive.mp4", [QUARTERS] * 3)
     turn_tag(path, matrix)
     video = Video(path)
     upright = np.rot90(QUARTERS, -quarter_turns_clockwise)
-    picture = next(video.frames()).rgb()
-    assert (video.height, video.width) == picture.shape[:2] == upright.shape[:2]
+    image = next(video.frames()).rgb()
+    assert (video.height, video.width) == image.shape[:2] == upright.shape[:2]
     for v, u in ((0.25, 0.25), (0.25, 0.75), (0.75, 0.25), (0.75, 0.75)):
         at = int(v * upright.shape[0]), int(u * upright.shape[1])
-        assert np.abs(picture[at].astype(int) - upright[at]).max() < 12
+        assert np.abs(image[at].astype(int) - upright[at]).max() < 12
 
 
 def test_pixels_that_are_not_square_are_made_square(tmp_path, write_video):
@@ -82,20 +82,20 @@ def test_pixels_that_are_not_square_are_made_square(tmp_path, write_video):
 
 
 @pytest.mark.parametrize(("tag", "lines", "matrix"), [(1, 96, 1), (5, 96, 5), (2, 720, 1), (2, 96, 5)])
-def test_colours_follow_the_tag_or_the_size(tmp_path, tag, lines, matrix):
+def test_colors_follow_the_tag_or_the_size(tmp_path, tag, lines, matrix):
     """BT.709 (1) or BT.601 (5); untagged (2) video is 709 from 720 lines on."""
-    colour = np.array([40, 160, 200], np.uint8)
+    color = np.array([40, 160, 200], np.uint8)
     with av.open(str(tmp_path / "dive.mp4"), "w") as file:
         stream = file.add_stream("libx264", rate=30)
         stream.width, stream.height, stream.pix_fmt = lines, lines, "yuv420p"
         stream.codec_context.colorspace = tag
-        frame = av.VideoFrame.from_ndarray(np.broadcast_to(colour, (lines, lines, 3)).copy(), "rgb24")
+        frame = av.VideoFrame.from_ndarray(np.broadcast_to(color, (lines, lines, 3)).copy(), "rgb24")
         frame = frame.reformat(format="yuv420p", dst_colorspace=matrix)
         frame.colorspace = tag
         file.mux(stream.encode(frame))
         file.mux(stream.encode())
-    picture = next(Video(tmp_path / "dive.mp4").frames()).rgb()
-    assert np.abs(picture[lines // 2, lines // 2].astype(int) - colour).max() <= 4
+    image = next(Video(tmp_path / "dive.mp4").frames()).rgb()
+    assert np.abs(image[lines // 2, lines // 2].astype(int) - color).max() <= 4
 
 
 def test_a_part_of_a_video_has_the_times_of_the_whole(tmp_path, write_video):
@@ -156,7 +156,7 @@ def test_sound_alone_is_no_video(tmp_path):
         sound.sample_rate = 8000
         file.mux(stream.encode(sound))
         file.mux(stream.encode())
-    with pytest.raises(InputError, match="no moving pictures"):
+    with pytest.raises(InputError, match="no moving images"):
         Video(tmp_path / "song.wav")
 
 

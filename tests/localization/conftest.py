@@ -1,4 +1,4 @@
-"""A blotchy wall as a map, filmed from a few places: everything localisation needs, exact."""
+"""A blotchy wall as a map, filmed from a few places: everything localization needs, exact."""
 
 from dataclasses import dataclass, replace
 from pathlib import Path
@@ -35,10 +35,10 @@ def place(tmp_path_factory: pytest.TempPathFactory) -> Place:
     folder: Path = tmp_path_factory.mktemp("place")
     scene = _blotchy_wall()
     turns = 0.03 * torch.randn(6, 3, generator=torch.Generator().manual_seed(1), dtype=torch.float64)
-    centres = torch.zeros(6, 3, dtype=torch.float64)
-    centres[:, 0] = torch.linspace(-0.4, 0.4, 6)
+    centers = torch.zeros(6, 3, dtype=torch.float64)
+    centers[:, 0] = torch.linspace(-0.4, 0.4, 6)
     K = torch.tensor([[260.0, 0, 122], [0, 260, 88], [0, 0, 1]], dtype=torch.float64).repeat(6, 1, 1)
-    cameras = Cameras(K, torch.zeros(6, 0, dtype=torch.float64), pose_from(so3_exp(turns), centres), 240, 180)
+    cameras = Cameras(K, torch.zeros(6, 0, dtype=torch.float64), pose_from(so3_exp(turns), centers), 240, 180)
     depth, listed = DepthMaps(folder / "z_depth"), []
     for i in range(6):
         out = scene.render(cameras[i])

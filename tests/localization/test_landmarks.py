@@ -1,4 +1,4 @@
-"""Where a picture was taken, by its keypoints."""
+"""Where an image was taken, by its keypoints."""
 
 from dataclasses import replace
 
@@ -8,7 +8,7 @@ import torch
 from swimm3r.cameras import Cameras, project
 from swimm3r.geometry import pose_from, relative_poses, rotation_angle, so3_exp
 from swimm3r.io.images import write_rgb
-from swimm3r.localization.interpolation import between, neighbours, pose_from_neighbours
+from swimm3r.localization.interpolation import between, neighbors, pose_from_neighbors
 from swimm3r.localization.landmarks import Landmarks, landmarks_of, locate
 from swimm3r.scene.frames import Frame, Frames
 from swimm3r.scene.reconstruction import DepthMaps, Matches, Points, Reconstruction, Tracks
@@ -20,7 +20,7 @@ SETTINGS = FeatureSettings(count=600)
 
 @pytest.fixture(scope="module")
 def plane(tmp_path_factory: pytest.TempPathFactory) -> tuple[Reconstruction, Frames, Cameras]:
-    """Four pictures of a blotchy plane at z = 2 from a camera that slides and turns; the third is not registered."""
+    """Four images of a blotchy plane at z = 2 from a camera that slides and turns; the third is not registered."""
     folder = tmp_path_factory.mktemp("plane")
     rng = torch.Generator().manual_seed(0)
     blotches = sum(
@@ -30,20 +30,20 @@ def plane(tmp_path_factory: pytest.TempPathFactory) -> tuple[Reconstruction, Fra
     texture = (blotches - blotches.min()) / (blotches.max() - blotches.min())
     K = torch.tensor([[220.0, 0, 120], [0, 220, 90], [0, 0, 1]], dtype=torch.float64).repeat(4, 1, 1)
     turns = torch.tensor([[0, 0, 0], [0.02, 0, 0.01], [0.03, -0.01, 0.02], [0.02, -0.02, 0.03]], dtype=torch.float64)
-    centres = torch.tensor([[-0.15, 0, 0], [-0.05, 0.02, 0.02], [0.05, 0.02, 0.03], [0.15, 0, 0]], dtype=torch.float64)
-    cameras = Cameras(K, torch.zeros(4, 0, dtype=torch.float64), pose_from(so3_exp(turns), centres), 240, 180)
+    centers = torch.tensor([[-0.15, 0, 0], [-0.05, 0.02, 0.02], [0.05, 0.02, 0.03], [0.15, 0, 0]], dtype=torch.float64)
+    cameras = Cameras(K, torch.zeros(4, 0, dtype=torch.float64), pose_from(so3_exp(turns), centers), 240, 180)
     registered = [0, 1, 3]
     frames, points, rows = [], [], []
     for i in range(4):
         xy = _on_plane(cameras[i])
         at = (xy / 1.6).float().reshape(1, 180, 240, 2)  # the texture spans x, y in -1.6..1.6
-        picture = torch.nn.functional.grid_sample(texture[None], at, align_corners=False)[0].permute(1, 2, 0)
+        image = torch.nn.functional.grid_sample(texture[None], at, align_corners=False)[0].permute(1, 2, 0)
         path = folder / f"{i}.png"
-        write_rgb(path, picture.numpy())
+        write_rgb(path, image.numpy())
         frames.append(Frame(path.name, path, float(i), 1.0, "train"))
         if i not in registered:
             continue
-        keypoints = torch.from_numpy(extract_features(picture, torch.ones(180, 240).bool(), SETTINGS).keypoints)
+        keypoints = torch.from_numpy(extract_features(image, torch.ones(180, 240).bool(), SETTINGS).keypoints)
         for x, y in keypoints[:, :2].double():
             rows.append((len(points), registered.index(i), x, y))
             points.append(_at(cameras[i], x, y))
@@ -68,20 +68,20 @@ def plane(tmp_path_factory: pytest.TempPathFactory) -> tuple[Reconstruction, Fra
 def _at(camera: Cameras, x: torch.Tensor, y: torch.Tensor) -> torch.Tensor:
     ray = torch.linalg.solve(camera.K[0], torch.tensor([float(x), float(y), 1.0], dtype=torch.float64))
     ray = camera.cam2world[0, :3, :3] @ ray
-    return camera.centres[0] + ray * (2 - camera.centres[0, 2]) / ray[2]
+    return camera.centers[0] + ray * (2 - camera.centers[0, 2]) / ray[2]
 
 
 def _on_plane(camera: Cameras) -> torch.Tensor:
     y, x = torch.meshgrid(torch.arange(180) + 0.5, torch.arange(240) + 0.5, indexing="ij")
     rays = torch.stack([x, y, torch.ones_like(x)], -1).reshape(-1, 3).double()
     rays = torch.linalg.solve(camera.K[0], rays.mT).mT @ camera.cam2world[0, :3, :3].mT
-    return (camera.centres[0] + rays * ((2 - camera.centres[0, 2]) / rays[:, 2])[:, None])[:, :2]
+    return (camera.centers[0] + rays * ((2 - camera.centers[0, 2]) / rays[:, 2])[:, None])[:, :2]
 
 
-def test_a_picture_is_placed_where_it_was_taken(plane):
+def test_a_image_is_placed_where_it_was_taken(plane):
     rec, frames, cameras = plane
     landmarks = landmarks_of(rec, frames, SETTINGS)
-    near = [landmarks(name) for name in neighbours(rec, frames, "2.png", 3)]
+    near = [landmarks(name) for name in neighbors(rec, frames, "2.png", 3)]
     lens = replace(rec.cameras[0])
     found = locate(frames.image(2), frames.mask(2), lens, near, SETTINGS)
     assert found is not None
@@ -92,7 +92,7 @@ def test_a_picture_is_placed_where_it_was_taken(plane):
     assert (project(there, points)[0] - project(cameras[2], points)[0]).norm(dim=-1).median() < 0.5
 
 
-def test_a_picture_of_another_place_is_not_placed(plane):
+def test_a_image_of_another_place_is_not_placed(plane):
     rec, frames, _ = plane
     landmarks = landmarks_of(rec, frames, SETTINGS)
     noise = torch.rand(180, 240, 3, generator=torch.Generator().manual_seed(1))
@@ -105,9 +105,9 @@ def test_nothing_to_match_with_is_no_pose(plane):
     assert locate(frames.image(0), frames.mask(0), rec.cameras[0], [nothing], SETTINGS) is None
 
 
-def test_neighbours_come_nearest_first(plane):
+def test_neighbors_come_nearest_first(plane):
     rec, frames, _ = plane
-    assert neighbours(rec, frames, "2.png", 2) == ["1.png", "3.png"]
+    assert neighbors(rec, frames, "2.png", 2) == ["1.png", "3.png"]
 
 
 def test_half_way_is_half_the_turn_and_half_the_motion():
@@ -120,14 +120,14 @@ def test_half_way_is_half_the_turn_and_half_the_motion():
     assert between(start, end, -0.5)[0, 3] == pytest.approx(-1)  # carried on
 
 
-def test_a_frame_without_matches_is_placed_between_its_neighbours(plane):
+def test_a_frame_without_matches_is_placed_between_its_neighbors(plane):
     rec, frames, cameras = plane
-    pose = pose_from_neighbours(rec, frames, "2.png")
+    pose = pose_from_neighbors(rec, frames, "2.png")
     torch.testing.assert_close(pose, between(cameras.cam2world[1], cameras.cam2world[3], 0.5))
 
 
 def test_a_frame_before_the_first_is_carried_on_backwards(plane):
     rec, frames, cameras = plane
     later = replace(rec, names=("1.png", "3.png"), cameras=cameras[[1, 3]])
-    pose = pose_from_neighbours(later, frames, "0.png")
+    pose = pose_from_neighbors(later, frames, "0.png")
     torch.testing.assert_close(pose, between(cameras.cam2world[1], cameras.cam2world[3], -0.5))

@@ -9,7 +9,7 @@ import torch
 import swimm3r
 from swimm3r.errors import InputError, RegistrationError, WeightsError
 from swimm3r.geometry import rotation_angle
-from swimm3r.localization.batch import Query, answer, match_picture
+from swimm3r.localization.batch import Query, answer, match_image
 from swimm3r.localization.localizer import STAGES, Localizer
 from swimm3r.localization.matchers import Mast3rMatcher, SiftMatcher, matcher_for
 from swimm3r.localization.references import rendered
@@ -75,7 +75,7 @@ def test_poses_are_those_of_the_reconstruction_even_where_the_maps_training_move
     assert off(in_map, true)[1] == pytest.approx(float(shift.norm()), abs=0.005)
 
 
-def test_a_dynamic_map_is_shown_at_the_pictures_time_and_half_way_through_the_clip_where_nobody_knows(place):
+def test_a_dynamic_map_is_shown_at_the_images_time_and_half_way_through_the_clip_where_nobody_knows(place):
     p = with_time(place.scene.primitives, InitialSettings(time_scale=0.4), torch.Generator().manual_seed(0))
     field = initial_field(None, place.scene.settings.medium, torch.Generator().manual_seed(0), dynamic=True)
     scene = replace(
@@ -87,16 +87,16 @@ def test_a_dynamic_map_is_shown_at_the_pictures_time_and_half_way_through_the_cl
     assert (shown[0.0] - shown[0.5]).abs().max() > 0.05
 
 
-def test_a_smaller_copy_of_a_picture_is_placed_and_another_shape_needs_its_lens(place, localizer: Localizer):
-    picture = place.frames.image(2).permute(2, 0, 1)[None]
-    half = torch.nn.functional.interpolate(picture, (135, 180), mode="area")[0].permute(1, 2, 0).contiguous()
+def test_a_smaller_copy_of_a_image_is_placed_and_another_shape_needs_its_lens(place, localizer: Localizer):
+    image = place.frames.image(2).permute(2, 0, 1)[None]
+    half = torch.nn.functional.interpolate(image, (135, 180), mode="area")[0].permute(1, 2, 0).contiguous()
     degrees, _ = off(localizer.locate(half).cam2world, place.cameras.cam2world[2])
     assert degrees < 0.2
     with pytest.raises(InputError, match="another lens"):
         localizer.locate(place.frames.image(2)[:, :200])
 
 
-def test_a_picture_of_something_else_is_refused(localizer: Localizer):
+def test_a_image_of_something_else_is_refused(localizer: Localizer):
     noise = torch.rand(180, 240, 3, generator=torch.Generator().manual_seed(3))
     with pytest.raises(RegistrationError, match="could not be placed"):
         localizer.locate(noise)
@@ -135,7 +135,7 @@ def test_masked_pixels_take_no_part(place):
     assert (matcher.describe(place.frames.image(2), left).xy[:, 0] < 120).all()
 
 
-def test_the_network_finds_the_picture_itself_and_matches_within_both_pictures(place, small_network):
+def test_the_network_finds_the_image_itself_and_matches_within_both_images(place, small_network):
     matcher = Mast3rMatcher(small_network, SETTINGS)
     everywhere = torch.ones(180, 240, dtype=torch.bool)
     described = {
@@ -172,10 +172,10 @@ def test_a_run_lends_the_checkpoint_that_found_its_poses():
     assert with_checkpoint_of(LocalizationSettings(), ColmapSettings()) == LocalizationSettings()
 
 
-def test_a_match_picture_shows_both_and_joins_inliers(localizer: Localizer, place):
+def test_a_match_image_shows_both_and_joins_inliers(localizer: Localizer, place):
     evidence = localizer.locate(place.frames.image(2)).evidence
     assert evidence is not None
-    picture = match_picture(evidence)
-    assert picture.shape == (180, 480, 3)
+    image = match_image(evidence)
+    assert image.shape == (180, 480, 3)
     plain = (torch.cat([evidence.query, evidence.rendering], 1).clamp(0, 1) * 255).round().numpy()
-    assert (abs(picture - plain).max(-1) > 30).mean() > 0.01
+    assert (abs(image - plain).max(-1) > 30).mean() > 0.01

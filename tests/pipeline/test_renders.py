@@ -14,7 +14,7 @@ from swimm3r.errors import InputError
 from swimm3r.io import images
 from swimm3r.io.depth import read_depth
 from swimm3r.medium import Medium
-from swimm3r.pipeline.renders import Look, shown_clear, smooth_path, write_view
+from swimm3r.pipeline.renders import DisplayStyle, shown_clear, smooth_path, write_view
 from swimm3r.sfm.settings import RestoreSettings
 from swimm3r.splat.rendering import RenderOutput
 
@@ -27,11 +27,11 @@ CAMERA = Cameras(
     H,
 )
 GAINS = torch.tensor([1.5, 0.9, 0.75])
-LOOK = Look(GAINS, (1.0, 4.0), RestoreSettings())
+LOOK = DisplayStyle(GAINS, (1.0, 4.0), RestoreSettings())
 
 
 def view(z: float, alpha: float, beta_D: float) -> RenderOutput:
-    """A grey surface of 0.4 in water, straight ahead and everywhere."""
+    """A gray surface of 0.4 in water, straight ahead and everywhere."""
     every = torch.ones(H, W, 3)
     medium = Medium(0.3 * every, beta_D * every, beta_D * every)
     rgb = torch.rand(H, W, 3)
@@ -48,7 +48,7 @@ def test_what_the_water_lets_through_is_white_balanced():
     [dict(z=0.0, alpha=0.0, beta_D=0.1), dict(z=50.0, alpha=1.0, beta_D=0.5)],
     ids=["open water", "too far for any channel"],
 )
-def test_the_horizon_keeps_the_colour_it_has(unseen: dict[str, float]):
+def test_the_horizon_keeps_the_color_it_has(unseen: dict[str, float]):
     out = view(**unseen)
     assert (shown_clear(out, CAMERA, LOOK) - out.rgb).abs().max() < 1e-6
 
@@ -59,7 +59,7 @@ def test_one_channel_that_sees_is_enough():
     assert (shown_clear(out, CAMERA, LOOK) - 0.4 * GAINS).abs().max() < 5e-3
 
 
-def test_pictures_show_it_and_the_output_stays_physical(tmp_path: Path):
+def test_images_show_it_and_the_output_stays_physical(tmp_path: Path):
     out = view(z=0.01, alpha=1.0, beta_D=0.1)
     write_view(tmp_path, "a", out, CAMERA, LOOK)
     written = torch.from_numpy(images.read_rgb(tmp_path / "a_clear.png")).float() / 255

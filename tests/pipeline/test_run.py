@@ -54,7 +54,7 @@ TINY_MAP = replace(
         iterations=60,
         long_side=160,
         initial=InitialSettings(primitives=2500),
-        densify=DensifySettings(max_primitives=3000),
+        densify=DensifySettings(cap_max=3000),
         medium=MediumFieldSettings(hidden=16),
     ),
     test=PoseRefinementSettings(steps=4, long_side=80),
@@ -143,8 +143,8 @@ def test_a_finished_run_is_scored_and_rendered_again(finished: tuple[Path, dict]
     again = evaluate_run(copy)
     assert again["test"] == summary["test"]
     assert again["truth"]["splat"]["clear_psnr"] == pytest.approx(summary["truth"]["splat"]["clear_psnr"], abs=1e-3)
-    pictures = render_run(copy, long_side=80)
-    assert len(list(pictures.rglob("*_rgb.png"))) == summary["sfm"]["registered"]
+    images = render_run(copy, long_side=80)
+    assert len(list(images.rglob("*_rgb.png"))) == summary["sfm"]["registered"]
 
 
 def test_scores_by_another_protocol_stand_beside_the_runs_own(dive: Path, finished: tuple[Path, dict], tmp_path: Path):
@@ -168,7 +168,7 @@ def test_scores_by_another_protocol_stand_beside_the_runs_own(dive: Path, finish
     assert run_pipeline(dive, copy, TINY_MAP) == again
 
 
-def test_the_test_frames_are_localised_in_the_map(dive: Path, finished: tuple[Path, dict], tmp_path: Path):
+def test_the_test_frames_are_localized_in_the_map(dive: Path, finished: tuple[Path, dict], tmp_path: Path):
     answers, out = localize_run(finished[0], out=tmp_path / "places", settings=LocalizationSettings(matcher="sift"))
     frames, rec = load_frames(finished[0] / "prepare"), reconstruction.load(finished[0] / "sfm")
     assert [a.name for a in answers] == list(frames.test.names)
@@ -207,7 +207,7 @@ def test_a_map_is_trained_on_any_colmap_model(dive: Path, finished: tuple[Path, 
     summary = run_pipeline(dive / "images", tmp_path / "run", own)
     assert summary["sfm"]["backend"] == "COLMAP model"
     assert summary["sfm"]["registered"] == finished[1]["sfm"]["registered"]
-    assert summary["sfm"]["epipolar_px"] < 1  # of the sightings of common points
+    assert summary["sfm"]["epipolar_px"] < 1  # of the observations of common points
     assert "from 2D-3D matches" in summary["test"]["protocol"]  # the model has no test frame
     assert summary["test"]["psnr"] > 20
     scored_again = evaluate_run(tmp_path / "run")

@@ -15,7 +15,7 @@ from swimm3r.io.image_header import read_header
 from swimm3r.prepare import check_source, load_frames, read_frames
 
 
-def picture(seed=0, height=48, width=64):
+def image(seed=0, height=48, width=64):
     return np.random.default_rng(seed).integers(0, 255, (height, width, 3), dtype=np.uint8)
 
 
@@ -27,9 +27,9 @@ def write(path, array, **options):
 
 @pytest.fixture
 def dive(tmp_path):
-    """Twelve numbered pictures."""
+    """Twelve numbered images."""
     for i in range(12):
-        write(tmp_path / "dive" / f"img{i}.png", picture(i))
+        write(tmp_path / "dive" / f"img{i}.png", image(i))
     return tmp_path / "dive"
 
 
@@ -61,15 +61,15 @@ def test_frames_come_back_from_their_folder(dive, prepared):
     assert load_frames(prepared) == frames
     assert frames.ordered
     assert (frames.width, frames.height) == (64, 48)
-    np.testing.assert_allclose(frames.image(3) * 255, picture(3), atol=1e-3)
+    np.testing.assert_allclose(frames.image(3) * 255, image(3), atol=1e-3)
 
 
-def test_pictures_that_serve_as_they_are_are_links(dive, prepared):
+def test_images_that_serve_as_they_are_are_links(dive, prepared):
     frames = read_frames(dive, folder=prepared)
     assert all(os.path.samefile(frame.path, dive / frame.name) for frame in frames)
 
 
-def test_without_links_pictures_are_copied(dive, prepared, monkeypatch):
+def test_without_links_images_are_copied(dive, prepared, monkeypatch):
     def refuse(*_, **__):
         raise OSError(18, "Invalid cross-device link")
 
@@ -79,23 +79,23 @@ def test_without_links_pictures_are_copied(dive, prepared, monkeypatch):
     assert frames.frames[0].path.read_bytes() == (dive / "img0.png").read_bytes()
 
 
-def test_large_pictures_are_scaled_to_the_long_side(dive, prepared):
+def test_large_images_are_scaled_to_the_long_side(dive, prepared):
     frames = read_frames(dive, folder=prepared, long_side=32)
     assert (frames.width, frames.height) == (32, 24)
-    expected = cv2.resize(picture(1), (32, 24), interpolation=cv2.INTER_AREA)
+    expected = cv2.resize(image(1), (32, 24), interpolation=cv2.INTER_AREA)
     np.testing.assert_allclose(frames.image(1) * 255, expected, atol=1e-3)
 
 
 def test_sixteen_bits_stay_and_float_tiff_becomes_sixteen(tmp_path, prepared):
     for i in range(3):
-        deep = picture(i).astype(np.uint16) * 257 + 3
+        deep = image(i).astype(np.uint16) * 257 + 3
         assert images.read_rgb(write_deep(tmp_path / "dive" / f"{i}.png", deep)).dtype == np.uint16
-        tifffile.imwrite(tmp_path / "dive" / f"t{i}.tif", picture(i).astype(np.float32) / 255, photometric="rgb")
+        tifffile.imwrite(tmp_path / "dive" / f"t{i}.tif", image(i).astype(np.float32) / 255, photometric="rgb")
     frames = read_frames(tmp_path / "dive", folder=prepared)
     for i in range(3):
-        np.testing.assert_allclose(frames.image(i) * 65535, picture(i).astype(float) * 257 + 3, atol=0.01)
+        np.testing.assert_allclose(frames.image(i) * 65535, image(i).astype(float) * 257 + 3, atol=0.01)
         assert frames.frames[i + 3].path.suffix == ".png"  # what every later reader opens
-        np.testing.assert_allclose(frames.image(i + 3), picture(i) / 255, atol=1e-5)
+        np.testing.assert_allclose(frames.image(i + 3), image(i) / 255, atol=1e-5)
 
 
 def write_deep(path, array):
@@ -104,26 +104,26 @@ def write_deep(path, array):
     return path
 
 
-def test_alpha_grey_and_turned_pictures_come_out_plain(tmp_path, prepared):
+def test_alpha_gray_and_turned_images_come_out_plain(tmp_path, prepared):
     exif = Image.Exif()
     exif[274] = 6
-    turned = picture(0, 64, 48)
+    turned = image(0, 64, 48)
     for i in range(2):
-        write(tmp_path / "dive" / f"alpha{i}.png", np.dstack([picture(i), np.full((48, 64), 5, np.uint8)]))
-        write(tmp_path / "dive" / f"grey{i}.png", picture(i)[..., 0])
+        write(tmp_path / "dive" / f"alpha{i}.png", np.dstack([image(i), np.full((48, 64), 5, np.uint8)]))
+        write(tmp_path / "dive" / f"gray{i}.png", image(i)[..., 0])
         write(tmp_path / "dive" / f"turned{i}.png", turned, exif=exif)
     frames = read_frames(tmp_path / "dive", folder=prepared)
     assert (frames.width, frames.height) == (64, 48)
     for frame in frames:
         assert read_header(frame.path).plain
-    np.testing.assert_allclose(frames.image(0) * 255, picture(0), atol=1e-3)
-    np.testing.assert_allclose(frames.image(2) * 255, picture(0)[..., [0, 0, 0]], atol=1e-3)
+    np.testing.assert_allclose(frames.image(0) * 255, image(0), atol=1e-3)
+    np.testing.assert_allclose(frames.image(2) * 255, image(0)[..., [0, 0, 0]], atol=1e-3)
     np.testing.assert_allclose(frames.image(4) * 255, np.rot90(turned, -1), atol=1e-3)
 
 
 def test_equal_names_in_nested_folders_stay_apart(tmp_path, prepared):
     for i, name in enumerate(("a.jpg", "one/a.jpg", "two/a.jpg", "two/deep/a.jpg")):
-        write(tmp_path / "dive" / name, picture(i))
+        write(tmp_path / "dive" / name, image(i))
     frames = read_frames(tmp_path / "dive", folder=prepared)
     assert sorted(frames.names) == ["a.jpg", "one/a.jpg", "two/a.jpg", "two/deep/a.jpg"]
     assert not frames.ordered
@@ -131,7 +131,7 @@ def test_equal_names_in_nested_folders_stay_apart(tmp_path, prepared):
 
 def test_names_stay_unique_without_their_suffix(tmp_path, prepared):
     for i, name in enumerate(("a.jpg", "a.png", "A.tif", "a_png.png", "b.tif")):
-        write(tmp_path / "dive" / name, picture(i))
+        write(tmp_path / "dive" / name, image(i))
     frames = read_frames(tmp_path / "dive", folder=prepared)
     stems = {name.rsplit(".", 1)[0].lower() for name in frames.names}
     assert len(stems) == len(frames) == 5
@@ -143,12 +143,12 @@ def test_names_stay_unique_without_their_suffix(tmp_path, prepared):
 def test_the_images_folder_is_taken_where_a_dive_has_one(dive, tmp_path, prepared):
     (tmp_path / "set").mkdir()
     dive.rename(tmp_path / "set" / "images")
-    write(tmp_path / "set" / "depth_mm" / "img0.png", picture(50))
+    write(tmp_path / "set" / "depth_mm" / "img0.png", image(50))
     assert read_frames(tmp_path / "set", folder=prepared).names[0] == "img0.png"
     assert len(load_frames(prepared)) == 12
 
 
-def test_run_folders_inside_the_input_are_not_pictures(dive):
+def test_run_folders_inside_the_input_are_not_images(dive):
     first = read_frames(dive, folder=dive / "run" / "prepare", long_side=32)
     assert read_frames(dive, folder=dive / "run" / "prepare", long_side=32).names == first.names
     assert read_frames(dive, folder=dive / "another" / "prepare").names == first.names
@@ -156,33 +156,33 @@ def test_run_folders_inside_the_input_are_not_pictures(dive):
     assert read_frames(dive, folder=dive / "prepare").names == first.names
 
 
-def test_hidden_files_are_not_pictures(dive, prepared):
-    write(dive / "__MACOSX" / "img0.png", picture(1))
+def test_hidden_files_are_not_images(dive, prepared):
+    write(dive / "__MACOSX" / "img0.png", image(1))
     (dive / "._img0.png").write_bytes(b"resource fork")
     assert len(read_frames(dive, folder=prepared)) == 12
 
 
-def test_the_cameras_clock_orders_and_times_pictures(tmp_path, prepared):
+def test_the_cameras_clock_orders_and_times_images(tmp_path, prepared):
     for name, clock, fraction in (("a", "12:00:05", "50"), ("b", "12:00:01", "0"), ("c", "12:00:01", "250")):
         exif = Image.Exif()
         exif.get_ifd(0x8769).update({36867: f"2024:05:01 {clock}", 37521: fraction})
-        write(tmp_path / "dive" / f"{name}.jpg", picture(ord(name)), exif=exif)
+        write(tmp_path / "dive" / f"{name}.jpg", image(ord(name)), exif=exif)
     frames = read_frames(tmp_path / "dive", folder=prepared)
     assert frames.names == ("b.jpg", "c.jpg", "a.jpg")
     np.testing.assert_allclose([frame.time for frame in frames], [0, 0.25, 4.5])
     assert frames.ordered
-    assert any("clock" in caution for caution in frames.cautions)
+    assert any("clock" in warning for warning in frames.warnings)
 
 
-def test_without_a_clock_on_every_picture_time_is_the_index(dive, prepared):
+def test_without_a_clock_on_every_image_time_is_the_index(dive, prepared):
     exif = Image.Exif()
     exif.get_ifd(0x8769)[36867] = "2024:05:01 12:00:00"
-    write(dive / "img5.png", picture(5), exif=exif)
+    write(dive / "img5.png", image(5), exif=exif)
     assert [frame.time for frame in read_frames(dive, folder=prepared)] == list(range(12))
 
 
-def test_sharper_pictures_score_higher(tmp_path, prepared):
-    sharp = cv2.resize(picture(0), (640, 480), interpolation=cv2.INTER_CUBIC)
+def test_sharper_images_score_higher(tmp_path, prepared):
+    sharp = cv2.resize(image(0), (640, 480), interpolation=cv2.INTER_CUBIC)
     for i, sigma in enumerate((0.01, 2, 4)):
         write(tmp_path / "dive" / f"{i}.png", cv2.GaussianBlur(sharp, None, sigma))
     first, second, third = (frame.sharpness for frame in read_frames(tmp_path / "dive", folder=prepared))
@@ -195,33 +195,33 @@ def test_a_limit_spreads_over_the_whole_dive(dive, prepared):
     assert {path.name for path in prepared.iterdir()} == {*frames.names, "frames.json"}
 
 
-def test_one_broken_picture_among_good_ones_is_left_out_and_named(dive, prepared):
+def test_one_broken_image_among_good_ones_is_left_out_and_named(dive, prepared):
     (dive / "img3.png").write_bytes((dive / "img3.png").read_bytes()[:2000])
     (dive / "img4.png").write_bytes(b"")
     frames = read_frames(dive, folder=prepared)
     assert len(frames) == 10
-    (caution,) = frames.cautions
-    assert "2 of 12" in caution
-    assert "img3.png" in caution
-    assert "img4.png" in caution
+    (warning,) = frames.warnings
+    assert "2 of 12" in warning
+    assert "img3.png" in warning
+    assert "img4.png" in warning
 
 
-def test_black_pictures_are_left_out_and_counted(dive, prepared):
+def test_black_images_are_left_out_and_counted(dive, prepared):
     write(dive / "img3.png", np.zeros((48, 64, 3), np.uint8))
     frames = read_frames(dive, folder=prepared)
     assert "img3.png" not in frames.names
-    assert "1 pictures show nothing" in frames.cautions[0]
+    assert "1 images show nothing" in frames.warnings[0]
     assert frames.test.names == ("img0.png", "img9.png")  # counted over the frames that are kept
 
 
-def test_all_black_pictures_are_refused(tmp_path, prepared):
+def test_all_black_images_are_refused(tmp_path, prepared):
     for i in range(6):
         write(tmp_path / "dive" / f"{i}.png", np.full((48, 64, 3), 2, np.uint8))
-    assert "6 pictures show nothing" in fails("0 usable frames", tmp_path / "dive", prepared).cause
+    assert "6 images show nothing" in fails("0 usable frames", tmp_path / "dive", prepared).cause
 
 
-def test_too_few_pictures_are_refused(tmp_path, prepared):
-    write(tmp_path / "dive" / "a.png", picture())
+def test_too_few_images_are_refused(tmp_path, prepared):
+    write(tmp_path / "dive" / "a.png", image())
     fails("1 usable frame,", tmp_path / "dive", prepared)
 
 
@@ -243,17 +243,17 @@ def test_no_such_file_is_refused(tmp_path, prepared):
         check_source(tmp_path / "dive.mp4")
 
 
-def test_a_single_picture_is_refused(tmp_path, prepared):
-    fails("single picture", write(tmp_path / "a.jpg", picture()), prepared)
+def test_a_single_image_is_refused(tmp_path, prepared):
+    fails("single image", write(tmp_path / "a.jpg", image()), prepared)
 
 
 def test_mixed_sizes_are_refused_by_name_or_left_out(dive, prepared):
-    write(dive / "img2.png", picture(2, 60, 60))
+    write(dive / "img2.png", image(2, 60, 60))
     error = fails(r"img2\.png \(60x60\)", dive, prepared)
     assert "skip" in error.hint
     frames = read_frames(dive, folder=prepared, odd_sizes="skip")
     assert len(frames) == 11
-    assert "img2.png (60x60)" in frames.cautions[0]
+    assert "img2.png (60x60)" in frames.warnings[0]
 
 
 def test_a_folder_in_use_is_not_touched(dive, tmp_path):
@@ -275,7 +275,7 @@ def test_what_progress_raises_stops_the_work_and_leaves_nothing(dive, prepared):
 
 
 def test_the_remains_of_a_killed_run_do_not_matter(dive, prepared):
-    write(prepared.parent / f"{DRAFT}prepare" / "img99.png", picture(99))
+    write(prepared.parent / f"{DRAFT}prepare" / "img99.png", image(99))
     assert len(read_frames(dive, folder=prepared)) == 12
     assert [path.name for path in prepared.parent.iterdir()] == ["prepare"]
 
@@ -295,7 +295,7 @@ def test_without_a_folder_the_cache_is_used_and_found_again(dive, tmp_path, monk
     written = frames.frames[0].path.stat().st_mtime_ns
     assert read_frames(dive, long_side=32).frames[0].path.stat().st_mtime_ns == written
     assert read_frames(dive, long_side=40).width == 40
-    write(dive / "img0.png", picture(77))
+    write(dive / "img0.png", image(77))
     assert read_frames(dive, long_side=32).frames[0].path != frames.frames[0].path
 
 

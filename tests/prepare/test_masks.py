@@ -1,4 +1,4 @@
-"""Masks follow their pictures in name and size, and cannot leave nothing."""
+"""Masks follow their images in name and size, and cannot leave nothing."""
 
 import json
 from pathlib import Path
@@ -16,7 +16,7 @@ USABLE[:, 20:] = True
 
 @pytest.fixture
 def dive(tmp_path) -> Path:
-    """Four pictures, a.jpg to d.jpg, in images/."""
+    """Four images, a.jpg to d.jpg, in images/."""
     (tmp_path / "dive" / "images").mkdir(parents=True)
     for i, name in enumerate("abcd"):
         array = np.random.default_rng(i).integers(0, 255, (48, 64, 3), dtype=np.uint8)
@@ -39,12 +39,12 @@ def test_masks_are_found_by_each_way_of_naming(dive, tmp_path, name, given):
     frames = read_frames(dive, folder=tmp_path / "prepare", masks=folder if given else None)
     for i, has in enumerate([True, True, False, True]):
         np.testing.assert_array_equal(frames.mask(i), USABLE if has else np.ones_like(USABLE))
-    assert frames.cautions == ("Masks: 3 of 4 frames have one; 1 masks match no frame (stranger.png).",)
+    assert frames.warnings == ("Masks: 3 of 4 frames have one; 1 masks match no frame (stranger.png).",)
 
 
 @pytest.mark.parametrize("suffix", [".png", ".jpg", ".JPG", ".tif", ".bmp", ".webp"])
 @pytest.mark.parametrize("layout", ["masks", "images/masks", "masks beside images", "given", "given inside"])
-def test_masks_may_have_the_very_names_of_the_pictures(tmp_path, suffix, layout):
+def test_masks_may_have_the_very_names_of_the_images(tmp_path, suffix, layout):
     root = tmp_path / "dive" / "images" if layout in ("images/masks", "masks beside images") else tmp_path / "dive"
     folders = {
         "masks": root / "masks",
@@ -56,15 +56,15 @@ def test_masks_may_have_the_very_names_of_the_pictures(tmp_path, suffix, layout)
     root.mkdir(parents=True)
     folders[layout].mkdir(parents=True)
     for i in range(4):
-        picture = np.random.default_rng(i).integers(0, 255, (48, 64, 3), dtype=np.uint8)
-        Image.fromarray(picture).save(root / f"{i}{suffix}")
+        image = np.random.default_rng(i).integers(0, 255, (48, 64, 3), dtype=np.uint8)
+        Image.fromarray(image).save(root / f"{i}{suffix}")
         mask = USABLE.astype(np.uint8) * 255
         tight = {"quality": 100} if suffix in (".jpg", ".JPG") else {"lossless": True} if suffix == ".webp" else {}
         Image.fromarray(mask).save(folders[layout] / f"{i}{suffix}", **tight)
     masks = folders[layout] if layout.startswith("given") else None
     frames = read_frames(tmp_path / "dive", folder=tmp_path / "prepare", masks=masks)
     assert len(frames) == 4
-    assert frames.cautions == ()
+    assert frames.warnings == ()
     for i in range(4):
         np.testing.assert_array_equal(frames.mask(i)[:, 40:], USABLE[:, 40:])
         assert frames.mask(i)[:, :10].float().mean() < 0.5  # JPEG rings
@@ -73,19 +73,19 @@ def test_masks_may_have_the_very_names_of_the_pictures(tmp_path, suffix, layout)
 
 
 def test_masks_of_a_video_have_the_names_of_its_frames(tmp_path, write_video):
-    pictures = [np.random.default_rng(i).integers(0, 255, (48, 64, 3), dtype=np.uint8) for i in range(30)]
-    write_video(tmp_path / "dive.mp4", pictures)
+    images = [np.random.default_rng(i).integers(0, 255, (48, 64, 3), dtype=np.uint8) for i in range(30)]
+    write_video(tmp_path / "dive.mp4", images)
     for i in range(4):
         write_mask(tmp_path / "masks" / f"frame_{i:06d}.png")
     frames = read_frames(tmp_path / "dive.mp4", folder=tmp_path / "prepare", masks=tmp_path / "masks")
     assert [frame.mask is not None for frame in frames] == [True] * 4 + [False]
-    assert frames.cautions == ("Masks: 4 of 5 frames have one; 0 masks match no frame.",)
+    assert frames.warnings == ("Masks: 4 of 5 frames have one; 0 masks match no frame.",)
 
 
 def test_masks_that_nobody_asked_for_and_that_match_nothing_are_said(dive, tmp_path):
     write_mask(dive / "masks" / "stranger.png")
     frames = read_frames(dive, folder=tmp_path / "prepare")
-    assert frames.cautions == ("Masks: 0 of 4 frames have one; 1 masks match no frame (stranger.png).",)
+    assert frames.warnings == ("Masks: 0 of 4 frames have one; 1 masks match no frame (stranger.png).",)
     assert frames.unused_masks == 1
 
 
@@ -102,7 +102,7 @@ def test_masks_are_found_when_the_images_folder_itself_is_given(dive, tmp_path):
     np.testing.assert_array_equal(frames.mask(0), USABLE)
 
 
-def test_masks_between_the_pictures_are_masks_and_not_frames(dive, tmp_path):
+def test_masks_between_the_images_are_masks_and_not_frames(dive, tmp_path):
     write_mask(dive / "images" / "a_mask.png")
     write_mask(dive / "images" / "b.jpg.png")
     for masks in (None, dive / "images"):
@@ -111,7 +111,7 @@ def test_masks_between_the_pictures_are_masks_and_not_frames(dive, tmp_path):
         assert [frame.mask is not None for frame in frames] == [True, True, False, False]
 
 
-def test_masks_of_nested_pictures_lie_in_nested_folders(dive, tmp_path):
+def test_masks_of_nested_images_lie_in_nested_folders(dive, tmp_path):
     (dive / "images" / "sub").mkdir()
     (dive / "images" / "a.jpg").rename(dive / "images" / "sub" / "b.jpg")
     write_mask(dive / "masks" / "sub" / "b.png")
@@ -145,7 +145,7 @@ def test_a_frame_that_its_mask_covers_wholly_is_left_out(dive, tmp_path):
     write_mask(dive / "masks" / "b.png", np.zeros_like(USABLE))
     frames = read_frames(dive, folder=tmp_path / "prepare")
     assert frames.names == ("a.jpg", "c.jpg", "d.jpg")
-    assert "1 frames were left out because their masks" in frames.cautions[-1]
+    assert "1 frames were left out because their masks" in frames.warnings[-1]
     assert not (tmp_path / "prepare" / "b.jpg").exists()
 
 

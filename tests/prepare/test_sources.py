@@ -1,4 +1,4 @@
-"""What may stand in the place of a source or of one of its pictures, and what names they may have."""
+"""What may stand in the place of a source or of one of its images, and what names they may have."""
 
 import json
 import os
@@ -17,16 +17,16 @@ from swimm3r.prepare import check_source, read_frames
 NOBODY = 65534
 
 
-def picture(seed, height=48, width=64):
+def image(seed, height=48, width=64):
     return np.random.default_rng(seed).integers(0, 255, (height, width, 3), dtype=np.uint8)
 
 
 @pytest.fixture
 def dive(tmp_path):
-    """Six pictures, 0.png to 5.png."""
+    """Six images, 0.png to 5.png."""
     (tmp_path / "dive").mkdir()
     for i in range(6):
-        Image.fromarray(picture(i)).save(tmp_path / "dive" / f"{i}.png")
+        Image.fromarray(image(i)).save(tmp_path / "dive" / f"{i}.png")
     return tmp_path / "dive"
 
 
@@ -54,14 +54,14 @@ def test_a_pipe_a_device_and_a_socket_are_no_videos(tmp_path):
                 check_source(tmp_path / name)
 
 
-def test_a_pipe_among_the_pictures_is_left_out_and_named(dive, tmp_path):
+def test_a_pipe_among_the_images_is_left_out_and_named(dive, tmp_path):
     os.mkfifo(dive / "pipe.png")
     (dive / "device.png").symlink_to("/dev/zero")
     frames = read_frames(dive, folder=tmp_path / "prepare")
     assert len(frames) == 6
-    (caution,) = frames.cautions
-    assert "2 of 8 files cannot be read" in caution
-    assert "pipe.png" in caution
+    (warning,) = frames.warnings
+    assert "2 of 8 files cannot be read" in warning
+    assert "pipe.png" in warning
 
 
 def test_a_pipe_among_the_masks_is_refused(dive, tmp_path):
@@ -89,7 +89,7 @@ def test_a_subfolder_that_may_not_be_searched_is_left_out_and_named(dive, tmp_pa
     monkeypatch.setattr(os, "scandir", guarded)
     frames = read_frames(dive, folder=tmp_path / "prepare")
     assert len(frames) == 6
-    assert frames.cautions == ("1 folders may not be searched and were left out (lost+found).",)
+    assert frames.warnings == ("1 folders may not be searched and were left out (lost+found).",)
 
 
 def test_a_name_that_is_too_long_is_an_input_error(tmp_path):
@@ -99,7 +99,7 @@ def test_a_name_that_is_too_long_is_an_input_error(tmp_path):
 
 def test_names_that_are_not_utf_8_become_names_that_are(dive, tmp_path):
     for i, name in enumerate((b"caf\xe9.png", b"caf\xe8.png", b"caf\n.png")):
-        Image.fromarray(picture(i)).save(tmp_path / "p.png")
+        Image.fromarray(image(i)).save(tmp_path / "p.png")
         os.rename(tmp_path / "p.png", os.fsencode(dive) + b"/" + name)
     frames = read_frames(dive, folder=tmp_path / "prepare")
     assert len(set(frames.names)) == 9
@@ -112,7 +112,7 @@ def test_names_that_are_not_utf_8_become_names_that_are(dive, tmp_path):
 def test_masks_follow_names_of_any_bytes_and_length(dive, tmp_path):
     (dive / "masks").mkdir()
     for name in (b"caf\xe9", b"a" * 251, "\N{GREEK SMALL LETTER ALPHA}".encode() * 125):
-        Image.fromarray(picture(7)).save(tmp_path / "p.png")
+        Image.fromarray(image(7)).save(tmp_path / "p.png")
         os.rename(tmp_path / "p.png", os.fsencode(dive) + b"/" + name + b".png")
         Image.fromarray(np.full((48, 64), 255, np.uint8)).save(tmp_path / "m.png")
         os.rename(tmp_path / "m.png", os.fsencode(dive / "masks") + b"/" + name + b".png")
@@ -127,7 +127,7 @@ def test_masks_follow_names_of_any_bytes_and_length(dive, tmp_path):
 
 def test_two_long_names_with_one_beginning_stay_apart(dive, tmp_path):
     for end in "bc":
-        Image.fromarray(picture(ord(end))).save(dive / f"{'a' * 240}{end}.png")
+        Image.fromarray(image(ord(end))).save(dive / f"{'a' * 240}{end}.png")
     assert len(set(read_frames(dive, folder=tmp_path / "prepare").names)) == 8
 
 
@@ -146,14 +146,14 @@ def test_a_bomb_is_left_out_and_named_and_the_rest_goes_on(dive, tmp_path):
     (dive / "bomb.png").write_bytes(data[:12] + header + struct.pack(">I", zlib.crc32(header)) + data[33:])
     frames = read_frames(dive, folder=tmp_path / "prepare")
     assert len(frames) == 6
-    (caution,) = frames.cautions
-    assert "1 of 7 files were left out" in caution
-    assert "bomb.png has 60000x60000 pixels" in caution
+    (warning,) = frames.warnings
+    assert "1 of 7 files were left out" in warning
+    assert "bomb.png has 60000x60000 pixels" in warning
 
 
 def test_a_folder_with_one_video_stands_for_it(tmp_path, write_video):
     (tmp_path / "dcim" / "100GOPRO").mkdir(parents=True)
-    write_video(tmp_path / "dcim" / "100GOPRO" / "GX01.MP4", [picture(i) for i in range(30)])
+    write_video(tmp_path / "dcim" / "100GOPRO" / "GX01.MP4", [image(i) for i in range(30)])
     (tmp_path / "dcim" / "notes.txt").write_text("visibility 5 m")
     assert check_source(tmp_path / "dcim") == tmp_path / "dcim" / "100GOPRO" / "GX01.MP4"
     assert len(read_frames(tmp_path / "dcim", folder=tmp_path / "prepare")) == 5
@@ -162,11 +162,11 @@ def test_a_folder_with_one_video_stands_for_it(tmp_path, write_video):
 def test_of_several_videos_none_is_chosen(tmp_path):
     for name in ("a.mp4", "b.mov"):
         (tmp_path / name).write_bytes(b"a video")
-    with pytest.raises(InputError, match=r"no pictures and 2 videos: a\.mp4, b\.mov"):
+    with pytest.raises(InputError, match=r"no images and 2 videos: a\.mp4, b\.mov"):
         check_source(tmp_path)
 
 
-def test_pictures_come_before_a_video_beside_them(dive):
+def test_images_come_before_a_video_beside_them(dive):
     (dive / "a.mp4").write_bytes(b"a video")
     assert check_source(dive) == dive
 
@@ -176,9 +176,9 @@ def test_equal_channels_are_said_to_be_gray(dive, tmp_path, write_video):
     for path in dive.iterdir():
         Image.open(path).convert("L").convert("RGB").save(path.with_suffix(".jpg"))
         path.unlink()
-    gray = [np.repeat(picture(i)[..., :1], 3, 2) for i in range(30)]
+    gray = [np.repeat(image(i)[..., :1], 3, 2) for i in range(30)]
     video = write_video(tmp_path / "gray.mp4", gray)
     for source in (dive, video):
         frames = read_frames(source, folder=tmp_path / "prepare" / source.name)
         assert frames.gray
-        assert "gray" in frames.cautions[-1]
+        assert "gray" in frames.warnings[-1]

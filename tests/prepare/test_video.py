@@ -14,14 +14,14 @@ TEXTURE = np.random.default_rng(0).integers(0, 255, (24, 32, 3), dtype=np.uint8)
 
 def numbered(i, blur=0.0):
     """A texture that carries its number as eight black or white bars."""
-    picture = cv2.GaussianBlur(TEXTURE, None, blur) if blur else TEXTURE.copy()
+    image = cv2.GaussianBlur(TEXTURE, None, blur) if blur else TEXTURE.copy()
     for bit in range(8):
-        picture[:48, bit * 32 : bit * 32 + 32] = 255 * (i >> bit & 1)
-    return picture
+        image[:48, bit * 32 : bit * 32 + 32] = 255 * (i >> bit & 1)
+    return image
 
 
-def number_of(picture):
-    return sum(1 << bit for bit in range(8) if picture[8:40, bit * 32 + 8 : bit * 32 + 24].mean() > 0.5)
+def number_of(image):
+    return sum(1 << bit for bit in range(8) if image[8:40, bit * 32 + 8 : bit * 32 + 24].mean() > 0.5)
 
 
 def numbers(frames):
@@ -35,7 +35,7 @@ def test_uniform_takes_every_sixth_frame_of_thirty_a_second(tmp_path, write_vide
     np.testing.assert_allclose([frame.time for frame in frames], np.arange(0, 60, 6) / 30, atol=1e-3)
     assert frames.ordered
     assert frames.names[3] == "frame_000003.png"
-    assert frames.cautions == ()
+    assert frames.warnings == ()
 
 
 def test_the_sharpest_frame_of_each_bin_is_taken(tmp_path, write_video):
@@ -84,7 +84,7 @@ def test_black_bins_are_left_out_and_said(tmp_path, write_video):
     path = write_video(tmp_path / "dive.mp4", [black if 12 <= i < 24 else numbered(i) for i in range(60)])
     frames = read_frames(path, folder=tmp_path / "prepare", pick="uniform")
     assert numbers(frames) == [0, 6, *range(24, 60, 6)]
-    assert "2 times of the video show nothing" in frames.cautions[0]
+    assert "2 times of the video show nothing" in frames.warnings[0]
 
 
 def test_a_black_video_is_refused(tmp_path, write_video):
@@ -106,7 +106,7 @@ def test_a_video_cut_off_is_used_as_far_as_it_goes(tmp_path, write_video):
     path.write_bytes(path.read_bytes()[: path.stat().st_size // 2])
     frames = read_frames(path, folder=tmp_path / "prepare", fps=2.0)
     assert 4 <= len(frames) <= 8
-    assert any("should last 6.0 s, but ends at" in caution for caution in frames.cautions)
+    assert any("should last 6.0 s, but ends at" in warning for warning in frames.warnings)
 
 
 def test_an_unreadable_video_leaves_nothing(tmp_path):

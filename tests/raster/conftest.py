@@ -1,4 +1,4 @@
-"""Scenes for the rasteriser's tests."""
+"""Scenes for the rasterizer's tests."""
 
 from collections.abc import Callable
 

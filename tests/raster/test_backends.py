@@ -92,7 +92,7 @@ def test_an_opaque_stack_ends_the_pixel_where_the_oracle_ends_it(backend: Backen
 
 @backends
 @kernels
-def test_a_capped_pair_keeps_its_colour_gradient_and_loses_its_shape_gradient(backend: Backend, kernel: Kernel):
+def test_a_capped_pair_keeps_its_color_gradient_and_loses_its_shape_gradient(backend: Backend, kernel: Kernel):
     p = Primitives2D(
         torch.tensor([[0.5, 0.5]]), torch.tensor([[0.01, 0.0, 0.01]]), torch.rand(1, 3), torch.tensor([1.0]),
         torch.tensor([2.0]), torch.tensor([1.5]),
@@ -191,7 +191,7 @@ def test_order_of_the_input_does_not_matter(backend: Backend, scene: Scene):
 @backends
 @pytest.mark.parametrize("case", ["px00", "px01", "px02", "px03", "px05"])
 def test_a_one_pixel_image_reproduces_the_published_pixel(backend: Backend, case: str):
-    """A centred primitive has alpha = opacity. px04 goes on below T = 1e-4, where a rasteriser ends the pixel."""
+    """A centerd primitive has alpha = opacity. px04 goes on below T = 1e-4, where a rasterizer ends the pixel."""
     x = {k: torch.from_numpy(np.array(VECTORS[f"{case}_in_{k}"])).float() for k in ("alpha", "c", "z")}
     n = len(x["alpha"])
     p = Primitives2D(

@@ -98,7 +98,7 @@ def test_gradients_of_the_image_agree_with_finite_differences(kernel: Kernel, sc
 
 
 @pytest.mark.parametrize("kernel", ["beta", "gaussian"])
-def test_geometry_and_medium_branches_add_up_to_the_plain_centre_gradient(kernel: Kernel, scene: Scene):
+def test_geometry_and_medium_branches_add_up_to_the_plain_center_gradient(kernel: Kernel, scene: Scene):
     p, medium = scene(30, 13, 18)
     p.mean2d.requires_grad_()
     buffers = SggBuffers(*(b.double() for b in SggBuffers.zeros(30)))

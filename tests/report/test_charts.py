@@ -1,4 +1,4 @@
-"""The page's charts and pictures."""
+"""The page's charts and images."""
 
 import base64
 
@@ -26,17 +26,17 @@ def test_a_curve_is_dashed_beyond_what_was_seen():
     assert ">z<" in svg
 
 
-def test_a_picture_is_its_own_data_scaled_to_fit():
-    picture = np.zeros((300, 800, 3), np.uint8)
-    picture[..., 0] = 200
-    uri = charts.picture(picture, long_side=400)
+def test_a_image_is_its_own_data_scaled_to_fit():
+    image = np.zeros((300, 800, 3), np.uint8)
+    image[..., 0] = 200
+    uri = charts.image(image, long_side=400)
     stored = cv2.imdecode(np.frombuffer(base64.b64decode(uri.split(",")[1]), np.uint8), cv2.IMREAD_COLOR)
     assert stored.shape == (150, 400, 3)
     assert abs(int(stored[70, 200, 2]) - 200) <= 2  # BGR
 
 
-def test_near_is_warm_far_is_cold_and_unknown_is_grey():
-    near, far, unknown = charts.depth_picture(np.array([[1.0, 5.0, 0.0]]), 1.0, 5.0)[0]
+def test_near_is_warm_far_is_cold_and_unknown_is_gray():
+    near, far, unknown = charts.depth_image(np.array([[1.0, 5.0, 0.0]]), 1.0, 5.0)[0]
     assert near[0] > near[2]
     assert far[2] > far[0]
     assert np.ptp(unknown.astype(int)) < 20
@@ -47,8 +47,8 @@ def test_the_plan_view_puts_the_path_over_the_points_below_it():
     xyz = np.column_stack([rng.uniform(-4, 4, 20_000), rng.uniform(-1, 1, 20_000), np.full(20_000, 3.0)])
     poses = np.eye(4)[None].repeat(9, 0)
     poses[:, 0, 3] = np.linspace(-3, 3, 9)  # swims along x, looks along z
-    grey = np.full((20_000, 3), 0.5)
-    view = charts.plan_view(xyz, grey, grey, poses)
+    gray = np.full((20_000, 3), 0.5)
+    view = charts.plan_view(xyz, gray, gray, poses)
     painted = (view.restored != 255).any(2)
     columns, rows = view.path.astype(int).T
     assert painted[rows, columns].mean() > 0.7

@@ -15,7 +15,7 @@ from swimm3r.scene.frames import Frame, Frames
 
 @pytest.fixture
 def dive(tmp_path):
-    """Thirty pictures of 48 KB each."""
+    """Thirty images of 48 KB each."""
     listed = []
     for i in range(30):
         path = tmp_path / f"{i}.png"
@@ -30,7 +30,7 @@ def test_train_and_test_part_the_frames(dive):
     assert dive.test.names == ("0.png", "8.png", "16.png", "24.png")
 
 
-def test_pictures_are_floats_from_nought_to_one_whatever_their_depth(dive, tmp_path):
+def test_images_are_floats_from_nought_to_one_whatever_their_depth(dive, tmp_path):
     torch.testing.assert_close(dive.image(20), torch.full((100, 160, 3), 20 / 255))
     images.write_rgb(tmp_path / "20.png", np.full((100, 160, 3), 30000, np.uint16))
     torch.testing.assert_close(dive.image(20), torch.full((100, 160, 3), 30000 / 65535))
@@ -42,7 +42,7 @@ def test_a_frame_without_a_mask_may_be_used_everywhere(dive):
 
 
 def test_the_cache_never_holds_more_than_it_may(dive, monkeypatch):
-    cache = ArrayCache(max_bytes=200_000)  # four pictures
+    cache = ArrayCache(max_bytes=200_000)  # four images
     monkeypatch.setattr(frames_module, "_CACHE", cache)
     held = []
     for i in (*range(30), *range(30)):
@@ -61,16 +61,16 @@ def test_what_is_in_use_is_not_read_again(dive, monkeypatch):
     assert len(reads) == 3
 
 
-def test_changing_a_loaded_picture_does_not_change_the_next_load(dive):
+def test_changing_a_loaded_image_does_not_change_the_next_load(dive):
     dive.image(5).zero_()
     assert dive.image(5).min() == pytest.approx(5 / 255)
 
 
-@pytest.mark.parametrize("what", ["picture", "mask"])
+@pytest.mark.parametrize("what", ["image", "mask"])
 def test_a_file_of_another_size_than_the_frames_is_named(what: str, dive, tmp_path):
     small = tmp_path / "small.png"
     images.write_rgb(small, np.full((50, 80, 3), 255, np.uint8))
-    frame = replace(dive.frames[3], path=small) if what == "picture" else replace(dive.frames[3], mask=small)
+    frame = replace(dive.frames[3], path=small) if what == "image" else replace(dive.frames[3], mask=small)
     damaged = replace(dive, frames=(frame,))
     with pytest.raises(InputError, match=r"small\.png is 80 x 50, the frames are 160 x 100"):
-        damaged.image(0) if what == "picture" else damaged.mask(0)
+        damaged.image(0) if what == "image" else damaged.mask(0)

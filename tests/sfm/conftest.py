@@ -1,4 +1,4 @@
-"""A small dive over a flat, textured seafloor: exact depth maps, pictures with water, known truth."""
+"""A small dive over a flat, textured seafloor: exact depth maps, images with water, known truth."""
 
 from dataclasses import dataclass
 from pathlib import Path
@@ -31,7 +31,7 @@ class FlatDive:
 
 
 def seafloor(xy: Tensor) -> Tensor:
-    """J of the plane at points (x, y): patches of several sizes, from black to bright, of all colours."""
+    """J of the plane at points (x, y): patches of several sizes, from black to bright, of all colors."""
     x, y = xy.unbind(-1)
     waves = [torch.sin(a * x + b * y + c) for a, b, c in ((7, 2, 0), (3, -9, 1), (15, 11, 2), (-4, 5, 3), (1, 1.5, 4))]
     value = torch.stack([waves[0] + waves[1], waves[1] + waves[2], waves[2] + waves[0]], -1) * 0.12
@@ -40,7 +40,7 @@ def seafloor(xy: Tensor) -> Tensor:
 
 
 def flat_dive(folder: Path, medium: Medium, heights: tuple[float, ...]) -> FlatDive:
-    """Write the pictures and depth maps of a flat dive."""
+    """Write the images and depth maps of a flat dive."""
     count = len(heights)
     cam2world = torch.eye(4, dtype=torch.float64).repeat(count, 1, 1)
     for k, height in enumerate(heights):  # looking along +z at the plane z = 0

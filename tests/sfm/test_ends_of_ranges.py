@@ -16,7 +16,7 @@ from swimm3r.scene.reconstruction import DepthMaps, Reconstruction
 from swimm3r.settings import Range, Settings, declarations, ranges_of
 from swimm3r.sfm.features.sift import extract_features
 from swimm3r.sfm.medium.dense_tracks import fuse_depth, shared_rays
-from swimm3r.sfm.medium.restore import restore_picture, restored_cloud
+from swimm3r.sfm.medium.restore import restore_image, restored_cloud
 from swimm3r.sfm.medium.seathru import estimate_medium
 from swimm3r.sfm.plane_sweep.estimate import estimate_depth
 from swimm3r.sfm.settings import FeatureSettings, PlaneSweepSettings, RestoreSettings, SeathruSettings, TrackSettings
@@ -67,10 +67,10 @@ def posed(dive, tmp_path: Path) -> Reconstruction:
     tracks = fuse_depth(dive.rec, dive.frames, TrackSettings(max_tracks=400))
     width = dive.frames.width
     xy = torch.stack([tracks.pixel % width + 0.5, tracks.pixel // width + 0.5], -1).to(dive.rec.tracks.xy)
-    colours = torch.full((len(tracks.xyz), 3), 0.5)
+    colors = torch.full((len(tracks.xyz), 3), 0.5)
     return replace(
         dive.rec,
-        points=replace(dive.rec.points, xyz=tracks.xyz, rgb=colours, error=torch.zeros(len(tracks.xyz))),
+        points=replace(dive.rec.points, xyz=tracks.xyz, rgb=colors, error=torch.zeros(len(tracks.xyz))),
         tracks=replace(dive.rec.tracks, point=tracks.track, frame=tracks.frame, xy=xy),
         depth=DepthMaps(tmp_path),
     )
@@ -92,13 +92,13 @@ def test_tracks_are_found_and_the_water_from_them(name: str, number: float, dive
 
 
 @pytest.mark.parametrize(("name", "number"), ends(RestoreSettings))
-def test_pictures_and_points_are_restored(name: str, number: float, dive, known_water: MediumFit):
+def test_images_and_points_are_restored(name: str, number: float, dive, known_water: MediumFit):
     settings = changed(RestoreSettings(), name, number)
     tracks = fuse_depth(dive.rec, dive.frames, TrackSettings(max_tracks=500))
     cloud = restored_cloud(dive.rec, dive.frames, tracks, known_water, settings)
     assert 0 < len(cloud.xyz) <= settings.max_points
     depth, rays = dive.rec.depth[dive.rec.names[3]], shared_rays(dive.rec.cameras)[3]
-    done = restore_picture(dive.frames.image(3), depth, rays, known_water, settings)
+    done = restore_image(dive.frames.image(3), depth, rays, known_water, settings)
     assert bool(done.clear.isfinite().all())
 
 

@@ -14,7 +14,7 @@ def matches(*rows: tuple[int, tuple[int, int], int, tuple[int, int], float]) -> 
     return FrameMatches(*(torch.tensor(column) for column in (i, j, xy_i, xy_j, confidence)), xyz)
 
 
-def sightings(tracks) -> set[frozenset[tuple[int, int, int]]]:
+def observations(tracks) -> set[frozenset[tuple[int, int, int]]]:
     rows = list(zip(tracks.point.tolist(), tracks.frame.tolist(), tracks.xy.tolist(), strict=True))
     return {frozenset((f, *xy) for p, f, xy in rows if p == point) for point in range(len(tracks.xyz))}
 
@@ -30,7 +30,7 @@ def test_matches_that_share_a_pixel_are_one_track():
         WIDTH,
         HEIGHT,
     )
-    assert sightings(found) == {
+    assert observations(found) == {
         frozenset({(0, 1, 2), (1, 3, 4), (2, 5, 6)}),
         frozenset({(0, 9, 9), (2, 8, 8)}),
         frozenset({(1, 4, 3), (2, 6, 5)}),
@@ -41,7 +41,7 @@ def test_a_track_that_comes_back_to_a_frame_keeps_the_surer_pixel():
     found = join(
         matches((0, (1, 1), 1, (2, 2), 1.0), (1, (2, 2), 2, (3, 3), 2.0), (0, (5, 5), 2, (3, 3), 3.0)), WIDTH, HEIGHT
     )
-    assert sightings(found) == {frozenset({(0, 5, 5), (1, 2, 2), (2, 3, 3)})}
+    assert observations(found) == {frozenset({(0, 5, 5), (1, 2, 2), (2, 3, 3)})}
 
 
 def test_the_point_is_the_mean_of_its_matches_by_confidence():
@@ -62,9 +62,9 @@ def test_points_left_in_one_frame_are_dropped_and_the_most_seen_stay():
     )
     bad = (found.frame == 0) & (found.xy == torch.tensor([7, 7])).all(1)
     kept = without(found, bad)
-    assert sightings(kept) == {frozenset({(0, 1, 1), (1, 2, 2), (2, 3, 3)}), frozenset({(0, 9, 9), (1, 6, 6)})}
-    assert sightings(most_seen(kept, 10)) == sightings(kept)
-    assert sightings(most_seen(kept, 1)) == {frozenset({(0, 1, 1), (1, 2, 2), (2, 3, 3)})}
+    assert observations(kept) == {frozenset({(0, 1, 1), (1, 2, 2), (2, 3, 3)}), frozenset({(0, 9, 9), (1, 6, 6)})}
+    assert observations(most_seen(kept, 10)) == observations(kept)
+    assert observations(most_seen(kept, 1)) == {frozenset({(0, 1, 1), (1, 2, 2), (2, 3, 3)})}
 
 
 def camera_pair() -> Cameras:

@@ -42,7 +42,7 @@ def primitives() -> Callable[..., BetaPrimitives]:
 
 @pytest.fixture
 def camera() -> Callable[..., Cameras]:
-    """A slightly turned pinhole camera near the origin, principal point off centre: `camera(width=80, height=56)`."""
+    """A slightly turned pinhole camera near the origin, principal point off center: `camera(width=80, height=56)`."""
 
     def make(width: int = 80, height: int = 56) -> Cameras:
         K = torch.tensor([[70.0, 0, 0.46 * width], [0, 66.0, 0.55 * height], [0, 0, 1]], dtype=torch.float64)
@@ -87,7 +87,7 @@ def make_wall(n: int = 1500) -> SplatMap:
 
 @dataclass(frozen=True)
 class TinyDive:
-    """Nine pictures of the wall, two of them held back, with what structure from motion would know."""
+    """Nine images of the wall, two of them held back, with what structure from motion would know."""
 
     rec: Reconstruction
     frames: Frames

@@ -19,12 +19,12 @@ from swimm3r.splat.settings import (
     DensifySettings,
     InitialSettings,
     PoseRefinementSettings,
-    Recipe,
+    RecipeName,
     SggSettings,
     UwbsSettings,
     with_recipe,
 )
-from swimm3r.splat.training.scene import Site
+from swimm3r.splat.training.scene import TrainingScene
 from swimm3r.splat.views import TrainingViews
 
 pytest.importorskip("warp", reason="warp-lang is not installed: maps were not trained on a pretended device")
@@ -33,11 +33,19 @@ from swimm3r.raster.cuda import backend as cuda_backend
 SIZE = UwbsSettings(
     iterations=12,
     initial=InitialSettings(primitives=300, scale=2.0),
-    densify=DensifySettings(max_primitives=400, min_every=3),
+    densify=DensifySettings(cap_max=400, min_refine_every=3),
     log_every=1 / 12,
     checkpoint_every=0.5,
 )
-RECIPES: list[Recipe] = ["uwbs-static", "uwbs-dynamic", "ubs", "watersplatting", "seasplat", "threers_gs", "mcmc_gs"]
+RECIPES: list[RecipeName] = [
+    "uwbs-static",
+    "uwbs-dynamic",
+    "ubs",
+    "watersplatting",
+    "seasplat",
+    "threers_gs",
+    "mcmc_gs",
+]
 
 on_the_processor = pytest.mark.usefixtures("warp_on_the_processor")
 
@@ -59,7 +67,7 @@ def losses(folder: Path) -> list[float]:
 
 @on_the_processor
 @pytest.mark.parametrize("recipe", RECIPES)
-def test_every_recipe_trains_elsewhere_as_on_the_processor(recipe: Recipe, tiny_dive, tmp_path):
+def test_every_recipe_trains_elsewhere_as_on_the_processor(recipe: RecipeName, tiny_dive, tmp_path):
     settings = with_recipe(SIZE, recipe)
     here = train_map.train(tiny_dive.rec, tiny_dive.frames, settings, tmp_path / "here")
     with Pretended():
@@ -80,14 +88,14 @@ def test_a_map_elsewhere_shows_and_places_what_it_does_here(tiny_dive):
     scene, lens = tiny_dive.truth, tiny_dive.rec.cameras[1]
     steps = PoseRefinementSettings(steps=6, long_side=64, halvings=0)
     here = scene.render(tiny_dive.cameras[1])
-    picture, mask = tiny_dive.frames.image(1), tiny_dive.frames.mask(1)
+    image, mask = tiny_dive.frames.image(1), tiny_dive.frames.mask(1)
     off = replace(lens, cam2world=lens.cam2world.clone())
     off.cam2world[0, 0, 3] += 0.02
-    expected = refine_pose(scene, off, picture, mask, steps)
+    expected = refine_pose(scene, off, image, mask, steps)
     with Pretended():
         moved = scene.to(DEVICE)
         there, water = moved.render(tiny_dive.cameras[1]), mean_water(moved, tiny_dive.cameras[1])
-        placed = refine_pose(moved, off, picture, mask, steps)
+        placed = refine_pose(moved, off, image, mask, steps)
     for name in ("rgb", "clear", "backscatter", "z_depth", "alpha"):
         torch.testing.assert_close(getattr(there, name), getattr(here, name), atol=2e-5, rtol=2e-4)
     torch.testing.assert_close(water.Binf, mean_water(scene, tiny_dive.cameras[1]).Binf)
@@ -118,12 +126,12 @@ def test_a_step_waits_for_the_device_only_to_bin(tiny_dive):
     settings = replace(SIZE, iterations=1000, poses=replace(SIZE.poses, enabled=False))
     views = TrainingViews(tiny_dive.rec, tiny_dive.frames, settings, 1.0)
     with Pretended():
-        site = Site(tiny_dive.rec, 1.0, 1.0, views, None, DEVICE)
-        recipe = uwbs.Uwbs(settings, site, uwbs.known_water(site, settings))
-        state, view = recipe.start().to(DEVICE), site.view(2)
+        scene = TrainingScene(tiny_dive.rec, 1.0, 1.0, views, None, DEVICE)
+        recipe = uwbs.Uwbs(settings, scene, uwbs.known_water(scene, settings))
+        state, view = recipe.start().to(DEVICE), scene.view(2)
         waits.clear()
         recipe.step(state, view, 26)
-    assert set(waits) == {"warp_gpu.py:bin_primitives"}
+    assert set(waits) == {"backend.py:bin_primitives"}
     assert len(waits) == 2  # how many tiles the primitives may touch, and how many they do
 
 
@@ -139,7 +147,7 @@ def test_the_pretence_sees_tensors_in_two_places():
 @pytest.mark.gpu
 @pytest.mark.skipif(not torch.cuda.is_available(), reason="no CUDA device: no map was trained on a GPU")
 @pytest.mark.parametrize("recipe", RECIPES)
-def test_every_recipe_trains_on_the_gpu_as_on_the_processor(recipe: Recipe, tiny_dive, tmp_path):
+def test_every_recipe_trains_on_the_gpu_as_on_the_processor(recipe: RecipeName, tiny_dive, tmp_path):
     settings = with_recipe(SIZE, recipe)
     train_map.train(tiny_dive.rec, tiny_dive.frames, settings, tmp_path / "here")
     there = train_map.train(tiny_dive.rec, tiny_dive.frames, settings, tmp_path / "there", device=torch.device("cuda"))

@@ -1,4 +1,4 @@
-"""From stored primitives through conditioning, projection and water to the picture, and back as far as the pose."""
+"""From stored primitives through conditioning, projection and water to the image, and back as far as the pose."""
 
 from collections.abc import Callable
 from dataclasses import replace
@@ -25,9 +25,9 @@ def water() -> MediumMaps:
 
 
 def turned(view: Pinhole, world2cam: torch.Tensor) -> Pinhole:
-    """The camera with another pose; its centre follows."""
+    """The camera with another pose; its center follows."""
     R, t = world2cam[:3, :3], world2cam[:3, 3]
-    return replace(view, R=R, t=t, centre=-R.mT @ t)
+    return replace(view, R=R, t=t, center=-R.mT @ t)
 
 
 def loss(out: RasterOutput) -> torch.Tensor:
@@ -36,7 +36,7 @@ def loss(out: RasterOutput) -> torch.Tensor:
     return sum(((w * image).sum() for w, image in zip(weights, out, strict=True)), torch.zeros(()))
 
 
-def picture(p: BetaPrimitives, view: Pinhole, backend: str) -> RasterOutput:
+def image(p: BetaPrimitives, view: Pinhole, backend: str) -> RasterOutput:
     dtype = p.xyz.dtype
     time = TIME.to(dtype) if p.query_mean.shape[1] == 4 else None
     drawn = project(p, view, RenderSettings(), time).primitives
@@ -55,12 +55,12 @@ def scene(primitives: Make, camera: Callable[..., Cameras], c: int) -> tuple[Bet
 
 
 @pytest.mark.parametrize("c", [3, 4])
-def test_gradients_of_the_picture_agree_with_finite_differences(c: int, primitives: Make, camera):
+def test_gradients_of_the_image_agree_with_finite_differences(c: int, primitives: Make, camera):
     p, view, pose = scene(primitives, camera, c)
     leaves = [t.clone().requires_grad_() for t in (*p, pose)]
 
     def value(tensors: list[torch.Tensor]) -> torch.Tensor:
-        return loss(picture(BetaPrimitives(*tensors[:-1]), turned(view, tensors[-1]), "reference"))
+        return loss(image(BetaPrimitives(*tensors[:-1]), turned(view, tensors[-1]), "reference"))
 
     found = torch.autograd.grad(value(leaves), leaves)
     rng = torch.Generator().manual_seed(7)
@@ -82,12 +82,12 @@ def test_gradients_of_the_picture_agree_with_finite_differences(c: int, primitiv
 
 
 @pytest.mark.parametrize("c", [3, 4])
-def test_the_fast_path_gives_the_oracles_picture_and_gradients(c: int, primitives: Make, camera):
+def test_the_fast_path_gives_the_oracles_image_and_gradients(c: int, primitives: Make, camera):
     p, view, pose = scene(primitives, camera, c)
     results = []
     for dtype, backend in ((torch.float64, "reference"), (torch.float32, "numba")):
         leaves = [t.to(dtype).requires_grad_() for t in (*p, pose)]
-        out = picture(BetaPrimitives(*leaves[:-1]), turned(view, leaves[-1]), backend)
+        out = image(BetaPrimitives(*leaves[:-1]), turned(view, leaves[-1]), backend)
         results.append((out, torch.autograd.grad(loss(out), leaves)))
     (exact, expected), (fast, found) = results
     assert exact.alpha.mean() > 0.1

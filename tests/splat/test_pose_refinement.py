@@ -42,7 +42,7 @@ def test_a_disturbed_pose_finds_its_way_back(tiny_dive):
     assert pixels_off(tiny_dive, refined.camera) < 0.1
 
 
-def test_smaller_pictures_are_looked_at_first_for_half_of_the_steps():
+def test_smaller_images_are_looked_at_first_for_half_of_the_steps():
     settings = PoseRefinementSettings()
     assert sizes(settings, 400) == [60, 120, 240]
     assert sizes(settings, 150) == [75, 150]
@@ -58,14 +58,14 @@ def test_a_pose_that_is_right_stays(tiny_dive):
     true = tiny_dive.cameras[3]
     refined = refine_pose(tiny_dive.truth, true, tiny_dive.frames.image(3), SEEN, PoseRefinementSettings(steps=5))
     assert refined.loss <= refined.start_loss
-    assert (refined.camera.centres - true.centres).norm() < 5e-3
+    assert (refined.camera.centers - true.centers).norm() < 5e-3
 
 
-def test_a_picture_of_full_size_is_the_training_pictures_not_the_frames(tiny_dive, monkeypatch):
+def test_a_image_of_full_size_is_the_training_images_not_the_frames(tiny_dive, monkeypatch):
     small = replace(tiny_dive.truth, settings=replace(tiny_dive.truth.settings, long_side=32))
     seen = []
     monkeypatch.setattr(
-        "swimm3r.splat.pose_refinement.pictures", lambda p, f, view, *_: seen.append(view.width) or drawn(view)
+        "swimm3r.splat.pose_refinement.images", lambda p, f, view, *_: seen.append(view.width) or drawn(view)
     )
     for settings in (PoseRefinementSettings(steps=1, long_side=0), PoseRefinementSettings(steps=1)):
         refine_pose(small, tiny_dive.cameras[3], tiny_dive.frames.image(3), SEEN, settings)
@@ -86,7 +86,7 @@ def test_no_motion_is_the_given_pose():
     assert moved(pose, torch.tensor([0.1, 0, 0, 0, 0, 0, 0, 0, 0]), 3.0)[0, 3] == pytest.approx(0.3)
 
 
-def test_a_flat_picture_is_compared_everywhere():
+def test_a_flat_image_is_compared_everywhere():
     flat = torch.full((48, 64, 3), 0.4)
     assert edges(flat, SEEN, PoseRefinementSettings()).all()
     stepped = flat.clone()

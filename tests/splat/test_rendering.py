@@ -1,4 +1,4 @@
-"""Pictures of a map: water, clear colours, backscatter and depth are consistent."""
+"""Images of a map: water, clear colors, backscatter and depth are consistent."""
 
 from dataclasses import replace
 
@@ -44,14 +44,14 @@ def test_a_surface_looks_as_the_water_makes_it_look_along_the_ray(wall, camera):
     assert out.z_depth[50, 6] == pytest.approx(4.0, abs=1e-3)
 
 
-def test_the_picture_is_the_backscatter_plus_what_comes_through(wall, camera):
+def test_the_image_is_the_backscatter_plus_what_comes_through(wall, camera):
     scene = wall()
     out = scene.render(camera())
     assert (out.backscatter <= out.medium.Binf + 1e-5).all()
     assert (out.rgb >= out.backscatter - 1e-5).all()
 
 
-def test_without_water_the_picture_is_the_clear_one(wall, camera):
+def test_without_water_the_image_is_the_clear_one(wall, camera):
     scene = wall()
     with torch.no_grad():
         last = scene.field.network[-1]
@@ -70,7 +70,7 @@ def test_a_wall_stands_where_it_is(wall, camera):
     assert out.z_depth[covered].max() < 3.6
 
 
-def test_more_water_between_means_less_clear_colour(wall, camera):
+def test_more_water_between_means_less_clear_color(wall, camera):
     scene, view = wall(), camera()
     near = scene.render(view)
     pose = view.cam2world.clone()

@@ -15,7 +15,7 @@ from swimm3r.splat import train, training_poses
 from swimm3r.splat.map_file import load_map
 from swimm3r.splat.rendering import SplatMap
 from swimm3r.splat.settings import DensifySettings, InitialSettings, TrainingPoseSettings, UwbsSettings
-from swimm3r.splat.training_poses import PoseCodes, epipolar_loss, epipolar_matches, pose_rate, training_stations
+from swimm3r.splat.training_poses import PoseMlp, epipolar_loss, epipolar_matches, pose_rate, training_poses_of
 from swimm3r.splat.views import TrainingViews
 
 
@@ -40,18 +40,18 @@ def disturbed(rec, degrees: float, share: float):
     poses, n = rec.cameras.cam2world, len(rec.names)
     axis, way = torch.nn.functional.normalize(torch.randn(2, n, 3, generator=rng, dtype=torch.float64), dim=-1)
     R = poses[:, :3, :3] @ so3_exp(axis * torch.deg2rad(torch.tensor(degrees)))
-    centres = poses[:, :3, 3] + share * training_poses.spread_of(poses) * way
-    return replace(rec, cameras=replace(rec.cameras, cam2world=pose_from(R, centres)))
+    centers = poses[:, :3, 3] + share * training_poses.spread_of(poses) * way
+    return replace(rec, cameras=replace(rec.cameras, cam2world=pose_from(R, centers)))
 
 
-def stations(dive, rec, settings: UwbsSettings):
+def poses(dive, rec, settings: UwbsSettings):
     views = TrainingViews(rec, dive.frames, settings, 1.0)
-    return training_stations(rec, views.names, views.cameras, 1.0)
+    return training_poses_of(rec, views.names, views.cameras, 1.0)
 
 
 def test_zero_codes_leave_every_pose_where_it_is(tiny_dive):
-    s = stations(tiny_dive, tiny_dive.rec, UwbsSettings())
-    codes = PoseCodes(len(s), TrainingPoseSettings())
+    s = poses(tiny_dive, tiny_dive.rec, UwbsSettings())
+    codes = PoseMlp(len(s), TrainingPoseSettings())
     torch.testing.assert_close(s.moved(codes), s.cameras.cam2world)
     total = s.moved(codes)[:, :3, 3].sum()
     learns = torch.autograd.grad(total, codes.network[4].weight)[0]
@@ -68,7 +68,7 @@ def test_a_motion_is_made_in_the_cameras_own_axes():
 
 def test_true_matches_under_true_poses_cost_nothing_and_weigh_by_confidence(tiny_dive):
     rec = matched(tiny_dive)
-    s = stations(tiny_dive, rec, UwbsSettings())
+    s = poses(tiny_dive, rec, UwbsSettings())
     assert epipolar_loss(s.matches, s.cameras.cam2world, s.cameras.K, s.spread) < 1e-3
     wrong = replace(s.matches, xy_j=s.matches.xy_j + torch.tensor([0.0, 3.0]))
     every = epipolar_loss(wrong, s.cameras.cam2world, s.cameras.K, s.spread)
@@ -81,15 +81,15 @@ def test_true_matches_under_true_poses_cost_nothing_and_weigh_by_confidence(tiny
 
 def test_cameras_in_one_place_have_no_say(tiny_dive):
     rec = matched(tiny_dive)
-    s = stations(tiny_dive, rec, UwbsSettings())
+    s = poses(tiny_dive, rec, UwbsSettings())
     same = s.cameras.cam2world.clone().requires_grad_()
     loss = epipolar_loss(s.matches, same * 0 + torch.eye(4, dtype=torch.float64), s.cameras.K, s.spread)
     assert loss == 0
 
 
-def test_matches_are_read_at_the_size_and_shape_of_the_training_pictures(tiny_dive):
+def test_matches_are_read_at_the_size_and_shape_of_the_training_images(tiny_dive):
     rec = matched(tiny_dive)
-    small = stations(tiny_dive, rec, UwbsSettings(long_side=32))
+    small = poses(tiny_dive, rec, UwbsSettings(long_side=32))
     torch.testing.assert_close(small.matches.xy_i, rec.matches.xy_i.double() / 2)
     fewer = tiny_dive.rec.names[2:5]
     cameras = small.cameras[[2, 3, 4]]
@@ -100,7 +100,7 @@ def test_matches_are_read_at_the_size_and_shape_of_the_training_pictures(tiny_di
 REFINED = UwbsSettings(
     iterations=200,
     initial=InitialSettings(primitives=500, scale=2.0),
-    densify=DensifySettings(max_primitives=600, min_every=20),
+    densify=DensifySettings(cap_max=600, min_refine_every=20),
     poses=TrainingPoseSettings(epipolar_end=0.75),
 )
 
@@ -143,6 +143,6 @@ def test_a_held_out_frame_follows_the_training_cameras_when_they_move_together(t
         tiny_dive.truth.primitives, tiny_dive.truth.field, tiny_dive.truth.settings, True, 1.0,
         poses=training_poses.RefinedPoses(rec.names, moved),
     )  # fmt: skip
-    found = in_axes_of(scene, rec, {"a": FirstPose(poses[2], "neighbours")})
+    found = in_axes_of(scene, rec, {"a": FirstPose(poses[2], "neighbors")})
     torch.testing.assert_close(found["a"].cam2world, moved[2])
     assert found["a"].cam2world[:3, :3].det().item() == pytest.approx(1)

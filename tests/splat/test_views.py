@@ -1,4 +1,4 @@
-"""Frames become pinhole pictures."""
+"""Frames become pinhole images."""
 
 from dataclasses import replace
 
@@ -29,7 +29,7 @@ def scenery(camera: Cameras) -> torch.Tensor:
 
 
 @pytest.mark.parametrize("long_side", [0, 48])
-def test_an_undistorted_picture_shows_what_a_pinhole_camera_would(long_side: int):
+def test_an_undistorted_image_shows_what_a_pinhole_camera_would(long_side: int):
     camera = lens()
     canvas = camera.pinhole(long_side)
     assert max(canvas.width, canvas.height) == (long_side or 96)
@@ -40,23 +40,23 @@ def test_an_undistorted_picture_shows_what_a_pinhole_camera_would(long_side: int
     assert error.max() < (0.02 if long_side else 0.005)
 
 
-def test_a_picture_without_distortion_keeps_its_bits():
+def test_a_image_without_distortion_keeps_its_bits():
     camera = replace(lens(), distortion=torch.zeros(1, 1, dtype=torch.float64))
-    picture = torch.rand(64, 96, 3)
-    got, seen = undistorted(picture, torch.ones(64, 96, dtype=torch.bool), camera, camera.pinhole())
-    assert torch.equal(got, picture)
+    image = torch.rand(64, 96, 3)
+    got, seen = undistorted(image, torch.ones(64, 96, dtype=torch.bool), camera, camera.pinhole())
+    assert torch.equal(got, image)
     assert seen.all()
 
 
 def test_what_the_lens_did_not_see_is_not_seen():
-    """A pincushion lens's picture does not reach the corners of its pinhole canvas."""
+    """A pincushion lens's image does not reach the corners of its pinhole canvas."""
     camera = lens(k=0.3)
     _, seen = undistorted(scenery(camera), torch.ones(64, 96, dtype=torch.bool), camera, camera.pinhole())
     assert not seen[0, 0]
     assert seen[32, 48]
 
 
-def test_a_mask_is_undistorted_with_its_picture():
+def test_a_mask_is_undistorted_with_its_image():
     camera = lens()
     mask = torch.ones(64, 96, dtype=torch.bool)
     mask[:, :48] = False
@@ -65,15 +65,15 @@ def test_a_mask_is_undistorted_with_its_picture():
     assert seen[20:40, 52:80].all()
 
 
-def test_views_are_the_registered_training_frames_with_pictures_and_depth_in_working_units(tiny_dive):
+def test_views_are_the_registered_training_frames_with_images_and_depth_in_working_units(tiny_dive):
     views = TrainingViews(tiny_dive.rec, tiny_dive.frames, UwbsSettings(), 2.0)
     assert views.names == tiny_dive.rec.names
     view = views[2]
-    picture = tiny_dive.frames.image(tiny_dive.frames.index(view.name))
-    torch.testing.assert_close(view.rgb.permute(1, 2, 0), picture, atol=1e-6, rtol=0)
+    image = tiny_dive.frames.image(tiny_dive.frames.index(view.name))
+    torch.testing.assert_close(view.rgb.permute(1, 2, 0), image, atol=1e-6, rtol=0)
     expected = 2 * tiny_dive.rec.depth[view.name].z_depth
     torch.testing.assert_close(view.z_depth, expected, rtol=1e-3, atol=0)
-    torch.testing.assert_close(view.camera.centres[0], 2 * tiny_dive.rec.cameras.centres[2])
+    torch.testing.assert_close(view.camera.centers[0], 2 * tiny_dive.rec.cameras.centers[2])
 
 
 def test_views_know_where_they_look_past_every_surface(tiny_dive, tmp_path):

@@ -34,7 +34,7 @@ def frames(dive):
     return [dive.frame(i) for i in range(0, 24, 4)]
 
 
-def test_pictures_are_the_clear_scene_seen_through_the_water(dive, frames):
+def test_images_are_the_clear_scene_seen_through_the_water(dive, frames):
     for frame in frames:
         hit = frame.z_depth > 0
         expected = add_water(frame.clear, frame.ray_depth, dive.medium)
@@ -84,10 +84,10 @@ def test_hits_lie_on_the_seafloor(dive, frames):
 
 
 def test_cameras_keep_clear_of_the_floor_and_revisit_where_they_began(dive):
-    x, y, z = dive.cameras.centres.T.numpy()
+    x, y, z = dive.cameras.centers.T.numpy()
     assert (z - height_at(dive.floor, x, y) > 0.35).all()
-    steps = dive.cameras.centres.diff(dim=0).norm(dim=-1)
-    assert (dive.cameras.centres[0] - dive.cameras.centres[-1]).norm() < 1.5 * steps.max()
+    steps = dive.cameras.centers.diff(dim=0).norm(dim=-1)
+    assert (dive.cameras.centers[0] - dive.cameras.centers[-1]).norm() < 1.5 * steps.max()
     R = dive.cameras.cam2world[:, :3, :3]
     torch.testing.assert_close(R @ R.mT, torch.eye(3).double().expand(24, 3, 3))
     assert (torch.linalg.det(R) > 0).all()

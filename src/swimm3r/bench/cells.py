@@ -1,6 +1,6 @@
 """One cell of a table: the scores of one method on one scene under one seed.
 
-A cell's folder OUT/SCENE/METHOD/SEED keeps what the method made (a map, pictures) and two keys (`io.cache_key`):
+A cell's folder OUT/SCENE/METHOD/SEED keeps what the method made (a map, images) and two keys (`io.cache_key`):
 
     made_from.json   of everything that decides what the method makes: input, settings, weights, the package's code
     scores.json      of that and of what decides the scores alone: the reference, weights of perceptual scores
@@ -32,7 +32,7 @@ Scores = Mapping[str, float | NotComputed]
 
 
 @dataclass(frozen=True)
-class Cell:
+class Result:
     """One method on one scene. A method that could not be run says why, and has no scores."""
 
     scene: str
@@ -43,7 +43,7 @@ class Cell:
 
 
 @dataclass(frozen=True)
-class Place:
+class ResultKey:
     """Where in the table a cell stands, and so where its folder lies."""
 
     scene: str
@@ -62,13 +62,13 @@ def scene_folder(out: Path, scene: str) -> Path:
 
 _MARK, _OLD = "made_from.json", "old"
 
-SceneWork = Callable[..., list[Cell]]
+SceneWork = Callable[..., list[Result]]
 """`work(scene, progress=...)`; a `partial` of a module's function, for it is sent to other processes."""
 
 
 def kept_cell(
-    out: Path, place: Place, made_from: object, make: Callable[[Path], Scores], scored_by: object = None
-) -> Cell:
+    out: Path, place: ResultKey, made_from: object, make: Callable[[Path], Scores], scored_by: object = None
+) -> Result:
     """The cell of that place, from its folder where it was computed from the same; else `make(folder)` computes it.
 
     `made_from` decides what the method makes, `scored_by` besides it the scores; both are what `cache_key` takes, and
@@ -81,15 +81,15 @@ def kept_cell(
     key = cache_key(work, scored_by)
     stored = _stored(path)
     if stored.get("key") == key:
-        return Cell(place.scene, place.method, place.seed, _scores(stored["scores"]))
+        return Result(place.scene, place.method, place.seed, _scores(stored["scores"]))
     _set_aside(folder, work)
     try:
         scores = dict(make(folder))
     except (WeightsError, DeviceError) as missing:
-        return Cell(place.scene, place.method, place.seed, not_run=missing.what)
+        return Result(place.scene, place.method, place.seed, not_run=missing.what)
     document = {"key": key, "scene": place.scene, "method": place.method, "seed": place.seed}
     write_text(path, json.dumps({**document, "scores": summary_entries(scores)}, indent=2) + "\n")
-    return Cell(place.scene, place.method, place.seed, _scores(summary_entries(scores)))
+    return Result(place.scene, place.method, place.seed, _scores(summary_entries(scores)))
 
 
 def _set_aside(folder: Path, work: str) -> None:
@@ -132,7 +132,7 @@ def check_choice(what: str, chosen: Sequence[str], against: str | None = None) -
 
 def over_scenes(
     scenes: Sequence[object], work: SceneWork, out: Path, how: JobSettings, progress: Progress = silent
-) -> list[Cell]:
+) -> list[Result]:
     """The cells of all scenes in the scenes' order. One scene's error is raised when the others are done."""
     if not scenes:
         raise UsageError(
@@ -163,8 +163,8 @@ def _submitted(scenes: Sequence[object], work: SceneWork, out: Path, how: JobSet
         return [executor.submit(work, scene, progress=silent) for scene in scenes]
 
 
-def _joined(results: Sequence[Callable[[], list[Cell]]], progress: Progress) -> list[Cell]:
-    cells: list[Cell] = []
+def _joined(results: Sequence[Callable[[], list[Result]]], progress: Progress) -> list[Result]:
+    cells: list[Result] = []
     failed: list[Swimm3rError] = []
     for done, result in enumerate(results):
         progress("scenes", done, len(results))

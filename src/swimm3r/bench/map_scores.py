@@ -38,7 +38,7 @@ def map_scores(
     """Refines each test frame's pose on the frozen map, renders it into folder/test beside NAME_target.png, scores it.
 
     `poses` are where refinement starts, in the reconstruction's axes. A synthetic dive adds the errors of the clear
-    colours and of the water.
+    colors and of the water.
     """
     there = held_out.in_axes_of(scene, sfm.rec, poses)
     views = held_out.score_views(

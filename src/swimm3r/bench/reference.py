@@ -6,7 +6,7 @@ made once per clip, without dense depth and water, and kept in a folder with the
 Poses that somebody else found can take their place: a folder with NAME.json, a cameras.json, for each clip.
 
 The lens is held at what the clip's first run found: calibrated anew, it would come out different on other frames (on
-small hazy pictures by a quarter), and poses under two lenses differ by more than a good localisation errs.
+small hazy images by a quarter), and poses under two lenses differ by more than a good localization errs.
 """
 
 import json

@@ -13,14 +13,14 @@ from swimm3r.io.video import Video
 from swimm3r.pipeline.presets import RunSettings
 from swimm3r.pipeline.run import FinishedSfm, open_finished_sfm, run_pipeline
 from swimm3r.prepare import check_source
-from swimm3r.prepare.image_folder import pictures_of
+from swimm3r.prepare.image_folder import images_of
 from swimm3r.progress import Progress, silent
 from swimm3r.scene.frames import Frames
 from swimm3r.scene.run_folder import is_run, open_run
 from swimm3r.sfm.distillation.settings import RECIPES
 from swimm3r.sfm.settings import ColmapModelSettings, ColmapSettings, Mast3rSettings
 
-PICTURES = ("images_wb", "images")  # folders named so lend their clip no name
+IMAGES = ("images_wb", "images")  # folders named so lend their clip no name
 POSES_REFINED = " + poses"
 """Ends the name of how poses were found where maps refined them, whatever their recipe says."""
 
@@ -58,7 +58,7 @@ def clips_of(folders: Sequence[Path]) -> list[Clip]:
     for folder in folders:
         sfm, run = open_finished_sfm(folder), open_run(folder, "sfm")
         source = Path(run.input.path)
-        named = source.parent if source.name.lower() in PICTURES else source
+        named = source.parent if source.name.lower() in IMAGES else source
         name = named.stem if named.suffix and not named.is_dir() else named.name
         if prints.setdefault(name, run.input.fingerprint) != run.input.fingerprint:
             raise InputError(
@@ -80,7 +80,7 @@ def made_runs(
 ) -> tuple[Path, ...]:
     """Run folders as they are; of clips, new ones up to their structure from motion in OUT/runs.
 
-    With `given_poses` a clip is a folder of pictures with their COLMAP model, whose poses are taken. Raises InputError
+    With `given_poses` a clip is a folder of images with their COLMAP model, whose poses are taken. Raises InputError
     where it has none.
     """
     runs = []
@@ -95,23 +95,23 @@ def made_runs(
 
 
 def _with_given_poses(scene: Path, settings: RunSettings) -> tuple[Path, RunSettings]:
-    """The pictures of a scene as SeaThru-NeRF and its kin lay it out, and settings that take its model's poses."""
+    """The images of a scene as SeaThru-NeRF and its kin lay it out, and settings that take its model's poses."""
     here = layouts.folder(scene, scene) if scene.is_dir() else None
-    pictures, model = (None, None) if here is None else (here.child(*PICTURES), here.child("sparse", "colmap"))
-    if pictures is None or model is None:
+    images, model = (None, None) if here is None else (here.child(*IMAGES), here.child("sparse", "colmap"))
+    if images is None or model is None:
         raise InputError(
-            f"{scene} is no folder of pictures with their COLMAP model",
-            cause=f"given poses are looked for in sparse/ or colmap/ beside {' or '.join(PICTURES)}",
+            f"{scene} is no folder of images with their COLMAP model",
+            cause=f"given poses are looked for in sparse/ or colmap/ beside {' or '.join(IMAGES)}",
             hint="without --given-poses they are found anew",
         )
     assert isinstance(settings.sfm, ColmapSettings)
-    return pictures, replace(settings, sfm=on_model(model, settings.sfm))
+    return images, replace(settings, sfm=on_model(model, settings.sfm))
 
 
 def original_pixels(source: Path, frames: Frames) -> float:
-    """Pixels of the clip's own pictures per pixel of the frames made of them."""
+    """Pixels of the clip's own images per pixel of the frames made of them."""
     source = check_source(source)
-    width = image_size(pictures_of(source).paths[0])[0] if source.is_dir() else Video(source).width
+    width = image_size(images_of(source).paths[0])[0] if source.is_dir() else Video(source).width
     return width / frames.width
 
 

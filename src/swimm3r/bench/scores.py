@@ -17,11 +17,11 @@ class Column:
 
 _PAIRS = "pairs i < j, W_i W_j^-1, baselines as lines, an unplaced frame fails its pairs"
 _MAP_PAIRS = f"a test frame with each training frame; {_PAIRS}"
-_TRAINING_PAIRS = "two training frames, the map's own poses against the reference: what localisation can reach"
+_TRAINING_PAIRS = "two training frames, the map's own poses against the reference: what localization can reach"
 _QUERY_PAIRS = f"two test frames; {_PAIRS}"
 _EPIPOLAR = (
     "mean of both distances, original pixels, under each method's own poses, over the matches its map was made from:"
-    " COLMAP's verified two-view ones, all of MASt3R's; of imported models sightings of one point"
+    " COLMAP's verified two-view ones, all of MASt3R's; of imported models observations of one point"
 )
 _DEPTH = "z depth, each frame scaled by its median, mean over frames"
 _AFTER = "over located frames, after the similarity of the training frames"
@@ -30,12 +30,12 @@ _WATER = "mean over held-out pixels at true ray depth and over channels"
 _COLORS = "physical colors unless the row says white-balanced"
 
 COLUMNS = (
-    Column("psnr", "PSNR", 2, "high", "dB, test frames as 8-bit pictures, their poses refined on the frozen map"),
+    Column("psnr", "PSNR", 2, "high", "dB, test frames as 8-bit images, their poses refined on the frozen map"),
     Column("ssim_3dgs", "SSIM", 4, "high", "11 x 11 Gaussian of sigma 1.5, zero padding, as 3DGS"),
     Column("lpips_vgg", "LPIPS", 4, "low", "v0.1, VGG-16, inputs 0..1 as 3DGS feeds them"),
     Column("sharpness", "Sharpness", 3, "neither", "mean gradient magnitude, rendering : test frame; 1 is as sharp"),
     Column("blur4_psnr", "Blurred by 4 px", 2, "neither", "dB of the test frame against itself blurred, sigma 4 px"),
-    Column("clear_psnr", "Clear PSNR", 2, "high", "dB of the picture without water where true T_D > 0.05"),
+    Column("clear_psnr", "Clear PSNR", 2, "high", "dB of the image without water where true T_D > 0.05"),
     Column("T_D_abs", "T_D error", 4, "low", f"absolute error of the direct transmittance, {_WATER}"),
     Column("B_abs", "B error", 4, "low", f"absolute error of the backscatter, {_WATER}"),
     Column("from_reference_pct", "By reference, %", 0, "neither", _FIRST_POSES),
@@ -82,9 +82,9 @@ COLUMNS = (
         Column(f"fps_{stage}", f"{stage}, FPS", 2, "high", "located frames per second of wall time")
         for stage in ("retrieve", "coarse", "render", "match", "refine")
     ),
-    Column("fps_localise", "Loc. FPS", 3, "high", "all stages together, without what is done once per map"),
-    Column("peak_mb", "Peak, MB", 0, "low", "resident memory of a process that localises in this map alone"),
-    Column("peak_vram_mb", "Peak VRAM, MB", 0, "low", "allocated by torch on the GPU while it localised"),
+    Column("fps_localize", "Loc. FPS", 3, "high", "all stages together, without what is done once per map"),
+    Column("peak_mb", "Peak, MB", 0, "low", "resident memory of a process that localizes in this map alone"),
+    Column("peak_vram_mb", "Peak VRAM, MB", 0, "low", "allocated by torch on the GPU while it localized"),
 )
 
 

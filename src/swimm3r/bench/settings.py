@@ -66,4 +66,4 @@ class SfmMethods(Settings):
     adapters: Path | None = None
     """Trainings of swimm3r train-sfm by the names of their recipes: ADAPTERS/dark3r/adapter.safetensors ..."""
     imports: Path | None = None
-    """What other programs made of the same pictures: IMPORTS/vggt/SCENE or SCENE.npz, IMPORTS/gluemap/SCENE, ..."""
+    """What other programs made of the same images: IMPORTS/vggt/SCENE or SCENE.npz, IMPORTS/gluemap/SCENE, ..."""

@@ -9,7 +9,7 @@ import math
 from collections.abc import Sequence
 from dataclasses import dataclass
 
-from swimm3r.bench.cells import Cell
+from swimm3r.bench.cells import Result
 from swimm3r.evaluate import NotComputed
 
 
@@ -28,7 +28,7 @@ class Row:
     against: str
 
 
-def rows(cells: Sequence[Cell], against: str | None = None) -> list[Row]:
+def rows(cells: Sequence[Result], against: str | None = None) -> list[Row]:
     """Every score of every method, in the order of the cells; differences are from `against`, else the first method.
 
     Where methods have two parts, "colmap / uwbs-static", `against` may be the last part alone: each is then compared
@@ -52,7 +52,7 @@ def rows(cells: Sequence[Cell], against: str | None = None) -> list[Row]:
     return found
 
 
-def number(cell: Cell, score: str) -> float | None:
+def number(cell: Result, score: str) -> float | None:
     """The score where it was computed."""
     value = cell.scores.get(score)
     return None if isinstance(value, NotComputed) else value

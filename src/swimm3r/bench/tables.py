@@ -1,6 +1,6 @@
 """Cells as the paper's table: NAME.md, NAME.csv (a line per cell), NAME.json (cells and rows), NAME.tex.
 
-A mean over fewer scenes than its neighbours' is no comparison, so the number of cells stands in each row; the
+A mean over fewer scenes than its neighbors' is no comparison, so the number of cells stands in each row; the
 differences are taken over common scenes and seeds only.
 """
 
@@ -12,7 +12,7 @@ from collections.abc import Sequence
 from dataclasses import asdict, dataclass
 from pathlib import Path
 
-from swimm3r.bench.cells import Cell
+from swimm3r.bench.cells import Result
 from swimm3r.bench.scores import Column
 from swimm3r.bench.statistics import Row, number, rows
 from swimm3r.evaluate import NotComputed, summary_entries
@@ -29,7 +29,7 @@ class Table:
 
     name: str  # of the files
     title: str
-    cells: Sequence[Cell]
+    cells: Sequence[Result]
     columns: Sequence[Column]
     against: str | None = None  # the method that differences are taken from; the first where none is named
     preset: str = ""  # that supplied the settings, and whether options changed them; none where no preset has a say
@@ -209,7 +209,7 @@ def _best(found: Sequence[Row], column: Column) -> str | None:
     return f"{value:.{column.digits}f}"
 
 
-def _methods(cells: Sequence[Cell]) -> list[str]:
+def _methods(cells: Sequence[Result]) -> list[str]:
     return list(dict.fromkeys(c.method for c in cells))
 
 

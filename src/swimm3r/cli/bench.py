@@ -16,7 +16,7 @@ from swimm3r.progress import Progress
 from swimm3r.scene.settings import FrameSettings
 from swimm3r.settings import Count
 from swimm3r.sfm.settings import ColmapSettings, Mast3rSettings
-from swimm3r.splat.settings import RECIPES, PoseRefinementSettings, Recipe, UwbsSettings
+from swimm3r.splat.settings import RECIPES, PoseRefinementSettings, RecipeName, UwbsSettings
 
 if TYPE_CHECKING:
     from swimm3r.bench.tables import Table
@@ -66,11 +66,11 @@ def command_for_preset(name: Preset) -> Callable:
         inputs: Positional[tuple[Path, ...]],
         /,
         out: Path,
-        recipes: tuple[Recipe, ...] = RECIPES,
+        recipes: tuple[RecipeName, ...] = RECIPES,
         seeds: Seeds = 1,
         poses: bool = False,
         given_poses: bool = False,
-        against: Recipe | None = None,
+        against: RecipeName | None = None,
         references: Path | None = None,
         preset: Preset = "fast",
         frames: FrameSettings = picked_evenly,
@@ -84,11 +84,11 @@ def command_for_preset(name: Preset) -> Callable:
         Args:
             inputs: run folders with finished structure from motion, which are only read; or clips, of which runs are
                 made in OUT/runs. Runs of one clip whose poses were found in different ways are rows of one table.
-            out: where maps, scores, pictures side by side and the tables go: render.md, .csv, .json and .tex.
+            out: where maps, scores, images side by side and the tables go: render.md, .csv, .json and .tex.
             recipes: the renderers.
             seeds: trainings of each recipe on each run.
             poses: add all recipes again with the training frames' poses refined along with the map.
-            given_poses: clips are folders of pictures with a COLMAP model (SeaThru-NeRF and its kin); take its poses.
+            given_poses: clips are folders of images with a COLMAP model (SeaThru-NeRF and its kin); take its poses.
             against: the recipe that differences are taken from; the first where none is named.
             references: a folder with CLIP.json (a cameras.json) of all frames of each clip, test frames included; by
                 default their poses are found by COLMAP.
@@ -131,7 +131,7 @@ def command_for_preset(name: Preset) -> Callable:
 
         Args:
             clips: videos or folders of stills.
-            out: where the methods' run folders, pictures of the clouds and the tables go: sfm.md, .csv, .json and .tex.
+            out: where the methods' run folders, images of the clouds and the tables go: sfm.md, .csv, .json and .tex.
             given: the methods and their files.
             references: a folder with NAME.json (a cameras.json) of clips whose poses are known; synthetic dives bring
                 their own.
@@ -165,7 +165,7 @@ def command_for_preset(name: Preset) -> Callable:
     ) -> None:
         """Depth and poses of every method on FLSea's test sequences.
 
-        Judged against the set's own depth, and COLMAP on its restored pictures.
+        Judged against the set's own depth, and COLMAP on its restored images.
 
         Args:
             root: FLSea-VI as unpacked.
@@ -200,7 +200,7 @@ def command_for_preset(name: Preset) -> Callable:
     ) -> None:
         """The same of the trainings that leave out a part of medium-aware distillation.
 
-        Their restored pictures: bench sfm --methods swimm3r without-forward ..., then bench restoration.
+        Their restored images: bench sfm --methods swimm3r without-forward ..., then bench restoration.
 
         Args:
             root: FLSea-VI as unpacked.
@@ -229,7 +229,7 @@ def command_for_preset(name: Preset) -> Callable:
         "sfm": sfm,
         "restoration": restoration,
         "render": render,
-        "localisation": localisation,
+        "localization": localization,
         "ablation-sfm": ablation_sfm,
         "ablation-uwbs": ablation_uwbs,
     }
@@ -256,7 +256,7 @@ def restoration(
 
     Args:
         runs: run folders with finished structure from motion, such as bench sfm leaves; they are only read.
-        out: where pictures side by side and the tables go: restoration.md, .csv, .json and .tex.
+        out: where images side by side and the tables go: restoration.md, .csv, .json and .tex.
         jobs: scenes in parallel.
     """
     from swimm3r.bench.protocols.restoration import score_restoration
@@ -264,7 +264,7 @@ def restoration(
     _show(out, lambda progress: score_restoration(runs, out, jobs, progress))
 
 
-def localisation(
+def localization(
     runs: Positional[tuple[Path, ...]],
     /,
     out: Path,
@@ -279,16 +279,16 @@ def localisation(
 
     Args:
         runs: run folders; they are only read.
-        out: where match pictures, references and the tables go: localisation.md, .csv, .json and .tex.
+        out: where match images, references and the tables go: localization.md, .csv, .json and .tex.
         maps: a folder of swimm3r bench render; its maps of these runs take the place of the runs' own.
         references: a folder with CLIP.json (a cameras.json) of all frames of each clip, test frames included; by
             default their poses are found by COLMAP.
         settings: the protocol; SIFT where no MASt3R weights are here.
         jobs: scenes in parallel.
     """
-    from swimm3r.bench.protocols.localization import localise
+    from swimm3r.bench.protocols.localization import localize
 
-    _show(out, lambda progress: localise(runs, out, settings, maps, references, jobs, progress))
+    _show(out, lambda progress: localize(runs, out, settings, maps, references, jobs, progress))
 
 
 def _preset(name: Preset, kept: bool) -> str:

@@ -6,7 +6,7 @@ from tyro.conf import Positional
 
 
 def datasets(root: Positional[Path], /) -> None:
-    """List the sequences below a folder, their raw and clean pictures, depth and poses, and what was left out.
+    """List the sequences below a folder, their raw and clean images, depth and poses, and what was left out.
 
     Args:
         root: FLSea-VI, Sea-Thru, SeaThru-NeRF, synthetic dives or folders raw/ clean/ depth/, as unpacked.

@@ -9,13 +9,13 @@ from tyro.conf import arg
 
 from swimm3r.cli.terminal.console import drawn_progress, print_next, print_summary
 from swimm3r.pipeline.presets import PRESETS
-from swimm3r.splat.settings import Recipe, UwbsSettings, with_recipe
+from swimm3r.splat.settings import RecipeName, UwbsSettings, with_recipe
 from swimm3r.synthetic.settings import DiveSettings
 
 
 def demo(
     out: Path = Path("runs/demo"),
-    recipe: Recipe = "uwbs-static",
+    recipe: RecipeName = "uwbs-static",
     redo: bool = False,
     dive: Annotated[DiveSettings, arg(name="")] = DiveSettings(),  # noqa: B008
 ) -> None:

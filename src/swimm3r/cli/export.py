@@ -24,5 +24,5 @@ def export(run: Positional[Path], /, ply: Path | None = None, time: ClipSecond |
         done = export_run(run, path, time)
     print(
         f"{done.path}: {done.gaussians:,} Gaussians of {done.primitives:,} primitives.\n"
-        f"Beside the map's own clear pictures: {done.difference.psnr:.1f} dB, mean alpha {done.difference.alpha:+.3f}."
+        f"Beside the map's own clear images: {done.difference.psnr:.1f} dB, mean alpha {done.difference.alpha:+.3f}."
     )

@@ -1,4 +1,4 @@
-"""`swimm3r localize`: where pictures were taken, in a run's map."""
+"""`swimm3r localize`: where images were taken, in a run's map."""
 
 from pathlib import Path
 
@@ -17,13 +17,13 @@ def localize(
     out: Path | None = None,
     settings: LocalizationSettings = LocalizationSettings(),  # noqa: B008
 ) -> None:
-    """Find where pictures were taken in a run's map; without pictures, its test frames.
+    """Find where images were taken in a run's map; without images, its test frames.
 
     Args:
         run: the run folder.
-        images: pictures of the same place.
-        lens: a cameras.json whose first camera is the pictures' own; otherwise they share the run's lens.
-        out: where poses.json, poses.tum and the match pictures go; RUN/localization otherwise.
+        images: images of the same place.
+        lens: a cameras.json whose first camera is the images' own; otherwise they share the run's lens.
+        out: where poses.json, poses.tum and the match images go; RUN/localization otherwise.
         settings: the protocol.
     """
     from swimm3r.io.files.outputs import output_folder
@@ -36,7 +36,7 @@ def localize(
     settings = with_checkpoint_of(settings, from_yaml(run / "settings.yaml").sfm)
     with output_folder(out or run / "localization"), drawn_progress() as progress:
         answers, folder = localize_run(run, images, lens, out, settings, progress)
-    table = Table("picture", "place", "inliers", "median error, px", "seconds")
+    table = Table("image", "place", "inliers", "median error, px", "seconds")
     for a in answers:
         if a.found is None:
             table.add_row(a.name, "not found", "", "", "")

@@ -1,4 +1,4 @@
-"""`swimm3r render`: pictures and a flight from a finished map."""
+"""`swimm3r render`: images and a flight from a finished map."""
 
 from pathlib import Path
 
@@ -23,9 +23,9 @@ def render(
         run: the run folder.
         cameras: a cameras.json in the axes of RUN/sfm/cameras.json, whose cameras (lens distortion left out) are
             rendered; the training cameras otherwise.
-        out: where the pictures go; RUN/renders/views otherwise.
-        long_side: longer side of the pictures, pixels, at most the cameras' own; 0 is the cameras' own.
-        flight: film a flight of this many pictures along the cameras, too: OUT/flythrough.mp4.
+        out: where the images go; RUN/renders/views otherwise.
+        long_side: longer side of the images, pixels, at most the cameras' own; 0 is the cameras' own.
+        flight: film a flight of this many images along the cameras, too: OUT/flythrough.mp4.
         time: second of the clip that a dynamic map is shown at; each camera's, else its frame's, where none is given.
     """
     from swimm3r.io.files.outputs import output_folder
@@ -38,4 +38,4 @@ def render(
 
     with output_folder(out or run / "renders" / "views"), drawn_progress() as progress:
         folder = render_run(run, cameras, out, long_side, flight, time, restore, progress)
-    print(f"Pictures: {folder}")
+    print(f"Images: {folder}")

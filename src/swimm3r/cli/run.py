@@ -17,7 +17,7 @@ from swimm3r.pipeline.presets import Preset, RunSettings, from_yaml
 from swimm3r.scene.run_folder import is_run, read_run
 from swimm3r.scene.settings import FrameSettings
 from swimm3r.sfm.settings import ColmapModelSettings, Mast3rSettings, SfmSettings
-from swimm3r.splat.settings import MapDevice, PoseRefinementSettings, Recipe, recipe_of
+from swimm3r.splat.settings import MapDevice, PoseRefinementSettings, RecipeName, recipe_of
 
 Backend = Literal["colmap", "mast3r", "swimm3r"]
 _FLAT = arg(name="")  # --fps, not --frames.fps; what lies deeper keeps its prefix: --depth.planes
@@ -50,7 +50,7 @@ def commands_for_settings(defaults: RunSettings) -> dict[str, Callable]:
         """Sample a video or check a folder of stills into RUN/prepare.
 
         Args:
-            source: a video, or a folder of pictures; or a run folder, to go on with its own input and settings.
+            source: a video, or a folder of images; or a run folder, to go on with its own input and settings.
             out: the run folder; not needed where SOURCE is one.
             preset: preset that supplies the other defaults; otherwise the run folder's own settings do, where it has
                 any, else `default`.
@@ -70,10 +70,10 @@ def commands_for_settings(defaults: RunSettings) -> dict[str, Callable]:
         frames: Annotated[FrameSettings, _FLAT] = defaults.frames,
         sfm: sfm_settings = sfm_defaults,
     ) -> None:
-        """Poses, dense depth, water, restored pictures and the restored cloud, without map and scores.
+        """Poses, dense depth, water, restored images and the restored cloud, without map and scores.
 
         Args:
-            source: a video, or a folder of pictures; or a run folder, to go on with its own input and settings.
+            source: a video, or a folder of images; or a run folder, to go on with its own input and settings.
             out: the run folder; not needed where SOURCE is one.
             preset: preset that supplies the other defaults; otherwise the run folder's own settings do, where it has
                 any, else `default`.
@@ -97,7 +97,7 @@ def commands_for_settings(defaults: RunSettings) -> dict[str, Callable]:
         images: Path | None = None,
         preset: Preset | None = None,
         redo: bool = False,
-        recipe: Recipe = default_recipe,
+        recipe: RecipeName = default_recipe,
         map_device: MapDevice = "auto",
         reference: Path | None = None,
         frames: Annotated[FrameSettings, _FLAT] = defaults.frames,
@@ -105,15 +105,15 @@ def commands_for_settings(defaults: RunSettings) -> dict[str, Callable]:
         splat: map_settings = defaults.splat,
         test: PoseRefinementSettings = defaults.test,
     ) -> None:
-        """A map of a dive, or of any COLMAP model: swimm3r splat --colmap sparse/0 --images pictures/ --out RUN.
+        """A map of a dive, or of any COLMAP model: swimm3r splat --colmap sparse/0 --images images/ --out RUN.
 
         Args:
-            source: a video, or a folder of pictures; or a run folder, to go on with its own input and settings; or
+            source: a video, or a folder of images; or a run folder, to go on with its own input and settings; or
                 give --colmap and --images, or --transforms.
             out: the run folder; not needed where SOURCE is one.
             colmap: a COLMAP model (or cameras.xml, sfm_data.json, predictions.npz) taken as it is.
             transforms: nerfstudio's transforms.json, taken as it is.
-            images: the pictures it was made of; its names are relative to this folder. Those that a transforms.json
+            images: the images it was made of; its names are relative to this folder. Those that a transforms.json
                 names are found without.
             preset: preset that supplies the other defaults; otherwise the run folder's own settings do, where it has
                 any, else `default`.
@@ -128,9 +128,9 @@ def commands_for_settings(defaults: RunSettings) -> dict[str, Callable]:
             test: how the test frames' poses are refined.
         """
         if transforms is not None and images is None:
-            from swimm3r.io.imports.nerfstudio import pictures_folder
+            from swimm3r.io.imports.nerfstudio import images_folder
 
-            images = pictures_folder(transforms)
+            images = images_folder(transforms)
         models = [model for model in (colmap, transforms) if model is not None]
         given = source or images
         if given is None or len(models) > 1 or (source is None) != (len(models) == 1) or (source and images):
@@ -151,7 +151,7 @@ def commands_for_settings(defaults: RunSettings) -> dict[str, Callable]:
         preset: Preset | None = None,
         redo: bool = False,
         backend: Backend = default_backend,
-        recipe: Recipe = default_recipe,
+        recipe: RecipeName = default_recipe,
         map_device: MapDevice = "auto",
         reference: Path | None = None,
         frames: Annotated[FrameSettings, _FLAT] = defaults.frames,
@@ -162,7 +162,7 @@ def commands_for_settings(defaults: RunSettings) -> dict[str, Callable]:
         """Everything, from a clip to the report page. Re-run the same command to resume, or swimm3r run RUN.
 
         Args:
-            source: a video, or a folder of pictures; or a run folder, to go on with its own input and settings.
+            source: a video, or a folder of images; or a run folder, to go on with its own input and settings.
             out: the run folder; not needed where SOURCE is one.
             preset: preset that supplies the other defaults; otherwise the run folder's own settings do, where it has
                 any, else `default`.

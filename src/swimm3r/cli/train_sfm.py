@@ -12,7 +12,7 @@ from tyro.conf import Positional, arg
 from swimm3r.cli.terminal.console import drawn_progress, print_next
 from swimm3r.sfm.distillation.settings import RECIPES, TrainSettings
 
-Recipe = Literal[
+TrainingRecipeName = Literal[
     "swimm3r",
     "without-forward",
     "without-inverse",
@@ -31,12 +31,12 @@ def command_for_recipe(name: str) -> Callable:
         /,
         out: Path,
         weights: Path | None = None,
-        base_licence: str | None = None,
-        recipe: Recipe = "swimm3r",
+        base_license: str | None = None,
+        recipe: TrainingRecipeName = "swimm3r",
         device: Literal["auto", "cpu", "cuda"] = "auto",
         settings: Annotated[TrainSettings, arg(name="")] = RECIPES[name],
     ) -> None:
-        """Train adapters and physics head on pairs of raw and clean pictures. The same command again goes on.
+        """Train adapters and physics head on pairs of raw and clean images. The same command again goes on.
 
         Under torchrun every process takes its share of each batch.
 
@@ -44,7 +44,7 @@ def command_for_recipe(name: str) -> Callable:
             data: a folder of data sets (swimm3r datasets shows what it holds).
             out: the training's folder; OUT/adapter.safetensors is the result.
             weights: the base checkpoint; by default the MASt3R weights of this computer.
-            base_licence: the base checkpoint's licence, where it is not one that Swimm3R knows.
+            base_license: the base checkpoint's license, where it is not one that Swimm3R knows.
             recipe: what the other defaults aim at: the paper's system, one of its ablations, or Dark3R.
             device: where the network runs.
             settings: every number of the training.
@@ -65,7 +65,7 @@ def command_for_recipe(name: str) -> Callable:
         # of torchrun's processes the first holds the folder for all
         hold = folder_lock(out) if os.environ.get("RANK", "0") == "0" else nullcontext()
         with output_folder(out), hold, drawn_progress() as progress:
-            adapter = run(data, out, settings, weights, base_licence, device, announce, progress)
+            adapter = run(data, out, settings, weights, base_license, device, announce, progress)
         if os.environ.get("RANK", "0") == "0":  # torchrun's other processes have the same to say
             print(f"Adapter: {adapter}")
             print_next("poses with it", "sfm", "dive.mp4", "--out", "RUN", "--backend", "swimm3r", "--adapter", adapter)

@@ -11,10 +11,10 @@ from swimm3r.errors import WeightsError
 
 
 def list_all() -> None:
-    """Print every file this program can use: what for, its size, its licence, and where it lies. No network."""
+    """Print every file this program can use: what for, its size, its license, and where it lies. No network."""
     for entry in store.MANIFEST:
         size = "size not published" if entry.about_mb is None else f"{entry.about_mb:,.4g} MB"
-        print(f"{entry.name:<20} {whereabouts(entry.name)}\n    {entry.purpose}; {size}\n    {entry.licence}")
+        print(f"{entry.name:<20} {whereabouts(entry.name)}\n    {entry.purpose}; {size}\n    {entry.license}")
     print(f"Downloads go to {store.directory()}")
 
 
@@ -23,10 +23,10 @@ def get(name: Positional[str], /, accept_license: bool = False) -> None:
 
     Args:
         name: as `swimm3r weights list` names them.
-        accept_license: you have read the licence of non-commercial weights and your use is within it.
+        accept_license: you have read the license of non-commercial weights and your use is within it.
     """
     with drawn_progress() as progress:
-        path = store.fetch(name, accept_licence=accept_license, progress=progress)
+        path = store.fetch(name, accept_license=accept_license, progress=progress)
     print(path)
 
 

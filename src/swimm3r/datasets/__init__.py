@@ -1,7 +1,7 @@
 """Published data sets in their own layouts, and any folder of pairs, as sequences of shots.
 
 survey = read_tree(Path("archive"))        every sequence below a folder, whichever data sets they are of
-view = load(survey.sequences[0], 12)       its pictures and depth in memory
+view = load(survey.sequences[0], 12)       its images and depth in memory
 pairs = make_pairs(survey.sequences[0], PairSettings())
 """
 
@@ -24,7 +24,7 @@ def read_tree(root: Path) -> "swimm3r.datasets.sequences.Survey":
     return tree.read_tree(root)
 
 
-def load(sequence: "swimm3r.datasets.sequences.Sequence", index: int) -> "swimm3r.datasets.sequences.View":
+def load(sequence: "swimm3r.datasets.sequences.Sequence", index: int) -> "swimm3r.datasets.sequences.DatasetView":
     """One shot in memory. Raises InputError where a file is damaged."""
     from swimm3r.datasets import sequences
 

@@ -10,7 +10,7 @@ from pathlib import Path
 
 import numpy as np
 
-from swimm3r.datasets.layouts import Folder, by_stem, counted, depth_maps, pictures
+from swimm3r.datasets.layouts import Folder, by_stem, counted, depth_maps, image_files
 from swimm3r.datasets.sequences import Lens, Sequence, Shot, Skipped
 from swimm3r.io.colmap import model as colmap
 
@@ -58,11 +58,11 @@ def read_sequence(folder: Folder) -> tuple[Sequence | None, list[Skipped]]:
     name = folder.name.split("/")[-1].lower()
     if name in _STEREO:
         return None, [Skipped(folder.path, "a sequence of FLSea-Stereo, which is another data set")]
-    raw = [p for p in pictures(folder.children.get("imgs") or folder.children["rgb"]) if not _is_extra(p)]
+    raw = [p for p in image_files(folder.children.get("imgs") or folder.children["rgb"]) if not _is_extra(p)]
     if not raw:
-        return None, [Skipped(folder.path, "its picture folder is empty")]
+        return None, [Skipped(folder.path, "its image folder is empty")]
     clean_folder, depth_folder = folder.child("seaerra"), folder.child("depth")
-    clean = by_stem(pictures(clean_folder)) if clean_folder else {}
+    clean = by_stem(image_files(clean_folder)) if clean_folder else {}
     depth = by_stem(depth_maps(depth_folder)) if depth_folder else {}
     split = "test" if name in TEST else "train"
     shots = tuple(
@@ -76,8 +76,8 @@ def read_sequence(folder: Folder) -> tuple[Sequence | None, list[Skipped]]:
         )
         for path in raw
     )
-    skipped = _unpaired(clean, {s.clean for s in shots}, "a restored picture without a raw one")
-    skipped += _unpaired(depth, {s.depth for s in shots}, "a depth map without a picture")
+    skipped = _unpaired(clean, {s.clean for s in shots}, "a restored image without a raw one")
+    skipped += _unpaired(depth, {s.depth for s in shots}, "a depth map without an image")
     region = next((r for r, names in REGIONS.items() if name in names), None)
     poses = _poses(folder)
     notes = (
@@ -86,9 +86,9 @@ def read_sequence(folder: Folder) -> tuple[Sequence | None, list[Skipped]]:
         else (f"{name} is no sequence of FLSea-VI; its lens is not known, and depth is taken as along rays",)
     )
     if missing := sum(s.clean is None for s in shots):
-        notes += (f"{counted(missing, 'picture')} without a restored one",)
+        notes += (f"{counted(missing, 'image')} without a restored one",)
     if missing := sum(s.depth is None for s in shots):
-        notes += (f"{counted(missing, 'picture')} without a depth map",)
+        notes += (f"{counted(missing, 'image')} without a depth map",)
     return Sequence(
         folder.name, "FLSea-VI", shots, "srgb", _DEPTH_RANGE, _LENSES.get(region or ""), poses, False, notes
     ), skipped
@@ -111,7 +111,7 @@ def _unpaired(files: dict[str, Path], used: set[Path | None], why: str) -> list[
 
 
 def _poses(folder: Folder) -> dict[str, np.ndarray]:
-    """By shot name, of a COLMAP model beside the pictures; its unit is its own."""
+    """By shot name, of a COLMAP model beside the images; its unit is its own."""
     place = folder.child("sparse", "colmap")
     if place is None:
         return {}

@@ -33,8 +33,8 @@ def folder(path: Path, root: Path) -> Folder:
     return Folder(path, "/".join(parts) or root.resolve().name, children)
 
 
-def pictures(path: Path) -> list[Path]:
-    """The visible pictures right in a folder, in natural order."""
+def image_files(path: Path) -> list[Path]:
+    """The visible images right in a folder, in natural order."""
     return _files(path, images.SUFFIXES)
 
 
@@ -58,7 +58,7 @@ def number(path: Path) -> int | None:
 
 
 def counted(count: int, singular: str, plural: str | None = None) -> str:
-    """`1 picture`, `3 pictures`."""
+    """`1 image`, `3 images`."""
     return f"{count} {singular if count == 1 else plural or singular + 's'}"
 
 

@@ -1,15 +1,15 @@
-"""Any folder of pictures that pair by name: raw/ clean/ depth/, and synthetic dives with their truth/.
+"""Any folder of images that pair by name: raw/ clean/ depth/, and synthetic dives with their truth/.
 
     raw/NAME    clean/NAME    depth/NAME      float TIFF in metres, 16 bits in millimetres, .npz    cameras.json
     images/NAME                               truth/clear, truth/z_depth, truth/cameras.json        (swimm3r.write_dive)
 
-raw/ or clean/ may be missing: pictures taken in air are clean/ alone, and get their water in training. input/ and
+raw/ or clean/ may be missing: images taken in air are clean/ alone, and get their water in training. input/ and
 reference/ stand for raw/ and clean/, too. cameras.json as docs/conventions.md has it, in metres.
 """
 
 from pathlib import Path
 
-from swimm3r.datasets.layouts import Folder, by_stem, counted, depth_maps, pictures
+from swimm3r.datasets.layouts import Folder, by_stem, counted, depth_maps, image_files
 from swimm3r.datasets.sequences import Lens, Sequence, Shot, Skipped
 from swimm3r.io import cameras_json
 from swimm3r.io.cameras_json import CameraTable
@@ -24,7 +24,7 @@ def is_dive(folder: Folder) -> bool:
 
 
 def is_triples(folder: Folder) -> bool:
-    """Whether a folder has clean pictures beside raw ones or beside depth maps."""
+    """Whether a folder has clean images beside raw ones or beside depth maps."""
     names = folder.children.keys()
     return bool(names & set(_CLEAN)) and bool(names & {*_RAW, *_DEPTH})
 
@@ -39,7 +39,7 @@ def read_dive(folder: Folder) -> tuple[Sequence | None, list[Skipped]]:
             _if_file(truth / "clear" / f"{path.name}.png"),
             _if_file(truth / "z_depth" / f"{path.name}.npz"),
         )
-        for path in pictures(folder.children["images"])
+        for path in image_files(folder.children["images"])
     )
     return _sequence(folder, "synthetic dive", shots, _if_file(truth / "cameras.json")), []
 
@@ -47,7 +47,7 @@ def read_dive(folder: Folder) -> tuple[Sequence | None, list[Skipped]]:
 def read_triples(folder: Folder) -> tuple[Sequence | None, list[Skipped]]:
     """The pairs or triples of a folder, and what in it pairs with nothing."""
     raw_folder, clean_folder, depth_folder = (folder.child(*names) for names in (_RAW, _CLEAN, _DEPTH))
-    raw, clean = (by_stem(pictures(f)) if f else {} for f in (raw_folder, clean_folder))
+    raw, clean = (by_stem(image_files(f)) if f else {} for f in (raw_folder, clean_folder))
     depth = by_stem(depth_maps(depth_folder)) if depth_folder else {}
     leading = raw if raw_folder else clean
     shots = tuple(
@@ -55,14 +55,12 @@ def read_triples(folder: Folder) -> tuple[Sequence | None, list[Skipped]]:
         for stem in leading
         if raw_folder is None or stem in clean
     )
-    skipped = [Skipped(path, "a raw picture without a clean one") for stem, path in raw.items() if stem not in clean]
+    skipped = [Skipped(path, "a raw image without a clean one") for stem, path in raw.items() if stem not in clean]
     if raw_folder:
-        skipped += [
-            Skipped(path, "a clean picture without a raw one") for stem, path in clean.items() if stem not in raw
-        ]
-    skipped += [Skipped(path, "a depth map without a picture") for stem, path in depth.items() if stem not in leading]
+        skipped += [Skipped(path, "a clean image without a raw one") for stem, path in clean.items() if stem not in raw]
+    skipped += [Skipped(path, "a depth map without an image") for stem, path in depth.items() if stem not in leading]
     if not shots:
-        return None, [Skipped(folder.path, "no picture in it has a partner of the same name"), *skipped]
+        return None, [Skipped(folder.path, "no image in it has a partner of the same name"), *skipped]
     return _sequence(folder, "folder of pairs", shots, _if_file(folder.path / "cameras.json")), skipped
 
 
@@ -71,7 +69,7 @@ def _sequence(folder: Folder, kind: str, shots: tuple[Shot, ...], cameras: Path 
         return None
     notes: tuple[str, ...] = ()
     if missing := sum(s.depth is None for s in shots):
-        notes += (f"{counted(missing, 'picture')} without a depth map",)
+        notes += (f"{counted(missing, 'image')} without a depth map",)
     if cameras is None:
         notes += ("the lens is not known, and depth is taken as along rays",)
         return Sequence(folder.name, kind, shots, notes=notes)

@@ -1,6 +1,6 @@
 """One shape for every data set: sequences of shots, and what was left out and why.
 
-A shot is a raw picture with, where the set has them, the same view restored and its metric depth. Files are named
+A shot is a raw image with, where the set has them, the same view restored and its metric depth. Files are named
 here and opened by `load`, one shot at a time.
 """
 
@@ -23,7 +23,7 @@ from swimm3r.medium import Encoding, srgb_from_linear
 
 @dataclass(frozen=True)
 class Shot:
-    """One view: at least a raw or a clean picture."""
+    """One view: at least a raw or a clean image."""
 
     name: str  # unique in its sequence
     raw: Path | None
@@ -51,7 +51,7 @@ class Sequence:
     name: str  # path of the sequence under the root, unique
     kind: str  # the data set it is of, in words
     shots: tuple[Shot, ...]
-    encoding: Encoding = "srgb"  # of the pictures on disk
+    encoding: Encoding = "srgb"  # of the images on disk
     depth_range: tuple[float, float] = (1e-3, 30.0)  # m; what lies outside is no depth
     lens: Lens | None = None
     cam2world: Mapping[str, Float[np.ndarray, "4 4"]] = field(default_factory=dict)  # by shot name
@@ -62,7 +62,7 @@ class Sequence:
         return len(self.shots)
 
     def camera(self, width: int, height: int) -> Cameras | None:
-        """The lens at a picture's size, at the origin; None where it is not known."""
+        """The lens at an image's size, at the origin; None where it is not known."""
         if self.lens is None:
             return None
         scale = np.diag([width / self.lens.width, height / self.lens.height, 1.0])
@@ -89,38 +89,38 @@ class Survey:
 
 
 @dataclass(frozen=True)
-class View:
-    """A shot in memory; sRGB-encoded pictures 0..1 of one size, whatever the files hold."""
+class DatasetView:
+    """A shot in memory; sRGB-encoded images 0..1 of one size, whatever the files hold."""
 
     raw: Float[Tensor, "h w 3"] | None
     clean: Float[Tensor, "h w 3"] | None
     z_depth: Float[Tensor, "h w"] | None  # m, 0 where nothing is known
 
 
-def load(sequence: Sequence, index: int) -> View:
-    """Shot `index`. Depth of another size is brought to the picture's by its nearest value.
+def load(sequence: Sequence, index: int) -> DatasetView:
+    """Shot `index`. Depth of another size is brought to the image's by its nearest value.
 
     Raises InputError where a file is damaged or raw and clean differ in size.
     """
     shot = sequence.shots[index]
-    raw, clean = (None if path is None else _picture(path, sequence.encoding) for path in (shot.raw, shot.clean))
+    raw, clean = (None if path is None else _image(path, sequence.encoding) for path in (shot.raw, shot.clean))
     if raw is not None and clean is not None and raw.shape != clean.shape:
         raise InputError(
             f"{shot.raw} is {raw.shape[1]}x{raw.shape[0]}, {shot.clean} is {clean.shape[1]}x{clean.shape[0]}",
-            cause="the two pictures of a pair must show the same view, pixel by pixel",
+            cause="the two images of a pair must show the same view, pixel by pixel",
             hint="resize one of them, or take the pair out",
         )
-    picture = raw if raw is not None else clean
+    image = raw if raw is not None else clean
     z_depth = None
-    if shot.depth is not None and picture is not None:
+    if shot.depth is not None and image is not None:
         depth = torch.from_numpy(read_depth(shot.depth))
         low, high = sequence.depth_range
         depth = torch.where((depth >= low) & (depth <= high), depth, 0.0)
-        z_depth = _nearest(depth, picture.shape[0], picture.shape[1])
-    return View(raw, clean, z_depth)
+        z_depth = _nearest(depth, image.shape[0], image.shape[1])
+    return DatasetView(raw, clean, z_depth)
 
 
-def _picture(path: Path, encoding: Encoding) -> Float[Tensor, "h w 3"]:
+def _image(path: Path, encoding: Encoding) -> Float[Tensor, "h w 3"]:
     stored = images.read_rgb(path)
     values = torch.from_numpy(stored.astype(np.float32)) / (255.0 if stored.dtype == np.uint8 else 65535.0)
     return srgb_from_linear(values) if encoding == "linear" else values
@@ -129,5 +129,5 @@ def _picture(path: Path, encoding: Encoding) -> Float[Tensor, "h w 3"]:
 def _nearest(depth: Float[Tensor, "a b"], height: int, width: int) -> Float[Tensor, "h w"]:
     if depth.shape == (height, width):
         return depth
-    # nearest-exact samples at pixel centres; nothing is averaged across an edge
+    # nearest-exact samples at pixel centers; nothing is averaged across an edge
     return torch.nn.functional.interpolate(depth[None, None], (height, width), mode="nearest-exact")[0, 0]

@@ -18,7 +18,7 @@ class NotComputed:
 def summary_entries(scores: Mapping[str, object]) -> dict[str, object]:
     """The scores as `summary.json` keeps them: a missing one is null, with `<key>_reason` beside it.
 
-    So is one that JSON cannot hold, as the infinite PSNR of equal pictures.
+    So is one that JSON cannot hold, as the infinite PSNR of equal images.
     """
     entries: dict[str, object] = {}
     for key, score in scores.items():

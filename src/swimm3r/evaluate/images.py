@@ -1,7 +1,7 @@
-"""Rendered pictures against taken ones, the way the 3D Gaussian Splatting papers print it.
+"""Rendered images against taken ones, the way the 3D Gaussian Splatting papers print it.
 
 PSNR = -10 log10 mse over all pixels and channels; SSIM with an 11 x 11 Gaussian window of sigma 1.5, C1 = 0.01^2,
-C2 = 0.03^2, biased moments and zero padding; both per picture, then averaged. A high PSNR of a blurred picture is no
+C2 = 0.03^2, biased moments and zero padding; both per image, then averaged. A high PSNR of a blurred image is no
 success, so two more stand beside them: the PSNR that mere blurring would get, and the ratio of gradient magnitudes.
 """
 
@@ -42,7 +42,7 @@ def view_scores(
     perceptual: Lpips | NotComputed,
     seen: Bool[Tensor, "h w"] | None = None,
 ) -> ViewScores:
-    """Every score of one view, both pictures as their 8-bit files show them.
+    """Every score of one view, both images as their 8-bit files show them.
 
     Pixels not `seen` (masked out) do not count in the PSNRs; the scores that look at surroundings take them as matched.
     Raises ValueError where no pixel is seen.
@@ -90,12 +90,12 @@ def mean_view_scores(views: Sequence[ViewScores]) -> ViewScores:
 
 
 def as_8_bit(image: Float[Tensor, "h w 3"]) -> Float[Tensor, "h w 3"]:
-    """The values a PNG of the picture holds, 0..1 in steps of 1/255."""
+    """The values a PNG of the image holds, 0..1 in steps of 1/255."""
     return (image.clamp(0, 1) * 255).round() / 255
 
 
 def psnr(render: Float[Tensor, "*pixels 3"], target: Float[Tensor, "*pixels 3"]) -> float:
-    """Peak signal-to-noise ratio, dB, of values in 0..1; infinite for equal pictures."""
+    """Peak signal-to-noise ratio, dB, of values in 0..1; infinite for equal images."""
     return psnr_from_errors(render.double() - target.double())
 
 
@@ -128,7 +128,7 @@ def ssim(render: Float[Tensor, "h w 3"], target: Float[Tensor, "h w 3"], border:
 
 
 def blur4_psnr(target: Float[Tensor, "h w 3"], seen: Bool[Tensor, "h w"] | None = None) -> float:
-    """PSNR of a picture against itself blurred with a Gaussian of sigma 4 px (mirrored borders), dB, where `seen`."""
+    """PSNR of an image against itself blurred with a Gaussian of sigma 4 px (mirrored borders), dB, where `seen`."""
     blurred = gaussian_filter(target.double().numpy(), sigma=(4, 4, 0), mode="reflect")
     errors = torch.from_numpy(blurred) - target.double()
     return psnr_from_errors(errors if seen is None else errors[seen])
@@ -138,7 +138,7 @@ def sharpness(render: Float[Tensor, "h w 3"], target: Float[Tensor, "h w 3"]) ->
     """Mean gradient magnitude (central differences of the channel mean) of the render over that of the target."""
     detail = _mean_gradient(target)
     if detail == 0:
-        return NotComputed("the target picture is flat")
+        return NotComputed("the target image is flat")
     return _mean_gradient(render) / detail
 
 

@@ -100,7 +100,7 @@ def load_lpips(
 
 @torch.no_grad()
 def lpips(render: Float[Tensor, "h w 3"], target: Float[Tensor, "h w 3"], model: Lpips) -> float:
-    """Perceptual distance of two pictures in 0..1; 0 for equal ones."""
+    """Perceptual distance of two images in 0..1; 0 for equal ones."""
     if min(render.shape[:2]) < 32:
         raise ValueError(f"LPIPS needs at least 32 pixels a side, got {tuple(render.shape[:2])}")
     x = torch.stack((render, target)).permute(0, 3, 1, 2).float()

@@ -36,7 +36,7 @@ def epipolar_errors(
     cam2world: Float[Tensor, "n 4 4"],
     form: SymmetricForm = "mean",
 ) -> Float[Tensor, " m"]:
-    """Symmetric epipolar error of each match, px; `i` and `j` index the frames. NaN where both share one centre."""
+    """Symmetric epipolar error of each match, px; `i` and `j` index the frames. NaN where both share one center."""
     errors = [xy_i.new_zeros(0, dtype=torch.float64)]
     K, cam2world = K.double(), cam2world.double()
     for a, b, x_a, x_b in zip(*(t.split(_CHUNK) for t in (i, j, xy_i, xy_j)), strict=True):
@@ -48,7 +48,7 @@ def epipolar_errors(
 def match_scores(errors: Float[Tensor, " m"], pixel_scale: float = 1.0, form: SymmetricForm = "mean") -> MatchScores:
     """Mean and inlier share of `epipolar_errors` of that form; `pixel_scale` is original pixels per pixel of theirs.
 
-    NaN errors (two frames with one centre) have no epipolar geometry and are left out.
+    NaN errors (two frames with one center) have no epipolar geometry and are left out.
     """
     errors = errors[~errors.isnan()] * pixel_scale
     variant = f"{form} of both distances"

@@ -48,10 +48,10 @@ class RelativePoseErrors:
 class AbsolutePoseErrors:
     """Errors of the registered poses after alignment with the reference."""
 
-    ate: float | NotComputed  # RMSE of the camera centres, in the reference's unit
+    ate: float | NotComputed  # RMSE of the camera centers, in the reference's unit
     rotation_deg: float  # mean over frames, after the rotation that fits the orientations best
     rotation_median_deg: float
-    alignment: str  # of the ATE: "centres" (Umeyama), or "poses" where the centres lie on a line
+    alignment: str  # of the ATE: "centers" (Umeyama), or "poses" where the centers lie on a line
 
 
 @dataclass(frozen=True)
@@ -129,9 +129,9 @@ def maa(errors: RelativePoseErrors, limit: int = 30, curve: Curve = "histogram")
 
 
 def absolute_pose_errors(cam2world: Float[Tensor, "n 4 4"], reference: Float[Tensor, "n 4 4"]) -> AbsolutePoseErrors:
-    """ATE after the similarity that fits the centres, rotation errors after the rotation that fits the orientations.
+    """ATE after the similarity that fits the centers, rotation errors after the rotation that fits the orientations.
 
-    Two alignments, because a nearly straight track leaves the turn about it to the noise of the centres, which says
+    Two alignments, because a nearly straight track leaves the turn about it to the noise of the centers, which says
     nothing about the orientations.
     """
     if not len(cam2world):
@@ -140,7 +140,7 @@ def absolute_pose_errors(cam2world: Float[Tensor, "n 4 4"], reference: Float[Ten
     _check_finite(reference, "reference")
     turn = mean_rotation(reference[:, :3, :3] @ cam2world[:, :3, :3].mT)
     rotation = torch.rad2deg(rotation_angle(reference[:, :3, :3].mT @ turn @ cam2world[:, :3, :3]))
-    alignment = "centres"
+    alignment = "centers"
     try:
         similarity = align_similarity(cam2world[:, :3, 3], reference[:, :3, 3])
     except DegenerateAlignmentError:

@@ -1,10 +1,10 @@
-"""How well colours come out of the water: scores without reference, and scores against a true water.
+"""How well colors come out of the water: scores without reference, and scores against a true water.
 
 UIQM (Panetta et al. 2015) in the variant of the FUnIE-GAN code, which the paper's table follows, two slips included;
-UCIQE (Yang & Sowmya 2015) in CIELAB's own units. Both reward contrast stretching, so read them beside pictures.
+UCIQE (Yang & Sowmya 2015) in CIELAB's own units. Both reward contrast stretching, so read them beside images.
 
 Against a synthetic truth: mean absolute errors of the direct transmittance T_D and of the backscatter B over pixels at
-their true ray depth, and the PSNR of clear colours where enough light is left to tell (true T_D > 0.05).
+their true ray depth, and the PSNR of clear colors where enough light is left to tell (true T_D > 0.05).
 """
 
 from collections.abc import Iterable
@@ -28,7 +28,7 @@ URANKER = NotComputed("URanker's network is not published in enough detail to be
 Known are a CoaT-like transformer (patches 4, 2, 2, 2; widths 152, 320, 320, 320; serial depths 2, 2, 2, 2; 6 parallel
 blocks; 8 heads; position windows 3, 5, 7 for 2, 3, 3 heads), a 64-bin histogram of each channel as a further token, and
 the mean of three linear heads on the class tokens of scales 2 to 4. Not known: where that token enters attention and
-position encodings, how the parallel blocks exchange scales, the normalisations, and the names in the weights' file,
+position encodings, how the parallel blocks exchange scales, the normalizations, and the names in the weights' file,
 without which a wrong guess would load in part and score silently. The authors' code is non-commercial and stays unread.
 """
 _BLOCK = 10  # pixels; only whole blocks count
@@ -36,7 +36,7 @@ _BLOCK = 10  # pixels; only whole blocks count
 
 @dataclass(frozen=True)
 class Uiqm:
-    """UIQM and its three parts: colourfulness, sharpness, contrast."""
+    """UIQM and its three parts: colorfulness, sharpness, contrast."""
 
     uiqm: float
     uicm: float
@@ -66,10 +66,10 @@ class WaterScores:
 
 
 def uiqm(rgb: Float[Tensor, "h w 3"], size: tuple[int, int] | None = None) -> Uiqm:
-    """UIQM = 0.0282 UICM + 0.2953 UISM + 3.5753 UIConM of a picture in 0..1, FUnIE-GAN variant.
+    """UIQM = 0.0282 UICM + 0.2953 UISM + 3.5753 UIConM of an image in 0..1, FUnIE-GAN variant.
 
-    The picture is scored as its 8-bit file shows it. `size` (width, height) resizes first (Pillow, bicubic), as that
-    code's driver does with 256 x 256; the default is the picture's own resolution: a few percent apart.
+    The image is scored as its 8-bit file shows it. `size` (width, height) resizes first (Pillow, bicubic), as that
+    code's driver does with 256 x 256; the default is the image's own resolution: a few percent apart.
     """
     values = (as_8_bit(rgb) * 255).round().numpy().astype(np.uint8)
     if size is not None:
@@ -77,13 +77,13 @@ def uiqm(rgb: Float[Tensor, "h w 3"], size: tuple[int, int] | None = None) -> Ui
     if min(values.shape[:2]) < _BLOCK:
         raise ValueError(f"UIQM needs at least {_BLOCK} pixels a side, got {values.shape[1]} x {values.shape[0]}")
     values = values.astype(np.float64)
-    uicm, uism, uiconm = _colourfulness(values), _sharpness(values), _contrast(values)
+    uicm, uism, uiconm = _colorfulness(values), _sharpness(values), _contrast(values)
     variant = "FUnIE-GAN, " + ("native size" if size is None else f"resized to {size[0]}x{size[1]}")
     return Uiqm(0.0282 * uicm + 0.2953 * uism + 3.5753 * uiconm, uicm, uism, uiconm, variant)
 
 
 def uciqe(rgb: Float[Tensor, "h w 3"]) -> float:
-    """0.4680 std of chroma + 0.2745 contrast of L + 0.2576 mean chroma / L of an sRGB picture, in CIELAB's own units.
+    """0.4680 std of chroma + 0.2745 contrast of L + 0.2576 mean chroma / L of an sRGB image, in CIELAB's own units.
 
     The contrast is the mean of the brightest 1 % of L less that of the darkest 1 %; scored as the 8-bit file shows it.
     """
@@ -115,7 +115,7 @@ def water_scores_from_views(
     identifiable: dict[str, Bool[Tensor, "3"]],
     true: Medium,
 ) -> WaterScores:
-    """The same for a water that varies over the picture: per view the true ray depth and the medium at its pixels.
+    """The same for a water that varies over the image: per view the true ray depth and the medium at its pixels.
 
     `coefficients` are the scene's three numbers per channel that are reported and compared with the truth.
     """
@@ -152,7 +152,7 @@ def clear_psnr(
     true: Medium,
     min_transmittance: float = 0.05,
 ) -> float | NotComputed:
-    """PSNR, dB, of restored against true clear colours, as shown (clamped to 0..1), where the light allows a judgement.
+    """PSNR, dB, of restored against true clear colors, as shown (clamped to 0..1), where the light allows a judgement.
 
     A pixel counts in a channel when its true ray depth is known and its true T_D there is above `min_transmittance`.
     """
@@ -164,11 +164,11 @@ def clear_psnr(
         return NotComputed(f"no pixel has a true depth and a transmittance above {min_transmittance}")
     errors = (restored.double().clamp(0, 1) - clear.double())[counted]
     if errors.isnan().any():
-        raise ValueError("the restored picture has values that are not numbers where it is scored")
+        raise ValueError("the restored image has values that are not numbers where it is scored")
     return psnr_from_errors(errors)
 
 
-def _colourfulness(rgb: ndarray) -> float:
+def _colorfulness(rgb: ndarray) -> float:
     R, G, B = rgb.reshape(-1, 3).T
     trimmed_means, variances = [], []
     for opponent in (R - G, (R + G) / 2 - B):

@@ -6,7 +6,7 @@ B on the ellipse of covariance S has on the image plane the mass and the second 
     covariance S / (2 (B + 2)),   peak o (B + 2) / (B + 1), at most 0.999
 
 A viewer's Gaussian knows neither conditioned direction nor time, so S is that seen from the mean direction of the
-cameras that have the primitive in their picture, and o their mean. How much is lost is measured: `clear_difference`.
+cameras that have the primitive in their image, and o their mean. How much is lost is measured: `clear_difference`.
 """
 
 from dataclasses import dataclass
@@ -19,16 +19,17 @@ from torch import Tensor
 from torch.nn.functional import normalize
 
 from swimm3r.cameras import Cameras, cameras_of
+from swimm3r.errors import UsageError
 from swimm3r.evaluate.images import psnr_from_errors
 from swimm3r.geometry import quaternion_from_rotation
 from swimm3r.io import cameras_json
-from swimm3r.io.ply import write_vertices
+from swimm3r.io.ply import is_ply, write_vertices
 from swimm3r.raster import ALPHA_MAX, ALPHA_MIN, RasterOutput, rasterize
 from swimm3r.scene.run_folder import open_run
 from swimm3r.settings import ClipSecond, accepted
 from swimm3r.splat.map_file import load_map
 from swimm3r.splat.primitives.beta import BetaPrimitives, select
-from swimm3r.splat.primitives.gaussian import coloured, covariance
+from swimm3r.splat.primitives.gaussian import colored, covariance
 from swimm3r.splat.primitives.spherical_harmonics import Y_00
 from swimm3r.splat.projection.conditioning import Conditioned, condition, queries, symmetric
 from swimm3r.splat.projection.dispatch import project
@@ -51,14 +52,14 @@ class Gaussians:
     rgb: Float[Tensor, "n 3"]  # without the water, not bounded; the mean over all directions
     opacity: Float[Tensor, " n"]  # peak, 0..1
     covariance: Float[Tensor, "n 3 3"]
-    harmonics: Float[Tensor, "n h 3"]  # of the colour from degree 1 on (splat.spherical); none of Beta maps
+    harmonics: Float[Tensor, "n h 3"]  # of the color from degree 1 on (splat.spherical); none of Beta maps
 
 
 @dataclass(frozen=True)
 class ClearDifference:
-    """How the Gaussians' clear pictures differ from the map's own, over some cameras."""
+    """How the Gaussians' clear images differ from the map's own, over some cameras."""
 
-    psnr: float  # dB, of colours blended over black
+    psnr: float  # dB, of colors blended over black
     alpha: float  # mean difference of opacity, Gaussians minus map
 
 
@@ -72,7 +73,7 @@ def clear_gaussians(scene: SplatMap, cameras: Cameras, time: float | None = None
         return moment_matched(scene, cameras, time)
     p = select(p, torch.sigmoid(p.opacity) >= ALPHA_MIN)
     peak = torch.sigmoid(p.opacity).clamp(max=ALPHA_MAX)
-    return Gaussians(p.xyz, 0.5 + Y_00 * p.colour, peak, covariance(p), p.harmonics)
+    return Gaussians(p.xyz, 0.5 + Y_00 * p.color, peak, covariance(p), p.harmonics)
 
 
 def moment_matched(scene: SplatMap, cameras: Cameras, time: float | None = None) -> Gaussians:
@@ -92,7 +93,7 @@ def moment_matched(scene: SplatMap, cameras: Cameras, time: float | None = None)
             at, reach = drawn.primitives.mean2d, drawn.radius[:, None]
             size = torch.tensor([view.width, view.height])
             inside = ((at > -reach) & (at < size + reach)).all(-1, keepdim=True) & (drawn.radius[:, None] > 0)
-            direction += inside * queries(p.xyz, view.centre)
+            direction += inside * queries(p.xyz, view.center)
             share += inside * drawn.primitives.opacity[:, None]
             seen += inside
         found = seen[:, 0] > 0
@@ -141,7 +142,7 @@ def draw_gaussians(g: Gaussians, camera: Cameras, near: float) -> RasterOutput:
     """What a 3DGS viewer shows of them: exp(-r2 / 2) under the image plane's covariance with its 0.3 px^2 of blur."""
     view = pinhole(camera)
     half = torch.full_like(g.opacity, 0.5)
-    rgb = coloured(g.rgb, g.harmonics, g.xyz - view.centre)
+    rgb = colored(g.rgb, g.harmonics, g.xyz - view.center)
     p = project_conditioned(Conditioned(g.xyz, g.covariance, g.opacity), half, rgb, view, near).primitives
     return rasterize(p, None, view.height, view.width, kernel="gaussian")
 
@@ -149,16 +150,16 @@ def draw_gaussians(g: Gaussians, camera: Cameras, near: float) -> RasterOutput:
 def clear_difference(scene: SplatMap, g: Gaussians, cameras: Cameras, time: float | None = None) -> ClearDifference:
     """The Gaussians against the map they were made of, both without water and before black, seen by `cameras`."""
     settings, now = in_scene_units(scene.settings, scene.length).render, scene.moment(time)
-    colours, alphas = [], []
+    colors, alphas = [], []
     with torch.no_grad():
         for i in range(len(cameras)):
             view = pinhole(cameras[i])
             seen = project(scene.primitives, view, settings, now)
             own = rasterize(seen.primitives, None, view.height, view.width, kernel=seen.kernel)
             theirs = draw_gaussians(g, cameras[i], settings.near)
-            colours.append(theirs.clear - own.clear)
+            colors.append(theirs.clear - own.clear)
             alphas.append(float((theirs.alpha - own.alpha).mean()))
-    return ClearDifference(psnr_from_errors(torch.stack(colours)), float(np.mean(alphas)))
+    return ClearDifference(psnr_from_errors(torch.stack(colors)), float(np.mean(alphas)))
 
 
 @dataclass(frozen=True)
@@ -174,17 +175,24 @@ class Exported:
 def export_run(folder: Path, path: Path, time: float | None = None) -> Exported:
     """The Gaussians of a finished run's map, and how far they are from it in views along the dive.
 
-    A dynamic map is exported at `time`, seconds of the clip; half way by default. Raises InputError without a map.
+    A dynamic map is exported at `time`, seconds of the clip; half way by default. Raises InputError without a map,
+    UsageError where `path` is a file that is no PLY file: it would be replaced.
     """
     accepted("time", time, ClipSecond | None)
+    if path.is_file() and not is_ply(path):
+        raise UsageError(
+            f"{path} exists and is no PLY file: it is not replaced",
+            cause="a slip in the name of the file to write",
+            hint="another name, or remove the file first",
+        )
     open_run(folder, "splat")
     scene = load_map(folder / "splat" / "map.safetensors")
-    stations = folder / "splat" / "cameras.json"  # where training moved them
-    stations = stations if stations.is_file() else folder / "sfm" / "cameras.json"
-    cameras = cameras_of(cameras_json.read_cameras(stations))
+    refined = folder / "splat" / "cameras.json"
+    table = refined if refined.is_file() else folder / "sfm" / "cameras.json"
+    cameras = cameras_of(cameras_json.read_cameras(table))
     time = sum(scene.span) / 2 if time is None else time
-    station = torch.linspace(0, len(cameras) - 1, min(_ASKED, len(cameras))).round().long()
-    canvas = cameras[station].pinhole(scene.settings.long_side)
+    asked = torch.linspace(0, len(cameras) - 1, min(_ASKED, len(cameras))).round().long()
+    canvas = cameras[asked].pinhole(scene.settings.long_side)
     g = clear_gaussians(scene, canvas, time)
     write_ply(path, g)
     looked_at = canvas[torch.linspace(0, len(canvas) - 1, min(_COMPARED, len(canvas))).round().long()]

@@ -1,4 +1,4 @@
-"""Depth for every pixel of a picture whose depth map has gaps, and where there is no surface at all."""
+"""Depth for every pixel of an image whose depth map has gaps, and where there is no surface at all."""
 
 import numpy as np
 import torch
@@ -14,9 +14,9 @@ _COARSE = 96  # long side of the grid on which unknown depth is filled
 
 
 def fill_z_depth(image: Float[Tensor, "h w 3"], depth: DepthMap, sea: Float[Tensor, "h w"]) -> Float[Tensor, "h w"]:
-    """Depth for every pixel: known values stay, gaps follow their surroundings along similar colours.
+    """Depth for every pixel: known values stay, gaps follow their surroundings along similar colors.
 
-    Inverse depth is diffused on a coarse grid and fitted to the picture by local linear models, between the nearest and
+    Inverse depth is diffused on a coarse grid and fitted to the image by local linear models, between the nearest and
     the farthest hundredth of what is known. `sea` (0..1) says where there is none; what is filled in there is no depth.
     """
     known = depth.z_depth > 0
@@ -41,7 +41,7 @@ def _diffused(
 ) -> Float[Tensor, "h w"]:
     """Inverse depth everywhere, from a sparse linear system on a coarse grid.
 
-    Neighbouring cells conduct with exp(-|dI|^2 / 0.04^2), and not at all into the sea, which is no surface.
+    Neighboring cells conduct with exp(-|dI|^2 / 0.04^2), and not at all into the sea, which is no surface.
     """
     height, width = inverse.shape
     factor = max(1.0, max(height, width) / _COARSE)
@@ -50,13 +50,13 @@ def _diffused(
     def shrink(x: Tensor) -> np.ndarray:
         return torch.nn.functional.interpolate(x[None], size, mode="area")[0].double().numpy()
 
-    colour, land = shrink(image.permute(2, 0, 1)), 1 - shrink(sea[None])[0]
+    color, land = shrink(image.permute(2, 0, 1)), 1 - shrink(sea[None])[0]
     weight = shrink(trust[None])[0]
     value = shrink((trust * inverse)[None])[0] / np.maximum(weight, 1e-9)
     index = np.arange(weight.size).reshape(size)
     a = np.concatenate([index[:-1].ravel(), index[:, :-1].ravel()])
     b = np.concatenate([index[1:].ravel(), index[:, 1:].ravel()])
-    flat = colour.reshape(3, -1)
+    flat = color.reshape(3, -1)
     g = np.exp(-((flat[:, a] - flat[:, b]) ** 2).sum(0) / 0.04**2) * land.ravel()[a] * land.ravel()[b] + 1e-4
     n = index.size
     affinity = coo_matrix((np.r_[g, g], (np.r_[a, b], np.r_[b, a])), shape=(n, n)).tocsr()

@@ -1,4 +1,4 @@
-"""Smoothing of pictures: over all neighbours, or along those that look alike."""
+"""Smoothing of images: over all neighbors, or along those that look alike."""
 
 import torch
 from jaxtyping import Float

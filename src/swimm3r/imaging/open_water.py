@@ -1,7 +1,7 @@
-"""Where a picture looks past every surface into open water.
+"""Where an image looks past every surface into open water.
 
 Such a region has no depth and next to no texture (the local standard deviation, after removing slopes, of any channel
-in 7 x 7 pixels), is large, reaches the upper or a side edge of the picture, is in its brightest channel brighter than
+in 7 x 7 pixels), is large, reaches the upper or a side edge of the image, is in its brightest channel brighter than
 the darkest fifth of what has texture (veil only grows with distance; shadows and urchins are smooth, too), or, where it
 is small, than half of it, and the surfaces at its rim are among the far ones: smooth sand has no depth either.
 """
@@ -15,7 +15,7 @@ from torch import Tensor
 from swimm3r.imaging.filters import LUMA, blur, local_linear
 
 _WINDOW = 7
-_RIM = 9  # pixels around a region in which its neighbours are looked for
+_RIM = 9  # pixels around a region in which its neighbors are looked for
 _FEW = 100  # pixels of known depth that decide nothing
 
 
@@ -26,10 +26,10 @@ def open_water_mask(
     max_texture: float = 0.006,
     min_share: float = 0.02,
 ) -> Bool[Tensor, "h w"]:
-    """True where the picture shows water and nothing else; z_depth is 0 where unknown.
+    """True where the image shows water and nothing else; z_depth is 0 where unknown.
 
-    Pixels within 0.05 of `veil`, the colour of open water where it is known already, need not be bright, and regions of
-    that colour may be a tenth as large.
+    Pixels within 0.05 of `veil`, the color of open water where it is known already, need not be bright, and regions of
+    that color may be a tenth as large.
     """
     known = z_depth.numpy() > 0
     if not known.any():
@@ -73,7 +73,7 @@ def open_water_mask(
 def sea_share(
     image: Float[Tensor, "h w 3"], z_depth: Float[Tensor, "h w"], veil: Float[Tensor, "3"] | None = None
 ) -> Float[Tensor, "h w"]:
-    """How surely a pixel shows water only: open water, unknown depth around it in the same colour; soft where hazy."""
+    """How surely a pixel shows water only: open water, unknown depth around it in the same color; soft where hazy."""
     water = open_water_mask(image, z_depth, veil).float()
     if not water.any():
         return water
@@ -89,7 +89,7 @@ def sea_share(
 
 
 def _without_specks(found: np.ndarray, known: np.ndarray) -> np.ndarray:
-    """Drifting particles inside open water belong to it: holes without depth below 1 % of the picture are closed."""
+    """Drifting particles inside open water belong to it: holes without depth below 1 % of the image are closed."""
     closed = np.asarray(ndimage.binary_closing(found, iterations=3)) | found
     holes = np.empty(found.shape, dtype=np.int32)
     ndimage.label(~closed, output=holes)

@@ -66,7 +66,7 @@ def write_cameras(path: Path, table: CameraTable) -> None:
         "model": table.model,
         **(intrinsics(0) if shared else {}),
         "units": table.units,
-        "convention": "OpenCV camera axes, camera-to-world; centre of the first pixel at (0.5, 0.5)",
+        "convention": "OpenCV camera axes, camera-to-world; center of the first pixel at (0.5, 0.5)",
         "frames": [
             {
                 "name": name,

@@ -1,6 +1,6 @@
 """Depth maps on disk -> metres: float TIFF, 16-bit PNG or TIFF, and .npz; 0 where nothing is known.
 
-Whole numbers are millimetres unless the caller knows better. 8 bits are refused: such files hold grey pictures of
+Whole numbers are millimetres unless the caller knows better. 8 bits are refused: such files hold gray images of
 depth, without a unit.
 """
 
@@ -28,7 +28,7 @@ def read_depth(path: Path, per_metre: float = 1000.0) -> Float32[np.ndarray, "h 
         raise _unreadable(path, f"its array is {stored.shape}, not one value per pixel")
     if stored.dtype.kind in "iu":
         if stored.dtype.itemsize == 1:
-            raise _unreadable(path, "it has 8 bits: a picture of depth, not depth")
+            raise _unreadable(path, "it has 8 bits: an image of depth, not depth")
         return (stored.astype(np.float64) / per_metre).clip(min=0).astype(np.float32)
     if stored.dtype.kind != "f":
         raise _unreadable(path, f"its values are {stored.dtype}")

@@ -1,4 +1,4 @@
-"""A folder of stills: which of its files are pictures, which are masks, and in which order."""
+"""A folder of stills: which of its files are images, which are masks, and in which order."""
 
 import os
 import re
@@ -40,53 +40,53 @@ def find_files(folder: Path, suffixes: tuple[str, ...], leave_out: Sequence[Path
     return FilesBelow(sorted(found, key=lambda path: natural_key(path, folder)), unreadable)
 
 
-def find_pictures(folder: Path, leave_out: Sequence[Path] = ()) -> FilesBelow:
-    """Every picture below a folder; masks beside their pictures are none."""
+def find_images(folder: Path, leave_out: Sequence[Path] = ()) -> FilesBelow:
+    """Every image below a folder; masks beside their images are none."""
     found = find_files(folder, SUFFIXES, leave_out)
     masks = masks_beside(found.paths)
     return FilesBelow([path for path in found.paths if path not in masks], found.unreadable)
 
 
-def masks_beside(pictures: Sequence[Path]) -> set[Path]:
+def masks_beside(images: Sequence[Path]) -> set[Path]:
     """Those that are masks of others in the same folder: a_mask.png or a.jpg.png beside a.jpg."""
-    files = set(pictures)
-    stems = {path.with_suffix("") for path in pictures}
+    files = set(images)
+    stems = {path.with_suffix("") for path in images}
     return {
         path
-        for path in pictures
+        for path in images
         if path.with_suffix("") in files
         or (path.stem.endswith("_mask") and path.with_name(path.stem.removesuffix("_mask")) in stems)
     }
 
 
 class MaskFolder:
-    """The masks below a folder, by the names of the pictures they belong to."""
+    """The masks below a folder, by the names of the images they belong to."""
 
-    def __init__(self, folder: Path, pictures: Collection[Path], leave_out: Sequence[Path] = ()) -> None:
-        """`pictures` are files that are no masks, wherever they lie. Raises OSError where there is no such folder."""
+    def __init__(self, folder: Path, images: Collection[Path], leave_out: Sequence[Path] = ()) -> None:
+        """`images` are files that are no masks, wherever they lie. Raises OSError where there is no such folder."""
         found = find_files(folder, SUFFIXES, leave_out).paths
-        self.paths = [path for path in found if path not in pictures]
+        self.paths = [path for path in found if path not in images]
         self._by_stem = {path.relative_to(folder).with_suffix(""): path for path in reversed(self.paths)}
 
-    def mask_of(self, picture: Path) -> Path | None:
-        """The mask of the picture with this relative name: NAME_mask.png, NAME.jpg.png or NAME.png, of any suffix."""
-        stem = picture.with_suffix("")
-        candidates = (stem.with_name(f"{stem.name}_mask"), picture, stem)
+    def mask_of(self, image: Path) -> Path | None:
+        """The mask of the image with this relative name: NAME_mask.png, NAME.jpg.png or NAME.png, of any suffix."""
+        stem = image.with_suffix("")
+        candidates = (stem.with_name(f"{stem.name}_mask"), image, stem)
         return next((self._by_stem[name] for name in candidates if name in self._by_stem), None)
 
 
 def natural_key(path: Path, folder: Path) -> list[tuple[int, int, str]]:
-    """Sorts img2 before img10, and a folder's own pictures before those of its subfolders."""
+    """Sorts img2 before img10, and a folder's own images before those of its subfolders."""
     relative = path.relative_to(folder)
     pieces = re.split(r"(\d+)", relative.as_posix().lower())
     number = [(0, int(piece), "") if piece.isdigit() else (1, 0, piece) for piece in pieces]
     return [(len(relative.parts) > 1, 0, ""), *number, (1, 0, relative.as_posix())]
 
 
-def numbered(pictures: Sequence[Path]) -> bool:
+def numbered(images: Sequence[Path]) -> bool:
     """Whether they lie in one folder and differ only in a running number: as a camera or a video export names them."""
-    patterns = {re.sub(r"\d+", "#", path.stem) for path in pictures}
-    return len({path.parent for path in pictures}) == 1 and len(patterns) == 1 and "#" in patterns.pop()
+    patterns = {re.sub(r"\d+", "#", path.stem) for path in images}
+    return len({path.parent for path in images}) == 1 and len(patterns) == 1 and "#" in patterns.pop()
 
 
 def _hidden(name: str) -> bool:

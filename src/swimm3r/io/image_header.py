@@ -42,7 +42,7 @@ class ImageHeader:
     kind: str  # JPEG, PNG, WEBP, BMP or TIFF
     size: tuple[int, int]  # width and height of the upright image
     orientation: int  # still to be applied, EXIF 2.3, tag 274
-    plain: bool  # every reader sees the same in it: JPEG or PNG, upright, RGB or grey, nothing transparent
+    plain: bool  # every reader sees the same in it: JPEG or PNG, upright, RGB or gray, nothing transparent
     decoding_bytes: int  # memory that decoding takes
 
 
@@ -83,9 +83,9 @@ def tiff_orientation(page: Any) -> int:
 def unreadable(path: Path, why: object) -> InputError:
     """The error of a file that is no image."""
     return InputError(
-        f"{path} cannot be read as a picture: {why}",
+        f"{path} cannot be read as an image: {why}",
         cause="the file is missing, damaged, cut off or of another format",
-        hint="open it in a picture viewer; copy it again, or save it as PNG, JPEG or TIFF",
+        hint="open it in an image viewer; copy it again, or save it as PNG, JPEG or TIFF",
     )
 
 
@@ -96,7 +96,7 @@ def too_large_for_memory(path: Path, size: tuple[int, int], needed: int) -> Imag
         f"{path} has {size[0]}x{size[1]} pixels, and decoding them takes {needed / 1e9:.1f} GB of memory"
         + ("" if free is None else f", of which {free / 1e3:.1f} GB are free"),
         cause="a mosaic larger than this computer's memory, or a file made to exhaust it",
-        hint="scale the picture down first, close other programs, or take it out of the folder",
+        hint="scale the image down first, close other programs, or take it out of the folder",
     )
 
 
@@ -158,6 +158,6 @@ def _opened(file: io.BufferedReader) -> Iterator[ImageFile.ImageFile]:
     elif start[:4] in TIFF_MAGIC:
         plugin = TiffImagePlugin.TiffImageFile
     else:
-        raise ValueError("it is of no known picture format")
+        raise ValueError("it is of no known image format")
     with plugin(file) as image:
         yield image

@@ -1,7 +1,7 @@
-"""Pictures and masks on disk <-> arrays, without losing bits on the way.
+"""Images and masks on disk <-> arrays, without losing bits on the way.
 
 Arrays are [h, w, 3] RGB, upright (the EXIF orientation is applied), in the depth of the file: uint8 or uint16. OpenCV
-and tifffile decode, for Pillow turns 16-bit colour into 8 bits without a word.
+and tifffile decode, for Pillow turns 16-bit color into 8 bits without a word.
 """
 
 import io
@@ -31,9 +31,9 @@ _NEEDS_NO_CODEC = (1, 8, 32773, 32946)  # TIFF compressions that tifffile undoes
 
 
 def read_rgb(path: Path) -> Rgb:
-    """A picture as stored; grey becomes three equal channels, an alpha channel is dropped.
+    """An image as stored; gray becomes three equal channels, an alpha channel is dropped.
 
-    Float TIFF becomes uint16. Its scale is told from the largest value: up to 2 the picture is 0..1, up to 256 it is
+    Float TIFF becomes uint16. Its scale is told from the largest value: up to 2 the image is 0..1, up to 256 it is
     0..255, up to 65536 it is 0..65535; what exceeds the scale is clipped. Raises InputError on a file that is damaged.
     """
     return _three_channels(_upright(*_decode(path)), path)
@@ -44,28 +44,28 @@ def read_mask(path: Path) -> Bool[np.ndarray, "h w"]:
     stored = _upright(*_decode(path))
     if stored.ndim == 2:
         return stored != 0
-    colours = stored.shape[2] - (stored.shape[2] in (2, 4))  # alpha says nothing about use
-    return (stored[..., :colours] != 0).any(axis=2)
+    colors = stored.shape[2] - (stored.shape[2] in (2, 4))  # alpha says nothing about use
+    return (stored[..., :colors] != 0).any(axis=2)
 
 
 def image_size(path: Path) -> tuple[int, int]:
-    """Width and height of the upright picture in pixels, from its header alone. Raises InputError."""
+    """Width and height of the upright image in pixels, from its header alone. Raises InputError."""
     return read_header(path).size
 
 
-def write_rgb(path: Path, picture: Rgb | Float[np.ndarray, "h w 3"]) -> None:
+def write_rgb(path: Path, image: Rgb | Float[np.ndarray, "h w 3"]) -> None:
     """Write a PNG, whole or not at all: 8 or 16 bits as given, 8 bits from floats 0..1 (clipped).
 
     Raises ValueError on another suffix and OSError where the disk refuses.
     """
-    if picture.dtype.kind == "f":
-        picture = (np.clip(picture, 0, 1) * 255 + 0.5).astype(np.uint8)
-    _write_png(path, np.ascontiguousarray(picture[..., ::-1]))
+    if image.dtype.kind == "f":
+        image = (np.clip(image, 0, 1) * 255 + 0.5).astype(np.uint8)
+    _write_png(path, np.ascontiguousarray(image[..., ::-1]))
 
 
-def write_rgb_16(path: Path, picture: Float[np.ndarray, "h w 3"]) -> None:
+def write_rgb_16(path: Path, image: Float[np.ndarray, "h w 3"]) -> None:
     """Write values 0..1 (clipped) as a PNG of 16 bits, whole or not at all."""
-    write_rgb(path, (np.clip(picture, 0, 1) * 65535 + 0.5).astype(np.uint16))
+    write_rgb(path, (np.clip(image, 0, 1) * 65535 + 0.5).astype(np.uint16))
 
 
 def write_mask(path: Path, usable: Bool[np.ndarray, "h w"]) -> None:
@@ -77,7 +77,7 @@ def _write_png(path: Path, stored: np.ndarray) -> None:
     import cv2
 
     if path.suffix.lower() != ".png":
-        raise ValueError(f"pictures are written as PNG, so a name ending in .png was expected, got {path.name}")
+        raise ValueError(f"images are written as PNG, so a name ending in .png was expected, got {path.name}")
     encoded = cv2.imencode(".png", stored)[1]
     with atomic_path(path) as draft:
         draft.write_bytes(encoded.tobytes())  # cv2.imwrite would hide a full disk
@@ -93,7 +93,7 @@ def _decode(path: Path) -> tuple[np.ndarray, int]:
         if header.kind == "PNG":
             verify_checksums(data)  # libpng hands out what it has of a damaged file
         if header.kind == "JPEG" and data.rfind(b"\xff\xd9") < data.rfind(b"\xff\xda"):
-            raise ValueError("the file ends inside its picture")  # libjpeg paints the rest grey
+            raise ValueError("the file ends inside its image")  # libjpeg paints the rest gray
         return _opencv(data), header.orientation
     except DAMAGED as error:
         raise unreadable(path, error) from error
@@ -146,18 +146,18 @@ def _three_channels(stored: np.ndarray, path: Path) -> np.ndarray:
     if stored.dtype == bool:
         stored = stored.astype(np.uint8) * 255
     if stored.dtype.kind == "f":
-        stored = _quantised(stored, path)
+        stored = _quantized(stored, path)
     if stored.dtype not in (np.uint8, np.uint16):
         raise unreadable(path, f"its values are {stored.dtype}; 8 or 16 bits without sign, or floats, were expected")
     if stored.ndim == 2:
         stored = stored[..., None]
     if stored.ndim != 3 or not 1 <= stored.shape[2] <= 4:
         raise unreadable(path, f"its array is {stored.shape}; one to four channels were expected")
-    colours = stored[..., :3] if stored.shape[2] >= 3 else stored[..., [0, 0, 0]]
-    return np.ascontiguousarray(colours)
+    colors = stored[..., :3] if stored.shape[2] >= 3 else stored[..., [0, 0, 0]]
+    return np.ascontiguousarray(colors)
 
 
-def _quantised(stored: np.ndarray, path: Path) -> np.ndarray:
+def _quantized(stored: np.ndarray, path: Path) -> np.ndarray:
     if not np.isfinite(stored).all():
         raise unreadable(path, "it holds values that are not finite")
     scale = next((full for limit, full in ((2, 1), (256, 255), (65536, 65535)) if stored.max() <= limit), None)

@@ -9,11 +9,11 @@ from swimm3r.io.files.atomic import atomic_path
 from swimm3r.io.files.damage import Remedy, guard
 
 _REMEDY = Remedy(
-    "save it as binary PLY with colours, in CloudCompare or MeshLab for example",
-    cause="the file is cut off, or a PLY of another kind (text, big-endian, without colours)",
-    fault="cannot be read as a coloured point cloud",
+    "save it as binary PLY with colors, in CloudCompare or MeshLab for example",
+    cause="the file is cut off, or a PLY of another kind (text, big-endian, without colors)",
+    fault="cannot be read as a colored point cloud",
 )
-_RECORD = np.dtype([(axis, "<f4") for axis in "xyz"] + [(colour, "u1") for colour in ("red", "green", "blue")])
+_RECORD = np.dtype([(axis, "<f4") for axis in "xyz"] + [(color, "u1") for color in ("red", "green", "blue")])
 _TYPES = {
     **dict.fromkeys(("char", "int8"), "i1"),
     **dict.fromkeys(("uchar", "uint8"), "u1"),
@@ -27,7 +27,7 @@ _TYPES = {
 
 
 def write_points(path: Path, xyz: Float[np.ndarray, "n 3"], rgb: Float[np.ndarray, "n 3"]) -> None:
-    """Write a cloud, whole or not at all; colours 0..1 are clipped and rounded to 8 bits."""
+    """Write a cloud, whole or not at all; colors 0..1 are clipped and rounded to 8 bits."""
     points = np.empty(len(xyz), _RECORD)
     for axis, name in enumerate("xyz"):
         points[name] = xyz[:, axis]
@@ -47,11 +47,17 @@ def write_vertices(path: Path, vertices: np.ndarray) -> None:
         file.write(vertices.tobytes())
 
 
+def is_ply(path: Path) -> bool:
+    """Whether a file begins as PLY files do."""
+    with path.open("rb") as file:
+        return file.read(4) in (b"ply\n", b"ply\r")
+
+
 def read_points(path: Path, remedy: Remedy = _REMEDY) -> tuple[Float32[np.ndarray, "n 3"], Float32[np.ndarray, "n 3"]]:
-    """Positions and colours 0..1 of a cloud. Raises InputError.
+    """Positions and colors 0..1 of a cloud. Raises InputError.
 
     Other tools' clouds are read too where they are binary little-endian, begin with the vertices, and give them
-    scalar properties; those that are neither position nor colour are left out.
+    scalar properties; those that are neither position nor color are left out.
     """
     with guard(path, remedy):
         data = path.read_bytes()
@@ -71,7 +77,7 @@ def read_points(path: Path, remedy: Remedy = _REMEDY) -> tuple[Float32[np.ndarra
         rgb = np.stack([points[name] for name in ("red", "green", "blue")], -1)
         rgb = rgb.astype(np.float32) / (1 if rgb.dtype.kind == "f" else np.iinfo(rgb.dtype).max)
         if not (np.isfinite(xyz).all() and np.isfinite(rgb).all()):
-            raise ValueError("it has positions or colours that are not finite numbers")
+            raise ValueError("it has positions or colors that are not finite numbers")
         return xyz, rgb
 
 

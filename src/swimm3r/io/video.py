@@ -22,9 +22,9 @@ if TYPE_CHECKING:
     from av.container import InputContainer
 
 VIDEO_SUFFIXES = (".mp4", ".mov", ".m4v", ".mkv", ".webm", ".avi", ".mts", ".m2ts", ".mpg", ".mpeg", ".wmv", ".3gp")
-"""What a folder without pictures is searched for; FFmpeg reads more."""
+"""What a folder without images is searched for; FFmpeg reads more."""
 
-_NOT_VIDEO = ("tty", "image2", "_pipe")  # FFmpeg's readers of text and of single pictures
+_NOT_VIDEO = ("tty", "image2", "_pipe")  # FFmpeg's readers of text and of single images
 _INDEXED = ("mov,mp4,m4a,3gp,3g2,mj2", "matroska,webm")  # the containers whose seeking can be relied on
 _FARTHEST = 2**62  # ticks; FFmpeg counts them in 64 bits
 _UNSPECIFIED = 2  # AVCOL_SPC_UNSPECIFIED
@@ -33,20 +33,20 @@ _HD_LINES = 720  # from here on untagged video is BT.709, as players take it; be
 
 @dataclass(frozen=True)
 class VideoFrame:
-    """A decoded frame; its picture is only made when asked for."""
+    """A decoded frame; its image is only made when asked for."""
 
     time: float  # seconds since the start of the clip
     _decoded: Any  # av.VideoFrame
     _video: "Video"
 
-    def grey(self, long_side: int) -> UInt8[np.ndarray, "h w"]:
-        """A small grey copy, as the sensor lay (not turned upright)."""
+    def gray(self, long_side: int) -> UInt8[np.ndarray, "h w"]:
+        """A small gray copy, as the sensor lay (not turned upright)."""
         scale = min(1.0, long_side / max(self._decoded.width, self._decoded.height))
         width, height = (max(2, round(side * scale)) for side in (self._decoded.width, self._decoded.height))
         return self._video._scale(self._decoded, "gray", width, height)
 
     def rgb(self) -> UInt8[np.ndarray, "h w 3"]:
-        """The picture at full size, upright, [video.height, video.width]."""
+        """The image at full size, upright, [video.height, video.width]."""
         width, height = self._video._sensor_size
         lying = self._video._scale(self._decoded, "rgb24", width, height)
         return np.ascontiguousarray(np.rot90(lying, self._video._quarter_turns))
@@ -56,7 +56,7 @@ class Video:
     """A video file that was looked into; each call of `frames` reads it anew."""
 
     path: Path
-    width: int  # of the upright picture with square pixels
+    width: int  # of the upright image with square pixels
     height: int
     seconds: float | None  # length as the file states it
     rate: float  # frames per second on average
@@ -103,10 +103,10 @@ class Video:
 
     def _look_into(self, file: "InputContainer") -> None:
         if file.format.name.endswith(_NOT_VIDEO):
-            raise _unreadable(self.path, "it is a text or a single picture")
+            raise _unreadable(self.path, "it is a text or a single image")
         streams = [s for s in file.streams.video if not s.disposition & s.disposition.attached_pic]
         if not streams:
-            raise _unreadable(self.path, "it holds no moving pictures")
+            raise _unreadable(self.path, "it holds no moving images")
         stream = streams[0]
         if stream.codec_context is None:
             raise _unreadable(self.path, "its codec is unknown")

@@ -1,4 +1,4 @@
-"""Where a picture was taken, in a map: `localize` for one picture, `Localizer` for many, by the paper's protocol."""
+"""Where an image was taken, in a map: `localize` for one image, `Localizer` for many, by the paper's protocol."""
 
 from typing import TYPE_CHECKING
 
@@ -22,10 +22,10 @@ def localize(
     settings: "LocalizationSettings | None" = None,
     time: float | None = None,
 ) -> "Float[Tensor, '4 4']":
-    """cam2world of one picture, in the axes and unit of `rec`. Raises RegistrationError where it cannot be placed.
+    """cam2world of one image, in the axes and unit of `rec`. Raises RegistrationError where it cannot be placed.
 
-    The query is first matched with training pictures: `frames` has them; without, the map's renderings from the same
-    poses take their place. `lens` is the picture's camera (its pose unused), by default that of the reconstruction;
+    The query is first matched with training images: `frames` has them; without, the map's renderings from the same
+    poses take their place. `lens` is the image's camera (its pose unused), by default that of the reconstruction;
     `time`, seconds of the clip, is the moment at which a dynamic map is shown.
     """
     from swimm3r.localization.localizer import Localizer

@@ -1,7 +1,7 @@
-"""Many pictures placed in the map of a finished run, and the record of it.
+"""Many images placed in the map of a finished run, and the record of it.
 
-OUT/poses.json       per picture: its pose and what speaks for it, or why it could not be placed
-OUT/poses.tum        timestamp tx ty tz qx qy qz qw, camera to world, of the pictures that were placed
+OUT/poses.json       per image: its pose and what speaks for it, or why it could not be placed
+OUT/poses.tum        timestamp tx ty tz qx qy qz qw, camera to world, of the images that were placed
 OUT/matches/NAME.png the query beside the rendering, a line per inlier
 """
 
@@ -35,13 +35,13 @@ _LINES = 60  # inliers drawn, spread over all of them
 
 @dataclass(frozen=True)
 class Query:
-    """One picture that asks where it was taken."""
+    """One image that asks where it was taken."""
 
     name: str
-    time: float  # seconds; the number of the picture where it has none
-    picture: Float[Tensor, "h w 3"]
+    time: float  # seconds; the number of the image where it has none
+    image: Float[Tensor, "h w 3"]
     mask: Bool[Tensor, "h w"] | None = None
-    moment: float | None = None  # seconds of the map's clip, where the picture is part of it
+    moment: float | None = None  # seconds of the map's clip, where the image is part of it
 
 
 @dataclass(frozen=True)
@@ -56,20 +56,20 @@ class Answer:
 
 def localize_run(
     folder: Path,
-    pictures: Sequence[Path] = (),
+    image_files: Sequence[Path] = (),
     lens: Path | None = None,
     out: Path | None = None,
     settings: LocalizationSettings | None = None,
     progress: Progress = silent,
 ) -> tuple[list[Answer], Path]:
-    """Places pictures, by default the run's test frames, in the run's map; the record goes to `out`.
+    """Places images, by default the run's test frames, in the run's map; the record goes to `out`.
 
     Poses are in the axes and unit of RUN/sfm.
 
-    Raises InputError where the run has no map, RegistrationError where not one picture could be placed.
+    Raises InputError where the run has no map, RegistrationError where not one image could be placed.
     """
     camera = None if lens is None else cameras_of(cameras_json.read_cameras(lens))[0]
-    for path in pictures:
+    for path in image_files:
         read_header(path)  # before minutes of matching
     open_run(folder, "splat")
     scene = load_map(folder / "splat" / "map.safetensors").to(devices.for_maps())
@@ -78,17 +78,17 @@ def localize_run(
     localizer = Localizer(scene, rec, frames, settings)
     out = out or folder / "localization"
     answers = []
-    names = [path.name for path in pictures] or list(frames.test.names)
+    names = [path.name for path in image_files] or list(frames.test.names)
     if len(set(names)) < len(names):
         raise InputError(
-            "two of the pictures have the same name",
+            "two of the images have the same name",
             cause="they lie in different folders",
             hint="one folder at a time, each with its own --out",
         )
     for i, name in enumerate(names):
-        progress("localising", i, len(names))
-        if pictures:
-            query = Query(name, float(i), _picture(pictures[i]))
+        progress("localizing", i, len(names))
+        if image_files:
+            query = Query(name, float(i), _image(image_files[i]))
         else:
             f = frames.index(name)
             time = frames.frames[f].time
@@ -96,14 +96,14 @@ def localize_run(
         found = answer(localizer, query, camera)
         answers.append(_in_axes_of_sfm(found, localizer))
         if found.found is not None and found.found.evidence is not None:
-            images.write_rgb(out / "matches" / f"{name}.png", match_picture(found.found.evidence))
+            images.write_rgb(out / "matches" / f"{name}.png", match_image(found.found.evidence))
         _write(out, answers, localizer.matcher.name, rec.metric)
-    progress("localising", len(names), len(names))
+    progress("localizing", len(names), len(names))
     if all(a.found is None for a in answers):
         raise RegistrationError(
-            f"none of the {len(answers)} pictures could be placed in the map",
+            f"none of the {len(answers)} images could be placed in the map",
             cause="they show other places than the map, or it was made in very different water",
-            hint="pictures from nearer to the dive's path",
+            hint="images from nearer to the dive's path",
         )
     return answers, out
 
@@ -111,13 +111,13 @@ def localize_run(
 def answer(localizer: Localizer, query: Query, lens: Cameras | None = None) -> Answer:
     """The query's place, or the reason why none was found."""
     try:
-        found = localizer.locate(query.picture, query.mask, lens, query.moment)
+        found = localizer.locate(query.image, query.mask, lens, query.moment)
         return Answer(query.name, query.time, found)
     except RegistrationError as failure:
         return Answer(query.name, query.time, None, failure.what)
 
 
-def match_picture(evidence: Evidence) -> UInt8[np.ndarray, "h w2 3"]:
+def match_image(evidence: Evidence) -> UInt8[np.ndarray, "h w2 3"]:
     """Query and rendering side by side, with inliers joined."""
     import cv2
 
@@ -138,7 +138,7 @@ def _in_axes_of_sfm(a: Answer, localizer: Localizer) -> Answer:
     return replace(a, found=replace(a.found, cam2world=localizer.in_axes_of_sfm(a.found.cam2world)))
 
 
-def _picture(path: Path) -> Float[Tensor, "h w 3"]:
+def _image(path: Path) -> Float[Tensor, "h w 3"]:
     stored = images.read_rgb(path)
     return torch.from_numpy(stored.astype(np.float32) / np.iinfo(stored.dtype).max)
 
@@ -151,7 +151,7 @@ def _write(out: Path, answers: Sequence[Answer], matcher: str, metric: bool) -> 
         "convention": "OpenCV camera axes, camera-to-world",
         "located": len(placed),
         "seconds": {stage: sum(found.seconds[stage] for _, found in placed) / max(1, len(placed)) for stage in STAGES},
-        "pictures": [_described(a) for a in answers],
+        "images": [_described(a) for a in answers],
     }
     write_text(out / "poses.json", json.dumps(document, indent=1) + "\n")
     poses = np.stack([found.cam2world.numpy() for _, found in placed]) if placed else np.empty((0, 4, 4))

@@ -7,7 +7,7 @@ from swimm3r.geometry import pose_from, so3_exp, so3_log
 from swimm3r.scene.frames import Frames
 from swimm3r.scene.reconstruction import Reconstruction
 
-_MAX_STEPS = 2.0  # a pose is carried on by at most this many steps of its neighbours
+_MAX_STEPS = 2.0  # a pose is carried on by at most this many steps of its neighbors
 
 
 def between(before: Float[Tensor, "4 4"], after: Float[Tensor, "4 4"], share: float) -> Float[Tensor, "4 4"]:
@@ -17,17 +17,17 @@ def between(before: Float[Tensor, "4 4"], after: Float[Tensor, "4 4"], share: fl
     return pose_from(before[:3, :3] @ turn, before[:3, 3] + share * (after[:3, 3] - before[:3, 3]))
 
 
-def neighbours(rec: Reconstruction, frames: Frames, name: str, count: int) -> list[str]:
+def neighbors(rec: Reconstruction, frames: Frames, name: str, count: int) -> list[str]:
     """The registered frames nearest to a frame in the order of the dive, nearest first."""
     place = {frame.name: i for i, frame in enumerate(frames)}
     known = [other for other in rec.names if other in place and other != name]
     return sorted(known, key=lambda other: abs(place[other] - place[name]))[:count]
 
 
-def pose_from_neighbours(rec: Reconstruction, frames: Frames, name: str) -> Float[Tensor, "4 4"]:
+def pose_from_neighbors(rec: Reconstruction, frames: Frames, name: str) -> Float[Tensor, "4 4"]:
     """Between the registered frames before and after in time, or carried on from the two nearest at an end."""
     time = {frame.name: frame.time for frame in frames}
-    near = neighbours(rec, frames, name, len(rec.names))
+    near = neighbors(rec, frames, name, len(rec.names))
     earlier = [other for other in near if time[other] <= time[name]]
     later = [other for other in near if time[other] > time[name]]
     pair = (earlier[0], later[0]) if earlier and later else (near[0], near[min(1, len(near) - 1)])

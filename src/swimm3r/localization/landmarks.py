@@ -1,6 +1,6 @@
-"""Where a picture was taken, from pixels that match points of the reconstruction: PnP with RANSAC over SIFT.
+"""Where an image was taken, from pixels that match points of the reconstruction: PnP with RANSAC over SIFT.
 
-A *landmark* is a keypoint of a registered frame that lies on the sighting of a triangulated point. A picture's
+A *landmark* is a keypoint of a registered frame that lies on the observation of a triangulated point. An image's
 keypoints are matched with the landmarks of frames that may show the same place; its pose reprojects most of them.
 """
 
@@ -23,9 +23,9 @@ from swimm3r.sfm.settings import FeatureSettings
 
 MIN_INLIERS = 12
 """Landmarks that agree on a pose before it is believed: 6 of them fix it, and strangers agree on a few more."""
-_MAX_ERROR = 4.0  # pixels of a picture of 1000; never less than _LEAST_ERROR
+_MAX_ERROR = 4.0  # pixels of an image of 1000; never less than _LEAST_ERROR
 _LEAST_ERROR = 2.5
-_SAME_KEYPOINT = 1.0  # pixels between a sighting and the keypoint that it is
+_SAME_KEYPOINT = 1.0  # pixels between an observation and the keypoint that it is
 
 
 @dataclass(frozen=True)
@@ -38,7 +38,7 @@ class Landmarks:
 
 @dataclass(frozen=True)
 class Located:
-    """A picture's pose and how many landmarks agree on it."""
+    """An image's pose and how many landmarks agree on it."""
 
     cam2world: Float[Tensor, "4 4"]
     inliers: int
@@ -56,10 +56,10 @@ def landmarks_of(
         f = frames.index(name)
         found = extract_features(frames.image(f), frames.mask(f), settings)
         mine = rec.tracks.frame == rec.index(name)
-        sightings, points = rec.tracks.xy[mine].double(), rec.tracks.point[mine]
-        if not len(sightings) or not len(found.keypoints):
+        observations, points = rec.tracks.xy[mine].double(), rec.tracks.point[mine]
+        if not len(observations) or not len(found.keypoints):
             return Landmarks(torch.zeros(0, 128), torch.zeros(0, 3, dtype=torch.float64))
-        distance, row = KDTree(sightings.numpy()).query(found.keypoints[:, :2])
+        distance, row = KDTree(observations.numpy()).query(found.keypoints[:, :2])
         near = torch.from_numpy(distance < _SAME_KEYPOINT)
         xyz = rec.points.xyz[points[torch.from_numpy(row)[near]]].double()
         return Landmarks(unit_descriptors(found.descriptors)[near], xyz)
@@ -68,14 +68,14 @@ def landmarks_of(
 
 
 def locate(
-    picture: Float[Tensor, "h w 3"],
+    image: Float[Tensor, "h w 3"],
     mask: Bool[Tensor, "h w"],
     lens: Cameras,
     near: Sequence[Landmarks],
     settings: FeatureSettings,
 ) -> Located | None:
-    """The pose of a picture taken through `lens` (one camera, its pose unused); None where too few landmarks agree."""
-    found = extract_features(picture, mask, settings)
+    """The pose of an image taken through `lens` (one camera, its pose unused); None where too few landmarks agree."""
+    found = extract_features(image, mask, settings)
     described = unit_descriptors(found.descriptors)
     keypoints = torch.from_numpy(found.keypoints[:, :2]).double()
     pixels, points = [], []

@@ -1,4 +1,4 @@
-"""Placing a picture in a map, by GS-CPR's protocol as the paper uses it (metrics.md 11).
+"""Placing an image in a map, by GS-CPR's protocol as the paper uses it (metrics.md 11).
 
 1. retrieve    the references that look most like the query;
 2. coarse      the query's matches with them, whose pixels have depth: PnP with RANSAC;
@@ -45,14 +45,14 @@ class Evidence:
 
     query: Float[Tensor, "h w 3"]  # on the pinhole canvas of the rendering
     rendering: Float[Tensor, "h w 3"]
-    xy_query: Float[Tensor, "m 2"]  # pixels of the canvas, centres at +0.5
+    xy_query: Float[Tensor, "m 2"]  # pixels of the canvas, centers at +0.5
     xy_rendering: Float[Tensor, "m 2"]
     inlier: Bool[Tensor, " m"]
 
 
 @dataclass(frozen=True)
 class Localization:
-    """Where a picture was taken, and why that is believed."""
+    """Where an image was taken, and why that is believed."""
 
     cam2world: Float[Tensor, "4 4"]
     stage: Literal["coarse", "refined"]
@@ -98,7 +98,7 @@ class _Solved:
 
 
 class Localizer:
-    """Places pictures in one map; what it learns of the references serves every query.
+    """Places images in one map; what it learns of the references serves every query.
 
     Poses are in the axes and unit of the map, and so of `rec`, the reconstruction with the poses as the map's training
     left them; `in_axes_of_sfm` takes them back to those of structure from motion.
@@ -128,24 +128,24 @@ class Localizer:
 
     def locate(
         self,
-        picture: Float[Tensor, "h w 3"],
+        image: Float[Tensor, "h w 3"],
         mask: Bool[Tensor, "h w"] | None = None,
         lens: Cameras | None = None,
         time: float | None = None,
     ) -> Localization:
-        """The pose of one picture (0..1), taken through `lens` (its pose unused), by default the reconstruction's.
+        """The pose of one image (0..1), taken through `lens` (its pose unused), by default the reconstruction's.
 
         `time`, seconds of the clip, matters to dynamic maps: it is the moment they are shown at, where it is known.
 
-        Raises RegistrationError where too few matches agree on any pose, InputError where the picture's shape is not
+        Raises RegistrationError where too few matches agree on any pose, InputError where the image's shape is not
         that of the reconstruction's frames and no lens is given.
         """
         s = self.settings
-        height, width = picture.shape[:2]
+        height, width = image.shape[:2]
         mask = torch.ones(height, width, dtype=torch.bool) if mask is None else mask
         seconds: dict[str, float] = {stage: 0.0 for stage in STAGES}
         with _timed(seconds, "retrieve"):
-            query = self.matcher.describe(picture, mask)
+            query = self.matcher.describe(image, mask)
             likest = torch.argsort(self._likeness(query), descending=True, stable=True)[: s.candidates].tolist()
             candidates = tuple(self.rec.names[k] for k in likest)
         lens = self._own_lens(likest[0], width, height) if lens is None else lens
@@ -153,16 +153,16 @@ class Localizer:
             coarse = self._coarse(query, candidates, lens)
         if coarse.cam2world is None:
             raise RegistrationError(
-                f"the picture could not be placed: fewer than {s.min_inliers} of its matches agree on a pose",
+                f"the image could not be placed: fewer than {s.min_inliers} of its matches agree on a pose",
                 cause="it shows a place that the map does not, or too little of it, or through very different water",
-                hint="a picture from nearer to the dive's path, or more --settings.candidates",
+                hint="an image from nearer to the dive's path, or more --settings.candidates",
             )
         coarse_inliers = int(coarse.inlier.sum())
         best = Localization(coarse.cam2world, "coarse", candidates, coarse_inliers, 0, 0, None, None, seconds)
         before = coarse
         for _ in range(s.rounds):
             there = replace(lens, cam2world=best.cam2world[None])
-            solved, evidence = self._against_rendering(picture, mask, there, time, seconds)
+            solved, evidence = self._against_rendering(image, mask, there, time, seconds)
             best = replace(best, matches=len(solved.pixels), evidence=evidence)
             if solved.cam2world is None or not self._stands(solved, before):
                 break
@@ -194,11 +194,11 @@ class Localizer:
         return reference, self.matcher.describe(reference.rgb, reference.usable)
 
     def _own_lens(self, nearest: int, width: int, height: int) -> Cameras:
-        """The lens of the nearest reference, for a picture of this size."""
+        """The lens of the nearest reference, for an image of this size."""
         lens = self.rec.cameras[nearest]
         if abs(width / height - lens.width / lens.height) > 0.01 * lens.width / lens.height:
             raise InputError(
-                f"the picture is {width} x {height}, the map's frames are {lens.width} x {lens.height}: another lens",
+                f"the image is {width} x {height}, the map's frames are {lens.width} x {lens.height}: another lens",
                 cause="it comes from another camera, or was cropped or turned",
                 hint="its own lens: --lens with a cameras.json that has it",
             )
@@ -217,7 +217,7 @@ class Localizer:
 
     def _against_rendering(
         self,
-        picture: Float[Tensor, "h w 3"],
+        image: Float[Tensor, "h w 3"],
         mask: Bool[Tensor, "h w"],
         lens: Cameras,
         time: float | None,
@@ -229,7 +229,7 @@ class Localizer:
             reference = rendered(self.scene, lens, self.long_side, s.min_alpha, time)
         with _timed(seconds, "match"):
             canvas = lens.pinhole(self.long_side)
-            shown, usable = undistorted(picture, mask, lens, canvas)
+            shown, usable = undistorted(image, mask, lens, canvas)
             xy_query, xy_rendering = self.matcher.match(
                 self.matcher.describe(shown, usable), self.matcher.describe(reference.rgb, reference.usable)
             )

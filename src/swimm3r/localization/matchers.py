@@ -1,7 +1,7 @@
-"""What localisation asks of features: which pictures look alike, and which of their pixels show the same.
+"""What localization asks of features: which images look alike, and which of their pixels show the same.
 
-SIFT needs no weights: keypoints matched by their descriptors, pictures compared by VLAD over a vocabulary learned from
-the references. MASt3R matches every pixel, and compares pictures by their encoder's tokens, as the paper does.
+SIFT needs no weights: keypoints matched by their descriptors, images compared by VLAD over a vocabulary learned from
+the references. MASt3R matches every pixel, and compares images by their encoder's tokens, as the paper does.
 """
 
 from collections.abc import Callable, Sequence
@@ -20,12 +20,12 @@ from swimm3r.sfm.features.sift import extract_features, match_descriptors, unit_
 from swimm3r.sfm.mast3r.inference import ViewPrediction, predict_pair
 from swimm3r.sfm.mast3r.matching import DescriptorMap, match_views
 from swimm3r.sfm.mast3r.network import Encoded, Mast3r
-from swimm3r.sfm.mast3r.preprocess import Framing, framing, mask_to_network, pixels_to_picture, to_network
+from swimm3r.sfm.mast3r.preprocess import Framing, framing, mask_to_network, pixels_to_image, to_network
 from swimm3r.sfm.mast3r_sfm.run_pairs import load_network
 from swimm3r.sfm.settings import Mast3rSettings
 
-Pixels = Float[Tensor, "m 2"]  # of pictures as they were described, centres at +0.5
-Likeness = Callable[[Any], Float[Tensor, " k"]]  # of a described picture to each reference
+Pixels = Float[Tensor, "m 2"]  # of images as they were described, centers at +0.5
+Likeness = Callable[[Any], Float[Tensor, " k"]]  # of a described image to each reference
 _SAMPLE = 64  # references, spread evenly, that a vocabulary or a mean is learned from
 
 
@@ -35,16 +35,16 @@ class Matcher(Protocol):
 
     name: str
 
-    def describe(self, picture: Float[Tensor, "h w 3"], usable: Bool[Tensor, "h w"]) -> Any:
-        """What the other methods need to know of a picture."""
+    def describe(self, image: Float[Tensor, "h w 3"], usable: Bool[Tensor, "h w"]) -> Any:
+        """What the other methods need to know of an image."""
         ...
 
     def index(self, names: Sequence[str], described: Callable[[str], Any]) -> Likeness:
-        """How much a picture looks like each of the references, which are asked for one at a time."""
+        """How much an image looks like each of the references, which are asked for one at a time."""
         ...
 
     def match(self, a: Any, b: Any) -> tuple[Pixels, Pixels]:
-        """Pixels of two pictures that show the same place."""
+        """Pixels of two images that show the same place."""
         ...
 
 
@@ -64,13 +64,13 @@ class SiftMatcher:
         silence_log()
         self.settings = settings.features
 
-    def describe(self, picture: Float[Tensor, "h w 3"], usable: Bool[Tensor, "h w"]) -> _Keypoints:
-        """The picture's keypoints outside its mask."""
-        found = extract_features(picture, usable, self.settings)
+    def describe(self, image: Float[Tensor, "h w 3"], usable: Bool[Tensor, "h w"]) -> _Keypoints:
+        """The image's keypoints outside its mask."""
+        found = extract_features(image, usable, self.settings)
         return _Keypoints(torch.from_numpy(found.keypoints[:, :2]).double(), unit_descriptors(found.descriptors))
 
     def index(self, names: Sequence[str], described: Callable[[str], _Keypoints]) -> Likeness:
-        """Cosines of VLAD descriptors; -1 for a picture without keypoints."""
+        """Cosines of VLAD descriptors; -1 for an image without keypoints."""
         sample = [described(name).descriptors for name in names[:: -(-len(names) // _SAMPLE)]]
         sample = [descriptors for descriptors in sample if len(descriptors)]
         if not sample:
@@ -99,7 +99,7 @@ class SiftMatcher:
 class _Seen:
     frame: Framing
     encoded: Encoded
-    usable: Bool[Tensor, "H W"]  # on the network's picture
+    usable: Bool[Tensor, "H W"]  # on the network's image
 
 
 class Mast3rMatcher:
@@ -110,11 +110,11 @@ class Mast3rMatcher:
     def __init__(self, network: Mast3r, settings: LocalizationSettings) -> None:
         self.network, self.settings = network, settings.matching
 
-    def describe(self, picture: Float[Tensor, "h w 3"], usable: Bool[Tensor, "h w"]) -> _Seen:
-        """The picture's encoding."""
-        frame = framing(picture.shape[1], picture.shape[0])
+    def describe(self, image: Float[Tensor, "h w 3"], usable: Bool[Tensor, "h w"]) -> _Seen:
+        """The image's encoding."""
+        frame = framing(image.shape[1], image.shape[0])
         with torch.no_grad():
-            encoded = self.network.encode(to_network(picture, frame)[None].to(self.network.device))
+            encoded = self.network.encode(to_network(image, frame)[None].to(self.network.device))
         return _Seen(frame, encoded, mask_to_network(usable, frame))
 
     def index(self, names: Sequence[str], described: Callable[[str], _Seen]) -> Likeness:
@@ -142,8 +142,8 @@ class Mast3rMatcher:
             self.settings,
         )
         return (
-            pixels_to_picture(found.xy1.cpu() + 0.5, a.frame),
-            pixels_to_picture(found.xy2.cpu() + 0.5, b.frame),
+            pixels_to_image(found.xy1.cpu() + 0.5, a.frame),
+            pixels_to_image(found.xy2.cpu() + 0.5, b.frame),
         )
 
 

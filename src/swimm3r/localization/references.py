@@ -1,4 +1,4 @@
-"""The pictures that a query is first compared with: of every registered pose a picture and its depth."""
+"""The images that a query is first compared with: of every registered pose an image and its depth."""
 
 from dataclasses import dataclass, replace
 from typing import Protocol, runtime_checkable
@@ -15,7 +15,7 @@ from swimm3r.splat.rendering import SplatMap
 
 @dataclass(frozen=True)
 class Reference:
-    """A picture whose pixels have known places in the world."""
+    """An image whose pixels have known places in the world."""
 
     camera: Cameras  # one, distortion included
     rgb: Float[Tensor, "h w 3"]
@@ -23,7 +23,7 @@ class Reference:
     z_depth: Float[Tensor, "h w"]  # 0 = unknown
 
     def points(self, pixels: Float[Tensor, "n 2"]) -> tuple[Float[Tensor, "m 3"], Bool[Tensor, " n"]]:
-        """World points of the pixels whose depth is known, and which those are. Centres are at +0.5."""
+        """World points of the pixels whose depth is known, and which those are. Centers are at +0.5."""
         column, row = pixels.long().unbind(-1)
         z = self.z_depth[row.clamp(0, self.camera.height - 1), column.clamp(0, self.camera.width - 1)].double()
         known = z > 0
@@ -34,7 +34,7 @@ class Reference:
 
 @runtime_checkable  # so that the suite can check calls against it
 class References(Protocol):
-    """The reference pictures of a reconstruction, by the names of its frames."""
+    """The reference images of a reconstruction, by the names of its frames."""
 
     def __getitem__(self, name: str) -> Reference: ...
 

@@ -1,4 +1,4 @@
-"""Every number of localisation in a map; torch-free."""
+"""Every number of localization in a map; torch-free."""
 
 from dataclasses import dataclass, field, replace
 from pathlib import Path
@@ -11,7 +11,7 @@ from swimm3r.sfm.settings import FeatureSettings, Mast3rSettings, SfmSettings
 
 @dataclass(frozen=True)
 class LocalizationSettings(Settings):
-    """A query picture placed in a map, as the paper does it after GS-CPR."""
+    """A query image placed in a map, as the paper does it after GS-CPR."""
 
     matcher: Literal["auto", "mast3r", "sift"] = "auto"
     """What finds matches; auto takes MASt3R where its weights are on this computer."""
@@ -22,7 +22,7 @@ class LocalizationSettings(Settings):
     precision: Literal["float32", "bfloat16", "float16"] = "float32"
     """Of MASt3R's trunk; its heads are always float32."""
     candidates: Count = 5
-    """Reference pictures that the query is matched with for its coarse pose."""
+    """Reference images that the query is matched with for its coarse pose."""
     rounds: Annotated[int, Range(0, 100)] = 1
     """Times that the map is rendered and matched; GS-CPR does it once."""
     max_error: Positive = 5.0

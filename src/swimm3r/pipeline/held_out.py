@@ -1,7 +1,7 @@
 """How well a map shows the frames it never saw: where they were taken, how the map looks from there, the scores.
 
 A frame's first pose comes from a reference where one is given, else from its matches with points of the reconstruction,
-else from its neighbours in time. Then it is refined on the frozen map (`splat.poses`), for a score should be about the
+else from its neighbors in time. Then it is refined on the frozen map (`splat.poses`), for a score should be about the
 map and not about a pose that is a pixel off. Scores count the pixels that the lens shows and the mask admits, on the
 pinhole canvas of the training size.
 """
@@ -23,9 +23,9 @@ from swimm3r.evaluate.images import ViewScores, as_8_bit, blur4_psnr, mean_view_
 from swimm3r.evaluate.lpips import Lpips, load_lpips
 from swimm3r.geometry import best_similarity
 from swimm3r.io.view_names import view_stems
-from swimm3r.localization.interpolation import neighbours, pose_from_neighbours
+from swimm3r.localization.interpolation import neighbors, pose_from_neighbors
 from swimm3r.localization.landmarks import landmarks_of, locate
-from swimm3r.pipeline.renders import look_of, write_view
+from swimm3r.pipeline.renders import display_style, write_view
 from swimm3r.progress import Progress, silent
 from swimm3r.scene.frames import Frames
 from swimm3r.scene.ground_truth import GroundTruth
@@ -37,8 +37,8 @@ from swimm3r.splat.settings import PoseRefinementSettings
 from swimm3r.splat.training_poses import axes_of_map
 from swimm3r.splat.views import undistorted
 
-Source = Literal["reference", "2D-3D matches", "neighbours"]
-_GAP = 0.03  # of the picture's width: gaps in the cloud up to this size are closed where coverage is asked
+Source = Literal["reference", "2D-3D matches", "neighbors"]
+_GAP = 0.03  # of the image's width: gaps in the cloud up to this size are closed where coverage is asked
 _WITNESSES = 6  # registered frames, the nearest in time, that a held-out frame is matched with
 
 
@@ -58,7 +58,7 @@ class HeldOutView:
     time: float  # seconds of the clip
     lens: Cameras  # the frame's own camera, its pose refined
     canvas: Cameras  # its pinhole at the training size
-    window: "Window"  # of the canvas that was rendered and scored
+    window: "Crop"  # of the canvas that was rendered and scored
     source: Source
     scores: ViewScores
     covered: "CoveredScores"
@@ -89,11 +89,11 @@ def first_poses(
         if frame.name in known:
             poses[frame.name] = FirstPose(known[frame.name], "reference")
             continue
-        near = neighbours(rec, frames, frame.name, _WITNESSES)
+        near = neighbors(rec, frames, frame.name, _WITNESSES)
         f, lens = frames.index(frame.name), rec.cameras[rec.index(near[0])]
         located = locate(frames.image(f), frames.mask(f), lens, [landmarks(name) for name in near], features)
         if located is None:
-            poses[frame.name] = FirstPose(pose_from_neighbours(rec, frames, frame.name), "neighbours")
+            poses[frame.name] = FirstPose(pose_from_neighbors(rec, frames, frame.name), "neighbors")
         else:
             poses[frame.name] = FirstPose(located.cam2world, "2D-3D matches")
     progress("placing test frames", len(frames.test), len(frames.test))
@@ -137,11 +137,11 @@ def score_views(
     """
     perceptual = published_lpips()
     views, stems = [], view_stems(frames.names)
-    look = look_of(scene, rec, restore)
+    style = display_style(scene, rec, restore)
     for done, (name, first) in enumerate(poses.items()):
         progress("scoring test frames", done, len(poses))
         f = frames.index(name)
-        lens = rec.cameras[rec.index(neighbours(rec, frames, name, 1)[0])]
+        lens = rec.cameras[rec.index(neighbors(rec, frames, name, 1)[0])]
         lens = replace(lens, cam2world=first.cam2world[None].to(lens.cam2world))
         time = frames.frames[f].time
         lens = refine_pose(scene, lens, frames.image(f), frames.mask(f), settings, time=time).camera
@@ -152,7 +152,7 @@ def score_views(
         )
         camera = cut(canvas, window)
         out = scene.render(camera, time)
-        write_view(folder, stems[name], out, camera, look)
+        write_view(folder, stems[name], out, camera, style)
         scores = view_scores(out.rgb, target, perceptual, seen)
         covered = covered_scores(out.rgb, target, seen, covered_by_training(rec, camera))
         views.append(HeldOutView(name, time, lens, canvas, window, first.source, scores, covered))
@@ -188,7 +188,7 @@ def covered_by_training(rec: Reconstruction, canvas: Cameras) -> Bool[Tensor, "h
     hit[row, column] = 1
     reach = max(3, round(_GAP * canvas.width)) | 1
     kernel = cv2.getStructuringElement(cv2.MORPH_ELLIPSE, (reach, reach))
-    border = reach  # closing must not eat into the picture's edge
+    border = reach  # closing must not eat into the image's edge
     padded = cv2.copyMakeBorder(hit.numpy(), border, border, border, border, cv2.BORDER_REFLECT)
     closed = cv2.morphologyEx(padded, cv2.MORPH_CLOSE, kernel)[border:-border, border:-border]
     return torch.from_numpy(closed.copy()) > 0
@@ -200,7 +200,7 @@ def covered_scores(
     seen: Bool[Tensor, "h w"],
     covered: Bool[Tensor, "h w"],
 ) -> CoveredScores:
-    """PSNR, and that of mere blurring, over the covered pixels; both pictures as their 8-bit files show them."""
+    """PSNR, and that of mere blurring, over the covered pixels; both images as their 8-bit files show them."""
     counted = seen & covered
     share = float(counted.sum() / seen.sum())
     if not bool(counted.any()):
@@ -223,15 +223,15 @@ def mean_covered(views: Sequence[HeldOutView]) -> CoveredScores:
 
 
 @dataclass(frozen=True)
-class Window:
+class Crop:
     """A rectangle of a canvas: rows and columns."""
 
     rows: slice
     columns: slice
 
 
-def visible_window(lens: Cameras, canvas: Cameras) -> Window:
-    """The part of a lens's pinhole canvas that its picture fills, cut straight."""
+def visible_window(lens: Cameras, canvas: Cameras) -> Crop:
+    """The part of a lens's pinhole canvas that its image fills, cut straight."""
     shown = distorted_grid(resized(lens, canvas.width, canvas.height), canvas)[1]
     top, bottom, left, right = 0, canvas.height, 0, canvas.width
     while True:
@@ -240,12 +240,12 @@ def visible_window(lens: Cameras, canvas: Cameras) -> Window:
         missing = [float((~edge).float().mean()) for edge in (part[0], part[-1], part[:, 0], part[:, -1])]
         worst = missing.index(max(missing))
         if missing[worst] == 0 or min(part.shape) <= 16:
-            return Window(slice(top, bottom), slice(left, right))
+            return Crop(slice(top, bottom), slice(left, right))
         top, bottom = top + (worst == 0), bottom - (worst == 1)
         left, right = left + (worst == 2), right - (worst == 3)
 
 
-def cut(canvas: Cameras, window: Window) -> Cameras:
+def cut(canvas: Cameras, window: Crop) -> Cameras:
     """The cameras of a window of a pinhole canvas."""
     K = canvas.K.clone()
     K[:, 0, 2] -= window.columns.start

@@ -45,7 +45,7 @@ LAPTOP = UwbsSettings(  # the paper's settings are made for a GPU
     iterations=5000,
     long_side=640,
     initial=InitialSettings(primitives=50_000),
-    densify=DensifySettings(max_primitives=100_000),
+    densify=DensifySettings(cap_max=100_000),
     sgg=WITHOUT_SGG,
     poses=HELD_POSES,
 )
@@ -113,9 +113,11 @@ PRESETS: dict[Preset, RunSettings] = {
             iterations=2000,
             long_side=480,
             initial=InitialSettings(primitives=25_000),
-            densify=DensifySettings(max_primitives=50_000),
+            densify=DensifySettings(cap_max=50_000),
             # UBS's rates are made for ten times as many steps (benchmarks/README.md says what these are worth)
-            rates=LearningRates(xyz=1e-3, query_mean=3e-3, rgb=1e-2, beta=4e-3, scale=1e-2, lower=4e-3, settle=0.1),
+            rates=LearningRates(
+                xyz=1e-3, query_mean=3e-3, rgb=1e-2, beta=4e-3, scale=1e-2, lower=4e-3, final_rate_factor=0.1
+            ),
             sgg=WITHOUT_SGG,
             poses=HELD_POSES,
         ),

@@ -27,13 +27,13 @@ from swimm3r.io.view_names import view_stems
 from swimm3r.medium import transmittances
 from swimm3r.prepare import load_frames
 from swimm3r.progress import Progress, silent
-from swimm3r.report.charts import depth_picture
+from swimm3r.report.charts import depth_image
 from swimm3r.scene import reconstruction
 from swimm3r.scene.frames import Frames
 from swimm3r.scene.reconstruction import Reconstruction
 from swimm3r.scene.run_folder import open_run
 from swimm3r.settings import ClipSecond, CountOrZero, LongSideOrOwn, accepted
-from swimm3r.sfm.medium.restore import horizon, shown_gains
+from swimm3r.sfm.medium.restore import keep_open_water, shown_gains
 from swimm3r.sfm.settings import RestoreSettings
 from swimm3r.splat.map_file import load_map
 from swimm3r.splat.rendering import RenderOutput, SplatMap
@@ -41,7 +41,7 @@ from swimm3r.splat.training_poses import axes_of_map
 
 KINDS = ("rgb", "clear", "clear_physical", "backscatter", "z_depth")
 """The PNG files of one view, NAME_KIND.png."""
-_RATE = 15  # pictures per second of the flight
+_RATE = 15  # images per second of the flight
 _X264 = {"crf": "23", "preset": "medium", "x264-params": "mbtree=0"}
 """Options of the video encoder, which gives the same bits for the same images: the vector code of its macroblock tree
 reads beyond its rows where half a width is no multiple of a vector, and what it finds there moves its decisions."""
@@ -49,44 +49,44 @@ _SMOOTH = 1.5  # frames of the dive over which the flight's hand steadies
 
 
 @dataclass(frozen=True)
-class Look:
-    """How a dive's pictures are shown: its restored frames, and the clear views and depths of its map."""
+class DisplayStyle:
+    """How a dive's images are shown: its restored frames, and the clear views and depths of its map."""
 
-    gains: Float[Tensor, "3"]  # white balance of clear pictures
+    gains: Float[Tensor, "3"]  # white balance of clear images
     near_far: tuple[float, float]  # z depths that are red and blue, scene units
     restore: RestoreSettings
 
 
-def look_of(scene: SplatMap, rec: Reconstruction, restore: RestoreSettings | None = None) -> Look:
+def display_style(scene: SplatMap, rec: Reconstruction, restore: RestoreSettings | None = None) -> DisplayStyle:
     """The look that the restored frames of a reconstruction have, for views of its map."""
     restore = restore or RestoreSettings()
     gains = shown_gains(rec, restore) if scene.has_water else torch.ones(3)
-    return Look(gains, depth_span(rec), restore)
+    return DisplayStyle(gains, depth_span(rec), restore)
 
 
-def shown_clear(out: RenderOutput, camera: Cameras, look: Look) -> Float[Tensor, "h w 3"]:
-    """A map's clear view as the restored frames are shown, white-balanced; open water keeps the colour it has.
+def shown_clear(out: RenderOutput, camera: Cameras, style: DisplayStyle) -> Float[Tensor, "h w 3"]:
+    """A map's clear view as the restored frames are shown, white-balanced; open water keeps the color it has.
 
-    So does what the water lets no channel see: the clear colour of such a surface is noise. `out.clear` itself is
+    So does what the water lets no channel see: the clear color of such a surface is noise. `out.clear` itself is
     physical, and what scores are taken of.
     """
     ray_depth = ray_depth_from_z(out.z_depth, image_directions(camera).to(out.z_depth))
     T_D, _ = transmittances(ray_depth, out.medium)
-    return horizon(out.clear * look.gains, T_D, out.rgb, 1 - out.alpha, look.restore)
+    return keep_open_water(out.clear * style.gains, T_D, out.rgb, 1 - out.alpha, style.restore)
 
 
-def physical_clear(out: RenderOutput, camera: Cameras, look: Look) -> Float[Tensor, "h w 3"]:
+def physical_clear(out: RenderOutput, camera: Cameras, style: DisplayStyle) -> Float[Tensor, "h w 3"]:
     """The same before the white balance: colors that scores without a reference may be taken of."""
-    return shown_clear(out, camera, replace(look, gains=torch.ones(3)))
+    return shown_clear(out, camera, replace(style, gains=torch.ones(3)))
 
 
-def write_view(folder: Path, stem: str, out: RenderOutput, camera: Cameras, look: Look) -> None:
+def write_view(folder: Path, stem: str, out: RenderOutput, camera: Cameras, style: DisplayStyle) -> None:
     """The files of one view, as the head of this module lists them."""
-    shown = {"rgb": out.rgb, "clear": shown_clear(out, camera, look), "backscatter": out.backscatter}
+    shown = {"rgb": out.rgb, "clear": shown_clear(out, camera, style), "backscatter": out.backscatter}
     for kind, image in shown.items():
         images.write_rgb(folder / f"{stem}_{kind}.png", image.numpy())
-    images.write_rgb_16(folder / f"{stem}_clear_physical.png", physical_clear(out, camera, look).numpy())
-    images.write_rgb(folder / f"{stem}_z_depth.png", depth_picture(out.z_depth.numpy(), *look.near_far))
+    images.write_rgb_16(folder / f"{stem}_clear_physical.png", physical_clear(out, camera, style).numpy())
+    images.write_rgb(folder / f"{stem}_z_depth.png", depth_image(out.z_depth.numpy(), *style.near_far))
     with atomic_path(folder / f"{stem}_z_depth.npz") as draft:
         np.savez_compressed(draft, z_depth=out.z_depth.numpy(), alpha=out.alpha.numpy())
 
@@ -125,7 +125,7 @@ def write_flythrough(
     cam2world: Float[Tensor, "c 4 4"],
     times: Sequence[float],
     count: int,
-    look: Look,
+    style: DisplayStyle,
     progress: Progress = silent,
 ) -> None:
     """An H.264 video of `count` views along the cameras' path: with the water, and beside it without.
@@ -139,7 +139,7 @@ def write_flythrough(
             progress("filming the flight", i, count)
             camera = replace(canvas, cam2world=pose[None])
             out = scene.render(camera, float(clock[i]))
-            both = torch.cat([out.rgb, shown_clear(out, camera, look)], 1)
+            both = torch.cat([out.rgb, shown_clear(out, camera, style)], 1)
             yield (both.clamp(0, 1) * 255).round().to(torch.uint8).numpy()
         progress("filming the flight", count, count)
 
@@ -157,11 +157,11 @@ def render_run(
     restore: RestoreSettings | None = None,
     progress: Progress = silent,
 ) -> Path:
-    """Pictures of a finished run's map from the cameras of a cameras.json, by default those of training; into `out`.
+    """Images of a finished run's map from the cameras of a cameras.json, by default those of training; into `out`.
 
     `cameras` are in the axes of RUN/sfm, or the map's own, RUN/splat/cameras.json.
 
-    Clear pictures look like the frames that `restore` made. A dynamic map shows `time` (seconds of the clip), by
+    Clear images look like the frames that `restore` made. A dynamic map shows `time` (seconds of the clip), by
     default the cameras' own times, else when the frames of their names were taken. Raises InputError where the run has
     no map or no moment is known.
     """
@@ -180,16 +180,16 @@ def render_run(
     if to_map is not None and cameras is not None and cameras.resolve() != own.resolve():
         stations = replace(stations, cam2world=to_map.poses(stations.cam2world.double()))
     times = moments_of(scene, table, frames, time)
-    look = look_of(scene, rec, restore)
+    style = display_style(scene, rec, restore)
     stems = view_stems(table.names)
     for i, name in enumerate(table.names):
         progress("rendering", i, len(table.names))
         camera = stations[i].pinhole(long_side)
-        write_view(out, stems[name], scene.render(camera, times[i]), camera, look)
+        write_view(out, stems[name], scene.render(camera, times[i]), camera, style)
     progress("rendering", len(table.names), len(table.names))
     if flight:
         canvas = stations[0].pinhole(long_side)
-        write_flythrough(out / "flythrough.mp4", scene, canvas, stations.cam2world, times, flight, look, progress)
+        write_flythrough(out / "flythrough.mp4", scene, canvas, stations.cam2world, times, flight, style, progress)
     return out
 
 
@@ -213,7 +213,7 @@ def moments_of(scene: SplatMap, table: CameraTable, frames: Frames, time: float 
     return frames.times_of(table.names)
 
 
-def _encode(path: Path, pictures: Iterable[UInt8[np.ndarray, "h w 3"]]) -> None:
+def _encode(path: Path, images: Iterable[UInt8[np.ndarray, "h w 3"]]) -> None:
     import av
 
     tick = Fraction(1, _RATE)
@@ -222,11 +222,11 @@ def _encode(path: Path, pictures: Iterable[UInt8[np.ndarray, "h w 3"]]) -> None:
         stream = file.add_stream("libx264", rate=_RATE, options=_X264)
         stream.pix_fmt, stream.codec_context.time_base = "yuv420p", tick
         stream.codec_context.thread_count = 1  # x264 cuts frames by the number of threads: other cores, other bits
-        for i, picture in enumerate(pictures):
-            height, width = (size // 2 * 2 for size in picture.shape[:2])  # 4:2:0 halves both
+        for i, image in enumerate(images):
+            height, width = (size // 2 * 2 for size in image.shape[:2])  # 4:2:0 halves both
             if i == 0:
                 stream.height, stream.width = height, width
-            frame = av.VideoFrame.from_ndarray(np.ascontiguousarray(picture[:height, :width]), "rgb24")
+            frame = av.VideoFrame.from_ndarray(np.ascontiguousarray(image[:height, :width]), "rgb24")
             frame.pts, frame.time_base = i, tick
             file.mux(stream.encode(frame))
         file.mux(stream.encode())

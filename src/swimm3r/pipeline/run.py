@@ -6,15 +6,14 @@ short goes on from what it left on disk; one whose settings changed is refused o
 """
 
 import json
-import os
 import platform
 from dataclasses import asdict, dataclass, replace
-from hashlib import sha256
 from importlib.metadata import version
 from pathlib import Path
 
 from swimm3r import devices
 from swimm3r.io.files.atomic import write_text
+from swimm3r.io.files.cache_key import stat_digest
 from swimm3r.pipeline import held_out
 from swimm3r.pipeline import summary as sections
 from swimm3r.pipeline.inputs import check_inputs, truth_of
@@ -56,7 +55,7 @@ def run_pipeline(
     """
     check_source(source)
     devices.for_maps(map_device)  # before there is a folder, and minutes of structure from motion
-    with open_record(folder, source, fingerprint_of(source, folder), redo=redo) as record:
+    with open_record(folder, source, stat_digest(source, leave_out=folder), redo=redo) as record:
         settings, reference = record.settle(settings, reference, last_stage)
         check_inputs(source, settings, reference)
         record.make_room(settings, reference)
@@ -100,7 +99,7 @@ def _make_stages(
         "gray": frames.gray,
         "masks": {"used": sum(frame.mask is not None for frame in frames), "unused": frames.unused_masks},
     }
-    record.add({"cautions": [{"what": what, "advice": ""} for what in frames.cautions]})
+    record.add({"warnings": [{"what": what, "advice": ""} for what in frames.warnings]})
     if last_stage == "prepare":
         return
 
@@ -221,24 +220,6 @@ def _other_scores(
         "views": views,
         **score_map(run, asked.test, truth, run.folder / views, progress),
     }
-
-
-def fingerprint_of(source: Path, folder: Path) -> str:
-    """What tells one input from another: names, sizes and times of its files, not where it lies.
-
-    A run folder inside the input is no part of it.
-    """
-    files, own = [source], os.path.realpath(folder)
-    if source.is_dir():
-        # Path.is_file raises where it may not look
-        files = sorted(p for p in source.rglob("*") if os.path.isfile(p) and not p.resolve().is_relative_to(own))
-    digest = sha256()
-    for path in files:
-        stat = path.stat()
-        digest.update(
-            f"{path.relative_to(source.parent)}|{stat.st_size}|{stat.st_mtime_ns}\n".encode(errors="surrogateescape")
-        )
-    return digest.hexdigest()[:16]
 
 
 def _versions() -> dict[str, str]:

@@ -6,7 +6,7 @@ from typing import Any
 
 from swimm3r.pipeline.presets import MAST3R_PRESETS, PRESETS, Preset, RunSettings
 from swimm3r.sfm.settings import Mast3rSettings
-from swimm3r.splat.settings import Recipe, UwbsSettings, recipe_of, with_recipe
+from swimm3r.splat.settings import RecipeName, UwbsSettings, recipe_of, with_recipe
 
 _PARTS = {"prepare": "frames", "sfm": "sfm", "splat": "splat", "eval": "test"}  # of RunSettings, by the stage they make
 
@@ -40,7 +40,7 @@ def differences(old: RunSettings, new: RunSettings, stages: list[str]) -> list[s
 
 
 def starting_settings(
-    preset: Preset | None, backend: str | None, recipe: Recipe | None, held: RunSettings | None
+    preset: Preset | None, backend: str | None, recipe: RecipeName | None, held: RunSettings | None
 ) -> RunSettings:
     """The defaults of a command's options: those of a named preset, else those that the run folder holds.
 

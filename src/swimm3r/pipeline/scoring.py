@@ -14,7 +14,7 @@ from swimm3r.io.view_names import view_stems
 from swimm3r.pipeline import held_out
 from swimm3r.pipeline import summary as sections
 from swimm3r.pipeline.presets import RunSettings
-from swimm3r.pipeline.renders import look_of, write_flythrough
+from swimm3r.pipeline.renders import display_style, write_flythrough
 from swimm3r.pipeline.restored_scores import restored_section
 from swimm3r.progress import Progress, silent
 from swimm3r.scene.frames import Frames
@@ -26,7 +26,7 @@ from swimm3r.splat.rendering import SplatMap
 from swimm3r.splat.settings import PoseRefinementSettings
 from swimm3r.splat.training_poses import as_mapped
 
-_FLIGHT = 90  # pictures of the fly-through
+_FLIGHT = 90  # images of the fly-through
 
 
 @dataclass(frozen=True)
@@ -110,6 +110,6 @@ def film_flight(run: MappedRun, progress: Progress = silent) -> None:
         path.cameras.cam2world,
         run.frames.times_of(path.names),
         _FLIGHT,
-        look_of(scene, run.rec, run.settings.sfm.restore),
+        display_style(scene, run.rec, run.settings.sfm.restore),
         progress,
     )

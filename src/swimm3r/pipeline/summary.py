@@ -31,7 +31,7 @@ _ASKED = 16  # training views that the map's mean water is taken over
 
 
 def sfm_sections(rec: Reconstruction, frames: Frames, matches: Matches | None = None) -> dict[str, object]:
-    """ "sfm", "medium" and "cautions": what structure from motion found.
+    """ "sfm", "medium" and "warnings": what structure from motion found.
 
     Epipolar scores are of `matches`, by default those that the reconstruction keeps.
     """
@@ -45,7 +45,7 @@ def sfm_sections(rec: Reconstruction, frames: Frames, matches: Matches | None = 
         "dense_points": 0 if rec.cloud is None else len(rec.cloud.xyz),
         "reprojection_px": ((rec.points.error.double() * observations).sum() / observations.sum()).item()
         if len(rec.tracks.point)
-        else NotComputed("no sightings of points are known"),
+        else NotComputed("no observations of points are known"),
         "epipolar_px": epipolar.epipolar_px,
         "inlier_1px": epipolar.inlier_1px,
         "epipolar_variant": epipolar.variant,
@@ -56,9 +56,9 @@ def sfm_sections(rec: Reconstruction, frames: Frames, matches: Matches | None = 
         sections["medium"] = {"sfm": _medium_section(rec.medium, rec.metric)}
         if rec.medium_linear is not None:
             sections["medium"] = {**sections["medium"], "sfm_linear": _medium_section(rec.medium_linear, rec.metric)}
-    sections["cautions"] = [
-        *({"what": what, "advice": ""} for what in frames.cautions),
-        *(vars(caution) for caution in rec.cautions),
+    sections["warnings"] = [
+        *({"what": what, "advice": ""} for what in frames.warnings),
+        *(vars(warning) for warning in rec.warnings),
     ]
     return sections
 
@@ -126,7 +126,7 @@ def truth_section(
     views: Sequence[HeldOutView] = (),
     progress: Progress = silent,
 ) -> dict[str, object]:
-    """Errors against reference poses and, where the truth has them, depth, clear colours and water of sfm and map."""
+    """Errors against reference poses and, where the truth has them, depth, clear colors and water of sfm and map."""
     reference = {name: i for i, name in enumerate(truth.names)}
     wanted = [name for name in frames.train.names if name in reference]
     if len(wanted) < 2:
@@ -224,7 +224,7 @@ def _depth_section(rec: Reconstruction, truth: GroundTruth, scale: float) -> dic
 
 
 def _water_section(fit: MediumFit, held_out: Frames, truth: GroundTruth, progress: Progress) -> dict[str, object]:
-    """The water's errors, and the clear colours it gives at true depth, over the frames nothing was fitted to."""
+    """The water's errors, and the clear colors it gives at true depth, over the frames nothing was fitted to."""
     assert truth.medium is not None
     ray_depths, psnrs = [], []
     for done, frame in enumerate(held_out):

@@ -38,7 +38,7 @@ def load_frames(folder: Path) -> "swimm3r.scene.frames.Frames":
 
 
 def check_source(source: Path) -> Path:
-    """The video or folder of pictures that a source stands for: a folder's only video where it has no pictures.
+    """The video or folder of images that a source stands for: a folder's only video where it has no images.
 
     Cheap, and writes nothing. Raises InputError where a source is plainly none of them, or cannot be read.
     """

@@ -12,15 +12,15 @@ from swimm3r.io.files.safe_names import shown_name
 from swimm3r.io.images import Rgb
 
 STEP = "preparing frames"  # what progress calls it
-GREY_SIDE = 960  # pixels; sharpness is judged on a copy of this size, so that it compares across cameras
-BLANK = 1.0  # standard deviation of an 8-bit grey copy below which a frame shows nothing: lens cap, fade, slate
+GRAY_SIDE = 960  # pixels; sharpness is judged on a copy of this size, so that it compares across cameras
+BLANK = 1.0  # standard deviation of an 8-bit gray copy below which a frame shows nothing: lens cap, fade, slate
 
 Item = TypeVar("Item")
 
 
 @dataclass(frozen=True)
-class Picture:
-    """A picture already written into the draft folder."""
+class SourceImage:
+    """An image already written into the draft folder."""
 
     name: str
     original: Path  # relative name by which its mask is looked up
@@ -31,52 +31,52 @@ class Picture:
 
 
 @dataclass(frozen=True)
-class Dive:
+class SelectedImages:
     """What was written into the draft folder, and what there is to say about it."""
 
-    pictures: list[Picture]
+    images: list[SourceImage]
     ordered: bool
-    cautions: list[str]
+    warnings: list[str]
     mask_folders: list[Path]
     originals: list[Path]  # what a mask may belong to, frames left out included
     files: frozenset[Path] = frozenset()  # the originals of stills where they lie: no masks, whatever their names
 
 
-def sharpness(grey: UInt8[np.ndarray, "h w"]) -> float:
+def sharpness(gray: UInt8[np.ndarray, "h w"]) -> float:
     """Variance of the Laplacian (Pech-Pacheco et al. 2000); larger is sharper, comparable within one scene."""
     import cv2
 
-    return float(cv2.Laplacian(grey, cv2.CV_16S).var(dtype=np.float64))
+    return float(cv2.Laplacian(gray, cv2.CV_16S).var(dtype=np.float64))
 
 
-def small_grey(picture: Rgb) -> UInt8[np.ndarray, "h w"]:
+def small_gray(image: Rgb) -> UInt8[np.ndarray, "h w"]:
     """The copy on which sharpness is judged."""
     import cv2
 
-    small = scaled_down(picture, GREY_SIDE)
+    small = scaled_down(image, GRAY_SIDE)
     if small.dtype == np.uint16:
         small = (small >> 8).astype(np.uint8)
     return cv2.cvtColor(small, cv2.COLOR_RGB2GRAY)
 
 
-def is_gray(picture: Rgb) -> bool:
+def is_gray(image: Rgb) -> bool:
     """Whether the three channels are equal, but for the rounding of JPEG and video in one pixel of a thousand."""
-    small = scaled_down(picture, GREY_SIDE).astype(np.int32)
+    small = scaled_down(image, GRAY_SIDE).astype(np.int32)
     spread = small.max(axis=2) - small.min(axis=2)
-    rounding = 2 if picture.dtype == np.uint8 else 2 * 257
+    rounding = 2 if image.dtype == np.uint8 else 2 * 257
     return float((spread <= rounding).mean()) >= 0.999
 
 
 def scaled_down(
-    picture: Rgb, long_side: int
+    image: Rgb, long_side: int
 ) -> UInt8[np.ndarray, "rows columns 3"] | UInt16[np.ndarray, "rows columns 3"]:
-    """A picture of at most `long_side` pixels along its longer side; 0 keeps it."""
+    """An image of at most `long_side` pixels along its longer side; 0 keeps it."""
     import cv2
 
-    target = target_size((picture.shape[1], picture.shape[0]), long_side)
-    if picture.shape[1::-1] == target:
-        return picture
-    return cv2.resize(picture, target, interpolation=cv2.INTER_AREA)
+    target = target_size((image.shape[1], image.shape[0]), long_side)
+    if image.shape[1::-1] == target:
+        return image
+    return cv2.resize(image, target, interpolation=cv2.INTER_AREA)
 
 
 def target_size(size: tuple[int, int], long_side: int) -> tuple[int, int]:
@@ -92,9 +92,9 @@ def thinned(items: Sequence[Item], most: int) -> list[Item]:
     return [items[i] for i in np.linspace(0, len(items) - 1, most).round().astype(int)]
 
 
-def blank_caution(count: int, of: str) -> str:
+def blank_warning(count: int, of: str) -> str:
     """What to say about frames without contents."""
-    return f"{count} {of} show nothing (black, or one even colour) and were left out."
+    return f"{count} {of} show nothing (black, or one even color) and were left out."
 
 
 def some_names(paths: Sequence[Path], root: Path, most: int = 3) -> str:

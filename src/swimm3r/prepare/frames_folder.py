@@ -1,7 +1,7 @@
 """From a source to a complete folder of frames, and back from the folder.
 
 The folder appears when it is complete, and not before. frames.json holds name, time, split, sharpness and mask of each
-frame, and width, height, ordered, gray, masks (how many are used and unused), source and cautions of them all.
+frame, and width, height, ordered, gray, masks (how many are used and unused), source and warnings of them all.
 """
 
 import json
@@ -10,20 +10,20 @@ import os
 import shutil
 from collections.abc import Iterator
 from contextlib import contextmanager, suppress
-from dataclasses import asdict, dataclass, replace
-from hashlib import sha256
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any, Literal
 
 from swimm3r.errors import InputError
 from swimm3r.io import images
 from swimm3r.io.files.atomic import DRAFT, write_text
+from swimm3r.io.files.cache_key import cache_key, stat_digest
 from swimm3r.io.files.damage import guard, remake
 from swimm3r.io.files.json_file import read_json
 from swimm3r.io.files.safe_names import check_name, check_names, shown_name
 from swimm3r.io.video import Video
-from swimm3r.prepare.candidates import Dive, target_size
-from swimm3r.prepare.image_folder import only_video, pictures_of, prepare_stills
+from swimm3r.prepare.candidates import SelectedImages, target_size
+from swimm3r.prepare.image_folder import images_of, only_video, prepare_stills
 from swimm3r.prepare.masks import check_masks, prepare_masks
 from swimm3r.prepare.video import prepare_clip
 from swimm3r.progress import Progress, silent
@@ -48,7 +48,7 @@ def read_frames(
     check_masks(settings)
     given, source = Path(source), check_source(Path(source))
     if source != given:
-        log.info("%s holds no pictures and one video, which is taken: %s", given, source.name)
+        log.info("%s holds no images and one video, which is taken: %s", given, source.name)
     if folder is None:
         folder = _cache_folder(source, settings)
         if (folder / "frames.json").is_file():
@@ -86,7 +86,7 @@ class _Document:
     height: int
     ordered: bool
     frames: tuple[_Entry, ...]
-    cautions: tuple[str, ...] = ()
+    warnings: tuple[str, ...] = ()
     gray: bool = False
     masks: _Masks = _Masks()
 
@@ -119,7 +119,7 @@ def load_frames(folder: Path) -> Frames:
         document.width,
         document.height,
         document.ordered,
-        document.cautions,
+        document.warnings,
         gray=document.gray,
         unused_masks=document.masks.unused,
     )
@@ -141,31 +141,31 @@ def _checked(source: Path) -> Path:
     if source.is_dir():
         video = only_video(source)
         if video is None:
-            pictures_of(source)
+            images_of(source)
             return source
         source = video
     elif not source.exists():
         raise InputError(
             f"there is no {source}",
             cause="a slip in the name, or a disk that is not mounted",
-            hint="give the path of a video, or of a folder with pictures",
+            hint="give the path of a video, or of a folder with images",
         )
     elif source.suffix.lower() in images.SUFFIXES:
         raise InputError(
-            f"{source} is a single picture",
-            cause="one picture shows no depth",
-            hint="give the folder that holds the pictures of the dive",
+            f"{source} is a single image",
+            cause="one image shows no depth",
+            hint="give the folder that holds the images of the dive",
         )
     Video(source)
     return source
 
 
-def _write_frames(dive: Dive, draft: Path, source: Path, settings: FrameSettings) -> None:
+def _write_frames(dive: SelectedImages, draft: Path, source: Path, settings: FrameSettings) -> None:
     """Masks and frames.json; frames.json is the last file of the folder."""
-    cautions = list(dive.cautions)
-    size = target_size(dive.pictures[0].size, settings.long_side) if dive.pictures else (0, 0)
-    masks = prepare_masks(dive, draft, size, settings, cautions)
-    kept = [picture for picture in dive.pictures if picture.name not in masks.covered]
+    warnings = list(dive.warnings)
+    size = target_size(dive.images[0].size, settings.long_side) if dive.images else (0, 0)
+    masks = prepare_masks(dive, draft, size, settings, warnings)
+    kept = [image for image in dive.images if image.name not in masks.covered]
     if masks.covered:
         if not kept:
             raise InputError(
@@ -173,16 +173,16 @@ def _write_frames(dive: Dive, draft: Path, source: Path, settings: FrameSettings
                 cause="the masks are the wrong way round; here 0 means leave out, anything else means use",
                 hint="invert the masks, or run without them",
             )
-        cautions.append(f"{len(masks.covered)} frames were left out because their masks cover them wholly.")
+        warnings.append(f"{len(masks.covered)} frames were left out because their masks cover them wholly.")
     if len(kept) < LEAST:
         raise InputError(
             f"{source} gives {len(kept)} usable frame{'s' * (len(kept) != 1)}, and at least {LEAST} are needed",
-            cause=" ".join(cautions) or "the clip is too short, or the pictures are too few",
-            hint="more pictures with overlap, a longer clip, or a larger fps",
+            cause=" ".join(warnings) or "the clip is too short, or the images are too few",
+            hint="more images with overlap, a longer clip, or a larger fps",
         )
-    gray = all(picture.gray for picture in kept)
+    gray = all(image.gray for image in kept)
     if gray:
-        cautions.append(
+        warnings.append(
             "The frames are gray: their three channels are equal. The water's coefficients are those of one channel, "
             "and removing the water restores contrast, not color."
         )
@@ -193,17 +193,17 @@ def _write_frames(dive: Dive, draft: Path, source: Path, settings: FrameSettings
         "height": size[1],
         "ordered": dive.ordered,
         "gray": gray,
-        "masks": {"used": sum(picture.name in masks.places for picture in kept), "unused": masks.unused},
-        "cautions": cautions,
+        "masks": {"used": sum(image.name in masks.places for image in kept), "unused": masks.unused},
+        "warnings": warnings,
         "frames": [
             {
-                "name": picture.name,
-                "time": round(picture.time, 6),
+                "name": image.name,
+                "time": round(image.time, 6),
                 "split": "test" if i % TEST_EVERY == 0 else "train",
-                "sharpness": round(picture.sharpness, 3),
-                "mask": masks.places.get(picture.name),
+                "sharpness": round(image.sharpness, 3),
+                "mask": masks.places.get(image.name),
             }
-            for i, picture in enumerate(kept)
+            for i, image in enumerate(kept)
         ],
     }
     _remove_all_but(draft, {entry[key] for entry in document["frames"] for key in ("name", "mask") if entry[key]})
@@ -254,7 +254,5 @@ def _whole_folder(folder: Path) -> Iterator[Path]:
 
 def _cache_folder(source: Path, settings: FrameSettings) -> Path:
     """Where frames go that were given no folder: the same source and settings find them again."""
-    files = sorted(path for path in source.rglob("*") if os.path.isfile(path)) if source.is_dir() else [source]
-    stats = [(str(path.resolve()), path.stat().st_size, path.stat().st_mtime_ns) for path in files]
-    key = sha256(repr((stats, sorted(asdict(settings).items()))).encode()).hexdigest()[:16]
+    key = cache_key(str(source.resolve()), stat_digest(source), settings)[:16]
     return Path(os.environ.get("XDG_CACHE_HOME") or Path.home() / ".cache") / "swimm3r" / "frames" / key

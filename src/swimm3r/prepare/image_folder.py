@@ -1,4 +1,4 @@
-"""A folder of stills -> pictures of one size, upright, in order, uniquely named."""
+"""A folder of stills -> images of one size, upright, in order, uniquely named."""
 
 import os
 import shutil
@@ -13,19 +13,20 @@ from typing import TypeVar
 from swimm3r import memory
 from swimm3r.errors import InputError
 from swimm3r.io import image_folder, images
+from swimm3r.io.files.cache_key import files_below
 from swimm3r.io.files.safe_names import safe_name, shown_name
 from swimm3r.io.image_header import ImageHeader, ImageSizeError, capture_time, read_header
 from swimm3r.io.video import VIDEO_SUFFIXES
 from swimm3r.prepare.candidates import (
     BLANK,
     STEP,
-    Dive,
-    Picture,
-    blank_caution,
+    SelectedImages,
+    SourceImage,
+    blank_warning,
     is_gray,
     scaled_down,
     sharpness,
-    small_grey,
+    small_gray,
     some_names,
     thinned,
 )
@@ -42,14 +43,14 @@ Result = TypeVar("Result")
 class _Still:
     source: Path
     original: Path  # relative name
-    name: str  # of the prepared picture
+    name: str  # of the prepared image
     time: float
     linked: bool  # the original serves as it is
 
 
 @dataclass(frozen=True)
-class PictureFolder:
-    """The pictures of a folder."""
+class ImageFolder:
+    """The images of a folder."""
 
     root: Path  # names are relative to it
     paths: list[Path]
@@ -58,9 +59,9 @@ class PictureFolder:
 
 def prepare_stills(
     source: Path, draft: Path, settings: FrameSettings, progress: Progress, leave_out: Sequence[Path]
-) -> Dive:
-    """Write the frames of a folder of pictures into `draft`. Raises InputError."""
-    folder = pictures_of(source, [*leave_out, *([settings.masks] if settings.masks else [])])
+) -> SelectedImages:
+    """Write the frames of a folder of images into `draft`. Raises InputError."""
+    folder = images_of(source, [*leave_out, *([settings.masks] if settings.masks else [])])
     root, originals = folder.root, [path.relative_to(folder.root) for path in folder.paths]
     headers: dict[Path, ImageHeader] = {}
     refused: dict[Path, InputError] = {}
@@ -70,13 +71,13 @@ def prepare_stills(
         except InputError as error:
             refused[path] = error
     sizes = {path: header.size for path, header in headers.items()}
-    paths, cautions = _one_size(list(headers), sizes, root, settings)
-    paths, times, ordered = _in_time_order(paths, cautions)
+    paths, warnings = _one_size(list(headers), sizes, root, settings)
+    paths, times, ordered = _in_time_order(paths, warnings)
     chosen = thinned(list(zip(paths, times, strict=True)), settings.max_frames)
     work = _named(chosen, root, settings.long_side, headers)
     most = max((headers[path].decoding_bytes for path in paths), default=0)
     results = _in_threads(partial(_prepare_still, draft=draft, long_side=settings.long_side), work, most, progress)
-    pictures, blank = [], 0
+    images, blank = [], 0
     for still, result in zip(work, results, strict=True):
         match result:
             case InputError():
@@ -84,10 +85,10 @@ def prepare_stills(
             case None:
                 blank += 1
             case (sharp, gray):
-                pictures.append(Picture(still.name, still.original, sizes[still.source], still.time, sharp, gray))
-    cautions += _left_out(refused, folder)
+                images.append(SourceImage(still.name, still.original, sizes[still.source], still.time, sharp, gray))
+    warnings += _left_out(refused, folder)
     if blank:
-        cautions.append(blank_caution(blank, "pictures"))
+        warnings.append(blank_warning(blank, "images"))
     if settings.masks is not None:
         mask_folders = [settings.masks]
     else:
@@ -95,38 +96,38 @@ def prepare_stills(
             dict.fromkeys([root, root / MASKS, source / MASKS, *([root.parent / MASKS] * (root.name == "images"))])
         )
     files = frozenset(root.resolve() / original for original in originals)
-    return Dive(pictures, ordered, cautions, mask_folders, originals, files)
+    return SelectedImages(images, ordered, warnings, mask_folders, originals, files)
 
 
-def pictures_of(source: Path, leave_out: Sequence[Path] = ()) -> PictureFolder:
-    """The pictures of a folder: those in images/ where there is one and no picture beside it. Raises InputError."""
+def images_of(source: Path, leave_out: Sequence[Path] = ()) -> ImageFolder:
+    """The images of a folder: those in images/ where there is one and no image beside it. Raises InputError."""
     root = _root_of(source)
     outer = [path for path in leave_out if path.resolve() != root.resolve()]
-    found = image_folder.find_pictures(root, [*outer, root / MASKS])
+    found = image_folder.find_images(root, [*outer, root / MASKS])
     if found.paths:
-        return PictureFolder(root, found.paths, found.unreadable)
-    kinds = Counter(path.suffix.lower() for path in root.rglob("*") if os.path.isfile(path))
+        return ImageFolder(root, found.paths, found.unreadable)
+    kinds = Counter(path.suffix.lower() for path in files_below(root))
     instead = ", ".join(f"{count} {kind or 'nameless'}" for kind, count in kinds.most_common(4))
     raise InputError(
-        f"{source} holds no pictures" + (f", only {instead}" if instead else ": it is empty"),
-        cause="another folder was meant, or the pictures are raw files or HEIC",
+        f"{source} holds no images" + (f", only {instead}" if instead else ": it is empty"),
+        cause="another folder was meant, or the images are raw files or HEIC",
         hint=f"a folder with {', '.join(images.SUFFIXES)}; a video is given by its own path; develop raw files first",
     )
 
 
 def only_video(source: Path) -> Path | None:
-    """The one video of a folder without pictures; None where it holds pictures, or no video.
+    """The one video of a folder without images; None where it holds images, or no video.
 
     Raises InputError where there are several.
     """
     root = _root_of(source)
-    if image_folder.find_pictures(root, [root / MASKS]).paths:
+    if image_folder.find_images(root, [root / MASKS]).paths:
         return None
     videos = image_folder.find_files(source, VIDEO_SUFFIXES).paths
     if len(videos) > 1:
         raise InputError(
-            f"{source} holds no pictures and {len(videos)} videos: {some_names(videos, source, most=10)}",
-            cause="a folder stands for the pictures in it, or for its only video",
+            f"{source} holds no images and {len(videos)} videos: {some_names(videos, source, most=10)}",
+            cause="a folder stands for the images in it, or for its only video",
             hint=f"give one of the videos by its own path, such as {videos[0]}",
         )
     return videos[0] if videos else None
@@ -138,30 +139,30 @@ def _root_of(source: Path) -> Path:
     return inner if inner.is_dir() and not beside else source
 
 
-def _left_out(refused: dict[Path, InputError], folder: PictureFolder) -> list[str]:
+def _left_out(refused: dict[Path, InputError], folder: ImageFolder) -> list[str]:
     """What to say about files and folders that could not be read."""
-    cautions = []
+    warnings = []
     too_large = [error for error in refused.values() if isinstance(error, ImageSizeError)]
     damaged = [path for path, error in refused.items() if not isinstance(error, ImageSizeError)]
     if damaged:
-        cautions.append(
-            f"{len(damaged)} of {len(folder.paths)} files cannot be read as pictures and were left out "
+        warnings.append(
+            f"{len(damaged)} of {len(folder.paths)} files cannot be read as images and were left out "
             f"({some_names(damaged, folder.root)}). Copy them again if the originals are whole."
         )
     if too_large:
         more = f" (and {len(too_large) - 3} more such files)" if len(too_large) > 3 else ""
         what = "; ".join(shown_name(error.what) for error in too_large[:3])
-        cautions.append(f"{len(too_large)} of {len(folder.paths)} files were left out: {what}{more}.")
+        warnings.append(f"{len(too_large)} of {len(folder.paths)} files were left out: {what}{more}.")
     if folder.unreadable:
         names = some_names(folder.unreadable, folder.root)
-        cautions.append(f"{len(folder.unreadable)} folders may not be searched and were left out ({names}).")
-    return cautions
+        warnings.append(f"{len(folder.unreadable)} folders may not be searched and were left out ({names}).")
+    return warnings
 
 
 def _one_size(
     paths: list[Path], sizes: dict[Path, tuple[int, int]], root: Path, settings: FrameSettings
 ) -> tuple[list[Path], list[str]]:
-    """The pictures of the commonest size, and what to say about the others."""
+    """The images of the commonest size, and what to say about the others."""
     if not paths:
         return [], []
     (usual, count), *_ = Counter(sizes[path] for path in paths).most_common(1)
@@ -172,22 +173,22 @@ def _one_size(
     which += f" and {len(odd) - 5} more" if len(odd) > 5 else ""
     if settings.odd_sizes == "refuse":
         raise InputError(
-            f"the pictures are not of one size: {count} are {usual[0]}x{usual[1]}, but {which}",
-            cause="pictures of another camera, crop, or orientation in the same folder",
+            f"the images are not of one size: {count} are {usual[0]}x{usual[1]}, but {which}",
+            cause="images of another camera, crop, or orientation in the same folder",
             hint="take those out, or leave them out with --odd-sizes skip",
         )
-    return [p for p in paths if sizes[p] == usual], [f"{len(odd)} pictures of another size were left out: {which}."]
+    return [p for p in paths if sizes[p] == usual], [f"{len(odd)} images of another size were left out: {which}."]
 
 
-def _in_time_order(paths: list[Path], cautions: list[str]) -> tuple[list[Path], list[float], bool]:
-    """Sorted pictures, their times, whether neighbours were taken in turn; by the camera's clock where all carry it."""
+def _in_time_order(paths: list[Path], warnings: list[str]) -> tuple[list[Path], list[float], bool]:
+    """Sorted images, their times, whether neighbors were taken in turn; by the camera's clock where all carry it."""
     taken = [capture_time(path) for path in paths]
     known = [time for time in taken if time is not None]
     if len(known) < len(paths) or len(set(known)) < 2:
         return paths, [float(i) for i in range(len(paths))], image_folder.numbered(paths)
     order = sorted(range(len(paths)), key=known.__getitem__)  # stable: equal seconds keep the order of names
     if order != list(range(len(paths))):
-        cautions.append("The pictures are ordered by the camera's clock, which is not the order of their names.")
+        warnings.append("The images are ordered by the camera's clock, which is not the order of their names.")
     return [paths[i] for i in order], [known[i] - min(known) for i in order], True
 
 
@@ -212,24 +213,24 @@ def _named(
 
 
 def _prepare_still(still: _Still, draft: Path, long_side: int) -> tuple[float, bool] | InputError | None:
-    """Put one picture in its place: its sharpness and greyness, None where it shows nothing, or what is wrong."""
+    """Put one image in its place: its sharpness and grayness, None where it shows nothing, or what is wrong."""
     target = draft / still.name
     try:
-        picture = images.read_rgb(still.source)
+        image = images.read_rgb(still.source)
     except InputError as error:
         return error
-    grey = small_grey(picture)
-    if grey.std() < BLANK:
+    gray = small_gray(image)
+    if gray.std() < BLANK:
         return None
     if not still.linked:
-        images.write_rgb(target, scaled_down(picture, long_side))
-        return sharpness(grey), is_gray(picture)
+        images.write_rgb(target, scaled_down(image, long_side))
+        return sharpness(gray), is_gray(image)
     target.parent.mkdir(parents=True, exist_ok=True)
     try:
         os.link(still.source.resolve(), target)
     except OSError:  # another disk, or a file system without links
         shutil.copyfile(still.source, target)
-    return sharpness(grey), is_gray(picture)
+    return sharpness(gray), is_gray(image)
 
 
 def _in_threads(

@@ -1,4 +1,4 @@
-"""Masks: found by name, checked against their pictures, prepared at the size of the frames."""
+"""Masks: found by name, checked against their images, prepared at the size of the frames."""
 
 from dataclasses import dataclass
 from pathlib import Path
@@ -8,7 +8,7 @@ from jaxtyping import Bool
 
 from swimm3r.errors import InputError
 from swimm3r.io import image_folder, images
-from swimm3r.prepare.candidates import Dive, Picture, some_names
+from swimm3r.prepare.candidates import SelectedImages, SourceImage, some_names
 from swimm3r.scene.settings import FrameSettings
 
 FOLDER = "masks"  # of the prepared ones, within the folder of the frames
@@ -32,9 +32,9 @@ def check_masks(settings: FrameSettings) -> None:
 
 
 def prepare_masks(
-    dive: Dive, draft: Path, size: tuple[int, int], settings: FrameSettings, cautions: list[str]
+    dive: SelectedImages, draft: Path, size: tuple[int, int], settings: FrameSettings, warnings: list[str]
 ) -> PreparedMasks:
-    """Write the masks of the frames; says in `cautions` which masks or frames are left without their counterpart."""
+    """Write the masks of the frames; says in `warnings` which masks or frames are left without their counterpart."""
     found, unused = _find(dive, settings)
     if not found and settings.masks is not None:
         raise InputError(
@@ -43,22 +43,22 @@ def prepare_masks(
             hint="name masks NAME.png, NAME.jpg.png or NAME_mask.png after the frames",
         )
     places, covered = {}, set()
-    for picture in dive.pictures:
-        if picture.original not in found:
+    for image in dive.images:
+        if image.original not in found:
             continue
-        usable = _read(found[picture.original], picture, size)
+        usable = _read(found[image.original], image, size)
         if not usable.any():
-            covered.add(picture.name)
-        places[picture.name] = f"{FOLDER}/{picture.name}.png"  # COLMAP's way of naming
-        images.write_mask(draft / places[picture.name], usable)
-    if unused or (found and len(places) < len(dive.pictures)):
+            covered.add(image.name)
+        places[image.name] = f"{FOLDER}/{image.name}.png"  # COLMAP's way of naming
+        images.write_mask(draft / places[image.name], usable)
+    if unused or (found and len(places) < len(dive.images)):
         names = f" ({some_names(unused, unused[0].parent)})" if unused else ""
-        matched = f"Masks: {len(places)} of {len(dive.pictures)} frames have one"
-        cautions.append(f"{matched}; {len(unused)} masks match no frame{names}.")
+        matched = f"Masks: {len(places)} of {len(dive.images)} frames have one"
+        warnings.append(f"{matched}; {len(unused)} masks match no frame{names}.")
     return PreparedMasks(places, covered, len(unused))
 
 
-def _find(dive: Dive, settings: FrameSettings) -> tuple[dict[Path, Path], list[Path]]:
+def _find(dive: SelectedImages, settings: FrameSettings) -> tuple[dict[Path, Path], list[Path]]:
     """The masks of the originals, from the first folder that has one, and the masks that belong to none."""
     check_masks(settings)
     folders = [folder.resolve() for folder in dive.mask_folders if folder.is_dir()]
@@ -74,17 +74,16 @@ def _find(dive: Dive, settings: FrameSettings) -> tuple[dict[Path, Path], list[P
     return found, sorted(masks - set(found.values()))
 
 
-def _read(path: Path, picture: Picture, size: tuple[int, int]) -> Bool[np.ndarray, "h w"]:
-    """A mask at the size of the frames, where it is of the picture's size or of that. Raises InputError."""
+def _read(path: Path, image: SourceImage, size: tuple[int, int]) -> Bool[np.ndarray, "h w"]:
+    """A mask at the size of the frames, where it is of the image's size or of that. Raises InputError."""
     import cv2
 
     usable = images.read_mask(path)
     given = usable.shape[::-1]
-    if given not in (picture.size, size):
+    if given not in (image.size, size):
         raise InputError(
-            f"the mask {path} is {given[0]}x{given[1]}, "
-            f"its picture {picture.original} is {picture.size[0]}x{picture.size[1]}",
-            cause="the mask was made for a resized, cropped or turned picture",
-            hint="make the masks at the size of the pictures",
+            f"the mask {path} is {given[0]}x{given[1]}, its image {image.original} is {image.size[0]}x{image.size[1]}",
+            cause="the mask was made for a resized, cropped or turned image",
+            hint="make the masks at the size of the images",
         )
     return cv2.resize(usable.astype(np.uint8), size, interpolation=cv2.INTER_NEAREST).astype(bool)

@@ -11,11 +11,11 @@ from swimm3r.io import images
 from swimm3r.io.video import Video, VideoFrame
 from swimm3r.prepare.candidates import (
     BLANK,
-    GREY_SIDE,
+    GRAY_SIDE,
     STEP,
-    Dive,
-    Picture,
-    blank_caution,
+    SelectedImages,
+    SourceImage,
+    blank_warning,
     is_gray,
     scaled_down,
     sharpness,
@@ -25,7 +25,7 @@ from swimm3r.progress import Progress
 from swimm3r.scene.settings import FrameSettings
 
 
-def prepare_clip(source: Path, draft: Path, settings: FrameSettings, progress: Progress) -> Dive:
+def prepare_clip(source: Path, draft: Path, settings: FrameSettings, progress: Progress) -> SelectedImages:
     """Write the frames of a video into `draft`, in one pass. Raises InputError."""
     video = Video(source)
     end = settings.end if settings.end is not None else inf
@@ -47,7 +47,7 @@ def prepare_clip(source: Path, draft: Path, settings: FrameSettings, progress: P
     def bin_of(frame: VideoFrame) -> int:
         return int((frame.time - settings.start) * rate + 1e-6) if rate < inf else seen
 
-    pictures: list[Picture] = []
+    found: list[SourceImage] = []
     blank = 0
     for _, bin_frames in groupby(watched(), bin_of):
         best = _best(bin_frames, settings.pick)
@@ -55,10 +55,10 @@ def prepare_clip(source: Path, draft: Path, settings: FrameSettings, progress: P
             blank += 1
             continue
         frame, sharp = best
-        name = f"frame_{len(pictures):06d}.png"
+        name = f"frame_{len(found):06d}.png"
         rgb = scaled_down(frame.rgb(), settings.long_side)
         images.write_rgb(draft / name, rgb)
-        pictures.append(Picture(name, Path(name), (video.width, video.height), frame.time, sharp, is_gray(rgb)))
+        found.append(SourceImage(name, Path(name), (video.width, video.height), frame.time, sharp, is_gray(rgb)))
     progress(STEP, max(seen, 1), max(seen, 1))
 
     if not seen:
@@ -67,32 +67,32 @@ def prepare_clip(source: Path, draft: Path, settings: FrameSettings, progress: P
             cause="the video is shorter than that, or cut off",
             hint="a smaller start",
         )
-    cautions = [blank_caution(blank, "times of the video")] if blank else []
-    cautions += _cautions(video, last, reached)
+    warnings = [blank_warning(blank, "times of the video")] if blank else []
+    warnings += _warnings(video, last, reached)
     mask_folders = [settings.masks] if settings.masks is not None else []
-    kept = thinned(pictures, settings.max_frames)
-    return Dive(kept, True, cautions, mask_folders, [picture.original for picture in pictures])
+    kept = thinned(found, settings.max_frames)
+    return SelectedImages(kept, True, warnings, mask_folders, [image.original for image in found])
 
 
-def _cautions(video: Video, last: float, reached: float) -> list[str]:
+def _warnings(video: Video, last: float, reached: float) -> list[str]:
     """What is wrong with a video that was read up to second `reached` and should last until `last`."""
-    name, cautions = video.path.name, []
+    name, warnings = video.path.name, []
     if video.damaged:
-        cautions.append(
+        warnings.append(
             f"{video.damaged} damaged packets of {name} were passed over; frames are missing or smeared there. "
             "Copy the video again if the original is whole."
         )
     if last < inf and last - reached > max(1.0, 0.02 * last, 2 / video.rate):
-        cautions.append(
+        warnings.append(
             f"{name} should last {last:.1f} s, but ends at {reached:.1f} s: it is cut off or damaged. "
             "What decoded is used; copy it again if the original is longer."
         )
     if video.interlaced:
-        cautions.append(
-            f"{name} is interlaced, which tears moving pictures into combs. "
+        warnings.append(
+            f"{name} is interlaced, which tears moving images into combs. "
             "Deinterlace it first: ffmpeg -i IN -vf bwdif OUT.mp4"
         )
-    return cautions
+    return warnings
 
 
 def _best(frames: Iterator[VideoFrame], pick: Literal["sharpest", "uniform"]) -> tuple[VideoFrame, float] | None:
@@ -101,10 +101,10 @@ def _best(frames: Iterator[VideoFrame], pick: Literal["sharpest", "uniform"]) ->
     for frame in frames:
         if best and pick == "uniform":
             continue
-        grey = frame.grey(GREY_SIDE)
-        if grey.std() < BLANK:
+        gray = frame.gray(GRAY_SIDE)
+        if gray.std() < BLANK:
             continue
-        sharp = sharpness(grey)
+        sharp = sharpness(gray)
         if best is None or sharp > best[1]:
             best = (frame, sharp)
     return best

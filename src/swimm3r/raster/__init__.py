@@ -1,4 +1,4 @@
-"""The differentiable underwater splat rasteriser: one function, two kernels, three back ends.
+"""The differentiable underwater splat rasterizer: one function, two kernels, three back ends.
 
     I = B_inf + sum_i w_i (c_i e^{-beta_D z_i} - B_inf e^{-beta_B z_i}),   w_i = T_i alpha_i
 
@@ -52,7 +52,7 @@ def bin_primitives(
 ) -> Bins:
     """Sort primitives into 16 x 16 tiles, front to back, on their device; without gradient, and exact.
 
-    Worth calling only to rasterise the same primitives twice: `rasterize` bins by itself.
+    Worth calling only to rasterize the same primitives twice: `rasterize` bins by itself.
     """
     _check_cut(alpha_min, kernel)
     kernels = _kernels("numba" if p.mean2d.device.type == "cpu" else "warp")
@@ -72,7 +72,7 @@ def rasterize(
     medium_depth_grad: bool = True,
     backend: Backend = "auto",
 ) -> RasterOutput:
-    """Underwater image, clear image, z depth (not normalised) and alpha of one camera; differentiable in p and medium.
+    """Underwater image, clear image, z depth (not normalized) and alpha of one camera; differentiable in p and medium.
 
     `medium=None` is clear water: no veil, no attenuation. Pairs fainter than `alpha_min` are skipped; a Gaussian has no
     other end, so it needs one. `sgg` is added to in place when the gradient is taken. Without `medium_depth_grad` only

@@ -79,7 +79,7 @@ def make(jit: Any, exp2: Any, log2: Any, minimum: Any, maximum: Any, select: Any
         return vec3(exp2(k[0] * z), exp2(k[1] * z), exp2(k[2] * z))
 
     @jit
-    def seen_colour(color, binf, E_B, E_D):
+    def seen_color(color, binf, E_B, E_D):
         """F: what a primitive adds to open water, per unit of weight."""
         return vec3(
             color[0] * E_D[0] - binf[0] * E_B[0],
@@ -88,7 +88,7 @@ def make(jit: Any, exp2: Any, log2: Any, minimum: Any, maximum: Any, select: Any
         )
 
     @jit
-    def colour_slope(g, g_clear, E_D):
+    def color_slope(g, g_clear, E_D):
         """dL/dc per unit of weight."""
         return vec3(g[0] * E_D[0] + g_clear[0], g[1] * E_D[1] + g_clear[1], g[2] * E_D[2] + g_clear[2])
 
@@ -126,8 +126,8 @@ def make(jit: Any, exp2: Any, log2: Any, minimum: Any, maximum: Any, select: Any
         coverage=coverage,
         advance=advance,
         transmittance=transmittance,
-        seen_colour=seen_colour,
-        colour_slope=colour_slope,
+        seen_color=seen_color,
+        color_slope=color_slope,
         payloads=payloads,
         shape_slopes=shape_slopes,
         depth_slope=depth_slope,

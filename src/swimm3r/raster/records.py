@@ -1,6 +1,6 @@
-"""What goes into the rasteriser and what comes out: one camera's projected primitives, the water per pixel, the images.
+"""What goes into the rasterizer and what comes out: one camera's projected primitives, the water per pixel, the images.
 
-Pixel (x, y) has its centre at (x + 0.5, y + 0.5). Images are [3, H, W]; depths are camera z in the units of the betas.
+Pixel (x, y) has its center at (x + 0.5, y + 0.5). Images are [3, H, W]; depths are camera z in the units of the betas.
 """
 
 from dataclasses import dataclass
@@ -15,9 +15,9 @@ TILE = 16
 ALPHA_MIN = 1 / 255
 """Pairs fainter than this are skipped by default; the paper and the vectors cut nothing (alpha_min=0)."""
 ALPHA_MAX = 0.999
-"""Opacity of one pair is capped here; a capped pair has no gradient towards its shape (uwbs.md 1.4)."""
+"""Opacity of one pair is capped here; a capped pair has no gradient toward its shape (uwbs.md 1.4)."""
 Kernel = Literal["beta", "gaussian"]
-"""How a primitive fades from its centre: (1 - r2)^b within r2 < 1, or e^{-b r2}, which only `alpha_min` ends."""
+"""How a primitive fades from its center: (1 - r2)^b within r2 < 1, or e^{-b r2}, which only `alpha_min` ends."""
 T_MIN = 1e-4
 """A pixel ends *before* the primitive that would bring its transmittance to this or below (uwbs.md 1.5)."""
 
@@ -27,10 +27,10 @@ class Primitives2D(NamedTuple):
 
     mean2d: Float[Tensor, "n 2"]  # px
     conic: Float[Tensor, "n 3"]  # (A, B, C) of r2 = A dx^2 + 2 B dx dy + C dy^2, 1/px^2
-    color: Float[Tensor, "n 3"]  # clear (water-free) colour
+    color: Float[Tensor, "n 3"]  # clear (water-free) color
     opacity: Float[Tensor, " n"]  # 0..1, already conditioned on the view
     beta: Float[Tensor, " n"]  # b of the kernel, > 0: 4 exp of a Beta primitive's raw parameter, 1/2 of a Gaussian
-    depth: Float[Tensor, " n"]  # camera z of the centre; <= 0 or not finite: not drawn
+    depth: Float[Tensor, " n"]  # camera z of the center; <= 0 or not finite: not drawn
 
 
 class MediumMaps(NamedTuple):
@@ -46,12 +46,12 @@ class RasterOutput(NamedTuple):
 
     rgb: Float[Tensor, "3 h w"]  # with its water (Eq. ugs_render)
     clear: Float[Tensor, "3 h w"]  # without: sum_i w_i c_i
-    z_depth: Float[Tensor, "h w"]  # sum_i w_i z_i, not normalised
+    z_depth: Float[Tensor, "h w"]  # sum_i w_i z_i, not normalized
     alpha: Float[Tensor, "h w"]  # 1 - T_{K+1}
 
 
 class SggBuffers(NamedTuple):
-    """Parts of the projected-centre gradient (Alg. 1), added to in place by the adjoint; start from `zeros`.
+    """Parts of the projected-center gradient (Alg. 1), added to in place by the adjoint; start from `zeros`.
 
     The clear-object, clear-image, depth and alpha branches make `geo`, attenuation and backscatter `med`;
     geo + med is the plain gradient of mean2d. (uwbs.md 6.4)
@@ -75,7 +75,7 @@ class CpuBins:
 
     order: Int[Tensor, " drawn"]  # the primitives that may be seen, by depth
     blocks: Int[Tensor, " pairs"]  # bit 4 r + c: the ellipse may cover a pixel of the tile's 4 x 4 block (r, c)
-    slot: Int[Tensor, " pairs"]  # where this pair's gradient is kept: the pairs of one primitive are neighbours
+    slot: Int[Tensor, " pairs"]  # where this pair's gradient is kept: the pairs of one primitive are neighbors
     first_slot: Int[Tensor, " slot_bounds"]  # order[r] owns slots first_slot[r] : first_slot[r + 1]
 
 

@@ -1,4 +1,4 @@
-"""The rasteriser as the paper writes it, in torch: slow, dense, the oracle of the fast ones.
+"""The rasterizer as the paper writes it, in torch: slow, dense, the oracle of the fast ones.
 
     V(u) = sum_i T_i (e^{-beta_B z_{i-1}} - e^{-beta_B z_i}) + T_{K+1} e^{-beta_B z_K},  z_0 = 0       (Eq. ugs_veil)
     I(u) = sum_i T_i alpha_i c_i e^{-beta_D z_i} + B_inf V(u),  T_i = prod_{j<i} (1 - alpha_j)         (Eq. ugs_render)
@@ -33,7 +33,7 @@ class Blend:
 class AlphaAdjoint:
     """dL/dalpha_i by the branch it comes through (uwbs.md 6.4); the branches add up to the full adjoint."""
 
-    clear: Float[Tensor, "*pixels k"]  # the image loss, as if it looked at the water-free picture
+    clear: Float[Tensor, "*pixels k"]  # the image loss, as if it looked at the water-free image
     attenuation: Float[Tensor, "*pixels k"]
     backscatter: Float[Tensor, "*pixels k"]
     depth: Float[Tensor, "*pixels k"]  # losses on z_depth
@@ -139,7 +139,7 @@ class _Pairs:
     """Every pixel against every drawn primitive, front to back."""
 
     order: Tensor  # [k] indices of the drawn primitives
-    dx: Tensor  # [p, k] centre minus pixel
+    dx: Tensor  # [p, k] center minus pixel
     dy: Tensor
     r2: Tensor
     alpha: Tensor  # 0 where the pair is skipped

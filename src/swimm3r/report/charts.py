@@ -1,4 +1,4 @@
-"""Charts as inline SVG and pictures as data URIs: the page needs no script and no network."""
+"""Charts as inline SVG and images as data URIs: the page needs no script and no network."""
 
 import base64
 import math
@@ -18,7 +18,7 @@ class Curve:
 
     x: np.ndarray
     y: np.ndarray
-    colour: str
+    color: str
     label: str
     solid_until: float = math.inf
 
@@ -47,7 +47,7 @@ def line_chart(curves: list[Curve], x_label: str, y_label: str, width: int = 420
         for part, dash in ((seen, ""), (~seen | _boundary(seen), ' stroke-dasharray="3 4" opacity=".6"')):
             xy = zip(curve.x[part].tolist(), curve.y[part].tolist(), strict=True)
             points = " ".join(f"{px(x):.1f},{py(y):.1f}" for x, y in xy)
-            parts.append(f'<polyline points="{points}" fill="none" stroke="{curve.colour}" stroke-width="2"{dash}/>')
+            parts.append(f'<polyline points="{points}" fill="none" stroke="{curve.color}" stroke-width="2"{dash}/>')
     parts.append(_text((left + width - right) / 2, height - 6, x_label, "middle"))
     parts.append(
         f'<text x="12" y="{(height - bottom) / 2}" text-anchor="middle" fill="{_INK}" font-size="12" '
@@ -63,8 +63,8 @@ def ticks(largest: float) -> list[float]:
     return [round(float(step * i), 10) for i in range(int(largest / step + 1e-9) + 1)]
 
 
-def picture(rgb: np.ndarray, long_side: int = 640, quality: int = 88) -> str:
-    """A data URI of an RGB uint8 picture, scaled down to fit."""
+def image(rgb: np.ndarray, long_side: int = 640, quality: int = 88) -> str:
+    """A data URI of an RGB uint8 image, scaled down to fit."""
     scale = min(1.0, long_side / max(rgb.shape[:2]))
     size = (round(rgb.shape[1] * scale), round(rgb.shape[0] * scale))
     small = cv2.resize(np.ascontiguousarray(rgb), size, interpolation=cv2.INTER_AREA)
@@ -72,18 +72,18 @@ def picture(rgb: np.ndarray, long_side: int = 640, quality: int = 88) -> str:
     return "data:image/jpeg;base64," + base64.b64encode(encoded.tobytes()).decode()
 
 
-def depth_picture(z_depth: np.ndarray, near: float, far: float) -> np.ndarray:
-    """Depth in colours, RGB uint8: near warm, far cold, grey where nothing is known; even steps in inverse depth."""
+def depth_image(z_depth: np.ndarray, near: float, far: float) -> np.ndarray:
+    """Depth in colors, RGB uint8: near warm, far cold, gray where nothing is known; even steps in inverse depth."""
     known = z_depth > 0
     inverse = (1 / np.maximum(z_depth, 1e-9) - 1 / far) / max(1 / near - 1 / far, 1e-12)
-    colours = cv2.applyColorMap((inverse.clip(0, 1) * 255).astype(np.uint8), cv2.COLORMAP_TURBO)
-    colours[~known] = _UNKNOWN
-    return colours[..., ::-1]
+    colors = cv2.applyColorMap((inverse.clip(0, 1) * 255).astype(np.uint8), cv2.COLORMAP_TURBO)
+    colors[~known] = _UNKNOWN
+    return colors[..., ::-1]
 
 
 @dataclass(frozen=True)
 class PlanView:
-    """A cloud and a camera path seen along the least-extended direction: RGB uint8 pictures and the path in pixels."""
+    """A cloud and a camera path seen along the least-extended direction: RGB uint8 images and the path in pixels."""
 
     raw: np.ndarray
     restored: np.ndarray
@@ -101,9 +101,9 @@ def plan_view(
     along = forward[0] - down * (forward[0] @ down)
     along /= np.linalg.norm(along)
     axes = np.stack([along, np.cross(down, along)])
-    flat, centres = xyz @ axes.T, cam2world[:, :3, 3] @ axes.T
-    low = np.minimum(np.quantile(flat, 0.01, axis=0), centres.min(0))
-    high = np.maximum(np.quantile(flat, 0.99, axis=0), centres.max(0))
+    flat, centers = xyz @ axes.T, cam2world[:, :3, 3] @ axes.T
+    low = np.minimum(np.quantile(flat, 0.01, axis=0), centers.min(0))
+    high = np.maximum(np.quantile(flat, 0.99, axis=0), centers.max(0))
     low, high = low - 0.03 * (high - low), high + 0.03 * (high - low)
     units = float((high - low)[0] / width)
     height = int(np.clip((high - low)[1] / units, 120, 1.2 * width))
@@ -111,12 +111,12 @@ def plan_view(
     inside: np.ndarray = np.all((cells >= 0) & (cells < (width, height)), axis=1)
     order = np.argsort(-(xyz @ down))  # what is nearer to the camera is painted last
     order = order[inside[order]]
-    pictures = []
-    for colours in (raw, restored):
+    images = []
+    for colors in (raw, restored):
         canvas = np.full((height, width, 3), 255, np.uint8)
-        canvas[cells[order, 1], cells[order, 0]] = (colours[order].clip(0, 1) * 255).astype(np.uint8)
-        pictures.append(_fill_pinholes(canvas))
-    return PlanView(pictures[0], pictures[1], (centres - low) / units, units)
+        canvas[cells[order, 1], cells[order, 0]] = (colors[order].clip(0, 1) * 255).astype(np.uint8)
+        images.append(_fill_pinholes(canvas))
+    return PlanView(images[0], images[1], (centers - low) / units, units)
 
 
 def path_overlay(view: PlanView) -> str:
@@ -137,7 +137,7 @@ def path_overlay(view: PlanView) -> str:
 
 
 def _fill_pinholes(canvas: np.ndarray) -> np.ndarray:
-    """Cells that no point fell into take their neighbours' colour, so that a plan view is no lattice of dots."""
+    """Cells that no point fell into take their neighbors' color, so that a plan view is no lattice of dots."""
     empty = (canvas == 255).all(2)
     closed = cv2.erode(canvas, np.ones((3, 3), np.uint8))
     canvas[empty] = closed[empty]

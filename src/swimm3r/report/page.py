@@ -69,8 +69,8 @@ def write(folder: Path) -> Path:
     fields = dict(
         title=Path(summary["input"]["path"]).name,
         summary=summary,
-        cautions=summary.get("cautions", []),
-        pictures=_triptychs(rec, frames, folder) if rec else [],
+        warnings=summary.get("warnings", []),
+        images=_triptychs(rec, frames, folder) if rec else [],
         tests=_test_rows(frames, folder) if "test" in summary else [],
         flight=_flight(folder / "renders" / "flythrough.mp4"),
         truths=_truth_rows(summary.get("truth")),
@@ -112,9 +112,9 @@ def _triptychs(rec: Reconstruction, frames: Frames, folder: Path) -> list[Tripty
         rows.append(
             Triptych(
                 name,
-                charts.picture(raw),
-                charts.picture(images.read_rgb(restored)) if restored.is_file() else None,
-                charts.picture(charts.depth_picture(depths[name], near, far)) if name in depths else None,
+                charts.image(raw),
+                charts.image(images.read_rgb(restored)) if restored.is_file() else None,
+                charts.image(charts.depth_image(depths[name], near, far)) if name in depths else None,
             )
         )
     return rows
@@ -128,7 +128,7 @@ def _test_rows(frames: Frames, folder: Path) -> list[TestRow]:
     for name in (names[i] for i in chosen):
         taken = (frames.image(frames.index(name)).numpy() * 255).round().astype(np.uint8)
         seen = (images.read_rgb(folder / "renders" / "test" / f"{stems[name]}_{kind}.png") for kind in _KINDS)
-        rows.append(TestRow(name, charts.picture(taken, 480), *(charts.picture(picture, 480) for picture in seen)))
+        rows.append(TestRow(name, charts.image(taken, 480), *(charts.image(image, 480) for image in seen)))
     return rows
 
 
@@ -168,15 +168,15 @@ def _plan(rec: Reconstruction) -> dict[str, str]:
         rec.cloud.xyz.numpy(), rec.cloud.raw.numpy(), rec.cloud.restored.numpy(), rec.cameras.cam2world.numpy()
     )
     return {
-        "raw": charts.picture(view.raw, 760, 90),
-        "restored": charts.picture(view.restored, 760, 90),
+        "raw": charts.image(view.raw, 760, 90),
+        "restored": charts.image(view.restored, 760, 90),
         "overlay": charts.path_overlay(view),
         "unit": "metres" if rec.metric else "scene units",
     }
 
 
 def _water(rec: Reconstruction) -> dict[str, object]:
-    """The two curves a scientist looks for, in the encoding the pipeline fitted, and the open water's colour."""
+    """The two curves a scientist looks for, in the encoding the pipeline fitted, and the open water's color."""
     assert rec.medium is not None
     fit = rec.medium
     unit = "m" if rec.metric else "scene units"

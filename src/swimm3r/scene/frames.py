@@ -1,6 +1,6 @@
-"""The frames of one dive: which pictures, when they were taken, how sharp they are, which are held back for testing.
+"""The frames of one dive: which images, when they were taken, how sharp they are, which are held back for testing.
 
-Pictures stay on disk as prepared (`read_frames` makes them) and are loaded one at a time through a bounded cache. Every
+Images stay on disk as prepared (`read_frames` makes them) and are loaded one at a time through a bounded cache. Every
 eighth frame (index % 8 == 0) is a test frame, as the paper and 3DGS count; SfM and training see `train` only.
 """
 
@@ -18,31 +18,31 @@ from swimm3r.errors import InputError
 from swimm3r.io import images
 from swimm3r.io.files.cache import ArrayCache
 
-_CACHE = ArrayCache(max_bytes=1 << 30)  # 1 GiB of 8-bit pictures: 170 frames of 1080p
+_CACHE = ArrayCache(max_bytes=1 << 30)  # 1 GiB of 8-bit images: 170 frames of 1080p
 
 
 @dataclass(frozen=True)
 class Frame:
-    """One prepared picture."""
+    """One prepared image."""
 
     name: str  # unique relative path, the key of everything a run writes
     path: Path
     time: float  # seconds since the start of the clip; the index where stills carry no time
-    sharpness: float  # variance of the Laplacian of a grey copy of at most 960 px, 8-bit units
+    sharpness: float  # variance of the Laplacian of a gray copy of at most 960 px, 8-bit units
     split: Literal["train", "test"]
-    mask: Path | None = None  # picture of the same size, 0 where the frame is not to be used
+    mask: Path | None = None  # image of the same size, 0 where the frame is not to be used
 
 
 @dataclass(frozen=True)
 class Frames:
-    """The pictures of a dive in time order, all of one size."""
+    """The images of a dive in time order, all of one size."""
 
     frames: tuple[Frame, ...]
     width: int
     height: int
-    ordered: bool  # neighbours in the list are neighbours in time: true of video, a guess for stills
-    cautions: tuple[str, ...] = ()  # what was left out or looks odd, in plain words
-    gray: bool = False  # the three channels of every picture are equal
+    ordered: bool  # neighbors in the list are neighbors in time: true of video, a guess for stills
+    warnings: tuple[str, ...] = ()  # what was left out or looks odd, in plain words
+    gray: bool = False  # the three channels of every image are equal
     unused_masks: int = 0  # masks given that belong to no frame
 
     def __len__(self) -> int:
@@ -85,7 +85,7 @@ class Frames:
         return tuple(times[name] for name in names)
 
     def image(self, i: int) -> Float[Tensor, "h w 3"]:
-        """Picture i as stored (sRGB-encoded unless the input was linear), 0..1. Raises InputError on a damaged one."""
+        """Image i as stored (sRGB-encoded unless the input was linear), 0..1. Raises InputError on a damaged one."""
         path = self.frames[i].path
         (stored,) = _CACHE.get(_version(path), lambda: (images.read_rgb(path),))
         self._check_size(stored, path)
@@ -93,7 +93,7 @@ class Frames:
         return torch.from_numpy(stored.astype(np.float32)) / scale
 
     def mask(self, i: int) -> Bool[Tensor, "h w"]:
-        """True where picture i may be used; true everywhere without a mask. Raises InputError where it is damaged."""
+        """True where image i may be used; true everywhere without a mask. Raises InputError where it is damaged."""
         path = self.frames[i].mask
         if path is None:
             return torch.ones(self.height, self.width, dtype=torch.bool)
@@ -112,5 +112,5 @@ class Frames:
 
 
 def _version(path: Path) -> tuple[Path, int]:
-    """A cache key that a picture prepared anew does not share."""
+    """A cache key that an image prepared anew does not share."""
     return path, path.stat().st_mtime_ns

@@ -1,6 +1,6 @@
-"""What is known for certain about a dive: reference poses, and for synthetic dives depth, clear colours and the water.
+"""What is known for certain about a dive: reference poses, and for synthetic dives depth, clear colors and the water.
 
-On disk a folder beside the pictures: cameras.json; z_depth/NAME.npz (key z_depth), clear/NAME.png, masks/NAME.png (0
+On disk a folder beside the images: cameras.json; z_depth/NAME.npz (key z_depth), clear/NAME.png, masks/NAME.png (0
 where something moves) and medium.json where they exist. A cameras.json alone is a reference, too.
 """
 
@@ -47,7 +47,7 @@ class GroundTruth:
         return torch.from_numpy(z_depth.astype(np.float32))
 
     def clear(self, name: str) -> Float[Tensor, "h w 3"] | None:
-        """The picture without water, 0..1; None where the reference has none."""
+        """The image without water, 0..1; None where the reference has none."""
         path = self._path("clear", f"{name}.png")
         if path is None:
             return None
@@ -56,7 +56,7 @@ class GroundTruth:
         return torch.from_numpy(rgb.astype(np.float32)) / (255.0 if rgb.dtype == np.uint8 else 65535.0)
 
     def moving(self, name: str) -> Bool[Tensor, "h w"] | None:
-        """True where the picture shows something that moves; None where the reference does not say."""
+        """True where the image shows something that moves; None where the reference does not say."""
         path = self._path("masks", f"{name}.png")
         if path is None:
             return None

@@ -1,8 +1,8 @@
 """What structure from motion knows about a dive; the one record every back end fills and every later stage reads.
 
 On disk (`save`, `load`) it is a folder: sparse/ (COLMAP model), cameras.json, trajectory.tum, z_depth/NAME.npz,
-matches.npz, medium.json, points.ply (restored colours), points_raw.ply, backdrop.ply (guessed ground, restored
-colours), backdrop_raw.ply, reconstruction.json (back end, metric flag, cautions, points found). Where matches that
+matches.npz, medium.json, points.ply (restored colors), points_raw.ply, backdrop.ply (guessed ground, restored
+colors), backdrop_raw.ply, reconstruction.json (back end, metric flag, warnings, points found). Where matches that
 contradict the result were dropped, matches_unfiltered.npz has all of them: what epipolar scores are taken over.
 """
 
@@ -41,7 +41,7 @@ _MATCHES = {
 
 @dataclass(frozen=True)
 class Points:
-    """Sparse points with the colours they have in the pictures."""
+    """Sparse points with the colors they have in the images."""
 
     xyz: Float[Tensor, "p 3"]  # world, float64
     rgb: Float[Tensor, "p 3"]  # raw, 0..1
@@ -110,7 +110,7 @@ class DepthMaps:
 
 @dataclass(frozen=True)
 class DenseCloud:
-    """Dense points: their colours in the water, and with the water removed."""
+    """Dense points: their colors in the water, and with the water removed."""
 
     xyz: Float[Tensor, "n 3"]
     raw: Float[Tensor, "n 3"]  # 0..1
@@ -118,7 +118,7 @@ class DenseCloud:
 
 
 @dataclass(frozen=True)
-class Caution:
+class QualityWarning:
     """Something about the result that its user should know, in plain words."""
 
     what: str
@@ -139,9 +139,9 @@ class Reconstruction:
     metric: bool = False
     medium: MediumFit | None = None  # on pixel values as stored, what the pipeline uses
     medium_linear: MediumFit | None = None  # in linear light, what the water table shows
-    cloud: DenseCloud | None = None  # fused from the depth maps; colours averaged over each point's track
+    cloud: DenseCloud | None = None  # fused from the depth maps; colors averaged over each point's track
     backdrop: DenseCloud | None = None  # ground filmed but not measured, at a guessed depth, for maps to start on
-    cautions: tuple[Caution, ...] = ()
+    warnings: tuple[QualityWarning, ...] = ()
     points_found: int | None = None  # sparse ones, before the settings' cap; None: nothing was left out
 
     def index(self, name: str) -> int:
@@ -194,7 +194,7 @@ def save(rec: Reconstruction, frames: Frames, folder: Path) -> None:
         if cloud is not None:
             ply.write_points(folder / f"{stem}.ply", cloud.xyz.numpy(), cloud.restored.numpy())
             ply.write_points(folder / f"{stem}_raw.ply", cloud.xyz.numpy(), cloud.raw.numpy())
-    about = {"backend": rec.backend, "metric": rec.metric, "cautions": [vars(caution) for caution in rec.cautions]}
+    about = {"backend": rec.backend, "metric": rec.metric, "warnings": [vars(warning) for warning in rec.warnings]}
     about["points_found"] = rec.points_found
     write_text(folder / "reconstruction.json", json.dumps(about, indent=2) + "\n")
 
@@ -205,7 +205,7 @@ class _About:
 
     backend: str
     metric: bool
-    cautions: tuple[Caution, ...]
+    warnings: tuple[QualityWarning, ...]
     points_found: int | None = None  # earlier versions did not count
 
 
@@ -235,7 +235,7 @@ def load(folder: Path, frames: Frames | None = None) -> Reconstruction:
         medium_linear=fits.get("linear"),
         cloud=_load_cloud(folder, "points"),
         backdrop=_load_cloud(folder, "backdrop"),
-        cautions=about.cautions,
+        warnings=about.warnings,
         points_found=about.points_found,
     )
 
@@ -246,7 +246,7 @@ def _check_frames(sparse: colmap.ColmapModel, frames: Frames) -> None:
         raise ValueError(f"it places {min(unknown)}, which is no training frame of prepare/")
     if (sparse.width, sparse.height) != (frames.width, frames.height):
         raise ValueError(
-            f"its pictures have {sparse.width}x{sparse.height} pixels, the frames {frames.width}x{frames.height}"
+            f"its images have {sparse.width}x{sparse.height} pixels, the frames {frames.width}x{frames.height}"
         )
 
 

@@ -71,7 +71,7 @@ class _Summary:
     restored: dict[str, Any] | None = None
     truth: dict[str, Any] | None = None
     other_protocols: dict[str, dict[str, Any]] | None = None
-    cautions: tuple[dict[str, str], ...] = ()
+    warnings: tuple[dict[str, str], ...] = ()
 
 
 def is_run(folder: Path) -> bool:

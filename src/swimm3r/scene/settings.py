@@ -23,7 +23,7 @@ class FrameSettings(Settings):
     max_frames: CountOrZero = 0
     """Most frames, spread evenly over the dive; 0 is no limit."""
     long_side: LongSideOrOwn = 1600
-    """Larger pictures are scaled down to this many pixels along their longer side; 0 keeps them as they are."""
+    """Larger images are scaled down to this many pixels along their longer side; 0 keeps them as they are."""
     masks: Path | None = None
     """Folder of masks NAME.png, NAME.jpg.png or NAME_mask.png (0 = leave out); else masks/ in the input, if any."""
     odd_sizes: Literal["refuse", "skip"] = "refuse"

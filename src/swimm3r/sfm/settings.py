@@ -35,15 +35,15 @@ class PlaneSweepSettings(Settings):
     planes: Annotated[int, Range(32, 1024)] = 128
     """Most planes of the coarse sweep, even in inverse depth; fewer where views are close: one per pixel of motion."""
     window: Annotated[int, Range(1, 16)] = 3
-    """Half width of the coarse sweep's NCC window, in pixels of the half-size picture."""
+    """Half width of the coarse sweep's NCC window, in pixels of the half-size image."""
     noise: PositiveShare = 0.8 / 255
-    """Standard deviation of grey below which a window says nothing."""
+    """Standard deviation of gray below which a window says nothing."""
     smooth: NotNegative = 0.15
-    """Price of one plane of disagreement between neighbours in the semi-global step; a jump costs eight times that."""
+    """Price of one plane of disagreement between neighbors in the semi-global step; a jump costs eight times that."""
     rounds: Annotated[int, Range(0, 32)] = 3
     """Rounds of slanted-plane refinement at full working size."""
     smooth_fine: NotNegative = 0.05
-    """Price there of one source pixel of disagreement with the neighbours."""
+    """Price there of one source pixel of disagreement with the neighbors."""
     min_ncc: Annotated[float, Range(0, below=1)] = 0.4
     """Correlation with the sources below which a depth is dropped."""
     min_peak: NotNegative = 0.12
@@ -64,8 +64,8 @@ class TrackSettings(Settings):
 
     tolerance: Share = 0.02
     """Relative difference in z depth up to which two frames show the same point."""
-    max_colour_change: Share = 0.3
-    """Largest change of a channel between two sightings; water alone changes less between neighbouring distances."""
+    max_color_change: Share = 0.3
+    """Largest change of a channel between two observations; water alone changes less between neighboring distances."""
     max_views: Count = 12
     """Other frames in which the points of one frame are looked up."""
     min_overlap: Share = 0.1
@@ -74,7 +74,7 @@ class TrackSettings(Settings):
 
 @dataclass(frozen=True)
 class RestoreSettings(Settings):
-    """Pictures and points with the water removed (`sfm/medium/restore.py`). Values are 0..1."""
+    """Images and points with the water removed (`sfm/medium/restore.py`). Values are 0..1."""
 
     noise: PositiveShare = 0.01
     """Standard deviation of a pixel: sensor and compression."""
@@ -82,14 +82,14 @@ class RestoreSettings(Settings):
     """Standard deviation of J within a small window."""
     veil_error: PositiveShare = 0.006
     """What B(z) may be wrong by; where T_D is not well above it, J is taken from the channels that still see."""
-    colour_error: PositiveShare = 0.12
+    color_error: PositiveShare = 0.12
     """Error of J that would be accepted."""
     window: Annotated[float, Range(0.001, 0.25)] = 0.02
     """Standard deviation of the local windows, as a share of the long side."""
     max_points: Annotated[int, Range(100)] = 500_000
     """Of the restored cloud, thinned by voxels."""
     white_balance: bool = True
-    """Grey-world gains, one triple per dive, on the images made for looking at (restored/, clear renders); points, the
+    """Gray-world gains, one triple per dive, on the images made for looking at (restored/, clear renders); points, the
     images in restored_physical/ and all scores stay physical."""
 
 
@@ -103,8 +103,8 @@ class SeathruSettings(Settings):
     open_water_pixels: Count = 2_000
     """Most pixels of open water taken from one frame."""
     patch_pixels: Positive = 12.0
-    """Edge of a patch of surface, in pixels of its farthest sighting; at most 1/32 of the picture's long side."""
-    patch_sightings: Count = 6
+    """Edge of a patch of surface, in pixels of its farthest observation; at most 1/32 of the image's long side."""
+    patch_observations: Count = 6
     """Fewest pixels of a patch in a frame."""
     patch_offset: NotNegative = 0.15
     """Largest distance between the centroids of a patch and of what a frame shows of it, in edges."""
@@ -117,21 +117,21 @@ class SeathruSettings(Settings):
     """J of the darkest 1 %: black things are rarely quite black."""
     dark_reflectance_std: PositiveShare = 0.03
     lsac_f: Positive = 2.0
-    """Sea-Thru's f: the illuminant is f times the local average colour, so surfaces reflect 1 / f on average."""
+    """Sea-Thru's f: the illuminant is f times the local average color, so surfaces reflect 1 / f on average."""
     mean_reflectance_std: Positive = 0.5
-    """Of ln(1 / f) for a whole dive: what the grey-world guess is worth."""
+    """Of ln(1 / f) for a whole dive: what the gray-world guess is worth."""
     average_std: Positive = 0.3
-    """Of the ln of one range bin's average colour."""
+    """Of the ln of one range bin's average color."""
     slope_std: Positive = 0.1
     """Of b times the median depth in beta_D(z) = a exp(b z)."""
     open_water_std: PositiveShare = 0.01
-    far_colour_std: PositiveShare = 0.2
-    """How far Binf may be from the mean colour of the farthest tenth, where no open water is in view."""
+    far_color_std: PositiveShare = 0.2
+    """How far Binf may be from the mean color of the farthest tenth, where no open water is in view."""
     min_open_water: Count = 200
     min_samples: Count = 500
     min_tracks: Count = 100
     min_depth_ratio: Annotated[float, Range(1)] = 1.05
-    """Farthest over nearest sighting of a point that enters the fit."""
+    """Farthest over nearest observation of a point that enters the fit."""
     black: Share = 0.002
     saturated: Share = 0.98
     max_observations: Count = 200_000
@@ -142,7 +142,7 @@ class SeathruSettings(Settings):
     """Residuals beyond it count as outliers."""
     reweightings: Annotated[int, Range(1, 100)] = 6
     depth_error: Share = 0.01
-    """Relative error of one sighting's ray depth, beyond what all sightings of a point share."""
+    """Relative error of one observation's ray depth, beyond what all observations of a point share."""
     gain_std: Share = 0.1
     """First guess of how much exposure and white balance vary between frames; then estimated."""
     gain_evidence: Share = 0.85
@@ -163,8 +163,8 @@ class FeatureSettings(Settings):
     """Contrast a keypoint needs, of 1; COLMAP's 0.0067 starves in haze."""
     faint_threshold: PositiveShare = 0.001
     """The same for frames that yield fewer than `count`: it places 14 of ruie_murky's 14 frames, not 12."""
-    equalise: Annotated[float, Range(0, 1000)] = 0.0
-    """Clip limit of the local contrast equalisation (CLAHE) before detection; 0 leaves pictures as they are."""
+    equalize: Annotated[float, Range(0, 1000)] = 0.0
+    """Clip limit of the local contrast equalization (CLAHE) before detection; 0 leaves images as they are."""
     long_side: LongSide = 1000
     """Larger frames are reduced to this many pixels for detection."""
     max_ratio: PositiveShare = 0.8
@@ -217,10 +217,10 @@ class ColmapSettings(Settings):
     housing: Literal["none", "flat", "dome"] = "none"
     """A flat port lengthens the focal length by water's 1.333; given and assumed ones are multiplied by it."""
     pairs: Literal["auto", "exhaustive", "sequential"] = "auto"
-    """Auto: every pair up to `exhaustive_to` frames; above, neighbours in time (video) and frames that look alike."""
+    """Auto: every pair up to `exhaustive_to` frames; above, neighbors in time (video) and frames that look alike."""
     exhaustive_to: CountOrZero = 60
     overlap: CountOrZero = 10
-    """Neighbours in time each frame is matched with, and some at doubling distances."""
+    """Neighbors in time each frame is matched with, and some at doubling distances."""
     loops: CountOrZero = 6
     """Frames elsewhere in the clip that look most alike (VLAD), matched with each frame; 5 times that for stills."""
     threads: Threads = 0
@@ -245,14 +245,14 @@ class Mast3rSettings(Settings):
     similarity: Literal["cosine", "asmk"] = "cosine"
     """How frames that look alike are found, from the encoder's tokens; asmk needs mast3r-retrieval and its codebook."""
     size: NetworkSide = 512
-    """Long side of the pictures the network sees; it was trained at 512."""
+    """Long side of the images the network sees; it was trained at 512."""
     square_ok: bool = False
-    """Square pictures stay square; else they lose a quarter of their height, as in training."""
+    """Square images stay square; else they lose a quarter of their height, as in training."""
     device: Literal["auto", "cpu", "cuda", "mps"] = "auto"
     precision: Literal["float32", "bfloat16", "float16"] = "float32"
     """Of the network's trunk; its heads are always float32."""
     camera: Literal["PINHOLE", "SIMPLE_RADIAL", "OPENCV", "OPENCV_FISHEYE"] = "PINHOLE"
-    """One lens for the whole clip; its distortion is removed before the network sees a picture."""
+    """One lens for the whole clip; its distortion is removed before the network sees an image."""
     focal: Positive | None = None
     """Focal length, pixels of the prepared frames, in water: where the alignment starts from; `alignment.intrinsics`
     says whether it stays there. A lens with distortion stays."""
@@ -269,11 +269,11 @@ class Mast3rSettings(Settings):
     min_matches: Count = 16
     """Pairs with fewer matches than this are taken for strangers: a few pixels agree by chance."""
     min_share: Share = 0.9
-    """Share of the frames that must hang together through matches; the few others are left out, under a caution."""
+    """Share of the frames that must hang together through matches; the few others are left out, under a warning."""
     max_matches: Count = 2_000_000
     """Of all pairs together in the alignment, drawn evenly from each: what bounds its memory, not its accuracy."""
     max_error: Positive = 3.0
-    """Pixels of the network's picture that a match may miss its point by; others are no tracks and not exported."""
+    """Pixels of the network's image that a match may miss its point by; others are no tracks and not exported."""
     max_points: Annotated[int, Range(100)] = 200_000
     """Sparse points that are kept, those seen in most frames first."""
     min_confidence: NotNegative = 1.5

@@ -41,7 +41,7 @@ class FrameMatches:
 
 @dataclass(frozen=True)
 class MatchTracks:
-    """p points and their o sightings, at most one per frame; sightings of one point stand together."""
+    """p points and their o observations, at most one per frame; observations of one point stand together."""
 
     xyz: Float[Tensor, "p 3"]
     point: Int64[Tensor, " o"]
@@ -52,7 +52,7 @@ class MatchTracks:
 def reprojection_errors(
     cameras: Cameras, frame: Int64[Tensor, " m"], xy: Float[Tensor, "m 2"], xyz: Float[Tensor, "m 3"]
 ) -> Float[Tensor, " m"]:
-    """Pixels between sightings and the projections of their points, each in its own camera; infinite behind it."""
+    """Pixels between observations and the projections of their points, each in its own camera; infinite behind it."""
     order = torch.argsort(frame, stable=True)
     bounds = torch.searchsorted(frame[order], torch.arange(len(cameras) + 1))
     errors = torch.full((len(frame),), torch.inf, dtype=torch.float64)
@@ -72,7 +72,7 @@ def consistent(matches: FrameMatches, cameras: Cameras, max_error: float) -> Boo
 
 
 def join(matches: FrameMatches, width: int, height: int) -> MatchTracks:
-    """The connected components of matches over pictures of one size."""
+    """The connected components of matches over images of one size."""
     pixels = width * height
     ends = [
         f * pixels + xy[:, 1] * width + xy[:, 0] for f, xy in ((matches.i, matches.xy_i), (matches.j, matches.xy_j))
@@ -101,7 +101,7 @@ def join(matches: FrameMatches, width: int, height: int) -> MatchTracks:
 
 
 def without(tracks: MatchTracks, dropped: Bool[Tensor, " o"]) -> MatchTracks:
-    """Without some sightings, then without points seen in fewer than 2 frames."""
+    """Without some observations, then without points seen in fewer than 2 frames."""
     seen = torch.bincount(tracks.point[~dropped], minlength=len(tracks.xyz))
     return _selected(tracks, torch.nonzero(seen >= 2)[:, 0], ~dropped)
 
@@ -115,27 +115,27 @@ def most_seen(tracks: MatchTracks, most: int) -> MatchTracks:
     return _selected(tracks, chosen, torch.ones(len(tracks.point), dtype=torch.bool))
 
 
-def _selected(tracks: MatchTracks, points: Int64[Tensor, " k"], sightings: Bool[Tensor, " o"]) -> MatchTracks:
-    """Some of the points with some of their sightings."""
+def _selected(tracks: MatchTracks, points: Int64[Tensor, " k"], observations: Bool[Tensor, " o"]) -> MatchTracks:
+    """Some of the points with some of their observations."""
     number = torch.full((len(tracks.xyz),), -1)
     number[points] = torch.arange(len(points))
-    kept = sightings & (number[tracks.point] >= 0)
+    kept = observations & (number[tracks.point] >= 0)
     return MatchTracks(tracks.xyz[points], number[tracks.point[kept]], tracks.frame[kept], tracks.xy[kept])
 
 
 def as_points(
     tracks: MatchTracks, xy: Float[Tensor, "o 2"], cameras: Cameras, frames: Frames, order: Sequence[int]
 ) -> tuple[Points, Tracks]:
-    """Points with colours and errors, and their tracks; `xy` and cameras are of the prepared frames, of which
+    """Points with colors and errors, and their tracks; `xy` and cameras are of the prepared frames, of which
     `frames.image(order[k])` is the k-th."""
     error = reprojection_errors(cameras, tracks.frame, xy, tracks.xyz[tracks.point])
     seen = torch.bincount(tracks.point, minlength=len(tracks.xyz)).clamp(min=1)
     mean = torch.zeros(len(tracks.xyz), dtype=torch.float64).index_add_(0, tracks.point, error) / seen
-    colour = torch.zeros(len(tracks.xyz), 3)
+    color = torch.zeros(len(tracks.xyz), 3)
     x = xy[:, 0].long().clamp(0, frames.width - 1)
     y = xy[:, 1].long().clamp(0, frames.height - 1)
     for k, i in enumerate(order):
         rows = tracks.frame == k
-        colour.index_add_(0, tracks.point[rows], frames.image(i)[y[rows], x[rows]])
-    points = Points(tracks.xyz, colour / seen[:, None], mean)
+        color.index_add_(0, tracks.point[rows], frames.image(i)[y[rows], x[rows]])
+    points = Points(tracks.xyz, color / seen[:, None], mean)
     return points, Tracks(tracks.point, tracks.frame, xy.double())

@@ -34,12 +34,12 @@ class GaussianInitialSettings(Settings):
     """Points of the cloud and its backdrop that become primitives, one per voxel."""
     backdrop: Share = 0.2
     """Largest share of them that lies on ground whose depth is a guess."""
-    colours: Literal["restored", "raw"] = "raw"
+    colors: Literal["restored", "raw"] = "raw"
     """As filmed, or without the water for maps that have one."""
     harmonics: Annotated[int, Range(0, 3)] = 3
-    """Degree of the colours' spherical harmonics."""
+    """Degree of the colors' spherical harmonics."""
     scale: Annotated[float, Range(1e-3, 1e3)] = 1.0
-    """In root mean square distances to the 3 nearest neighbours."""
+    """In root mean square distances to the 3 nearest neighbors."""
     opacity: Opacity = 0.1
 
 
@@ -67,10 +67,10 @@ class GaussianRates(Settings):
     quaternion: Rate = 1e-3
     scale: Rate = 5e-3
     opacity: Rate = 5e-2
-    colour: Rate = 2.5e-3
+    color: Rate = 2.5e-3
     harmonics: Rate = 1.25e-4
-    haste: Annotated[float, Range(0, 4)] = 0.5
-    """In runs shorter than the published one the rates of positions, rotations and colours grow with its length over
+    short_run_rate_exponent: Annotated[float, Range(0, 4)] = 0.5
+    """In runs shorter than the published one the rates of positions, rotations and colors grow with its length over
     theirs to this power, at most fourfold; 0 keeps them. UWBS's `fast` preset has rates raised by as much, and 400
     steps of Gaussian MCMC on ruie_green_rock gain 1.2 dB by it on frames held back."""
 
@@ -81,15 +81,15 @@ class GaussianSettings(Settings):
 
     iterations: Count = 30_000
     long_side: LongSideOrOwn = 1600
-    """Longer side of the training pictures, pixels; they are never enlarged."""
+    """Longer side of the training images, pixels; they are never enlarged."""
     working_depth: Annotated[float, Range(1e-3, 1e6)] = 3.0
     """Median depth, working units, that a scene without metric scale is given while it is trained."""
-    max_primitives: MapSize = 800_000
+    cap_max: MapSize = 800_000
     initial: GaussianInitialSettings = field(default_factory=GaussianInitialSettings)
     render: GaussianRenderSettings = field(default_factory=GaussianRenderSettings)
     rates: GaussianRates = field(default_factory=GaussianRates)
     degree_every: Cadence = 1 / 30
-    """Share of the run between two degrees of the colours' harmonics."""
+    """Share of the run between two degrees of the colors' harmonics."""
     poses: TrainingPoseSettings = field(default_factory=TrainingPoseSettings)
     seed: Seed = 0
     log_every: Cadence = 0.005
@@ -103,16 +103,16 @@ class GaussianSettings(Settings):
 
 @dataclass(frozen=True)
 class McmcSettings(Settings):
-    """Relocation, growth and noise (3DGS-MCMC), with its regularisers."""
+    """Relocation, growth and noise (3DGS-MCMC), with its regularizers."""
 
-    begin: Share = 1 / 60  # 500 of 30,000
-    end: Share = 5 / 6  # 25,000 of 30,000
-    every: Cadence = 1 / 300  # 100 of 30,000
-    min_every: Count = 20
-    """Fewest steps between two rounds, whatever `every` says; growth is made up for."""
+    refine_start: Share = 1 / 60  # 500 of 30,000
+    refine_stop: Share = 5 / 6  # 25,000 of 30,000
+    refine_every: Cadence = 1 / 300  # 100 of 30,000
+    min_refine_every: Count = 20
+    """Fewest steps between two rounds, whatever `refine_every` says; growth is made up for."""
     growth: Annotated[float, Range(1, 2)] = 1.05
-    """Per round at `every`."""
-    dead_opacity: Opacity = 0.005
+    """Per round at `refine_every`."""
+    min_opacity: Opacity = 0.005
     noise: NotNegative = 5e5
     """Times the positions' learning rate, with every step."""
 
@@ -142,20 +142,20 @@ class McmcGsSettings(GaussianSettings):
 class AbsGradSettings(Settings):
     """Multiplication by absolute gradients, culls, and cuts of the opacities (WaterSplatting)."""
 
-    begin: Share = 1 / 30  # 500 of 15,000
-    end: Share = 2 / 3  # 10,000 of 15,000
-    every: Cadence = 1 / 150  # 100 of 15,000
-    min_every: Count = 40
-    """Fewest steps between two rounds, whatever `every` says: a round needs its views."""
-    pull: NotNegative = 8e-4
-    """Least mean gradient of a projected centre, in half pictures."""
-    large: NotNegative = 1e-3
+    refine_start: Share = 1 / 30  # 500 of 15,000
+    refine_stop: Share = 2 / 3  # 10,000 of 15,000
+    refine_every: Cadence = 1 / 150  # 100 of 15,000
+    min_refine_every: Count = 40
+    """Fewest steps between two rounds, whatever `refine_every` says: a round needs its views."""
+    grow_grad2d: NotNegative = 8e-4
+    """Least mean gradient of a projected center, in half images."""
+    grow_scale3d: NotNegative = 1e-3
     """Scale from which on a Gaussian is split instead of doubled, in radii of the cameras' path."""
-    least_opacity: Share = 0.5
+    prune_opacity: Share = 0.5
     """Fainter Gaussians are culled by a round,"""
-    least_opacity_late: Share = 0.1
+    prune_opacity_late: Share = 0.1
     """and these after the last."""
-    largest: Positive = 10.0
+    prune_scale3d: Positive = 10.0
     """Scale above which they are culled, in radii of the cameras' path."""
     reset_every: Share = 1 / 30  # 500 of 15,000
     """Share of the run between two cuts of the opacities; 0 for none."""
@@ -177,7 +177,7 @@ class WaterSplattingSettings(GaussianSettings):
     """Gaussians in water that a network knows for every direction."""
 
     iterations: Count = 15_000
-    initial: GaussianInitialSettings = field(default_factory=lambda: GaussianInitialSettings(colours="restored"))
+    initial: GaussianInitialSettings = field(default_factory=lambda: GaussianInitialSettings(colors="restored"))
     medium: MediumFieldSettings = field(
         default_factory=lambda: MediumFieldSettings(layers=1, activation="sigmoid", biases=False, begin=0.0)
     )
@@ -188,7 +188,7 @@ class WaterSplattingSettings(GaussianSettings):
     densify: AbsGradSettings = field(default_factory=AbsGradSettings)
     degree_every: Cadence = 1 / 15
     first_divisor: Annotated[int, Range(1, 64)] = 4
-    """By how much the training pictures are smaller at first,"""
+    """By how much the training images are smaller at first,"""
     double_every: Cadence = 0.2  # 3,000 of 15,000
     """and the share of the run after which they double."""
 
@@ -197,21 +197,21 @@ class WaterSplattingSettings(GaussianSettings):
 class GradientSettings(Settings):
     """Multiplication by gradients, culls, and cuts of the opacities (3DGS)."""
 
-    begin: Share = 1 / 60  # 500 of 30,000
-    end: Share = 0.5  # 15,000 of 30,000
-    every: Cadence = 1 / 300  # 100 of 30,000
-    min_every: Count = 40
-    """Fewest steps between two rounds, whatever `every` says: a round needs its views."""
-    pull: NotNegative = 2e-4
-    """Least mean gradient of a projected centre, in half pictures."""
-    large: NotNegative = 0.01
+    refine_start: Share = 1 / 60  # 500 of 30,000
+    refine_stop: Share = 0.5  # 15,000 of 30,000
+    refine_every: Cadence = 1 / 300  # 100 of 30,000
+    min_refine_every: Count = 40
+    """Fewest steps between two rounds, whatever `refine_every` says: a round needs its views."""
+    grow_grad2d: NotNegative = 2e-4
+    """Least mean gradient of a projected center, in half images."""
+    grow_scale3d: NotNegative = 0.01
     """Scale from which on a Gaussian is split instead of doubled, in radii of the cameras' path."""
-    least_opacity: Share = 0.005
+    prune_opacity: Share = 0.005
     """Fainter Gaussians are culled,"""
-    largest: Positive = 0.1
+    prune_scale3d: Positive = 0.1
     """and, after the first cut, those of larger scales, in radii of the cameras' path,"""
     largest_radius: Positive = 20.0
-    """or of larger radius in a training picture, pixels."""
+    """or of larger radius in a training image, pixels."""
     reset_every: Share = 0.1  # 3,000 of 30,000
     """Share of the run between two cuts of the opacities; 0 for none."""
     reset_opacity: Opacity = 0.01
@@ -226,18 +226,18 @@ class SeaSplatWeights(Settings):
     far: NotNegative = 1.0
     """Of the error in proportion to depth."""
     background: NotNegative = 0.01
-    """Of what covers pixels that have the colour of the open water."""
+    """Of what covers pixels that have the color of the open water."""
     background_distance: Positive = 0.2 * 3**0.5
-    """Largest distance in RGB of a colour that counts as such."""
+    """Largest distance in RGB of a color that counts as such."""
     smooth_depth: NotNegative = 2.0
-    grey: NotNegative = 0.1
+    gray: NotNegative = 0.1
     saturation: NotNegative = 2.0
     saturated: NotNegative = 0.7
-    """Clear colours are to be darker than this."""
+    """Clear colors are to be darker than this."""
     dark: NotNegative = 1.0
     """Of the light left when the backscatter is taken away,"""
     negative: NotNegative = 1000.0
-    """and of backscatter beyond the picture, in units of the former."""
+    """and of backscatter beyond the image, in units of the former."""
 
 
 @dataclass(frozen=True)
@@ -250,8 +250,8 @@ class SceneWaterSettings(Settings):
     """Of Adam, for water and background."""
     first_burst: Annotated[float, Range(0, 10)] = 1 / 30
     """Steps of the water alone when it comes, 1,000, as a share of the run, which does not count them;"""
-    colour_burst: Annotated[float, Range(0, 10)] = 1 / 15
-    """then of the colours alone, 2,000."""
+    color_burst: Annotated[float, Range(0, 10)] = 1 / 15
+    """then of the colors alone, 2,000."""
     every: Cadence = 1 / 300
     """Share of the run between two more bursts of the water, 100 steps,"""
     burst: Annotated[float, Range(0, 10)] = 0.5

@@ -2,7 +2,7 @@
 
 map.safetensors (`schema` 1) holds the primitives as stored (before activation), the water, and in its header
 the recipe, its settings, the metric flag, the working unit and when the clip begins and ends; also the training
-frames' poses where they were refined. A checkpoint adds the optimiser's moments and the step.
+frames' poses where they were refined. A checkpoint adds the optimizer's moments and the step.
 """
 
 from collections.abc import Mapping
@@ -20,7 +20,7 @@ from swimm3r.settings_document import from_document, to_document
 from swimm3r.splat.parts import parts_of
 from swimm3r.splat.primitives.kinds import primitives_from
 from swimm3r.splat.rendering import SplatMap
-from swimm3r.splat.settings import RECIPES, Recipe, recipe_of, settings_of
+from swimm3r.splat.settings import RECIPES, RecipeName, recipe_of, settings_of
 from swimm3r.splat.training_poses import RefinedPoses
 
 SCHEMA = 1
@@ -73,7 +73,7 @@ def load_map(path: Path) -> SplatMap:
     stored = read_tensors(path, _MapHeader, remedy, SCHEMA)
     about = stored.about
     with guard(path, remedy):
-        settings = from_document(about.settings, settings_of(cast(Recipe, about.recipe)))
+        settings = from_document(about.settings, settings_of(cast(RecipeName, about.recipe)))
         parts = parts_of(settings)
         field, primitives = parts.field, primitives_from(stored.tensors, parts.primitives, "primitives.")
         try:

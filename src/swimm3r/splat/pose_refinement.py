@@ -3,8 +3,8 @@
     cam2world' = cam2world [R(w) | length v]
 
 with a 9-vector (v, w), zero at first, w added to the 6D form of the identity. The loss is the mean absolute difference
-to the picture over its edges: pixels whose Scharr gradient exceeds a few medians. It has a minimum within a few pixels
-only, so that smaller pictures are looked at first.
+to the image over its edges: pixels whose Scharr gradient exceeds a few medians. It has a minimum within a few pixels
+only, so that smaller images are looked at first.
 """
 
 from dataclasses import dataclass, replace
@@ -20,19 +20,19 @@ from swimm3r.splat.primitives.beta import select
 from swimm3r.splat.primitives.kinds import Primitives
 from swimm3r.splat.projection.dispatch import project
 from swimm3r.splat.projection.pinhole import pinhole
-from swimm3r.splat.rendering import SplatMap, in_scene_units, memory_for_views, pictures
+from swimm3r.splat.rendering import SplatMap, images, in_scene_units, memory_for_views
 from swimm3r.splat.settings import PoseRefinementSettings
 from swimm3r.splat.training_poses import moved
 from swimm3r.splat.views import undistorted
 
 _DARK = 0.01  # sum of R, G, B below which a pixel is not looked at
-_SMALLEST = 60  # pixels of the longer side, below which a picture no longer tells a pose
-_MARGIN = 0.25  # of the picture, within which primitives outside it are kept: the pose moves
+_SMALLEST = 60  # pixels of the longer side, below which an image no longer tells a pose
+_MARGIN = 0.25  # of the image, within which primitives outside it are kept: the pose moves
 
 
 @dataclass(frozen=True)
 class RefinedPose:
-    """A camera after refinement, and how well it explains its picture."""
+    """A camera after refinement, and how well it explains its image."""
 
     camera: Cameras  # as given, with another pose
     start_loss: float  # mean absolute difference over the edges, 0..1
@@ -43,21 +43,21 @@ class RefinedPose:
 def refine_pose(
     scene: SplatMap,
     camera: Cameras,
-    picture: Float[Tensor, "h w 3"],
+    image: Float[Tensor, "h w 3"],
     mask: Bool[Tensor, "h w"],
     settings: PoseRefinementSettings | None = None,
     progress: Progress = silent,
     time: float | None = None,
 ) -> RefinedPose:
-    """The pose near `camera`'s from which the map looks most like the picture; the given one where none looks better.
+    """The pose near `camera`'s from which the map looks most like the image; the given one where none looks better.
 
-    `picture` and `mask` are the frame as prepared, distortion included; `time` is when it was taken, seconds.
+    `image` and `mask` are the frame as prepared, distortion included; `time` is when it was taken, seconds.
     """
     settings = settings or PoseRefinementSettings()
     delta = torch.zeros(9, requires_grad=True)
     whole = camera.pinhole(scene.settings.long_side)
     sides = sizes(settings, max(whole.width, whole.height))
-    looks = [_Look(scene, camera, picture, mask, settings, side, time) for side in sides]
+    looks = [_Look(scene, camera, image, mask, settings, side, time) for side in sides]
     with torch.no_grad():
         start = float(looks[-1].loss(delta))
     done = 0
@@ -78,13 +78,13 @@ def refine_pose(
 
 
 class _Look:
-    """A camera's picture at one size, and how far the map is from it where the camera has moved to."""
+    """A camera's image at one size, and how far the map is from it where the camera has moved to."""
 
     def __init__(
         self,
         scene: SplatMap,
         camera: Cameras,
-        picture: Float[Tensor, "h w 3"],
+        image: Float[Tensor, "h w 3"],
         mask: Bool[Tensor, "h w"],
         settings: PoseRefinementSettings,
         long_side: int,
@@ -92,7 +92,7 @@ class _Look:
     ) -> None:
         self._scene, self._now = scene, scene.moment(time)
         self._canvas = camera.pinhole(long_side)
-        target, seen = undistorted(picture, mask, camera, self._canvas)
+        target, seen = undistorted(image, mask, camera, self._canvas)
         self._target, self._wanted = target.to(scene.device), edges(target, seen, settings).to(scene.device)
         self._units = in_scene_units(scene.settings, scene.length)
         self._primitives = in_sight(scene, self._canvas, self._now)
@@ -104,13 +104,13 @@ class _Look:
     def loss(self, delta: Float[Tensor, "9"]) -> Float[Tensor, ""]:
         """Mean absolute difference over the edges."""
         view = pinhole(replace(self._canvas, cam2world=self.pose(delta)[None])).to(self._scene.device)
-        rgb = pictures(self._primitives, self._scene.field, view, self._units, self._now).rgb
+        rgb = images(self._primitives, self._scene.field, view, self._units, self._now).rgb
         off = (rgb.permute(1, 2, 0) - self._target).abs().mean(-1)
         return (off * self._wanted).sum() / self._wanted.sum()
 
 
 def sizes(settings: PoseRefinementSettings, long_side: int) -> list[int]:
-    """Longer sides of the pictures that are compared in turn; `long_side` is the map's own."""
+    """Longer sides of the images that are compared in turn; `long_side` is the map's own."""
     largest = min(settings.long_side or long_side, long_side)
     return [largest >> k for k in range(settings.halvings, 0, -1) if largest >> k >= _SMALLEST] + [largest]
 
@@ -123,11 +123,11 @@ def ends(steps: int, count: int) -> list[int]:
 def edges(
     target: Float[Tensor, "h w 3"], seen: Bool[Tensor, "h w"], settings: PoseRefinementSettings
 ) -> Bool[Tensor, "h w"]:
-    """The pixels that tell a pose: strong gradients; every pixel where the picture has too few of them."""
+    """The pixels that tell a pose: strong gradients; every pixel where the image has too few of them."""
     import cv2
 
-    grey = target.mean(-1).numpy()
-    gradient = np.hypot(cv2.Scharr(grey, cv2.CV_32F, 1, 0), cv2.Scharr(grey, cv2.CV_32F, 0, 1))
+    gray = target.mean(-1).numpy()
+    gradient = np.hypot(cv2.Scharr(gray, cv2.CV_32F, 1, 0), cv2.Scharr(gray, cv2.CV_32F, 0, 1))
     usable = seen & (target.sum(-1) > _DARK)
     strong = usable & torch.from_numpy(gradient > settings.edge * np.median(gradient))
     return strong if int(strong.sum()) >= settings.min_edges * strong.numel() else usable

@@ -1,4 +1,4 @@
-"""A trained map and its pictures: with the water, without it, the water alone, and depth."""
+"""A trained map and its images: with the water, without it, the water alone, and depth."""
 
 import copy
 from dataclasses import dataclass, replace
@@ -33,7 +33,7 @@ from swimm3r.splat.training_poses import RefinedPoses
 from swimm3r.splat.views import moment
 
 _SEEN = 1e-3  # alpha below which a pixel has no depth
-_COVERED = 0.5  # alpha from which on a pixel's clear colour is that of a surface
+_COVERED = 0.5  # alpha from which on a pixel's clear color is that of a surface
 
 
 @dataclass(frozen=True)
@@ -41,7 +41,7 @@ class RenderOutput:
     """One view of a map."""
 
     rgb: Float[Tensor, "h w 3"]  # as the camera sees it
-    clear: Float[Tensor, "h w 3"]  # J, without the water: the colour of what covers a pixel; black where nothing does
+    clear: Float[Tensor, "h w 3"]  # J, without the water: the color of what covers a pixel; black where nothing does
     backscatter: Float[Tensor, "h w 3"]  # Binf V, the light of the water alone (Eq. ugs_veil)
     z_depth: Float[Tensor, "h w"]  # expected, scene units; 0 where nothing is
     alpha: Float[Tensor, "h w"]
@@ -77,7 +77,7 @@ class SplatMap:
     def render(self, camera: Cameras, time: float | None = None) -> RenderOutput:
         """The view of one pinhole camera at a time of the clip (seconds; static maps need none), without gradient.
 
-        The pictures are where the camera is, on the processor as a rule, wherever the map may be.
+        The images are where the camera is, on the processor as a rule, wherever the map may be.
 
         Raises ValueError where the camera has distortion, or where a dynamic map is given no time.
         """
@@ -96,12 +96,12 @@ class SplatMap:
 
 @dataclass(frozen=True)
 class Drawing:
-    """A view as the rasteriser makes it, channels first, with what the losses need."""
+    """A view as the rasterizer makes it, channels first, with what the losses need."""
 
     images: RasterOutput
     projection: Projection
     grid: FieldGrid
-    maps: MediumMaps | None  # as the rasteriser reads them, per unit of z depth; None in clear water
+    maps: MediumMaps | None  # as the rasterizer reads them, per unit of z depth; None in clear water
     sgg: SggBuffers | None  # filled when the gradient is taken
     time: Float[Tensor, ""] | None = None  # that primitives were conditioned on
 
@@ -114,7 +114,7 @@ def draw(
     time: Float[Tensor, ""] | None = None,
     sgg: bool = False,
 ) -> Drawing:
-    """Project, evaluate the water and rasterise; differentiable in everything but time, the pose included."""
+    """Project, evaluate the water and rasterize; differentiable in everything but time, the pose included."""
     time = time if p.dynamic else None
     projection = project(p, view, settings.render, time)
     grid = grid_of(field, view, field.stride, time)
@@ -130,7 +130,7 @@ def draw(
     return Drawing(images, projection, grid, maps, buffers, time)
 
 
-def pictures(
+def images(
     p: Primitives, field: Water, view: Pinhole, settings: SplatSettings, time: Float[Tensor, ""] | None = None
 ) -> RasterOutput:
     """The images of any map; differentiable as `draw` is."""
@@ -147,10 +147,10 @@ def expected_z_depth(images: RasterOutput) -> Float[Tensor, "h w"]:
     return torch.where(images.alpha > _SEEN, images.z_depth / images.alpha.clamp(min=_SEEN), 0.0)
 
 
-def surface_colour(images: RasterOutput) -> Float[Tensor, "3 h w"]:
-    """Mean clear colour of what covers a pixel; it fades to black where less than half of the pixel is covered.
+def surface_color(images: RasterOutput) -> Float[Tensor, "3 h w"]:
+    """Mean clear color of what covers a pixel; it fades to black where less than half of the pixel is covered.
 
-    The blended clear colour itself is as dark as the pixel is transparent: the light of what lies behind is missing.
+    The blended clear color itself is as dark as the pixel is transparent: the light of what lies behind is missing.
     """
     return images.clear / images.alpha.clamp(min=_COVERED)
 
@@ -164,7 +164,7 @@ def in_scene_units(settings: OfMethod, length: float) -> OfMethod:
 
 
 memory_for_views = devices.memory_for(
-    "views of this map", "smaller pictures; or the processor, by CUDA_VISIBLE_DEVICES= before the command"
+    "views of this map", "smaller images; or the processor, by CUDA_VISIBLE_DEVICES= before the command"
 )
 """Wraps what renders a map wherever it may be."""
 
@@ -192,7 +192,7 @@ def render(scene: SplatMap, camera: Cameras, time: float | None = None) -> Rende
     there = camera.cam2world.device
     return RenderOutput(
         rgb=images.rgb.permute(1, 2, 0).to(there),
-        clear=surface_colour(images).permute(1, 2, 0).to(there),
+        clear=surface_color(images).permute(1, 2, 0).to(there),
         backscatter=backscatter.permute(1, 2, 0).to(there),
         z_depth=expected_z_depth(images).to(there),
         alpha=images.alpha.to(there),

@@ -65,9 +65,9 @@ class InitialSettings(Settings):
     """Scale of a primitive in time, in lengths of the clip; its mean time is drawn from all of the clip (UBS). UBS's 1
     lets still ground fade away from that moment: 4 is worth 0.2 dB on the synthetic dive with the fish."""
     scale: Annotated[float, Range(1e-3, 1e3)] = 1.0
-    """Spatial scale, in root mean square distances to the 3 nearest neighbours."""
+    """Spatial scale, in root mean square distances to the 3 nearest neighbors."""
     opacity: Opacity = 0.5
-    colours: Literal["restored", "raw"] = "restored"
+    colors: Literal["restored", "raw"] = "restored"
     """Without the water, or as filmed for maps that have none."""
     max_views: Count = 64
     """Frames asked whether they see a point."""
@@ -88,10 +88,10 @@ class LearningRates(Settings):
     lower: Rate = 1e-3
     medium: DecayingRate = 1e-3
     medium_end: DecayingRate = 1.5e-4
-    settle: PositiveShare = 1.0
-    """Share that the other rates have fallen to at the end of the run, log-linearly from `settle_begin` on; UBS holds
-    them, and at rates high enough for a short run the primitives then never come to rest."""
-    settle_begin: Annotated[float, Range(0, below=1)] = 0.5
+    final_rate_factor: PositiveShare = 1.0
+    """Share that the other rates have fallen to at the end of the run, log-linearly from `rate_decay_start` on; UBS
+    holds them, and at rates high enough for a short run the primitives then never come to rest."""
+    rate_decay_start: Annotated[float, Range(0, below=1)] = 0.5
 
 
 @dataclass(frozen=True)
@@ -102,51 +102,51 @@ class LossWeights(Settings):
     opacity: NotNegative = 0.01
     scale: NotNegative = 0.01
     mcmc_begin: Share = 0.025
-    """Share of the run before which opacity and scale are not regularised: UBS's window, MCMC-GS has 0 to 1."""
+    """Share of the run before which opacity and scale are not regularized: UBS's window, MCMC-GS has 0 to 1."""
     mcmc_end: Share = 0.5
     ubs_scale_reg_bug: bool = False
-    """Regularise all scales of the first three primitives, as UBS's code does, instead of the spatial ones of all."""
+    """Regularize all scales of the first three primitives, as UBS's code does, instead of the spatial ones of all."""
     depth: NotNegative = 0.1
     depth_edges: NotNegative = 10.0
     """Gradient scale k of the depth term's weights, the mean of e^(-k |dI/dx|) and e^(-k |dI/dy|) in pixel values per
-    pixel, normalised to a sum of 1. 0 counts all pixels alike; the paper names no scale."""
+    pixel, normalized to a sum of 1. 0 counts all pixels alike; the paper names no scale."""
     medium_smoothness: NotNegative = 1.0
     medium_prior: NotNegative = 0.01
     """Of the deviation from the reconstruction's water in its standard deviations; 0 is the paper's objective.
-    Colours and water can trade places in a map, and without it they do."""
+    Colors and water can trade places in a map, and without it they do."""
     radius: NotNegative = 0.1
     max_radius: Positive = 256.0
-    """Projected radius, pixels of a picture `max_radius_width` wide, beyond which a primitive counts as veil."""
+    """Projected radius, pixels of an image `max_radius_width` wide, beyond which a primitive counts as veil."""
     max_radius_width: CountOrZero = 1280
-    """Width in pixels that `max_radius` refers to; 0 is that of the training pictures."""
+    """Width in pixels that `max_radius` refers to; 0 is that of the training images."""
     coverage: NotNegative = 0.05
     """Of the light that passes a surface whose depth is known; 0 is the paper's objective. A map may leave a surface
-    half transparent and let the veil behind it fill in; its clear colours are then dark."""
+    half transparent and let the veil behind it fill in; its clear colors are then dark."""
     open_water: NotNegative = 0.025
     """Of what is drawn over pixels that look past every surface; 0 is the paper's objective. Painted on primitives,
-    open water is part of the scene: in clear pictures it glares."""
+    open water is part of the scene: in clear images it glares."""
     gamut: NotNegative = 1.0
-    """Of the squared excess of clear colours over 0..1; 0 is the paper's objective. Where the water leaves little of a
-    channel nearly any value of it explains the pictures, and Adam, whose steps know no scale, lets it stray."""
+    """Of the squared excess of clear colors over 0..1; 0 is the paper's objective. Where the water leaves little of a
+    channel nearly any value of it explains the images, and Adam, whose steps know no scale, lets it stray."""
     depth_confidence: NotNegative = 0.3
-    """Least confidence of a depth that regularises."""
+    """Least confidence of a depth that regularizes."""
     depth_alpha: Share = 0.5
-    """Least alpha of a pixel whose depth is regularised."""
+    """Least alpha of a pixel whose depth is regularized."""
 
 
 @dataclass(frozen=True)
 class DensifySettings(Settings):
     """Relocation, growth and noise of the primitives (MCMC-GS, for Beta kernels as UBS has it)."""
 
-    max_primitives: MapSize = 800_000
-    begin: Share = 0.025  # 500 of 20,000
-    end: Share = 0.5  # 10,000 of 20,000
-    every: Cadence = 0.005  # 100 of 20,000
-    min_every: Count = 20
-    """Fewest steps between two rounds, whatever `every` says; growth is made up for."""
+    cap_max: MapSize = 800_000
+    refine_start: Share = 0.025  # 500 of 20,000
+    refine_stop: Share = 0.5  # 10,000 of 20,000
+    refine_every: Cadence = 0.005  # 100 of 20,000
+    min_refine_every: Count = 20
+    """Fewest steps between two rounds, whatever `refine_every` says; growth is made up for."""
     growth: Annotated[float, Range(1, 2)] = 1.02
-    """Per round at `every`."""
-    dead_opacity: Opacity = 0.005
+    """Per round at `refine_every`."""
+    min_opacity: Opacity = 0.005
     noise: NotNegative = 1e6
     """Rate times the positions' learning rate in static maps; UBS's."""
     noise_dynamic: NotNegative = 1e6
@@ -182,7 +182,7 @@ class SggSettings(Settings):
     enabled: bool = True
     end: Share = 0.5  # tau_c, 10,000 of 20,000
     residual: Share = 0.15
-    """eta: share of the exact gradient that an uncertain centre keeps."""
+    """eta: share of the exact gradient that an uncertain center keeps."""
     split: Literal["clear", "direct"] = "clear"
     """What counts as geometry: the light without water, or the light that arrives, attenuated ("direct")."""
     depth: Literal["geometry", "apart"] = "geometry"
@@ -202,7 +202,7 @@ class UwbsSettings(Settings):
     """Condition primitives on time besides direction (D = 7), and let the water change with it."""
     iterations: Count = 20_000
     long_side: LongSideOrOwn = 1600
-    """Longer side of the training pictures, pixels; they are never enlarged."""
+    """Longer side of the training images, pixels; they are never enlarged."""
     working_depth: Annotated[float, Range(1e-3, 1e6)] = 3.0
     """Median depth, working units, that a scene without metric scale is given while it is trained."""
     initial: InitialSettings = field(default_factory=InitialSettings)
@@ -232,14 +232,14 @@ class PoseRefinementSettings(Settings):
     rate: Rate = 8e-4
     """Of Adam, for a rotation in the 6D form and a translation in working units; decays to 1 %."""
     long_side: LongSideOrOwn = 240
-    """Longer side of the picture the pose is refined on, pixels; at most, and for 0, that of the training pictures."""
+    """Longer side of the image the pose is refined on, pixels; at most, and for 0, that of the training images."""
     halvings: Annotated[int, Range(0, 16)] = 2
-    """How often that picture is halved at first; the smaller ones share half of the steps. A pose that starts 9 px off
+    """How often that image is halved at first; the smaller ones share half of the steps. A pose that starts 9 px off
     (of 400) is found from a quarter of the size, and not from the whole: on ruie_green_rock 24.0 instead of 20.2 dB."""
     edge: NotNegative = 4.0
     """Pixels count whose gradient exceeds this many medians."""
     min_edges: Share = 0.01
-    """Share of the picture below which every pixel counts instead."""
+    """Share of the image below which every pixel counts instead."""
 
 
 SplatSettings = UwbsSettings | WaterSplattingSettings | SeaSplatSettings | McmcGsSettings
@@ -248,11 +248,11 @@ uwbs = UwbsSettings  # as the Python API calls it: swimm3r.train(rec, frames, sw
 MapDevice = Literal["auto", "cpu", "cuda"]
 """Where maps are trained and rendered; no part of the settings, for a map can go from one to the other."""
 
-Recipe = Literal["uwbs-static", "uwbs-dynamic", "ubs", "watersplatting", "seasplat", "threers_gs", "mcmc_gs"]
-RECIPES: tuple[Recipe, ...] = get_args(Recipe)
+RecipeName = Literal["uwbs-static", "uwbs-dynamic", "ubs", "watersplatting", "seasplat", "threers_gs", "mcmc_gs"]
+RECIPES: tuple[RecipeName, ...] = get_args(RecipeName)
 
 
-def with_recipe(settings: UwbsSettings, recipe: Recipe) -> SplatSettings:
+def with_recipe(settings: UwbsSettings, recipe: RecipeName) -> SplatSettings:
     """Settings of another method at the same size and length, on the same cloud; poses as that method has them."""
     match recipe:
         case "uwbs-static":
@@ -263,7 +263,7 @@ def with_recipe(settings: UwbsSettings, recipe: Recipe) -> SplatSettings:
             none = dict.fromkeys(_BEYOND_UBS, 0.0)
             return replace(
                 settings,
-                initial=replace(settings.initial, directions="uniform", colours="raw"),
+                initial=replace(settings.initial, directions="uniform", colors="raw"),
                 render=replace(settings.render, alpha_min=0.0, covariance="upper"),
                 medium=replace(settings.medium, model="none"),
                 weights=replace(settings.weights, **none),
@@ -273,7 +273,7 @@ def with_recipe(settings: UwbsSettings, recipe: Recipe) -> SplatSettings:
         case "watersplatting":
             water = _of_the_same_size(settings, watersplatting())
             if water.iterations < _SHORT:
-                gentle = replace(water.densify, reset_every=0.0, least_opacity=water.densify.least_opacity_late)
+                gentle = replace(water.densify, reset_every=0.0, prune_opacity=water.densify.prune_opacity_late)
                 water = replace(water, densify=gentle, initial=replace(water.initial, opacity=_SHORT_OPACITY))
             return water
         case "seasplat":
@@ -309,7 +309,7 @@ def _of_the_same_size(settings: UwbsSettings, peer: Peer) -> Peer:
     start = replace(peer.initial, primitives=settings.initial.primitives, backdrop=settings.initial.backdrop)
     alike = ("iterations", "long_side", "working_depth", "seed", "log_every", "checkpoint_every")
     same = {name: getattr(settings, name) for name in alike}
-    return replace(peer, initial=start, max_primitives=settings.densify.max_primitives, **same)
+    return replace(peer, initial=start, cap_max=settings.densify.cap_max, **same)
 
 
 def ubs(**changes: Any) -> UwbsSettings:
@@ -342,7 +342,7 @@ def mcmc_gs(**changes: Any) -> McmcGsSettings:
     return McmcGsSettings(**changes)
 
 
-def settings_of(recipe: Recipe) -> type[SplatSettings]:
+def settings_of(recipe: RecipeName) -> type[SplatSettings]:
     """The kind of settings that a recipe has."""
     match recipe:
         case "uwbs-static" | "uwbs-dynamic" | "ubs":
@@ -355,7 +355,7 @@ def settings_of(recipe: Recipe) -> type[SplatSettings]:
             return McmcGsSettings
 
 
-def recipe_of(settings: SplatSettings) -> Recipe:
+def recipe_of(settings: SplatSettings) -> RecipeName:
     """What the settings train."""
     match settings:
         case WaterSplattingSettings():

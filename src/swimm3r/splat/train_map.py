@@ -22,9 +22,9 @@ from swimm3r.splat.recipes.watersplatting import WaterSplatting
 from swimm3r.splat.rendering import SplatMap
 from swimm3r.splat.settings import McmcGsSettings, SeaSplatSettings, SplatSettings, UwbsSettings, WaterSplattingSettings
 from swimm3r.splat.training import loop
-from swimm3r.splat.training.scene import Site, path_radius
+from swimm3r.splat.training.scene import TrainingScene, path_radius
 from swimm3r.splat.training.state import in_scene_units
-from swimm3r.splat.training_poses import training_stations, write_refined
+from swimm3r.splat.training_poses import training_poses_of, write_refined
 from swimm3r.splat.views import TrainingViews, median_z_depth, working_scale
 
 
@@ -43,15 +43,15 @@ def train(
     scale = working_scale(rec, settings)
     _check_near(settings, scale * median_z_depth(rec))
     views = TrainingViews(rec, frames, settings, scale)
-    stations = training_stations(rec, views.names, views.cameras, scale) if settings.poses.enabled else None
+    poses_in_training = training_poses_of(rec, views.names, views.cameras, scale) if settings.poses.enabled else None
     radius = path_radius(rec, scale, settings.working_depth)
-    site = Site(rec, scale, radius, views, stations, device)
+    training_scene = TrainingScene(rec, scale, radius, views, poses_in_training, device)
     with devices.memory_for("this map", "fewer primitives, a smaller --splat.long-side, or --map-device cpu"):
-        final = loop.run(_recipe(settings, site), _schedule(settings, rec, views), folder, progress)
+        final = loop.run(_recipe(settings, training_scene), _schedule(settings, rec, views), folder, progress)
     primitives, field = in_scene_units(final, 1 / scale)
     poses = None
-    if stations is not None and final.poses is not None:
-        poses = stations.refined(final.poses)
+    if poses_in_training is not None and final.poses is not None:
+        poses = poses_in_training.refined(final.poses)
         write_refined(folder, rec, frames, poses)
     scene = SplatMap(primitives, field, settings, rec.metric, 1 / scale, frames.span, poses)
     map_file.save_map(folder / "map.safetensors", scene)
@@ -69,16 +69,16 @@ def _check_near(settings: SplatSettings, median_depth: float) -> None:
         )
 
 
-def _recipe(settings: SplatSettings, site: Site) -> loop.Recipe:
+def _recipe(settings: SplatSettings, training_scene: TrainingScene) -> loop.Recipe:
     match settings:
         case UwbsSettings():
-            return Uwbs(settings, site, known_water(site, settings))
+            return Uwbs(settings, training_scene, known_water(training_scene, settings))
         case McmcGsSettings():
-            return McmcGs(settings, site)
+            return McmcGs(settings, training_scene)
         case WaterSplattingSettings():
-            return WaterSplatting(settings, site)
+            return WaterSplatting(settings, training_scene)
         case SeaSplatSettings():
-            return SeaSplat(settings, site)
+            return SeaSplat(settings, training_scene)
 
 
 def _schedule(settings: SplatSettings, rec: Reconstruction, views: TrainingViews) -> loop.Schedule:

@@ -38,7 +38,7 @@ IDENTITY = (1.0, 0.0, 0.0, 0.0, 1.0, 0.0)  # in the 6D form
 _NO_BASELINE = 1e-6  # of the spread: cameras nearer than this have no epipolar lines
 
 
-class PoseCodes(nn.Module):
+class PoseMlp(nn.Module):
     """One code per camera, and the network that reads motions from them."""
 
     def __init__(self, cameras: int, settings: TrainingPoseSettings, rng: torch.Generator | None = None) -> None:
@@ -73,8 +73,8 @@ def moved(cam2world: Float[Tensor, "*k 4 4"], motion: Float[Tensor, "*k 9"], len
 
 def spread_of(cam2world: Float[Tensor, "c 4 4"]) -> float:
     """Root mean square distance of the cameras from their middle."""
-    centres = cam2world[:, :3, 3]
-    return float((centres - centres.mean(0)).square().sum(-1).mean().sqrt())
+    centers = cam2world[:, :3, 3]
+    return float((centers - centers.mean(0)).square().sum(-1).mean().sqrt())
 
 
 def pose_rate(settings: TrainingPoseSettings, iterations: int) -> float:
@@ -84,7 +84,7 @@ def pose_rate(settings: TrainingPoseSettings, iterations: int) -> float:
 
 @dataclass(frozen=True)
 class EpipolarMatches:
-    """Two-view matches among the training views, as the training pictures show them."""
+    """Two-view matches among the training views, as the training images show them."""
 
     i: Int[Tensor, " m"]  # index of a view
     j: Int[Tensor, " m"]
@@ -109,7 +109,7 @@ class RefinedPoses:
 
 
 @dataclass(frozen=True)
-class Stations:
+class TrainingPoses:
     """The training views' cameras as structure from motion placed them, and what the matches say about them."""
 
     names: tuple[str, ...]
@@ -121,26 +121,26 @@ class Stations:
     def __len__(self) -> int:
         return len(self.names)
 
-    def moved(self, codes: PoseCodes, which: Int[Tensor, " k"] | None = None) -> Float[Tensor, "k 4 4"]:
+    def moved(self, codes: PoseMlp, which: Int[Tensor, " k"] | None = None) -> Float[Tensor, "k 4 4"]:
         """The poses of some views, of all by default, as refined so far, working units."""
         which = torch.arange(len(self)) if which is None else which
         return moved(self.cameras.cam2world[which], codes(which), self.spread)
 
-    def epipolar_error(self, codes: PoseCodes, matches: EpipolarMatches) -> Float[Tensor, ""]:
+    def epipolar_error(self, codes: PoseMlp, matches: EpipolarMatches) -> Float[Tensor, ""]:
         """L_epi of some matches under the refined poses, pixels."""
         return epipolar_loss(matches, self.moved(codes), self.cameras.K, self.spread)
 
-    def refined(self, codes: PoseCodes) -> RefinedPoses:
+    def refined(self, codes: PoseMlp) -> RefinedPoses:
         """All poses, in scene units."""
         with torch.no_grad():
             poses = self.moved(codes)
         return RefinedPoses(self.names, pose_from(poses[:, :3, :3], poses[:, :3, 3] / self.scale))
 
 
-def training_stations(rec: Reconstruction, names: tuple[str, ...], cameras: Cameras, scale: float) -> Stations:
+def training_poses_of(rec: Reconstruction, names: tuple[str, ...], cameras: Cameras, scale: float) -> TrainingPoses:
     """The stations of the views `names` with their pinhole `cameras`, working units."""
     matches = epipolar_matches(rec, names, cameras)
-    return Stations(names, cameras, scale, spread_of(cameras.cam2world), matches)
+    return TrainingPoses(names, cameras, scale, spread_of(cameras.cam2world), matches)
 
 
 def as_mapped(rec: Reconstruction, poses: RefinedPoses | None) -> Reconstruction:
@@ -210,8 +210,8 @@ def epipolar_loss(
 ) -> Float[Tensor, ""]:
     """L_epi of matches under poses, pixels; 0 where no match has a baseline."""
     m, poses = matches, cam2world.double()
-    centres = poses[:, :3, 3].detach()
-    told = torch.linalg.vector_norm(centres[m.i] - centres[m.j], dim=-1) > _NO_BASELINE * spread
+    centers = poses[:, :3, 3].detach()
+    told = torch.linalg.vector_norm(centers[m.i] - centers[m.j], dim=-1) > _NO_BASELINE * spread
     if not bool(told.any()):
         return poses.new_zeros(())
     i, j = m.i[told], m.j[told]

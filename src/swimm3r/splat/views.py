@@ -1,6 +1,6 @@
-"""What a map is trained on: undistorted pictures of one size, their masks and depth, in working units.
+"""What a map is trained on: undistorted images of one size, their masks and depth, in working units.
 
-Every frame becomes a pinhole picture with its own K at the training size. Depth along the optical axis is the same
+Every frame becomes a pinhole image with its own K at the training size. Depth along the optical axis is the same
 number on both grids. Time runs from 0 at the clip's first frame to 1 at its last, test frames included. What the frame
 does not show, or its mask excludes, is not `seen` and takes no part in any loss.
 """
@@ -24,8 +24,8 @@ from swimm3r.splat.settings import SplatSettings
 
 
 @dataclass(frozen=True)
-class View:
-    """One training picture."""
+class TrainingView:
+    """One training image."""
 
     name: str
     camera: Cameras  # one pinhole, working units
@@ -35,8 +35,8 @@ class View:
     open_water: Bool[Tensor, "h w"]  # looks past every surface; nowhere where depth is not read
     time: Float[Tensor, ""] | None = None  # of the clip, 0..1; static maps do not ask
 
-    def to(self, device: torch.device) -> "View":
-        """The same picture on a device; its camera stays with the poses."""
+    def to(self, device: torch.device) -> "TrainingView":
+        """The same image on a device; its camera stays with the poses."""
         return replace(
             self,
             rgb=self.rgb.to(device),
@@ -48,7 +48,7 @@ class View:
 
 
 class TrainingViews:
-    """The registered training frames as views; pictures are made when asked for and kept in a bounded cache."""
+    """The registered training frames as views; images are made when asked for and kept in a bounded cache."""
 
     def __init__(self, rec: Reconstruction, frames: Frames, settings: SplatSettings, scale: float) -> None:
         self.rec, self.frames, self.settings, self.scale = rec, frames, settings, scale
@@ -58,8 +58,8 @@ class TrainingViews:
         if not self.names:
             raise InputError(
                 "None of the training frames is registered in the reconstruction.",
-                cause="the reconstruction was made of other pictures, or its names differ",
-                hint="the folder of pictures the reconstruction was made of",
+                cause="the reconstruction was made of other images, or its names differ",
+                hint="the folder of images the reconstruction was made of",
             )
         self._cache = ArrayCache(max_bytes=768 << 20)
 
@@ -77,7 +77,7 @@ class TrainingViews:
         lenses = self.rec.cameras[[self.rec.index(name) for name in self.names]]
         return _in_working_units(lenses.pinhole(self.settings.long_side), self.scale)
 
-    def __getitem__(self, k: int) -> View:
+    def __getitem__(self, k: int) -> TrainingView:
         name = self.names[k]
         i = self.rec.index(name)
         lens = self.rec.cameras[i]
@@ -91,7 +91,7 @@ class TrainingViews:
             return stored, seen.numpy(), z_depth.half().numpy(), open_water.numpy()
 
         rgb, seen, z_depth, open_water = self._cache.get(name, make)
-        return View(
+        return TrainingView(
             name,
             _in_working_units(canvas, self.scale),
             torch.from_numpy(rgb.astype(np.float32)) / 255,
@@ -104,7 +104,7 @@ class TrainingViews:
     def _depth(
         self, name: str, lens: Cameras, canvas: Cameras, rgb: Float[Tensor, "h w 3"], seen: Bool[Tensor, "h w"]
     ) -> tuple[Float[Tensor, "h w"], Bool[Tensor, "h w"]]:
-        """Depth, and where there is none to be known because the picture shows open water."""
+        """Depth, and where there is none to be known because the image shows open water."""
         least = self.settings.depth_confidence
         if least is None or name not in self.rec.depth:
             nothing = torch.zeros(canvas.height, canvas.width)
@@ -121,7 +121,7 @@ class TrainingViews:
         return z_depth, open_water & seen
 
 
-def smaller(view: View, divisor: int) -> View:
+def smaller(view: TrainingView, divisor: int) -> TrainingView:
     """A view of fewer pixels, each the mean of those it covers; without depth or open water."""
     if divisor == 1:
         return view
@@ -129,7 +129,7 @@ def smaller(view: View, divisor: int) -> View:
     rgb = interpolate(view.rgb[None], (height, width), mode="area")[0]
     seen = interpolate(view.seen[None, None].float(), (height, width), mode="area")[0, 0] > 0.999
     nothing = view.rgb.new_zeros(height, width)
-    return View(view.name, resized(view.camera, width, height), rgb, seen, nothing, nothing > 0, view.time)
+    return TrainingView(view.name, resized(view.camera, width, height), rgb, seen, nothing, nothing > 0, view.time)
 
 
 def _in_working_units(cameras: Cameras, scale: float) -> Cameras:
@@ -145,13 +145,13 @@ def moment(span: tuple[float, float], time: float) -> Float[Tensor, ""]:
 
 
 def undistorted(
-    picture: Float[Tensor, "h w 3"], mask: Bool[Tensor, "h w"], lens: Cameras, canvas: Cameras
+    image: Float[Tensor, "h w 3"], mask: Bool[Tensor, "h w"], lens: Cameras, canvas: Cameras
 ) -> tuple[Float[Tensor, "ch cw 3"], Bool[Tensor, "ch cw"]]:
-    """A frame's picture on its pinhole canvas, and which of its pixels the frame shows and its mask admits."""
+    """A frame's image on its pinhole canvas, and which of its pixels the frame shows and its mask admits."""
     import cv2
 
     size = (canvas.width, canvas.height)
-    rgb, usable = picture.numpy(), mask.numpy().astype(np.float32)
+    rgb, usable = image.numpy(), mask.numpy().astype(np.float32)
     if (lens.width, lens.height) != size:  # smaller first, by area, so that nothing aliases
         rgb = cv2.resize(rgb, size, interpolation=cv2.INTER_AREA)
         usable = cv2.resize(usable, size, interpolation=cv2.INTER_AREA)

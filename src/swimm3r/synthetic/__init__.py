@@ -13,14 +13,14 @@ __all__ = ["Coefficients", "DiveSettings", "make_dive", "write_dive"]
 
 
 def make_dive(settings: DiveSettings) -> "swimm3r.synthetic.dive.Dive":
-    """The seafloor, path and water of a dive; pictures are rendered one by one, by `Dive.frame`."""
+    """The seafloor, path and water of a dive; images are rendered one by one, by `Dive.frame`."""
     from swimm3r.synthetic import dive
 
     return dive.make_dive(settings)
 
 
 def write_dive(settings: DiveSettings, folder: Path, progress: Progress = silent) -> None:
-    """Render a dive into a folder: images/ and truth/. Raises InputError where another dive's pictures lie there."""
+    """Render a dive into a folder: images/ and truth/. Raises InputError where another dive's images lie there."""
     from swimm3r.synthetic import dive
 
     dive.write_dive(settings, folder, progress)

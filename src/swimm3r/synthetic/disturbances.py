@@ -1,4 +1,4 @@
-"""What comes between a clean picture and a camera's: a fish, marine snow, vignetting, sensor noise."""
+"""What comes between a clean image and a camera's: a fish, marine snow, vignetting, sensor noise."""
 
 from dataclasses import dataclass
 
@@ -21,10 +21,10 @@ _ABOVE = 0.3  # m between the fish's way and the highest ground under it
 
 @dataclass(frozen=True)
 class Fish:
-    """The fish as one picture shows it."""
+    """The fish as one image shows it."""
 
     cover: Float[Tensor, "h w"]  # share of each pixel it hides
-    clear: Float[Tensor, "h w 3"]  # its colour without water
+    clear: Float[Tensor, "h w 3"]  # its color without water
     ray_depth: Float[Tensor, "h w"]  # 0 where it is not
 
 
@@ -61,13 +61,13 @@ def swimming(floor: Seafloor, share: float, seed: int) -> Swimmer:
 
 
 def fish(sample_rays: Float[Tensor, "h2 w2 3"], floor_z_depth: Float[Tensor, "h w"], there: Swimmer) -> Fish:
-    """The fish in a picture, hidden by what is nearer; `there` is in the camera's axes.
+    """The fish in an image, hidden by what is nearer; `there` is in the camera's axes.
 
-    `sample_rays` are the rays (z = 1) of twice the picture's resolution; `floor_z_depth` is 0 in open water.
+    `sample_rays` are the rays (z = 1) of twice the image's resolution; `floor_z_depth` is 0 in open water.
     """
     middle, axes = there.middle.float(), there.axes.float()
     z = torch.full(sample_rays.shape[:2], torch.inf)
-    colour = torch.zeros(*sample_rays.shape[:2], 3)
+    color = torch.zeros(*sample_rays.shape[:2], 3)
     for half_axes, offset in ((_BODY, 0.0), (_TAIL, _TAIL_AT)):
         size = torch.tensor(half_axes)
         start = -(axes @ middle) - torch.tensor([offset, 0.0, 0.0])
@@ -85,7 +85,7 @@ def fish(sample_rays: Float[Tensor, "h2 w2 3"], floor_z_depth: Float[Tensor, "h 
             [0.10, 0.12, 0.22]
         )
         z = torch.where(nearer, t, z)
-        colour = torch.where(nearer[..., None], paint * light[..., None], colour)
+        color = torch.where(nearer[..., None], paint * light[..., None], color)
     floor = floor_z_depth.repeat_interleave(2, 0).repeat_interleave(2, 1)
     seen = torch.isfinite(z) & ((floor == 0) | (z < floor))
 
@@ -98,26 +98,26 @@ def fish(sample_rays: Float[Tensor, "h2 w2 3"], floor_z_depth: Float[Tensor, "h 
     ray_depth = ray_depth_from_z(torch.where(seen, z, 0.0), sample_rays.float())
     return Fish(
         cover=count[..., 0] / 4,
-        clear=per_pixel(torch.where(seen[..., None], colour, 0.0)) / share,
+        clear=per_pixel(torch.where(seen[..., None], color, 0.0)) / share,
         ray_depth=(per_pixel(ray_depth) / share)[..., 0],
     )
 
 
 def with_fish(raw: Float[Tensor, "h w 3"], seen: Fish, medium: Medium) -> Float[Tensor, "h w 3"]:
-    """The picture with the fish, through as much water as is before it."""
+    """The image with the fish, through as much water as is before it."""
     cover = seen.cover[..., None]
     return raw * (1 - cover) + add_water(seen.clear, seen.ray_depth, medium) * cover
 
 
 def untouched(seen: Fish) -> Bool[Tensor, "h w"]:
-    """True where the picture shows nothing of the fish."""
+    """True where the image shows nothing of the fish."""
     return seen.cover == 0
 
 
 def marine_snow(
     raw: Float[Tensor, "h w 3"], camera: Cameras, particles: int, medium: Medium, rng: np.random.Generator
 ) -> Float[Tensor, "h w 3"]:
-    """The picture with bright specks between 0.12 and 2 m, blurred the more the nearer they are."""
+    """The image with bright specks between 0.12 and 2 m, blurred the more the nearer they are."""
     out = raw.numpy().copy()
     height, width = out.shape[:2]
     focal = float(camera.K[0, 0, 0])
@@ -129,7 +129,7 @@ def marine_snow(
         sigma = np.hypot(max(sharp, 0.35), blur)
         alpha = min(0.85, rng.uniform(0.5, 1.0) * (max(sharp, 0.35) / sigma) ** 2)
         tone = torch.full((3,), rng.uniform(0.7, 0.95))
-        colour = add_water(tone, torch.tensor(z), medium).numpy()
+        color = add_water(tone, torch.tensor(z), medium).numpy()
         reach = int(3 * sigma) + 1
         rows = np.arange(max(int(y) - reach, 0), min(int(y) + reach + 1, height))
         columns = np.arange(max(int(x) - reach, 0), min(int(x) + reach + 1, width))
@@ -138,12 +138,12 @@ def marine_snow(
         )
         cover = (alpha * spot)[..., None].astype(np.float32)
         patch = np.ix_(rows, columns)
-        out[patch] = out[patch] * (1 - cover) + colour * cover
+        out[patch] = out[patch] * (1 - cover) + color * cover
     return torch.from_numpy(out)
 
 
 def vignette(raw: Float[Tensor, "h w 3"], strength: float) -> Float[Tensor, "h w 3"]:
-    """The picture darkened towards the corners, by `strength` in the very corner."""
+    """The image darkened toward the corners, by `strength` in the very corner."""
     h, w = raw.shape[:2]
     y = (torch.arange(h) + 0.5 - h / 2)[:, None]
     x = (torch.arange(w) + 0.5 - w / 2)[None]
@@ -151,5 +151,5 @@ def vignette(raw: Float[Tensor, "h w 3"], strength: float) -> Float[Tensor, "h w
 
 
 def sensor_noise(raw: Float[Tensor, "h w 3"], sigma: float, rng: np.random.Generator) -> Float[Tensor, "h w 3"]:
-    """The picture with Gaussian noise of standard deviation `sigma`; values may leave 0..1."""
+    """The image with Gaussian noise of standard deviation `sigma`; values may leave 0..1."""
     return raw + sigma * torch.from_numpy(rng.standard_normal(tuple(raw.shape), dtype=np.float32))

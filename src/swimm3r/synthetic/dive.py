@@ -1,4 +1,4 @@
-"""A synthetic dive: pictures through known water, with everything about them known.
+"""A synthetic dive: images through known water, with everything about them known.
 
     raw = add_water(clear, ray_depth, medium), and Binf where a ray meets nothing      (paper Eq. 1-3)
 
@@ -39,7 +39,7 @@ _FRAMES_PER_SECOND = 5.0  # the speed of caustics; the pace of the path depends 
 
 @dataclass(frozen=True)
 class DiveFrame:
-    """One picture and the truth about it."""
+    """One image and the truth about it."""
 
     raw: Float[Tensor, "h w 3"]  # what the camera stores, 0..1 (noise may overshoot)
     clear: Float[Tensor, "h w 3"]  # J
@@ -53,7 +53,7 @@ class Dive:
     """A dive whose frames are rendered when asked for."""
 
     settings: DiveSettings
-    names: tuple[str, ...]  # of the pictures, with extension
+    names: tuple[str, ...]  # of the images, with extension
     cameras: Cameras  # metres
     medium: Medium  # [3], 1/m
     floor: Seafloor
@@ -93,7 +93,7 @@ class Dive:
 
 
 def make_dive(settings: DiveSettings) -> Dive:
-    """The seafloor, path and water of a dive; pictures are rendered by `Dive.frame`."""
+    """The seafloor, path and water of a dive; images are rendered by `Dive.frame`."""
     floor = make_seafloor(settings.seed)
     focal = settings.width / 2 / np.tan(np.radians(settings.fov) / 2)
     K = torch.tensor([[focal, 0, settings.width / 2], [0, focal, settings.height / 2], [0, 0, 1]], dtype=torch.float64)

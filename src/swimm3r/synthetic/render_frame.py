@@ -1,4 +1,4 @@
-"""One picture of the seafloor through clear water: exact depth along every pixel's ray, averaged radiance."""
+"""One image of the seafloor through clear water: exact depth along every pixel's ray, averaged radiance."""
 
 from typing import no_type_check
 
@@ -13,37 +13,37 @@ SAMPLES = 2  # per pixel and axis
 
 
 def render(
-    floor: Seafloor, pose: np.ndarray, centre_rays: np.ndarray, sample_rays: np.ndarray, time: float, caustics: float
+    floor: Seafloor, pose: np.ndarray, center_rays: np.ndarray, sample_rays: np.ndarray, time: float, caustics: float
 ) -> tuple[np.ndarray, np.ndarray]:
     """Linear radiance [h, w, 3] and z depth [h, w] (metres, 0 where the ray meets nothing) from a camera.
 
-    Rays are in camera axes with z = 1: [h, w, 3] at pixel centres for depth, [2h, 2w, 3] for colour.
+    Rays are in camera axes with z = 1: [h, w, 3] at pixel centers for depth, [2h, 2w, 3] for color.
     """
     s = floor.surface
     corner = np.array([s.x0, s.y0, 0.0])
     return _render(
-        s.height, s.pyramid, s.cell, corner, floor.shade, floor.animals, floor.owner, pose, centre_rays, sample_rays,
+        s.height, s.pyramid, s.cell, corner, floor.shade, floor.animals, floor.owner, pose, center_rays, sample_rays,
         time, caustics, floor.seed * 1000 + 17,
     )  # fmt: skip
 
 
 @numba.njit(cache=True)
 @no_type_check
-def _render(height, pyramid, cell, corner, shade, animals, owner, pose, centre_rays, sample_rays, time, caustics, seed):
-    rows, columns = centre_rays.shape[:2]
+def _render(height, pyramid, cell, corner, shade, animals, owner, pose, center_rays, sample_rays, time, caustics, seed):
+    rows, columns = center_rays.shape[:2]
     R = np.ascontiguousarray(pose[:3, :3])
     origin = pose[:3, 3] - corner
     z_depth = np.zeros((rows, columns))
-    colour = np.zeros((rows, columns, 3))
+    color = np.zeros((rows, columns, 3))
     direction = np.empty(3)
     p = np.empty(3)
     pixel = np.hypot(
-        centre_rays[rows // 2, columns // 2, 0] - centre_rays[rows // 2, columns // 2 - 1, 0],
-        centre_rays[rows // 2, columns // 2, 1] - centre_rays[rows // 2, columns // 2 - 1, 1],
+        center_rays[rows // 2, columns // 2, 0] - center_rays[rows // 2, columns // 2 - 1, 0],
+        center_rays[rows // 2, columns // 2, 1] - center_rays[rows // 2, columns // 2 - 1, 1],
     )
     for row in range(rows):
         for column in range(columns):
-            d = centre_rays[row, column]
+            d = center_rays[row, column]
             for axis in range(3):
                 direction[axis] = R[axis, 0] * d[0] + R[axis, 1] * d[1] + R[axis, 2] * d[2]
             z_depth[row, column] = max(cast(height, pyramid, cell, origin, direction, 0.0), 0.0)
@@ -77,19 +77,19 @@ def _render(height, pyramid, cell, corner, shade, animals, owner, pose, centre_r
                     length * np.sqrt(1 + sx * sx + sy * sy)
                 )
                 footprint = pixel * t / np.sqrt(max(facing, 0.12))
-                radiance(shade, animals, owner, corner, cell, p, footprint, time, caustics, seed, colour[row, column])
-            if hits == 0:  # only the centre of a sliver was met: the surface right there
+                radiance(shade, animals, owner, corner, cell, p, footprint, time, caustics, seed, color[row, column])
+            if hits == 0:  # only the center of a sliver was met: the surface right there
                 for axis in range(3):
                     p[axis] = pose[axis, 3] + z_depth[row, column] * (
-                        R[axis, 0] * centre_rays[row, column, 0]
-                        + R[axis, 1] * centre_rays[row, column, 1]
-                        + R[axis, 2] * centre_rays[row, column, 2]
+                        R[axis, 0] * center_rays[row, column, 0]
+                        + R[axis, 1] * center_rays[row, column, 1]
+                        + R[axis, 2] * center_rays[row, column, 2]
                     )
                 radiance(
                     shade, animals, owner, corner, cell, p, pixel * z_depth[row, column], time, caustics, seed,
-                    colour[row, column],
+                    color[row, column],
                 )  # fmt: skip
                 hits = 1
             for channel in range(3):
-                colour[row, column, channel] /= hits
-    return colour, z_depth
+                color[row, column, channel] /= hits
+    return color, z_depth

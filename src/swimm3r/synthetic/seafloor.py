@@ -1,6 +1,6 @@
 """A procedural seafloor: a sandy terrace with dunes and ripples, outcrops, boulders, animals, and a drop-off around it.
 
-World axes: x to the right, y ahead, z up, metres; the terrace is about 5 m in radius around CENTRE and its sand lies
+World axes: x to the right, y ahead, z up, metres; the terrace is about 5 m in radius around CENTER and its sand lies
 near z = 0. Past its rim the floor falls away, so a camera that looks over the rim sees open water.
 """
 
@@ -16,15 +16,15 @@ from swimm3r.synthetic.raycast import Heightfield, heightfield
 
 CELLS = 2048
 EXTENT = 14.0  # m, side of the grid
-CENTRE = (0.0, 2.6)  # of the terrace
+CENTER = (0.0, 2.6)  # of the terrace
 RIM = 5.2  # m, its mean radius
-SUN = np.array([-0.45, 0.35, 0.82])  # towards the sun; unit length to 1 %
+SUN = np.array([-0.45, 0.35, 0.82])  # toward the sun; unit length to 1 %
 
 STAR, URCHIN, SPONGE = 0, 1, 2
 # kind, x, y, radius, height, angle, red, green, blue (linear albedo)
 ANIMAL_FIELDS = 9
-_STAR_COLOURS = ((0.75, 0.06, 0.03), (0.85, 0.28, 0.03), (0.05, 0.12, 0.55), (0.45, 0.08, 0.35))
-_SPONGE_COLOURS = ((0.80, 0.30, 0.04), (0.70, 0.05, 0.05), (0.80, 0.60, 0.08), (0.35, 0.10, 0.45))
+_STAR_COLORS = ((0.75, 0.06, 0.03), (0.85, 0.28, 0.03), (0.05, 0.12, 0.55), (0.45, 0.08, 0.35))
+_SPONGE_COLORS = ((0.80, 0.30, 0.04), (0.70, 0.05, 0.05), (0.80, 0.60, 0.08), (0.35, 0.10, 0.45))
 
 
 @dataclass(frozen=True)
@@ -42,7 +42,7 @@ def make_seafloor(seed: int) -> Seafloor:
     """The seafloor of a seed."""
     rng = np.random.default_rng(seed)
     cell = EXTENT / CELLS
-    x0, y0 = CENTRE[0] - EXTENT / 2, CENTRE[1] - EXTENT / 2
+    x0, y0 = CENTER[0] - EXTENT / 2, CENTER[1] - EXTENT / 2
     sand, height = _terrain(CELLS + 1, x0, y0, cell, int(seed) * 7919 + 1)
     for boulder in _boulders(rng):
         _add_boulder(height, x0, y0, cell, boulder, int(rng.integers(1 << 30)))
@@ -92,7 +92,7 @@ def _terrain(nodes: int, x0: float, y0: float, cell: float, seed: int) -> tuple[
         y = y0 + row * cell
         for column in range(nodes):
             x = x0 + column * cell
-            if np.hypot(x - CENTRE[0], y - CENTRE[1]) > RIM + 1.2:  # past the rim, out of sight
+            if np.hypot(x - CENTER[0], y - CENTER[1]) > RIM + 1.2:  # past the rim, out of sight
                 sand[row, column] = height[row, column] = 0.0
                 continue
             dune = 0.16 * fractal(x, y, 0.0, 2.6, 3, 0.45, 0.0, seed)
@@ -127,7 +127,7 @@ def _boulders(rng: np.random.Generator) -> list[np.ndarray]:
         placed = 0
         while placed < count:
             distance, angle = RIM * 0.97 * np.sqrt(rng.random()), rng.uniform(0, 2 * np.pi)
-            x, y = CENTRE[0] + distance * np.cos(angle), CENTRE[1] + distance * np.sin(angle)
+            x, y = CENTER[0] + distance * np.cos(angle), CENTER[1] + distance * np.sin(angle)
             if np.hypot(x, y - 0.6) < nearest + 0.6 * (nearest > 1):  # large ones leave room for the camera
                 continue
             r = rng.uniform(*radius)
@@ -167,13 +167,13 @@ def _add_boulder(height: np.ndarray, x0: float, y0: float, cell: float, boulder:
 def _animals(
     rng: np.random.Generator, height: np.ndarray, rock: np.ndarray, x0: float, y0: float, cell: float
 ) -> np.ndarray:
-    """Sea stars and urchins everywhere, sponges on rock: bright colours and near-black at every distance."""
+    """Sea stars and urchins everywhere, sponges on rock: bright colors and near-black at every distance."""
     rows = []
     wanted = {STAR: 70, URCHIN: 110, SPONGE: 90}
     while any(wanted.values()):
         kind = int(rng.choice([kind for kind, left in wanted.items() if left]))
         distance, angle = RIM * 0.98 * np.sqrt(rng.random()), rng.uniform(0, 2 * np.pi)
-        x, y = CENTRE[0] + distance * np.cos(angle), CENTRE[1] + distance * np.sin(angle)
+        x, y = CENTER[0] + distance * np.cos(angle), CENTER[1] + distance * np.sin(angle)
         row, column = int((y - y0) / cell), int((x - x0) / cell)
         patch = height[row - 6 : row + 7, column - 6 : column + 7]
         if np.ptp(patch) > 0.09 or (kind == SPONGE and rock[row, column] < 0.9):
@@ -181,12 +181,12 @@ def _animals(
         if any(np.hypot(x - other[1], y - other[2]) < 0.14 for other in rows):
             continue
         if kind == STAR:
-            r, top, colour = rng.uniform(0.06, 0.12), 0.012, _STAR_COLOURS[rng.integers(4)]
+            r, top, color = rng.uniform(0.06, 0.12), 0.012, _STAR_COLORS[rng.integers(4)]
         elif kind == URCHIN:
-            r, top, colour = rng.uniform(0.045, 0.08), 0.035, (0.002, 0.0016, 0.002)
+            r, top, color = rng.uniform(0.045, 0.08), 0.035, (0.002, 0.0016, 0.002)
         else:
-            r, top, colour = rng.uniform(0.03, 0.075), rng.uniform(0.03, 0.08), _SPONGE_COLOURS[rng.integers(4)]
-        rows.append([kind, x, y, r, top, rng.uniform(0, 2 * np.pi), *(np.array(colour) * rng.uniform(0.75, 1.1))])
+            r, top, color = rng.uniform(0.03, 0.075), rng.uniform(0.03, 0.08), _SPONGE_COLORS[rng.integers(4)]
+        rows.append([kind, x, y, r, top, rng.uniform(0, 2 * np.pi), *(np.array(color) * rng.uniform(0.75, 1.1))])
         wanted[kind] -= 1
     return np.array(rows)
 
@@ -229,7 +229,7 @@ def _add_rim(height: np.ndarray, x0: float, y0: float, cell: float, seed: int) -
         y = y0 + row * cell
         for column in range(height.shape[1]):
             x = x0 + column * cell
-            dx, dy = x - CENTRE[0], y - CENTRE[1]
+            dx, dy = x - CENTER[0], y - CENTER[1]
             past = np.hypot(dx, dy) - RIM - 0.7 * fractal(x, y, 0.0, 3.0, 3, 0.5, 0.0, seed)
             if past > 0:
                 height[row, column] -= 1.4 * past * past / (past + 0.25)

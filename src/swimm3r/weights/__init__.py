@@ -1,4 +1,4 @@
-"""Model weights: where they come from, where they lie, what their licence allows, whether they are whole.
+"""Model weights: where they come from, where they lie, what their license allows, whether they are whole.
 
 Nothing here is bundled or re-distributed.
 """

@@ -34,11 +34,11 @@ _CHUNK = 1 << 20
 
 
 def fetch(
-    name: str, accept_licence: bool = False, progress: Progress = silent, manifest: tuple[Weights, ...] = MANIFEST
+    name: str, accept_license: bool = False, progress: Progress = silent, manifest: tuple[Weights, ...] = MANIFEST
 ) -> Path:
     """The weights' path, downloaded if they are not here; goes on where an interrupted download stopped.
 
-    Raises WeightsError without the licence's acceptance where it is non-commercial, within five seconds where no server
+    Raises WeightsError without the license's acceptance where it is non-commercial, within five seconds where no server
     answers, and for a file that arrives damaged; StorageError where it does not fit.
     """
     weights = entry(name, manifest)
@@ -47,11 +47,11 @@ def fetch(
         if (folder / weights.filename).is_file():
             check_size(folder / weights.filename, weights)
             return folder / weights.filename
-    if weights.non_commercial and not accept_licence:
+    if weights.non_commercial and not accept_license:
         raise WeightsError(
-            f"the weights {name!r} may not be used commercially: {weights.licence}",
+            f"the weights {name!r} may not be used commercially: {weights.license}",
             cause="their authors set these terms, and only you can accept them",
-            hint=f"read {weights.licence_url}, then swimm3r weights get {name} --accept-license",
+            hint=f"read {weights.license_url}, then swimm3r weights get {name} --accept-license",
         )
     with _writable(target.parent), _locked(target.with_name(target.name + ".lock")):
         if not target.is_file():  # else another process was faster

@@ -1,4 +1,4 @@
-"""The published weight files: where each comes from, how large it is, what its licence allows."""
+"""The published weight files: where each comes from, how large it is, what its license allows."""
 
 from dataclasses import dataclass
 
@@ -6,7 +6,7 @@ from swimm3r.errors import UsageError
 
 _NAVER = "https://download.europe.naverlabs.com/ComputerVision"
 _MAST3R = "MASt3R_ViTLarge_BaseDecoder_512_catmlpdpt_metric"
-_MAST3R_LICENCE = (
+_MAST3R_LICENSE = (
     "CC BY-NC-SA 4.0 and the terms of the training sets (CHECKPOINTS_NOTICE; Map-free allows no commercial use at all)"
 )
 
@@ -22,8 +22,8 @@ class Weights:
     size: int | None  # bytes; None where it is not published
     about_mb: float | None  # for messages, where the size is not exactly known
     sha256: str | None  # whole, or the first digits; None where it is not published
-    licence: str
-    licence_url: str
+    license: str
+    license_url: str
     non_commercial: bool
     serves_as: str | None = None  # another entry's name, of which this is the same in another format
 
@@ -37,8 +37,8 @@ MANIFEST = (
         size=2_754_910_614,
         about_mb=2755.0,
         sha256=None,
-        licence=_MAST3R_LICENCE,
-        licence_url="https://github.com/naver/mast3r/blob/main/CHECKPOINTS_NOTICE",
+        license=_MAST3R_LICENSE,
+        license_url="https://github.com/naver/mast3r/blob/main/CHECKPOINTS_NOTICE",
         non_commercial=True,
     ),
     Weights(
@@ -49,8 +49,8 @@ MANIFEST = (
         size=None,
         about_mb=2755.0,
         sha256=None,
-        licence=_MAST3R_LICENCE,
-        licence_url="https://github.com/naver/mast3r/blob/main/CHECKPOINTS_NOTICE",
+        license=_MAST3R_LICENSE,
+        license_url="https://github.com/naver/mast3r/blob/main/CHECKPOINTS_NOTICE",
         non_commercial=True,
         serves_as="mast3r",
     ),
@@ -62,8 +62,8 @@ MANIFEST = (
         size=None,
         about_mb=8.4,
         sha256=None,
-        licence=_MAST3R_LICENCE,
-        licence_url="https://github.com/naver/mast3r/blob/main/CHECKPOINTS_NOTICE",
+        license=_MAST3R_LICENSE,
+        license_url="https://github.com/naver/mast3r/blob/main/CHECKPOINTS_NOTICE",
         non_commercial=True,
     ),
     Weights(
@@ -74,8 +74,8 @@ MANIFEST = (
         size=None,
         about_mb=268.0,  # 65,536 words of 1,024 float32; not verified
         sha256=None,
-        licence=_MAST3R_LICENCE,
-        licence_url="https://github.com/naver/mast3r/blob/main/CHECKPOINTS_NOTICE",
+        license=_MAST3R_LICENSE,
+        license_url="https://github.com/naver/mast3r/blob/main/CHECKPOINTS_NOTICE",
         non_commercial=True,
     ),
     Weights(
@@ -86,8 +86,8 @@ MANIFEST = (
         size=7_289,
         about_mb=0.01,
         sha256="a78928a0af1e5f0fcb1f3b9e8f8c3a2a5a3de244d830ad5c1feddc79b8432868",
-        licence="BSD-2-Clause",
-        licence_url="https://github.com/richzhang/PerceptualSimilarity/blob/master/LICENSE",
+        license="BSD-2-Clause",
+        license_url="https://github.com/richzhang/PerceptualSimilarity/blob/master/LICENSE",
         non_commercial=False,
     ),
     Weights(
@@ -98,20 +98,20 @@ MANIFEST = (
         size=None,
         about_mb=528.0,
         sha256="397923af",
-        licence="BSD-3-Clause (torchvision); trained on ImageNet",
-        licence_url="https://github.com/pytorch/vision/blob/main/LICENSE",
+        license="BSD-3-Clause (torchvision); trained on ImageNet",
+        license_url="https://github.com/pytorch/vision/blob/main/LICENSE",
         non_commercial=False,
     ),
     Weights(
         name="uranker",
-        purpose="the URanker score of underwater pictures; nothing here loads them yet",
+        purpose="the URanker score of underwater images; nothing here loads them yet",
         filename="URanker_ckpt-450eb36d.pth",
         urls=("https://huggingface.co/chaofengc/IQA-PyTorch-Weights/resolve/main/URanker_ckpt-450eb36d.pth",),
         size=None,
         about_mb=None,
         sha256="450eb36d",
-        licence="CC BY-NC 4.0",
-        licence_url="https://github.com/RQ-Wu/UnderwaterRanker",
+        license="CC BY-NC 4.0",
+        license_url="https://github.com/RQ-Wu/UnderwaterRanker",
         non_commercial=True,
     ),
 )

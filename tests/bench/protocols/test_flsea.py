@@ -79,7 +79,7 @@ def perfect(run: Path, truth: GroundTruth, monkeypatch: pytest.MonkeyPatch, tmp_
         assert settings.focal == pytest.approx(1296.67 * 192 / 968, abs=0.01)
         first = truth.clear(truth.names[0])
         assert first is not None
-        assert float(frames.image(0).mean()) == pytest.approx(float(first.mean()), abs=1e-3)  # the restored picture
+        assert float(frames.image(0).mean()) == pytest.approx(float(first.mean()), abs=1e-3)  # the restored image
         return known(frames, truth, rec, folder)
 
     monkeypatch.setattr(flsea, "reconstruct", reconstruct)
@@ -147,7 +147,7 @@ def test_sequences_are_the_papers_unless_others_are_named(tree: Path):
         chosen_sequences(tree, ["u_canyon"])
 
 
-def test_poses_beside_the_pictures_are_the_reference(tree: Path, tmp_path: Path, truth: GroundTruth):
+def test_poses_beside_the_images_are_the_reference(tree: Path, tmp_path: Path, truth: GroundTruth):
     sequence = read_tree(tree).sequences[0]
     poses = {shot.name: truth.cameras.cam2world[k].numpy() for k, shot in enumerate(sequence.shots[:4])}
     frames = _named([f"{shot.name}.tiff" for shot in sequence.shots[1:6]])
@@ -158,7 +158,7 @@ def test_poses_beside_the_pictures_are_the_reference(tree: Path, tmp_path: Path,
     torch.testing.assert_close(found.cameras.cam2world, truth.cameras.cam2world[1:4].double())
 
 
-def test_without_restored_pictures_there_is_no_reference(tree: Path, tmp_path: Path):
+def test_without_restored_images_there_is_no_reference(tree: Path, tmp_path: Path):
     sequence = read_tree(tree).sequences[0]
     bare = replace(sequence, shots=tuple(replace(shot, clean=None) for shot in sequence.shots))
     frames = _named([f"{shot.name}.tiff" for shot in bare.shots])

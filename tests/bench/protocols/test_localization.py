@@ -1,4 +1,4 @@
-"""Localisation as a table: exact answers score full marks, lost frames are failures, runs of a clip are rows."""
+"""Localization as a table: exact answers score full marks, lost frames are failures, runs of a clip are rows."""
 
 import json
 import shutil
@@ -8,7 +8,7 @@ from pathlib import Path
 import pytest
 import torch
 
-from swimm3r.bench.protocols.localization import localisation_scores, localise, pose_scores
+from swimm3r.bench.protocols.localization import localization_scores, localize, pose_scores
 from swimm3r.bench.runs import clips_of
 from swimm3r.errors import InputError
 from swimm3r.evaluate import NotComputed
@@ -44,9 +44,9 @@ def test_exact_answers_score_full_marks_and_lost_frames_fail_their_pairs(run: Pa
     scores = pose_scores(sfm.rec, one_lost, truth)
     assert scores["rra2_map"] == pytest.approx(50)
     assert scores["rra15_queries"] == 0
-    assert localisation_scores(one_lost)["located_pct"] == 50
-    assert localisation_scores(one_lost)["inlier_5px_pct"] == pytest.approx(37.5)
-    assert localisation_scores(one_lost)["fps_localise"] == pytest.approx(2)
+    assert localization_scores(one_lost)["located_pct"] == 50
+    assert localization_scores(one_lost)["inlier_5px_pct"] == pytest.approx(37.5)
+    assert localization_scores(one_lost)["fps_localize"] == pytest.approx(2)
 
 
 def test_the_reference_may_lie_elsewhere_at_another_scale(run: Path):
@@ -95,7 +95,7 @@ def test_runs_of_one_clip_are_rows_and_their_reference_is_made_once(
         return replace(sfm.rec, names=frames.names, cameras=truth.cameras[order])
 
     monkeypatch.setattr(colmap, "reconstruct", all_frames)
-    table = localise(runs, tmp_path / "out", LocalizationSettings(matcher="sift"))
+    table = localize(runs, tmp_path / "out", LocalizationSettings(matcher="sift"))
     assert made == [("auto", sfm.frames.names, {"train"})]
     assert [(c.scene, c.method) for c in table.cells] == [
         ("dive", "truth (first) / uwbs-static"),
@@ -105,7 +105,7 @@ def test_runs_of_one_clip_are_rows_and_their_reference_is_made_once(
         assert isinstance(cell.scores["located_pct"], float)
         assert isinstance(cell.scores["peak_mb"], float | NotComputed)
         assert isinstance(cell.scores["rra2_map"], float)
-    assert localise(runs, tmp_path / "out", LocalizationSettings(matcher="sift")).cells == table.cells
+    assert localize(runs, tmp_path / "out", LocalizationSettings(matcher="sift")).cells == table.cells
     assert len(made) == 1
 
 
@@ -121,4 +121,4 @@ def test_runs_with_other_frames_do_not_compare(run: Path, tmp_path: Path):
 
 def test_a_run_without_a_map_is_refused(run: Path, tmp_path: Path):
     with pytest.raises(InputError, match="there is no map"):
-        localise([run], tmp_path)
+        localize([run], tmp_path)

@@ -1,4 +1,4 @@
-"""Recipes on one reconstruction: one start for all, the block with refined poses, pictures side by side."""
+"""Recipes on one reconstruction: one start for all, the block with refined poses, images side by side."""
 
 import json
 import shutil
@@ -9,7 +9,7 @@ import pytest
 import torch
 
 from swimm3r.bench import map_scores, reference, tables
-from swimm3r.bench.cells import Cell
+from swimm3r.bench.cells import Result
 from swimm3r.bench.protocols import render
 from swimm3r.bench.protocols.localization import maps_of
 from swimm3r.bench.protocols.render import compare_renderers, settings_for
@@ -51,9 +51,9 @@ def test_every_recipe_starts_from_the_same_poses_of_the_whole_clip(
         assert all(isinstance(cell.scores[name], float) for name in ("clear_psnr", "T_D_abs", "B_abs"))
     text = tables.write(tmp_path, table)
     assert "| psnr | truth + poses / ubs | truth + poses / uwbs-static |" in text
-    pictures = sorted((tmp_path / "pictures" / "dive").glob("*.png"))
-    assert len(pictures) == 2
-    assert read_rgb(pictures[0]).shape[0] == 2 * (240 + 22 + 4)
+    images = sorted((tmp_path / "images" / "dive").glob("*.png"))
+    assert len(images) == 2
+    assert read_rgb(images[0]).shape[0] == 2 * (240 + 22 + 4)
     found = maps_of(clips_of([run])[0].runs[0], tmp_path)
     assert {m.method for m in found} == {c.method for c in table.cells[:5]}
 
@@ -94,7 +94,7 @@ def test_a_scene_with_a_model_lends_its_poses_where_asked(run: Path, tmp_path: P
     sfm, known = clip.runs[0].open(), open_finished_sfm(run).rec
     assert sfm.rec.names == known.names
     torch.testing.assert_close(sfm.rec.cameras.cam2world, known.cameras.cam2world)
-    with pytest.raises(InputError, match="no folder of pictures with their COLMAP model"):
+    with pytest.raises(InputError, match="no folder of images with their COLMAP model"):
         made_runs([run.parent / "dive"], tmp_path / "out", settings, given_poses=True)
 
 
@@ -140,7 +140,7 @@ def test_weights_that_arrive_fill_the_scores_that_lacked_them(
     monkeypatch.setenv("SWIMM3R_CACHE", str(tmp_path / "cache"))
     monkeypatch.setattr(reference, "of_clip", lambda *_: open_finished_sfm(run).truth)
 
-    def compared() -> Cell:
+    def compared() -> Result:
         return compare_renderers([run], tmp_path / "out", ("ubs",), tiny, test=quick).cells[0]
 
     trainings, train = [], map_scores.train

@@ -47,7 +47,7 @@ def with_matches(rec: Reconstruction, off: float) -> Reconstruction:
     return replace(rec, matches=Matches(first, second, a[0].float(), xy_b, torch.ones(count)))
 
 
-def test_a_map_is_scored_in_pixels_of_the_original_pictures(run: Path):
+def test_a_map_is_scored_in_pixels_of_the_original_images(run: Path):
     rec = open_finished_sfm(run).rec
     seen = with_matches(rec, 0.0)
     exact = model_scores(seen, Uncapped(seen.matches, 7), 14, 1.0)
@@ -156,7 +156,7 @@ def test_every_method_is_a_row_and_none_is_skipped_in_silence(
     assert all(c.not_run and not c.scores for c in others)
     assert [path.parent.parent.name for path in tmp_path.glob("dive/*/0/run")] == ["colmap-incremental"]
     assert "vggt: not run" in tables.markdown(table)
-    assert read_rgb(tmp_path / "pictures" / "dive.png").shape[1] > 400
+    assert read_rgb(tmp_path / "images" / "dive.png").shape[1] > 400
     assert compare_sfm([clip], tmp_path, SfmMethods(), PRESETS["fast"], Mast3rSettings()).cells == table.cells
     assert calls == ["incremental", "global"]
 
@@ -219,6 +219,6 @@ def test_restored_frames_are_scored_in_physical_colors_beside_the_shown_ones_and
         assert cell.scores["uciqe_cielab"] == pytest.approx(sum(uciqe(image) for image in images) / 2, rel=1e-3)
         assert cell.scores["uranker"] == URANKER
     assert len({round(cell.scores["uciqe_cielab"], 2) for cell in table.cells}) == 3
-    assert list((tmp_path / "out" / "pictures" / "dive").glob("*.png"))
+    assert list((tmp_path / "out" / "images" / "dive").glob("*.png"))
     nothing = score_restoration([with_water(run, tmp_path / "unrestored")], tmp_path / "none").cells[1]
     assert isinstance(nothing.scores["uiqm_funie"], NotComputed)

@@ -14,6 +14,7 @@ from swimm3r.io import images, ply
 from swimm3r.io.cameras_json import CameraTable, write_cameras
 from swimm3r.io.colmap import model as colmap
 from swimm3r.io.colmap.model import ColmapModel
+from swimm3r.io.imports.nerfstudio import images_folder
 from swimm3r.io.imports.read import read_foreign
 from swimm3r.io.imports.record import ForeignModel
 
@@ -28,7 +29,7 @@ class Scene:
     cam2world: np.ndarray
     xyz: np.ndarray
 
-    def sightings(self, lens: str = "OPENCV", distortion: np.ndarray = OPENCV, k: np.ndarray = K) -> np.ndarray:
+    def observations(self, lens: str = "OPENCV", distortion: np.ndarray = OPENCV, k: np.ndarray = K) -> np.ndarray:
         """Pixels [c, p, 2] of the points by our own camera model."""
         cameras = Cameras(
             torch.from_numpy(k).repeat(N, 1, 1), torch.from_numpy(distortion).repeat(N, 1),
@@ -67,7 +68,7 @@ def same_pixels(found: ForeignModel, scene: Scene, pixels: np.ndarray, scale: fl
 
 
 def write_colmap(folder: Path, scene: Scene) -> None:
-    pixels = scene.sightings()
+    pixels = scene.observations()
     points, frames = np.repeat(np.arange(20), N), np.tile(np.arange(N), 20)
     colmap.write_model(
         folder,
@@ -94,7 +95,7 @@ def test_a_colmap_model(scene: Scene, tmp_path: Path):
     found = read_foreign(tmp_path)
     assert found.program == "COLMAP model"
     same_cameras(found, scene)
-    same_pixels(found, scene, scene.sightings())
+    same_pixels(found, scene, scene.observations())
     np.testing.assert_allclose(found.model.xyz, scene.xyz)
 
 
@@ -108,7 +109,7 @@ def test_our_own_cameras_json_is_read_by_name_and_never_hides_the_model_beside_i
     assert found.metric
     assert len(found.model.xyz) == 0
     same_cameras(found, scene)
-    same_pixels(found, scene, scene.sightings())
+    same_pixels(found, scene, scene.observations())
     assert len(read_foreign(tmp_path).model.xyz) == 20  # a run's folder holds both
 
 
@@ -141,7 +142,7 @@ def test_nerfstudio_transforms_come_back_in_the_original_world(scene: Scene, tmp
     write_json(tmp_path / "transforms.json", document)
     found = read_foreign(tmp_path)
     same_cameras(found, scene)
-    same_pixels(found, scene, scene.sightings())
+    same_pixels(found, scene, scene.observations())
     np.testing.assert_allclose(found.model.xyz, scene.xyz, atol=1e-5)
     assert (found.model.rgb == 102).all()
     assert not found.metric
@@ -204,7 +205,7 @@ def test_metashape_cameras_keep_their_scale(scene: Scene, tmp_path: Path):
     expected[:, :3, 3] *= 2.5
     np.testing.assert_allclose(found.model.cam2world, expected, atol=1e-9)
     np.testing.assert_allclose(found.model.distortion, np.tile(OPENCV, (N, 1)), atol=1e-9)
-    same_pixels(found, scene, scene.sightings(), scale=2.5)
+    same_pixels(found, scene, scene.observations(), scale=2.5)
 
 
 def test_metashape_higher_terms_are_fitted_or_refused(scene: Scene, tmp_path: Path):
@@ -227,11 +228,11 @@ def test_metashape_fisheye(scene: Scene, tmp_path: Path):
     (tmp_path / "c.xml").write_text(metashape(scene, lens, kind="fisheye"))
     found = read_foreign(tmp_path / "c.xml")
     assert found.model.model == "OPENCV_FISHEYE"
-    same_pixels(found, scene, scene.sightings("OPENCV_FISHEYE", k))
+    same_pixels(found, scene, scene.observations("OPENCV_FISHEYE", k))
 
 
 def openmvg(scene: Scene, lens: dict) -> dict:
-    pixels = scene.sightings("OPENCV", OPENCV, np.array([[310.0, 0, 203], [0, 310, 148], [0, 0, 1]]))
+    pixels = scene.observations("OPENCV", OPENCV, np.array([[310.0, 0, 203], [0, 310, 148], [0, 0, 1]]))
     first = {"polymorphic_id": 2147483649, "polymorphic_name": "pinhole_brown_t2"}
     entries = [
         {"key": i, "value": {**(first if i == 0 else {"polymorphic_id": 1}), "ptr_wrapper": {"id": i, "data": lens}}}
@@ -255,14 +256,14 @@ def openmvg(scene: Scene, lens: dict) -> dict:
     }  # fmt: skip
 
 
-def test_openmvg_keeps_points_and_sightings(scene: Scene, tmp_path: Path):
+def test_openmvg_keeps_points_and_observations(scene: Scene, tmp_path: Path):
     k1, k2, p1, p2 = OPENCV.tolist()
     lens = {"width": WIDTH, "height": HEIGHT, "focal_length": 310.0, "principal_point": [203.0, 148.0]}
     document = openmvg(scene, {"value0": lens, "disto_t2": [k1, k2, 0.0, p1, p2]})
     write_json(tmp_path / "sfm_data.json", document)
     found = read_foreign(tmp_path)
     same_cameras(found, scene)
-    assert not found.coloured
+    assert not found.colored
     np.testing.assert_allclose(found.model.xyz, scene.xyz)
     assert len(found.model.track_point) == 20 * N
     cameras = Cameras(*(torch.from_numpy(a) for a in (found.model.K, found.model.distortion, found.model.cam2world)),
@@ -291,7 +292,7 @@ def test_openmvg_lenses(name: str, data: dict, model: str, distortion: list[floa
 
 
 @pytest.mark.parametrize(("width", "height"), [(400, 300), (300, 400)])
-def test_vggt_predictions_go_back_to_the_pictures_pixels(width: int, height: int, scene: Scene, tmp_path: Path):
+def test_vggt_predictions_go_back_to_the_images_pixels(width: int, height: int, scene: Scene, tmp_path: Path):
     for name in NAMES:
         images.write_rgb(
             tmp_path / "images" / Path(name).with_suffix(".png").name, np.zeros((height, width, 3), np.float32)
@@ -317,10 +318,10 @@ def test_vggt_predictions_go_back_to_the_pictures_pixels(width: int, height: int
     np.testing.assert_allclose(found.depth.confidence, 0.8)
 
 
-def test_vggt_without_its_pictures_is_refused(scene: Scene, tmp_path: Path):
+def test_vggt_without_its_images_is_refused(scene: Scene, tmp_path: Path):
     np.savez(tmp_path / "predictions.npz", extrinsic=np.zeros((N, 3, 4)), intrinsic=np.zeros((N, 3, 3)),
              depth=np.zeros((N, 2, 2, 1)), depth_conf=np.zeros((N, 2, 2)), images=np.zeros((N, 3, 2, 2)))  # fmt: skip
-    with pytest.raises(InputError, match="speaks of 4 pictures"):
+    with pytest.raises(InputError, match="speaks of 4 images"):
         read_foreign(tmp_path)
 
 
@@ -359,3 +360,14 @@ def test_names_that_lead_out_of_their_folder_are_refused(scene: Scene, tmp_path:
         read_foreign(write_json(tmp_path / "sfm_data.json", document))
     with pytest.raises(InputError, match="names a file outside its folder"):
         read_foreign(write_json(tmp_path / "transforms.json", transforms(scene, ply_file_path="../../secret.ply")))
+
+
+def test_images_that_are_not_there_are_refused_before_any_search(scene: Scene, tmp_path: Path):
+    (tmp_path / "images").mkdir()
+    path = write_json(tmp_path / "transforms.json", transforms(scene))
+    first = json.loads(path.read_text())["frames"][0]["file_path"]
+    with pytest.raises(InputError, match="which is not there"):
+        images_folder(path)
+    (tmp_path / first).parent.mkdir(parents=True, exist_ok=True)
+    (tmp_path / first).touch()
+    assert images_folder(path) == (tmp_path / first).parent

@@ -23,7 +23,7 @@ def float32(scene: tuple[Primitives2D, MediumMaps]) -> tuple[Primitives2D, Mediu
 
 
 def full_pass(p: Primitives2D, medium: MediumMaps, kernel: Kernel = "beta") -> list[torch.Tensor]:
-    """Everything a training step reads from the rasteriser."""
+    """Everything a training step reads from the rasterizer."""
     leaves = [t.detach().requires_grad_() for t in (*p, *medium)]
     sgg = SggBuffers.zeros(len(p.depth))
     height, width = medium.binf.shape[1:]
@@ -114,7 +114,7 @@ def test_every_covered_pixel_is_in_a_tile_list_and_every_listed_tile_is_touched(
         dx, dy = x - p.mean2d[i, 0].item(), y - p.mean2d[i, 1].item()
         a, b, c = p.conic[i].tolist()
         r2 = a * dx**2 + 2 * b * dx * dy + c * dy**2
-        for limit, found in ((1.0, covered), (1.6, near)):  # near: the ellipse may pass between pixel centres
+        for limit, found in ((1.0, covered), (1.6, near)):  # near: the ellipse may pass between pixel centers
             rows, columns = np.nonzero(r2 < limit * r2_max[i].item() - (1e-5 if limit == 1 else -0.2))
             found |= {(t, i) for t in np.unique(rows // 16 * 6 + columns // 16).tolist()}
     assert covered <= listed <= near

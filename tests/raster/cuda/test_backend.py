@@ -55,7 +55,7 @@ def test_bins_of_the_gpu_back_end_are_refused_by_the_cpu_kernels(scene: Scene):
 def test_a_missing_warp_says_what_to_install(monkeypatch: pytest.MonkeyPatch, scene: Scene):
     p, medium = scene(5, 20, 20)
     monkeypatch.delitem(sys.modules, "swimm3r.raster.cuda.backend")
-    monkeypatch.delattr(sys.modules["swimm3r.raster"], "warp_gpu")
+    monkeypatch.delattr(sys.modules["swimm3r.raster.cuda"], "backend")
     monkeypatch.setitem(sys.modules, "warp", None)
     with pytest.raises(DeviceError, match=r"swimm3r\[cuda\]"):
         rasterize(p, medium, 20, 20, backend="warp")
@@ -81,7 +81,7 @@ def test_on_the_gpu_a_pass_agrees_with_numba(kernel: Kernel, scene: Scene):
 
 @gpu
 @needs_gpu
-def test_on_the_gpu_gradient_descent_finds_the_colours(scene: Scene):
+def test_on_the_gpu_gradient_descent_finds_the_colors(scene: Scene):
     p, medium = scene(200, 64, 64)
     p, medium = Primitives2D(*(t.float().cuda() for t in p)), MediumMaps(*(t.float().cuda() for t in medium))
     target = rasterize(p, medium, 64, 64).rgb.detach()

@@ -1,4 +1,4 @@
-"""Floaters of aligned depth maps: seen through by surer neighbours, and only by those that are asked."""
+"""Floaters of aligned depth maps: seen through by surer neighbors, and only by those that are asked."""
 
 import torch
 

@@ -50,7 +50,7 @@ def surface(cameras: Cameras) -> torch.Tensor:
         rays = rays_of(cameras[i]) @ cameras.cam2world[i, :3, :3].T
         best = torch.full(rays.shape[:2], torch.inf, dtype=torch.float64)
         for middle, radius in SPHERES:
-            o = cameras.centres[i] - torch.tensor(middle, dtype=torch.float64)
+            o = cameras.centers[i] - torch.tensor(middle, dtype=torch.float64)
             a, b, c = (rays * rays).sum(-1), (rays @ o), o @ o - radius**2
             root = (b * b - a * c).clamp(min=0).sqrt()
             for t in ((-b - root) / a, (-b + root) / a):
@@ -59,7 +59,7 @@ def surface(cameras: Cameras) -> torch.Tensor:
     return torch.stack(out)
 
 
-def make_scene(n: int = 4, noise: float = 0.0, scales: torch.Tensor | None = None, centre: float = 0.5) -> Scene:
+def make_scene(n: int = 4, noise: float = 0.0, scales: torch.Tensor | None = None, center: float = 0.5) -> Scene:
     """What a perfect (or noisy) network would say about n frames; `scales` are its errors of scale per frame."""
     generator = torch.Generator().manual_seed(0)
     cameras = truth(n)
@@ -73,7 +73,7 @@ def make_scene(n: int = 4, noise: float = 0.0, scales: torch.Tensor | None = Non
             points = points * (1 + noise * torch.randn(*points.shape, generator=generator))
             sums[f] = canonical.add_pass(sums[f], points, torch.full((HEIGHT, WIDTH), 5.0))
     views = [canonical.canonical_view(s) for s in sums]
-    frames = [canonical.anchored_frame(v, pixel_centre=centre) for v in views]
+    frames = [canonical.anchored_frame(v, pixel_center=center) for v in views]
     pairs = [match(cameras, z, views, i, j) for i, j in graph]
     return Scene(cameras, z, frames, pairs, views)
 
@@ -83,7 +83,7 @@ def match(cameras: Cameras, z: torch.Tensor, views: list, i: int, j: int) -> Anc
     y, x = torch.meshgrid(torch.arange(1, HEIGHT, HEIGHT // 32), torch.arange(1, WIDTH, WIDTH // 42), indexing="ij")
     xy_i = torch.stack([x, y], dim=-1).reshape(-1, 2)
     seen = rays_of(cameras[i])[xy_i[:, 1], xy_i[:, 0]] * z[i, xy_i[:, 1], xy_i[:, 0], None]
-    world = seen @ cameras.cam2world[i, :3, :3].T + cameras.centres[i]
+    world = seen @ cameras.cam2world[i, :3, :3].T + cameras.centers[i]
     uv, depth = project(cameras[j], world[None])
     xy_j = uv[0].floor().long()
     inside = (xy_j >= 0).all(1) & (xy_j[:, 0] < WIDTH) & (xy_j[:, 1] < HEIGHT)
@@ -95,12 +95,12 @@ def match(cameras: Cameras, z: torch.Tensor, views: list, i: int, j: int) -> Anc
 
 
 def errors(found: optimize.Alignment, cameras: Cameras) -> tuple[float, float]:
-    """Largest relative rotation error, degrees, and largest error of a centre after a similarity, scene units."""
+    """Largest relative rotation error, degrees, and largest error of a center after a similarity, scene units."""
     R, S = found.cam2world[:, :3, :3], cameras.cam2world[:, :3, :3]
     rotation = rotation_angle((R[0].T @ R).mT @ (S[0].T @ S)).max()
-    fit = align_similarity(found.cam2world[:, :3, 3], cameras.centres)
+    fit = align_similarity(found.cam2world[:, :3, 3], cameras.centers)
     moved = fit.points(found.cam2world[:, :3, 3])
-    return float(rotation.rad2deg()), float((moved - cameras.centres).norm(dim=1).max())
+    return float(rotation.rad2deg()), float((moved - cameras.centers).norm(dim=1).max())
 
 
 @pytest.fixture(scope="module")
@@ -114,9 +114,9 @@ def aligned(scene: Scene) -> optimize.Alignment:
 
 
 def test_cameras_of_an_exact_scene_are_found(scene: Scene, aligned: optimize.Alignment):
-    rotation, centre = errors(aligned, scene.cameras)
+    rotation, center = errors(aligned, scene.cameras)
     assert rotation < 0.3
-    assert centre < 0.02
+    assert center < 0.02
     torch.testing.assert_close(aligned.K[:, 0, 0], scene.cameras.K[:, 0, 0], rtol=0.02, atol=0)
     torch.testing.assert_close(aligned.K[:, :2, 2], scene.cameras.K[:, :2, 2], rtol=0, atol=1e-4)
 
@@ -131,13 +131,13 @@ def test_noise_of_one_percent_costs_less_than_a_degree():
 def test_frames_of_different_scale_are_brought_together():
     wrong = make_scene(scales=torch.tensor([1.0, 1.3, 0.8, 1.1]))
     found = align(wrong.frames, wrong.pairs, QUICK)
-    rotation, centre = errors(found, wrong.cameras)
+    rotation, center = errors(found, wrong.cameras)
     assert rotation < 0.5
-    assert centre < 0.04
+    assert center < 0.04
 
 
 def test_dense_depth_is_the_scene(scene: Scene, aligned: optimize.Alignment):
-    fit = align_similarity(aligned.cam2world[:, :3, 3], scene.cameras.centres)
+    fit = align_similarity(aligned.cam2world[:, :3, 3], scene.cameras.centers)
     for i, view in enumerate(scene.views):
         z = optimize.dense_z_depth(
             aligned.anchor_z_depth[i], view.relative_depth, float(aligned.focal_before[i]), float(aligned.K[i, 0, 0])
@@ -148,7 +148,7 @@ def test_dense_depth_is_the_scene(scene: Scene, aligned: optimize.Alignment):
 
 def test_points_of_matches_lie_on_the_scene(scene: Scene, aligned: optimize.Alignment):
     assert len(aligned.points) == sum(len(p.confidence) for p in scene.pairs)
-    fit = align_similarity(aligned.cam2world[:, :3, 3], scene.cameras.centres)
+    fit = align_similarity(aligned.cam2world[:, :3, 3], scene.cameras.centers)
     points = fit.points(aligned.points.double())
     distance = torch.stack([((points - torch.tensor(m)).norm(dim=1) - r).abs() for m, r in SPHERES]).amin(0)
     assert distance.median() < 0.15  # 3 % of the room's radius
@@ -204,7 +204,7 @@ def test_known_poses_are_kept_and_the_others_found(scene: Scene):
     known = Known(cam2world=scene.cameras.cam2world, posed=posed)
     found = align(scene.frames, scene.pairs, QUICK, known)
     torch.testing.assert_close(found.cam2world[posed], scene.cameras.cam2world[posed], atol=1e-6, rtol=0)
-    assert (found.cam2world[1, :3, 3] - scene.cameras.centres[1]).norm() < 0.03  # in the known poses' own unit
+    assert (found.cam2world[1, :3, 3] - scene.cameras.centers[1]).norm() < 0.03  # in the known poses' own unit
     assert rotation_angle(found.cam2world[1, :3, :3].T @ scene.cameras.cam2world[1, :3, :3]).rad2deg() < 0.5
 
 
@@ -216,23 +216,23 @@ def test_known_poses_are_the_start_of_the_chain(scene: Scene):
     free = replace(problem, known_pose=None, posed=torch.zeros(4, dtype=torch.bool))
     chained = optimize._scene(start, free, none)
     torch.testing.assert_close(chained.R.double(), scene.cameras.cam2world[:, :3, :3], atol=1e-5, rtol=0)
-    torch.testing.assert_close(chained.centre.double(), scene.cameras.centres, atol=1e-5, rtol=0)
+    torch.testing.assert_close(chained.center.double(), scene.cameras.centers, atol=1e-5, rtol=0)
 
 
 @pytest.mark.parametrize(
     "change",
     [
-        {"optimise_principal_point": True},
+        {"optimize_principal_point": True},
         {"depth": "multiply"},
         {"exponential_depth": True},
-        {"optimise_depth": False},
+        {"optimize_depth": False},
         {"tree": "spanning"},
         {"parity": True},
     ],
     ids=lambda c: next(iter(c)),
 )
 def test_every_variant_finds_the_cameras(change: dict):
-    scene = make_scene(centre=0.0 if "parity" in change else 0.5)
+    scene = make_scene(center=0.0 if "parity" in change else 0.5)
     found = align(scene.frames, scene.pairs, replace(QUICK, coarse_iterations=60, fine_iterations=60, **change))
     assert errors(found, scene.cameras)[0] < 0.8
 
@@ -256,8 +256,8 @@ def test_pair_without_confident_matches_is_held_by_its_pointmaps(scene: Scene):
             for f, other in ((p.i, p.j), (p.j, p.i)):
                 rays = rays_of(scene.cameras[f])[4::8, 4::8].reshape(-1, 3)
                 world = rays * scene.z_depth[f, 4::8, 4::8].reshape(-1, 1)
-                world = world @ scene.cameras.cam2world[f, :3, :3].T + scene.cameras.centres[f]
-                local = (world - scene.cameras.centres[other]) @ scene.cameras.cam2world[other, :3, :3]
+                world = world @ scene.cameras.cam2world[f, :3, :3].T + scene.cameras.centers[f]
+                local = (world - scene.cameras.centers[other]) @ scene.cameras.cam2world[other, :3, :3]
                 anchors.append(Predicted(local.float(), torch.full((len(local),), 5.0)))
             p = replace(p, confidence=torch.full_like(p.confidence, 1.0), i_in_j=anchors[0], j_in_i=anchors[1])
         weak.append(p)

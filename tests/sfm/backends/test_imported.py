@@ -51,9 +51,9 @@ def model(dive) -> ColmapModel:
     )
 
 
-def test_cameras_points_scale_and_sightings_are_those_of_the_file(dive, model: ColmapModel, tmp_path: Path):
+def test_cameras_points_scale_and_observations_are_those_of_the_file(dive, model: ColmapModel, tmp_path: Path):
     rec = imported_backend.from_foreign(
-        dive.frames, ForeignModel("OpenMVG", model, metric=True, coloured=False), tmp_path
+        dive.frames, ForeignModel("OpenMVG", model, metric=True, colored=False), tmp_path
     )
     assert rec.backend == "OpenMVG"
     assert rec.metric
@@ -69,8 +69,8 @@ def test_cameras_points_scale_and_sightings_are_those_of_the_file(dive, model: C
     assert torch.equal(again.matches.xy_i, rec.matches.xy_i)
 
 
-def test_points_without_colours_get_those_of_the_pictures(dive, model: ColmapModel, tmp_path: Path):
-    rec = imported_backend.from_foreign(dive.frames, ForeignModel("OpenMVG", model, coloured=False), tmp_path)
+def test_points_without_colors_get_those_of_the_images(dive, model: ColmapModel, tmp_path: Path):
+    rec = imported_backend.from_foreign(dive.frames, ForeignModel("OpenMVG", model, colored=False), tmp_path)
     mine = rec.tracks.point == 7
     places = zip(rec.tracks.frame[mine].tolist(), rec.tracks.xy[mine].long().tolist(), strict=True)
     seen = [dive.frames.image(f)[y, x] for f, (x, y) in places]
@@ -78,7 +78,7 @@ def test_points_without_colours_get_those_of_the_pictures(dive, model: ColmapMod
     assert rec.points.error.max() < 1e-6
 
 
-def test_matches_pair_the_sightings_of_one_point_with_the_next_frames():
+def test_matches_pair_the_observations_of_one_point_with_the_next_frames():
     tracks = Tracks(
         torch.tensor([0, 0, 0, 0, 0, 1, 1]),
         torch.tensor([4, 0, 1, 2, 3, 6, 2]),
@@ -146,7 +146,7 @@ def test_poses_alone_get_points_of_our_own_where_the_file_puts_the_cameras(posed
     assert (z[found.tracks.frame, found.tracks.point] > 0).all()
 
 
-def test_a_cloud_without_sightings_stays_beside_the_triangulated_points(posed_dive, tmp_path: Path):
+def test_a_cloud_without_observations_stays_beside_the_triangulated_points(posed_dive, tmp_path: Path):
     frames, path = posed_dive
     foreign = read_foreign(path)
     cloud = replace(foreign.model, xyz=np.ones((3, 3)), rgb=np.full((3, 3), 9, np.uint8), error=np.zeros(3))
@@ -158,16 +158,16 @@ def test_a_cloud_without_sightings_stays_beside_the_triangulated_points(posed_di
     assert len(reconstruction.load(tmp_path / "sfm").points.xyz) == len(found.points.xyz)
 
 
-def test_pictures_that_match_nowhere_come_with_a_caution(posed_dive, tmp_path: Path):
+def test_images_that_match_nowhere_come_with_a_warning(posed_dive, tmp_path: Path):
     frames, path = posed_dive
     for frame in frames:
         images.write_rgb(frame.path, np.full((160, 240, 3), 0.4))
     rec = imported_backend.reconstruct(frames, ColmapModelSettings(path), tmp_path / "sfm")
-    assert "at its poses the pictures' own matches meet nowhere" in rec.cautions[0].what
+    assert "at its poses the images' own matches meet nowhere" in rec.warnings[0].what
     assert len(rec.tracks.point) == len(rec.matches.i) == 0
 
 
-def test_a_model_of_other_pictures_is_an_input_error(dive, model: ColmapModel, tmp_path: Path):
+def test_a_model_of_other_images_is_an_input_error(dive, model: ColmapModel, tmp_path: Path):
     other = replace(model, names=tuple(f"reef_{i}.jpg" for i in range(len(model.names))))
     with pytest.raises(InputError, match="0 of 7 training frames are in the"):
         imported_backend.from_foreign(dive.frames, ForeignModel("Metashape", other), tmp_path)

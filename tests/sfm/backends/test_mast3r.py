@@ -25,7 +25,7 @@ from swimm3r.sfm.backends import mast3r as mast3r_backend
 from swimm3r.sfm.mast3r.network import Architecture, Decoded, Descriptors, Encoded, Mast3r, Pointmap
 from swimm3r.sfm.mast3r.settings import AlignmentSettings, MatchingSettings
 from swimm3r.sfm.mast3r_sfm import run_pairs
-from swimm3r.sfm.mast3r_sfm.network_frames import network_pictures
+from swimm3r.sfm.mast3r_sfm.network_frames import network_images
 from swimm3r.sfm.settings import Mast3rSettings
 from swimm3r.synthetic import DiveSettings, write_dive
 
@@ -37,20 +37,20 @@ WAVELENGTHS = (8.0, 2.0, 0.5, 0.125)  # m, along three directions each: 24 numbe
 
 
 class ExactNetwork(Mast3r):
-    """Takes the network's place: recognises its pictures and says where every pixel's surface truly is."""
+    """Takes the network's place: recognizes its images and says where every pixel's surface truly is."""
 
-    def __init__(self, pictures: list[Tensor], cameras: Cameras, z_depth: Tensor, noise: float = 0.0) -> None:
-        """`z_depth` (n h w) and `cameras` are of the network's pictures; noise is relative, per pass and pixel."""
+    def __init__(self, images: list[Tensor], cameras: Cameras, z_depth: Tensor, noise: float = 0.0) -> None:
+        """`z_depth` (n h w) and `cameras` are of the network's images; noise is relative, per pass and pixel."""
         torch.nn.Module.__init__(self)
         self.architecture = Architecture()
         self.mask_token = torch.nn.Parameter(torch.full((1,), noise))
         self.enc_norm = torch.nn.LayerNorm(8)
-        self.pictures, self.cameras, self.z_depth, self.noise = pictures, cameras, z_depth.double(), noise
+        self.images, self.cameras, self.z_depth, self.noise = images, cameras, z_depth.double(), noise
         self.encoded, self.passes = [], []
         self.generator = torch.Generator().manual_seed(0)
 
     def encode(self, images: Tensor, portrait: Tensor | None = None) -> Encoded:
-        i = next(k for k, picture in enumerate(self.pictures) if torch.equal(picture, images[0]))
+        i = next(k for k, image in enumerate(self.images) if torch.equal(image, images[0]))
         self.encoded.append(i)
         height, width = images.shape[2:]
         count = height * width // 256
@@ -65,7 +65,7 @@ class ExactNetwork(Mast3r):
 
     def pointmap(self, view: Decoded, which: int) -> Pointmap:
         first, own = self._frames(view, which)
-        points = (self._world(own) - self.cameras.centres[first]) @ self.cameras.cam2world[first, :3, :3]
+        points = (self._world(own) - self.cameras.centers[first]) @ self.cameras.cam2world[first, :3, :3]
         if self.noise:
             points = points * (1 + self.noise * torch.randn(points.shape, generator=self.generator))
         confidence = torch.full(points.shape[:2], CONFIDENCE)
@@ -89,7 +89,7 @@ class ExactNetwork(Mast3r):
     def _world(self, i: int) -> Tensor:
         z = torch.where(self.z_depth[i] > 0, self.z_depth[i], 30.0)  # open water is far away
         seen = image_directions(self.cameras[i]).double() * z[..., None]
-        return seen @ self.cameras.cam2world[i, :3, :3].T + self.cameras.centres[i]
+        return seen @ self.cameras.cam2world[i, :3, :3].T + self.cameras.centers[i]
 
 
 @dataclass(frozen=True)
@@ -104,15 +104,15 @@ class Dive:
         return self.truth.cameras[[self.truth.names.index(name) for name in self.frames.train.names]]
 
     def network(self, noise: float = 0.0, kind: type[ExactNetwork] = ExactNetwork) -> ExactNetwork:
-        """One that knows this dive; the network's pictures are a whole fraction of the frames."""
+        """One that knows this dive; the network's images are a whole fraction of the frames."""
         train = self.frames.train
-        pictures = network_pictures(train, self.settings)
-        frame = pictures.framing
+        images = network_images(train, self.settings)
+        frame = images.framing
         assert (frame.left, frame.top) == (0, 0)
         step = self.frames.width // frame.network_width
         cameras = resized(self.cameras, frame.network_width, frame.network_height)
         seen = [exact_depth(self.truth.z_depth(name), step) for name in train.names]
-        return kind([pictures.image(i) for i in range(len(train))], cameras, torch.stack(seen), noise)
+        return kind([images.image(i) for i in range(len(train))], cameras, torch.stack(seen), noise)
 
 
 def exact_depth(z_depth: torch.Tensor, step: int) -> torch.Tensor:
@@ -226,7 +226,7 @@ def test_what_is_stored_is_what_other_back_ends_store(finished: tuple[Reconstruc
 
 def test_dense_depth_is_the_dive(small: Dive, finished: tuple[Reconstruction, Path]):
     rec, _ = finished
-    scale = align_similarity(rec.cameras.centres, small.cameras.centres).scale
+    scale = align_similarity(rec.cameras.centers, small.cameras.centers).scale
     for name in rec.names:
         found, true = rec.depth[name], small.truth.z_depth(name)
         known = (found.z_depth > 0) & (true > 0)
@@ -246,7 +246,7 @@ def test_tracks_see_each_frame_once_and_reproject(finished: tuple[Reconstruction
     assert ((rec.points.rgb >= 0) & (rec.points.rgb <= 1)).all()
 
 
-def test_pixels_have_their_centres_at_a_half_at_the_frames_own_resolution(
+def test_pixels_have_their_centers_at_a_half_at_the_frames_own_resolution(
     small: Dive, tmp_path: Path, take: Callable[[ExactNetwork], None]
 ):
     half = replace(small, settings=replace(small.settings, size=64, matching=MatchingSettings(subsample=4)))
@@ -260,9 +260,9 @@ def test_pixels_have_their_centres_at_a_half_at_the_frames_own_resolution(
         xy = rec.matches.xy_i[rows].double()
         z = half.truth.z_depth(rec.names[i])[xy[:, 1].long(), xy[:, 0].long()].double()
         rays = image_directions(half.cameras[i])[xy[:, 1].long(), xy[:, 0].long()].double()
-        world = (rays * z[:, None]) @ half.cameras.cam2world[i, :3, :3].T + half.cameras.centres[i]
+        world = (rays * z[:, None]) @ half.cameras.cam2world[i, :3, :3].T + half.cameras.centers[i]
         misses.append((project(half.cameras[j], world[None])[0][0] - rec.matches.xy_j[rows])[z > 0])
-    # a whole number of network pixels would be a centre; an error of half of one is 1 pixel here
+    # a whole number of network pixels would be a center; an error of half of one is 1 pixel here
     assert torch.cat(misses).median(0).values.abs().max() < 0.6
 
 
@@ -272,7 +272,7 @@ def test_bundle_adjustment_keeps_poses_and_depth_together(
     take(small.network())
     rec = swimm3r.reconstruct(small.frames, replace(small.settings, bundle_adjustment=True), tmp_path)
     assert errors(rec, small)[0] < 0.5
-    scale = align_similarity(rec.cameras.centres, small.cameras.centres).scale
+    scale = align_similarity(rec.cameras.centers, small.cameras.centers).scale
     found, true = rec.depth[rec.names[2]], small.truth.z_depth(rec.names[2])
     known = (found.z_depth > 0) & (true > 0)
     assert (found.z_depth[known] * scale / true[known] - 1).abs().median() < 0.02
@@ -304,7 +304,7 @@ def test_known_cameras_of_a_file_are_kept_and_the_others_found_in_its_unit(
     assert rec.metric
     torch.testing.assert_close(rec.cameras.cam2world[named], moved[named], atol=1e-5, rtol=0)
     torch.testing.assert_close(rec.cameras.K, small.cameras.K, rtol=1e-6, atol=0)
-    assert (rec.cameras.centres[[2, 4]] - moved[[2, 4], :3, 3]).norm(dim=1).max() < 0.1
+    assert (rec.cameras.centers[[2, 4]] - moved[[2, 4], :3, 3]).norm(dim=1).max() < 0.1
     found, true = rec.depth[rec.names[2]].z_depth, 2 * small.truth.z_depth(rec.names[2])
     known = (found > 0) & (true > 0)
     assert (found[known] / true[known] - 1).abs().median() < 0.03
@@ -355,7 +355,7 @@ def test_a_killed_run_goes_on_and_ends_where_an_undisturbed_one_does(
     torch.testing.assert_close(rec.points.xyz, finished[0].points.xyz, atol=1e-3, rtol=0)
 
 
-def test_a_shared_cache_serves_other_alignments_but_no_other_picture(
+def test_a_shared_cache_serves_other_alignments_but_no_other_image(
     small: Dive, tmp_path: Path, take: Callable[[ExactNetwork], None]
 ):
     settings = replace(small.settings, cache=tmp_path / "cache", graph="swin-1")
@@ -445,13 +445,13 @@ def test_what_the_network_may_say_wrong(
     assert caught.value.hint
 
 
-def test_a_single_stray_frame_is_left_out_under_a_caution(
+def test_a_single_stray_frame_is_left_out_under_a_warning(
     small: Dive, tmp_path: Path, take: Callable[[ExactNetwork], None]
 ):
     take(small.network(kind=OneStranger))
     rec = swimm3r.reconstruct(small.frames, replace(small.settings, min_share=0.8), tmp_path)
     assert rec.names == small.frames.train.names[:5]
-    assert "1 of 6 frames match no other" in rec.cautions[0].what
+    assert "1 of 6 frames match no other" in rec.warnings[0].what
 
 
 @pytest.mark.parametrize(

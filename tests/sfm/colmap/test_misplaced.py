@@ -40,10 +40,10 @@ def model(store: FeatureDatabase) -> pycolmap.Reconstruction:
 
 
 def moved(model: pycolmap.Reconstruction, degrees: float, which: tuple[int, ...] = (WRONG,)) -> pycolmap.Reconstruction:
-    """The model with frames swung about the scene's centre, as the second solution of a flat bottom swings them."""
-    centre = np.median([point.xyz for point in model.points3D.values()], axis=0)
+    """The model with frames swung about the scene's center, as the second solution of a flat bottom swings them."""
+    center = np.median([point.xyz for point in model.points3D.values()], axis=0)
     turn = pycolmap.Rotation3d(np.array([0.0, np.deg2rad(degrees), 0.0]))
-    swing = pycolmap.Rigid3d(turn, centre - turn.matrix() @ centre)
+    swing = pycolmap.Rigid3d(turn, center - turn.matrix() @ center)
     out = pycolmap.Reconstruction(model)
     for image_id in which:
         image = out.images[image_id]

@@ -1,4 +1,4 @@
-"""Poses without weights: from pictures of two textured planes whose poses are known, and from a murky real clip."""
+"""Poses without weights: from images of two textured planes whose poses are known, and from a murky real clip."""
 
 import shutil
 from dataclasses import replace
@@ -51,7 +51,7 @@ def _render(cameras: Cameras, folder: Path) -> Frames:
         def homography(origin: list[float], u: list[float], v: list[float], P: np.ndarray = P) -> np.ndarray:
             return P @ np.stack([[*u, 0], [*v, 0], [*origin, 1]], 1)
 
-        picture = cv2.warpPerspective(
+        image = cv2.warpPerspective(
             far, homography([-5, -5, 4], [10 / 1024, 0, 0], [0, 10 / 1024, 0]), (WIDTH, HEIGHT), borderMode=1
         )
         H = homography([-0.9, -0.6, 2.4], [1.5 / 1024, 0, 0.9 / 1024], [0, 1.2 / 1024, 0.2 / 1024])
@@ -59,14 +59,14 @@ def _render(cameras: Cameras, folder: Path) -> Frames:
         cover = cv2.warpPerspective(np.full_like(near, 255), H, (WIDTH, HEIGHT)) > 127
         path = folder / f"{i}.png"
         folder.mkdir(parents=True, exist_ok=True)
-        cv2.imwrite(str(path), np.where(cover, front, picture))
+        cv2.imwrite(str(path), np.where(cover, front, image))
         frames.append(Frame(f"dive one/{i}.png", path, float(i), 0.0, "train"))
     return Frames(tuple(frames), WIDTH, HEIGHT, ordered=True)
 
 
 @pytest.fixture(scope="module")
 def frames(tmp_path_factory: pytest.TempPathFactory) -> Frames:
-    return _render(_cameras(), tmp_path_factory.mktemp("pictures"))
+    return _render(_cameras(), tmp_path_factory.mktemp("images"))
 
 
 @pytest.fixture(scope="module")
@@ -80,7 +80,7 @@ def rec(frames: Frames, folder: Path) -> Reconstruction:
 
 
 def _worst_rotation_deg(rec: Reconstruction, truth: Cameras) -> float:
-    fit = align_similarity(rec.cameras.centres, truth.centres)
+    fit = align_similarity(rec.cameras.centers, truth.centers)
     turned = fit.poses(rec.cameras.cam2world)[:, :3, :3]
     return torch.rad2deg(rotation_angle(turned.mT @ truth.cam2world[:, :3, :3])).max().item()
 
@@ -89,8 +89,8 @@ def test_every_frame_of_a_good_clip_is_placed_where_it_was_taken(rec: Reconstruc
     truth = _cameras()
     assert rec.names == frames.names
     assert _worst_rotation_deg(rec, truth) < 0.3
-    fit = align_similarity(rec.cameras.centres, truth.centres)
-    assert (fit.points(rec.cameras.centres) - truth.centres).norm(dim=1).max() < 0.02
+    fit = align_similarity(rec.cameras.centers, truth.centers)
+    assert (fit.points(rec.cameras.centers) - truth.centers).norm(dim=1).max() < 0.02
     assert rec.backend == "colmap"
     assert not rec.metric
 
@@ -107,7 +107,7 @@ def test_points_reproject_where_their_tracks_saw_them(rec: Reconstruction) -> No
         assert (pixels[0] - rec.tracks.xy[own]).norm(dim=1).mean() < 1.0
 
 
-def test_points_have_the_colour_of_the_picture(rec: Reconstruction, frames: Frames) -> None:
+def test_points_have_the_color_of_the_image(rec: Reconstruction, frames: Frames) -> None:
     own = rec.tracks.frame == 3
     x, y = rec.tracks.xy[own].long().unbind(1)
     seen = frames.image(3)[y, x]
@@ -131,8 +131,8 @@ def test_matches_join_projections_of_one_surface_point(rec: Reconstruction) -> N
     assert (distance < 1.5).float().mean() > 0.95
 
 
-def test_good_pictures_raise_no_caution(rec: Reconstruction) -> None:
-    assert rec.cautions == ()
+def test_good_images_raise_no_warning(rec: Reconstruction) -> None:
+    assert rec.warnings == ()
 
 
 def test_a_second_run_goes_on_from_the_database_and_ends_in_the_same_poses(
@@ -192,7 +192,7 @@ def test_fixed_intrinsics_stay_as_given_but_for_a_flat_port_which_is_confessed(f
     assert found.cameras.model == "SIMPLE_RADIAL"
     assert found.cameras.K[0, 0, 0].item() == pytest.approx(FOCAL)
     assert found.cameras.distortion[0].tolist() == [0.01]
-    assert any("flat port" in caution.what for caution in found.cautions)
+    assert any("flat port" in warning.what for warning in found.warnings)
 
 
 def test_a_lens_that_is_given_is_held(frames: Frames, folder: Path, tmp_path: Path) -> None:
@@ -213,16 +213,16 @@ def test_frames_of_another_place_are_left_out_and_said(frames: Frames, tmp_path:
     stranger = Frame("elsewhere.png", path, 9.0, 0.0, "train")
     found = colmap.reconstruct(replace(frames, frames=(*frames.frames, stranger)), SETTINGS, tmp_path / "sfm")
     assert found.names == frames.names
-    assert any("1 of 9 frames could not be placed" in caution.what for caution in found.cautions)
+    assert any("1 of 9 frames could not be placed" in warning.what for warning in found.warnings)
 
 
-@pytest.mark.parametrize("picture", ["black", "unrelated"])
-def test_pictures_without_common_ground_fail_with_advice(picture: str, tmp_path: Path) -> None:
+@pytest.mark.parametrize("image", ["black", "unrelated"])
+def test_images_without_common_ground_fail_with_advice(image: str, tmp_path: Path) -> None:
     frames = []
     for i in range(4):
         path = tmp_path / f"{i}.png"
-        grey = np.zeros((HEIGHT, WIDTH), np.uint8)
-        cv2.imwrite(str(path), grey if picture == "black" else cv2.resize(_texture(20 + i), (WIDTH, HEIGHT)))
+        gray = np.zeros((HEIGHT, WIDTH), np.uint8)
+        cv2.imwrite(str(path), gray if image == "black" else cv2.resize(_texture(20 + i), (WIDTH, HEIGHT)))
         frames.append(Frame(path.name, path, float(i), 0.0, "train"))
     with pytest.raises(RegistrationError, match="of 4 frames") as caught:
         colmap.reconstruct(Frames(tuple(frames), WIDTH, HEIGHT, True), SETTINGS, tmp_path / "sfm")
@@ -256,7 +256,7 @@ def test_a_full_disk_is_a_storage_error(frames: Frames, tmp_path: Path, monkeypa
         colmap.reconstruct(frames, SETTINGS, tmp_path)
 
 
-def test_video_is_matched_with_neighbours_and_lookalikes_only(rec, frames: Frames, folder: Path) -> None:
+def test_video_is_matched_with_neighbors_and_lookalikes_only(rec, frames: Frames, folder: Path) -> None:
     camera = calibration.first_camera(WIDTH, HEIGHT, SETTINGS)
     store = feature_database.start_database(folder, frames, camera, SETTINGS.features)
     sparse = replace(SETTINGS, exhaustive_to=4, overlap=1, loops=1)
@@ -313,7 +313,7 @@ def test_pnp_without_a_consistent_pose_finds_none() -> None:
 def test_bundle_adjustment_mends_shaken_poses(rec: Reconstruction) -> None:
     generator = torch.Generator().manual_seed(0)
     shaken = rec.cameras.cam2world.clone()
-    shaken[:, :3, 3] += 0.01 * rec.cameras.centres.std() * torch.randn(COUNT, 3, generator=generator)
+    shaken[:, :3, 3] += 0.01 * rec.cameras.centers.std() * torch.randn(COUNT, 3, generator=generator)
     mended = colmap.bundle_adjust(replace(rec, cameras=replace(rec.cameras, cam2world=shaken)))
     assert mended.names == rec.names
     assert _worst_rotation_deg(mended, _cameras()) < 0.3
@@ -327,9 +327,9 @@ def test_a_tiled_floor_has_twins_and_a_reef_has_none() -> None:
     usable = torch.ones(HEIGHT, WIDTH, dtype=torch.bool)
     tile = cv2.resize(_texture(3), (40, 40))
 
-    def share(grey: np.ndarray) -> float:
-        picture = torch.from_numpy(np.repeat(grey[..., None], 3, 2).astype(np.float32) / 255)
-        found = extract_features(picture, usable, FeatureSettings())
+    def share(gray: np.ndarray) -> float:
+        image = torch.from_numpy(np.repeat(gray[..., None], 3, 2).astype(np.float32) / 255)
+        found = extract_features(image, usable, FeatureSettings())
         xy = torch.from_numpy(found.keypoints[:, :2].copy())
         return plausibility.twin_share(xy, unit_descriptors(found.descriptors))
 
@@ -347,7 +347,7 @@ def test_halves_that_share_no_points_are_called_badly_joined(rec, frames: Frames
         tracks=replace(rec.tracks, point=half),
         points=Points(rec.points.xyz.repeat(2, 1), rec.points.rgb.repeat(2, 1), rec.points.error.repeat(2)),
     )
-    said = [caution.what for caution in plausibility.implausible(doubled, store, frames)]
+    said = [warning.what for warning in plausibility.implausible(doubled, store, frames)]
     assert any("Parts of 4 + 4 frames did not join" in what for what in said)
 
 
@@ -355,7 +355,7 @@ def test_a_camera_that_only_turned_is_implausible(rec, frames: Frames, folder: P
     camera = calibration.first_camera(WIDTH, HEIGHT, SETTINGS)
     store = feature_database.start_database(folder, frames, camera, SETTINGS.features)
     far = replace(rec, points=replace(rec.points, xyz=rec.points.xyz * 300))
-    said = [caution.what for caution in plausibility.implausible(far, store, frames)]
+    said = [warning.what for warning in plausibility.implausible(far, store, frames)]
     assert any("rays only" in what for what in said)
 
 
@@ -363,9 +363,9 @@ def test_a_leap_of_the_camera_is_said(rec, frames: Frames, folder: Path) -> None
     camera = calibration.first_camera(WIDTH, HEIGHT, SETTINGS)
     store = feature_database.start_database(folder, frames, camera, SETTINGS.features)
     poses = rec.cameras.cam2world.clone()
-    poses[5:, :3, 3] += 100 * rec.cameras.centres.std()
+    poses[5:, :3, 3] += 100 * rec.cameras.centers.std()
     leap = replace(rec, cameras=replace(rec.cameras, cam2world=poses))
-    said = [caution.what for caution in plausibility.implausible(leap, store, frames)]
+    said = [warning.what for warning in plausibility.implausible(leap, store, frames)]
     assert any(f"jumps 1 time, first at {rec.names[5]}" in what for what in said)
 
 
@@ -375,4 +375,4 @@ def test_a_murky_real_clip_is_placed_without_any_prior(shared: Path, tmp_path: P
     real = Frames(tuple(Frame(p.name, p, float(i), 0.0, "train") for i, p in enumerate(paths)), 400, 300, False)
     found = colmap.reconstruct(real, SETTINGS, tmp_path)
     assert len(found.names) >= 0.9 * len(real)
-    assert not any("implausible" in caution.what for caution in found.cautions)
+    assert not any("implausible" in warning.what for warning in found.warnings)

@@ -43,23 +43,23 @@ def drawn(seed: int):
     return torch.Generator().manual_seed(seed)
 
 
-def colours(pictures: torch.Tensor) -> torch.Tensor:
-    return ((pictures + 1) / 2).permute(0, 2, 3, 1)
+def colors(images: torch.Tensor) -> torch.Tensor:
+    return ((images + 1) / 2).permute(0, 2, 3, 1)
 
 
 def test_without_augmentation_teacher_and_student_see_the_same_crop(tmp_path: Path):
-    item = made(tmp_path).item(0, 0.0, drawn(0))  # raw and clean are the same picture here
+    item = made(tmp_path).item(0, 0.0, drawn(0))  # raw and clean are the same image here
     assert item.clean.shape == (2, 3, 48, 64)
     assert torch.equal(item.clean, item.raw)
 
 
-def test_the_augmentation_is_the_clear_picture_through_one_water_at_ray_depth(tmp_path: Path):
+def test_the_augmentation_is_the_clear_image_through_one_water_at_ray_depth(tmp_path: Path):
     item = made(tmp_path).item(0, 1.0, drawn(3))
     water = water_types.draw(drawn(3), 1.0)
     assert water is not None
-    restored = remove_water(colours(item.raw), item.ray_depth, water, 0.0)
+    restored = remove_water(colors(item.raw), item.ray_depth, water, 0.0)
     known = item.valid
-    torch.testing.assert_close(restored[known], colours(item.clean)[known], atol=2e-4, rtol=0)
+    torch.testing.assert_close(restored[known], colors(item.clean)[known], atol=2e-4, rtol=0)
     assert not torch.equal(item.raw, item.clean)
     assert torch.equal(item.drawn, torch.stack([water.Binf, water.beta_D, water.beta_B]).expand(2, 3, 3))
     assert made(tmp_path).item(0, 0.0, drawn(3)).drawn.isnan().all()  # as taken: nobody knows its water
@@ -85,18 +85,18 @@ def test_where_nothing_is_seen_the_augmentation_shows_open_water(tmp_path: Path)
     write_rgb(tmp_path / "clean" / "0.png", np.zeros((HEIGHT, WIDTH, 3), np.uint8))
     item, water = data.item(0, 1.0, drawn(3)), water_types.draw(drawn(3), 1.0)
     assert water is not None
-    torch.testing.assert_close(colours(item.raw)[0][~item.valid[0]], water.Binf.expand(int((~item.valid[0]).sum()), 3))
-    assert (colours(item.raw)[0][item.valid[0]] < water.Binf).all()  # a black thing, nearer
+    torch.testing.assert_close(colors(item.raw)[0][~item.valid[0]], water.Binf.expand(int((~item.valid[0]).sum()), 3))
+    assert (colors(item.raw)[0][item.valid[0]] < water.Binf).all()  # a black thing, nearer
 
 
-def test_pictures_taken_in_air_always_get_water(tmp_path: Path):
+def test_images_taken_in_air_always_get_water(tmp_path: Path):
     data = made(tmp_path, with_raw=False)
     for seed in range(5):
         item = data.item(0, 0.0, drawn(seed))
         assert not torch.equal(item.raw, item.clean)
 
 
-def test_ray_depth_grows_towards_the_corners_as_the_lens_says(tmp_path: Path):
+def test_ray_depth_grows_toward_the_corners_as_the_lens_says(tmp_path: Path):
     K = np.array([[40.0, 0, WIDTH / 2], [0, 40.0, HEIGHT / 2], [0, 0, 1]])
     item = made(tmp_path, lens=Lens(WIDTH, HEIGHT, K)).item(0, 0.0, drawn(0))
     x, y = (32 - 0.5) / 32, (24 - 0.5) / 32  # of the corner pixel: f is 32 network pixels
@@ -111,7 +111,7 @@ def test_gaps_are_filled_from_the_nearest_known_pixel():
     assert nearest_known(depth).tolist() == [[1, 1, 4, 4], [1, 1, 4, 4]]
 
 
-def test_only_training_shots_with_a_clean_picture_are_trained_on(tmp_path: Path):
+def test_only_training_shots_with_a_clean_image_are_trained_on(tmp_path: Path):
     (sequence,) = made(tmp_path).sequences
     one, two = sequence.shots
     pair = [[Pair(0, 1)]]
@@ -122,7 +122,7 @@ def test_only_training_shots_with_a_clean_picture_are_trained_on(tmp_path: Path)
         assert trainable([replace(sequence, shots=(one, other))], pair) == []
     in_air = [replace(sequence, shots=(one, replace(two, raw=None)))]
     assert len(trainable(in_air, pair)) == 1
-    assert trainable(in_air, pair, augmented=False) == []  # nothing else gives such a shot its raw picture
+    assert trainable(in_air, pair, augmented=False) == []  # nothing else gives such a shot its raw image
     assert len(trainable([sequence], pair, augmented=False)) == 1
 
 

@@ -16,7 +16,7 @@ import pytest
 import tifffile
 import torch
 
-from swimm3r.cli.train_sfm import Recipe
+from swimm3r.cli.train_sfm import TrainingRecipeName
 from swimm3r.datasets import PairSettings, make_pairs, read_tree
 from swimm3r.errors import InputError, UsageError, WeightsError
 from swimm3r.io.images import write_rgb
@@ -24,7 +24,7 @@ from swimm3r.medium import Medium
 from swimm3r.sfm.distillation.loop import Workers, batch_size, learning_rate, pairs_of_step, train
 from swimm3r.sfm.distillation.pairs import PairData, split_data
 from swimm3r.sfm.distillation.settings import RECIPES, TrainSettings
-from swimm3r.sfm.distillation.state import Rows
+from swimm3r.sfm.distillation.state import MetricsSums
 from swimm3r.sfm.distillation.teacher_cache import TeacherCache
 from swimm3r.sfm.distillation.train import retrieved_pairs, train_sfm
 from swimm3r.sfm.distillation.validation import score, water_error
@@ -107,12 +107,12 @@ def test_the_teacher_is_left_as_it_was(network: Mast3r, eight: PairData, none: P
     before = fingerprint(network.state_dict())
     train(network, BASE, eight, none, SETTINGS, tmp_path, nothing)
     assert fingerprint(network.state_dict()) == before
-    picture = eight.item(0, 0.0, torch.Generator()).clean
-    tokens = network.encode(picture).tokens
+    image = eight.item(0, 0.0, torch.Generator()).clean
+    tokens = network.encode(image).tokens
     again = adapter_file.load(tmp_path / "adapter.safetensors", network)
     with again.adapters.off():
-        assert torch.equal(network.encode(picture).tokens, tokens)  # the trained adapters no longer hung on it
-    assert not torch.allclose(network.encode(picture).tokens, tokens)
+        assert torch.equal(network.encode(image).tokens, tokens)  # the trained adapters no longer hung on it
+    assert not torch.allclose(network.encode(image).tokens, tokens)
     again.adapters.detach()
 
 
@@ -233,7 +233,7 @@ def test_a_trunk_of_low_precision_trains_the_same_parameters(
     assert all(np.isfinite(row["loss"]) for row in rows(tmp_path))
 
 
-def test_a_batch_may_mix_pictures_of_several_shapes(
+def test_a_batch_may_mix_images_of_several_shapes(
     network: Mast3r, dive: Path, eight: PairData, none: PairData, tmp_path: Path
 ):
     write_dive(DiveSettings(frames=4, width=64, height=32, family="teal"), tmp_path / "data" / "wide")
@@ -298,7 +298,7 @@ def test_the_adapter_holds_no_base_weight_and_says_what_it_belongs_to(
     base = Base("x.pth", fingerprint(network.state_dict()), "CC BY-NC-SA 4.0")
     path = train(network, base, eight, none, replace(SETTINGS, epochs=1), tmp_path, nothing)
     header = adapter_file.describe(path)
-    assert header["base"] == {"name": "x.pth", "sha256": base.sha256, "licence": "CC BY-NC-SA 4.0"}
+    assert header["base"] == {"name": "x.pth", "sha256": base.sha256, "license": "CC BY-NC-SA 4.0"}
     assert header["trained"]["settings"]["seed"] == 0
     names = learned(path).keys()
     assert all(".lora_" in name or name.startswith("head.") for name in names)
@@ -328,7 +328,7 @@ def test_one_network_has_one_fingerprint_whatever_its_file(network: Mast3r, tmp_
 
 
 def test_the_recipes_are_the_papers_system_its_ablations_and_dark3r():
-    assert set(RECIPES) == set(Recipe.__args__)
+    assert set(RECIPES) == set(TrainingRecipeName.__args__)
     full = RECIPES["swimm3r"]
     assert (full.learning_rate, full.weight_decay, full.epochs, full.batch, full.water_probability) == (
         5e-4, 1e-4, 20, 4, 0.5,
@@ -389,7 +389,7 @@ def test_one_epoch_on_a_tree_in_flseas_layout_runs_from_the_command_line(
     out = tmp_path / "out"
     main(
         ["train-sfm", str(tmp_path / "archive"), "--out", str(out), "--weights", str(weights), "--device", "cpu",
-         "--epochs", "1", "--size", "64", "--validation", "2", "--base-licence", "made in a test"]
+         "--epochs", "1", "--size", "64", "--validation", "2", "--base-license", "made in a test"]
     )  # fmt: skip
     told = capsys.readouterr()
     assert "Adapter:" in told.out
@@ -399,7 +399,7 @@ def test_one_epoch_on_a_tree_in_flseas_layout_runs_from_the_command_line(
     assert validation["depth_absrel"] > 0
     assert validation["rotation_deg"] is None  # FLSea has no poses
     header = adapter_file.describe(out / "adapter.safetensors")
-    assert header["base"]["licence"] == "made in a test"
+    assert header["base"]["license"] == "made in a test"
     assert header["base"]["sha256"] == fingerprint(network.state_dict())
 
 
@@ -438,13 +438,13 @@ def test_tensorboard_gets_every_number_of_a_row_and_is_asked_for_where_it_is_mis
     module.SummaryWriter = Writer
     monkeypatch.setitem(sys.modules, "torch.utils.tensorboard", ModuleType("torch.utils.tensorboard"))
     monkeypatch.setitem(sys.modules, "torch.utils.tensorboard.writer", module)
-    Rows(tmp_path / "metrics.jsonl", tmp_path / "board").append(
+    MetricsSums(tmp_path / "metrics.jsonl", tmp_path / "board").append(
         {"step": 3, "loss": 0.5, "validation": {"a": 1.0, "b": None}}
     )
     assert written == [("loss", 0.5, 3), ("validation/a", 1.0, 3)]
     monkeypatch.setitem(sys.modules, "torch.utils.tensorboard.writer", None)
     with pytest.raises(UsageError, match="package tensorboard"):
-        Rows(tmp_path / "metrics.jsonl", tmp_path / "board")
+        MetricsSums(tmp_path / "metrics.jsonl", tmp_path / "board")
 
 
 def test_validation_knows_pose_depth_and_restoration_of_a_dive(network: Mast3r, eight: PairData):
@@ -502,7 +502,7 @@ def test_the_adapter_says_how_far_its_head_was_off_and_what_it_divided_by(
         "[" * 100_000 + "]" * 100_000,
         "[]",
         '{"schema": 1, "base": 1}',
-        '{"schema": 1, "base": {"name": "x", "sha256": "0", "licence": ""}, "peft": {}, '
+        '{"schema": 1, "base": {"name": "x", "sha256": "0", "license": ""}, "peft": {}, '
         '"objective": {"min_transmittance": "x"}, "trained": {}}',
     ],
 )
@@ -515,7 +515,7 @@ def test_an_adapters_header_that_is_not_ours_is_refused_by_name(network: Mast3r,
         adapter_file.load(path, network)
 
 
-def test_training_without_a_clean_picture_anywhere_says_so(network: Mast3r, tmp_path: Path):
+def test_training_without_a_clean_image_anywhere_says_so(network: Mast3r, tmp_path: Path):
     for k in range(3):
         write_rgb(
             tmp_path / "flatiron" / "imgs" / f"{16233051861828957 + k * 5_000_000}.png", np.zeros((8, 8, 3), np.uint8)

@@ -19,7 +19,7 @@ def rng(seed: int = 0) -> torch.Generator:
 
 
 def places(n: int = 6, features: int = 40, channels: int = 48) -> list[torch.Tensor]:
-    """Frames along a path: neighbours share half of their features, noisily."""
+    """Frames along a path: neighbors share half of their features, noisily."""
     world = torch.randn(features * (n + 1) // 2, channels, generator=rng(1))
     step = features // 2
     return [
@@ -84,7 +84,7 @@ def test_global_descriptor_is_a_unit_vector_whatever_the_order():
     assert torch.equal(asmk.global_descriptor(torch.zeros(3, 8)), torch.zeros(8))
 
 
-def test_cosine_finds_the_neighbours_along_a_path():
+def test_cosine_finds_the_neighbors_along_a_path():
     features = places()
     similarity = asmk.cosine_similarity(torch.stack([asmk.global_descriptor(f) for f in features]))
     torch.testing.assert_close(similarity.diagonal(), torch.ones(6))
@@ -102,7 +102,7 @@ def test_asmk_is_its_formula(channels: int):
     torch.testing.assert_close(fast, slow_asmk(features, codebook, settings), atol=1e-12, rtol=0)
 
 
-def test_asmk_finds_the_neighbours_along_a_path():
+def test_asmk_finds_the_neighbors_along_a_path():
     features = places()
     similarity = asmk.asmk_similarity(features, torch.randn(64, 48, generator=rng(3)))
     best = asmk.most_similar(similarity, 2)

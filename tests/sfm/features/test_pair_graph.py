@@ -8,7 +8,7 @@ import torch
 
 from swimm3r.errors import UsageError
 from swimm3r.sfm.features import pair_graph
-from swimm3r.sfm.mast3r.settings import Complete, LogWindow, OneReference, Retrieval, SlidingWindow, Video
+from swimm3r.sfm.mast3r.settings import Complete, LogWindow, OneReference, Retrieval, SlidingWindow, VideoPairs
 
 GRAPHS = [Complete(), SlidingWindow(3), SlidingWindow(20, cyclic=True), LogWindow(3), OneReference(2), Retrieval(4, 3)]
 
@@ -54,7 +54,7 @@ def test_retrieval_graphs_reproduce_the_reference(vectors: dict):
     assert pair_graph.farthest_frames(1 - similarity.numpy(), fps["N"], fps["numpy_seed"]) == fps["indices"]
 
 
-@pytest.mark.parametrize("graph", [*GRAPHS, Video(2, 1, 3)], ids=lambda g: type(g).__name__)
+@pytest.mark.parametrize("graph", [*GRAPHS, VideoPairs(2, 1, 3)], ids=lambda g: type(g).__name__)
 @pytest.mark.parametrize("n", [3, 9])
 def test_pairs_come_once_ordered_and_never_join_a_frame_to_itself(graph, n: int):
     found = pair_graph.make_pairs(n, graph, alike(n))
@@ -67,7 +67,7 @@ def test_video_graph_is_the_window_and_the_loops():
     n = 40
     similarity = torch.full((n, n), 0.1, dtype=torch.float64)
     similarity[35, 3], similarity[35, 4], similarity[35, 12], similarity[35, 34] = 0.9, 0.8, 0.7, 0.95
-    found = pair_graph.make_pairs(n, Video(window=2, closures=2, gap=10), similarity)
+    found = pair_graph.make_pairs(n, VideoPairs(window=2, closures=2, gap=10), similarity)
     assert {(i, j) for i, j in found if j - i <= 2} == {(i, i + d) for i in range(n) for d in (1, 2) if i + d < n}
     assert (3, 35) in found
     assert (12, 35) in found  # frame 4 would only say again what frame 3 says
@@ -76,9 +76,9 @@ def test_video_graph_is_the_window_and_the_loops():
 
 
 def test_video_graph_without_closures_needs_no_similarities():
-    assert pair_graph.make_pairs(3, Video(window=1, closures=0)) == [(0, 1), (1, 2)]
+    assert pair_graph.make_pairs(3, VideoPairs(window=1, closures=0)) == [(0, 1), (1, 2)]
     with pytest.raises(UsageError, match="which frames look alike"):
-        pair_graph.make_pairs(3, Video())
+        pair_graph.make_pairs(3, VideoPairs())
     with pytest.raises(UsageError, match="which frames look alike"):
         pair_graph.make_pairs(3, Retrieval())
 
@@ -97,8 +97,8 @@ def test_frames_that_no_pair_joins_are_told_apart():
         ("logwin-2-noncyclic", LogWindow(2)),
         ("oneref-7", OneReference(7)),
         ("retrieval-12-4", Retrieval(12, 4)),
-        ("video", Video()),
-        ("video-5-1", Video(5, 1)),
+        ("video", VideoPairs()),
+        ("video-5-1", VideoPairs(5, 1)),
     ],
 )
 def test_graph_has_a_short_name(text: str, graph):

@@ -28,14 +28,14 @@ def test_no_keypoint_lies_under_the_mask() -> None:
     assert len(found.descriptors) == len(found.keypoints)
 
 
-def test_keypoints_of_a_reduced_picture_are_in_pixels_of_the_full_one() -> None:
-    picture, usable = _texture(400, 600), torch.ones(400, 600, dtype=torch.bool)
-    found = extract_features(picture, usable, FeatureSettings(long_side=300))
+def test_keypoints_of_a_reduced_image_are_in_pixels_of_the_full_one() -> None:
+    image, usable = _texture(400, 600), torch.ones(400, 600, dtype=torch.bool)
+    found = extract_features(image, usable, FeatureSettings(long_side=300))
     assert found.keypoints[:, 0].max() > 500
     assert found.keypoints[:, 1].max() > 330
 
 
-def test_a_black_picture_has_no_keypoints() -> None:
+def test_a_black_image_has_no_keypoints() -> None:
     found = extract_features(torch.zeros(100, 120, 3), torch.ones(100, 120, dtype=torch.bool), FeatureSettings())
     assert found.keypoints.shape == (0, 4)
     assert found.descriptors.shape == (0, 128)

@@ -20,7 +20,7 @@ def test_a_place_seen_again_is_found_among_all_frames() -> None:
     assert alike[same & off].min() > alike[~same].max()
 
 
-def test_loops_leave_out_neighbours_in_time() -> None:
+def test_loops_leave_out_neighbors_in_time() -> None:
     alike = vlad.similarity(_frames_of_places([0, 0, 1, 1, 2, 2, 0, 1]), torch.Generator().manual_seed(0))
     pairs = vlad.alike_pairs(alike, 1, apart=2)
     assert {(0, 6), (1, 6), (2, 7), (3, 7)} <= set(pairs)

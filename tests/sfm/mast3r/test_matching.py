@@ -70,7 +70,7 @@ def test_seeds_matched_within_a_tolerance_reproduce_the_reference(vectors: dict[
 
 @pytest.mark.shared
 @pytest.mark.parametrize("distance", ["dot", "l2"])
-def test_nearest_neighbours_reproduce_the_reference(vectors: dict[str, torch.Tensor], distance: str):
+def test_nearest_neighbors_reproduce_the_reference(vectors: dict[str, torch.Tensor], distance: str):
     a, b = vectors["desc11"].flatten(0, 1), vectors["desc21"].flatten(0, 1)
     assert torch.equal(matching.nearest(a, b, block=1000), vectors[f"brute.{distance}.nn12"])
     assert torch.equal(matching.nearest(b, a), vectors[f"brute.{distance}.nn21"])

@@ -1,4 +1,4 @@
-"""Pictures reach the network in the published framing, and no pixel loses its way."""
+"""Images reach the network in the published framing, and no pixel loses its way."""
 
 import json
 import math
@@ -15,7 +15,7 @@ SIZES = [(1280, 720), (720, 1280), (640, 480), (333, 500), (512, 512), (300, 200
 
 
 def wave(width: int, height: int) -> torch.Tensor:
-    """A smooth picture whose three channels are different functions of the position, 0..1."""
+    """A smooth image whose three channels are different functions of the position, 0..1."""
     x, y = (pixel_grid(height, width) / torch.tensor([width, height])).unbind(-1)
     return torch.stack([x, y, 0.5 + 0.4 * torch.sin(7 * x + 3 * y)], dim=-1)
 
@@ -30,12 +30,12 @@ def test_sizes_reproduce_the_reference(shared: Path):
 
 
 @pytest.mark.parametrize(("width", "height"), SIZES)
-def test_network_image_is_the_centre_of_the_resized_picture(width: int, height: int):
+def test_network_image_is_the_center_of_the_resized_image(width: int, height: int):
     f = framing(width, height)
     image = preprocess.to_network(wave(width, height), f)
     assert image.shape == (3, f.network_height, f.network_width)
-    # every network pixel shows the place of the picture its coordinates say
-    xy = preprocess.pixels_to_picture(pixel_grid(f.network_height, f.network_width), f)
+    # every network pixel shows the place of the image its coordinates say
+    xy = preprocess.pixels_to_image(pixel_grid(f.network_height, f.network_width), f)
     x, y = (xy / torch.tensor([width, height])).unbind(-1)
     expected = torch.stack([x, y, 0.5 + 0.4 * torch.sin(7 * x + 3 * y)])
     torch.testing.assert_close((image + 1) / 2, expected, atol=0.012, rtol=0)
@@ -45,9 +45,9 @@ def test_network_image_is_the_centre_of_the_resized_picture(width: int, height: 
 def test_pixels_and_intrinsics_find_their_way_back(width: int, height: int):
     f = framing(width, height)
     xy = torch.rand(20, 2, generator=torch.Generator().manual_seed(0), dtype=torch.float64) * width
-    torch.testing.assert_close(preprocess.pixels_to_picture(preprocess.pixels_to_network(xy, f), f), xy)
+    torch.testing.assert_close(preprocess.pixels_to_image(preprocess.pixels_to_network(xy, f), f), xy)
     K = torch.tensor([[700.0, 0, 310], [0, 690, 250], [0, 0, 1]], dtype=torch.float64)
-    torch.testing.assert_close(preprocess.K_to_picture(preprocess.K_to_network(K, f), f), K)
+    torch.testing.assert_close(preprocess.K_to_image(preprocess.K_to_network(K, f), f), K)
 
 
 def test_intrinsics_and_pixels_are_mapped_alike():
@@ -55,13 +55,13 @@ def test_intrinsics_and_pixels_are_mapped_alike():
     K = torch.tensor([[[700.0, 0, 640], [0, 690, 380], [0, 0, 1]]], dtype=torch.float64)
     points = torch.tensor([[[0.3, -0.2, 2.0], [-1.0, 0.4, 3.0]]], dtype=torch.float64)
     pose = torch.eye(4, dtype=torch.float64)[None]
-    picture = Cameras(K, torch.zeros(1, 0), pose, f.width, f.height)
+    image = Cameras(K, torch.zeros(1, 0), pose, f.width, f.height)
     network = Cameras(preprocess.K_to_network(K, f), torch.zeros(1, 0), pose, f.network_width, f.network_height)
-    expected = preprocess.pixels_to_network(project(picture, points)[0], f)
+    expected = preprocess.pixels_to_network(project(image, points)[0], f)
     torch.testing.assert_close(project(network, points)[0], expected)
 
 
-def test_centred_camera_stays_centred():
+def test_centerd_camera_stays_centerd():
     f = framing(1280, 720)
     K = preprocess.K_to_network(torch.tensor([[900.0, 0, 640], [0, 900, 360], [0, 0, 1]]), f)
     torch.testing.assert_close(K, torch.tensor([[360.0, 0, 256], [0, 360, 144], [0, 0, 1]]))
@@ -74,8 +74,8 @@ def test_network_image_spans_minus_one_to_one():
         torch.testing.assert_close(image, torch.full((3, 384, 512), expected))
 
 
-def test_picture_of_another_size_is_refused():
-    with pytest.raises(ValueError, match="pictures of 640 x 480 pixels, got 480 x 640"):
+def test_image_of_another_size_is_refused():
+    with pytest.raises(ValueError, match="images of 640 x 480 pixels, got 480 x 640"):
         preprocess.to_network(torch.zeros(640, 480, 3), framing(640, 480))
 
 
@@ -102,14 +102,14 @@ def test_distortion_is_gone_before_the_network(model: str, parameters: list[floa
     K = torch.tensor([[[110.0, 0, 82], [0, 112, 59], [0, 0, 1]]], dtype=torch.float64)
     pose = torch.eye(4, dtype=torch.float64)[None]
     lens = Cameras(K, torch.tensor([parameters], dtype=torch.float64), pose, width, height, model)
-    # a picture whose value at a pixel is the pixel: undistorted, it says where each pinhole pixel was seen
-    picture = torch.cat([pixel_grid(height, width) / 160, torch.zeros(height, width, 1)], dim=-1)
-    flat, mask, pinhole = preprocess.remove_distortion(picture, torch.ones(height, width, dtype=torch.bool), lens)
+    # an image whose value at a pixel is the pixel: undistorted, it says where each pinhole pixel was seen
+    image = torch.cat([pixel_grid(height, width) / 160, torch.zeros(height, width, 1)], dim=-1)
+    flat, mask, pinhole = preprocess.remove_distortion(image, torch.ones(height, width, dtype=torch.bool), lens)
     assert pinhole.model == "PINHOLE"
     points = torch.tensor([[[x, y, 1.0] for x in (-0.4, 0.0, 0.3) for y in (-0.3, 0.1, 0.35)]], dtype=torch.float64)
     at = project(pinhole, points)[0][0].floor().long()
-    centres = (at + 0.5).double()
-    rays = torch.cat([(centres - K[0, :2, 2]) / K[0, :2, :2].diagonal(), torch.ones(len(at), 1)], dim=1)
+    centers = (at + 0.5).double()
+    rays = torch.cat([(centers - K[0, :2, 2]) / K[0, :2, :2].diagonal(), torch.ones(len(at), 1)], dim=1)
     expected = project(lens, rays[None])[0][0]
     seen = flat[at[:, 1], at[:, 0], :2].double() * 160
     assert mask[at[:, 1], at[:, 0]].all()
@@ -126,7 +126,7 @@ def test_masked_pixels_stay_masked_without_distortion():
     assert kept[10:40].all()
 
 
-def test_wide_picture_keeps_its_field_of_view():
+def test_wide_image_keeps_its_field_of_view():
     f = framing(1920, 1080)
     K = preprocess.K_to_network(torch.tensor([[1000.0, 0, 960], [0, 1000, 540], [0, 0, 1]]), f)
     assert math.atan(256 / K[0, 0]) == pytest.approx(math.atan(960 / 1000), abs=1e-6)

@@ -115,8 +115,8 @@ def exact_pair(views: list[CanonicalView], i: int, j: int) -> AnchoredPair:
     y, x = torch.meshgrid(torch.arange(2, HEIGHT, 5), torch.arange(2, WIDTH, 5), indexing="ij")
     xy_i = torch.stack([x, y], -1).reshape(-1, 2)
     rays = image_directions(cameras[i]).double()[xy_i[:, 1], xy_i[:, 0]]
-    world = (rays * z_depth[i][xy_i[:, 1], xy_i[:, 0], None]) @ cameras.cam2world[i, :3, :3].T + cameras.centres[i]
-    seen = (world - cameras.centres[j]) @ cameras.cam2world[j, :3, :3]
+    world = (rays * z_depth[i][xy_i[:, 1], xy_i[:, 0], None]) @ cameras.cam2world[i, :3, :3].T + cameras.centers[i]
+    seen = (world - cameras.centers[j]) @ cameras.cam2world[j, :3, :3]
     xy_j = (seen[:, :2] / seen[:, 2:] * FOCAL + torch.tensor([WIDTH / 2, HEIGHT / 2])).floor().long()
     inside = ((xy_j >= 0) & (xy_j < torch.tensor([WIDTH, HEIGHT]))).all(1)
     xy_i, xy_j = xy_i[inside], xy_j[inside]
@@ -142,7 +142,7 @@ def test_other_partners_are_another_view(passes: dict, tmp_path: Path):
     stream(tmp_path, passes, 1 << 30, PAIRS)
     fewer = FrameStore(tmp_path, NAMES, [{1}, {0}, set(), set()], 1 << 30)
     assert not fewer.has(0, 1)
-    renamed = FrameStore(tmp_path, ["another picture", *NAMES[1:]], PARTNERS, 1 << 30)
+    renamed = FrameStore(tmp_path, ["another image", *NAMES[1:]], PARTNERS, 1 << 30)
     assert not renamed.has(0, 1)
     assert not renamed.has(1, 0)
 

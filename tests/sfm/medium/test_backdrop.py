@@ -8,7 +8,7 @@ import torch
 from swimm3r.cameras import project
 from swimm3r.scene.reconstruction import DenseCloud, DepthMap, DepthMaps
 from swimm3r.sfm.medium.backdrop import Backdrop
-from swimm3r.sfm.medium.restore import restored_pictures
+from swimm3r.sfm.medium.restore import restored_images
 from swimm3r.sfm.settings import RestoreSettings
 
 from .test_restore import exact
@@ -29,19 +29,19 @@ def patchy(dive, tmp_path):
     uv = torch.stack([column + 0.5, torch.arange(72).repeat_interleave(96) + 0.5], -1).double()[known]
     xyz = torch.cat([uv, torch.ones(len(uv), 1)], -1) @ torch.linalg.inv(first.K[0]).mT * z[known, None]
     xyz = (xyz @ first.cam2world[0, :3, :3].mT + first.cam2world[0, :3, 3]).float()
-    colours = dive.frames.image(0).reshape(-1, 3)[known]
-    return replace(rec, cloud=DenseCloud(xyz, colours, colours))
+    colors = dive.frames.image(0).reshape(-1, 3)[known]
+    return replace(rec, cloud=DenseCloud(xyz, colors, colors))
 
 
 def gathered(rec, dive, count: int) -> DenseCloud:
     backdrop = Backdrop(rec, dive.frames)
-    for i, picture in restored_pictures(rec, dive.frames, RestoreSettings(white_balance=False)):
+    for i, image in restored_images(rec, dive.frames, RestoreSettings(white_balance=False)):
         if i < count:
-            backdrop.add(i, picture)
+            backdrop.add(i, image)
     return backdrop.points()
 
 
-def test_ground_without_depth_gets_points_with_its_clear_colours(patchy, dive):
+def test_ground_without_depth_gets_points_with_its_clear_colors(patchy, dive):
     found = gathered(patchy, dive, 1)
     pixels, z = project(patchy.cameras[0], found.xyz[None].double())
     assert len(found.xyz) > 200
@@ -54,11 +54,11 @@ def test_ground_without_depth_gets_points_with_its_clear_colours(patchy, dive):
 
 
 def test_ground_that_an_earlier_frame_gave_is_not_taken_again(patchy, dive):
-    pictures = dict(restored_pictures(patchy, dive.frames, RestoreSettings(white_balance=False)))
+    images = dict(restored_images(patchy, dive.frames, RestoreSettings(white_balance=False)))
     alone, after = Backdrop(patchy, dive.frames), Backdrop(patchy, dive.frames)
-    alone.add(1, pictures[1])
+    alone.add(1, images[1])
     for i in (0, 0, 1):
-        after.add(i, pictures[i])
+        after.add(i, images[i])
     first = len(gathered(patchy, dive, 1).xyz)
     assert first < len(after.points().xyz) < first + 0.7 * len(alone.points().xyz)
 
@@ -67,15 +67,15 @@ def test_known_depth_and_open_water_leave_nothing_to_guess(dive, patchy):
     full = replace(patchy, depth=dive.rec.depth)
     assert len(gathered(full, dive, 1).xyz) == 0
     backdrop = Backdrop(patchy, dive.frames)
-    _, picture = next(restored_pictures(patchy, dive.frames, RestoreSettings()))
-    backdrop.add(0, replace(picture, sea=torch.ones_like(picture.sea)))
+    _, image = next(restored_images(patchy, dive.frames, RestoreSettings()))
+    backdrop.add(0, replace(image, sea=torch.ones_like(image.sea)))
     assert len(backdrop.points().xyz) == 0
 
 
-def test_ground_too_white_for_its_guessed_distance_is_not_pulled_towards_the_camera(patchy, dive):
-    """Its colour is restored over a shorter path; a point there would hang before the lens."""
-    _, picture = next(restored_pictures(patchy, dive.frames, RestoreSettings()))
+def test_ground_too_white_for_its_guessed_distance_is_not_pulled_toward_the_camera(patchy, dive):
+    """Its color is restored over a shorter path; a point there would hang before the lens."""
+    _, image = next(restored_images(patchy, dive.frames, RestoreSettings()))
     glaring = replace(dive.medium, beta_D=3 * dive.medium.beta_D)
-    _, white = next(restored_pictures(replace(patchy, medium=exact(glaring)), dive.frames, RestoreSettings()))
-    torch.testing.assert_close(white.ray_depth, picture.ray_depth)
+    _, white = next(restored_images(replace(patchy, medium=exact(glaring)), dive.frames, RestoreSettings()))
+    torch.testing.assert_close(white.ray_depth, image.ray_depth)
     assert (white.ray_depth[:, :32] > 0.8 * white.ray_depth[:, 32:].amin()).all()

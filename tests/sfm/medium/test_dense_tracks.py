@@ -17,8 +17,8 @@ def test_tracks_of_a_flat_seafloor_lie_on_it(dive):
 
 def test_ray_depth_is_the_distance_from_the_camera_to_the_fused_point(dive):
     tracks = fuse_depth(dive.rec, dive.frames, TrackSettings())
-    centres = dive.rec.cameras.centres.float()
-    expected = (tracks.xyz[tracks.track] - centres[tracks.frame]).norm(dim=-1)
+    centers = dive.rec.cameras.centers.float()
+    expected = (tracks.xyz[tracks.track] - centers[tracks.frame]).norm(dim=-1)
     torch.testing.assert_close(tracks.ray_depth, expected, atol=1e-5, rtol=1e-5)
 
 

@@ -8,9 +8,9 @@ import torch
 
 from swimm3r.errors import InputError
 from swimm3r.medium import AttenuationCurve, Medium, remove_water
-from swimm3r.sfm.mast3r_sfm.network_frames import NetworkPictures, network_pictures
+from swimm3r.sfm.mast3r_sfm.network_frames import NetworkImages, network_images
 from swimm3r.sfm.medium.dense_tracks import fuse_depth
-from swimm3r.sfm.medium.from_head import PredictedWater, dive_fit, predicted_pictures, read, write
+from swimm3r.sfm.medium.from_head import PredictedWater, dive_fit, predicted_images, read, write
 from swimm3r.sfm.medium.restore import restored_cloud
 from swimm3r.sfm.settings import Mast3rSettings, SeathruSettings
 from swimm3r.sfm.student.physics_head import HeadFacts, WaterMaps
@@ -27,24 +27,24 @@ SURE, UNMEASURED = off_by(0.01), HeadFacts(0.05)
 
 
 @pytest.fixture
-def pictures(dive) -> NetworkPictures:
-    return network_pictures(dive.frames, Mast3rSettings(size=96))
+def images(dive) -> NetworkImages:
+    return network_images(dive.frames, Mast3rSettings(size=96))
 
 
-def maps(medium: Medium, pictures: NetworkPictures, metres: float = 1.0) -> WaterMaps:
+def maps(medium: Medium, images: NetworkImages, metres: float = 1.0) -> WaterMaps:
     """What a perfect head would say, per `metres` of the scene's unit; half of the attenuation in each exponential."""
-    frame = pictures.framing
+    frame = images.framing
     half = (0.5 * metres * medium.beta_D).expand(1, frame.network_height, frame.network_width, 3)
     zero = torch.zeros_like(half)
     return WaterMaps(medium.Binf[None], metres * medium.beta_B[None], AttenuationCurve(half, zero, half, zero))
 
 
 @pytest.fixture
-def water(dive, pictures: NetworkPictures, tmp_path: Path) -> PredictedWater:
+def water(dive, images: NetworkImages, tmp_path: Path) -> PredictedWater:
     """Written by a head whose metre is half of the scene's unit: the scale puts it right."""
     for name in dive.rec.names:
-        write(maps(dive.medium, pictures, metres=0.5), 0.5, tmp_path / "water", name)
-    found = read(tmp_path / "water", pictures, SURE)
+        write(maps(dive.medium, images, metres=0.5), 0.5, tmp_path / "water", name)
+    found = read(tmp_path / "water", images, SURE)
     assert found is not None
     return found
 
@@ -59,11 +59,11 @@ def test_the_dives_water_is_what_the_frames_say(dive, water: PredictedWater):
     torch.testing.assert_close(fit.at(z).beta_D, dive.medium.beta_D.expand(5, 3), atol=1e-4, rtol=1e-4)
 
 
-def test_a_coefficient_the_frames_disagree_on_is_not_identifiable(dive, pictures: NetworkPictures, tmp_path: Path):
+def test_a_coefficient_the_frames_disagree_on_is_not_identifiable(dive, images: NetworkImages, tmp_path: Path):
     for i, name in enumerate(dive.rec.names):
         other = replace(dive.medium, beta_B=dive.medium.beta_B * (1 + 0.5 * i))
-        write(maps(other, pictures), 1.0, tmp_path, name)
-    found = read(tmp_path, pictures, SURE)
+        write(maps(other, images), 1.0, tmp_path, name)
+    found = read(tmp_path, images, SURE)
     assert found is not None
     fit = dive_fit(found, dive.rec, SeathruSettings())
     assert not fit.identifiable["beta_B"].any()
@@ -86,7 +86,7 @@ def test_the_maps_prior_trusts_the_water_as_far_as_the_heads_error_goes(dive, wa
     torch.testing.assert_close(prior_std(off_by(0.3)), torch.full((6,), 0.3), atol=1e-3, rtol=0)
 
 
-def test_true_water_restores_the_cloud_to_its_clear_colours(dive, water: PredictedWater):
+def test_true_water_restores_the_cloud_to_its_clear_colors(dive, water: PredictedWater):
     tracks = fuse_depth(dive.rec, dive.frames, SeathruSettings().tracks)
     fit = dive_fit(water, dive.rec, SeathruSettings())
     cloud = restored_cloud(dive.rec, dive.frames, tracks, fit, medium_at=water.at)
@@ -98,33 +98,33 @@ def test_true_water_restores_the_cloud_to_its_clear_colours(dive, water: Predict
     )
 
 
-def test_restored_pictures_are_clear(dive, water: PredictedWater):
-    for i, picture in predicted_pictures(dive.rec, dive.frames, water):
-        name, J = dive.rec.names[i], picture.clear
+def test_restored_images_are_clear(dive, water: PredictedWater):
+    for i, restored in predicted_images(dive.rec, dive.frames, water):
+        name, J = dive.rec.names[i], restored.clear
         known = dive.rec.depth[name].z_depth > 0
         raw = dive.frames.image(dive.frames.index(name))
         error = (J - dive.clear[i])[known].abs().mean()
         assert error < 0.3 * (raw - dive.clear[i])[known].abs().mean()
 
 
-def test_shown_pictures_are_white_balanced_and_the_clear_ones_stay_physical(dive, water: PredictedWater):
+def test_shown_images_are_white_balanced_and_the_clear_ones_stay_physical(dive, water: PredictedWater):
     gains = torch.tensor([1.5, 1.0, 0.7])
-    plain = dict(predicted_pictures(dive.rec, dive.frames, water))
-    for i, picture in predicted_pictures(dive.rec, dive.frames, water, gains=gains):
-        torch.testing.assert_close(picture.clear, plain[i].clear)
-        surface = (picture.sea == 0) & (picture.clear > 0).all(-1) & (picture.clear < 0.6).all(-1)
+    plain = dict(predicted_images(dive.rec, dive.frames, water))
+    for i, restored in predicted_images(dive.rec, dive.frames, water, gains=gains):
+        torch.testing.assert_close(restored.clear, plain[i].clear)
+        surface = (restored.sea == 0) & (restored.clear > 0).all(-1) & (restored.clear < 0.6).all(-1)
         assert surface.float().mean() > 0.1
-        torch.testing.assert_close(picture.shown[surface], picture.clear[surface] * gains)
+        torch.testing.assert_close(restored.shown[surface], restored.clear[surface] * gains)
 
 
 def test_restoration_divides_by_no_less_than_the_head_was_trained_with(dive, water: PredictedWater):
     half = replace(water, head=HeadFacts(0.5))
-    i, picture = next(predicted_pictures(dive.rec, dive.frames, half))
-    name, z = dive.rec.names[i], picture.ray_depth.flatten()
+    i, restored = next(predicted_images(dive.rec, dive.frames, half))
+    name, z = dive.rec.names[i], restored.ray_depth.flatten()
     image = dive.frames.image(dive.frames.index(name))
     J = remove_water(image.reshape(-1, 3), z, water.frame(name).at(z, water.place), 0.5).clamp(0, 1)
-    surface = picture.sea == 0
-    torch.testing.assert_close(picture.clear[surface], J.reshape(image.shape)[surface])
+    surface = restored.sea == 0
+    torch.testing.assert_close(restored.clear[surface], J.reshape(image.shape)[surface])
     tracks, fit = (
         fuse_depth(dive.rec, dive.frames, SeathruSettings().tracks),
         dive_fit(water, dive.rec, SeathruSettings()),
@@ -136,12 +136,12 @@ def test_restoration_divides_by_no_less_than_the_head_was_trained_with(dive, wat
     assert (clouds[1] < clouds[0] - 0.01).any()
 
 
-def test_the_water_follows_the_pixels_through_resize_and_crop(dive, pictures: NetworkPictures, tmp_path: Path):
+def test_the_water_follows_the_pixels_through_resize_and_crop(dive, images: NetworkImages, tmp_path: Path):
     """A curve that grows from left to right does so on the prepared frame, too."""
-    m = maps(dive.medium, pictures)
-    ramp = torch.linspace(0.2, 1.0, pictures.framing.network_width)[:, None] * torch.ones_like(m.curve.a)
+    m = maps(dive.medium, images)
+    ramp = torch.linspace(0.2, 1.0, images.framing.network_width)[:, None] * torch.ones_like(m.curve.a)
     write(replace(m, curve=replace(m.curve, a=ramp)), 1.0, tmp_path, "x.png")
-    found = read(tmp_path, pictures, SURE)
+    found = read(tmp_path, images, SURE)
     assert found is not None
     pixels = torch.arange(dive.frames.width)
     beta_D = found.at("x.png", pixels, torch.ones(len(pixels))).beta_D[:, 0] - 0.5 * dive.medium.beta_D[0]
@@ -149,8 +149,8 @@ def test_the_water_follows_the_pixels_through_resize_and_crop(dive, pictures: Ne
     torch.testing.assert_close(beta_D[8:-8], (0.2 + 0.8 * x)[8:-8], atol=0.02, rtol=0)
 
 
-def test_without_a_head_there_is_no_predicted_water(pictures: NetworkPictures, tmp_path: Path):
-    assert read(tmp_path / "nothing", pictures, UNMEASURED) is None
+def test_without_a_head_there_is_no_predicted_water(images: NetworkImages, tmp_path: Path):
+    assert read(tmp_path / "nothing", images, UNMEASURED) is None
 
 
 def test_without_any_depth_it_says_so(dive, water: PredictedWater, tmp_path: Path):

@@ -1,4 +1,4 @@
-"""Water that is not determined, or cannot be: it is said, and pictures do not pretend."""
+"""Water that is not determined, or cannot be: it is said, and images do not pretend."""
 
 from dataclasses import replace
 from pathlib import Path
@@ -14,7 +14,7 @@ from swimm3r.scene.frames import Frames
 from swimm3r.scene.reconstruction import DenseCloud
 from swimm3r.sfm.medium import apply
 from swimm3r.sfm.medium.dense_tracks import fuse_depth
-from swimm3r.sfm.medium.plausibility import attenuation_is_a_guess, optical_depth, water_cautions
+from swimm3r.sfm.medium.plausibility import attenuation_is_a_guess, optical_depth, water_warnings
 from swimm3r.sfm.medium.restore import display_gains, restored_cloud, shown_gains
 from swimm3r.sfm.settings import ColmapSettings, RestoreSettings, TrackSettings
 
@@ -28,12 +28,12 @@ def fit_of(medium: Medium, std: float, known: bool, z_range: tuple[float, float]
     return MediumFit(medium, curve, Medium(zero, of_beta, zero), flags, z_range, "srgb")
 
 
-def said(fit: MediumFit, *, grey: bool = False) -> str:
-    return " ".join(caution.what for caution in water_cautions(fit, grey=grey))
+def said(fit: MediumFit, *, gray: bool = False) -> str:
+    return " ".join(warning.what for warning in water_warnings(fit, gray=gray))
 
 
-def test_water_that_is_determined_and_takes_red_first_raises_no_caution(teal):
-    assert water_cautions(fit_of(teal, 0.05, known=True), grey=False) == ()
+def test_water_that_is_determined_and_takes_red_first_raises_no_warning(teal):
+    assert water_warnings(fit_of(teal, 0.05, known=True), gray=False) == ()
 
 
 def test_the_optical_depth_does_not_depend_on_the_unit_of_length(teal):
@@ -46,17 +46,17 @@ def test_the_optical_depth_does_not_depend_on_the_unit_of_length(teal):
 
 
 def test_attenuation_that_is_a_guess_in_every_channel_is_said_with_its_size_and_advice(teal):
-    caution = water_cautions(fit_of(teal, 0.9, known=False), grey=False)[0]
-    assert "factor of up to 2.5" in caution.what
-    assert "as filmed" in caution.what
-    assert "near and from far" in caution.advice
-    assert "adapter" in water_cautions(fit_of(teal, 0.9, known=False), grey=False, predicted=True)[0].advice
+    warning = water_warnings(fit_of(teal, 0.9, known=False), gray=False)[0]
+    assert "factor of up to 2.5" in warning.what
+    assert "as filmed" in warning.what
+    assert "near and from far" in warning.advice
+    assert "adapter" in water_warnings(fit_of(teal, 0.9, known=False), gray=False, predicted=True)[0].advice
     one_known = fit_of(teal, 0.9, known=False)
     one_known.std.beta_D[1] = 0.01
     assert not attenuation_is_a_guess(one_known)
 
 
-def test_curves_without_a_determined_coefficient_are_said_to_give_no_true_colours(teal):
+def test_curves_without_a_determined_coefficient_are_said_to_give_no_true_colors(teal):
     fit = fit_of(teal, 0.1, known=False)
     assert not attenuation_is_a_guess(fit)
     assert "not white-balanced" in said(fit)
@@ -71,7 +71,7 @@ def test_red_attenuated_least_is_implausible_in_every_natural_water(teal, known:
     assert "red least" in said(fit_of(odd, 0.1, known=known))
     coastal = Medium(teal.Binf, torch.tensor([0.3, 0.25, 0.6]), teal.beta_B)  # dissolved matter takes blue first
     assert "red least" not in said(fit_of(coastal, 0.1, known=known))
-    assert "red least" not in said(fit_of(odd, 0.1, known=known), grey=True)
+    assert "red least" not in said(fit_of(odd, 0.1, known=known), gray=True)
 
 
 def written(dive, fit: MediumFit, folder: Path, monkeypatch: pytest.MonkeyPatch) -> dict[str, np.ndarray]:
@@ -100,7 +100,7 @@ def test_where_attenuation_is_a_guess_frames_are_shown_as_filmed(dive, tmp_path:
     assert abs(found["physical"] - found["filmed"]).mean() > 0.02  # what a map starts on: the inverse of its water
 
 
-def test_where_nothing_of_the_water_is_determined_frames_are_not_balanced_to_neutral_greys(
+def test_where_nothing_of_the_water_is_determined_frames_are_not_balanced_to_neutral_grays(
     dive, tmp_path: Path, monkeypatch
 ):
     unsure = written(dive, fit_of(dive.medium, 0.1, known=False), tmp_path, monkeypatch)
@@ -120,15 +120,15 @@ def test_gains_need_water_that_is_determined_and_somebody_who_wants_them(dive):
     assert torch.equal(shown_gains(unsure, RestoreSettings()), torch.ones(3))
 
 
-def test_a_grey_clip_is_called_grey_and_stays_grey(dive, tmp_path: Path):
-    grey = []
+def test_a_gray_clip_is_called_gray_and_stays_gray(dive, tmp_path: Path):
+    gray = []
     for i, frame in enumerate(dive.frames):
-        picture = dive.frames.image(i).mean(-1, keepdim=True).expand(-1, -1, 3)
-        images.write_rgb(tmp_path / frame.name, picture.numpy())
-        grey.append(replace(frame, path=tmp_path / frame.name))
-    frames = Frames(tuple(grey), dive.frames.width, dive.frames.height, ordered=True)
+        image = dive.frames.image(i).mean(-1, keepdim=True).expand(-1, -1, 3)
+        images.write_rgb(tmp_path / frame.name, image.numpy())
+        gray.append(replace(frame, path=tmp_path / frame.name))
+    frames = Frames(tuple(gray), dive.frames.width, dive.frames.height, ordered=True)
     rec = apply.with_water(dive.rec, frames, ColmapSettings(), tmp_path)
-    assert [caution.what.startswith("The frames are grey") for caution in rec.cautions].count(True) == 1
+    assert [warning.what.startswith("The frames are gray") for warning in rec.warnings].count(True) == 1
     assert rec.cloud is not None
     assert rec.medium is not None
     torch.testing.assert_close(rec.medium.medium.beta_D, rec.medium.medium.beta_D[:1].expand(3))

@@ -1,4 +1,4 @@
-"""Restored pictures and points: the inverse where the water lets it, calm where it does not."""
+"""Restored images and points: the inverse where the water lets it, calm where it does not."""
 
 from dataclasses import replace
 
@@ -10,7 +10,7 @@ from swimm3r.imaging.open_water import open_water_mask
 from swimm3r.medium import AttenuationCurve, Medium, MediumFit, add_water, linear_from_srgb, srgb_from_linear
 from swimm3r.scene.reconstruction import DepthMap
 from swimm3r.sfm.medium.dense_tracks import fuse_depth
-from swimm3r.sfm.medium.restore import display_gains, restore_picture, restored_cloud
+from swimm3r.sfm.medium.restore import display_gains, restore_image, restored_cloud
 from swimm3r.sfm.settings import RestoreSettings, TrackSettings
 
 
@@ -30,7 +30,7 @@ def psnr(a: torch.Tensor, b: torch.Tensor) -> float:
     return float(-10 * torch.log10(((a - b) ** 2).mean()))
 
 
-def horizon_picture(medium: Medium) -> tuple[torch.Tensor, DepthMap]:
+def horizon_image(medium: Medium) -> tuple[torch.Tensor, DepthMap]:
     """Textured ground in the lower half, open water with pixel noise above."""
     g = torch.Generator().manual_seed(3)
     image = medium.Binf + 0.004 * torch.randn(96, 128, 3, generator=g)
@@ -42,21 +42,21 @@ def horizon_picture(medium: Medium) -> tuple[torch.Tensor, DepthMap]:
     return image.clamp(0, 1), DepthMap(z_depth, (z_depth > 0).float())
 
 
-def test_a_picture_with_known_depth_gets_its_clear_colours_back(dive):
+def test_a_image_with_known_depth_gets_its_clear_colors_back(dive):
     name = dive.rec.names[2]
-    J = restore_picture(
+    J = restore_image(
         dive.frames.image(2), dive.rec.depth[name], rays_of(dive.rec.cameras[2]), exact(dive.medium)
     ).shown
     assert psnr(J, dive.clear[2]) > 33
 
 
-def test_gaps_in_the_depth_leave_no_holes_in_the_picture(dive):
+def test_gaps_in_the_depth_leave_no_holes_in_the_image(dive):
     depth = dive.rec.depth[dive.rec.names[2]]
     z = depth.z_depth.clone()
     z[20:40, 30:60] = 0
     z[torch.rand(z.shape, generator=torch.Generator().manual_seed(0)) < 0.3] = 0
     patchy = DepthMap(z, (z > 0).float())
-    J = restore_picture(dive.frames.image(2), patchy, rays_of(dive.rec.cameras[2]), exact(dive.medium)).shown
+    J = restore_image(dive.frames.image(2), patchy, rays_of(dive.rec.cameras[2]), exact(dive.medium)).shown
     assert psnr(J, dive.clear[2]) > 28
 
 
@@ -69,7 +69,7 @@ def test_surfaces_of_unknown_depth_in_green_water_look_like_those_of_known_depth
     camera = dive.rec.cameras[0]
     raw = add_water(J, ray_depth_from_z(z, image_directions(camera).float()), green)
     z[20:50, 50:] = 0
-    restored = restore_picture(raw, DepthMap(z, (z > 0).float()), rays_of(camera), exact(green)).clear
+    restored = restore_image(raw, DepthMap(z, (z > 0).float()), rays_of(camera), exact(green)).clear
     assert psnr(restored[25:45, 60:], J[25:45, 60:]) > 28
 
 
@@ -82,7 +82,7 @@ def test_a_linear_fit_restores_light_that_was_lost_in_linear_light(dive):
     clear = dive.clear[2]
     ray_depth = ray_depth_from_z(z, image_directions(camera).float())
     raw = srgb_from_linear(add_water(linear_from_srgb(clear), ray_depth, dive.medium))
-    assert psnr(restore_picture(raw, DepthMap(z, near), rays_of(camera), linear).shown, clear) > 30
+    assert psnr(restore_image(raw, DepthMap(z, near), rays_of(camera), linear).shown, clear) > 30
 
 
 def test_filling_keeps_what_is_known_and_stays_in_its_range(dive):
@@ -95,22 +95,22 @@ def test_filling_keeps_what_is_known_and_stays_in_its_range(dive):
 
 
 def test_open_water_is_found_above_the_horizon_and_nowhere_else(teal):
-    image, depth = horizon_picture(teal)
+    image, depth = horizon_image(teal)
     mask = open_water_mask(image, depth.z_depth)
     assert mask[:40].float().mean() > 0.7
     assert not mask[48:].any()
 
 
 def test_smooth_darkness_is_not_open_water(teal):
-    image, depth = horizon_picture(teal)
+    image, depth = horizon_image(teal)
     image[:48] = 0.02
     assert not open_water_mask(image, depth.z_depth).any()
 
 
-def test_open_water_keeps_its_colour_instead_of_amplified_noise(teal, dive):
-    image, depth = horizon_picture(teal)
+def test_open_water_keeps_its_color_instead_of_amplified_noise(teal, dive):
+    image, depth = horizon_image(teal)
     camera = replace(dive.rec.cameras[0], width=128, height=96)
-    J = restore_picture(image, depth, rays_of(camera), exact(teal)).shown
+    J = restore_image(image, depth, rays_of(camera), exact(teal)).shown
     assert (J[:36] - teal.Binf).abs().amax(-1).median() < 0.03
     assert J[:36].std((0, 1)).max() < 0.03
 
@@ -118,15 +118,15 @@ def test_open_water_keeps_its_colour_instead_of_amplified_noise(teal, dive):
 def test_noise_is_not_amplified_where_a_channel_no_longer_sees(dive):
     dead = Medium(dive.medium.Binf, torch.tensor([3.0, 0.1, 0.1]), torch.tensor([1.0, 0.1, 0.1]))
     z = torch.full((72, 96), 2.0)
-    grey = torch.full((72, 96, 3), 0.4)
+    gray = torch.full((72, 96, 3), 0.4)
     noise = 0.01 * torch.randn(72, 96, 3, generator=torch.Generator().manual_seed(2))
-    raw = (add_water(grey, z, dead) + noise).clamp(0, 1)
-    J = restore_picture(raw, DepthMap(z, torch.ones_like(z)), rays_of(dive.rec.cameras[0]), exact(dead)).shown
+    raw = (add_water(gray, z, dead) + noise).clamp(0, 1)
+    J = restore_image(raw, DepthMap(z, torch.ones_like(z)), rays_of(dive.rec.cameras[0]), exact(dead)).shown
     assert J[..., 0].std() < 0.1  # the plain inverse has 0.01 / exp(-6) = 4
     assert J[..., 1].std() < 0.02
 
 
-def test_restored_points_have_the_clear_colours_of_the_seafloor(dive):
+def test_restored_points_have_the_clear_colors_of_the_seafloor(dive):
     tracks = fuse_depth(dive.rec, dive.frames, TrackSettings())
     cloud = restored_cloud(dive.rec, dive.frames, tracks, exact(dive.medium))
     assert (cloud.restored - dive.seafloor(cloud.xyz[:, :2])).abs().mean() < 0.02
@@ -142,20 +142,20 @@ def test_a_cloud_is_thinned_to_the_asked_count_and_keeps_its_extent(dive):
     torch.testing.assert_close(thin.restored.mean(0), full.restored.mean(0), atol=0.05, rtol=0)
 
 
-def test_a_grey_dive_needs_no_white_balance():
+def test_a_gray_dive_needs_no_white_balance():
     torch.testing.assert_close(display_gains(torch.rand(500, 1).expand(-1, 3) * 0.9), torch.ones(3))
 
 
-def test_white_balance_makes_tinted_surfaces_grey():
+def test_white_balance_makes_tinted_surfaces_gray():
     tinted = torch.linspace(0.1, 0.7, 300)[:, None] * torch.tensor([0.6, 1.0, 0.9])
     balanced = tinted * display_gains(tinted)
     torch.testing.assert_close(balanced[:, 0], balanced[:, 1], atol=1e-3, rtol=1e-3)
 
 
-def test_display_gains_colour_surfaces_and_leave_open_water_as_it_was(teal, dive):
-    image, depth = horizon_picture(teal)
+def test_display_gains_color_surfaces_and_leave_open_water_as_it_was(teal, dive):
+    image, depth = horizon_image(teal)
     camera = replace(dive.rec.cameras[0], width=128, height=96)
-    plain = restore_picture(image, depth, rays_of(camera), exact(teal)).shown
-    gained = restore_picture(image, depth, rays_of(camera), exact(teal), gains=torch.tensor([1.2, 0.9, 0.9])).shown
+    plain = restore_image(image, depth, rays_of(camera), exact(teal)).shown
+    gained = restore_image(image, depth, rays_of(camera), exact(teal), gains=torch.tensor([1.2, 0.9, 0.9])).shown
     torch.testing.assert_close(gained[:20], plain[:20])
     assert (gained[70:, :, 1] < 0.95 * plain[70:, :, 1]).float().mean() > 0.9

@@ -32,8 +32,8 @@ def draw_samples(
     track, frame = np.repeat(np.arange(points), 6), np.tile(np.arange(24), points * 6 // 24)
     place, view = g.normal(0, 0.5 * spread, points), spread * np.sin(np.arange(24) * 1.3)
     z = 2.5 * np.exp(place[track] + view[frame])
-    grey = np.where(g.random(points) < 0.03, 0.0, g.uniform(0.1, 0.8, points))
-    J = torch.from_numpy((grey[:, None] * g.uniform(0.8, 1.2, (points, 3))).astype(np.float32))[track]
+    gray = np.where(g.random(points) < 0.03, 0.0, g.uniform(0.1, 0.8, points))
+    J = torch.from_numpy((gray[:, None] * g.uniform(0.8, 1.2, (points, 3))).astype(np.float32))[track]
     I = add_water(J, torch.from_numpy(z.astype(np.float32)), medium)
     if encoding == "linear":
         I = srgb_from_linear(I)
@@ -155,14 +155,14 @@ def test_surfaces_hundreds_of_times_as_far_as_the_rest_do_no_harm(teal):
     assert B < 0.03
 
 
-def grey_copy(samples: WaterSamples) -> WaterSamples:
-    def grey(colours: torch.Tensor) -> torch.Tensor:
-        return colours.mean(-1, keepdim=True).expand_as(colours).contiguous()
+def gray_copy(samples: WaterSamples) -> WaterSamples:
+    def gray(colors: torch.Tensor) -> torch.Tensor:
+        return colors.mean(-1, keepdim=True).expand_as(colors).contiguous()
 
-    return replace(samples, I=grey(samples.I), open_water=grey(samples.open_water))
+    return replace(samples, I=gray(samples.I), open_water=gray(samples.open_water))
 
 
-def test_of_a_grey_clip_one_channel_is_fitted_and_stands_for_all(teal, monkeypatch: pytest.MonkeyPatch):
+def test_of_a_gray_clip_one_channel_is_fitted_and_stands_for_all(teal, monkeypatch: pytest.MonkeyPatch):
     fitted = []
 
     def counted(*arguments):
@@ -171,7 +171,7 @@ def test_of_a_grey_clip_one_channel_is_fitted_and_stands_for_all(teal, monkeypat
 
     monkeypatch.setattr(seathru, "fit_channel", counted)
     samples = draw_samples(Medium(*(v.mean().expand(3) for v in vars(teal).values())), open_water=1000)
-    fit = fit_medium(grey_copy(samples), SETTINGS, "srgb")
+    fit = fit_medium(gray_copy(samples), SETTINGS, "srgb")
     assert len(fitted) == 1
     for value in (fit.medium.Binf, fit.medium.beta_D, fit.medium.beta_B, fit.std.beta_D, fit.curve.a):
         assert torch.equal(value, value[:1].expand(3))
@@ -180,14 +180,14 @@ def test_of_a_grey_clip_one_channel_is_fitted_and_stands_for_all(teal, monkeypat
     assert len(fitted) == 1 + 3
 
 
-def test_a_time_stamp_in_colour_leaves_a_clip_grey_and_a_tinted_clip_is_in_colour(teal):
+def test_a_time_stamp_in_color_leaves_a_clip_gray_and_a_tinted_clip_is_in_color(teal):
     samples = draw_samples(teal)
-    assert not samples.grey
-    stamped = grey_copy(samples)
-    assert stamped.grey
+    assert not samples.gray
+    stamped = gray_copy(samples)
+    assert stamped.gray
     stamped.I[:3, 0] = 1.0
-    assert stamped.grey
-    assert not replace(stamped, I=stamped.I * torch.tensor([1.0, 0.97, 1.0])).grey
+    assert stamped.gray
+    assert not replace(stamped, I=stamped.I * torch.tensor([1.0, 0.97, 1.0])).gray
 
 
 def test_too_few_pixels_are_an_error_in_plain_words(teal):
@@ -209,9 +209,9 @@ def test_backscatter_explains_the_darkest_pixels_of_real_frames(shared):
     """Mean |I - B| over the darkest 1 % of each of 10 range bins, eight FLSea frames, each fitted alone."""
     residuals = []
     for path in sorted((shared / "data/flsea_samples/rgb").glob("*.tiff")):
-        picture = cv2.imread(str(path))[::4, ::4, ::-1].astype(np.float32) / 255
+        image = cv2.imread(str(path))[::4, ::4, ::-1].astype(np.float32) / 255
         depth = cv2.imread(str(path.parents[1] / "depth" / f"{path.stem}_depth.tif"), cv2.IMREAD_UNCHANGED)[::4, ::4]
-        I, z = torch.from_numpy(picture[depth > 0]), torch.from_numpy(depth[depth > 0].astype(np.float32))
+        I, z = torch.from_numpy(image[depth > 0]), torch.from_numpy(depth[depth > 0].astype(np.float32))
         alone = torch.zeros(len(z), dtype=torch.long)
         fit = fit_medium(WaterSamples(I, z, alone, alone - 1, torch.zeros(0, 3)), SETTINGS, "srgb")
         edges = torch.linspace(float(z.quantile(0.002)), float(z.quantile(0.998)), 11)

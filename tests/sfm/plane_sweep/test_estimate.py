@@ -14,7 +14,7 @@ from swimm3r.io import images
 from swimm3r.scene.frames import Frame, Frames
 from swimm3r.scene.reconstruction import DepthMaps, Matches, Points, Reconstruction, Tracks
 from swimm3r.sfm.plane_sweep.estimate import RawDepth, consistent, estimate_depth, sweep
-from swimm3r.sfm.plane_sweep.views import View, choose_sources, depth_range, make_view, undistorted_cameras
+from swimm3r.sfm.plane_sweep.views import SweepView, choose_sources, depth_range, make_view, undistorted_cameras
 from swimm3r.sfm.settings import PlaneSweepSettings
 
 WIDTH, HEIGHT = 128, 96
@@ -24,7 +24,7 @@ FRONTAL, SLANTED = (0.0, 0.0, 4.0), (0.45, -0.3, 4.0)  # the plane Z = a X + b Y
 
 
 def texture(X: np.ndarray, Y: np.ndarray) -> np.ndarray:
-    """A smooth picture without repetition on a surface, from waves down to 6 pixels long."""
+    """A smooth image without repetition on a surface, from waves down to 6 pixels long."""
     rng = np.random.default_rng(3)
     value = np.zeros_like(X)
     for _ in range(60):
@@ -45,30 +45,30 @@ def dive(model: str = "PINHOLE", distortion: tuple[float, ...] = ()) -> Cameras:
 def z_of_plane(camera: Cameras, plane: tuple[float, float, float]) -> Float[Tensor, "h w"]:
     """Exact z depth of Z = a X + b Y + c in an unrotated camera."""
     a, b, c = plane
-    rays, centre = image_directions(camera), camera.centres[0]
-    return (a * centre[0] + b * centre[1] + c - centre[2]) / (1 - a * rays[..., 0] - b * rays[..., 1])
+    rays, center = image_directions(camera), camera.centers[0]
+    return (a * center[0] + b * center[1] + c - center[2]) / (1 - a * rays[..., 0] - b * rays[..., 1])
 
 
 def photograph(camera: Cameras, plane: tuple[float, float, float]) -> Float[Tensor, "h w 3"]:
     """The textured plane as the camera sees it, without noise."""
-    points = image_directions(camera) * z_of_plane(camera, plane)[..., None] + camera.centres[0]
-    grey = torch.from_numpy(texture(points[..., 0].numpy(), points[..., 1].numpy())).float()
-    return grey.clamp(0, 1)[..., None].expand(-1, -1, 3).contiguous()
+    points = image_directions(camera) * z_of_plane(camera, plane)[..., None] + camera.centers[0]
+    gray = torch.from_numpy(texture(points[..., 0].numpy(), points[..., 1].numpy())).float()
+    return gray.clamp(0, 1)[..., None].expand(-1, -1, 3).contiguous()
 
 
-def views_of(plane: tuple[float, float, float], change: tuple[float, float] = (1.0, 0.0)) -> list[View]:
+def views_of(plane: tuple[float, float, float], change: tuple[float, float] = (1.0, 0.0)) -> list[SweepView]:
     """All views of the plane; every one but the middle has its brightness changed to gain * value + offset."""
     cameras, everywhere = dive(), torch.ones(HEIGHT, WIDTH, dtype=torch.bool)
     canvas = undistorted_cameras(cameras, 640)
     views = []
     for i in range(5):
         gain, offset = (1.0, 0.0) if i == 2 else change
-        picture = gain * photograph(cameras[i], plane) + offset
-        views.append(make_view(picture, everywhere, cameras[i], canvas[i]))
+        image = gain * photograph(cameras[i], plane) + offset
+        views.append(make_view(image, everywhere, cameras[i], canvas[i]))
     return views
 
 
-def middle_depth(views: list[View], settings: PlaneSweepSettings = SETTINGS) -> RawDepth:
+def middle_depth(views: list[SweepView], settings: PlaneSweepSettings = SETTINGS) -> RawDepth:
     return sweep(views[2], [views[i] for i in (0, 1, 3, 4)], (2.0, 9.0), settings)
 
 

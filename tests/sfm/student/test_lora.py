@@ -25,7 +25,7 @@ def network(small_network: Mast3r) -> Mast3r:
     return copy.deepcopy(small_network)
 
 
-def randomised(adapters: Adapters) -> Adapters:
+def randomized(adapters: Adapters) -> Adapters:
     """As after training: B is not zero any more."""
     g = torch.Generator().manual_seed(7)
     for update in adapters:
@@ -66,7 +66,7 @@ def test_the_update_of_a_convolution_is_a_convolution_with_its_merged_weight():
 
 def test_switched_off_the_network_is_the_teacher_again_and_on_again_afterwards(network: Mast3r):
     teacher = forward(network)
-    adapters = randomised(attach(network, LoraSettings(), generator()))
+    adapters = randomized(attach(network, LoraSettings(), generator()))
     student = forward(network)
     assert not torch.allclose(student, teacher, atol=1e-3)
     with adapters.off():
@@ -80,7 +80,7 @@ def test_switched_off_the_network_is_the_teacher_again_and_on_again_afterwards(n
 
 def test_merging_keeps_the_student_and_its_parameter_names(network: Mast3r):
     names = set(network.state_dict())
-    adapters = randomised(attach(network, LoraSettings(), generator()))
+    adapters = randomized(attach(network, LoraSettings(), generator()))
     assert set(network.state_dict()) == names
     student = forward(network)
     adapters.merge()
@@ -91,7 +91,7 @@ def test_merging_keeps_the_student_and_its_parameter_names(network: Mast3r):
 
 
 def test_only_the_adapters_get_a_gradient(network: Mast3r):
-    adapters = randomised(attach(network, LoraSettings(), generator()))
+    adapters = randomized(attach(network, LoraSettings(), generator()))
     forward(network).square().mean().backward()
     assert all(p.grad is not None and p.grad.abs().sum() > 0 for p in adapters.parameters())
     assert all(p.grad is None for p in network.parameters())
@@ -99,7 +99,7 @@ def test_only_the_adapters_get_a_gradient(network: Mast3r):
 
 def test_a_low_precision_trunk_keeps_its_dtype(network: Mast3r):
     network.set_precision(torch.bfloat16)
-    adapters = randomised(attach(network, LoraSettings(), generator()))
+    adapters = randomized(attach(network, LoraSettings(), generator()))
     assert network.encode(IMAGES).tokens.dtype == torch.bfloat16
     assert all(p.dtype == torch.float32 for p in adapters.parameters())
 
@@ -130,7 +130,7 @@ def test_a_layer_that_is_not_there_or_not_linear_is_refused(network: Mast3r):
 
 
 def test_written_and_read_the_student_is_the_same(network: Mast3r, small_network: Mast3r, tmp_path):
-    adapters = randomised(attach(network, LoraSettings(alpha_per_rank=2.0), generator()))
+    adapters = randomized(attach(network, LoraSettings(alpha_per_rank=2.0), generator()))
     write_peft(adapters, tmp_path / "adapter", base="a checkpoint")
     other = copy.deepcopy(small_network)
     again = read_peft(tmp_path / "adapter", other)
@@ -140,7 +140,7 @@ def test_written_and_read_the_student_is_the_same(network: Mast3r, small_network
 
 def test_peft_computes_the_same_from_our_folder_and_we_from_its(network: Mast3r, small_network: Mast3r, tmp_path):
     peft = pytest.importorskip("peft", reason="the dev extra has it")
-    adapters = randomised(attach(network, LoraSettings(), generator()))
+    adapters = randomized(attach(network, LoraSettings(), generator()))
     write_peft(adapters, tmp_path / "ours")
     theirs = peft.PeftModel.from_pretrained(copy.deepcopy(small_network), tmp_path / "ours")
     assert not theirs.peft_config["default"].use_dora
@@ -153,7 +153,7 @@ def test_peft_computes_the_same_from_our_folder_and_we_from_its(network: Mast3r,
     torch.testing.assert_close(forward(other), expected, atol=1e-5, rtol=1e-5)
 
 
-def test_a_rank_stabilised_adapter_of_peft_is_read_with_its_scale(small_network: Mast3r, tmp_path):
+def test_a_rank_stabilized_adapter_of_peft_is_read_with_its_scale(small_network: Mast3r, tmp_path):
     peft = pytest.importorskip("peft", reason="the dev extra has it")
     config = peft.LoraConfig(r=4, lora_alpha=3, use_rslora=True, target_modules=["decoder_embed", "patch_embed.proj"])
     theirs = peft.get_peft_model(copy.deepcopy(small_network), config)

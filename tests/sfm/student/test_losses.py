@@ -12,7 +12,7 @@ from swimm3r.sfm.mast3r.settings import ObjectiveSettings
 from swimm3r.sfm.student.losses import (
     LossTerms,
     anchor_loss,
-    dim_colour,
+    dim_color,
     features,
     forward_loss,
     inverse_loss,
@@ -31,7 +31,7 @@ def image(*pixels: tuple[float, float, float]) -> torch.Tensor:
 
 
 def scene(b: int = 2, seed: int = 0) -> tuple[torch.Tensor, torch.Tensor, Medium]:
-    """Clear picture, ray depth and a hazy water per frame."""
+    """Clear image, ray depth and a hazy water per frame."""
     generator = torch.Generator().manual_seed(seed)
     J, z = torch.rand(b, 6, 8, 3, generator=generator), 0.5 + 3 * torch.rand(b, 6, 8, generator=generator)
     draws = torch.rand(3, b, 1, 1, 3, generator=generator)
@@ -93,18 +93,18 @@ def test_overshoot_by_hand_and_none_inside_the_range():
     assert overshoot_loss(torch.rand(1, 1, 2, 3), ALL).item() == 0
 
 
-def test_the_dim_colour_is_each_channels_own_five_percent_quantile():
+def test_the_dim_color_is_each_channels_own_five_percent_quantile():
     ramp = torch.linspace(0, 1, 101)[torch.randperm(101, generator=torch.Generator().manual_seed(0))]
     I = torch.stack([ramp, 1 - ramp / 2, ramp.flip(0) * 0 + 0.3], -1)[None, None]
     torch.testing.assert_close(
-        dim_colour(I, torch.ones(1, 1, 101, dtype=torch.bool)), torch.tensor([[0.05, 0.525, 0.3]])
+        dim_color(I, torch.ones(1, 1, 101, dtype=torch.bool)), torch.tensor([[0.05, 0.525, 0.3]])
     )
 
 
-def test_the_dim_colour_looks_at_valid_pixels_only():
+def test_the_dim_color_looks_at_valid_pixels_only():
     I = image((0.0, 0.0, 0.0), (0.4, 0.5, 0.6))
     valid = torch.tensor([[[False, True]]])
-    torch.testing.assert_close(dim_colour(I, valid), torch.tensor([[0.4, 0.5, 0.6]]))
+    torch.testing.assert_close(dim_color(I, valid), torch.tensor([[0.4, 0.5, 0.6]]))
 
 
 def test_anchor_by_hand():
@@ -130,7 +130,7 @@ def test_in_haze_the_anchor_pulls_the_true_veil_down_and_nothing_else_moves_it()
     Binf = medium.Binf.clone().requires_grad_()
     terms = physics_terms(I, J, z, everywhere, replace(medium, Binf=Binf), PAPER)
     (saturation,) = torch.autograd.grad((terms.overshoot + 0.5 * terms.anchor).sum(), Binf)
-    assert (dim_colour(I, everywhere) < medium.Binf[:, 0, 0]).all()
+    assert (dim_color(I, everywhere) < medium.Binf[:, 0, 0]).all()
     assert (saturation[:, 0, 0] > 0).all()  # descending lowers Binf
     assert (saturation[:, 1:] == 0).all()
 
@@ -156,7 +156,7 @@ def test_far_away_the_inverse_divides_by_the_floor_and_stays_finite():
 
 
 def test_beyond_the_floor_under_t_d_the_inverse_loss_pulls_the_true_veil_down_and_leaves_beta_d_alone():
-    """A bias of Eq. stage1_loss_inv itself: where T_D < eps_inv the true water restores too dark a picture."""
+    """A bias of Eq. stage1_loss_inv itself: where T_D < eps_inv the true water restores too dark an image."""
     J, z, medium = scene()
     far = z + 30
     I = add_water(J, far, medium)

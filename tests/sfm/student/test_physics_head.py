@@ -68,7 +68,7 @@ def test_attenuation_follows_sea_thrus_double_exponential_at_every_pixel():
     assert water.curve.a[0].std() > 0.01  # not one value for the whole frame
 
 
-def test_a_change_of_the_scenes_unit_changes_no_picture():
+def test_a_change_of_the_scenes_unit_changes_no_image():
     water, scale = wild_head()(encoded()), 7.3
     generator = torch.Generator().manual_seed(4)
     z, J = torch.rand(2, 32, 48, generator=generator) * 4, torch.rand(2, 32, 48, 3, generator=generator)

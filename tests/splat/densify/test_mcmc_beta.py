@@ -28,10 +28,10 @@ def test_the_vectors_opacities_are_reproduced():
     torch.testing.assert_close(found, expected, rtol=1e-10, atol=1e-10)
 
 
-def test_copies_in_one_place_block_the_light_of_the_one_they_replace_at_centre_and_rim_and_more_in_between():
+def test_copies_in_one_place_block_the_light_of_the_one_they_replace_at_center_and_rim_and_more_in_between():
     o, n = torch.tensor([0.2, 0.7, 0.95]).double()[:, None], torch.tensor([2.0, 3.0, 5.0]).double()[:, None]
     each = shared_opacity(o, n, 0.005)
-    v = (1 - torch.linspace(0, 1, 101).double()) ** 4  # a Beta kernel from its centre to its rim
+    v = (1 - torch.linspace(0, 1, 101).double()) ** 4  # a Beta kernel from its center to its rim
     more = (1 - o * v) - (1 - each * v) ** n
     torch.testing.assert_close(more[:, [0, -1]], torch.zeros(3, 2).double())
     assert (more[:, 1:-1] > 0).all()

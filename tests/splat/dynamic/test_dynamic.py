@@ -34,7 +34,7 @@ DYNAMIC = UwbsSettings(
     dynamic=True,
     iterations=40,
     initial=InitialSettings(primitives=500, scale=2.0),
-    densify=DensifySettings(max_primitives=700, min_every=4),
+    densify=DensifySettings(cap_max=700, min_refine_every=4),
     log_every=0.125,
     checkpoint_every=0.25,
 )
@@ -154,7 +154,7 @@ def test_what_moves_is_scored_apart_where_the_truth_knows_it(tiny_dive, trained,
         f = frames.index(name)
         render = scene.render(cameras[f], frames.frames[f].time).rgb.clamp(0, 1)
         expected.append(psnr(render[10:20, 10:30], frames.image(f)[10:20, 10:30]))
-    assert section["psnr_moving"] == pytest.approx(np.mean(expected), abs=0.1)  # 8-bit pictures
+    assert section["psnr_moving"] == pytest.approx(np.mean(expected), abs=0.1)  # 8-bit images
     assert section["psnr_still"] != section["psnr_moving"]
 
 

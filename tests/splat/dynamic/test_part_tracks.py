@@ -7,9 +7,9 @@ from torch.nn.functional import interpolate
 from swimm3r.cameras import Cameras, pixel_grid
 from swimm3r.splat.dynamic.part_flow import carried, full_size, passages
 from swimm3r.splat.dynamic.part_tracks import Part, laid_over, tracks
-from swimm3r.splat.views import View
+from swimm3r.splat.views import TrainingView
 
-HEIGHT, WIDTH, SCALE = 54, 80, 3  # of the small pictures; the frames are three times as large
+HEIGHT, WIDTH, SCALE = 54, 80, 3  # of the small images; the frames are three times as large
 YELLOW, BLUE = torch.tensor([0.8, 0.7, 0.2]), torch.tensor([0.1, 0.2, 0.5])
 
 
@@ -25,17 +25,17 @@ def striped(middle: tuple[float, float], size: float = 1.0, turn: float = 0.0, t
     return torch.cat([rgb, inside[..., None].float()], -1).permute(2, 0, 1)
 
 
-def part(picture: torch.Tensor, frame: int) -> Part:
-    small = interpolate(picture[None], (HEIGHT, WIDTH), mode="area")[0]
+def part(image: torch.Tensor, frame: int) -> Part:
+    small = interpolate(image[None], (HEIGHT, WIDTH), mode="area")[0]
     return Part(frame, float(frame), small[3] > 0.5, small[:3])
 
 
-def view(picture: torch.Tensor) -> View:
+def view(image: torch.Tensor) -> TrainingView:
     K = torch.tensor([[200.0, 0, 120], [0, 200, 80], [0, 0, 1]], dtype=torch.float64)[None]
     pose = torch.eye(4, dtype=torch.float64)[None]
     camera = Cameras(K, torch.zeros(1, 0, dtype=torch.float64), pose, SCALE * WIDTH, SCALE * HEIGHT)
     nothing = torch.zeros(SCALE * HEIGHT, SCALE * WIDTH)
-    return View("", camera, picture[:3], nothing == 0, nothing, nothing > 0)
+    return TrainingView("", camera, image[:3], nothing == 0, nothing, nothing > 0)
 
 
 HERE = (30.0, 24.0)
@@ -64,7 +64,7 @@ def test_pixels_are_followed_to_where_they_are(middle, size, turn):
     shown = ((truth > 0) & (truth < torch.tensor([SCALE * WIDTH, SCALE * HEIGHT]))).all(-1)
     off = (there.there(pixels) - truth).norm(dim=-1)
     assert off[shown].median() < 1
-    assert off.quantile(0.9) < 4  # what has left the picture goes with the rest
+    assert off.quantile(0.9) < 4  # what has left the image goes with the rest
     returned = (back.there(truth[shown]) - pixels[shown]).norm(dim=-1)
     assert returned.median() < 1.5
 
@@ -76,7 +76,7 @@ def test_what_looks_otherwise_is_not_the_same():
 def test_two_that_pass_each_other_keep_their_tracks():
     def frame(k: int) -> list[Part]:
         bright, dark = striped((20.0 + 10 * k, 12.0)), striped((60.0 - 10 * k, 40.0), tone=0.5)
-        return [part(picture, k) for picture in ((bright, dark) if k % 2 else (dark, bright))]
+        return [part(image, k) for image in ((bright, dark) if k % 2 else (dark, bright))]
 
     found = tracks([frame(k) for k in range(5)])
     assert len(found) == 2

@@ -13,21 +13,21 @@ from swimm3r.io.images import write_rgb
 from swimm3r.medium import Medium
 from swimm3r.scene.frames import Frames
 from swimm3r.splat import train
-from swimm3r.splat.dynamic.linear_motion import travelling
-from swimm3r.splat.dynamic.motion_masks import Look, against_others, look, moving_parts, moving_pixels
+from swimm3r.splat.dynamic.linear_motion import traveling
+from swimm3r.splat.dynamic.motion_masks import MotionView, against_others, motion_view, moving_parts, moving_pixels
 from swimm3r.splat.dynamic.spawn import born
 from swimm3r.splat.medium.field import MediumField, initial_field
 from swimm3r.splat.primitives.beta import BetaPrimitives, select, with_time
 from swimm3r.splat.projection.conditioning import condition
 from swimm3r.splat.recipes.uwbs import Uwbs
 from swimm3r.splat.settings import DensifySettings, InitialSettings, MediumFieldSettings, MoverSettings, UwbsSettings
-from swimm3r.splat.training.scene import Site
+from swimm3r.splat.training.scene import TrainingScene
 from swimm3r.splat.training.state import first_state
 from swimm3r.splat.views import TrainingViews
 
 WATER = Medium(torch.tensor([0.1, 0.4, 0.5]), torch.tensor([0.4, 0.15, 0.1]), torch.tensor([0.3, 0.2, 0.2]))
-DYNAMIC = UwbsSettings(dynamic=True, densify=DensifySettings(max_primitives=4000))
-SIDE, LEFT, TOP = 16, 6, 16  # of the patch that crosses the picture, and where it is in the first frame, pixels
+DYNAMIC = UwbsSettings(dynamic=True, densify=DensifySettings(cap_max=4000))
+SIDE, LEFT, TOP = 16, 6, 16  # of the patch that crosses the image, and where it is in the first frame, pixels
 STEP = 3  # pixels it goes on in each frame
 
 
@@ -36,12 +36,12 @@ def rng() -> torch.Generator:
 
 
 @pytest.mark.parametrize("speed", [0.0, 0.1, 2.0])
-def test_a_travelling_primitive_is_where_its_velocity_takes_it(speed):
+def test_a_traveling_primitive_is_where_its_velocity_takes_it(speed):
     n, generator = 64, rng()
     xyz, way = torch.randn(2, n, 3, generator=generator, dtype=torch.float64)
     direction = torch.nn.functional.normalize(way.flip(-1), dim=-1)
     radius = torch.full((n,), 0.02, dtype=torch.float64)
-    p = travelling(
+    p = traveling(
         xyz, speed * way, direction, 0.4, radius=radius, duration=0.1, rgb=torch.rand(n, 3), opacity=0.5
     )  # fmt: skip
     for time, share in ((0.4, 1.0), (0.45, 0.325), (0.3, 0.0032)):  # (1 - tanh y^2)^4, y = 0, 1/2, 1
@@ -62,9 +62,9 @@ class Crossing:
     still: BetaPrimitives  # D = 7
     field: MediumField
 
-    def looks(self, still: BetaPrimitives | None = None) -> list[Look]:
+    def looks(self, still: BetaPrimitives | None = None) -> list[MotionView]:
         still = self.still if still is None else still
-        return [look(still, self.field, self.views[k], DYNAMIC) for k in range(len(self.views))]
+        return [motion_view(still, self.field, self.views[k], DYNAMIC) for k in range(len(self.views))]
 
 
 @pytest.fixture(scope="module")
@@ -75,9 +75,9 @@ def crossing(tiny_dive, tmp_path_factory) -> Crossing:
     patch = np.stack([200 + 55 * tone, 255 * tone, 255 * tone], -1).astype(np.uint8)
     listed = []
     for i, frame in enumerate(tiny_dive.frames):
-        picture = (tiny_dive.frames.image(i) * 255).round().byte().numpy()
-        picture[TOP : TOP + SIDE, LEFT + STEP * i : LEFT + STEP * i + SIDE] = patch
-        write_rgb(folder / frame.name, picture)
+        image = (tiny_dive.frames.image(i) * 255).round().byte().numpy()
+        image[TOP : TOP + SIDE, LEFT + STEP * i : LEFT + STEP * i + SIDE] = patch
+        write_rgb(folder / frame.name, image)
         listed.append(replace(frame, path=folder / frame.name))
     frames = replace(tiny_dive.frames, frames=tuple(listed))
     everlasting = InitialSettings(time_exponent=-9.0)
@@ -86,7 +86,7 @@ def crossing(tiny_dive, tmp_path_factory) -> Crossing:
     return Crossing(TrainingViews(tiny_dive.rec, frames, DYNAMIC, 1.0), frames, still, field)
 
 
-def others_than(k: int, looks: list[Look]) -> list[Look]:
+def others_than(k: int, looks: list[MotionView]) -> list[MotionView]:
     return [other for j, other in enumerate(looks) if j != k]
 
 
@@ -152,7 +152,7 @@ def test_one_other_frame_is_not_enough_to_tell(crossing):
 def test_what_is_born_travels_with_the_patch(crossing):
     views = crossing.views
     p = born(crossing.still, crossing.field, views, DYNAMIC, rng())
-    assert 0 < len(p.xyz) <= DYNAMIC.movers.share * DYNAMIC.densify.max_primitives
+    assert 0 < len(p.xyz) <= DYNAMIC.movers.share * DYNAMIC.densify.cap_max
     for k in range(1, len(views) - 1):
         here = select(p, (p.query_mean[:, 3] - views.times[k]).abs() < 1e-3)
         assert len(here.xyz) > 5
@@ -165,9 +165,9 @@ def test_what_is_born_travels_with_the_patch(crossing):
 
 
 def test_training_leaves_what_travels_on_its_way(tiny_dive, crossing):
-    """Colour, opacity and place are learned; the still primitives learn everything."""
-    site = Site(tiny_dive.rec, 1.0, 1.0, crossing.views)
-    recipe = Uwbs(DYNAMIC, site)
+    """Color, opacity and place are learned; the still primitives learn everything."""
+    scene = TrainingScene(tiny_dive.rec, 1.0, 1.0, crossing.views)
+    recipe = Uwbs(DYNAMIC, scene)
     fresh = born(crossing.still, crossing.field, crossing.views, DYNAMIC, rng())
     p = BetaPrimitives(*(torch.cat(pair) for pair in zip(crossing.still, fresh, strict=True)))
     before = BetaPrimitives(*(values.clone() for values in p))
@@ -185,12 +185,12 @@ def test_nothing_is_born_where_nothing_moves(tiny_dive, crossing):
 
 
 def test_a_map_shows_the_patch_between_the_frames_it_learned(tiny_dive, crossing, tmp_path):
-    """The fifth frame, held back, has the patch where neither of its neighbours has it."""
+    """The fifth frame, held back, has the patch where neither of its neighbors has it."""
     frames = tuple(replace(f, split="test" if i == 4 else "train") for i, f in enumerate(crossing.frames))
     frames = replace(crossing.frames, frames=frames)
     rec = replace(tiny_dive.rec, names=frames.names, cameras=tiny_dive.cameras)
     settings = replace(
-        DYNAMIC, iterations=120, initial=InitialSettings(primitives=1500), densify=DensifySettings(max_primitives=4000)
+        DYNAMIC, iterations=120, initial=InitialSettings(primitives=1500), densify=DensifySettings(cap_max=4000)
     )
     target = frames.image(4)[TOP : TOP + SIDE, LEFT + 4 * STEP : LEFT + 4 * STEP + SIDE]
     scores = {}

@@ -69,7 +69,7 @@ def test_a_camera_that_goes_along_with_it_learns_little():
     assert (z > 2.5).all()
 
 
-def test_one_sighting_lies_on_its_ray_at_the_assumed_distance():
+def test_one_observation_lies_on_its_ray_at_the_assumed_distance():
     there = cameras("loop")[[3]]
     pixel = torch.tensor([[100.0, 200.0]])
     found = course(there, pixel, TIMES[3:4], torch.tensor([2.5]))

@@ -16,7 +16,7 @@ from swimm3r.splat.medium.field import (
     smoothness,
     spherical_harmonics,
     water_prior,
-    with_expected_horizon,
+    with_binf_prior,
 )
 from swimm3r.splat.projection.pinhole import pinhole
 from swimm3r.splat.settings import MediumFieldSettings
@@ -67,7 +67,7 @@ def test_interpolating_between_grid_points_changes_a_rough_field_little(camera):
         assert (a - b).abs().max() < 0.02 * (b.max() - b.min())
 
 
-def test_the_field_is_seen_at_pixel_centres_of_the_turned_camera(camera):
+def test_the_field_is_seen_at_pixel_centers_of_the_turned_camera(camera):
     view, field = pinhole(camera()), rough_field()
     maps = medium_at_pixels(grid_of(field, view, 1), view.height, view.width)
     ray = torch.tensor([(11.5 - view.cx) / view.fx, (7.5 - view.cy) / view.fy, 1.0])
@@ -123,7 +123,7 @@ def test_an_unknown_horizon_looks_like_the_scene_and_a_known_one_like_itself(tin
     fit = tiny_dive.rec.medium
     Binf = torch.tensor([0.6, 0.99, 0.7])
     fit = replace(fit, medium=replace(fit.medium, Binf=Binf), std=replace(fit.std, Binf=torch.full((3,), spread)))
-    drawn = with_expected_horizon(fit, torch.tensor([0.5, 0.6, 0.5]), 0.2)
+    drawn = with_binf_prior(fit, torch.tensor([0.5, 0.6, 0.5]), 0.2)
     torch.testing.assert_close(drawn.medium.Binf, torch.tensor(expected), atol=1e-3, rtol=0)
     assert (drawn.std.Binf <= torch.tensor(min(spread, 0.2)) + 1e-6).all()
     z = torch.tensor(fit.z_range).prod().sqrt()
@@ -134,7 +134,7 @@ def test_a_known_horizon_that_is_black_or_nearly_reached_stays(tiny_dive):
     fit = tiny_dive.rec.medium
     medium = replace(fit.medium, Binf=torch.tensor([0.0, 0.4, 0.5]), beta_B=torch.tensor([0.3, 2.0, 0.2]))
     fit = replace(fit, medium=medium, std=replace(fit.std, Binf=torch.zeros(3)))
-    drawn = with_expected_horizon(fit, torch.tensor([0.5, 0.6, 0.5]), 0.2).medium
+    drawn = with_binf_prior(fit, torch.tensor([0.5, 0.6, 0.5]), 0.2).medium
     assert drawn.beta_B.isfinite().all()
     torch.testing.assert_close(drawn.Binf, medium.Binf)
     torch.testing.assert_close(drawn.beta_B[1:], medium.beta_B[1:], rtol=1e-4, atol=0)

@@ -32,8 +32,8 @@ def test_the_mean_direction_is_that_of_the_frames_which_see_the_point(tiny_dive)
     xyz = tiny_dive.rec.points.xyz[:50]
     mean = mean_directions(xyz, tiny_dive.rec, 64)
     assert (mean.norm(dim=-1) <= 1 + 1e-9).all()
-    towards = torch.nn.functional.normalize(xyz - tiny_dive.rec.cameras.centres.mean(0), dim=-1)
-    assert (torch.nn.functional.normalize(mean, dim=-1) * towards).sum(-1).min() > 0.95
+    toward = torch.nn.functional.normalize(xyz - tiny_dive.rec.cameras.centers.mean(0), dim=-1)
+    assert (torch.nn.functional.normalize(mean, dim=-1) * toward).sum(-1).min() > 0.95
 
 
 def test_with_mean_directions_most_primitives_are_visible_at_first_and_with_uniform_ones_few(tiny_dive):
@@ -43,7 +43,7 @@ def test_with_mean_directions_most_primitives_are_visible_at_first_and_with_unif
     for directions in ("mean", "uniform"):
         settings = InitialSettings(primitives=1000, directions=directions)
         p = initial_primitives(tiny_dive.rec, settings, torch.Generator().manual_seed(0))
-        seen = condition(p, queries(p.xyz, tiny_dive.rec.cameras.centres[3].float()))
+        seen = condition(p, queries(p.xyz, tiny_dive.rec.cameras.centers[3].float()))
         share[directions] = (seen.opacity > 0.05).double().mean()
     assert share["mean"] > 0.9
     assert share["uniform"] < 0.3
@@ -74,7 +74,7 @@ def test_softplus_undoes_its_inverse():
 
 
 def test_a_scene_in_another_unit_looks_the_same(wall, camera):
-    """Lengths times ten and coefficients by ten: the same picture from the camera moved as far."""
+    """Lengths times ten and coefficients by ten: the same image from the camera moved as far."""
     scene, view = wall(400), camera()
     pose = view.cam2world.clone()
     pose[:, :3, 3] *= 10

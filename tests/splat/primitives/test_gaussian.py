@@ -1,4 +1,4 @@
-"""Gaussians: colours, shapes, projection and what relocation does to them."""
+"""Gaussians: colors, shapes, projection and what relocation does to them."""
 
 from collections.abc import Callable
 from dataclasses import replace
@@ -18,11 +18,11 @@ from swimm3r.splat.gaussian_settings import GaussianInitialSettings, GaussianRen
 from swimm3r.splat.optimizer import Moments
 from swimm3r.splat.primitives.gaussian import (
     GaussianPrimitives,
-    coloured,
+    colored,
     covariance,
     initial_gaussians,
     rescaled,
-    seen_colour,
+    seen_color,
     to_degree,
 )
 from swimm3r.splat.primitives.spherical_harmonics import Y_00, spherical_harmonics
@@ -47,17 +47,17 @@ def gaussians(n: int, seed: int = 0) -> GaussianPrimitives:
 
 def turned(view: Pinhole, world2cam: torch.Tensor) -> Pinhole:
     R, t = world2cam[:3, :3], world2cam[:3, 3]
-    return replace(view, R=R, t=t, centre=-R.mT @ t)
+    return replace(view, R=R, t=t, center=-R.mT @ t)
 
 
-def test_without_higher_harmonics_a_colour_is_the_same_from_everywhere():
+def test_without_higher_harmonics_a_color_is_the_same_from_everywhere():
     p = to_degree(gaussians(20), 0)
-    assert torch.equal(seen_colour(p, torch.zeros(3)), seen_colour(p, 5 * torch.ones(3)))
-    torch.testing.assert_close(seen_colour(p, torch.zeros(3)), (0.5 + Y_00 * p.colour).clamp(min=0))
+    assert torch.equal(seen_color(p, torch.zeros(3)), seen_color(p, 5 * torch.ones(3)))
+    torch.testing.assert_close(seen_color(p, torch.zeros(3)), (0.5 + Y_00 * p.color).clamp(min=0))
 
 
 def test_harmonics_turn_with_the_scene():
-    """A turned colour is again a sum of harmonics of the same degree, of the same power."""
+    """A turned color is again a sum of harmonics of the same degree, of the same power."""
     rng = torch.Generator().manual_seed(1)
     d = normalize(torch.randn(400, 3, generator=rng, dtype=torch.float64), dim=-1)
     R = rotation_from_quaternion(torch.tensor([0.3, -0.5, 0.7, 0.2], dtype=torch.float64))
@@ -70,11 +70,11 @@ def test_harmonics_turn_with_the_scene():
         torch.testing.assert_close(fitted.solution.norm(), k.norm())
 
 
-def test_colours_are_never_negative_and_rays_have_no_length():
+def test_colors_are_never_negative_and_rays_have_no_length():
     p = gaussians(50)
-    seen = coloured(p.colour, p.harmonics, p.xyz)
+    seen = colored(p.color, p.harmonics, p.xyz)
     assert (seen >= 0).all()
-    torch.testing.assert_close(seen, coloured(p.colour, p.harmonics, 7 * p.xyz))
+    torch.testing.assert_close(seen, colored(p.color, p.harmonics, 7 * p.xyz))
 
 
 def test_covariances_have_the_squared_scales_as_variances_along_turned_axes():
@@ -91,7 +91,7 @@ def test_a_change_of_unit_changes_lengths_alone():
     assert torch.equal(ten.harmonics, p.harmonics)
 
 
-def test_gradients_of_the_picture_agree_with_finite_differences(camera: Callable[..., Cameras]):
+def test_gradients_of_the_image_agree_with_finite_differences(camera: Callable[..., Cameras]):
     view = pinhole(camera(32, 24), torch.float64)
     p, pose = gaussians(12), torch.cat([view.R, view.t[:, None]], -1)
     rng = torch.Generator().manual_seed(3)
@@ -125,21 +125,21 @@ def test_a_gaussian_reaches_as_far_as_its_radius(camera: Callable[..., Cameras])
     seen = project(p, view, GaussianRenderSettings())
     alpha = rasterize(seen.primitives, None, view.height, view.width, kernel="gaussian", backend="reference").alpha
     y, x = (alpha > 0).nonzero().unbind(-1)
-    centre = seen.primitives.mean2d[0]
-    reach = (torch.stack([x, y], -1) + 0.5 - centre).norm(dim=-1).max()
+    center = seen.primitives.mean2d[0]
+    reach = (torch.stack([x, y], -1) + 0.5 - center).norm(dim=-1).max()
     assert reach <= seen.radius[0] < reach + 1.5
 
 
-def test_gaussians_start_round_on_the_cloud_with_its_colours(tiny_dive):
+def test_gaussians_start_round_on_the_cloud_with_its_colors(tiny_dive):
     settings = GaussianInitialSettings(primitives=500, scale=0.5, opacity=0.3)
     p = initial_gaussians(tiny_dive.rec, settings, torch.Generator().manual_seed(0))
     assert (p.scale == p.scale[:, :1]).all()
     torch.testing.assert_close(torch.sigmoid(p.opacity), torch.full_like(p.opacity, 0.3))
-    colours = {tuple(c) for c in tiny_dive.rec.cloud.raw.tolist()}
+    colors = {tuple(c) for c in tiny_dive.rec.cloud.raw.tolist()}
     assert len(p.xyz) >= 450
-    nearest = (seen_colour(p, torch.zeros(3))[:, None] - tiny_dive.rec.cloud.raw[None]).abs().amax(-1).amin(1)
+    nearest = (seen_color(p, torch.zeros(3))[:, None] - tiny_dive.rec.cloud.raw[None]).abs().amax(-1).amin(1)
     assert nearest.max() < 1e-5
-    assert len(colours) > 100
+    assert len(colors) > 100
 
 
 def test_scales_of_copies_are_the_published_ones():
@@ -187,7 +187,7 @@ def test_noise_moves_what_is_nearly_dead_and_leaves_the_rest():
     assert not moved[50:].any()
 
 
-def test_fewer_points_than_a_neighbourhood_are_refused(tiny_dive):
+def test_fewer_points_than_a_neighborhood_are_refused(tiny_dive):
     cloud = tiny_dive.rec.cloud
     few = replace(tiny_dive.rec, cloud=type(cloud)(*(values[:3] for values in vars(cloud).values())))
     with pytest.raises(InputError, match="at least 4 points"):
@@ -251,7 +251,7 @@ def test_culled_rows_leave_and_the_others_keep_their_place():
     assert sorted(left.restarted.tolist()) == [38, 39]
 
 
-def test_pulls_are_counted_while_a_gaussian_is_in_the_picture(camera: Callable[..., Cameras]):
+def test_pulls_are_counted_while_a_gaussian_is_in_the_image(camera: Callable[..., Cameras]):
     view = pinhole(camera())
     p = GaussianPrimitives(*(t.float() for t in to_degree(gaussians(30), 0)))
     p.xyz[10:20, 2] = -3.0

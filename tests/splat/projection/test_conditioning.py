@@ -65,12 +65,12 @@ def test_the_vectors_gradients_are_reproduced(nd6: dict[str, torch.Tensor]):
 @pytest.mark.parametrize("c", [3, 4])
 def test_gradients_agree_with_finite_differences(c: int, primitives: Callable[..., BetaPrimitives]):
     p = primitives(3, c)
-    centre, time = torch.tensor([0.1, -0.2, 0.3], dtype=torch.float64), torch.tensor(0.4, dtype=torch.float64)
-    wanted = [p.xyz, p.query_mean, p.opacity, p.beta, p.scale, p.lower, centre]
+    center, time = torch.tensor([0.1, -0.2, 0.3], dtype=torch.float64), torch.tensor(0.4, dtype=torch.float64)
+    wanted = [p.xyz, p.query_mean, p.opacity, p.beta, p.scale, p.lower, center]
 
-    def results(xyz, query_mean, opacity, beta, scale, lower, centre):
+    def results(xyz, query_mean, opacity, beta, scale, lower, center):
         q = BetaPrimitives(xyz, query_mean, p.rgb, opacity, beta, scale, lower)
-        seen = conditioned_in_view(q, centre, RenderSettings(), time if c == 4 else None)
+        seen = conditioned_in_view(q, center, RenderSettings(), time if c == 4 else None)
         return seen.mean, seen.covariance, seen.opacity
 
     assert torch.autograd.gradcheck(results, [t.clone().requires_grad_() for t in wanted])
@@ -78,9 +78,9 @@ def test_gradients_agree_with_finite_differences(c: int, primitives: Callable[..
 
 def test_a_primitive_seen_from_its_mean_direction_keeps_its_place_and_opacity(primitives):
     p = primitives(20)
-    centre = torch.zeros(3, dtype=torch.float64)
-    p = p._replace(query_mean=queries(p.xyz, centre))
-    seen = condition(p, queries(p.xyz, centre))
+    center = torch.zeros(3, dtype=torch.float64)
+    p = p._replace(query_mean=queries(p.xyz, center))
+    seen = condition(p, queries(p.xyz, center))
     torch.testing.assert_close(seen.mean, p.xyz)
     torch.testing.assert_close(seen.opacity, torch.sigmoid(p.opacity))
 

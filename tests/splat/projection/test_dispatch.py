@@ -9,20 +9,22 @@ import torch
 from swimm3r.cameras import Cameras
 from swimm3r.cameras import project as project_points
 from swimm3r.splat.primitives.beta import BetaPrimitives
-from swimm3r.splat.projection import dispatch
+from swimm3r.splat.projection.dispatch import project
+from swimm3r.splat.projection.pinhole import BLUR, Pinhole, Projection, pinhole
+from swimm3r.splat.projection.plain import project_plainly
 from swimm3r.splat.settings import RenderSettings
 
 Make = Callable[..., BetaPrimitives]
 
 
-def leaves(p: BetaPrimitives, view: dispatch.Pinhole) -> tuple[BetaPrimitives, dispatch.Pinhole, list[torch.Tensor]]:
+def leaves(p: BetaPrimitives, view: Pinhole) -> tuple[BetaPrimitives, Pinhole, list[torch.Tensor]]:
     p = BetaPrimitives(*(t.detach().clone().requires_grad_() for t in p))
-    pose = [t.detach().clone().requires_grad_() for t in (view.R, view.t, view.centre)]
-    return p, replace(view, R=pose[0], t=pose[1], centre=pose[2]), [*p, *pose]
+    pose = [t.detach().clone().requires_grad_() for t in (view.R, view.t, view.center)]
+    return p, replace(view, R=pose[0], t=pose[1], center=pose[2]), [*p, *pose]
 
 
-def weighted_sum(seen: dispatch.Projection) -> torch.Tensor:
-    """Something that depends on everything the rasteriser reads."""
+def weighted_sum(seen: Projection) -> torch.Tensor:
+    """Something that depends on everything the rasterizer reads."""
     rng = torch.Generator().manual_seed(3)
     drawn = seen.primitives.depth.detach() > 0
     total = torch.zeros((), dtype=seen.primitives.depth.dtype)
@@ -32,11 +34,11 @@ def weighted_sum(seen: dispatch.Projection) -> torch.Tensor:
     return total
 
 
-def test_a_centre_lands_where_its_camera_sees_it(primitives: Make, camera: Callable[..., Cameras]):
+def test_a_center_lands_where_its_camera_sees_it(primitives: Make, camera: Callable[..., Cameras]):
     p = primitives(50)
-    seen = dispatch.project_plainly(
-        p._replace(query_mean=torch.nn.functional.normalize(p.xyz - camera().centres[0], dim=-1)),
-        dispatch.pinhole(camera(), torch.float64),
+    seen = project_plainly(
+        p._replace(query_mean=torch.nn.functional.normalize(p.xyz - camera().centers[0], dim=-1)),
+        pinhole(camera(), torch.float64),
         RenderSettings(),
     )
     pixels, z = project_points(camera(), p.xyz[None])
@@ -54,24 +56,24 @@ def test_a_primitive_is_drawn_out_to_the_ellipse_of_its_covariance(primitives: M
         lower=torch.zeros_like(p.lower),
     )
     view = replace(
-        dispatch.pinhole(camera(), torch.float64),
+        pinhole(camera(), torch.float64),
         R=torch.eye(3, dtype=torch.float64), t=torch.zeros(3, dtype=torch.float64),
-        centre=torch.zeros(3, dtype=torch.float64), fx=80.0, fy=80.0,
+        center=torch.zeros(3, dtype=torch.float64), fx=80.0, fy=80.0,
     )  # fmt: skip
-    seen = dispatch.project_plainly(p, view, RenderSettings())
+    seen = project_plainly(p, view, RenderSettings())
     radius = 80 * torch.log(torch.tensor(2.0, dtype=torch.float64)) / 4
-    expected = (radius**2 + dispatch.BLUR).rsqrt() ** 2
+    expected = (radius**2 + BLUR).rsqrt() ** 2
     torch.testing.assert_close(
         seen.primitives.conic[0], torch.stack([expected, 0 * expected, expected]), atol=1e-9, rtol=1e-6
     )
-    assert abs(seen.radius[0] - (radius**2 + dispatch.BLUR + 0.1).sqrt()) < 1e-6  # 0.1: the floor of the spread
+    assert abs(seen.radius[0] - (radius**2 + BLUR + 0.1).sqrt()) < 1e-6  # 0.1: the floor of the spread
 
 
 def test_what_is_behind_the_camera_is_not_drawn(primitives: Make, camera: Callable[..., Cameras]):
     p = primitives(20)
-    for form in (dispatch.project, dispatch.project_plainly):
+    for form in (project, project_plainly):
         behind = BetaPrimitives(*(t.float() for t in p._replace(xyz=-p.xyz, lower=0 * p.lower)))
-        assert (form(behind, dispatch.pinhole(camera()), RenderSettings()).primitives.depth == 0).all()
+        assert (form(behind, pinhole(camera()), RenderSettings()).primitives.depth == 0).all()
 
 
 @pytest.mark.parametrize("c", [3, 4])
@@ -81,14 +83,14 @@ def test_the_fast_form_agrees_with_the_plain_one(
 ):
     settings = RenderSettings(covariance=covariance)
     time = torch.tensor(0.4) if c == 4 else None
-    p, view = primitives(700, c), dispatch.pinhole(camera(), torch.float64)
+    p, view = primitives(700, c), pinhole(camera(), torch.float64)
     exact_p, exact_view, exact = leaves(p, view)
-    oracle = dispatch.project_plainly(exact_p, exact_view, settings, None if time is None else time.double())
+    oracle = project_plainly(exact_p, exact_view, settings, None if time is None else time.double())
     fast_p, fast_view, fast = leaves(
         BetaPrimitives(*(t.float() for t in p)),
-        replace(view, R=view.R.float(), t=view.t.float(), centre=view.centre.float()),
+        replace(view, R=view.R.float(), t=view.t.float(), center=view.center.float()),
     )
-    seen = dispatch.project(fast_p, fast_view, settings, time)
+    seen = project(fast_p, fast_view, settings, time)
     # nearly singular covariances amplify rounding beyond any tolerance
     tame = (oracle.primitives.conic.detach().abs().amax(-1) < 2) & (oracle.primitives.depth > 0.3)
     assert tame.sum() > 300
@@ -96,12 +98,12 @@ def test_the_fast_form_agrees_with_the_plain_one(
         torch.testing.assert_close(a[tame], b[tame].float(), rtol=1e-4, atol=1e-5, msg=lambda m, n=name: f"{n}: {m}")
     torch.testing.assert_close(seen.radius[tame], oracle.radius[tame].float(), rtol=1e-4, atol=1e-4)
 
-    def some(form: dispatch.Projection) -> dispatch.Projection:
+    def some(form: Projection) -> Projection:
         return replace(form, primitives=form.primitives._replace(depth=torch.where(tame, form.primitives.depth, 0.0)))
 
     expected = torch.autograd.grad(weighted_sum(some(oracle)), exact)
     found = torch.autograd.grad(weighted_sum(some(seen)), fast)
-    for name, a, b in zip([*p._fields, "R", "t", "centre"], found, expected, strict=True):
+    for name, a, b in zip([*p._fields, "R", "t", "center"], found, expected, strict=True):
         assert (a - b).abs().max() < 1e-3 * b.abs().max() + 1e-6, name
         assert (a - b).norm() < 2e-4 * b.norm(), name
 
@@ -113,8 +115,8 @@ def test_threads_change_no_bit(primitives: Make, camera: Callable[..., Cameras])
     try:
         for threads in (1, 2, 3):
             torch.set_num_threads(threads)
-            q, view, everything = leaves(p, dispatch.pinhole(camera()))
-            seen = dispatch.project(q, view, RenderSettings())
+            q, view, everything = leaves(p, pinhole(camera()))
+            seen = project(q, view, RenderSettings())
             results.append([*seen.primitives, *torch.autograd.grad(weighted_sum(seen), everything)])
     finally:
         torch.set_num_threads(before)
@@ -125,4 +127,4 @@ def test_threads_change_no_bit(primitives: Make, camera: Callable[..., Cameras])
 def test_a_distorted_camera_is_refused(camera: Callable[..., Cameras]):
     bent = replace(camera(), distortion=torch.tensor([[0.1]], dtype=torch.float64), model="SIMPLE_RADIAL")
     with pytest.raises(ValueError, match=r"camera\.pinhole\(\)"):
-        dispatch.pinhole(bent)
+        pinhole(bent)

@@ -14,7 +14,7 @@ from swimm3r.splat.projection.pinhole import pinhole
 from swimm3r.splat.recipes import uwbs
 from swimm3r.splat.rendering import draw
 from swimm3r.splat.settings import UwbsSettings, with_recipe
-from swimm3r.splat.training.scene import Site
+from swimm3r.splat.training.scene import TrainingScene
 from swimm3r.splat.views import TrainingViews
 
 PAPER = PRESETS["paper"]
@@ -40,11 +40,11 @@ def test_the_objective_is_the_literal_sum_of_eq_18(tiny_dive):
     p = tiny_dive.truth.primitives
     scale, rgb = p.scale.clone(), p.rgb.clone()
     scale[:40, :3] = 20.0
-    rgb[::7] = 1.8  # beyond what a clear colour can be
+    rgb[::7] = 1.8  # beyond what a clear color can be
     p = p._replace(scale=scale, rgb=rgb, opacity=p.opacity - 5, xyz=p.xyz * 1.1)
     field = varied_field(tiny_dive, MAP)
-    site = Site(tiny_dive.rec, 1.0, 1.0, TrainingViews(tiny_dive.rec, tiny_dive.frames, MAP, 1.0))
-    prior = uwbs.known_water(site, MAP)
+    scene = TrainingScene(tiny_dive.rec, 1.0, 1.0, TrainingViews(tiny_dive.rec, tiny_dive.frames, MAP, 1.0))
+    prior = uwbs.known_water(scene, MAP)
     drawing = draw(p, field, pinhole(view.camera), MAP)
     loss = uwbs.objective(p, drawing, view, MAP, prior, True)
 
@@ -81,8 +81,8 @@ def test_the_water_learns_from_the_first_step(tiny_dive):
         whole = PRESETS[name].splat
         settings = replace(whole, initial=replace(whole.initial, primitives=300), iterations=1000)
         views = TrainingViews(tiny_dive.rec, tiny_dive.frames, settings, 1.0)
-        site = Site(tiny_dive.rec, 1.0, 1.0, views)
-        recipe = uwbs.Uwbs(settings, site, uwbs.known_water(site, settings))
+        scene = TrainingScene(tiny_dive.rec, 1.0, 1.0, views)
+        recipe = uwbs.Uwbs(settings, scene, uwbs.known_water(scene, settings))
         start = recipe.start()
         first = {name: values.clone() for name, values in start.field.state_dict().items()}
         state, _ = recipe.step(start, views[3], 1)
@@ -92,13 +92,17 @@ def test_the_water_learns_from_the_first_step(tiny_dive):
 
 
 def test_the_numbers_are_the_printed_ones():
-    assert (MAP.initial.primitives, MAP.densify.max_primitives, MAP.iterations) == (400_000, 800_000, 20_000)
+    assert (MAP.initial.primitives, MAP.densify.cap_max, MAP.iterations) == (400_000, 800_000, 20_000)
     assert MAP.sgg.enabled
-    assert (MAP.sgg.residual, MAP.sgg.end * MAP.iterations, MAP.densify.end * MAP.iterations) == (0.15, 10_000, 10_000)
+    assert (MAP.sgg.residual, MAP.sgg.end * MAP.iterations, MAP.densify.refine_stop * MAP.iterations) == (
+        0.15,
+        10_000,
+        10_000,
+    )
     assert MAP.poses.enabled
     assert (PAPER.frames.pick, PAPER.frames.fps) == ("uniform", 5)
     assert (PAPER.test.steps, PAPER.test.long_side, PAPER.test.halvings) == (300, 0, 0)
-    assert PRESETS["best"].test.long_side == 0  # the training pictures' own
+    assert PRESETS["best"].test.long_side == 0  # the training images' own
     assert MAST3R_PRESETS.keys() == PRESETS.keys()
 
 
@@ -115,5 +119,5 @@ def test_every_command_with_presets_knows_it(command: str, capsys: pytest.Captur
 
 def test_it_trains_no_peer_otherwise_than_at_its_size():
     peer = with_recipe(MAP, "watersplatting")
-    assert (peer.iterations, peer.initial.primitives, peer.max_primitives) == (20_000, 400_000, 800_000)
+    assert (peer.iterations, peer.initial.primitives, peer.cap_max) == (20_000, 400_000, 800_000)
     assert asdict(peer.weights) == asdict(with_recipe(UwbsSettings(), "watersplatting").weights)

@@ -27,7 +27,7 @@ from swimm3r.splat.settings import (
 FEW = UwbsSettings(
     iterations=60,
     initial=InitialSettings(primitives=500, scale=2.0),
-    densify=DensifySettings(max_primitives=600, min_every=10),
+    densify=DensifySettings(cap_max=600, min_refine_every=10),
 )
 
 
@@ -47,7 +47,7 @@ def test_ubs_as_the_python_api_has_it():
 
 
 def test_ubs_paints_the_water_onto_the_scene(tiny_dive, tmp_path):
-    """Nothing is known of the water afterwards: the clear picture is the filmed one."""
+    """Nothing is known of the water afterwards: the clear image is the filmed one."""
     scene = train(tiny_dive.rec, tiny_dive.frames, with_recipe(FEW, "ubs"), tmp_path)
     assert recipe_of(load_map(tmp_path / "map.safetensors").settings) == "ubs"
     view = tiny_dive.cameras[4]
@@ -58,7 +58,7 @@ def test_ubs_paints_the_water_onto_the_scene(tiny_dive, tmp_path):
     torch.testing.assert_close(out.rgb[covered], out.clear[covered] * out.alpha[covered][:, None])
 
 
-def test_ubs_begins_with_the_colours_as_filmed(tiny_dive, tmp_path):
+def test_ubs_begins_with_the_colors_as_filmed(tiny_dive, tmp_path):
     raw = replace(tiny_dive.rec.cloud, raw=torch.full_like(tiny_dive.rec.cloud.raw, 0.25))
     none = replace(with_recipe(FEW, "ubs"), iterations=1)
     scene = train(replace(tiny_dive.rec, cloud=raw), tiny_dive.frames, none, tmp_path)

@@ -1,4 +1,4 @@
-"""SeaSplat: water over finished pictures, its losses, its bursts."""
+"""SeaSplat: water over finished images, its losses, its bursts."""
 
 import math
 from collections.abc import Callable
@@ -14,8 +14,8 @@ from swimm3r.splat.medium.seasplat import SceneWater, layer, relative_depth, see
 from swimm3r.splat.recipes.seasplat import SeaSplat, covered_background, dark_channel, depth_steps, objective
 from swimm3r.splat.rendering import SplatMap, mean_water
 from swimm3r.splat.settings import UwbsSettings, seasplat, with_recipe
-from swimm3r.splat.training.scene import Site
-from swimm3r.splat.views import TrainingViews, View
+from swimm3r.splat.training.scene import TrainingScene
+from swimm3r.splat.views import TrainingView, TrainingViews
 
 
 def water(a: float = 0.9, b: float = 0.7) -> SceneWater:
@@ -33,7 +33,7 @@ def images(height: int = 12, width: int = 16, dtype: torch.dtype = torch.float32
     return RasterOutput(*(t.to(dtype) for t in (clear, clear, alpha * z, alpha)))
 
 
-def view_like(images: RasterOutput) -> View:
+def view_like(images: RasterOutput) -> TrainingView:
     rng = torch.Generator().manual_seed(1)
     height, width = images.alpha.shape
     eye = torch.eye(3, dtype=torch.float64)[None]
@@ -43,7 +43,7 @@ def view_like(images: RasterOutput) -> View:
     rgb = torch.rand(3, height, width, generator=rng).to(images.alpha)
     seen = torch.ones(height, width, dtype=torch.bool)
     nothing = torch.zeros(height, width)
-    return View("a", camera, rgb, seen, nothing, nothing > 0)
+    return TrainingView("a", camera, rgb, seen, nothing, nothing > 0)
 
 
 @pytest.fixture
@@ -51,7 +51,7 @@ def recipe(tiny_dive) -> Callable[..., SeaSplat]:
     def make(**changes) -> SeaSplat:
         settings = seasplat(**changes)
         views = TrainingViews(tiny_dive.rec, tiny_dive.frames, settings, 1.0)
-        return SeaSplat(settings, Site(tiny_dive.rec, 1.0, 1.0, views))
+        return SeaSplat(settings, TrainingScene(tiny_dive.rec, 1.0, 1.0, views))
 
     return make
 
@@ -66,7 +66,7 @@ def test_negative_coefficients_count_as_none():
     torch.testing.assert_close(seen_through(J, layer(water(-1.0, -2.0), d)), J)
 
 
-def test_far_water_is_its_own_colour_and_near_water_invisible():
+def test_far_water_is_its_own_color_and_near_water_invisible():
     W = water(80.0, 80.0)
     J = images().clear
     far, near = (seen_through(J, layer(W, torch.full((12, 16), d))) for d in (1.0, 0.0))
@@ -108,7 +108,7 @@ def test_gradients_of_every_loss_agree_with_finite_differences():
 class _Losses(torch.nn.Module):
     """The objective as a module, so that its water can be swapped. Terms whose weights are detached count as such."""
 
-    def __init__(self, of: SceneWater, out: RasterOutput, view: View, w: SeaSplatWeights, wet: bool) -> None:
+    def __init__(self, of: SceneWater, out: RasterOutput, view: TrainingView, w: SeaSplatWeights, wet: bool) -> None:
         super().__init__()
         self.of, self.rest = of, (out, view, w, wet)
 
@@ -123,10 +123,10 @@ def test_the_losses_add_up_with_their_weights():
     n = objective(I, W, view_like(I), w, True)
     m = {name: float(torch.as_tensor(value).detach()) for name, value in n.numbers.items()}
     expected = 0.8 * m["l1"] + 0.2 * (1 - m["ssim"]) + m["far"] + 0.01 * m["background"] + 2 * m["smooth_depth"]
-    expected += 0.1 * m["grey"] + 2 * m["saturation"] + m["dark"]
+    expected += 0.1 * m["gray"] + 2 * m["saturation"] + m["dark"]
     assert float(n.total.detach()) == pytest.approx(expected, rel=1e-5)
     dry = objective(I, W, view_like(I), w, False).numbers
-    assert set(m) - set(dry) == {"grey", "saturation", "dark"}
+    assert set(m) - set(dry) == {"gray", "saturation", "dark"}
 
 
 def test_what_stands_before_open_water_is_to_be_transparent():
@@ -139,7 +139,7 @@ def test_what_stands_before_open_water_is_to_be_transparent():
     assert covered_background(like + 5, I.alpha, W, view, w) == 0
 
 
-def test_depth_may_step_where_the_picture_brightens():
+def test_depth_may_step_where_the_image_brightens():
     I = images()
     view = view_like(I)
     depth = torch.zeros(12, 16)
@@ -150,11 +150,11 @@ def test_depth_may_step_where_the_picture_brightens():
     assert float(depth_steps(depth, bright)) == pytest.approx(math.exp(-1) / 15, rel=1e-5)
 
 
-def test_backscatter_beyond_the_picture_costs_much_more_than_light_left_over():
+def test_backscatter_beyond_the_image_costs_much_more_than_light_left_over():
     view = view_like(images())
-    grey = replace(view, rgb=torch.full((3, 12, 16), 0.5))
-    left = dark_channel(torch.full((3, 12, 16), 0.4), grey, 1000.0)
-    beyond = dark_channel(torch.full((3, 12, 16), 0.6), grey, 1000.0)
+    gray = replace(view, rgb=torch.full((3, 12, 16), 0.5))
+    left = dark_channel(torch.full((3, 12, 16), 0.4), gray, 1000.0)
+    beyond = dark_channel(torch.full((3, 12, 16), 0.6), gray, 1000.0)
     assert float(left) == pytest.approx(0.1, rel=1e-4)
     assert float(beyond) == pytest.approx(1000 * 0.1**2 / 0.4, rel=1e-4)
 
@@ -170,13 +170,13 @@ def test_pixels_that_do_not_count_change_nothing(tiny_dive):
         torch.testing.assert_close(torch.as_tensor(before[name]), torch.as_tensor(after[name]), rtol=1e-5, atol=0)
 
 
-def test_before_the_water_a_background_is_learned_and_becomes_its_colour(recipe):
+def test_before_the_water_a_background_is_learned_and_becomes_its_color(recipe):
     of = recipe(iterations=60)
-    state, view = of.start(), of.site.views[3]
+    state, view = of.start(), of.scene.views[3]
     a, veil = state.field.attenuation.detach().clone(), state.field.veil.detach().clone()
     for step in range(1, 21):
         state, numbers = of.step(state, view, step)
-    assert "grey" not in numbers
+    assert "gray" not in numbers
     assert torch.equal(state.field.attenuation, a)
     learned = state.field.veil.detach().clone()
     assert (learned - veil).abs().max() > 0.05
@@ -197,8 +197,8 @@ def test_water_learns_in_bursts_alone_and_they_move_nothing_else(recipe):
     still = recipe(iterations=3000)  # 10 steps between two bursts
     state = still.start()
     a = state.field.attenuation.detach().clone()
-    state, numbers = still.step(state, still.site.views[2], 1501)
-    assert "grey" in numbers
+    state, numbers = still.step(state, still.scene.views[2], 1501)
+    assert "gray" in numbers
     assert torch.equal(state.field.attenuation, a)
 
 

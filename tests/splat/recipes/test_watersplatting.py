@@ -13,7 +13,7 @@ from swimm3r.splat.recipes.watersplatting import WaterSplatting, relative_photom
 from swimm3r.splat.rendering import draw
 from swimm3r.splat.settings import UwbsSettings, watersplatting, with_recipe
 from swimm3r.splat.training.losses import mean_ssim
-from swimm3r.splat.training.scene import Site
+from swimm3r.splat.training.scene import TrainingScene
 from swimm3r.splat.views import TrainingViews, smaller
 
 SETTINGS = watersplatting(iterations=1500)
@@ -22,14 +22,14 @@ SETTINGS = watersplatting(iterations=1500)
 def recipe(dive, settings=SETTINGS, views: int = 7) -> WaterSplatting:
     of = TrainingViews(dive.rec, dive.frames, settings, 1.0)
     of.names = (of.names * views)[:views]  # only their number matters
-    return WaterSplatting(settings, Site(dive.rec, 1.0, 1.0, of))
+    return WaterSplatting(settings, TrainingScene(dive.rec, 1.0, 1.0, of))
 
 
 def view_of(dive, k: int = 3):
     return TrainingViews(dive.rec, dive.frames, SETTINGS, 1.0)[k]
 
 
-def test_the_picture_is_the_one_that_its_kernel_adds_up(tiny_dive):
+def test_the_image_is_the_one_that_its_kernel_adds_up(tiny_dive):
     """Uwbs.md 3.2, pair by pair in depth order: sums with z_{i-1}, and the medium behind the last."""
     start = recipe(tiny_dive)
     state, view = start.start(), view_of(tiny_dive)
@@ -37,13 +37,13 @@ def test_the_picture_is_the_one_that_its_kernel_adds_up(tiny_dive):
     drawing = draw(state.primitives, state.field, sight, SETTINGS)
     p, maps = drawing.projection.primitives, drawing.maps
     y, x = 20, 31
-    centre = torch.tensor([x + 0.5, y + 0.5])
+    center = torch.tensor([x + 0.5, y + 0.5])
     T, z_before = 1.0, 0.0
-    colour, (binf, beta_b, beta_d) = torch.zeros(3), (m[:, y, x].detach() for m in maps)
+    color, (binf, beta_b, beta_d) = torch.zeros(3), (m[:, y, x].detach() for m in maps)
     for i in torch.argsort(p.depth).tolist():
         if p.depth[i] <= 0:
             continue
-        dx, dy = centre - p.mean2d[i]
+        dx, dy = center - p.mean2d[i]
         a, b, c = p.conic[i]
         alpha = min(0.999, float(p.opacity[i] * torch.exp(-0.5 * (a * dx * dx + 2 * b * dx * dy + c * dy * dy))))
         if alpha < 1 / 255:
@@ -51,12 +51,12 @@ def test_the_picture_is_the_one_that_its_kernel_adds_up(tiny_dive):
         if T * (1 - alpha) <= 1e-4:
             break
         z = float(p.depth[i])
-        colour += T * alpha * p.color[i] * torch.exp(-beta_d * z)
-        colour += T * binf * (torch.exp(-beta_b * z_before) - torch.exp(-beta_b * z))
+        color += T * alpha * p.color[i] * torch.exp(-beta_d * z)
+        color += T * binf * (torch.exp(-beta_b * z_before) - torch.exp(-beta_b * z))
         T, z_before = T * (1 - alpha), z
-    colour += T * binf * torch.exp(-beta_b * z_before)
+    color += T * binf * torch.exp(-beta_b * z_before)
     assert T < 0.9
-    torch.testing.assert_close(drawing.images.rgb[:, y, x].detach(), colour, rtol=1e-4, atol=1e-5)
+    torch.testing.assert_close(drawing.images.rgb[:, y, x].detach(), color, rtol=1e-4, atol=1e-5)
 
 
 def test_its_network_has_one_hidden_layer_of_sigmoids_and_no_biases(tiny_dive):
@@ -93,7 +93,7 @@ def test_the_relative_loss_has_the_gradient_of_a_fixed_unit(tiny_dive):
         assert float(render.grad[at]) == pytest.approx((moved[0] - moved[1]) / 2e-4, rel=2e-2, abs=1e-6)
 
 
-def test_pictures_begin_at_a_quarter_and_are_whole_after_two_fifths(tiny_dive):
+def test_images_begin_at_a_quarter_and_are_whole_after_two_fifths(tiny_dive):
     of = recipe(tiny_dive)
     assert [of._divisor(step) for step in (1, 300, 301, 600, 601, 1500)] == [4, 4, 2, 2, 1, 1]
     view = view_of(tiny_dive)
@@ -134,12 +134,12 @@ def test_clips_of_any_length_are_densified(tiny_dive):
 
 def test_short_runs_are_culled_gently_and_long_ones_as_published():
     short, long = (with_recipe(UwbsSettings(iterations=n), "watersplatting") for n in (2000, 15_000))
-    assert (short.densify.reset_every, short.densify.least_opacity) == (0, 0.1)
+    assert (short.densify.reset_every, short.densify.prune_opacity) == (0, 0.1)
     assert long.densify == watersplatting().densify
 
 
-def test_rows_of_the_optimiser_follow_their_gaussians(tiny_dive):
-    settings = watersplatting(initial=replace(watersplatting().initial, primitives=300), max_primitives=1000)
+def test_rows_of_the_optimizer_follow_their_gaussians(tiny_dive):
+    settings = watersplatting(initial=replace(watersplatting().initial, primitives=300), cap_max=1000)
     of, state = with_opacities(tiny_dive, settings, torch.tensor([0.05, 0.7]))
     marks = torch.arange(len(state.primitives.xyz)).float()
     first = {name: m.first.clone() for name, m in state.moments.items()}

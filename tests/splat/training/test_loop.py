@@ -24,13 +24,13 @@ from swimm3r.splat.settings import (
     UwbsSettings,
 )
 from swimm3r.splat.training.loop import view_of_step
-from swimm3r.splat.training.scene import Site
+from swimm3r.splat.training.scene import TrainingScene
 from swimm3r.splat.views import TrainingViews
 
 SETTINGS = UwbsSettings(
     iterations=40,
     initial=InitialSettings(primitives=500, scale=2.0),
-    densify=DensifySettings(max_primitives=700, min_every=4),
+    densify=DensifySettings(cap_max=700, min_refine_every=4),
     log_every=0.125,
     checkpoint_every=0.25,
 )
@@ -58,7 +58,7 @@ def stop_at(step: int):
     return progress
 
 
-def test_training_brings_the_map_nearer_to_a_picture_it_has_not_seen(tiny_dive, tmp_path):
+def test_training_brings_the_map_nearer_to_a_image_it_has_not_seen(tiny_dive, tmp_path):
     settings = replace(SETTINGS, iterations=150)
     scene = train(tiny_dive.rec, tiny_dive.frames, settings, tmp_path)
     logged = rows(tmp_path)
@@ -100,7 +100,7 @@ def test_a_map_comes_back_from_disk_as_it_was(tiny_dive, tmp_path):
 
 
 def test_a_scene_in_another_unit_trains_to_the_same_map_in_that_unit(tiny_dive, tmp_path):
-    """Without metric scale the unit is arbitrary: the picture must not depend on it."""
+    """Without metric scale the unit is arbitrary: the image must not depend on it."""
     rec = replace(tiny_dive.rec, metric=False)
     few = replace(SETTINGS, iterations=10)
     scene = train(rec, tiny_dive.frames, few, tmp_path / "one")
@@ -129,7 +129,7 @@ def test_an_epoch_visits_every_view_once_and_each_in_its_own_order():
 
 
 def test_the_number_of_primitives_never_exceeds_the_cap(tiny_dive, tmp_path):
-    capped = replace(SETTINGS, densify=DensifySettings(max_primitives=510, min_every=4))
+    capped = replace(SETTINGS, densify=DensifySettings(cap_max=510, min_refine_every=4))
     assert len(train(tiny_dive.rec, tiny_dive.frames, capped, tmp_path).primitives.xyz) == 510
 
 
@@ -138,15 +138,15 @@ def test_the_objective_is_the_papers_sum_with_the_papers_weights(tiny_dive):
     view = TrainingViews(tiny_dive.rec, tiny_dive.frames, paper, 1.0)[3]
     p = tiny_dive.truth.primitives
     p = p._replace(xyz=p.xyz + 0.05, scale=p.scale.clone())
-    p.scale[0] = 3.0  # larger than 100 px of a 1280 px wide picture
+    p.scale[0] = 3.0  # larger than 100 px of a 1280 px wide image
     drawing = draw(p, tiny_dive.truth.field, pinhole(view.camera), paper)
-    found = uwbs.objective(p, drawing, view, paper, None, regularised=True)
+    found = uwbs.objective(p, drawing, view, paper, None, regularized=True)
     n = {name: float(torch.as_tensor(value).detach()) for name, value in found.numbers.items()}
     expected = 0.8 * n["l1"] + 0.2 * (1 - n["ssim"]) + 0.01 * n["opacity"] + 0.01 * n["scale"]
     expected += 0.1 * n["depth"] + 1.0 * n["medium_smoothness"] + 0.1 * n["radius"]
     assert float(found.total) == pytest.approx(expected, rel=1e-5)
     assert min(n["depth"], n["radius"], n["l1"]) > 0
-    without = uwbs.objective(p, drawing, view, paper, None, regularised=False)
+    without = uwbs.objective(p, drawing, view, paper, None, regularized=False)
     assert float(found.total - without.total) == pytest.approx(0.01 * (n["opacity"] + n["scale"]), rel=1e-3)
 
 
@@ -156,20 +156,20 @@ def test_mcmc_noise_comes_with_every_step_where_asked(tiny_dive):
     for cadence in ("round", "step"):
         faint = replace(SETTINGS, iterations=1000, initial=InitialSettings(primitives=200, opacity=0.004))
         settings = replace(faint, densify=DensifySettings(noise_cadence=cadence))
-        recipe = uwbs.Uwbs(settings, Site(tiny_dive.rec, 1.0, 1.0, views))
+        recipe = uwbs.Uwbs(settings, TrainingScene(tiny_dive.rec, 1.0, 1.0, views))
         moved[cadence] = recipe.step(recipe.start(), views[3], 1)[0].primitives.xyz
     assert (moved["round"] != moved["step"]).any(-1).float().mean() > 0.9
 
 
 def test_rates_settle_from_half_of_the_run_on(tiny_dive):
-    held = replace(SETTINGS, sgg=SggSettings(enabled=False), densify=DensifySettings(end=0.0))
+    held = replace(SETTINGS, sgg=SggSettings(enabled=False), densify=DensifySettings(refine_stop=0.0))
     views = TrainingViews(tiny_dive.rec, tiny_dive.frames, held, 1.0)
-    settling = replace(held, rates=replace(held.rates, settle=0.01))
-    start = uwbs.Uwbs(held, Site(tiny_dive.rec, 1.0, 1.0, views)).start()
+    settling = replace(held, rates=replace(held.rates, final_rate_factor=0.01))
+    start = uwbs.Uwbs(held, TrainingScene(tiny_dive.rec, 1.0, 1.0, views)).start()
     for step, share in ((20, 1.0), (30, 0.1), (40, 0.01)):
         moved = []
         for settings in (held, settling):
-            recipe = uwbs.Uwbs(settings, Site(tiny_dive.rec, 1.0, 1.0, views))
+            recipe = uwbs.Uwbs(settings, TrainingScene(tiny_dive.rec, 1.0, 1.0, views))
             after = recipe.step(copy.deepcopy(start), views[3], step)[0].primitives.opacity
             moved.append((after - start.primitives.opacity).abs().max())
         assert moved[0] > 0

@@ -12,7 +12,7 @@ from swimm3r.splat.training import losses
 from swimm3r.splat.views import TrainingViews
 
 
-def pictures(height: int = 40, width: int = 50) -> tuple[torch.Tensor, torch.Tensor]:
+def images(height: int = 40, width: int = 50) -> tuple[torch.Tensor, torch.Tensor]:
     rng = torch.Generator().manual_seed(0)
     a = torch.rand(3, height, width, generator=rng)
     return a, (a + 0.3 * torch.rand(3, height, width, generator=rng)).clamp(0, 1)
@@ -22,14 +22,14 @@ ALL = torch.ones(40, 50, dtype=torch.bool)
 
 
 def test_ssim_is_the_score_of_the_evaluation():
-    a, b = pictures()
+    a, b = images()
     expected = ssim(a.permute(1, 2, 0), b.permute(1, 2, 0))
     assert losses.photometric(a, b, ALL, 0.2).ssim == pytest.approx(expected, abs=1e-5)
     assert float(losses.mean_ssim(a, b)) == pytest.approx(expected, abs=1e-5)
 
 
 def test_the_photometric_gradient_is_that_of_the_plain_form():
-    a, b = pictures()
+    a, b = images()
     x = a.clone().requires_grad_()
     exact = a.double().requires_grad_()
     loss = losses.photometric(x, b, ALL, 0.2).loss
@@ -39,15 +39,15 @@ def test_the_photometric_gradient_is_that_of_the_plain_form():
     torch.testing.assert_close(found, expected.float(), rtol=1e-3, atol=1e-4 * float(expected.abs().max()))
 
 
-def test_equal_pictures_cost_nothing():
-    a, _ = pictures()
+def test_equal_images_cost_nothing():
+    a, _ = images()
     result = losses.photometric(a, a, ALL, 0.2)
     assert result.l1 == 0
     assert float(result.loss) == pytest.approx(0, abs=1e-6)
 
 
 def test_pixels_that_are_not_seen_have_no_gradient_and_no_say():
-    a, b = pictures()
+    a, b = images()
     seen = ALL.clone()
     seen[10:20, 10:30] = False
     x = a.clone().requires_grad_()
@@ -78,7 +78,7 @@ def test_the_depth_error_is_a_weighted_mean_over_known_and_covered_pixels():
     torch.testing.assert_close(losses.depth_error(depth_images(z, alpha), prior, weight, 0.5), expected)
 
 
-def test_a_picture_without_known_depth_has_no_depth_error():
+def test_a_image_without_known_depth_has_no_depth_error():
     z = torch.full((2, 2), 3.0)
     images = depth_images(z, torch.ones(2, 2))
     assert losses.depth_error(images, torch.zeros(2, 2), torch.ones(2, 2), 0.5) == 0
@@ -118,7 +118,7 @@ def test_what_looks_past_every_surface_is_to_show_nothing_but_water():
     assert losses.drawn_on_water(images, torch.zeros(2, 2, dtype=torch.bool)) == 0
 
 
-def test_colours_in_view_are_drawn_back_to_those_that_there_are(primitives):
+def test_colors_in_view_are_drawn_back_to_those_that_there_are(primitives):
     p = primitives(3)
     rgb = torch.tensor([[0.0, 0.5, 1.0], [1.5, -0.2, 0.3], [9.0, -9.0, 9.0]]).to(p.rgb).requires_grad_()
     outside = losses.outside_gamut(p._replace(rgb=rgb), torch.tensor([2.0, 7.0, 0.0]))
@@ -129,7 +129,7 @@ def test_colours_in_view_are_drawn_back_to_those_that_there_are(primitives):
     torch.testing.assert_close(slope, expected.to(slope), rtol=1e-5, atol=1e-8)
 
 
-def test_depth_may_step_where_colour_does():
+def test_depth_may_step_where_color_does():
     rgb = torch.zeros(3, 6, 8)
     rgb[:, :, 4:] = 0.2
     weight = losses.edge_weight(rgb, 10.0)
@@ -138,7 +138,7 @@ def test_depth_may_step_where_colour_does():
     assert (losses.edge_weight(rgb, 0.0) == 1).all()
 
 
-def test_the_weights_are_normalised_so_that_lambda_depth_is_what_it_says(tiny_dive):
+def test_the_weights_are_normalized_so_that_lambda_depth_is_what_it_says(tiny_dive):
     """1 / D is 0.1 too large everywhere; DN-Splatter's own two means, one per axis, would count that twice."""
     view = TrainingViews(tiny_dive.rec, tiny_dive.frames, UwbsSettings(), 1.0)[2]
     images = depth_images(view.z_depth, torch.ones_like(view.z_depth))
@@ -149,7 +149,7 @@ def test_the_weights_are_normalised_so_that_lambda_depth_is_what_it_says(tiny_di
 
 
 def test_an_edge_of_a_tenth_counts_half_or_less_by_default():
-    """On ruie_teal_rocks the depth maps step twice as far there as where the picture is flat (benchmarks/README.md)."""
+    """On ruie_teal_rocks the depth maps step twice as far there as where the image is flat (benchmarks/README.md)."""
     rgb = torch.zeros(3, 6, 8)
     rgb[:, :, 4:] += 0.1
     rgb[:, 3:] += 0.1
@@ -170,7 +170,7 @@ def test_only_oversize_primitives_are_held_back(primitives):
     assert losses.oversize(p, radius, 1000.0) == 0
 
 
-def test_the_scale_regulariser_sees_the_spatial_scales_of_all_or_with_ubs_slip_all_scales_of_three(primitives):
+def test_the_scale_regularizer_sees_the_spatial_scales_of_all_or_with_ubs_slip_all_scales_of_three(primitives):
     p = primitives(10)
     spread = torch.nn.functional.softplus(p.scale)
     torch.testing.assert_close(losses.mean_scale(p), spread[:, :3].mean())

@@ -10,14 +10,16 @@ from swimm3r.cameras import Cameras
 from swimm3r.raster import MediumMaps, Primitives2D, SggBuffers, rasterize
 from swimm3r.splat.medium.field import initial_field
 from swimm3r.splat.primitives.beta import BetaPrimitives
-from swimm3r.splat.projection import dispatch
+from swimm3r.splat.projection.dispatch import center_gradients, project
+from swimm3r.splat.projection.pinhole import pinhole
+from swimm3r.splat.projection.plain import project_plainly
 from swimm3r.splat.recipes import uwbs
 from swimm3r.splat.rendering import draw
 from swimm3r.splat.settings import InitialSettings, RenderSettings, SggSettings, UwbsSettings
 from swimm3r.splat.training import sgg as gradients
-from swimm3r.splat.training.scene import Site
+from swimm3r.splat.training.scene import TrainingScene
 from swimm3r.splat.training.sgg import Branches
-from swimm3r.splat.views import TrainingViews, View
+from swimm3r.splat.views import TrainingView, TrainingViews
 
 Make = Callable[..., BetaPrimitives]
 
@@ -62,19 +64,19 @@ def test_the_multiplier_is_bounded_and_protects_depth_that_is_right():
 
 
 @pytest.mark.parametrize("time", [None, torch.tensor(0.4)], ids=["static", "dynamic"])
-def test_centre_gradients_are_the_projections_own(time, primitives: Make, camera: Callable[..., Cameras]):
+def test_center_gradients_are_the_projections_own(time, primitives: Make, camera: Callable[..., Cameras]):
     """Fast against autograd of the plain form, several at once; both against the whole adjoint."""
-    p, view = primitives(500, 3 if time is None else 4), dispatch.pinhole(camera(), torch.float64)
+    p, view = primitives(500, 3 if time is None else 4), pinhole(camera(), torch.float64)
     rng = torch.Generator().manual_seed(1)
     pulls = torch.randn(500, 2, 3, generator=rng, dtype=torch.float64)
-    expected = dispatch.centre_gradients(p, view, RenderSettings(), pulls, time)
+    expected = center_gradients(p, view, RenderSettings(), pulls, time)
     single = BetaPrimitives(*(t.float() for t in p))
-    found = dispatch.centre_gradients(single, dispatch.pinhole(camera()), RenderSettings(), pulls.float(), time)
+    found = center_gradients(single, pinhole(camera()), RenderSettings(), pulls.float(), time)
     tame = (p.xyz @ view.R.mT + view.t)[:, 2] > 0.5
     torch.testing.assert_close(found[tame], expected[tame].float(), rtol=1e-3, atol=1e-3)
     xyz = single.xyz.clone().requires_grad_()
-    sight = dispatch.pinhole(camera())
-    seen = dispatch.project(single._replace(xyz=xyz), sight, RenderSettings(), time).primitives
+    seen_from = pinhole(camera())
+    seen = project(single._replace(xyz=xyz), seen_from, RenderSettings(), time).primitives
     (whole,) = torch.autograd.grad((seen.mean2d, seen.depth), xyz, (pulls[:, 0, :2].float(), pulls[:, 0, 2].float()))
     torch.testing.assert_close(found[:, 0], whole, rtol=1e-4, atol=1e-4)
 
@@ -89,22 +91,22 @@ def scene(dive):
     z_depth = dive.rec.depth["4.png"].z_depth
     rgb = dive.frames.image(4).permute(2, 0, 1)
     everywhere = torch.ones(48, 64, dtype=torch.bool)
-    view = View("4.png", camera, rgb, everywhere, z_depth, ~everywhere)
+    view = TrainingView("4.png", camera, rgb, everywhere, z_depth, ~everywhere)
     return p, view
 
 
 def differentiated(dive, settings: UwbsSettings):
     p, view = scene(dive)
-    sight = dispatch.pinhole(view.camera)
-    drawing = draw(p, dive.truth.field, sight, settings, sgg=True)
+    seen_from = pinhole(view.camera)
+    drawing = draw(p, dive.truth.field, seen_from, settings, sgg=True)
     loss = uwbs.objective(p, drawing, view, settings, None, True)
-    result = gradients.differentiate(loss.total, loss.depth, [*p], p, drawing, sight, settings)
+    result = gradients.differentiate(loss.total, loss.depth, [*p], p, drawing, seen_from, settings)
     return result, drawing, p, view
 
 
-def test_geometry_and_medium_add_up_to_the_exact_gradient_and_all_but_the_centres_keep_it(tiny_dive):
+def test_geometry_and_medium_add_up_to_the_exact_gradient_and_all_but_the_centers_keep_it(tiny_dive):
     result, drawing, p, view = differentiated(tiny_dive, UwbsSettings())
-    plain = draw(p, tiny_dive.truth.field, dispatch.pinhole(view.camera), UwbsSettings())
+    plain = draw(p, tiny_dive.truth.field, pinhole(view.camera), UwbsSettings())
     loss = uwbs.objective(p, plain, view, UwbsSettings(), None, True)
     exact = torch.autograd.grad(loss.total, [*p, plain.projection.primitives.mean2d], materialize_grads=True)
     for name, a, b in zip(p._fields, result.gradients, exact, strict=False):
@@ -120,10 +122,10 @@ def test_no_water_no_cancellation_no_change(tiny_dive):
         last = clear.network[-1]
         last.bias.copy_(torch.tensor([-30.0] * 9))  # black, and neither attenuating nor scattering
     p, view = scene(tiny_dive)
-    sight = dispatch.pinhole(view.camera)
-    drawing = draw(p, clear, sight, UwbsSettings(), sgg=True)
+    seen_from = pinhole(view.camera)
+    drawing = draw(p, clear, seen_from, UwbsSettings(), sgg=True)
     loss = uwbs.objective(p, drawing, view, UwbsSettings(), None, True)
-    result = gradients.differentiate(loss.total, loss.depth, [*p], p, drawing, sight, UwbsSettings())
+    result = gradients.differentiate(loss.total, loss.depth, [*p], p, drawing, seen_from, UwbsSettings())
     assert result.uncertainty.max() < 1e-4
     assert (result.multiplier - 1).max() < 1e-4
     b = Branches(drawing.sgg.geo, drawing.sgg.med, drawing.sgg.geo_abs)
@@ -138,8 +140,8 @@ def test_no_water_no_cancellation_no_change(tiny_dive):
     [SggSettings(), SggSettings(split="direct"), SggSettings(isolated="exact"), SggSettings(depth="apart")],
     ids=["default", "direct", "exact", "apart"],
 )
-def test_the_step_of_the_centres_is_that_of_the_float64_oracle(tiny_dive, sgg: SggSettings):
-    """Every reading of Alg. 1 against pictures drawn one branch at a time, in torch and float64."""
+def test_the_step_of_the_centers_is_that_of_the_float64_oracle(tiny_dive, sgg: SggSettings):
+    """Every reading of Alg. 1 against images drawn one branch at a time, in torch and float64."""
     settings = UwbsSettings(sgg=sgg)
     result, drawing, p, view = differentiated(tiny_dive, settings)
     expected = oracle(drawing, p, view, settings)
@@ -147,11 +149,11 @@ def test_the_step_of_the_centres_is_that_of_the_float64_oracle(tiny_dive, sgg: S
     assert (result.multiplier - expected["multiplier"]).norm() < 5e-3 * (expected["multiplier"] - 1).norm()
 
 
-def oracle(drawing, p: BetaPrimitives, view: View, settings: UwbsSettings) -> dict[str, torch.Tensor]:
+def oracle(drawing, p: BetaPrimitives, view: TrainingView, settings: UwbsSettings) -> dict[str, torch.Tensor]:
     """Corrections and multipliers of the plain form: black water shows the geometry's branch by itself."""
     exact = BetaPrimitives(*(t.detach().double().requires_grad_() for t in p))
-    sight = dispatch.pinhole(view.camera, torch.float64)
-    seen = dispatch.project_plainly(exact, sight, settings.render).primitives
+    seen_from = pinhole(view.camera, torch.float64)
+    seen = project_plainly(exact, seen_from, settings.render).primitives
     maps = MediumMaps(*(t.detach().double() for t in drawing.maps))
     images = [t.detach().requires_grad_() for t in drawing.images]
     again = replace(drawing, images=type(drawing.images)(*images))
@@ -202,7 +204,7 @@ def test_filter_and_multiplier_end_at_the_cut_off(tiny_dive):
     moved = {}
     for enabled in (True, False):
         sgg = replace(settings.sgg, enabled=enabled)
-        recipe = uwbs.Uwbs(replace(settings, sgg=sgg), Site(tiny_dive.rec, 1.0, 1.0, views))
+        recipe = uwbs.Uwbs(replace(settings, sgg=sgg), TrainingScene(tiny_dive.rec, 1.0, 1.0, views))
         for step in (10, 11):
             moved[enabled, step] = recipe.step(recipe.start(), views[3], step)[0].primitives
     assert not torch.equal(moved[True, 10].xyz, moved[False, 10].xyz)

@@ -1,4 +1,4 @@
-"""What scattering-aware gradients and the depth regulariser gain (the paper's Tab. ablation_compact), with its spread.
+"""What scattering-aware gradients and the depth regularizer gain (the paper's Tab. ablation_compact), with its spread.
 
 From one structure from motion each variant is trained under several seeds and scored on the held-out frames. Our own
 terms (the water's prior, coverage) stay as they are in every variant, and need the depth maps.
@@ -10,7 +10,7 @@ from dataclasses import dataclass, replace
 from functools import partial
 from pathlib import Path
 
-from swimm3r.bench.cells import Cell, Place, Scores, kept_cell, over_scenes
+from swimm3r.bench.cells import Result, ResultKey, Scores, kept_cell, over_scenes
 from swimm3r.bench.inputs import lpips_weights, reconstruction_of
 from swimm3r.bench.map_scores import map_scores, trained
 from swimm3r.bench.scores import columns
@@ -81,7 +81,7 @@ def ablate(
 
 def _cells_of_run(
     run: Path, /, *, out: Path, full: UwbsSettings, seeds: int, test: PoseRefinementSettings, progress: Progress
-) -> list[Cell]:
+) -> list[Result]:
     sfm = open_finished_sfm(run)
     poses: dict[str, held_out.FirstPose] = {}
 
@@ -95,7 +95,7 @@ def _cells_of_run(
             settings = variant.settings(full, seed)
             made_from = [reconstruction_of(run, sfm), settings]
             scored_by = [test, lpips_weights(), [c.score for c in COLUMNS]]
-            place = Place(run.resolve().name, variant.name, seed)
+            place = ResultKey(run.resolve().name, variant.name, seed)
             cells.append(kept_cell(out, place, made_from, partial(scores, settings), scored_by))
     return cells
 

@@ -1,8 +1,8 @@
 """Depth and poses on FLSea's test sequences (the paper's Tab. swimm3r_flsea), and of its ablated trainings.
 
 Every method sees the same raw frames, every `stride`-th of a sequence, all of them: the paper holds none back here.
-Depth is judged against the set's own. Reference poses are a COLMAP model beside the pictures where there is one; else
-structure from motion of the restored (seaErra) pictures of the same frames, made once into OUT/references. It holds the
+Depth is judged against the set's own. Reference poses are a COLMAP model beside the images where there is one; else
+structure from motion of the restored (seaErra) images of the same frames, made once into OUT/references. It holds the
 set's calibration where that has a distortion, and begins with its focal length where it has none.
 """
 
@@ -17,7 +17,7 @@ from pathlib import Path
 import torch
 
 from swimm3r.bench import reference
-from swimm3r.bench.cells import Cell, Place, Scores, check_choice, kept_cell, over_scenes, scene_folder
+from swimm3r.bench.cells import Result, ResultKey, Scores, check_choice, kept_cell, over_scenes, scene_folder
 from swimm3r.bench.inputs import files_of
 from swimm3r.bench.scores import columns
 from swimm3r.bench.settings import JobSettings, SfmMethods
@@ -99,7 +99,7 @@ def _cells_of_sequence(
     mast3r: Mast3rSettings,
     stride: int,
     progress: Progress,
-) -> list[Cell]:
+) -> list[Result]:
     sequence = next(s for s in read_tree(root).sequences if s.name == scene)
     shots = tuple(shot for shot in sequence.shots if shot.raw is not None)[::stride]
     frames = _frames({shot.name: shot.raw for shot in shots if shot.raw}, scene_folder(out / "frames", scene), progress)
@@ -108,12 +108,12 @@ def _cells_of_sequence(
     for method in given.methods:
         chosen = settings_for(method, scene.split("/")[-1], given, colmap, mast3r)
         if isinstance(chosen, NotComputed):
-            cells.append(Cell(scene, method, 0, not_run=chosen.reason))
+            cells.append(Result(scene, method, 0, not_run=chosen.reason))
             continue
         made_from = [_listing(frames), chosen, files_of(chosen)]
         scored_by = [reference.digest(truth), [c.score for c in COLUMNS]]
         make = partial(_scores, sequence=sequence, frames=frames, settings=chosen, truth=truth, progress=progress)
-        cells.append(kept_cell(out, Place(scene, method), made_from, make, scored_by))
+        cells.append(kept_cell(out, ResultKey(scene, method), made_from, make, scored_by))
     return cells
 
 
@@ -137,25 +137,25 @@ def reference_of(
         return GroundTruth(tuple(named[name] for name in posed), cameras, sequence.metric)
     clean = {shot.name: shot.clean for shot in shots if shot.clean is not None}
     if len(clean) < 2:
-        return NotComputed("no reference: the sequence has neither a COLMAP model nor restored pictures to make one of")
-    pictures = _frames(clean, scene_folder(out / "frames", sequence.name), progress)
+        return NotComputed("no reference: the sequence has neither a COLMAP model nor restored images to make one of")
+    images = _frames(clean, scene_folder(out / "frames", sequence.name), progress)
     if lens is not None and not lens.distortion.shape[-1]:
         colmap, lens = replace(colmap, focal=float(lens.K[0, 0, 0])), None
     folder = scene_folder(out / "references", sequence.name)
-    found = reference.whole_clip(pictures, lens, colmap, folder, progress)
+    found = reference.whole_clip(images, lens, colmap, folder, progress)
     if isinstance(found, NotComputed):
         return found
     return replace(found, names=tuple(named.get(Path(name).stem, name) for name in found.names))
 
 
-def _frames(pictures: dict[str, Path], folder: Path, progress: Progress) -> Frames:
-    """The pictures as frames, none of them held back; prepared once into a folder by what they are."""
-    listing = sorted(f"{name}|{path}|{path.stat().st_size}" for name, path in pictures.items())
+def _frames(images: dict[str, Path], folder: Path, progress: Progress) -> Frames:
+    """The images as frames, none of them held back; prepared once into a folder by what they are."""
+    listing = sorted(f"{name}|{path}|{path.stat().st_size}" for name, path in images.items())
     folder = folder / cache_key(listing)[:12]
     if not (folder / "prepare" / "frames.json").is_file():
-        together = folder / "pictures"
+        together = folder / "images"
         together.mkdir(parents=True, exist_ok=True)
-        for name, path in pictures.items():
+        for name, path in images.items():
             link = together / f"{name}{path.suffix}"
             link.unlink(missing_ok=True)
             try:

@@ -19,7 +19,7 @@ from torch import Tensor
 
 from swimm3r import devices
 from swimm3r.bench import reference
-from swimm3r.bench.cells import Cell, Place, Scores, kept_cell, over_scenes, scene_folder
+from swimm3r.bench.cells import Result, ResultKey, Scores, kept_cell, over_scenes, scene_folder
 from swimm3r.bench.inputs import reconstruction_of, weights_digest
 from swimm3r.bench.memory import in_own_process, with_peak_mb
 from swimm3r.bench.runs import POSES_REFINED, Clip, SfmRun, clips_of
@@ -32,7 +32,7 @@ from swimm3r.evaluate.poses import RelativePoseErrors, relative_pose_errors, rra
 from swimm3r.geometry import best_similarity, rotation_angle
 from swimm3r.io import images
 from swimm3r.io.files.cache_key import content_digest
-from swimm3r.localization.batch import Answer, Query, answer, match_picture
+from swimm3r.localization.batch import Answer, Query, answer, match_image
 from swimm3r.localization.localizer import STAGES, Localizer
 from swimm3r.localization.matchers import chosen_matcher
 from swimm3r.localization.settings import GS_CPR, LocalizationSettings, with_checkpoint_of
@@ -47,7 +47,7 @@ _PAIRS = [f"{score}_{pairs}" for pairs in ("map", "queries") for score in ("rra2
 _PAIRS += ["rra2_training", "rta5_training"]
 COLUMNS = columns(
     "located_pct", "inlier_5px_pct", "reprojection_px", *_PAIRS, "rotation_median_deg", "position_median_pct",
-    *(f"fps_{stage}" for stage in STAGES), "fps_localise", "peak_mb", "peak_vram_mb",
+    *(f"fps_{stage}" for stage in STAGES), "fps_localize", "peak_mb", "peak_vram_mb",
 )  # fmt: skip
 
 
@@ -60,7 +60,7 @@ class FoundMap:
     seed: int
 
 
-def localise(
+def localize(
     runs: Sequence[Path],
     out: Path,
     settings: LocalizationSettings | None = None,
@@ -81,7 +81,7 @@ def localise(
             maps_of(run, maps)
     work = partial(_cells_of_clip, out=out, settings=settings or GS_CPR, maps=maps, references=references)
     cells = over_scenes(clips, work, out, how or JobSettings(), progress)
-    return Table("localisation", "Test frames placed in maps", cells, COLUMNS)
+    return Table("localization", "Test frames placed in maps", cells, COLUMNS)
 
 
 def maps_of(run: SfmRun, maps: Path | None) -> list[FoundMap]:
@@ -116,7 +116,7 @@ def _cells_of_clip(
     maps: Path | None,
     references: Path | None,
     progress: Progress,
-) -> list[Cell]:
+) -> list[Result]:
     truth = reference.given(references, clip.name)
     if truth is None:
         own = scene_folder((maps or out) / "references", clip.name)
@@ -125,14 +125,14 @@ def _cells_of_clip(
     keys = {run.folder: reconstruction_of(run.folder, run.open()) for run in clip.runs}
     work = [(run, found) for run in clip.runs for found in maps_of(run, maps)]
     for done, (run, found) in enumerate(work):
-        progress("localising in maps", done, len(work))
+        progress("localizing in maps", done, len(work))
         chosen = with_checkpoint_of(settings, run.open().settings.sfm)
         made_from = [keys[run.folder], content_digest(found.path), chosen, _matcher(chosen)]
         scored_by = [reference.digest(truth), [c.score for c in COLUMNS]]
-        place = Place(clip.name, found.method, found.seed)
+        place = ResultKey(clip.name, found.method, found.seed)
         scores = partial(_scores, run=run, path=found.path, truth=truth, settings=chosen)
         cells.append(kept_cell(out, place, made_from, partial(in_own_process, scores), scored_by))
-    progress("localising in maps", len(work), len(work))
+    progress("localizing in maps", len(work), len(work))
     return cells
 
 
@@ -156,7 +156,7 @@ def _scores(
         return localizer, _answers(localizer, sfm, folder)
 
     (localizer, answers), peaks = with_peak_mb(work)
-    return {**localisation_scores(answers), **pose_scores(localizer.rec, answers, truth), **peaks}
+    return {**localization_scores(answers), **pose_scores(localizer.rec, answers, truth), **peaks}
 
 
 def _answers(localizer: Localizer, sfm: FinishedSfm, folder: Path) -> list[Answer]:
@@ -169,12 +169,12 @@ def _answers(localizer: Localizer, sfm: FinishedSfm, folder: Path) -> list[Answe
     found = [answer(localizer, query) for query in queries]
     for place in found:
         if place.found is not None and place.found.evidence is not None:
-            picture = match_picture(place.found.evidence)
-            images.write_rgb(folder / "matches" / f"{place.name}.png", picture)
+            image = match_image(place.found.evidence)
+            images.write_rgb(folder / "matches" / f"{place.name}.png", image)
     return found
 
 
-def localisation_scores(answers: Sequence[Answer]) -> dict[str, float | NotComputed]:
+def localization_scores(answers: Sequence[Answer]) -> dict[str, float | NotComputed]:
     """What needs no reference: how many were placed, on what evidence, how fast."""
     found = [a.found for a in answers if a.found is not None]
     nothing = NotComputed("no test frame was located")
@@ -188,7 +188,7 @@ def localisation_scores(answers: Sequence[Answer]) -> dict[str, float | NotCompu
         seconds = sum(f.seconds[stage] for f in found)
         scores[f"fps_{stage}"] = len(found) / seconds if seconds > 0 else nothing
     total = sum(sum(f.seconds.values()) for f in found)
-    scores["fps_localise"] = len(found) / total if total > 0 else nothing
+    scores["fps_localize"] = len(found) / total if total > 0 else nothing
     return scores
 
 
@@ -240,8 +240,8 @@ def _aligned_errors(
     true = to_ours.poses(theirs[:queries][found[:queries]])
     turned = torch.rad2deg(rotation_angle(true[:, :3, :3].mT @ placed[:, :3, :3]))
     moved = (true[:, :3, 3] - placed[:, :3, 3]).norm(dim=-1)
-    centres = ours[:, :3, 3]
-    spread = (centres - centres.mean(0)).norm(dim=-1).square().mean().sqrt()
+    centers = ours[:, :3, 3]
+    spread = (centers - centers.mean(0)).norm(dim=-1).square().mean().sqrt()
     return {names[0]: turned.quantile(0.5).item(), names[1]: 100 * (moved.quantile(0.5) / spread).item()}
 
 

@@ -12,10 +12,10 @@ from functools import partial
 from pathlib import Path
 
 from swimm3r.bench import reference
-from swimm3r.bench.cells import Cell, Place, Scores, check_choice, kept_cell, over_scenes, scene_folder
+from swimm3r.bench.cells import Result, ResultKey, Scores, check_choice, kept_cell, over_scenes, scene_folder
+from swimm3r.bench.images import Panel, stored, write_grid
 from swimm3r.bench.inputs import lpips_weights, reconstruction_of
 from swimm3r.bench.map_scores import map_scores, trained
-from swimm3r.bench.pictures import Panel, stored, write_grid
 from swimm3r.bench.runs import POSES_REFINED, Clip, clips_of
 from swimm3r.bench.scores import columns
 from swimm3r.bench.settings import JobSettings, Seeds
@@ -27,7 +27,7 @@ from swimm3r.pipeline.run import FinishedSfm
 from swimm3r.progress import Progress, silent
 from swimm3r.scene.ground_truth import GroundTruth
 from swimm3r.settings import accepted
-from swimm3r.splat.settings import PoseRefinementSettings, Recipe, SplatSettings, UwbsSettings, with_recipe
+from swimm3r.splat.settings import PoseRefinementSettings, RecipeName, SplatSettings, UwbsSettings, with_recipe
 
 COLUMNS = columns(
     "psnr", "ssim_3dgs", "lpips_vgg", "sharpness", "blur4_psnr", "clear_psnr", "T_D_abs", "B_abs",
@@ -39,7 +39,7 @@ _SEEDS_APART = 1_000
 def compare_renderers(
     runs: Sequence[Path],
     out: Path,
-    recipes: Sequence[Recipe],
+    recipes: Sequence[RecipeName],
     base: UwbsSettings,
     seeds: int = 1,
     poses: bool = False,
@@ -79,29 +79,29 @@ def _cells_of_clip(
     /,
     *,
     out: Path,
-    recipes: Sequence[Recipe],
+    recipes: Sequence[RecipeName],
     base: UwbsSettings,
     seeds: int,
     blocks: Sequence[bool],
     test: PoseRefinementSettings,
     references: Path | None,
     progress: Progress,
-) -> list[Cell]:
+) -> list[Result]:
     first = clip.runs[0].open()
     truth = reference.given(references, clip.name)
     if truth is None:
         truth = reference.of_clip(first, scene_folder(out / "references", clip.name), progress)
-    cells: list[Cell] = []
+    cells: list[Result] = []
     shown: dict[str, Path] = {}
     for run in clip.runs:
         sfm = run.open()
         start: dict[str, held_out.FirstPose] = {}
         for seed in range(seeds):
-            as_it_comes: dict[SplatSettings, tuple[Cell, Path]] = {}
+            as_it_comes: dict[SplatSettings, tuple[Result, Path]] = {}
             for refined in blocks:
                 for recipe in recipes:
                     settings = settings_for(base, recipe, refined, seed)
-                    place = Place(clip.name, f"{run.sfm}{POSES_REFINED if refined else ''} / {recipe}", seed)
+                    place = ResultKey(clip.name, f"{run.sfm}{POSES_REFINED if refined else ''} / {recipe}", seed)
                     if refined and settings in as_it_comes:  # it refines poses of its own accord
                         cell, folder = as_it_comes[settings]
                         cell = replace(cell, method=place.method)
@@ -116,11 +116,11 @@ def _cells_of_clip(
                     shown.setdefault(place.method, folder / "test")
     stems = view_stems(first.frames.names)
     for name in first.frames.test.names:
-        _side_by_side(out / "pictures" / clip.name, stems[name], shown)
+        _side_by_side(out / "images" / clip.name, stems[name], shown)
     return cells
 
 
-def settings_for(base: UwbsSettings, recipe: Recipe, refined: bool, seed: int) -> SplatSettings:
+def settings_for(base: UwbsSettings, recipe: RecipeName, refined: bool, seed: int) -> SplatSettings:
     """A recipe at the size and length of `base`, its training poses refined where asked."""
     settings = with_recipe(base, recipe)
     settings = replace(settings, seed=settings.seed + _SEEDS_APART * seed)
@@ -146,10 +146,10 @@ def _scores(
 
 
 def _side_by_side(out: Path, stem: str, shown: Mapping[str, Path]) -> None:
-    """OUT/STEM.png, a row per structure from motion: the frame, then colours and depth of each map."""
+    """OUT/STEM.png, a row per structure from motion: the frame, then colors and depth of each map."""
     rows: dict[str, list[Panel]] = {}
-    for method, pictures in shown.items():
+    for method, images in shown.items():
         sfm, recipe = method.split(" / ")
-        row = rows.setdefault(sfm, [stored(f"{sfm}: test frame", pictures / f"{stem}_target.png")])
-        row += [stored(recipe, pictures / f"{stem}_rgb.png"), stored("depth", pictures / f"{stem}_z_depth.png")]
+        row = rows.setdefault(sfm, [stored(f"{sfm}: test frame", images / f"{stem}_target.png")])
+        row += [stored(recipe, images / f"{stem}_rgb.png"), stored("depth", images / f"{stem}_z_depth.png")]
     write_grid(out / f"{stem}.png", list(rows.values()))

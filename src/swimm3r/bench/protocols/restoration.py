@@ -11,9 +11,9 @@ from pathlib import Path
 
 import torch
 
-from swimm3r.bench.cells import Cell, Place, Scores, kept_cell, over_scenes
+from swimm3r.bench.cells import Result, ResultKey, Scores, kept_cell, over_scenes
+from swimm3r.bench.images import Panel, stored, write_grid
 from swimm3r.bench.inputs import reconstruction_of
-from swimm3r.bench.pictures import Panel, stored, write_grid
 from swimm3r.bench.runs import Clip, clips_of
 from swimm3r.bench.scores import columns
 from swimm3r.bench.settings import JobSettings
@@ -34,17 +34,17 @@ def score_restoration(
 ) -> Table:
     """Every run's restored frames. Raises InputError where a folder holds no finished structure from motion."""
     cells = over_scenes(clips_of(runs), partial(_cells_of_clip, out=out), out, how or JobSettings(), progress)
-    return Table("restoration", "Pictures without the water", cells, COLUMNS)
+    return Table("restoration", "Images without the water", cells, COLUMNS)
 
 
-def _cells_of_clip(clip: Clip, /, *, out: Path, progress: Progress) -> list[Cell]:
+def _cells_of_clip(clip: Clip, /, *, out: Path, progress: Progress) -> list[Result]:
     first = clip.runs[0].open()
     scored = [c.score for c in COLUMNS]
     frames = first.frames.train
     cells = [
         kept_cell(
             out,
-            Place(clip.name, _FILMED),
+            ResultKey(clip.name, _FILMED),
             [clip.runs[0].frames, [content_digest(frame.path) for frame in frames]],
             partial(_of_paths, paths=[frame.path for frame in frames], progress=progress),
             scored,
@@ -53,14 +53,14 @@ def _cells_of_clip(clip: Clip, /, *, out: Path, progress: Progress) -> list[Cell
     for run in clip.runs:
         sfm = run.open()
         if sfm.rec.medium is None:
-            cells.append(Cell(clip.name, run.sfm, 0, not_run="its water was not estimated"))
+            cells.append(Result(clip.name, run.sfm, 0, not_run="its water was not estimated"))
             continue
         restored = f"{run.sfm} + {sfm.rec.medium.estimator}"
         for method, kind in ((restored, "restored_physical"), (_SHOWN_AS.format(restored), "restored")):
             paths = [run.folder / "sfm" / kind / f"{name}.png" for name in sfm.rec.names]
             make = partial(_of_paths, paths=paths, progress=progress)
             made_from = [reconstruction_of(run.folder, sfm), [content_digest(path) for path in paths]]
-            cells.append(kept_cell(out, Place(clip.name, method), made_from, make, scored))
+            cells.append(kept_cell(out, ResultKey(clip.name, method), made_from, make, scored))
     for i in range(0, len(frames), max(1, len(frames) // _SHOWN)):
         _side_by_side(out, clip, frames, i)
     return cells
@@ -76,4 +76,4 @@ def _side_by_side(out: Path, clip: Clip, frames: Frames, i: int) -> None:
     filmed = (frames.image(i) * 255).round().to(torch.uint8).numpy()
     panels = [Panel(_FILMED, filmed)]
     panels += [stored(run.sfm, run.folder / "sfm" / "restored" / f"{name}.png") for run in clip.runs]
-    write_grid(out / "pictures" / clip.name / f"{Path(name).stem}.png", [panels])
+    write_grid(out / "images" / clip.name / f"{Path(name).stem}.png", [panels])

@@ -1,6 +1,6 @@
 """Structure from motion by every method on the same frames (the paper's Tab. sfm_metrics), and the clouds side by side.
 
-A method that succeeds leaves a run folder OUT/SCENE/METHOD/0/run for `bench render`, `localisation` and `restoration`.
+A method that succeeds leaves a run folder OUT/SCENE/METHOD/0/run for `bench render`, `localization` and `restoration`.
 """
 
 import shutil
@@ -10,9 +10,9 @@ from functools import partial
 from pathlib import Path
 
 from swimm3r.bench import reference
-from swimm3r.bench.cells import Cell, Place, Scores, check_choice, kept_cell, over_scenes
+from swimm3r.bench.cells import Result, ResultKey, Scores, check_choice, kept_cell, over_scenes
+from swimm3r.bench.images import Panel, write_grid
 from swimm3r.bench.inputs import files_of
-from swimm3r.bench.pictures import Panel, write_grid
 from swimm3r.bench.runs import original_pixels
 from swimm3r.bench.scores import columns
 from swimm3r.bench.settings import JobSettings, SfmMethods
@@ -21,9 +21,10 @@ from swimm3r.bench.tables import Table
 from swimm3r.errors import InputError, RegistrationError
 from swimm3r.evaluate import NotComputed
 from swimm3r.geometry import Similarity, best_similarity
+from swimm3r.io.files.cache_key import stat_digest
 from swimm3r.pipeline.inputs import truth_of
 from swimm3r.pipeline.presets import RunSettings
-from swimm3r.pipeline.run import fingerprint_of, run_pipeline
+from swimm3r.pipeline.run import run_pipeline
 from swimm3r.prepare import check_source, load_frames
 from swimm3r.progress import Progress, silent
 from swimm3r.report.charts import plan_view
@@ -80,7 +81,7 @@ def _cells_of_clip(
     mast3r: Mast3rSettings,
     references: Path | None,
     progress: Progress,
-) -> list[Cell]:
+) -> list[Result]:
     scene = clip.stem
     truth = reference.given(references, scene) or truth_of(clip, None)
     assert isinstance(settings.sfm, ColmapSettings)
@@ -88,12 +89,12 @@ def _cells_of_clip(
     for method in given.methods:
         chosen = settings_for(method, scene, given, settings.sfm, mast3r)
         if isinstance(chosen, NotComputed):
-            cells.append(Cell(scene, method, 0, not_run=chosen.reason))
+            cells.append(Result(scene, method, 0, not_run=chosen.reason))
             continue
-        made_from = [fingerprint_of(clip, out), settings.frames, chosen, files_of(chosen)]
+        made_from = [stat_digest(clip, leave_out=out), settings.frames, chosen, files_of(chosen)]
         scored_by = [None if truth is None else reference.digest(truth), [c.score for c in COLUMNS]]
         make = partial(_scores, clip=clip, settings=replace(settings, sfm=chosen), truth=truth, progress=progress)
-        cells.append(kept_cell(out, Place(scene, method), made_from, make, scored_by))
+        cells.append(kept_cell(out, ResultKey(scene, method), made_from, make, scored_by))
     _cloud_grid(out, scene, [cell.method for cell in cells if not cell.not_run])
     return cells
 
@@ -121,10 +122,10 @@ def _scores(
 
 
 def _cloud_grid(out: Path, scene: str, methods: Sequence[str]) -> None:
-    """OUT/pictures/SCENE.png: each method's cloud from above, as filmed and without the water, in one method's axes."""
+    """OUT/images/SCENE.png: each method's cloud from above, as filmed and without the water, in one method's axes."""
     filmed, restored, first = [], [], None
     for method in methods:
-        folder = Place(scene, method).folder(out) / "run" / "sfm"
+        folder = ResultKey(scene, method).folder(out) / "run" / "sfm"
         if not (folder / "reconstruction.json").is_file():
             filmed.append(Panel(method, None))
             restored.append(Panel("without the water", None))
@@ -135,7 +136,7 @@ def _cloud_grid(out: Path, scene: str, methods: Sequence[str]) -> None:
         filmed.append(Panel(method, raw))
         restored.append(Panel("without the water", clear))
     if first is not None:
-        write_grid(out / "pictures" / f"{scene}.png", [filmed, restored])
+        write_grid(out / "images" / f"{scene}.png", [filmed, restored])
 
 
 def _from_above(rec: Reconstruction, first: Reconstruction) -> tuple:

@@ -178,8 +178,8 @@ def print_summary(summary: dict, folder: Path) -> None:
     for name, other in summary.get("other_protocols", {}).items():
         scores = other["test"]
         console.print(f"By the protocol {name}: PSNR {_shown(scores['psnr'], 1)} dB, SSIM {scores['ssim']:.3f}")
-    for caution in summary.get("cautions", []):
-        console.print("!", f"{caution['what']} {caution['advice']}".strip(), style="yellow")
+    for warning in summary.get("warnings", []):
+        console.print("!", f"{warning['what']} {warning['advice']}".strip(), style="yellow")
     if (folder / "report.html").is_file():
         console.print(f"Report: {folder / 'report.html'}")
 

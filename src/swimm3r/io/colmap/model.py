@@ -1,6 +1,6 @@
-"""COLMAP models on disk <-> arrays: cameras, poses, points and tracks of registered pictures.
+"""COLMAP models on disk <-> arrays: cameras, poses, points and tracks of registered images.
 
-COLMAP's pixel grid is ours: the centre of the first pixel is (0.5, 0.5). It stores world-to-camera; here poses are
+COLMAP's pixel grid is ours: the center of the first pixel is (0.5, 0.5). It stores world-to-camera; here poses are
 cam2world. A pinhole or radial lens that `cameras` does not name is the same lens written as OPENCV with zeros:
 
     SIMPLE_PINHOLE f cx cy -> PINHOLE        RADIAL k1 k2 -> OPENCV k1 k2 0 0
@@ -45,7 +45,7 @@ def silence_log() -> None:
 
 @dataclass(frozen=True)
 class ColmapModel:
-    """Registered pictures of one size under one camera model, in the order of their COLMAP image ids.
+    """Registered images of one size under one camera model, in the order of their COLMAP image ids.
 
     Raises ValueError where an index points nowhere or a number is none.
     """
@@ -67,13 +67,13 @@ class ColmapModel:
     def __post_init__(self) -> None:
         check_names(self.names)
         if not len(self.names) == len(self.K) == len(self.distortion) == len(self.cam2world):
-            raise ValueError("each picture has one name, one lens and one pose")
+            raise ValueError("each image has one name, one lens and one pose")
         check_cameras(cameras_of(self))
         if not (np.isfinite(self.xyz).all() and np.isfinite(self.track_xy).all()) or np.isnan(self.error).any():
-            raise ValueError("positions of points and of their sightings are finite numbers")
+            raise ValueError("positions of points and of their observations are finite numbers")
         for index, length, what in (
             (self.track_point, len(self.xyz), "points"),
-            (self.track_frame, len(self.names), "pictures"),
+            (self.track_frame, len(self.names), "images"),
         ):
             if len(index) and not 0 <= int(index.min()) <= int(index.max()) < length:
                 raise ValueError(f"its tracks point beyond its {length} {what}")
@@ -82,7 +82,7 @@ class ColmapModel:
 def read_model(folder: Path, remedy: Remedy | None = None) -> ColmapModel:
     """Read the binary or text model in `folder`, `folder/0`, `folder/sparse` or `folder/sparse/0`, the first found.
 
-    Raises InputError where there is none, or one that mixes picture sizes or has a lens `cameras` cannot express.
+    Raises InputError where there is none, or one that mixes image sizes or has a lens `cameras` cannot express.
     """
     import pycolmap
 
@@ -118,7 +118,7 @@ def from_pycolmap(model: "pycolmap.Reconstruction") -> ColmapModel:
     images = [model.image(i) for i in sorted(model.reg_image_ids())]
     if not images:
         raise InputError(
-            "the COLMAP model has no registered pictures",
+            "the COLMAP model has no registered images",
             cause="its reconstruction did not start, or its images file is empty",
             hint="use another sub-model (sparse/0, sparse/1, ...)",
         )
@@ -127,9 +127,9 @@ def from_pycolmap(model: "pycolmap.Reconstruction") -> ColmapModel:
     sizes = sorted({(camera.width, camera.height) for camera in cameras})
     if len(sizes) > 1:
         raise InputError(
-            f"the COLMAP model mixes picture sizes: {', '.join(f'{w}x{h}' for w, h in sizes)}",
-            cause="pictures of several cameras or crops were reconstructed together",
-            hint="reconstruct the pictures of one size, or resize them first",
+            f"the COLMAP model mixes image sizes: {', '.join(f'{w}x{h}' for w, h in sizes)}",
+            cause="images of several cameras or crops were reconstructed together",
+            hint="reconstruct the images of one size, or resize them first",
         )
     lens = _common_lens({camera.model.name for camera in cameras})
     intrinsics = [_intrinsics(camera, lens) for camera in cameras]
@@ -206,7 +206,7 @@ def _common_lens(models: set[str]) -> str:
         raise InputError(
             f"the COLMAP model has lenses that cannot be read together: {', '.join(sorted(models))}",
             cause=f"readable are {', '.join(sorted(_FOCALS))}, fisheye not mixed with others",
-            hint="undistort the pictures first (colmap image_undistorter), which leaves PINHOLE cameras",
+            hint="undistort the images first (colmap image_undistorter), which leaves PINHOLE cameras",
         )
     if models <= {"SIMPLE_PINHOLE", "PINHOLE"}:
         return "PINHOLE"

@@ -7,12 +7,16 @@ only show results leave a key as it is, so that kept results survive an edit tha
 
 import ast
 import json
+import os
+from contextlib import suppress
 from dataclasses import asdict, is_dataclass
 from functools import cache, lru_cache
 from hashlib import file_digest, sha256
 from importlib.metadata import version
 from pathlib import Path
 from typing import Any
+
+import swimm3r
 
 _ONLY_SHOWS = ("cli", "report", "export")
 _LENGTH = 32  # hexadecimal digits
@@ -31,14 +35,38 @@ def content_digest(path: Path | None) -> str | None:
     if path.is_file():
         stat = path.stat()
         return _file_digest(path.resolve(), stat.st_size, stat.st_mtime_ns)
-    files = sorted(p for p in path.rglob("*") if p.is_file())
-    return cache_key(*([file.relative_to(path).as_posix(), content_digest(file)] for file in files))
+    return cache_key(*([file.relative_to(path).as_posix(), content_digest(file)] for file in files_below(path)))
+
+
+def stat_digest(path: Path, leave_out: Path | None = None) -> str:
+    """Of the names, sizes and times of a file, or of all files below a folder; its own place does not matter.
+
+    Files below `leave_out` are no part of it.
+    """
+    lines = []
+    for file in files_below(path, leave_out):
+        with suppress(FileNotFoundError):  # removed meanwhile
+            stat = file.stat()
+            lines.append(f"{file.relative_to(path.parent)}|{stat.st_size}|{stat.st_mtime_ns}\n")
+    return sha256("".join(lines).encode(errors="surrogateescape")).hexdigest()[:_LENGTH]
+
+
+def files_below(path: Path, leave_out: Path | None = None) -> list[Path]:
+    """The file itself, or all files below a folder, sorted; folders that may not be searched count as empty."""
+    if not path.is_dir():
+        return [path]
+    closed = None if leave_out is None else os.path.realpath(leave_out)
+    found: list[Path] = []
+    for where, folders, names in os.walk(path):
+        folders[:] = [name for name in folders if os.path.realpath(Path(where, name)) != closed]
+        found += [Path(where, name) for name in names]
+    return sorted(file for file in found if os.path.isfile(file))
 
 
 @cache
 def code_version() -> str:
     """Of the statements of this package, as they lie on disk."""
-    package = Path(__file__).parents[1]
+    package = Path(swimm3r.__file__).parent
     digest = sha256(version("swimm3r").encode())
     for path in sorted(package.rglob("*.py")):
         if path.relative_to(package).parts[0] not in _ONLY_SHOWS:

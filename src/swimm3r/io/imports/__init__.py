@@ -1,1 +1,1 @@
-"""Reconstructions made by other programs, read from their own files: poses, lens, points, sightings, depth, scale."""
+"""Reconstructions made by other programs, read from their own files."""

@@ -1,6 +1,6 @@
 """Agisoft Metashape's cameras.xml (File > Export > Export Cameras).
 
-Camera axes and pixel centres are ours; cx and cy count from the picture's centre; p1 and p2 are OpenCV's p2 and p1:
+Camera axes and pixel centers are ours; cx and cy count from the image's center; p1 and p2 are OpenCV's p2 and p1:
 
     x' = x (1 + k1 r^2 + ... + k4 r^8) + p1 (r^2 + 2 x^2) + 2 p2 x y,    u = w/2 + cx + x' (f + b1) + y' b2
     y' = y (...)                       + p2 (r^2 + 2 y^2) + 2 p1 x y,    v = h/2 + cy + y' f

@@ -2,7 +2,7 @@
 
 Poses are camera to world with OpenGL's camera axes (x right, y up, z backwards). `applied_transform` and
 `applied_scale` tell what was done to the world on the way; they are undone, so that the original frame and scale come
-back. The cloud of `ply_file_path` is in the file's world; it has no sightings.
+back. The cloud of `ply_file_path` is in the file's world; it has no observations.
 """
 
 import math
@@ -12,6 +12,7 @@ from typing import Any
 
 import numpy as np
 
+from swimm3r.errors import InputError
 from swimm3r.io.files.json_file import read_json, structure
 from swimm3r.io.files.safe_names import check_name
 from swimm3r.io.imports.record import REMEDY, ForeignModel, one_size, without_points
@@ -99,13 +100,20 @@ def read(path: Path, document: dict[str, Any]) -> ForeignModel:
     return ForeignModel("nerfstudio", model)
 
 
-def pictures_folder(path: Path) -> Path:
-    """Where the pictures of a transforms.json lie. Raises InputError for a file that is not one."""
+def images_folder(path: Path) -> Path:
+    """Where the images of a transforms.json lie. Raises InputError for a file that is not one."""
     file = path / "transforms.json" if path.is_dir() else path
     document = read_json(file, _Document, REMEDY)
     names, first = _names(document), _relative(document.frames[0])
     # names with folders of their own are relative to the file, others to the one folder that all lie in
-    return file.parent if any("/" in name for name in names) else file.parent / first.parent
+    folder = file.parent if any("/" in name for name in names) else file.parent / first.parent
+    if not (file.parent / first).is_file():
+        raise InputError(
+            f"{file} names the image {first}, which is not there",
+            cause="the images lie elsewhere, or were renamed",
+            hint="put the images back beside the file, or name their folder with --images",
+        )
+    return folder
 
 
 def _relative(frame: _Frame) -> PurePosixPath:

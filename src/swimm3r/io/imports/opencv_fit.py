@@ -1,6 +1,6 @@
 """Other programs' distortion polynomials as the nearest OPENCV lens, with what that costs in pixels.
 
-A lens of k1, k2, p1, p2 is linear in them, so the nearest one over the picture is a linear least-squares problem.
+A lens of k1, k2, p1, p2 is linear in them, so the nearest one over the image is a linear least-squares problem.
 """
 
 from collections.abc import Callable
@@ -21,7 +21,7 @@ def nearest_opencv(
     Raises ValueError where K is no camera's, InputError where the nearest lens is more than half a pixel away.
     """
     if not (np.isfinite(K).all() and min(K[0, 0], K[1, 1], width, height) > 0):
-        raise ValueError(f"its lens has focal lengths of {K[0, 0]:g} and {K[1, 1]:g} in pictures of {width}x{height}")
+        raise ValueError(f"its lens has focal lengths of {K[0, 0]:g} and {K[1, 1]:g} in images of {width}x{height}")
     u, v = np.meshgrid(np.linspace(0, width, _SAMPLES), np.linspace(0, height, _SAMPLES))
     x, y = ((u - K[0, 2]) / K[0, 0]).ravel(), ((v - K[1, 2]) / K[1, 1]).ravel()
     r2 = x * x + y * y
@@ -35,7 +35,7 @@ def nearest_opencv(
         raise InputError(
             f"the lens is {worst:.1f} pixels away from any that is supported",
             cause="its distortion has strong higher terms (k3, k4, skew)",
-            hint="undistort the pictures in the program that calibrated them and export again",
+            hint="undistort the images in the program that calibrated them and export again",
         )
     return found
 

@@ -97,7 +97,7 @@ class _Pixel:
 
 
 @dataclass(frozen=True)
-class _Sighting:
+class _Observation:
     key: int
     value: _Pixel
 
@@ -105,7 +105,7 @@ class _Sighting:
 @dataclass(frozen=True)
 class _Point:
     X: _Triple
-    observations: tuple[_Sighting, ...]
+    observations: tuple[_Observation, ...]
 
 
 @dataclass(frozen=True)
@@ -122,7 +122,7 @@ class _Document:
 
 
 def read(document: dict[str, Any]) -> ForeignModel:
-    """Poses, lenses, points and sightings of the placed views. Raises ValueError for a damaged file."""
+    """Poses, lenses, points and observations of the placed views. Raises ValueError for a damaged file."""
     file = structure(document, _Document)
     poses = {entry.key: entry.value for entry in file.extrinsics}
     lenses = _lenses(file.intrinsics)
@@ -149,7 +149,7 @@ def read(document: dict[str, Any]) -> ForeignModel:
     )
     row = {view.id_view: i for i, view in enumerate(placed)}
     points = [entry.value for entry in file.structure]
-    sightings = [
+    observations = [
         (p, row[seen.key], seen.value.x)
         for p, point in enumerate(points)
         for seen in point.observations
@@ -160,11 +160,11 @@ def read(document: dict[str, Any]) -> ForeignModel:
         xyz=np.array([point.X for point in points], np.float64).reshape(-1, 3),
         rgb=np.zeros((len(points), 3), np.uint8),
         error=np.zeros(len(points)),
-        track_point=np.array([p for p, _, _ in sightings], np.int64),
-        track_frame=np.array([frame for _, frame, _ in sightings], np.int64),
-        track_xy=np.array([xy for _, _, xy in sightings], np.float64).reshape(-1, 2),
+        track_point=np.array([p for p, _, _ in observations], np.int64),
+        track_frame=np.array([frame for _, frame, _ in observations], np.int64),
+        track_xy=np.array([xy for _, _, xy in observations], np.float64).reshape(-1, 2),
     )
-    return ForeignModel("OpenMVG", model, coloured=False)
+    return ForeignModel("OpenMVG", model, colored=False)
 
 
 def _lenses(entries: tuple[_LensEntry, ...]) -> dict[int, tuple[str, tuple[int, int], np.ndarray, np.ndarray]]:

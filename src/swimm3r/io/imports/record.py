@@ -17,12 +17,12 @@ REMEDY = Remedy(
 
 @dataclass(frozen=True)
 class ForeignDepth:
-    """Dense depth of the pictures in the order of the model's names, on a grid of their own."""
+    """Dense depth of the images in the order of the model's names, on a grid of their own."""
 
     K: np.ndarray  # [c, 3, 3] of the grid
     z_depth: np.ndarray  # [c, h, w], 0 = unknown
     confidence: np.ndarray  # [c, h, w], 0..1
-    grey: np.ndarray  # [c, h, w] the pictures on the grid, 0..1
+    gray: np.ndarray  # [c, h, w] the images on the grid, 0..1
 
 
 @dataclass(frozen=True)
@@ -32,7 +32,7 @@ class ForeignModel:
     program: str
     model: ColmapModel
     metric: bool = False
-    coloured: bool = True  # whether the points' colours are known
+    colored: bool = True  # whether the points' colors are known
     depth: ForeignDepth | None = None
 
 
@@ -64,11 +64,11 @@ def without_points(
 
 
 def one_size(sizes: set[tuple[int, int]]) -> tuple[int, int]:
-    """The common picture size. Raises InputError where there are several."""
+    """The common image size. Raises InputError where there are several."""
     if len(sizes) != 1:
         raise InputError(
-            f"the reconstruction mixes picture sizes: {', '.join(f'{w}x{h}' for w, h in sorted(sizes))}",
-            cause="pictures of several cameras or crops were reconstructed together",
-            hint="reconstruct the pictures of one size, or resize them first",
+            f"the reconstruction mixes image sizes: {', '.join(f'{w}x{h}' for w, h in sorted(sizes))}",
+            cause="images of several cameras or crops were reconstructed together",
+            hint="reconstruct the images of one size, or resize them first",
         )
     return next(iter(sizes))

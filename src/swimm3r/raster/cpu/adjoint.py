@@ -1,4 +1,4 @@
-"""The adjoint of the pictures: the pairs once more, front to back, then sums over the tiles of each primitive."""
+"""The adjoint of the images: the pairs once more, front to back, then sums over the tiles of each primitive."""
 
 from typing import no_type_check
 
@@ -37,7 +37,7 @@ from swimm3r.raster.cpu.tiles import (
     advance,
     begin_tile,
     channels,
-    colour_slope,
+    color_slope,
     coverage,
     depth_slope,
     falloff,
@@ -62,8 +62,8 @@ from swimm3r.raster.records import TILE
 G0, G1, G2, C0, C1, C2, GZ, GA, RF, RG, RD = (np.uintp(STRIDE * k) for k in range(OWN_ROWS, 23))
 # sums of w E_B, w z E_B, w z c E_D
 VB0, VB1, VB2, ZB0, ZB1, ZB2, ZD0, ZD1, ZD2 = (np.uintp(STRIDE * k) for k in range(23, 32))
-# Rows of one primitive's pairs, its blocks one after the other: distance from its centre, u and l, weight, the two
-# shape slopes, dL/dr2 of each payload, and w times the slopes of colour, of z through the water, of z itself
+# Rows of one primitive's pairs, its blocks one after the other: distance from its center, u and l, weight, the two
+# shape slopes, dL/dr2 of each payload, and w times the slopes of color, of z through the water, of z itself
 DX, DY, U, LOG_F, PW, P, Q, TF, TG, TD, S0, S1, S2, SW, SZ = (np.uintp(STRIDE * k) for k in range(15))
 ROWS, PAIR_ROWS = 32, 15
 
@@ -140,7 +140,7 @@ def take_light(ws, pairs, blocks, n, color, z, middle, at_middle, with_sgg, d_bi
                 E_B = through_water(d_b, z, middle[0], at_middle[0], far)
                 E_D = through_water(d_d, z, middle[1], at_middle[1], far)
                 k_b, k_d = plus(middle[0], d_b), plus(middle[1], d_d)
-            slope = colour_slope(g, g_clear, E_D)
+            slope = color_slope(g, g_clear, E_D)
             full, geo, depth = payloads(color, z, E_B, slope, g, g_veil, g_clear, ws[GZ + q], ws[GA + q])
             pairs[S0 + c] = w * slope[0]
             pairs[S1 + c] = w * slope[1]
@@ -171,7 +171,7 @@ def take_light(ws, pairs, blocks, n, color, z, middle, at_middle, with_sgg, d_bi
 @no_type_check
 @math.inlined
 def put_sums(slots, own, column, sums):
-    """Write neighbours in a row."""
+    """Write neighbors in a row."""
     for k in range(len(sums)):
         slots[own, np.uintp(column + k)] = sums[k]
 

@@ -5,8 +5,8 @@ Primitives are ordered by depth once (radix sort of the float bits) and scattere
 Culling never changes the image: alpha >= alpha_min means r2 < 1 - (alpha_min / o)^(1/b) under the Beta kernel, and
 r2 < ln(o / alpha_min) / b under the Gaussian.
 
-A packed primitive is one cache line: mean (2), conic (3), log2 opacity, exponent, r2_max, depth, colour (3), and what
-`span` needs: half width, half height, y of the rightmost point from the centre, determinant of the conic.
+A packed primitive is one cache line: mean (2), conic (3), log2 opacity, exponent, r2_max, depth, color (3), and what
+`span` needs: half width, half height, y of the rightmost point from the center, determinant of the conic.
 """
 
 import math
@@ -30,7 +30,7 @@ ZERO, HALF, ONE = np.float32(0.0), np.float32(0.5), np.float32(1.0)
 @no_type_check
 @inlined
 def span(p, inverse_a, y0, y1):
-    """Interval of x, from the centre, that a packed primitive covers where y0 <= y - centre <= y1.
+    """Interval of x, from the center, that a packed primitive covers where y0 <= y - center <= y1.
 
     The right end of a row is a concave function of y, so the strip's rightmost point lies where the whole ellipse's
     does, moved into the strip; the left end is the same mirrored.
@@ -47,14 +47,14 @@ def span(p, inverse_a, y0, y1):
 @no_type_check
 @inlined
 def first_pixel(x, size):
-    """Index of the first pixel whose centre is at or right of x, within the image."""
+    """Index of the first pixel whose center is at or right of x, within the image."""
     return math.ceil(min(max(x - HALF, ZERO), np.float32(size)))
 
 
 @no_type_check
 @inlined
 def last_pixel(x, size):
-    """Index of the last pixel whose centre is at or left of x; -1 if there is none."""
+    """Index of the last pixel whose center is at or left of x; -1 if there is none."""
     return math.floor(min(max(x - HALF, -ONE), np.float32(size - 1)))
 
 

@@ -1,4 +1,4 @@
-"""The pictures, a tile at a time: pairs front to back, each over the blocks it may touch."""
+"""The images, a tile at a time: pairs front to back, each over the blocks it may touch."""
 
 from typing import no_type_check
 
@@ -41,7 +41,7 @@ from swimm3r.raster.cpu.tiles import (
     live_blocks,
     middle_of,
     put_back,
-    seen_colour,
+    seen_color,
     squared_distance,
     through_water,
     transmittance,
@@ -49,7 +49,7 @@ from swimm3r.raster.cpu.tiles import (
 )
 from swimm3r.raster.records import TILE
 
-# Rows beyond those of every tile: sums of the underwater colour, the clear colour, z; the pair's weight
+# Rows beyond those of every tile: sums of the underwater color, the clear color, z; the pair's weight
 I0, I1, I2, J0, J1, J2, Z, W = (np.uintp(STRIDE * k) for k in range(OWN_ROWS, 20))
 ROWS = 20
 
@@ -57,7 +57,7 @@ ROWS = 20
 @no_type_check
 @math.inlined
 def add_light(ws, blocks, n, color, z, middle, at_middle, far):
-    """Add the pairs of n blocks, whose weights are known, to the pictures; no `middle`, no water."""
+    """Add the pairs of n blocks, whose weights are known, to the images; no `middle`, no water."""
     full_width_vectors()
     for j in range(n):
         first = blocks[j]
@@ -66,7 +66,7 @@ def add_light(ws, blocks, n, color, z, middle, at_middle, far):
             if middle is not None:
                 E_B = through_water((ws[KB0 + q], ws[KB1 + q], ws[KB2 + q]), z, middle[0], at_middle[0], far)
                 E_D = through_water((ws[KD0 + q], ws[KD1 + q], ws[KD2 + q]), z, middle[1], at_middle[1], far)
-                F = seen_colour(color, (ws[B0 + q], ws[B1 + q], ws[B2 + q]), E_B, E_D)
+                F = seen_color(color, (ws[B0 + q], ws[B1 + q], ws[B2 + q]), E_B, E_D)
                 ws[I0 + q] += w * F[0]
                 ws[I1 + q] += w * F[1]
                 ws[I2 + q] += w * F[2]

@@ -1,6 +1,6 @@
-"""Scalar functions that LLVM can vectorise across pixels, and the flags the kernels need for that.
+"""Scalar functions that LLVM can vectorize across pixels, and the flags the kernels need for that.
 
-libm's exp2 and log2 are calls and stop the vectoriser, so both are polynomials here (raster.md 6), good to 3e-7 with
+libm's exp2 and log2 are calls and stop the vectorizer, so both are polynomials here (raster.md 6), good to 3e-7 with
 float32's rounding. `contract` and the no-NaN flags are on everywhere, but `reassoc` only for the sums of the adjoint:
 both passes must round alike to take the same decisions.
 """
@@ -19,7 +19,7 @@ inlined = njit(fastmath=FLAGS, error_model="numpy")
 MAGIC = np.float32(12582912.0)  # 1.5 * 2^23: adding it leaves the rounded integer in the low bits
 LOWEST_EXPONENT = np.float32(-80.0)  # deeper would be denormal after a product, which costs a microcode assist
 MANTISSA_SHIFT = np.int32(23)
-TWO_THIRDS = np.int32(0x3F2AAAAB)  # mantissas are taken from [2/3, 4/3), centred on 1
+TWO_THIRDS = np.int32(0x3F2AAAAB)  # mantissas are taken from [2/3, 4/3), centerd on 1
 ONE = np.float32(1.0)
 
 # 2^f on [-1/2, 1/2]

@@ -2,7 +2,7 @@
 
 A tile's 256 pixels live in a workspace, one row per quantity, in the order of its 4 x 4 blocks: a block is one vector
 of 512 bits where the machine has them. Only the blocks that an ellipse may touch, and that have not ended, are gone
-through. What keeps the loops over their pixels vectorised (raster.md 6, asserted by tests): a one-dimensional
+through. What keeps the loops over their pixels vectorized (raster.md 6, asserted by tests): a one-dimensional
 workspace, unsigned indices, constant row offsets, float32 constants, and no call that is not inlined. Short loops one
 after the other beat one long loop: fewer values spill, and the long chain of the coverage overlaps with itself.
 
@@ -26,7 +26,7 @@ _pair = pairmath.make(math.inlined, math.exp2, math.log2, minimum, maximum, sele
 half_slope, squared_distance, coverage = _pair.half_slope, _pair.squared_distance, _pair.coverage
 beta_falloff, gaussian_falloff = _pair.beta_falloff, _pair.gaussian_falloff
 advance, transmittance = _pair.advance, _pair.transmittance
-seen_colour, colour_slope, payloads = _pair.seen_colour, _pair.colour_slope, _pair.payloads
+seen_color, color_slope, payloads = _pair.seen_color, _pair.color_slope, _pair.payloads
 shape_slopes, depth_slope = _pair.shape_slopes, _pair.depth_slope
 transmittance_near_one = pairmath.make(
     math.inlined, math.exp2_near_zero, math.log2, minimum, maximum, select, vec3, np.float32
@@ -47,7 +47,7 @@ UP1, UP2, UP3, UP4, UP5 = (np.uintp(k) for k in range(1, 6))
 NEG_LOG2_E, LN_2 = np.float32(-pairmath.LOG2_E), np.float32(pairmath.LN_2)
 ZERO, HALF, ONE, TWO = np.float32(0.0), np.float32(0.5), np.float32(1.0), np.float32(2.0)
 
-# Rows of the workspace: pixel centre, transmittance, the water's exponents less those of the tile's middle, B_inf
+# Rows of the workspace: pixel center, transmittance, the water's exponents less those of the tile's middle, B_inf
 # (adjoint: dL/dI B_inf)
 X, Y, T, KB0, KB1, KB2, KD0, KD1, KD2, B0, B1, B2 = (np.uintp(STRIDE * k) for k in range(12))
 MIDDLE = X + np.uintp(PIXELS)  # in a gap between rows: the six exponents of the tile's middle
@@ -83,7 +83,7 @@ def block_order(y, x):
 @no_type_check
 @math.inlined
 def copy_four(source, i, target, j):
-    """Copy four neighbours: all reads before all writes, or LLVM would fear that they overlap, and go one by one."""
+    """Copy four neighbors: all reads before all writes, or LLVM would fear that they overlap, and go one by one."""
     a, b, c, d = source[i], source[i + UP1], source[i + UP2], source[i + UP3]
     target[j], target[j + UP1], target[j + UP2], target[j + UP3] = a, b, c, d
 
@@ -122,7 +122,7 @@ def put_back(ws, row, image, tile_y, tile_x):
 
 @no_type_check
 @math.inlined
-def centred(ws):
+def centerd(ws):
     """Move the middle of the water's exponents from its rows to MIDDLE; returns the largest departure left."""
     spread = ZERO
     for k in range(6):
@@ -142,7 +142,7 @@ def centred(ws):
 @no_type_check
 @math.inlined
 def channels(matrix, i, column):
-    """Three neighbours in a row."""
+    """Three neighbors in a row."""
     column = np.uintp(column)
     return matrix[i, column], matrix[i, column + UP1], matrix[i, column + UP2]
 
@@ -181,7 +181,7 @@ def through_water(departure, z, middle, at_middle, far):
 @no_type_check
 @math.inlined
 def begin_tile(ws, tile_y, tile_x, height, width, binf, beta_b, beta_d):
-    """Pixel centres, T = 1, B_inf, and the water around its middle, which is returned (`centred`)."""
+    """Pixel centers, T = 1, B_inf, and the water around its middle, which is returned (`centerd`)."""
     for y in range(TILE):
         for x in range(TILE):
             q = block_order(y, x)
@@ -197,7 +197,7 @@ def begin_tile(ws, tile_y, tile_x, height, width, binf, beta_b, beta_d):
         gather(ws, KD0 + row, beta_d[k], tile_y, tile_x)
     for q in range(KB0, B0):
         ws[q] *= NEG_LOG2_E
-    return centred(ws)
+    return centerd(ws)
 
 
 @no_type_check

@@ -29,14 +29,14 @@ wp.config.log_level = 30
 wp.init()
 
 VALUES = 20
-"""Sums per primitive: mean 2, conic 3, colour 3, opacity, beta, z through the water, z direct, geo 2, |geo| 2,
+"""Sums per primitive: mean 2, conic 3, color 3, opacity, beta, z through the water, z direct, geo 2, |geo| 2,
 |full| 2, depth branch 2."""
 LN_2, LOG2_E = wp.constant(pairmath.LN_2), wp.constant(pairmath.LOG2_E)
 CHANNELS = {"conic", "color", "binf", "E_B", "E_D", "slope", "g", "g_veil", "g_clear", "k", "k_b", "k_d"}
 
 
 def _function(f: Callable[..., Any]) -> Any:
-    """wp.func of a pair function: its colours and conics are vec3, all else is float."""
+    """wp.func of a pair function: its colors and conics are vec3, all else is float."""
     f.__annotations__ = {name: wp.vec3 if name in CHANNELS else float for name in inspect.signature(f).parameters}
     return wp.func(f)
 
@@ -111,7 +111,7 @@ exp2, warp_any, add_over_warp = _native_helpers()
 _pair = pairmath.make(_function, exp2, wp.log2, wp.min, wp.max, wp.where, wp.vec3, float)
 half_slope, squared_distance, coverage = _pair.half_slope, _pair.squared_distance, _pair.coverage
 advance, transmittance = _pair.advance, _pair.transmittance
-seen_colour, colour_slope, payloads = _pair.seen_colour, _pair.colour_slope, _pair.payloads
+seen_color, color_slope, payloads = _pair.seen_color, _pair.color_slope, _pair.payloads
 shape_slopes, depth_slope = _pair.shape_slopes, _pair.depth_slope
 
 
@@ -165,7 +165,7 @@ def _pixel_kernels(falloff: Any) -> PixelKernels:
         pixel_x, pixel_y = pixel_of(tile, thread, (width + 15) // 16)
         inside = pixel_x < width and pixel_y < height
         x, y = wp.min(pixel_x, width - 1), wp.min(pixel_y, height - 1)
-        centre_x, centre_y = float(x) + 0.5, float(y) + 0.5
+        center_x, center_y = float(x) + 0.5, float(y) + 0.5
         B, k_b, k_d = channels(binf, y, x), -LOG2_E * channels(beta_b, y, x), -LOG2_E * channels(beta_d, y, x)
         T = wp.where(inside, 1.0, -1.0)
         image = wp.vec3(0.0, 0.0, 0.0)
@@ -177,7 +177,7 @@ def _pixel_kernels(falloff: Any) -> PixelKernels:
             i = ids[entry]
             entry += 1
             conic = wp.vec3(packed[i, 2], packed[i, 3], packed[i, 4])
-            r2 = squared_distance(centre_x - packed[i, 0], centre_y - packed[i, 1], conic)
+            r2 = squared_distance(center_x - packed[i, 0], center_y - packed[i, 1], conic)
             _u, log_f = falloff(r2)
             alpha, _shaped = coverage(r2, log_f, packed[i, 5], packed[i, 6], packed[i, 7])
             if warp_any(wp.where(alpha > 0.0 and T > 0.0, 1, 0)) != 0:
@@ -185,7 +185,7 @@ def _pixel_kernels(falloff: Any) -> PixelKernels:
                 color = wp.vec3(packed[i, 9], packed[i, 10], packed[i, 11])
                 w, behind = advance(T, alpha)
                 T = behind
-                image += w * seen_colour(color, B, transmittance(k_b, z), transmittance(k_d, z))
+                image += w * seen_color(color, B, transmittance(k_b, z), transmittance(k_d, z))
                 J += w * color
                 D += w * z
                 if warp_any(wp.where(T > 0.0, 1, 0)) == 0:
@@ -214,7 +214,7 @@ def _pixel_kernels(falloff: Any) -> PixelKernels:
         pixel_x, pixel_y = pixel_of(tile, thread, (width + 15) // 16)
         inside = pixel_x < width and pixel_y < height
         x, y = wp.min(pixel_x, width - 1), wp.min(pixel_y, height - 1)
-        centre_x, centre_y = float(x) + 0.5, float(y) + 0.5
+        center_x, center_y = float(x) + 0.5, float(y) + 0.5
         B, k_b, k_d = channels(binf, y, x), -LOG2_E * channels(beta_b, y, x), -LOG2_E * channels(beta_d, y, x)
         g, gc = channels(g_rgb, y, x), channels(g_clear, y, x)
         gz, ga = g_z[y, x], g_alpha[y, x]
@@ -233,7 +233,7 @@ def _pixel_kernels(falloff: Any) -> PixelKernels:
         while entry < end:
             i = ids[entry]
             entry += 1
-            dx, dy = centre_x - packed[i, 0], centre_y - packed[i, 1]
+            dx, dy = center_x - packed[i, 0], center_y - packed[i, 1]
             conic = wp.vec3(packed[i, 2], packed[i, 3], packed[i, 4])
             r2 = squared_distance(dx, dy, conic)
             u, log_f = falloff(r2)
@@ -245,7 +245,7 @@ def _pixel_kernels(falloff: Any) -> PixelKernels:
                 p, q = shape_slopes(w, T, alpha, shaped, u)
                 T = behind
                 E_B, E_D = transmittance(k_b, z), transmittance(k_d, z)
-                slope = colour_slope(g, gc, E_D)
+                slope = color_slope(g, gc, E_D)
                 full, geo, depth = payloads(color, z, E_B, slope, g, g_veil, gc, gz, ga)
                 rest -= w * full
                 rest_geo -= w * geo

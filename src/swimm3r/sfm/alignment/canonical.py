@@ -94,21 +94,21 @@ def canonical_view(sums: CanonicalSums, subsample: int = 8) -> CanonicalView:
     return CanonicalView(points.float(), relative.clamp(min=_LEAST_RATIO).float(), confidence.float())
 
 
-def anchored_frame(view: CanonicalView, subsample: int = 8, pixel_centre: float = 0.5) -> AnchoredFrame:
-    """The anchors' depths and the focal length; `pixel_centre` is the coordinate of the first pixel's centre."""
+def anchored_frame(view: CanonicalView, subsample: int = 8, pixel_center: float = 0.5) -> AnchoredFrame:
+    """The anchors' depths and the focal length; `pixel_center` is the coordinate of the first pixel's center."""
     h, w = view.confidence.shape
     half = subsample // 2
     depth = view.points[half::subsample, half::subsample, 2].flatten().clamp(min=_NEAREST)
-    return AnchoredFrame(h, w, implied_focal(view.points, pixel_centre), depth, float(view.confidence.mean()))
+    return AnchoredFrame(h, w, implied_focal(view.points, pixel_center), depth, float(view.confidence.mean()))
 
 
-def implied_focal(points: Float[Tensor, "h w 3"], pixel_centre: float = 0.5) -> float:
+def implied_focal(points: Float[Tensor, "h w 3"], pixel_center: float = 0.5) -> float:
     """The focal length (pixels) that projects the points onto their own pixels, by Weiszfeld's median of 10 steps.
 
-    The principal point is the image's centre. Clipped to 0.5 .. 3.5 times that of a 60 degree lens.
+    The principal point is the image's center. Clipped to 0.5 .. 3.5 times that of a 60 degree lens.
     """
     h, w = points.shape[:2]
-    y, x = torch.meshgrid(torch.arange(h) + pixel_centre, torch.arange(w) + pixel_centre, indexing="ij")
+    y, x = torch.meshgrid(torch.arange(h) + pixel_center, torch.arange(w) + pixel_center, indexing="ij")
     pixels = torch.stack([x - w / 2, y - h / 2], dim=-1)
     rays = torch.nan_to_num(points[..., :2] / points[..., 2:], nan=0.0, posinf=0.0, neginf=0.0)
     along, squared = (rays * pixels).sum(-1), (rays * rays).sum(-1)

@@ -26,18 +26,18 @@ def confidence_share(confidence: Float[Tensor, "h w"]) -> Float[Tensor, "h w"]:
 
 def clean_confidence(
     i: int,
-    neighbours: Sequence[int],
+    neighbors: Sequence[int],
     cameras: Cameras,
     view: Callable[[int], tuple[Float[Tensor, "h w"], Float[Tensor, "h w"]]],
 ) -> Float[Tensor, "h w"]:
-    """The confidence of frame i, 0 where its points are in a neighbour's way; `view` gives z depth and confidence."""
+    """The confidence of frame i, 0 where its points are in a neighbor's way; `view` gives z depth and confidence."""
     z_depth, confidence = view(i)
     height, width = z_depth.shape
     y, x = torch.meshgrid(torch.arange(height) + 0.5, torch.arange(width) + 0.5, indexing="ij")
     grid = torch.stack([x, y], -1).reshape(1, -1, 2).double()
     points = unproject(cameras[i], grid, z_depth.reshape(1, -1).double())[0]
     mine = confidence.reshape(-1).clone()
-    for j in neighbours:
+    for j in neighbors:
         uv, z = project(cameras[j], points[None])
         column, row = uv[0].floor().nan_to_num(-1, -1, -1).clamp(-1, max(height, width)).long().unbind(-1)
         seen = (z[0] > 0) & (column >= 0) & (column < width) & (row >= 0) & (row < height)
@@ -51,7 +51,7 @@ def clean_confidence(
 
 def cleaned(
     frames: Sequence[int],
-    neighbours: Sequence[Sequence[int]],
+    neighbors: Sequence[Sequence[int]],
     cameras: Cameras,
     load: Callable[[int], tuple[Float[Tensor, "h w"], Float[Tensor, "h w"]]],
     max_bytes: int,
@@ -71,5 +71,5 @@ def cleaned(
 
     for done, i in enumerate(frames):
         progress("depth", done, len(frames))
-        finish(i, view(i)[0], clean_confidence(i, neighbours[i], cameras, view))
+        finish(i, view(i)[0], clean_confidence(i, neighbors[i], cameras, view))
     progress("depth", len(frames), len(frames))

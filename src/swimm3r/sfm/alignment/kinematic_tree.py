@@ -1,6 +1,6 @@
 """A tree over frames along which poses are chained: frame = parent o relative pose, from the root outwards.
 
-A step of the optimiser on one relative pose moves everything that hangs on it, which is what a loop of a hundred frames
+A step of the optimizer on one relative pose moves everything that hangs on it, which is what a loop of a hundred frames
 needs. Composing along the tree takes log2(depth) batched products (pointer jumping), not one per frame.
 """
 

@@ -2,14 +2,14 @@
 
     frame i:  scale s_i, focal f_i, principal point c_i, block depths d; m_i, f0_i: its median depth and own first focal
     focal plane  z_i = s_i m_i f_i / f0_i;     block depth  D = g (z_i + (d - 1) m_i s_i),   g = 1 / min s
-    pose         R_i, centre = g (t_i - R_i o_i),   o_i = z_i (((W/2, H/2) - c_i) / f_i, 1)
+    pose         R_i, center = g (t_i - R_i o_i),   o_i = z_i (((W/2, H/2) - c_i) / f_i, 1)
     pixel p of a block  X = pose_i (D * (1 + (r(p) - 1) f0 / f) * K^-1 (p, 1)),   r(p): its relative depth
 
     coarse:  sum c l_1.5(X_i - X_j) / sum c                       over matches with confidence c
     fine:    sum c l_0.5(p_i - project_i(X_j)) / sum c            both ways
     l_gamma(r) = (r + delta)^gamma - delta^gamma,  delta = (1/gamma)^(1/(gamma-1)), so that l'(0) = 1
 
-t_i is the point of the scene before the frame's centre, which turns with less effect than the camera would: that is why
+t_i is the point of the scene before the frame's center, which turns with less effect than the camera would: that is why
 it is the parameter. All frames are computed at once, ragged in flat arrays; nothing loops over frames in a step.
 """
 
@@ -39,7 +39,7 @@ _FOCAL_RANGE = (0.25, 10.0)  # of the image's diagonal
 class Alignment:
     """Cameras and block depths of all frames, in the unit of the least scaled frame (the network's metres)."""
 
-    K: Float[Tensor, "n 3 3"]  # float64, pixels of the network's image, centres at +0.5
+    K: Float[Tensor, "n 3 3"]  # float64, pixels of the network's image, centers at +0.5
     cam2world: Float[Tensor, "n 4 4"]  # float64
     anchor_z_depth: tuple[Float[Tensor, " _"], ...]  # per frame
     focal_before: Float[Tensor, " n"]  # the pointmaps' own: `dense_z_depth` needs it
@@ -61,17 +61,17 @@ def align(
     """
     problem = AlignmentProblem.of(frames, pairs, settings, known)
     parameters = _Parameters.initial(problem, settings, known)
-    coarse = _optimise("coarse alignment", parameters.pose(), problem, parameters, settings, progress)
+    coarse = _optimize("coarse alignment", parameters.pose(), problem, parameters, settings, progress)
     fine_set = [*parameters.pose(), *parameters.camera(settings)]
-    fine = _optimise("fine alignment", fine_set, problem, parameters, settings, progress)
+    fine = _optimize("fine alignment", fine_set, problem, parameters, settings, progress)
     last = fine if len(fine.losses) else coarse
     with torch.no_grad():
         scene = last.scene if settings.parity and last.scene is not None else _scene(parameters, problem, settings)
         points = _points(scene, problem).unflatten(0, (2, -1)).mean(0)
     K = scene.K.detach().double()
-    K[:, :2, 2] += 0.5 - problem.pixel_centre
+    K[:, :2, 2] += 0.5 - problem.pixel_center
     cam2world = torch.eye(4, dtype=torch.float64).repeat(len(frames), 1, 1)
-    cam2world[:, :3, :3], cam2world[:, :3, 3] = scene.R.detach().double(), scene.centre.detach().double()
+    cam2world[:, :3, :3], cam2world[:, :3, 3] = scene.R.detach().double(), scene.center.detach().double()
     depths = scene.depth.detach().split([len(f.anchor_depth) for f in frames])
     return Alignment(K, cam2world, tuple(depths), problem.focal, points, (coarse.losses, fine.losses))
 
@@ -136,9 +136,9 @@ class _Parameters:
         chosen = []
         if settings.intrinsics != "fixed":
             chosen.append(self.log_focal)
-            if settings.optimise_principal_point:
+            if settings.optimize_principal_point:
                 chosen.append(self.principal)
-        if settings.optimise_depth:
+        if settings.optimize_depth:
             chosen.append(self.depth)
         return chosen
 
@@ -149,7 +149,7 @@ class _Scene:
 
     K: Tensor  # n 3 3
     R: Tensor  # n 3 3, camera to world
-    centre: Tensor  # n 3
+    center: Tensor  # n 3
     depth: Tensor  # a
 
 
@@ -170,7 +170,7 @@ def _scene(parameters: _Parameters, problem: AlignmentProblem, settings: Alignme
     K[:, :2, 2] = principal * problem.size
 
     size = parameters.log_size.exp()
-    # Two known camera centres settle the scale; else it is held by the least scaled frame.
+    # Two known camera centers settle the scale; else it is held by the least scaled frame.
     unit = torch.ones(()) if int(problem.posed.sum()) >= 2 else 1 / size.min()
     plane = size * problem.median * focal / problem.focal
     offset = _focal_point(plane, focal, principal, problem)
@@ -181,15 +181,15 @@ def _scene(parameters: _Parameters, problem: AlignmentProblem, settings: Alignme
         quaternion = torch.where(fixed[:, None], quaternion.detach(), quaternion)
         translation = torch.where(fixed[:, None], translation.detach(), translation)
     R, t = compose(problem.tree, rotation_from_quaternion(quaternion), translation)
-    centre = unit * (t - (R @ offset[..., None])[..., 0])
+    center = unit * (t - (R @ offset[..., None])[..., 0])
     if problem.known_pose is not None:
         R = torch.where(problem.posed[:, None, None], problem.known_pose[:, :3, :3], R)
-        centre = torch.where(problem.posed[:, None], problem.known_pose[:, :3, 3], centre)
+        center = torch.where(problem.posed[:, None], problem.known_pose[:, :3, 3], center)
 
     ratio = parameters.depth.exp() if settings.exponential_depth else parameters.depth
     at = problem.anchor_frame
     added = plane[at] + (ratio - 1) * (problem.median * size)[at]
-    return _Scene(K, R, centre, unit * (added if settings.depth == "add" else plane[at] * ratio))
+    return _Scene(K, R, center, unit * (added if settings.depth == "add" else plane[at] * ratio))
 
 
 def _points(scene: _Scene, problem: AlignmentProblem) -> Float[Tensor, "p 3"]:
@@ -200,7 +200,7 @@ def _points(scene: _Scene, problem: AlignmentProblem) -> Float[Tensor, "p 3"]:
     z = scene.depth[problem.point_anchor] * relative
     plane = (problem.point_xy - scene.K[at, :2, 2]) / scene.K[:, [0, 1], [0, 1]][at]
     seen = torch.cat([plane, torch.ones_like(plane[:, :1])], dim=1) * z[:, None]
-    return (scene.R[at] @ seen[..., None])[..., 0] + scene.centre[at]
+    return (scene.R[at] @ seen[..., None])[..., 0] + scene.center[at]
 
 
 def _loss(scene: _Scene, problem: AlignmentProblem, fine: bool) -> Tensor:
@@ -211,7 +211,7 @@ def _loss(scene: _Scene, problem: AlignmentProblem, fine: bool) -> Tensor:
     if fine:
         other = torch.cat([points[half:], points[:half]])
         at = problem.point_frame
-        seen = (scene.R[at].mT @ (other - scene.centre[at])[..., None])[..., 0]
+        seen = (scene.R[at].mT @ (other - scene.center[at])[..., None])[..., 0]
         pixel = (scene.K[at] @ seen[..., None])[..., 0]
         pixel = (pixel[:, :2] / seen[:, 2:].clamp(min=_NEAREST)).clamp(*_VISIBLE)
         residual = robust(_length(problem.point_xy - pixel), 0.5).unflatten(0, (2, half)).sum(0)
@@ -220,7 +220,7 @@ def _loss(scene: _Scene, problem: AlignmentProblem, fine: bool) -> Tensor:
         loss = (confidence * robust(_length(points[:half] - points[half:]), 1.5)).sum() / total
     if len(problem.failed_point):
         at = problem.failed_frame
-        target = (scene.R[at] @ problem.failed_target[..., None])[..., 0] + scene.centre[at]
+        target = (scene.R[at] @ problem.failed_target[..., None])[..., 0] + scene.center[at]
         residual = robust(_length(points[problem.failed_point] - target), 1.1)
         weight = problem.failed_confidence
         loss = loss + _FALLBACK_WEIGHT * (weight * residual).sum() / weight.sum()
@@ -234,7 +234,7 @@ def _prior(parameters: _Parameters, problem: AlignmentProblem) -> Tensor:
     return (focal**2).mean() + (principal**2).sum(1).mean()
 
 
-def _optimise(
+def _optimize(
     phase: str,
     trainable: list[Tensor],
     problem: AlignmentProblem,
@@ -246,13 +246,13 @@ def _optimise(
     fine = phase.startswith("fine")
     iterations = settings.fine_iterations if fine else settings.coarse_iterations
     rate = settings.fine_rate if fine else settings.coarse_rate
-    optimiser = torch.optim.Adam(trainable, lr=rate, betas=(0.9, 0.9))
+    optimizer = torch.optim.Adam(trainable, lr=rate, betas=(0.9, 0.9))
     losses, scene = [], None
     for it in range(iterations):
         progress(phase, it, iterations)
-        for group in optimiser.param_groups:
+        for group in optimizer.param_groups:
             group["lr"] = rate * (1 + math.cos(math.pi * it / iterations)) / 2
-        optimiser.zero_grad()
+        optimizer.zero_grad()
         scene = _scene(parameters, problem, settings)
         loss = _loss(scene, problem, fine)
         if fine and settings.intrinsics == "prior":
@@ -265,7 +265,7 @@ def _optimise(
                 hint="more overlap between frames, or known intrinsics",
             )
         loss.backward()
-        optimiser.step()
+        optimizer.step()
         with torch.no_grad():
             parameters.quaternion.div_(parameters.quaternion.norm(dim=1, keepdim=True))
     progress(phase, iterations, iterations)

@@ -56,7 +56,7 @@ def anchored_pair(
 
 @dataclass(frozen=True)
 class Known:
-    """What is known beforehand; pixels are the network's, their centres at +0.5."""
+    """What is known beforehand; pixels are the network's, their centers at +0.5."""
 
     K: Float[Tensor, "n 3 3"] | None = None
     cam2world: Float[Tensor, "n 4 4"] | None = None
@@ -84,7 +84,7 @@ class AlignmentProblem:
     failed_target: Float[Tensor, "f 3"]
     failed_confidence: Float[Tensor, " f"]
     tree: KinematicTree
-    pixel_centre: float
+    pixel_center: float
     known_K: Float[Tensor, "n 3 3"] | None
     known_pose: Float[Tensor, "n 4 4"] | None
     posed: Bool[Tensor, " n"]
@@ -95,7 +95,7 @@ class AlignmentProblem:
     ) -> "AlignmentProblem":
         """Raises what `alignment.align` says."""
         _check(frames, pairs, settings, known)
-        centre = 0.0 if settings.parity else 0.5
+        center = 0.0 if settings.parity else 0.5
         counts = [len(f.anchor_depth) for f in frames]
         first = np.cumsum([0, *counts])
         sides = [(p.i, p.xy_i, p.anchor_i, p.relative_i) for p in pairs]
@@ -110,7 +110,7 @@ class AlignmentProblem:
         K = None
         if known.K is not None:
             K = known.K.float().clone()
-            K[:, :2, 2] += centre - 0.5
+            K[:, :2, 2] += center - 0.5
             focal = K[:, 0, 0].clone()
         start = focal
         if settings.intrinsics == "shared":
@@ -128,13 +128,13 @@ class AlignmentProblem:
             anchor_ratio=torch.cat([f.anchor_depth for f in frames]) / median[anchor_frame],
             anchor_frame=anchor_frame,
             point_frame=frame,
-            point_xy=torch.cat([xy for _, xy, _, _ in sides]).float() + centre,
+            point_xy=torch.cat([xy for _, xy, _, _ in sides]).float() + center,
             point_anchor=torch.cat([anchor + int(first[f]) for f, _, anchor, _ in sides]),
             point_relative=torch.cat([relative for _, _, _, relative in sides]).float(),
             match_confidence=torch.cat([p.confidence * ok for p, ok in zip(pairs, passes, strict=True)]).float(),
             **_failed(pairs, passes, frame, torch.cat([anchor for _, _, anchor, _ in sides])),
             tree=kinematic_tree(matches, counts, settings.tree),
-            pixel_centre=centre,
+            pixel_center=center,
             known_K=K,
             known_pose=pose,
             posed=posed,
@@ -142,7 +142,7 @@ class AlignmentProblem:
 
     @property
     def aspect(self) -> Float[Tensor, " n"]:
-        """fy / fx of every frame, which is never optimised."""
+        """fy / fx of every frame, which is never optimized."""
         if self.known_K is None:
             return torch.ones(len(self.focal))
         return self.known_K[:, 1, 1] / self.known_K[:, 0, 0]

@@ -21,7 +21,7 @@ from swimm3r.io.imports.record import ForeignModel
 from swimm3r.progress import Progress, silent
 from swimm3r.scene import reconstruction
 from swimm3r.scene.frames import Frames
-from swimm3r.scene.reconstruction import Caution, DepthMap, DepthMaps, Matches, Points, Reconstruction, Tracks
+from swimm3r.scene.reconstruction import DepthMap, DepthMaps, Matches, Points, QualityWarning, Reconstruction, Tracks
 from swimm3r.sfm.colmap.triangulation import triangulate
 from swimm3r.sfm.imported.match_frames import at_frame_size, named_frames
 from swimm3r.sfm.medium.apply import with_water
@@ -55,7 +55,7 @@ def from_model(frames: Frames, model: ColmapModel, folder: Path) -> Reconstructi
     if len(names) < 2:
         raise InputError(
             f"{len(names)} of {len(frames)} training frames are in the COLMAP model, at least 2 are needed",
-            cause=f"the model is of other pictures; it names {', '.join(model.names[:3])}, ...",
+            cause=f"the model is of other images; it names {', '.join(model.names[:3])}, ...",
             hint="give with --images the folder that the model's names are relative to",
         )
     row_of = {row: i for i, row in enumerate(rows)}
@@ -86,9 +86,9 @@ def from_model(frames: Frames, model: ColmapModel, folder: Path) -> Reconstructi
 
 
 def from_foreign(frames: Frames, foreign: ForeignModel, folder: Path) -> Reconstruction:
-    """`from_model` with what the program knows besides: its name, whether lengths are metres, colours, matches."""
+    """`from_model` with what the program knows besides: its name, whether lengths are metres, colors, matches."""
     rec = from_model(frames, foreign.model, folder)
-    if not foreign.coloured:
+    if not foreign.colored:
         order = [frames.index(name) for name in rec.names]
         points, _ = as_points(_as_match_tracks(rec), rec.tracks.xy, rec.cameras, frames, order)
         rec = replace(rec, points=points)
@@ -96,7 +96,7 @@ def from_foreign(frames: Frames, foreign: ForeignModel, folder: Path) -> Reconst
 
 
 def matches_of(tracks: Tracks, reach: int = 3) -> Matches:
-    """Pairs of sightings of one point, each with the next few frames that see it; confidence 1."""
+    """Pairs of observations of one point, each with the next few frames that see it; confidence 1."""
     order = torch.from_numpy(np.lexsort((tracks.frame.numpy(), tracks.point.numpy())))
     point, frame, xy = tracks.point[order], tracks.frame[order], tracks.xy[order].float()
     pairs = []
@@ -118,10 +118,10 @@ def write_depth(rec: Reconstruction, frames: Frames, foreign: ForeignModel, prog
     )
     for k, (name, row) in enumerate(zip(names, rows, strict=True)):
         progress("depth", k, len(rows))
-        z_depth, share, grey = (torch.from_numpy(a[row]).float() for a in (dense.z_depth, dense.confidence, dense.grey))
+        z_depth, share, gray = (torch.from_numpy(a[row]).float() for a in (dense.z_depth, dense.confidence, dense.gray))
         inverse = torch.where(z_depth > 0, 1 / z_depth.clamp(min=1e-12), 0.0)
-        picture = frames.image(frames.index(name))
-        q, share = on_frame_grid(inverse, share, grey, picture, rec.cameras[k], canvas[k])
+        image = frames.image(frames.index(name))
+        q, share = on_frame_grid(inverse, share, gray, image, rec.cameras[k], canvas[k])
         known = (q > 0) & frames.mask(frames.index(name))
         z = torch.where(known, 1 / q.clamp(min=1e-12), 0.0)
         rec.depth.write(name, DepthMap(z, torch.where(known, share, 0.0)))
@@ -140,12 +140,12 @@ def _with_points(
     rec = triangulate(rec, frames, settings.features, folder, progress)
     if len(rec.tracks.point):
         return rec
-    caution = Caution(
-        f"{foreign.program}'s file has no sightings of points, and at its poses the pictures' own matches meet nowhere,"
-        " so depth and water cannot be found.",
-        "Check that the pictures are those of the file; or let swimm3r find the poses itself.",
+    warning = QualityWarning(
+        f"{foreign.program}'s file has no observations of points, and the images' own matches do not agree with its"
+        " poses: depth and water cannot be found.",
+        "Check that the images are those of the file, or let swimm3r estimate the poses.",
     )
-    return replace(rec, cautions=(*rec.cautions, caution))
+    return replace(rec, warnings=(*rec.warnings, warning))
 
 
 def _as_match_tracks(rec: Reconstruction) -> MatchTracks:

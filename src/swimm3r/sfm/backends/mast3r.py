@@ -1,4 +1,4 @@
-"""Structure from motion by the MASt3R network: pictures -> pairs -> matches and canonical views -> alignment -> record.
+"""Structure from motion by the MASt3R network: images -> pairs -> matches and canonical views -> alignment -> record.
 
 Everything slow lies on disk as soon as it is known (`encodings`, `pair_store`), under names that are hashes of what it
 was made from: a killed run goes on, and nothing stale is used. Memory is bounded for any number of frames: one pair's
@@ -19,7 +19,7 @@ from swimm3r.imaging.filters import LUMA
 from swimm3r.progress import Progress, silent
 from swimm3r.scene import reconstruction
 from swimm3r.scene.frames import Frames
-from swimm3r.scene.reconstruction import Caution, DepthMap, DepthMaps, Matches, Reconstruction
+from swimm3r.scene.reconstruction import DepthMap, DepthMaps, Matches, QualityWarning, Reconstruction
 from swimm3r.sfm import tracks as match_tracks
 from swimm3r.sfm.alignment import depth_cleaning
 from swimm3r.sfm.alignment.canonical import AnchoredFrame, anchors_of
@@ -29,9 +29,9 @@ from swimm3r.sfm.colmap import poses as colmap
 from swimm3r.sfm.features.pair_graph import groups, parse_graph
 from swimm3r.sfm.mast3r.matching import PixelMatches
 from swimm3r.sfm.mast3r_sfm.encodings import EncodingStore
-from swimm3r.sfm.mast3r_sfm.network_frames import NetworkPictures, network_pictures
+from swimm3r.sfm.mast3r_sfm.network_frames import NetworkImages, network_images
 from swimm3r.sfm.mast3r_sfm.pair_store import PairRecord
-from swimm3r.sfm.mast3r_sfm.run_pairs import Said, load_network, look_at_pairs, put_on
+from swimm3r.sfm.mast3r_sfm.run_pairs import PairResults, apply_adapter, load_network, run_pairs
 from swimm3r.sfm.medium import from_head
 from swimm3r.sfm.medium.apply import with_water
 from swimm3r.sfm.plane_sweep.views import on_frame_grid
@@ -53,22 +53,22 @@ def reconstruct(frames: Frames, settings: Mast3rSettings, folder: Path, progress
     cache = settings.cache or folder / _FOLDER
     if not (folder / "reconstruction.json").is_file():
         graph = parse_graph(settings.graph)
-        pictures = network_pictures(frames, settings)
+        images = network_images(frames, settings)
         network = load_network(settings)
-        head = None if settings.adapter is None else put_on(network, settings.adapter, settings)
-        said = look_at_pairs(network, pictures, graph, settings, cache, progress)
+        head = None if settings.adapter is None else apply_adapter(network, settings.adapter, settings)
+        said = run_pairs(network, images, graph, settings, cache, progress)
         read_water = None
         if head is not None:
-            encodings = EncodingStore(network, pictures, cache / "encodings")
+            encodings = EncodingStore(network, images, cache / "encodings")
             read_water = _WaterReader(head, encodings, folder / _WATER)
-        rec = _place(said, pictures, settings, folder, progress, read_water)
+        rec = _place(said, images, settings, folder, progress, read_water)
         reconstruction.save(rec, frames, folder)
     rec = reconstruction.load(folder, frames)  # also where it was just made: the same bits as after an interruption
     if settings.adapter is None:
         rec = with_water(rec, frames, settings, folder, progress)
     else:
         facts = adapter_file.head_facts(settings.adapter)
-        predicted = from_head.read(folder / _WATER, network_pictures(frames, settings), facts)
+        predicted = from_head.read(folder / _WATER, network_images(frames, settings), facts)
         rec = with_water(rec, frames, settings, folder, progress, predicted)
     reconstruction.save(rec, frames, folder)
     if settings.cache is None:
@@ -92,38 +92,38 @@ class _WaterReader:
 
 
 def _place(
-    said: Said,
-    pictures: NetworkPictures,
+    said: PairResults,
+    images: NetworkImages,
     settings: Mast3rSettings,
     folder: Path,
     progress: Progress,
     water: _WaterReader | None = None,
 ) -> Reconstruction:
     """The aligned record, without water; depth maps are written on the way."""
-    frames = pictures.frames
-    pairs, kept, cautions = _joined_frames(said, frames, settings)
-    aligned = _align(said, pairs, kept, pictures, settings, progress)
-    lens, canvas = pictures.cameras(aligned.alignment.K, aligned.alignment.cam2world)
+    frames = images.frames
+    pairs, kept, warnings = _joined_frames(said, frames, settings)
+    aligned = _align(said, pairs, kept, images, settings, progress)
+    lens, canvas = images.cameras(aligned.alignment.K, aligned.alignment.cam2world)
     matches = aligned.matches.select(match_tracks.consistent(aligned.matches, canvas, settings.max_error))
     found = _tracks(matches, canvas, settings)
     tracks = match_tracks.most_seen(found, settings.max_points)
-    reconstruction.write_unfiltered_matches(folder, _on_frames(aligned.matches, pictures))
-    points, sightings = match_tracks.as_points(tracks, pictures.to_frame(tracks.xy + 0.5), lens, frames, kept)
+    reconstruction.write_unfiltered_matches(folder, _on_frames(aligned.matches, images))
+    points, observations = match_tracks.as_points(tracks, images.to_frame(tracks.xy + 0.5), lens, frames, kept)
     rec = Reconstruction(
         names=tuple(frames.names[f] for f in kept),
         cameras=lens,
         points=points,
-        tracks=sightings,
-        matches=_on_frames(matches, pictures),
+        tracks=observations,
+        matches=_on_frames(matches, images),
         depth=DepthMaps(folder / "z_depth"),
         backend="mast3r" if settings.adapter is None else "swimm3r",
-        metric=_is_metric(pictures, kept),
-        cautions=tuple(cautions),
+        metric=_is_metric(images, kept),
+        warnings=tuple(warnings),
         points_found=len(found.xyz),
     )
     if settings.bundle_adjustment:
         rec = colmap.bundle_adjust(rec)
-    _write_depth(rec, said, kept, pairs, aligned.alignment, pictures, settings, progress)
+    _write_depth(rec, said, kept, pairs, aligned.alignment, images, settings, progress)
     if water is not None:
         for k, f in enumerate(kept):
             before = said.frame_store.read(f).anchored.anchor_depth.clamp(min=1e-9)
@@ -131,21 +131,21 @@ def _place(
     return rec
 
 
-def _on_frames(matches: FrameMatches, pictures: NetworkPictures) -> Matches:
+def _on_frames(matches: FrameMatches, images: NetworkImages) -> Matches:
     """Matches of the network's pixels in pixels of the prepared frames."""
-    xy_i, xy_j = (pictures.to_frame(xy + 0.5).float() for xy in (matches.xy_i, matches.xy_j))
+    xy_i, xy_j = (images.to_frame(xy + 0.5).float() for xy in (matches.xy_i, matches.xy_j))
     return Matches(matches.i, matches.j, xy_i, xy_j, matches.confidence)
 
 
-def _is_metric(pictures: NetworkPictures, kept: list[int]) -> bool:
-    """Two known camera centres settle the unit; the network's own metres nobody measured."""
-    poses = pictures.poses
+def _is_metric(images: NetworkImages, kept: list[int]) -> bool:
+    """Two known camera centers settle the unit; the network's own metres nobody measured."""
+    poses = images.poses
     return poses is not None and poses.metric and int(poses.posed[kept].sum()) >= 2
 
 
 def _joined_frames(
-    said: Said, frames: Frames, settings: Mast3rSettings
-) -> tuple[dict[tuple[int, int], PairRecord], list[int], list[Caution]]:
+    said: PairResults, frames: Frames, settings: Mast3rSettings
+) -> tuple[dict[tuple[int, int], PairRecord], list[int], list[QualityWarning]]:
     """The pairs that match, each with what is known of it, and the frames they join."""
     n = len(frames)
     records = {pair: said.pair_store.read(*(said.names[f] for f in pair)) for pair in said.pairs}
@@ -166,10 +166,10 @@ def _joined_frames(
             cause="a cut in the clip, or a stretch of open water",
             hint="take the longest stretch only, more frames per second, or a graph with more pairs (--graph)",
         )
-    cautions = []
+    warnings = []
     if len(kept) < n:
-        cautions.append(
-            Caution(
+        warnings.append(
+            QualityWarning(
                 f"{n - len(kept)} of {n} frames match no other and are left out.",
                 "They are blurred, show open water, or overlap too little with the rest: raise --fps, or swim slower.",
             )
@@ -177,7 +177,7 @@ def _joined_frames(
     number = {f: k for k, f in enumerate(kept)}
     joined = {(number[i], number[j]): record for (i, j), record in found.items() if i in number}
     share = max(settings.min_matches, settings.max_matches // len(joined))
-    return {pair: _thinned(record, share) for pair, record in joined.items()}, kept, cautions
+    return {pair: _thinned(record, share) for pair, record in joined.items()}, kept, warnings
 
 
 def _thinned(record: PairRecord, most: int) -> PairRecord:
@@ -195,10 +195,10 @@ class _Aligned:
 
 
 def _align(
-    said: Said,
+    said: PairResults,
     pairs: dict[tuple[int, int], PairRecord],
     kept: list[int],
-    pictures: NetworkPictures,
+    images: NetworkImages,
     settings: Mast3rSettings,
     progress: Progress,
 ) -> _Aligned:
@@ -236,11 +236,11 @@ def _align(
                 record.j_in_i,
             )
         )
-    if pictures.lens.model != "PINHOLE":  # its distortion belongs to its focal length
+    if images.lens.model != "PINHOLE":  # its distortion belongs to its focal length
         alignment = replace(alignment, intrinsics="fixed")
-    known = Known(K=None if pictures.K is None else pictures.K.repeat(len(kept), 1, 1))
-    if pictures.poses is not None:
-        known = replace(known, cam2world=pictures.poses.cam2world[kept], posed=pictures.poses.posed[kept])
+    known = Known(K=None if images.K is None else images.K.repeat(len(kept), 1, 1))
+    if images.poses is not None:
+        known = replace(known, cam2world=images.poses.cam2world[kept], posed=images.poses.posed[kept])
     found = align(anchored, anchored_pairs, alignment, known, progress)
     matches = FrameMatches(
         torch.cat([torch.full_like(p.anchor_i, p.i) for p in anchored_pairs]),
@@ -269,20 +269,20 @@ def _tracks(matches: FrameMatches, canvas: Cameras, settings: Mast3rSettings) ->
 
 def _write_depth(
     rec: Reconstruction,
-    said: Said,
+    said: PairResults,
     kept: list[int],
     pairs: dict[tuple[int, int], PairRecord],
     found: Alignment,
-    pictures: NetworkPictures,
+    images: NetworkImages,
     settings: Mast3rSettings,
     progress: Progress,
 ) -> None:
     """Depth maps on the grid of the prepared frames."""
-    _, canvas = pictures.cameras(found.K, rec.cameras.cam2world)
-    neighbours: list[list[int]] = [[] for _ in kept]
+    _, canvas = images.cameras(found.K, rec.cameras.cam2world)
+    neighbors: list[list[int]] = [[] for _ in kept]
     for i, j in pairs:
-        neighbours[i].append(j)
-        neighbours[j].append(i)
+        neighbors[i].append(j)
+        neighbors[j].append(i)
 
     def dense(k: int) -> tuple[Float[Tensor, "h w"], Float[Tensor, "h w"]]:
         view = said.frame_store.read(kept[k]).view
@@ -296,18 +296,18 @@ def _write_depth(
 
     def finish(k: int, z_depth: Float[Tensor, "h w"], confidence: Float[Tensor, "h w"]) -> None:
         f = kept[k]
-        mask = pictures.mask(f)
+        mask = images.mask(f)
         usable = (confidence >= settings.min_confidence) & (z_depth > 0)
         usable = usable if mask is None else usable & mask
         inverse = torch.where(usable, 1 / z_depth.clamp(min=1e-12), 0.0)
         share = torch.where(usable, depth_cleaning.confidence_share(confidence), 0.0)
-        grey = (pictures.image(f).permute(1, 2, 0) / 2 + 0.5) @ LUMA
-        q, share = on_frame_grid(inverse, share, grey, pictures.frames.image(f), rec.cameras[k], canvas[k])
-        known = (q > 0) & pictures.frames.mask(f)
+        gray = (images.image(f).permute(1, 2, 0) / 2 + 0.5) @ LUMA
+        q, share = on_frame_grid(inverse, share, gray, images.frames.image(f), rec.cameras[k], canvas[k])
+        known = (q > 0) & images.frames.mask(f)
         z = torch.where(known, 1 / q.clamp(min=1e-12), 0.0)
         rec.depth.write(rec.names[k], DepthMap(z, torch.where(known, share, 0.0)))
 
-    depth_cleaning.cleaned(range(len(kept)), neighbours, canvas, dense, settings.memory_mb << 20, finish, progress)
+    depth_cleaning.cleaned(range(len(kept)), neighbors, canvas, dense, settings.memory_mb << 20, finish, progress)
 
 
 def _scale_to_points(z_depth: Float[Tensor, "h w"], rec: Reconstruction, canvas: Cameras, k: int) -> float:

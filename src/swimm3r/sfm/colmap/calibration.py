@@ -1,6 +1,6 @@
 """The one lens of a clip: what to begin with when nobody knows it, what can be a lens at all, and its refinement.
 
-On small hazy pictures a self-calibrating mapper drifts to any focal length and then loses frames. So a lens is held
+On small hazy images a self-calibrating mapper drifts to any focal length and then loses frames. So a lens is held
 while frames are placed (`mapping`), and only with every frame in place are the intrinsics refined: what comes out is
 kept only if it is a lens. OPENCV's further parameters must earn their keep by a clearly lower reprojection error.
 """
@@ -24,7 +24,7 @@ if TYPE_CHECKING:
 WATER = 1.333  # refractive index; a flat port multiplies the focal length by it (to first order)
 SEED = 0
 THREADS = 1  # sums in a changing order end in poses 0.01 degrees apart, on weak clips more; a resumed run must not
-_MAX_TANGENTIAL = 0.1  # a lens some 10 degrees askew behind its port, or a picture cut off-centre by a tenth
+_MAX_TANGENTIAL = 0.1  # a lens some 10 degrees askew behind its port, or an image cut off-center by a tenth
 _PASSES, _ENOUGH = 6, 0.99  # adjustments of the lens at most, and the share of the last error that ends them
 STILL = 1e-6  # relative change of the cost that ends a bundle adjustment; COLMAP's 0 always takes 50 or 100 iterations
 
@@ -53,9 +53,9 @@ def first_camera(width: int, height: int, settings: ColmapSettings) -> "pycolmap
         )
     if settings.focal is not None and not 0.1 * width < settings.focal < 20 * width:
         raise UsageError(
-            f"a focal length of {settings.focal:g} px does not fit pictures {width} px wide",
-            cause="it may be in millimetres, or belong to another picture size",
-            hint="give it in pixels of the prepared frames: millimetres / sensor width in millimetres * picture width",
+            f"a focal length of {settings.focal:g} px does not fit images {width} px wide",
+            cause="it may be in millimetres, or belong to another image size",
+            hint="give it in pixels of the prepared frames: millimetres / sensor width in millimetres * image width",
         )
     if settings.intrinsics == "fixed" and settings.focal is None:
         raise UsageError(
@@ -165,7 +165,7 @@ def is_lens(camera: "pycolmap.Camera") -> bool:
         return False
     k = torch.from_numpy(np.asarray(camera.params)[-len(DISTORTION_PARAMETERS[name]) :].copy())
     corner = torch.tensor([width / 2 / fx, height / 2 / fy], dtype=torch.float64)
-    # along every half diagonal the picture radius must grow with the ray's angle, by a share a lens can have
+    # along every half diagonal the image radius must grow with the ray's angle, by a share a lens can have
     reach = torch.linspace(0, 1, 50, dtype=torch.float64)[1:, None, None]
     signs = torch.tensor([[1.0, 1], [1, -1], [-1, 1], [-1, -1]], dtype=torch.float64)
     rays = reach * corner * signs

@@ -34,13 +34,13 @@ def map_frames(store: FeatureDatabase, settings: ColmapSettings, progress: Progr
     """The models found, the best one first, its frames where they explain most; empty where no two could be joined."""
     method = settings.mapping.method
     if method == "global" or (method == "auto" and store.frames >= settings.mapping.global_from):
-        return _put_right(store, _place_many(store, settings, progress), settings, progress)
-    one_by_one = _put_right(
-        store, _climb(store, calibration.lenses(store, settings), settings, progress), settings, progress
+        return _replace_outliers(store, _place_many(store, settings, progress), settings, progress)
+    one_by_one = _replace_outliers(
+        store, _try_focal_lengths(store, calibration.lenses(store, settings), settings, progress), settings, progress
     )
     if method == "incremental" or not one_by_one:
         return one_by_one
-    at_once = _put_right(store, _map_globally(store, settings, progress), settings, progress)
+    at_once = _replace_outliers(store, _map_globally(store, settings, progress), settings, progress)
     if not at_once or at_once[0].compute_mean_observations_per_reg_image() < settings.mapping.thin_points:
         return one_by_one  # it gives every frame a pose, be there ever so little to see (dolphin_dynamic: 61 points)
     return max(one_by_one, at_once, key=_explained)
@@ -58,11 +58,11 @@ def _place_many(
     calibration.set_camera(store, lenses[0])
     models = _map_globally(store, settings, progress)
     if not models or models[0].num_reg_images() < _GLOBAL_ENOUGH * store.frames:
-        models = max(models, _climb(store, lenses, settings, progress), key=_merit)
+        models = max(models, _try_focal_lengths(store, lenses, settings, progress), key=_quality)
     return [calibration.adjust_lens(store, model, settings, progress) for model in models[:1]] + models[1:]
 
 
-def _put_right(
+def _replace_outliers(
     store: FeatureDatabase,
     models: list["pycolmap.Reconstruction"],
     settings: ColmapSettings,
@@ -71,7 +71,7 @@ def _put_right(
     return [replace_misplaced(store, model, settings, progress) for model in models[:1]] + models[1:]
 
 
-def _climb(
+def _try_focal_lengths(
     store: FeatureDatabase, lenses: list["pycolmap.Camera"], settings: ColmapSettings, progress: Progress
 ) -> list["pycolmap.Reconstruction"]:
     """The models under the best of some lenses, which is left in the database."""
@@ -80,8 +80,8 @@ def _climb(
         calibration.set_camera(store, lens)
         what = "placing frames" if k == 0 else f"placing frames, lens {k + 1} of {len(lenses)}"
         models = _map_in_turn(store, settings, what, progress)
-        frames, score = _merit(models)
-        best_frames, best_score = _merit(best)
+        frames, score = _quality(models)
+        best_frames, best_score = _quality(best)
         # earlier ones are likelier lenses: a later one must place more frames, or explain clearly more
         if frames > best_frames or (frames == best_frames and score > _CLEARLY * best_score):
             best = models
@@ -101,7 +101,7 @@ def place_leftovers(
         model.write_binary(folder)
         what, missing = "placing the frames left over", store.frames - model.num_reg_images()
         models = _map_in_turn(store, settings, what, progress, goes_on_from=Path(folder), total=missing)
-    return max([model, *models], key=lambda m: _merit([m]))
+    return max([model, *models], key=lambda m: _quality([m]))
 
 
 def replace_misplaced(
@@ -122,13 +122,13 @@ def replace_misplaced(
             for image_id in misplaced:
                 rest.deregister_frame(rest.images[image_id].frame_id)
             again = place_leftovers(store, rest, settings, progress)
-            if _merit([again]) <= _merit([model]):
+            if _quality([again]) <= _quality([model]):
                 break
             model = again
     return model
 
 
-def _merit(models: "list[pycolmap.Reconstruction]") -> tuple[int, float]:
+def _quality(models: "list[pycolmap.Reconstruction]") -> tuple[int, float]:
     """Of the best of some models: how many frames it holds, and how much it explains."""
     return (models[0].num_reg_images(), _explained(models)) if models else (0, 0.0)
 
@@ -188,7 +188,7 @@ def _map_in_turn(
             next_image_callback=count(1),
         )
     progress(what, most, most)
-    return sorted(models.values(), key=lambda m: _merit([m]), reverse=True)
+    return sorted(models.values(), key=lambda m: _quality([m]), reverse=True)
 
 
 def _map_globally(
@@ -222,4 +222,4 @@ def _map_globally(
     if failures:
         raise failures[0]
     progress("placing all frames at once", store.frames, store.frames)
-    return sorted(models, key=lambda m: _merit([m]), reverse=True)
+    return sorted(models, key=lambda m: _quality([m]), reverse=True)

@@ -13,7 +13,7 @@ from torch import Tensor
 from swimm3r.cameras import project
 from swimm3r.geometry import relative_poses, rotation_angle
 from swimm3r.scene.frames import Frames
-from swimm3r.scene.reconstruction import Caution, Reconstruction
+from swimm3r.scene.reconstruction import QualityWarning, Reconstruction
 from swimm3r.sfm.features.database import FeatureDatabase
 from swimm3r.sfm.features.sift import unit_descriptors
 
@@ -24,11 +24,11 @@ _SAMPLED_FRAMES = 8
 _WEAK_LINK = 50  # shared points; skerki_wreck's lines hang together by fewer, single clips by 80 and more
 _MIN_ANGLE = 1.5  # degrees between the rays of a typical point; good clips have 6 to 15
 _MAX_DEPTH_CHANGE = 10.0  # of the frames' median depth along a clip; good clips have up to 3.2, the tiled pool 5.6
-_MAX_STEP, _MAX_TURN = 15.0, 30.0  # times the median step, and degrees, between neighbouring frames of a video
-_FOCAL_BOUNDS = (0.35, 3.0)  # focal length over picture width: 110 degrees to 19 degrees across
+_MAX_STEP, _MAX_TURN = 15.0, 30.0  # times the median step, and degrees, between neighboring frames of a video
+_FOCAL_BOUNDS = (0.35, 3.0)  # focal length over image width: 110 degrees to 19 degrees across
 
 
-def implausible(rec: Reconstruction, store: FeatureDatabase, frames: Frames) -> tuple[Caution, ...]:
+def implausible(rec: Reconstruction, store: FeatureDatabase, frames: Frames) -> tuple[QualityWarning, ...]:
     """What speaks against a reconstruction, in plain words; empty where nothing does."""
     checks = (
         _repeated_texture(store),
@@ -38,7 +38,7 @@ def implausible(rec: Reconstruction, store: FeatureDatabase, frames: Frames) -> 
         _jump(rec, frames),
         _weak_link(rec),
     )
-    return tuple(caution for caution in checks if caution is not None)
+    return tuple(warning for warning in checks if warning is not None)
 
 
 def twin_share(xy: Float[Tensor, "n 2"], descriptors: Float[Tensor, "n 128"]) -> float:
@@ -48,7 +48,7 @@ def twin_share(xy: Float[Tensor, "n 2"], descriptors: Float[Tensor, "n 128"]) ->
     return (alike.amax(1) > np.cos(_TWIN_ANGLE)).float().mean().item()
 
 
-def _repeated_texture(store: FeatureDatabase) -> Caution | None:
+def _repeated_texture(store: FeatureDatabase) -> QualityWarning | None:
     shares = []
     with store.open() as database:
         for i in range(0, store.frames, max(1, store.frames // _SAMPLED_FRAMES)):
@@ -58,7 +58,7 @@ def _repeated_texture(store: FeatureDatabase) -> Caution | None:
     share = float(np.median(shares)) if shares else 0.0
     if share < _TWIN_SHARE:
         return None
-    return Caution(
+    return QualityWarning(
         f"The reconstruction is implausible: the scene repeats itself ({share:.0%} of the keypoints have a twin in the"
         " same frame), so frames may have been joined one tile, plank or bar off although all of them fit.",
         "Do not measure on it. Lay things that occur once (a slate, a tool) into the view, mask the pattern out, or "
@@ -66,20 +66,20 @@ def _repeated_texture(store: FeatureDatabase) -> Caution | None:
     )
 
 
-def _bad_lens(rec: Reconstruction) -> Caution | None:
+def _bad_lens(rec: Reconstruction) -> QualityWarning | None:
     ratio = float(rec.cameras.K[0, 0, 0]) / rec.cameras.width
     if _FOCAL_BOUNDS[0] <= ratio <= _FOCAL_BOUNDS[1]:
         return None
-    return Caution(
-        f"The reconstruction is implausible: its focal length ({ratio:.2f} picture widths) is that of no common lens.",
+    return QualityWarning(
+        f"The reconstruction is implausible: its focal length ({ratio:.2f} image widths) is that of no common lens.",
         "Shapes will be stretched in depth. Give --focal and --k1 of the camera, calibrated in water.",
     )
 
 
-def _no_parallax(rec: Reconstruction) -> Caution | None:
+def _no_parallax(rec: Reconstruction) -> QualityWarning | None:
     if len(rec.tracks.point) == 0:
         return None
-    to_camera = rec.cameras.centres[rec.tracks.frame] - rec.points.xyz[rec.tracks.point]
+    to_camera = rec.cameras.centers[rec.tracks.frame] - rec.points.xyz[rec.tracks.point]
     to_camera = to_camera / to_camera.norm(dim=1, keepdim=True)
     count = torch.bincount(rec.tracks.point, minlength=len(rec.points.xyz)).clamp(min=1)
     mean = torch.zeros_like(rec.points.xyz).index_add_(0, rec.tracks.point, to_camera) / count[:, None]
@@ -89,13 +89,13 @@ def _no_parallax(rec: Reconstruction) -> Caution | None:
     angle = 2 * float(torch.rad2deg(widest.median()))
     if angle >= _MIN_ANGLE:
         return None
-    return Caution(
+    return QualityWarning(
         f"The reconstruction is implausible: typical points are seen under rays only {angle:.1f} degrees apart.",
         "The camera turned more than it moved, or the scene is far away: depths are guesses. Swim sideways past it.",
     )
 
 
-def _runaway_depth(rec: Reconstruction) -> Caution | None:
+def _runaway_depth(rec: Reconstruction) -> QualityWarning | None:
     medians = []
     for i in range(len(rec.names)):
         seen = rec.points.xyz[rec.tracks.point[rec.tracks.frame == i]]
@@ -103,14 +103,14 @@ def _runaway_depth(rec: Reconstruction) -> Caution | None:
             medians.append(project(rec.cameras[i], seen[None])[1].median().item())
     if not medians or max(medians) <= _MAX_DEPTH_CHANGE * min(medians):
         return None
-    return Caution(
+    return QualityWarning(
         f"The reconstruction is implausible: the scene is {max(medians) / min(medians):.0f} times as far in one frame"
         " as in another.",
         "The scale drifts along the clip. Use a shorter part, or film so that the path crosses itself.",
     )
 
 
-def _jump(rec: Reconstruction, frames: Frames) -> Caution | None:
+def _jump(rec: Reconstruction, frames: Frames) -> QualityWarning | None:
     if not frames.ordered or len(rec.names) < 5:
         return None
     order = sorted(range(len(rec.names)), key=lambda i: frames.index(rec.names[i]))
@@ -124,13 +124,13 @@ def _jump(rec: Reconstruction, frames: Frames) -> Caution | None:
     if not jumps:
         return None
     name = rec.names[order[jumps[0] + 1]]
-    return Caution(
+    return QualityWarning(
         f"The camera path jumps {len(jumps)} time{'s' if len(jumps) > 1 else ''}, first at {name}.",
-        "Where the film was cut there, split it; else a higher --fps makes neighbouring frames overlap more.",
+        "Where the film was cut there, split it; else a higher --fps makes neighboring frames overlap more.",
     )
 
 
-def _weak_link(rec: Reconstruction) -> Caution | None:
+def _weak_link(rec: Reconstruction) -> QualityWarning | None:
     seen = np.zeros((len(rec.points.xyz), len(rec.names)), np.float32)
     seen[rec.tracks.point.numpy(), rec.tracks.frame.numpy()] = 1
     shared = seen.T @ seen
@@ -138,7 +138,7 @@ def _weak_link(rec: Reconstruction) -> Caution | None:
     parts = sorted(np.bincount(connected_components(shared >= _WEAK_LINK)[1]).tolist(), reverse=True)
     if len(parts) == 1 or parts[1] < 2:
         return None
-    return Caution(
+    return QualityWarning(
         f"Parts of {' + '.join(map(str, parts))} frames did not join well: they share fewer than {_WEAK_LINK} points,"
         " so their place relative to each other is uncertain.",
         "Let lines overlap by half, cross them with one more line, and turn slowly between them; or raise --fps.",

@@ -24,7 +24,15 @@ from swimm3r.io.colmap.model import ColmapModel, from_pycolmap, silence_log, to_
 from swimm3r.io.files.atomic import atomic_path
 from swimm3r.progress import Progress, silent
 from swimm3r.scene.frames import Frames
-from swimm3r.scene.reconstruction import Caution, DepthMaps, Matches, Points, Reconstruction, Tracks, colmap_model
+from swimm3r.scene.reconstruction import (
+    DepthMaps,
+    Matches,
+    Points,
+    QualityWarning,
+    Reconstruction,
+    Tracks,
+    colmap_model,
+)
 from swimm3r.sfm.colmap import calibration, mapping
 from swimm3r.sfm.colmap.plausibility import implausible
 from swimm3r.sfm.features import vlad
@@ -76,20 +84,20 @@ def reconstruct(
         try:
             with atomic_path(working.path) as draft:
                 shutil.copyfile(store.path, draft)
-            model, sizes, cautions = _map(working, frames, pairs, settings, progress)
+            model, sizes, warnings = _map(working, frames, pairs, settings, progress)
             rec = _record(model, working, frames, folder)
             found = implausible(rec, working, frames)
         finally:
             working.path.unlink(missing_ok=True)
-    cautions += _registration_cautions(len(rec.names), sizes, frames)
+    warnings += _registration_warnings(len(rec.names), sizes, frames)
     if settings.housing == "flat":
-        cautions.append(
-            Caution(
+        warnings.append(
+            QualityWarning(
                 "The flat port is only approximated, by a longer focal length and radial distortion.",
-                "Expect distances that drift towards the corners; a dome port or a calibration in water is better.",
+                "Expect distances that drift toward the corners; a dome port or a calibration in water is better.",
             )
         )
-    return replace(rec, cautions=(*found, *cautions))
+    return replace(rec, warnings=(*found, *warnings))
 
 
 def choose_pairs(store: FeatureDatabase, frames: Frames, settings: ColmapSettings) -> list[tuple[int, int]]:
@@ -171,7 +179,7 @@ def _map(
     pairs: list[tuple[int, int]],
     settings: ColmapSettings,
     progress: Progress,
-) -> "tuple[pycolmap.Reconstruction, list[int], list[Caution]]":
+) -> "tuple[pycolmap.Reconstruction, list[int], list[Warning]]":
     n, threads = len(frames), settings.threads or os.cpu_count() or 1
     models = mapping.map_frames(store, settings, progress)
     if not models:
@@ -191,17 +199,17 @@ def _map(
     if sizes[0] < max(min(settings.mapping.min_frames, n), share * n):
         raise _too_few(sizes[0], n, settings)
     mapped = calibration.refine(store, model, settings, progress)
-    cautions = []
+    warnings = []
     if not mapped.refined and settings.intrinsics != "fixed":
         camera = mapped.model.cameras[1]
-        cautions.append(
-            Caution(
+        warnings.append(
+            QualityWarning(
                 f"The lens could not be calibrated from this clip; {camera.focal_length_x:.0f} px was assumed as its"
                 " focal length.",
                 "Shapes may be stretched in depth. Give --focal and --k1 of the camera, calibrated in water.",
             )
         )
-    return mapped.model, sizes, cautions
+    return mapped.model, sizes, warnings
 
 
 def _record(model: "pycolmap.Reconstruction", store: FeatureDatabase, frames: Frames, folder: Path) -> Reconstruction:
@@ -211,7 +219,7 @@ def _record(model: "pycolmap.Reconstruction", store: FeatureDatabase, frames: Fr
     return Reconstruction(
         names=table.names,
         cameras=cameras_of(table),
-        points=Points(torch.from_numpy(table.xyz), _colours(table, frames, index), torch.from_numpy(table.error)),
+        points=Points(torch.from_numpy(table.xyz), _colors(table, frames, index), torch.from_numpy(table.error)),
         tracks=Tracks(*(torch.from_numpy(a) for a in (table.track_point, table.track_frame, table.track_xy))),
         matches=verified_matches(store, index),
         depth=DepthMaps(folder / "z_depth"),
@@ -219,7 +227,7 @@ def _record(model: "pycolmap.Reconstruction", store: FeatureDatabase, frames: Fr
     )
 
 
-def _colours(table: ColmapModel, frames: Frames, index: list[int]) -> Float[Tensor, "p 3"]:
+def _colors(table: ColmapModel, frames: Frames, index: list[int]) -> Float[Tensor, "p 3"]:
     total = torch.zeros(len(table.xyz), 3)
     point, frame = torch.from_numpy(table.track_point), torch.from_numpy(table.track_frame)
     x = torch.from_numpy(table.track_xy[:, 0]).long().clamp(0, frames.width - 1)
@@ -268,7 +276,7 @@ def _lens(camera: Cameras) -> "pycolmap.Camera":
     return pycolmap.Camera(model=name, width=camera.width, height=camera.height, params=params)
 
 
-def _registration_cautions(placed: int, sizes: list[int], frames: Frames) -> list[Caution]:
+def _registration_warnings(placed: int, sizes: list[int], frames: Frames) -> list[QualityWarning]:
     if placed == len(frames):
         return []
     left = len(frames) - placed
@@ -276,14 +284,14 @@ def _registration_cautions(placed: int, sizes: list[int], frames: Frames) -> lis
     if others:
         parts = " + ".join(str(size) for size in (placed, *others))
         return [
-            Caution(
+            QualityWarning(
                 f"The frames fall into parts that did not join ({parts} of {len(frames)}); only the largest is used.",
                 "Record lines that overlap by half, cross them with one line, and keep a slow turn between them; "
                 "a higher --fps helps where the parts follow each other.",
             )
         ]
     return [
-        Caution(
+        QualityWarning(
             f"{left} of {len(frames)} frames could not be placed and are left out.",
             "They are blurred, show open water, or overlap too little with the rest: raise --fps, or swim slower.",
         )

@@ -22,7 +22,7 @@ def misplaced_frames(store: FeatureDatabase, model: "pycolmap.Reconstruction") -
     """Image ids of frames for which a quite different pose explains as many of their matches, or more; at most half.
 
     Each frame is resected (PnP with RANSAC) from the points that at least two other frames see. As those points bend
-    towards where the frame stands, a tie already speaks against it; placing it again must then show which is better.
+    toward where the frame stands, a tie already speaks against it; placing it again must then show which is better.
     """
     import pycolmap
 
@@ -30,8 +30,8 @@ def misplaced_frames(store: FeatureDatabase, model: "pycolmap.Reconstruction") -
     options.ransac.max_error = _MAX_ERROR
     options.ransac.random_seed = _SEED
     gains: dict[int, float] = {}
-    sightings = _matched_points(store, model)
-    for image_id, (feature, xy, xyz) in sightings.items():
+    observations = _matched_points(store, model)
+    for image_id, (feature, xy, xyz) in observations.items():
         image = model.images[image_id]
         standing = _explained(image.cam_from_world(), model.cameras[1], feature, xy, xyz)
         found = pycolmap.estimate_and_refine_absolute_pose(xy, xyz, model.cameras[1], estimation_options=options)
@@ -42,7 +42,7 @@ def misplaced_frames(store: FeatureDatabase, model: "pycolmap.Reconstruction") -
         if possible >= standing and np.degrees(turn.angle()) > _ELSEWHERE:
             gains[image_id] = possible / max(standing, 1)
     worst_first = sorted(gains, key=lambda image_id: gains[image_id], reverse=True)
-    return worst_first[: len(sightings) // 2]
+    return worst_first[: len(observations) // 2]
 
 
 def _explained(

@@ -1,7 +1,7 @@
 """Points for cameras that somebody else placed: SIFT matches, triangulated where the given poses put them.
 
-For files that name poses and no sightings (transforms.json, cameras.xml): without points nobody knows where depth is to
-be looked for. Poses and lenses stay as they are.
+For files that name poses and no observations (transforms.json, cameras.xml): without points nobody knows where depth is
+to be looked for. Poses and lenses stay as they are.
 """
 
 import os
@@ -63,11 +63,11 @@ def triangulate(
         torch.from_numpy(rows[made.track_frame].astype(np.int64)),
         torch.from_numpy(made.track_xy).long(),
     )
-    points, sightings = as_points(tracks, torch.from_numpy(made.track_xy), rec.cameras, frames, order)
+    points, observations = as_points(tracks, torch.from_numpy(made.track_xy), rec.cameras, frames, order)
     old = rec.points
     return replace(
         rec,
         points=Points(*(torch.cat([getattr(p, n) for p in (old, points)]) for n in ("xyz", "rgb", "error"))),
-        tracks=Tracks(sightings.point + len(old.xyz), sightings.frame, sightings.xy),
+        tracks=Tracks(observations.point + len(old.xyz), observations.frame, observations.xy),
         matches=poses.verified_matches(store, list(range(len(rec.names)))),
     )

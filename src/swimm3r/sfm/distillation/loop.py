@@ -33,7 +33,7 @@ from swimm3r.memory import MB, peak_mb
 from swimm3r.progress import Progress, silent
 from swimm3r.sfm.distillation.pairs import PairData, PairItem
 from swimm3r.sfm.distillation.settings import TrainSettings
-from swimm3r.sfm.distillation.state import Rows, resume, write_state
+from swimm3r.sfm.distillation.state import MetricsSums, resume, write_state
 from swimm3r.sfm.distillation.teacher_cache import TeacherCache
 from swimm3r.sfm.mast3r.network import Mast3r
 from swimm3r.sfm.student import adapter_file
@@ -42,7 +42,7 @@ from swimm3r.sfm.student.student import Student, new_student
 
 _ORDER, _WATER = 1, 2  # purposes of randomness
 _TERMS = ("encoder", "decoder", "descriptors", "forward", "inverse", "overshoot", "anchor", "known_water", "clean")
-_LOADERS = 4  # threads that read and resize pictures while the network works
+_LOADERS = 4  # threads that read and resize images while the network works
 
 Validate = Callable[[Student, PairData], dict[str, Any]]
 
@@ -113,12 +113,12 @@ def _run(
     size = batch_size(settings, len(data), workers)
     per_epoch = len(data) // size
     total = settings.epochs * per_epoch
-    optimiser = torch.optim.AdamW(
+    optimizer = torch.optim.AdamW(
         trained_parameters(student).values(), lr=settings.learning_rate, weight_decay=settings.weight_decay
     )
     mark = _fingerprint(settings, base, data)
     state, metrics, adapter = (folder / n for n in ("state.safetensors", "metrics.jsonl", "adapter.safetensors"))
-    done = resume(student, optimiser, state, mark)
+    done = resume(student, optimizer, state, mark)
     if workers.first:
         folder.mkdir(parents=True, exist_ok=True)
         drop_rows_after(metrics, done)
@@ -128,7 +128,7 @@ def _run(
     cache = None
     if settings.teacher_cache_mb:
         cache = TeacherCache(folder / "teacher" / mark[:16] / str(workers.rank), settings.teacher_cache_mb << 20)
-    rows = Rows(metrics, folder / "tensorboard" if settings.tensorboard and workers.first else None)
+    rows = MetricsSums(metrics, folder / "tensorboard" if settings.tensorboard and workers.first else None)
     with ThreadPoolExecutor(_LOADERS) as pool:
         coming = _load(pool, data, settings, size, done + 1, workers) if done < total else []
         for step in range(done + 1, total + 1):
@@ -136,9 +136,9 @@ def _run(
                 progress("training the student", step - 1, total)
             items = [future.result() for future in coming]
             coming = _load(pool, data, settings, size, step + 1, workers) if step < total else []
-            for group in optimiser.param_groups:
+            for group in optimizer.param_groups:
                 group["lr"] = learning_rate(settings, step, total)
-            terms = _step(model, student, optimiser, items, settings, size // workers.count, cache)
+            terms = _step(model, student, optimizer, items, settings, size // workers.count, cache)
             rows.add(_mean_over_workers(terms, workers), step / per_epoch)
             ends_epoch = step % per_epoch == 0
             if workers.first and (step % settings.log_every == 0 or ends_epoch):
@@ -153,7 +153,7 @@ def _run(
                     rows.append({"step": step, "validation": about["validation"]})
                 adapter_file.save(student, base, adapter, about)
             if workers.first and (step % settings.checkpoint_every == 0 or ends_epoch):
-                write_state(student, optimiser, state, {"step": step, "fingerprint": mark})
+                write_state(student, optimizer, state, {"step": step, "fingerprint": mark})
     if workers.first:
         progress("training the student", total, total)
     return adapter
@@ -214,7 +214,7 @@ def _load(
 def _step(
     model: torch.nn.Module,
     student: Student,
-    optimiser: torch.optim.Optimizer,
+    optimizer: torch.optim.Optimizer,
     items: list[PairItem],
     settings: TrainSettings,
     share: int,
@@ -232,13 +232,13 @@ def _step(
             (student.total(terms).sum() / share).backward()
         for name, values in {**terms, "loss": student.total(terms)}.items():
             sums[name] = sums.get(name, torch.zeros((), device=values.device)) + values.detach().sum()
-    optimiser.step()
-    optimiser.zero_grad(set_to_none=True)
+    optimizer.step()
+    optimizer.zero_grad(set_to_none=True)
     return {name: value / share for name, value in sums.items()}
 
 
 def _parts(items: list[PairItem], most: int) -> Iterator[list[PairItem]]:
-    """The items in groups of one size of picture, none larger than `most`."""
+    """The items in groups of one size of image, none larger than `most`."""
     groups: dict[torch.Size, list[PairItem]] = {}
     for item in items:
         groups.setdefault(item.clean.shape, []).append(item)

@@ -1,10 +1,10 @@
-"""Pairs of views as training sees them: the network's pictures of one crop, clear and raw, with ray depth.
+"""Pairs of views as training sees them: the network's images of one crop, clear and raw, with ray depth.
 
-    teacher: the clear picture       student: the raw one, or with probability p the clear one through drawn water
+    teacher: the clear image       student: the raw one, or with probability p the clear one through drawn water
 
 Both come from one framing, so that every token shows the same piece of the scene to both. Water of the augmentation
 acts at ray depth. Where depth is unknown no loss looks, but the student sees it: the open water's Binf where the clear
-picture is black, because nothing is there, and else water at the nearest known depth.
+image is black, because nothing is there, and else water at the nearest known depth.
 """
 
 import hashlib
@@ -38,7 +38,7 @@ class PairItem:
     raw: Float[Tensor, "2 3 h w"]
     ray_depth: Float[Tensor, "2 h w"]  # m, 0 where unknown
     valid: Bool[Tensor, "2 h w"]  # where the water's losses look
-    drawn: Float[Tensor, "2 3 3"]  # Binf, beta_D, beta_B of the augmentation's water; NaN for a picture taken in water
+    drawn: Float[Tensor, "2 3 3"]  # Binf, beta_D, beta_B of the augmentation's water; NaN for an image taken in water
 
 
 @dataclass(frozen=True)
@@ -47,7 +47,7 @@ class PairData:
 
     sequences: tuple[Sequence, ...]
     pairs: tuple[tuple[int, Pair], ...]  # index of the sequence, and the pair in it
-    size: int  # long side of the network's pictures
+    size: int  # long side of the network's images
     patch: int = 16
 
     def __len__(self) -> int:
@@ -64,8 +64,8 @@ class PairData:
             one, two = (sequence.shots[k].name for k in (pair.i, pair.j))
             raise InputError(
                 f"{one} and {two} of {sequence.name} differ in shape",
-                cause="the sequence mixes upright and lying pictures, or sizes",
-                hint="put pictures of each size into a folder of their own",
+                cause="the sequence mixes upright and lying images, or sizes",
+                hint="put images of each size into a folder of their own",
             )
         return PairItem(*(torch.stack([getattr(v, name) for v in views]) for name in PairItem.__annotations__))
 
@@ -75,7 +75,7 @@ class PairData:
         return hashlib.sha256(repr((names, self.size)).encode()).hexdigest()
 
     def two_views(self, index: int) -> "TwoViews | None":
-        """Intrinsics of the network's pictures and the true pose of a pair; None where they are not known."""
+        """Intrinsics of the network's images and the true pose of a pair; None where they are not known."""
         s, pair = self.pairs[index]
         sequence = self.sequences[s]
         first, second = (sequence.shots[k] for k in (pair.i, pair.j))
@@ -104,7 +104,7 @@ class PairData:
     def _view(self, sequence: Sequence, k: int, water: Medium | None) -> "_ViewItem":
         view = load(sequence, k)
         if view.clean is None:
-            raise ValueError(f"{sequence.shots[k].name} has no clean picture; trainable() leaves such shots out")
+            raise ValueError(f"{sequence.shots[k].name} has no clean image; trainable() leaves such shots out")
         height, width = view.clean.shape[:2]
         frame = framing(width, height, self.size, patch=self.patch)
         clean = to_network(view.clean, frame)
@@ -122,7 +122,7 @@ class PairData:
         elif view.raw is not None:
             raw = to_network(view.raw, frame)
         else:
-            raise ValueError(f"{sequence.shots[k].name} has neither a raw picture nor any depth")
+            raise ValueError(f"{sequence.shots[k].name} has neither a raw image nor any depth")
         return _ViewItem(clean, raw, depth, known, drawn)
 
 
@@ -130,7 +130,7 @@ class PairData:
 class TwoViews:
     """What is known about the geometry of a pair."""
 
-    camera: Cameras  # one, with K of the network's pictures; its size is that of the files
+    camera: Cameras  # one, with K of the network's images; its size is that of the files
     second_from_first: Float[Tensor, "4 4"]  # float64; the unit is the sequence's
 
 
@@ -144,9 +144,9 @@ class _ViewItem:
 
 
 def trainable(sequences: Items[Sequence], pairs: Items[Items[Pair]], augmented: bool = True) -> list[tuple[int, Pair]]:
-    """The pairs of the training shots that have what training needs: a clean picture, and a raw one.
+    """The pairs of the training shots that have what training needs: a clean image, and a raw one.
 
-    Where training is `augmented`, depth stands for the raw picture, which is then drawn.
+    Where training is `augmented`, depth stands for the raw image, which is then drawn.
     """
     found = []
     for s, (sequence, own) in enumerate(zip(sequences, pairs, strict=True)):
@@ -172,7 +172,7 @@ def split_data(
     """Training and validation pairs, both spread evenly over all sequences. Raises InputError where none is trainable.
 
     At most a fifth of the pairs is held back. Validation pairs come from the same dives as the training pairs: they
-    tell when training stops helping, not how it generalises, for which the data sets have test sequences.
+    tell when training stops helping, not how it generalizes, for which the data sets have test sequences.
     """
     found = trainable(sequences, pairs, augmented)
     held = set(_evenly(len(found), min(validation, len(found) // 5)))
@@ -182,7 +182,7 @@ def split_data(
     if not kept:
         raise InputError(
             "no pair of shots can be trained on",
-            cause="training needs a clean picture per shot, a raw one (or, with the water augmentation, depth), and "
+            cause="training needs a clean image per shot, a raw one (or, with the water augmentation, depth), and "
             "two shots of one training sequence",
             hint="swimm3r datasets ROOT shows what was found",
         )

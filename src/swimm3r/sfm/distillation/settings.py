@@ -29,7 +29,7 @@ class TrainSettings(Settings):
     micro_batch: CountOrZero = 0
     """Pairs per forward pass, their gradients added up to the batch; 0 is the whole batch. Less memory, same result."""
     size: NetworkSide = 512
-    """Long side of the network's pictures, pixels."""
+    """Long side of the network's images, pixels."""
     precision: Literal["auto", "float32", "bfloat16"] = "auto"
     """Of the frozen trunk; adapters, heads and losses stay float32. auto: bfloat16 on a GPU."""
     seed: Seed = 0
@@ -64,7 +64,7 @@ RECIPES: dict[str, TrainSettings] = {
     "without-augmentation": replace(TrainSettings(), water_probability=0.0),
     # its caption: "disables all physics losses and parametric water augmentation"
     "distillation-only": replace(_without("forward", "inverse", "saturation"), water_probability=0.0),
-    # Dark3R as a system of its own: three feature levels alike, the student also on clear pictures, no water
+    # Dark3R as a system of its own: three feature levels alike, the student also on clear images, no water
     "dark3r": TrainSettings(
         objective=ObjectiveSettings(
             encoder=1.0, decoder=1.0, descriptors=1.0, clean=0.3, forward=0.0, inverse=0.0, saturation=0.0

@@ -20,12 +20,12 @@ from swimm3r.sfm.student.student import Student
 log = logging.getLogger(__name__)
 
 
-def write_state(student: Student, optimiser: torch.optim.Optimizer, path: Path, about: dict[str, object]) -> None:
-    """Trained parameters and the optimiser's moments, whole or not at all; `about` holds `step` and `fingerprint`."""
+def write_state(student: Student, optimizer: torch.optim.Optimizer, path: Path, about: dict[str, object]) -> None:
+    """Trained parameters and the optimizer's moments, whole or not at all; `about` holds `step` and `fingerprint`."""
     stored: dict[str, Tensor] = {}
     for name, parameter in trained_parameters(student).items():
         stored[f"parameter/{name}"] = parameter
-        stored |= {f"{key}/{name}": value for key, value in optimiser.state[parameter].items()}
+        stored |= {f"{key}/{name}": value for key, value in optimizer.state[parameter].items()}
     write_tensors(path, stored, about)
 
 
@@ -35,7 +35,7 @@ class _Header:
     fingerprint: str
 
 
-def resume(student: Student, optimiser: torch.optim.Optimizer, path: Path, mark: str) -> int:
+def resume(student: Student, optimizer: torch.optim.Optimizer, path: Path, mark: str) -> int:
     """The steps done according to the state on disk, which is taken over; 0 where there is none.
 
     Raises InputError for a damaged state and for one of another `mark`.
@@ -52,7 +52,7 @@ def resume(student: Student, optimiser: torch.optim.Optimizer, path: Path, mark:
         kept = {k: stored[f"{k}/{name}"] for k in ("step", "exp_avg", "exp_avg_sq") if f"{k}/{name}" in stored}
         if kept:  # a parameter that never had a gradient has no moments
             moments = {k: v if k == "step" else v.to(parameter.device) for k, v in kept.items()}
-            optimiser.state[parameter] = moments
+            optimizer.state[parameter] = moments
     log.info("going on from step %d", about.step)
     return about.step
 
@@ -65,7 +65,7 @@ def _check_shapes(stored: Mapping[str, Tensor], name: str, parameter: Tensor, pa
             raise damaged(path, f"{key} is not of the shape {tuple(parameter.shape)}", _remedy(path))
 
 
-class Rows:
+class MetricsSums:
     """Sums of the terms since the last row, and the file they go to."""
 
     def __init__(self, path: Path, tensorboard: Path | None = None) -> None:

@@ -1,7 +1,7 @@
 """The teacher's features of each pair, computed in the first epoch and read from disk in the others.
 
-The teacher always sees the same crop of the same clear pictures, water or not, so what it says of a pair never changes.
-A file is named by a hash of the pictures' pixels: pictures that do change find nothing. Features are kept in half
+The teacher always sees the same crop of the same clear images, water or not, so what it says of a pair never changes.
+A file is named by a hash of the images' pixels: images that do change find nothing. Features are kept in half
 precision, and rounded to it before their first use, too: every epoch compares with the same numbers, and a training
 that was interrupted ends with the same bits.
 """
@@ -16,7 +16,7 @@ from safetensors.torch import load_file, save_file
 from torch import Tensor
 
 from swimm3r.io.files.atomic import atomic_path
-from swimm3r.sfm.student.losses import Features
+from swimm3r.sfm.student.losses import PairFeatures
 from swimm3r.sfm.student.student import Student
 
 _LEVELS = ("encoder", "decoder", "descriptors")
@@ -29,9 +29,9 @@ class TeacherCache:
         self._folder = folder
         self._room = max_bytes - sum(path.stat().st_size for path in folder.glob("*.safetensors"))
 
-    def features(self, student: Student, clean: Float[Tensor, "b 2 3 h w"]) -> Features:
-        """What the student's teacher makes of the clear pictures of pairs, on their device."""
-        stored = [self._read(pictures) for pictures in clean]
+    def features(self, student: Student, clean: Float[Tensor, "b 2 3 h w"]) -> PairFeatures:
+        """What the student's teacher makes of the clear images of pairs, on their device."""
+        stored = [self._read(images) for images in clean]
         missing = [k for k, found in enumerate(stored) if found is None]
         if missing:
             made = student.teacher(clean[missing])
@@ -43,19 +43,19 @@ class TeacherCache:
                 }
                 stored[k] = one
                 self._write(clean[k], one)
-        return Features(*(self._stacked(stored, level, clean.device) for level in _LEVELS))
+        return PairFeatures(*(self._stacked(stored, level, clean.device) for level in _LEVELS))
 
     @staticmethod
     def _stacked(stored: list, level: str, device: torch.device) -> tuple[Tensor, ...]:
         names = sorted((name for name in stored[0] if name.startswith(level)), key=lambda name: int(name.split(".")[1]))
         return tuple(torch.stack([one[name].to(device).float() for one in stored]) for name in names)
 
-    def _path(self, pictures: Tensor) -> Path:
-        pixels = pictures.detach().cpu().contiguous().numpy().tobytes()
+    def _path(self, images: Tensor) -> Path:
+        pixels = images.detach().cpu().contiguous().numpy().tobytes()
         return self._folder / f"{blake2b(pixels, digest_size=12).hexdigest()}.safetensors"
 
-    def _read(self, pictures: Tensor) -> dict[str, Tensor] | None:
-        path = self._path(pictures)
+    def _read(self, images: Tensor) -> dict[str, Tensor] | None:
+        path = self._path(images)
         if not path.is_file():
             return None
         try:
@@ -63,10 +63,10 @@ class TeacherCache:
         except (SafetensorError, OSError):  # damaged: made anew, which gives the same numbers
             return None
 
-    def _write(self, pictures: Tensor, features: dict[str, Tensor]) -> None:
+    def _write(self, images: Tensor, features: dict[str, Tensor]) -> None:
         size = sum(value.nbytes for value in features.values())
         if size > self._room:
             return
         self._room -= size
-        with atomic_path(self._path(pictures)) as draft:
+        with atomic_path(self._path(images)) as draft:
             save_file({name: value.cpu().contiguous() for name, value in features.items()}, draft)

@@ -22,7 +22,7 @@ from swimm3r.sfm.features.pair_graph import video_pairs
 from swimm3r.sfm.mast3r import checkpoint
 from swimm3r.sfm.mast3r.network import Mast3r
 from swimm3r.sfm.mast3r.preprocess import framing, to_network
-from swimm3r.sfm.mast3r.settings import Video
+from swimm3r.sfm.mast3r.settings import VideoPairs
 from swimm3r.sfm.student.adapter_file import Base, fingerprint
 
 
@@ -31,7 +31,7 @@ def train_sfm(
     folder: Path,
     settings: TrainSettings,
     weights: Path | None = None,
-    base_licence: str | None = None,
+    base_license: str | None = None,
     device: str = "auto",
     announce: Callable[[loop.Estimate], None] = lambda estimate: None,
     progress: Progress = silent,
@@ -45,7 +45,7 @@ def train_sfm(
     low = settings.precision == "bfloat16" or (settings.precision == "auto" and place.type == "cuda")
     path = published.require("mast3r", weights)
     state, _ = checkpoint.read(path)
-    base = Base(path.name, fingerprint(state), base_licence or _licence(path))
+    base = Base(path.name, fingerprint(state), base_license or _license(path))
     del state
     network = checkpoint.load(path, place, torch.bfloat16 if low else torch.float32)
     sequences = with_made_targets(read_tree(data).sequences, folder / "made", progress)
@@ -88,16 +88,16 @@ def retrieved_pairs(
     for i in range(n):
         progress(f"describing {sequence.name}", i, n)
         view = load(sequence, i)
-        picture = view.clean if view.clean is not None else view.raw
-        assert picture is not None  # every reader gives a shot at least one
-        frame = framing(picture.shape[1], picture.shape[0], size, patch=network.architecture.patch)
+        image = view.clean if view.clean is not None else view.raw
+        assert image is not None  # every reader gives a shot at least one
+        frame = framing(image.shape[1], image.shape[0], size, patch=network.architecture.patch)
         with torch.no_grad():
-            tokens = network.encode(to_network(picture, frame)[None].to(network.decoder_embed.weight.device)).tokens[0]
+            tokens = network.encode(to_network(image, frame)[None].to(network.decoder_embed.weight.device)).tokens[0]
         described.append(tokens.float().cpu())
     progress(f"describing {sequence.name}", n, n)
     mean = torch.stack([tokens.mean(0) for tokens in described]).mean(0)
     similarity = cosine_similarity(torch.stack([global_descriptor(tokens - mean) for tokens in described]))
-    found = video_pairs(n, Video(window=0, closures=settings.retrieved, gap=settings.reach), similarity)
+    found = video_pairs(n, VideoPairs(window=0, closures=settings.retrieved, gap=settings.reach), similarity)
     shots = sequence.shots
     chosen = {(min(pair), max(pair)) for pair in found}
     return [Pair(i, j) for i, j in sorted(chosen) if shots[i].split == shots[j].split]
@@ -109,6 +109,6 @@ def _device(name: str) -> torch.device:
     return torch.device("cuda", int(os.environ.get("LOCAL_RANK", "0"))) if device.type == "cuda" else device
 
 
-def _licence(path: Path) -> str:
-    known = (w.licence for w in published.MANIFEST if w.filename == path.name)
+def _license(path: Path) -> str:
+    known = (w.license for w in published.MANIFEST if w.filename == path.name)
     return next(known, f"not stated: {path.name} is no published checkpoint that Swimm3R knows")

@@ -3,8 +3,8 @@
     depth_absrel       mean |s d - d*| / d* of view 1, ray depths, s = median d* / median d
     rotation_deg       of the essential matrix through the descriptors' matches against the true pose, median;
     translation_deg    the same for the direction of motion; a pair without a pose counts 180
-    restored_psnr      of the clear picture by the head's water at true ray depth, dB over the pixels of known depth
-    raw_psnr           of the picture as taken: what restoration starts from
+    restored_psnr      of the clear image by the head's water at true ray depth, dB over the pixels of known depth
+    raw_psnr           of the image as taken: what restoration starts from
     loss               L_SfM
     water_error        of the head's coefficients in water that the augmentation draws, and so is known: the 68th
                        percentile of |estimate / truth - 1| over frames, one standard error, per coefficient and channel
@@ -111,9 +111,9 @@ def absolute_relative(depth: Float[Tensor, " n"], truth: Float[Tensor, " n"]) ->
     return float(((scale * depth - truth).abs() / truth).mean())
 
 
-def psnr(picture: Float[Tensor, "n 3"], target: Float[Tensor, "n 3"]) -> float:
+def psnr(image: Float[Tensor, "n 3"], target: Float[Tensor, "n 3"]) -> float:
     """Peak signal-to-noise ratio of values in 0..1, dB; 100 for equal ones."""
-    return min(100.0, -10 * math.log10(max(1e-10, float((picture - target).square().mean()))))
+    return min(100.0, -10 * math.log10(max(1e-10, float((image - target).square().mean()))))
 
 
 def pose_error(matches: PixelMatches, truth: TwoViews) -> _PoseError:
@@ -122,7 +122,7 @@ def pose_error(matches: PixelMatches, truth: TwoViews) -> _PoseError:
 
     if len(matches.xy1) < _MIN_MATCHES:
         return _PoseError(_LOST, _LOST)
-    rays = [_normalised(xy, truth) for xy in (matches.xy1, matches.xy2)]
+    rays = [_normalized(xy, truth) for xy in (matches.xy1, matches.xy2)]
     threshold = 1.0 / float(truth.camera.K[0, 0, 0])  # one pixel
     cv2.setRNGSeed(0)
     E, inliers = cv2.findEssentialMat(rays[0], rays[1], np.eye(3), cv2.RANSAC, 0.999, threshold)
@@ -136,7 +136,7 @@ def pose_error(matches: PixelMatches, truth: TwoViews) -> _PoseError:
     return _PoseError(math.degrees(turned), math.degrees(angle))
 
 
-def _normalised(xy: Tensor, truth: TwoViews) -> np.ndarray:
+def _normalized(xy: Tensor, truth: TwoViews) -> np.ndarray:
     """Pixels, whole numbers, as points of the undistorted plane z = 1."""
     K = truth.camera.K[0].double()
     plane = torch.linalg.solve(K[:2, :2], (xy.double() + 0.5 - K[:2, 2]).mT).mT

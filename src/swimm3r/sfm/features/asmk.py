@@ -127,7 +127,7 @@ def aggregate(features: Float[Tensor, "n c"], codebook: Float[Tensor, "words c"]
     """A frame's signatures, each feature counted at its `words` nearest visual words."""
     if len(features) == 0:
         return Signatures(np.zeros(0, np.int64), np.zeros((0, -(-codebook.shape[1] // 8)), np.uint8))
-    # the nearest centroid maximises x.c - |c|^2 / 2
+    # the nearest centroid maximizes x.c - |c|^2 / 2
     closeness = features @ codebook.T - (codebook * codebook).sum(1) / 2
     nearest = closeness.topk(min(words, len(codebook)), dim=1).indices
     present, slot = nearest.flatten().unique(return_inverse=True)

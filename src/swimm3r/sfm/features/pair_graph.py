@@ -15,7 +15,15 @@ from scipy.sparse.csgraph import connected_components
 from torch import Tensor
 
 from swimm3r.errors import UsageError
-from swimm3r.sfm.mast3r.settings import Complete, LogWindow, OneReference, PairGraph, Retrieval, SlidingWindow, Video
+from swimm3r.sfm.mast3r.settings import (
+    Complete,
+    LogWindow,
+    OneReference,
+    PairGraph,
+    Retrieval,
+    SlidingWindow,
+    VideoPairs,
+)
 
 Pairs = list[tuple[int, int]]
 
@@ -42,7 +50,7 @@ def parse_graph(text: str) -> PairGraph:
         case "retrieval", 0 | 2, []:
             return Retrieval(*numbers)
         case "video", 0 | 2, []:
-            return Video(*numbers)
+            return VideoPairs(*numbers)
     raise UsageError(
         f"there is no pair graph {text!r}",
         cause="a mistyped name or number",
@@ -63,7 +71,7 @@ def make_pairs(n: int, graph: PairGraph, similarity: Float[Tensor, "n n"] | None
                 cause="frames count from 0",
                 hint=f"oneref-0 to oneref-{n - 1}",
             )
-        case Video():
+        case VideoPairs():
             found = video_pairs(n, graph, _needed(similarity, n) if graph.closures else None)
         case _:
             found = reference_pairs(n, graph, similarity)
@@ -85,11 +93,11 @@ def reference_pairs(n: int, graph: PairGraph, similarity: Float[Tensor, "n n"] |
             return [(frame, j) for j in range(n) if j != frame]
         case Retrieval():
             return retrieval_pairs(_needed(similarity, n), graph)
-        case Video():
+        case VideoPairs():
             raise ValueError("the reference has no video graph")
 
 
-def video_pairs(n: int, graph: Video, similarity: Float[Tensor, "n n"] | None) -> Pairs:
+def video_pairs(n: int, graph: VideoPairs, similarity: Float[Tensor, "n n"] | None) -> Pairs:
     """A window along the sequence and, per frame, the most similar far-away frames, a window apart from each other."""
     found = _window(n, range(1, graph.window + 1), cyclic=False)
     if similarity is None:
@@ -117,7 +125,7 @@ def retrieval_pairs(similarity: Float[Tensor, "n n"], graph: Retrieval) -> Pairs
             j = keys[int(np.argmin(distance[i, keys]))]
             found.add((min(i, j), max(i, j)))
     for i in range(n):
-        for j in np.argsort(distance[i], kind="stable")[: graph.neighbours]:
+        for j in np.argsort(distance[i], kind="stable")[: graph.neighbors]:
             if i != j:
                 found.add((min(i, int(j)), max(i, int(j))))
     return list(found)

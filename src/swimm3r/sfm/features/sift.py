@@ -1,6 +1,6 @@
-"""SIFT for hazy pictures: where the keypoints are, what they look like, and which of two pictures' keypoints agree.
+"""SIFT for hazy images: where the keypoints are, what they look like, and which of two images' keypoints agree.
 
-Haze lowers contrast, not shape, so the detector's threshold is lowered and, where asked, local contrast is equalised
+Haze lowers contrast, not shape, so the detector's threshold is lowered and, where asked, local contrast is equalized
 (CLAHE) before detection. Two keypoints match if each is the other's nearest in angle between descriptors, and nearer
 than `max_ratio` times the second nearest from both sides (Lowe 2004).
 """
@@ -19,47 +19,47 @@ from swimm3r.sfm.settings import FeatureSettings
 if TYPE_CHECKING:
     import pycolmap
 
-_MAX_ANGLE = 0.7  # radians between descriptors beyond which the nearest neighbour is a stranger (COLMAP's limit)
-_UPSAMPLE_BELOW = 700  # long side in pixels; small pictures have their detail at half a pixel's blur, large ones do not
+_MAX_ANGLE = 0.7  # radians between descriptors beyond which the nearest neighbor is a stranger (COLMAP's limit)
+_UPSAMPLE_BELOW = 700  # long side in pixels; small images have their detail at half a pixel's blur, large ones do not
 
 
 @dataclass(frozen=True)
 class Features:
-    """The keypoints of one picture, as COLMAP stores them."""
+    """The keypoints of one image, as COLMAP stores them."""
 
-    keypoints: np.ndarray  # [n, 4] float32: x, y, scale, orientation; pixels of the full picture
+    keypoints: np.ndarray  # [n, 4] float32: x, y, scale, orientation; pixels of the full image
     descriptors: np.ndarray  # [n, 128] uint8
 
 
 def extract_features(image: Float[Tensor, "h w 3"], usable: Bool[Tensor, "h w"], settings: FeatureSettings) -> Features:
-    """Keypoints of a picture outside its mask."""
+    """Keypoints of an image outside its mask."""
     import cv2
     import pycolmap
 
     # Rec. 601 luma, as every SIFT is fed
-    grey = (image.numpy() @ np.array([0.299, 0.587, 0.114], np.float32) * 255).round().astype(np.uint8)
-    height, width = grey.shape
+    gray = (image.numpy() @ np.array([0.299, 0.587, 0.114], np.float32) * 255).round().astype(np.uint8)
+    height, width = gray.shape
     scale = min(1.0, settings.long_side / max(height, width))
     if scale < 1:
-        grey = cv2.resize(grey, (round(width * scale), round(height * scale)), interpolation=cv2.INTER_AREA)
-    if settings.equalise > 0:
-        grey = cv2.createCLAHE(settings.equalise, (8, 8)).apply(grey)
+        gray = cv2.resize(gray, (round(width * scale), round(height * scale)), interpolation=cv2.INTER_AREA)
+    if settings.equalize > 0:
+        gray = cv2.createCLAHE(settings.equalize, (8, 8)).apply(gray)
 
     options = pycolmap.FeatureExtractionOptions()
     options.num_threads = 1
     options.sift.max_num_features = settings.count
     options.sift.peak_threshold = settings.peak_threshold
-    options.sift.first_octave = -1 if max(grey.shape) < _UPSAMPLE_BELOW else 0
-    grey = np.ascontiguousarray(grey)
-    found, described = _detect(grey, options)
+    options.sift.first_octave = -1 if max(gray.shape) < _UPSAMPLE_BELOW else 0
+    gray = np.ascontiguousarray(gray)
+    found, described = _detect(gray, options)
     if len(found) < settings.count:  # water this murky leaves little else than faint keypoints
         options.sift.peak_threshold = settings.faint_threshold
-        found, described = _detect(grey, options)
+        found, described = _detect(gray, options)
     if len(found) == 0:
         return Features(np.zeros((0, 4), np.float32), np.zeros((0, 128), np.uint8))
     keypoints = pycolmap.keypoints_to_matrix(found).astype(np.float32)
-    keypoints[:, 0] *= width / grey.shape[1]
-    keypoints[:, 1] *= height / grey.shape[0]
+    keypoints[:, 0] *= width / gray.shape[1]
+    keypoints[:, 1] *= height / gray.shape[0]
     keypoints[:, 2] /= scale
     x = np.clip(keypoints[:, 0].astype(int), 0, width - 1)
     y = np.clip(keypoints[:, 1].astype(int), 0, height - 1)
@@ -82,11 +82,11 @@ def unit_descriptors(descriptors: np.ndarray) -> Float[Tensor, "n 128"]:
 
 
 def _detect(
-    grey: np.ndarray, options: "pycolmap.FeatureExtractionOptions"
+    gray: np.ndarray, options: "pycolmap.FeatureExtractionOptions"
 ) -> "tuple[pycolmap.FeatureKeypoints, pycolmap.FeatureDescriptors]":
     import pycolmap
 
-    return pycolmap.FeatureExtractor.create(options, pycolmap.Device.cpu).extract_from_uint8_array(grey)
+    return pycolmap.FeatureExtractor.create(options, pycolmap.Device.cpu).extract_from_uint8_array(gray)
 
 
 @numba.njit(cache=True)

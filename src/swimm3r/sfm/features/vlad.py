@@ -1,7 +1,7 @@
 """Which frames look alike: VLAD descriptors over a vocabulary learned from the clip itself, nothing downloaded.
 
 VLAD sums, per visual word, what separates a frame's descriptors from the word (Jegou et al. 2010); each word's sum is
-normalised, so that one repeated texture cannot drown the rest (Arandjelovic and Zisserman 2013).
+normalized, so that one repeated texture cannot drown the rest (Arandjelovic and Zisserman 2013).
 """
 
 from collections.abc import Sequence
@@ -46,7 +46,7 @@ def vocabulary(descriptors: Sequence[Float[Tensor, "_ 128"]], generator: torch.G
 
 
 def summed(descriptors: Float[Tensor, "n 128"], words: Float[Tensor, "k 128"]) -> Float[Tensor, " d"]:
-    """A frame's VLAD descriptor of unit length: per word the normalised sum of what its descriptors differ from it."""
+    """A frame's VLAD descriptor of unit length: per word the normalized sum of what its descriptors differ from it."""
     nearest = (descriptors @ words.mT).argmax(1)
     sums = torch.zeros_like(words).index_add_(0, nearest, descriptors - words[nearest])
     return normalize(normalize(sums, dim=1).flatten(), dim=0)

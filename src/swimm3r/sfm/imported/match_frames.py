@@ -7,7 +7,7 @@ from swimm3r.errors import InputError
 from swimm3r.io.colmap.model import ColmapModel
 from swimm3r.scene.frames import Frames
 
-_ASPECT = 0.01  # relative difference of aspect ratios beyond which pictures are not those of the model
+_ASPECT = 0.01  # relative difference of aspect ratios beyond which images are not those of the model
 
 
 def model_cameras(frames: Frames, model: ColmapModel) -> tuple[tuple[str, ...], Cameras]:
@@ -30,9 +30,9 @@ def at_frame_size(cameras: Cameras, frames: Frames) -> Cameras:
     width, height = frames.width, frames.height
     if abs(width * cameras.height / (height * cameras.width) - 1) > _ASPECT:
         raise InputError(
-            f"the frames are {width}x{height}, the COLMAP model's pictures {cameras.width}x{cameras.height}",
-            cause="the pictures were cropped or turned after the model was made",
-            hint="give the pictures that the model was made of",
+            f"the frames are {width}x{height}, the COLMAP model's images {cameras.width}x{cameras.height}",
+            cause="the images were cropped or turned after the model was made",
+            hint="give the images that the model was made of",
         )
     if (width, height) == (cameras.width, cameras.height):
         return cameras

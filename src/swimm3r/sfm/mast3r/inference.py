@@ -70,7 +70,7 @@ def predict_pairs(
 ) -> Iterator[PairPrediction]:
     """The pairs' predictions one after another, in the order given.
 
-    `image` gives the network's picture (-1..1, see `preprocess.to_network`) of a frame; `heads` says whether pointmaps
+    `image` gives the network's image (-1..1, see `preprocess.to_network`) of a frame; `heads` says whether pointmaps
     and descriptors are wanted. 1 GiB holds 340 encodings of 512 x 384 pixels in float32.
     """
 

@@ -1,4 +1,4 @@
-"""Which pixels of two views show the same point: reciprocal nearest neighbours of dense descriptors (MASt3R, sec. 3.3).
+"""Which pixels of two views show the same point: reciprocal nearest neighbors of dense descriptors (MASt3R, sec. 3.3).
 
 From a grid of seeds in view 1, walk to the nearest descriptor in view 2 and back until the walk stands still; it then
 stands on a reciprocal pair. Costs a hundredth of comparing every pixel with every pixel and finds the pairs with the
@@ -66,7 +66,7 @@ def match_pass(
     """Matches from one pass of the network only; the confidence is the smaller of the two pixels'.
 
     With a tolerance (pixels) the seeds themselves are matched if their walk comes back that near: an even cover of the
-    view, for localisation.
+    view, for localization.
     """
     grids = [None, None]
     if pixel_tolerance > 0:

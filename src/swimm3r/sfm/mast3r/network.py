@@ -58,7 +58,7 @@ class Encoded:
 
 @dataclass(frozen=True)
 class Decoded:
-    """One view after the exchange: [0] the encoder's tokens, [i] after decoder block i, the last one normalised."""
+    """One view after the exchange: [0] the encoder's tokens, [i] after decoder block i, the last one normalized."""
 
     tokens: tuple[Float[Tensor, "b n _"], ...]
     height: int

@@ -1,8 +1,8 @@
-"""From a picture to what the network sees, and every pixel's way there and back.
+"""From an image to what the network sees, and every pixel's way there and back.
 
-undistort -> resize to a long side of 512 (Lanczos down, bicubic up) -> centre crop to whole patches -> -1..1
+undistort -> resize to a long side of 512 (Lanczos down, bicubic up) -> center crop to whole patches -> -1..1
 
-Resize and crop act on pixel coordinates with centres at +0.5, so that a picture's edge stays an edge:
+Resize and crop act on pixel coordinates with centers at +0.5, so that an image's edge stays an edge:
 
     u' = s_x u - x_0,   v' = s_y v - y_0,   K' = [[s_x, 0, -x_0], [0, s_y, -y_0], [0, 0, 1]] K
 """
@@ -21,20 +21,20 @@ from swimm3r.cameras import Cameras, distorted_grid
 
 @dataclass(frozen=True)
 class Framing:
-    """How a picture of one size becomes the network's."""
+    """How an image of one size becomes the network's."""
 
-    width: int  # of the picture, pixels
+    width: int  # of the image, pixels
     height: int
     resized_width: int
     resized_height: int
-    left: int  # of the crop in the resized picture
+    left: int  # of the crop in the resized image
     top: int
     network_width: int
     network_height: int
 
     @property
     def matrix(self) -> Float[Tensor, "3 3"]:
-        """Picture pixels to network pixels, float64."""
+        """Image pixels to network pixels, float64."""
         sx, sy = self.resized_width / self.width, self.resized_height / self.height
         return torch.tensor([[sx, 0, -self.left], [0, sy, -self.top], [0, 0, 1]], dtype=torch.float64)
 
@@ -42,8 +42,8 @@ class Framing:
 def framing(width: int, height: int, size: int = 512, square_ok: bool = False, patch: int = 16) -> Framing:
     """The framing of the published network: long side `size`; 224 means a square crop of the short side.
 
-    A square picture loses a quarter of its height unless `square_ok`: the network was trained on 4:3 at the squarest.
-    Raises ValueError for a picture so narrow that not one patch is left.
+    A square image loses a quarter of its height unless `square_ok`: the network was trained on 4:3 at the squarest.
+    Raises ValueError for an image so narrow that not one patch is left.
     """
     long = size if size != 224 else round(224 * max(width / height, height / width))
     longest = max(width, height)
@@ -56,15 +56,15 @@ def framing(width: int, height: int, size: int = 512, square_ok: bool = False, p
         if resized_width == resized_height and not square_ok:
             half_height = 3 * half_width // 4
     if half_width == 0 or half_height == 0:
-        raise ValueError(f"a picture of {width} x {height} pixels is too narrow for the network")
+        raise ValueError(f"an image of {width} x {height} pixels is too narrow for the network")
     left, top = cx - half_width, cy - half_height
     return Framing(width, height, resized_width, resized_height, left, top, 2 * half_width, 2 * half_height)
 
 
-def to_network(picture: Float[Tensor, "h w 3"], frame: Framing) -> Float[Tensor, "3 H W"]:
-    """A picture (0..1, undistorted) resized and cropped, in -1..1; through 8 bits, as the network was trained."""
-    _check_size(picture, frame)
-    pixels = (picture.clamp(0, 1) * 255).round().to(torch.uint8).cpu().numpy()
+def to_network(source: Float[Tensor, "h w 3"], frame: Framing) -> Float[Tensor, "3 H W"]:
+    """An image (0..1, undistorted) resized and cropped, in -1..1; through 8 bits, as the network was trained."""
+    _check_size(source, frame)
+    pixels = (source.clamp(0, 1) * 255).round().to(torch.uint8).cpu().numpy()
     shrinks = max(frame.width, frame.height) > max(frame.resized_width, frame.resized_height)
     image = Image.fromarray(pixels).resize(
         (frame.resized_width, frame.resized_height),
@@ -75,7 +75,7 @@ def to_network(picture: Float[Tensor, "h w 3"], frame: Framing) -> Float[Tensor,
 
 
 def mask_to_network(mask: Bool[Tensor, "h w"], frame: Framing) -> Bool[Tensor, "H W"]:
-    """True where every picture pixel under a network pixel may be used."""
+    """True where every image pixel under a network pixel may be used."""
     _check_size(mask, frame)
     unusable = (~mask).float()[None, None]
     # area averaging sees every pixel, so a thin masked line cannot slip through
@@ -84,44 +84,44 @@ def mask_to_network(mask: Bool[Tensor, "h w"], frame: Framing) -> Bool[Tensor, "
 
 
 def K_to_network(K: Float[Tensor, "*c 3 3"], frame: Framing) -> Float[Tensor, "*c 3 3"]:
-    """Intrinsics of the picture -> of the network's image."""
+    """Intrinsics of the image -> of the network's image."""
     return frame.matrix.to(K) @ K
 
 
-def K_to_picture(K: Float[Tensor, "*c 3 3"], frame: Framing) -> Float[Tensor, "*c 3 3"]:
-    """Intrinsics of the network's image -> of the picture."""
+def K_to_image(K: Float[Tensor, "*c 3 3"], frame: Framing) -> Float[Tensor, "*c 3 3"]:
+    """Intrinsics of the network's image -> of the image."""
     return torch.linalg.inv(frame.matrix).to(K) @ K
 
 
 def pixels_to_network(xy: Float[Tensor, "*m 2"], frame: Framing) -> Float[Tensor, "*m 2"]:
-    """Pixels of the picture -> of the network's image; centres at +0.5 in both."""
+    """Pixels of the image -> of the network's image; centers at +0.5 in both."""
     matrix = frame.matrix.to(xy)
     return xy * matrix.diagonal()[:2] + matrix[:2, 2]
 
 
-def pixels_to_picture(xy: Float[Tensor, "*m 2"], frame: Framing) -> Float[Tensor, "*m 2"]:
-    """Pixels of the network's image -> of the picture; add 0.5 to whole pixel numbers first."""
+def pixels_to_image(xy: Float[Tensor, "*m 2"], frame: Framing) -> Float[Tensor, "*m 2"]:
+    """Pixels of the network's image -> of the image; add 0.5 to whole pixel numbers first."""
     matrix = frame.matrix.to(xy)
     return (xy - matrix[:2, 2]) / matrix.diagonal()[:2]
 
 
 def remove_distortion(
-    picture: Float[Tensor, "h w 3"], mask: Bool[Tensor, "h w"], camera: Cameras
+    source: Float[Tensor, "h w 3"], mask: Bool[Tensor, "h w"], camera: Cameras
 ) -> tuple[Float[Tensor, "h w 3"], Bool[Tensor, "h w"], Cameras]:
-    """The picture a pinhole camera of the same K and size would take, where it is known, and that camera.
+    """The image a pinhole camera of the same K and size would take, where it is known, and that camera.
 
-    Of a fisheye only the part near the axis fits into such a picture. Unknown pixels are False in the mask.
+    Of a fisheye only the part near the axis fits into such an image. Unknown pixels are False in the mask.
     """
     if len(camera) != 1:
         raise ValueError(f"remove_distortion takes one camera, got {len(camera)}")
     if camera.model == "PINHOLE":
-        return picture, mask, camera
+        return source, mask, camera
     pinhole = replace(camera, model="PINHOLE", distortion=camera.distortion[:, :0])
     source, inside = distorted_grid(camera, pinhole)
     size = torch.tensor([camera.width, camera.height], dtype=source.dtype)
     sampled = F.grid_sample(
-        torch.cat([picture, mask[..., None].to(picture)], dim=-1).permute(2, 0, 1)[None],
-        (source / size * 2 - 1).to(picture)[None],
+        torch.cat([source, mask[..., None].to(source)], dim=-1).permute(2, 0, 1)[None],
+        (source / size * 2 - 1).to(source)[None],
         mode="bilinear",
         padding_mode="border",
         align_corners=False,
@@ -136,4 +136,4 @@ def _crop(frame: Framing) -> tuple[slice, slice]:
 def _check_size(image: Tensor, frame: Framing) -> None:
     if image.shape[:2] != (frame.height, frame.width):
         h, w = image.shape[:2]
-        raise ValueError(f"the framing is for pictures of {frame.width} x {frame.height} pixels, got {w} x {h}")
+        raise ValueError(f"the framing is for images of {frame.width} x {frame.height} pixels, got {w} x {h}")

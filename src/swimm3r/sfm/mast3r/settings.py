@@ -52,14 +52,14 @@ class Retrieval(Settings):
     """Key frames far apart, all paired; every other frame with its nearest key frame; all with their most similar."""
 
     key_frames: CountOrZero = 20
-    neighbours: CountOrZero = 10
+    neighbors: CountOrZero = 10
     """Counted as the reference does: the frame itself is the first of them."""
     seed: Seed = 0
     """Draws the first key frame."""
 
 
 @dataclass(frozen=True)
-class Video(Settings):
+class VideoPairs(Settings):
     """An ordered window for the path and the most similar far-away frames to close its loops."""
 
     window: CountOrZero = 4
@@ -70,7 +70,7 @@ class Video(Settings):
     """Nearer frames than this are the window's business, not a loop."""
 
 
-PairGraph = Complete | SlidingWindow | LogWindow | OneReference | Retrieval | Video
+PairGraph = Complete | SlidingWindow | LogWindow | OneReference | Retrieval | VideoPairs
 
 
 @dataclass(frozen=True)
@@ -88,7 +88,7 @@ class AlignmentSettings(Settings):
     """Sparse global alignment (`sfm/alignment/`); the defaults are MASt3R-SfM's unless a line says otherwise."""
 
     subsample: Annotated[int, Range(1, 64)] = 8
-    """One depth per block of this many pixels is optimised; the rest of the block follows it."""
+    """One depth per block of this many pixels is optimized; the rest of the block follows it."""
     coarse_iterations: CountOrZero = 300
     """Poses and scales, on distances in space."""
     coarse_rate: Rate = 0.07
@@ -99,10 +99,10 @@ class AlignmentSettings(Settings):
     """`prior` and `fixed` need known intrinsics; `prior` keeps them near, `fixed` does not move them."""
     prior_weight: NotNegative = 10.0
     """Of the squared relative deviation of focal and principal point, against a loss of about one pixel."""
-    optimise_principal_point: bool = False
+    optimize_principal_point: bool = False
     """The reference does. But on a path without roll a shifted principal point and a turned camera look the same: on an
     exact scene of five 512 x 384 frames it costs 0.9 degrees and 3 % of focal length, against 0.03 degrees without."""
-    optimise_depth: bool = True
+    optimize_depth: bool = True
     depth: Literal["add", "multiply"] = "add"
     """How a block's depth follows its frame's scale: as an offset from the focal plane, or as a factor."""
     exponential_depth: bool = False
@@ -112,7 +112,7 @@ class AlignmentSettings(Settings):
     """Pairs without any match above it are aligned by their pointmaps instead; the reference's function has 5, its
     authors recommend 0."""
     parity: bool = False
-    """The reference's habits: the root's pose is free, pixel centres are at whole numbers, and the result is the one
+    """The reference's habits: the root's pose is free, pixel centers are at whole numbers, and the result is the one
     before the last step."""
 
 
@@ -135,27 +135,27 @@ class LoraSettings(Settings):
 
 @dataclass(frozen=True)
 class ObjectiveSettings(Settings):
-    """What is minimised (`sfm/student/losses.py`); the defaults are the paper's, Eq. geom to stage1_objective."""
+    """What is minimized (`sfm/student/losses.py`); the defaults are the paper's, Eq. geom to stage1_objective."""
 
     encoder: NotNegative = 0.5
     decoder: NotNegative = 0.5
     descriptors: NotNegative = 2.0
     clean: NotNegative = 0.0
-    """Weight of the same distances with the student on the clear pictures; Dark3R's 0.3, not in this paper."""
+    """Weight of the same distances with the student on the clear images; Dark3R's 0.3, not in this paper."""
     reduction: Literal["mean", "token", "sum"] = "mean"
     """The paper writes squared norms without saying over what: mean over all elements; sum over channels and mean over
     tokens or pixels; or the sum, which makes the encoder's term thousands of times larger than the descriptors'."""
     decoder_levels: Literal["last", "all"] = "last"
-    """The decoder's normalised output, or the outputs of all its blocks."""
+    """The decoder's normalized output, or the outputs of all its blocks."""
     forward: NotNegative = 1.0
     inverse: NotNegative = 1.0
     saturation: NotNegative = 1.0
     anchor: NotNegative = 0.5
-    """Inside L_sat, of the veiling light's distance to the dim pixels' colour. It pulls Binf below the truth wherever
+    """Inside L_sat, of the veiling light's distance to the dim pixels' color. It pulls Binf below the truth wherever
     the dimmest pixels are nearer than the open water; 0 leaves it out."""
     anchor_quantile: Share = 0.05
     known_water: NotNegative = 0.0
-    """Weight of the head's mistake in T_D and B themselves, in pictures whose water the augmentation drew. Not in the
+    """Weight of the head's mistake in T_D and B themselves, in images whose water the augmentation drew. Not in the
     paper: L_inv makes a head that is not sure err on the side of clear water, and this does not."""
     min_transmittance: PositiveShare = 0.05
     """eps_inv of Eq. swimm3r_render_inverse; the paper gives none. At 1/20 a noise of 1/255 stays below 0.08."""

@@ -10,11 +10,19 @@ from dataclasses import dataclass
 import torch
 
 from swimm3r.sfm.mast3r.network import Architecture, Mast3r
-from swimm3r.sfm.mast3r.settings import Complete, LogWindow, OneReference, PairGraph, Retrieval, SlidingWindow, Video
-from swimm3r.sfm.mast3r_sfm.network_frames import NetworkPictures
+from swimm3r.sfm.mast3r.settings import (
+    Complete,
+    LogWindow,
+    OneReference,
+    PairGraph,
+    Retrieval,
+    SlidingWindow,
+    VideoPairs,
+)
+from swimm3r.sfm.mast3r_sfm.network_frames import NetworkImages
 from swimm3r.sfm.settings import Mast3rSettings
 
-_SEARCHES = 10  # nearest-neighbour searches over all seeds that the walks of one pair amount to
+_SEARCHES = 10  # nearest-neighbor searches over all seeds that the walks of one pair amount to
 _MATCHING_FLOPS = 2.4e10  # per second of one core: thin products, then a maximum
 _POINT_BYTES = 400  # of the alignment's graph, per matched pixel of a frame (benchmarks/mast3r_scale.py)
 _POINT_SECONDS = 4e-7  # of one alignment step, per matched pixel of a frame (benchmarks/mast3r_scale.py)
@@ -38,12 +46,12 @@ class Plan:
         )
 
 
-def make_plan(network: Mast3r, pictures: NetworkPictures, graph: PairGraph, settings: Mast3rSettings) -> Plan:
+def make_plan(network: Mast3r, images: NetworkImages, graph: PairGraph, settings: Mast3rSettings) -> Plan:
     """Encodes one frame to see how fast this machine is."""
-    n, frame = len(pictures.frames), pictures.framing
+    n, frame = len(images.frames), images.framing
     pixels = frame.network_width * frame.network_height
     a = network.architecture
-    image = pictures.image(0)[None].to(network.device)
+    image = images.image(0)[None].to(network.device)
     began = time.perf_counter()
     with torch.no_grad():
         float(network.encode(image).tokens.float().sum())  # waits for an accelerator
@@ -80,10 +88,10 @@ def most_pairs(n: int, graph: PairGraph) -> int:
             found = n * size
         case OneReference():
             found = n - 1
-        case Retrieval(keys, neighbours):
+        case Retrieval(keys, neighbors):
             keys = min(keys, n)
-            found = keys * (keys - 1) // 2 + n - keys + n * neighbours
-        case Video(window, closures):
+            found = keys * (keys - 1) // 2 + n - keys + n * neighbors
+        case VideoPairs(window, closures):
             found = n * (window + closures)
     return min(found, n * (n - 1) // 2)
 

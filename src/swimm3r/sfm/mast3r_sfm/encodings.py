@@ -1,7 +1,7 @@
 """Every frame encoded once, whatever number of pairs it is in: on disk keyed by content, and which frames look alike.
 
-A file is named by a hash of the picture as the network sees it and of the network's own weights, so that no file can be
-stale: another picture or another checkpoint is another name.
+A file is named by a hash of the image as the network sees it and of the network's own weights, so that no file can be
+stale: another image or another checkpoint is another name.
 """
 
 from hashlib import blake2b, sha256
@@ -19,7 +19,7 @@ from swimm3r.io.files.damage import guard, remake
 from swimm3r.progress import Progress, silent
 from swimm3r.sfm.features import asmk
 from swimm3r.sfm.mast3r.network import Encoded, Mast3r
-from swimm3r.sfm.mast3r_sfm.network_frames import NetworkPictures
+from swimm3r.sfm.mast3r_sfm.network_frames import NetworkImages
 
 _SAMPLED_FRAMES = 64  # for the mean token
 _USABLE = 0.5  # share of a patch
@@ -28,17 +28,17 @@ _USABLE = 0.5  # share of a patch
 class EncodingStore:
     """Encodings of frames, made on first use and read from disk from then on."""
 
-    def __init__(self, network: Mast3r, pictures: NetworkPictures, folder: Path) -> None:
+    def __init__(self, network: Mast3r, images: NetworkImages, folder: Path) -> None:
         self.network = network
-        self.pictures = pictures
+        self.images = images
         self.folder = folder
         self.network_key = fingerprint(network)
         self._keys: dict[int, str] = {}
 
     def key(self, i: int) -> str:
-        """The name of frame i: its picture and the network."""
+        """The name of frame i: its image and the network."""
         if i not in self._keys:
-            self._keys[i] = sha256(f"{self.pictures.digest(i)} {self.network_key}".encode()).hexdigest()[:24]
+            self._keys[i] = sha256(f"{self.images.digest(i)} {self.network_key}".encode()).hexdigest()[:24]
         return self._keys[i]
 
     def path(self, i: int) -> Path:
@@ -47,7 +47,7 @@ class EncodingStore:
 
     def __getitem__(self, i: int) -> Encoded:
         """The encoding of frame i on the network's device."""
-        path, frame = self.path(i), self.pictures.framing
+        path, frame = self.path(i), self.images.framing
         if path.is_file():
             with (
                 guard(path, remake(path)),
@@ -58,7 +58,7 @@ class EncodingStore:
                 )
             return Encoded(tokens, positions, frame.network_height, frame.network_width)
         with torch.no_grad():  # not inference_mode: its tensors could never meet a gradient
-            encoded = self.network.encode(self.pictures.image(i)[None].to(self.network.device))
+            encoded = self.network.encode(self.images.image(i)[None].to(self.network.device))
         with atomic_path(path) as draft:
             kept = {"tokens": encoded.tokens, "positions": encoded.positions}
             save_file({name: value.cpu().contiguous() for name, value in kept.items()}, draft)
@@ -66,7 +66,7 @@ class EncodingStore:
 
     def fill(self, progress: Progress = silent) -> None:
         """Encode every frame that is not on disk yet."""
-        missing = [i for i in range(len(self.pictures.frames)) if not self.path(i).is_file()]
+        missing = [i for i in range(len(self.images.frames)) if not self.path(i).is_file()]
         for done, i in enumerate(missing):
             progress("encoding frames", done, len(missing))
             self[i]
@@ -88,7 +88,7 @@ def frame_similarity(store: EncodingStore, method: str = "cosine", progress: Pro
     `cosine` compares sums of the tokens' deviations from the dive's mean token, each weighted by its length; `asmk`
     (with the published whitening and codebook, else WeightsError) aggregates them by visual words.
     """
-    n = len(store.pictures.frames)
+    n = len(store.images.frames)
     if method == "asmk":
         whitening = asmk.load_whitening(weights.require("mast3r-retrieval"))
         codebook = asmk.load_codebook(weights.require("mast3r-codebook"))
@@ -111,7 +111,7 @@ def frame_similarity(store: EncodingStore, method: str = "cosine", progress: Pro
 def _tokens(store: EncodingStore, i: int) -> Float[Tensor, "k c"]:
     """The tokens of the patches of frame i that are not masked, float32, on the CPU."""
     tokens = store[i].tokens[0].float().cpu()
-    mask = store.pictures.mask(i)
+    mask = store.images.mask(i)
     return tokens if mask is None else tokens[_usable_patches(mask, len(tokens))]
 
 

@@ -19,12 +19,12 @@ from swimm3r.scene.frames import Frames
 from swimm3r.sfm.imported.match_frames import model_cameras
 from swimm3r.sfm.mast3r.preprocess import (
     Framing,
+    K_to_image,
     K_to_network,
-    K_to_picture,
     framing,
     mask_to_network,
+    pixels_to_image,
     pixels_to_network,
-    pixels_to_picture,
     remove_distortion,
     to_network,
 )
@@ -44,8 +44,8 @@ class KnownPoses:
 
 
 @dataclass(frozen=True)
-class NetworkPictures:
-    """Pictures, masks and intrinsics of frames that share one lens; pictures are made one at a time."""
+class NetworkImages:
+    """Images, masks and intrinsics of frames that share one lens; images are made one at a time."""
 
     frames: Frames
     lens: Cameras  # one camera of the prepared frames
@@ -64,7 +64,7 @@ class NetworkPictures:
         return mask_to_network(self._undistorted(i)[1], self.framing)
 
     def digest(self, i: int) -> str:
-        """What tells frame i, as the network sees it, from any other picture."""
+        """What tells frame i, as the network sees it, from any other image."""
         frame = self.frames.frames[i]
         parts = [frame.path.read_bytes(), repr(self.framing).encode()]
         if frame.mask is not None:
@@ -75,7 +75,7 @@ class NetworkPictures:
 
     @cached_property
     def K(self) -> Float[Tensor, "3 3"] | None:
-        """Known intrinsics in the network's pixels, centres at +0.5; None where the lens is not known."""
+        """Known intrinsics in the network's pixels, centers at +0.5; None where the lens is not known."""
         return K_to_network(self.lens.K[0].double(), self.framing) if self.known else None
 
     def cameras(self, K: Float[Tensor, "n 3 3"], cam2world: Float[Tensor, "n 4 4"]) -> tuple[Cameras, Cameras]:
@@ -84,13 +84,13 @@ class NetworkPictures:
         canvas = Cameras(K, flat, cam2world, self.framing.network_width, self.framing.network_height)
         original = self.lens.K.double().repeat(len(K), 1, 1)
         if self.lens.model == "PINHOLE":
-            original = K_to_picture(K, self.framing)
+            original = K_to_image(K, self.framing)
         lens = replace(self.lens, K=original, distortion=self.lens.distortion.repeat(len(K), 1), cam2world=cam2world)
         return lens, canvas
 
     def to_frame(self, xy: Float[Tensor, "m 2"]) -> Float[Tensor, "m 2"]:
-        """Pixels of the network's picture (centres at +0.5) -> of the prepared frame, distorted as it is."""
-        straight = pixels_to_picture(xy.double(), self.framing)
+        """Pixels of the network's image (centers at +0.5) -> of the prepared frame, distorted as it is."""
+        straight = pixels_to_image(xy.double(), self.framing)
         if self.lens.model == "PINHOLE":
             return straight
         pinhole = replace(self.lens, model="PINHOLE", distortion=self.lens.distortion[:, :0])
@@ -106,25 +106,25 @@ class NetworkPictures:
         return pixels_to_network(straight, self.framing)
 
     def _undistorted(self, i: int) -> tuple[Tensor, Tensor]:
-        picture, mask, _ = remove_distortion(self.frames.image(i), self.frames.mask(i), self.lens)
-        return picture, mask
+        image, mask, _ = remove_distortion(self.frames.image(i), self.frames.mask(i), self.lens)
+        return image, mask
 
 
-def network_pictures(frames: Frames, settings: Mast3rSettings) -> NetworkPictures:
-    """Raises UsageError where the lens settings contradict themselves, InputError for pictures too narrow."""
+def network_images(frames: Frames, settings: Mast3rSettings) -> NetworkImages:
+    """Raises UsageError where the lens settings contradict themselves, InputError for images too narrow."""
     try:
         frame = framing(frames.width, frames.height, settings.size, settings.square_ok)
     except ValueError as error:
         raise InputError(
             str(error),
-            cause="panoramas and strips are no pictures of a camera",
-            hint="pictures up to 16 times as wide as high",
+            cause="panoramas and strips are no images of a camera",
+            hint="images up to 16 times as wide as high",
         ) from error
     if settings.known is not None:
         lens, poses = _from_file(frames, settings, settings.known)
-        return NetworkPictures(frames, lens, True, frame, poses)
+        return NetworkImages(frames, lens, True, frame, poses)
     lens = _lens(frames.width, frames.height, settings)
-    return NetworkPictures(frames, lens, settings.focal is not None, frame)
+    return NetworkImages(frames, lens, settings.focal is not None, frame)
 
 
 def _from_file(frames: Frames, settings: Mast3rSettings, path: Path) -> tuple[Cameras, KnownPoses]:
@@ -142,7 +142,7 @@ def _from_file(frames: Frames, settings: Mast3rSettings, path: Path) -> tuple[Ca
     if not names:
         raise InputError(
             f"none of the {len(frames)} frames is in {path}",
-            cause=f"it is of other pictures; it names {', '.join(foreign.model.names[:3])}, ...",
+            cause=f"it is of other images; it names {', '.join(foreign.model.names[:3])}, ...",
             hint="its names must be those of the prepared frames, with or without suffix",
         )
     intrinsics = torch.cat([cameras.K.flatten(1), cameras.distortion], dim=1)
@@ -173,15 +173,15 @@ def _lens(width: int, height: int, settings: Mast3rSettings) -> Cameras:
     focal = settings.focal
     if focal is None and settings.camera != "PINHOLE":
         raise UsageError(
-            f"a lens with distortion ({settings.camera}) must be known before the network sees its pictures",
+            f"a lens with distortion ({settings.camera}) must be known before the network sees its images",
             cause="--camera was given without --focal",
             hint="add --focal and the distortion of a calibration, or leave --camera at PINHOLE",
         )
     if focal is not None and not 0.1 * width < focal < 20 * width:
         raise UsageError(
-            f"a focal length of {focal:g} px does not fit pictures {width} px wide",
-            cause="it may be in millimetres, or belong to another picture size",
-            hint="give it in pixels of the prepared frames: millimetres / sensor width in millimetres * picture width",
+            f"a focal length of {focal:g} px does not fit images {width} px wide",
+            cause="it may be in millimetres, or belong to another image size",
+            hint="give it in pixels of the prepared frames: millimetres / sensor width in millimetres * image width",
         )
     f = _ASSUMED * width if focal is None else focal
     K = torch.tensor([[[f, 0, width / 2], [0, f, height / 2], [0, 0, 1]]], dtype=torch.float64)

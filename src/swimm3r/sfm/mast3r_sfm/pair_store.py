@@ -104,12 +104,12 @@ class FrameStore:
         partners: Sequence[set[int]],
         max_bytes: int,
         subsample: int = 8,
-        pixel_centre: float = 0.5,
+        pixel_center: float = 0.5,
     ) -> None:
         self.folder = folder
         self.names = names
         self.partners = partners
-        self.subsample, self.pixel_centre = subsample, pixel_centre
+        self.subsample, self.pixel_center = subsample, pixel_center
         self._max_bytes = max_bytes
         self._held: OrderedDict[int, tuple[CanonicalSums, set[int]]] = OrderedDict()
         self._unsaved: set[int] = set()
@@ -184,7 +184,7 @@ class FrameStore:
         sums, _ = self._held.pop(i)
         self._unsaved.discard(i)
         view = canonical_view(sums, self.subsample)
-        frame = anchored_frame(view, self.subsample, self.pixel_centre)
+        frame = anchored_frame(view, self.subsample, self.pixel_center)
         with atomic_path(self._view_path(i)) as draft:
             np.savez(
                 draft,
@@ -205,7 +205,7 @@ class FrameStore:
     def _name(self, i: int) -> str:
         """Of the frame and everything it is averaged over."""
         others = sorted(self.names[p] for p in self.partners[i])
-        return _short(self.names[i], *others, f"{self.subsample} {self.pixel_centre}")
+        return _short(self.names[i], *others, f"{self.subsample} {self.pixel_center}")
 
 
 def _bytes(sums: CanonicalSums) -> int:

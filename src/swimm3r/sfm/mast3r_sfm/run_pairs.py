@@ -19,10 +19,10 @@ from swimm3r.sfm.mast3r import checkpoint
 from swimm3r.sfm.mast3r.inference import EncodingCache, PairPrediction, ViewPrediction, predict_pair
 from swimm3r.sfm.mast3r.matching import DescriptorMap, match_views
 from swimm3r.sfm.mast3r.network import Mast3r
-from swimm3r.sfm.mast3r.settings import AlignmentSettings, PairGraph, Retrieval, Video
+from swimm3r.sfm.mast3r.settings import AlignmentSettings, PairGraph, Retrieval, VideoPairs
 from swimm3r.sfm.mast3r_sfm.cost_estimate import make_plan
 from swimm3r.sfm.mast3r_sfm.encodings import EncodingStore, frame_similarity
-from swimm3r.sfm.mast3r_sfm.network_frames import NetworkPictures
+from swimm3r.sfm.mast3r_sfm.network_frames import NetworkImages
 from swimm3r.sfm.mast3r_sfm.pair_store import FrameStore, PairRecord, PairStore
 from swimm3r.sfm.settings import Mast3rSettings
 from swimm3r.sfm.student import adapter_file
@@ -30,7 +30,7 @@ from swimm3r.sfm.student.physics_head import PhysicsHead
 
 log = logging.getLogger(__name__)
 
-_PAIR = "one pair of pictures"
+_PAIR = "one pair of images"
 _SMALLER = "--precision bfloat16, a smaller --size (384), less --memory-mb, or --device cpu"
 
 
@@ -40,7 +40,7 @@ def load_network(settings: Mast3rSettings) -> Mast3r:
     return checkpoint.load(path, devices.chosen(settings.device), getattr(torch, settings.precision))
 
 
-def put_on(network: Mast3r, adapter: Path, settings: Mast3rSettings) -> PhysicsHead | None:
+def apply_adapter(network: Mast3r, adapter: Path, settings: Mast3rSettings) -> PhysicsHead | None:
     """Makes the network the student of an adapter file, for good, and returns its physics head, if it has one.
 
     Raises WeightsError for a file that is missing or damaged, or that was trained on other weights.
@@ -52,7 +52,7 @@ def put_on(network: Mast3r, adapter: Path, settings: Mast3rSettings) -> PhysicsH
 
 
 @dataclass(frozen=True)
-class Said:
+class PairResults:
     """What the network said about frames, on disk: names and stores to read it with."""
 
     pairs: Pairs
@@ -61,40 +61,40 @@ class Said:
     frame_store: FrameStore
 
 
-def look_at_pairs(
+def run_pairs(
     network: Mast3r,
-    pictures: NetworkPictures,
+    images: NetworkImages,
     graph: PairGraph,
     settings: Mast3rSettings,
     cache: Path,
     progress: Progress = silent,
-) -> Said:
+) -> PairResults:
     """The network over all pairs of a graph; goes on from what `cache` holds."""
-    n = len(pictures.frames)
-    encodings = EncodingStore(network, pictures, cache / "encodings")
+    n = len(images.frames)
+    encodings = EncodingStore(network, images, cache / "encodings")
     with devices.memory_for(_PAIR, _SMALLER):
-        log.info("%s", make_plan(network, pictures, graph, settings))
+        log.info("%s", make_plan(network, images, graph, settings))
         encodings.fill(progress)
     similarity = None
-    if isinstance(graph, Retrieval) or (isinstance(graph, Video) and graph.closures):
+    if isinstance(graph, Retrieval) or (isinstance(graph, VideoPairs) and graph.closures):
         similarity = frame_similarity(encodings, settings.similarity, progress)
     pairs = make_pairs(n, graph, similarity)
     partners: list[set[int]] = [set() for _ in range(n)]
     for i, j in pairs:
         partners[i].add(j)
         partners[j].add(i)
-    # two frames with the same picture are still two frames
-    names = tuple(f"{encodings.key(i)} {name}" for i, name in enumerate(pictures.frames.names))
+    # two frames with the same image are still two frames
+    names = tuple(f"{encodings.key(i)} {name}" for i, name in enumerate(images.frames.names))
     alignment = settings.alignment
     half = settings.memory_mb << 19
-    said = Said(
+    said = PairResults(
         pairs,
         names,
         PairStore(cache / "pairs", f"{settings.matching} {alignment.confidence_threshold} {alignment.parity}"),
         FrameStore(cache / "views", names, partners, half, alignment.subsample, 0.0 if alignment.parity else 0.5),
     )
     cached = EncodingCache(encodings.__getitem__, half)
-    mask_of = lru_cache(maxsize=64)(pictures.mask)  # of a distorted lens it is as dear as a picture
+    mask_of = lru_cache(maxsize=64)(images.mask)  # of a distorted lens it is as dear as an image
     todo = [pair for pair in pairs if not _is_done(said, *pair)]
     for done, (i, j) in enumerate(todo):
         progress("two-view network", done, len(todo))
@@ -106,12 +106,12 @@ def look_at_pairs(
     return said
 
 
-def _is_done(said: Said, i: int, j: int) -> bool:
+def _is_done(said: PairResults, i: int, j: int) -> bool:
     added = said.frame_store.has(i, j) and said.frame_store.has(j, i)
     return added and said.pair_store.has(said.names[i], said.names[j])
 
 
-def _keep(p: PairPrediction, masks: list[Tensor | None], said: Said, settings: Mast3rSettings) -> None:
+def _keep(p: PairPrediction, masks: list[Tensor | None], said: PairResults, settings: Mast3rSettings) -> None:
     assert p.view_ii.points is not None
     assert p.view_jj.points is not None
     assert p.view_ii.confidence is not None

@@ -7,12 +7,12 @@ from swimm3r.errors import InputError
 from swimm3r.io import images
 from swimm3r.progress import Progress, silent
 from swimm3r.scene.frames import Frames
-from swimm3r.scene.reconstruction import Caution, Reconstruction
+from swimm3r.scene.reconstruction import QualityWarning, Reconstruction
 from swimm3r.sfm.medium.backdrop import Backdrop
 from swimm3r.sfm.medium.dense_tracks import fuse_depth
-from swimm3r.sfm.medium.from_head import PredictedWater, dive_fit, predicted_pictures
-from swimm3r.sfm.medium.plausibility import attenuation_is_a_guess, water_cautions
-from swimm3r.sfm.medium.restore import restored_cloud, restored_pictures, shown_gains
+from swimm3r.sfm.medium.from_head import PredictedWater, dive_fit, predicted_images
+from swimm3r.sfm.medium.plausibility import attenuation_is_a_guess, water_warnings
+from swimm3r.sfm.medium.restore import restored_cloud, restored_images, shown_gains
 from swimm3r.sfm.medium.samples import gather_samples
 from swimm3r.sfm.medium.seathru import fit_medium
 from swimm3r.sfm.settings import SfmSettings
@@ -26,10 +26,10 @@ def with_water(
     progress: Progress = silent,
     predicted: PredictedWater | None = None,
 ) -> Reconstruction:
-    """The reconstruction with its water, in both encodings, restored cloud and backdrop, and restored pictures on disk.
+    """The reconstruction with its water, in both encodings, restored cloud and backdrop, and restored images on disk.
 
-    Where depth is too scarce to tell the water, the poses and depth stand without it, under a caution. `predicted` is
-    the physics head's water, which then restores pictures and cloud; only the fit in linear light is Sea-Thru's.
+    Where depth is too scarce to tell the water, the poses and depth stand without it, under a warning. `predicted` is
+    the physics head's water, which then restores images and cloud; only the fit in linear light is Sea-Thru's.
     """
     tracks = fuse_depth(rec, frames, settings.water.tracks, progress)
     samples = gather_samples(rec, frames, tracks, settings.water, progress)
@@ -41,24 +41,24 @@ def with_water(
         )
         linear = fit_medium(samples, settings.water, "linear")
     except InputError as failure:
-        caution = Caution(f"The water was not estimated: {failure.what}.", f"Try: {failure.hint}")
-        return replace(rec, cautions=(*rec.cautions, caution))
+        warning = QualityWarning(f"The water was not estimated: {failure.what}.", f"Try: {failure.hint}")
+        return replace(rec, warnings=(*rec.warnings, warning))
     if predicted is None:
         cloud = restored_cloud(rec, frames, tracks, stored, settings.restore, progress)
     else:
         eps_inv = predicted.head.min_transmittance
         cloud = restored_cloud(rec, frames, tracks, stored, settings.restore, progress, predicted.at, eps_inv)
-    doubts = water_cautions(stored, grey=samples.grey, predicted=predicted is not None)
-    rec = replace(rec, medium=stored, medium_linear=linear, cloud=cloud, cautions=(*rec.cautions, *doubts))
-    pictures = (
-        restored_pictures(rec, frames, settings.restore, progress)
+    doubts = water_warnings(stored, gray=samples.gray, predicted=predicted is not None)
+    rec = replace(rec, medium=stored, medium_linear=linear, cloud=cloud, warnings=(*rec.warnings, *doubts))
+    restored = (
+        restored_images(rec, frames, settings.restore, progress)
         if predicted is None
-        else predicted_pictures(rec, frames, predicted, progress, shown_gains(rec, settings.restore))
+        else predicted_images(rec, frames, predicted, progress, shown_gains(rec, settings.restore))
     )
     backdrop = Backdrop(rec, frames)
-    for i, picture in pictures:
-        shown = frames.image(frames.index(rec.names[i])) if attenuation_is_a_guess(stored) else picture.shown
+    for i, image in restored:
+        shown = frames.image(frames.index(rec.names[i])) if attenuation_is_a_guess(stored) else image.shown
         images.write_rgb(folder / "restored" / f"{rec.names[i]}.png", shown.numpy())
-        images.write_rgb_16(folder / "restored_physical" / f"{rec.names[i]}.png", picture.clear.numpy())
-        backdrop.add(i, picture)
+        images.write_rgb_16(folder / "restored_physical" / f"{rec.names[i]}.png", image.clear.numpy())
+        backdrop.add(i, image)
     return replace(rec, backdrop=backdrop.points())

@@ -1,9 +1,9 @@
-"""Ground that pictures show and no two of them confirm: a guess at where it is, for a map to start on.
+"""Ground that images show and no two of them confirm: a guess at where it is, for a map to start on.
 
 Smooth sand, ground that passes once through a corner, far slopes: plane sweep gives them no depth, so the dense cloud
 has nothing there. Their depth is filled in from the surroundings (`depth_filling`), which is no measurement, so these
 points are kept apart from the cloud. Each piece of ground is taken from the first frame that shows it, unless most of
-that frame's neighbours contradict: they look through the point at a surface behind it, or show another colour there.
+that frame's neighbors contradict: they look through the point at a surface behind it, or show another color there.
 """
 
 import torch
@@ -14,20 +14,20 @@ from swimm3r.cameras import Cameras, directions, project
 from swimm3r.imaging.filters import blur
 from swimm3r.scene.frames import Frames
 from swimm3r.scene.reconstruction import DenseCloud, Reconstruction
-from swimm3r.sfm.medium.restore import RestoredPicture
+from swimm3r.sfm.medium.restore import RestoredImage
 
-_CELLS = 48  # cells along the long side of a picture in which ground is looked for
+_CELLS = 48  # cells along the long side of an image in which ground is looked for
 _POINTS = 2  # along each side of a cell
 _WITNESSES = 200_000  # points of the cloud, at most, that are asked which cells it shows
 _SURFACE = 0.5  # share of open water from which there is no ground
-_MEASURED = 0.1  # share of a picture below which its known depth is too little to guess the rest from
-_NEIGHBOURS = 8  # frames before and after that may contradict
+_MEASURED = 0.1  # share of an image below which its known depth is too little to guess the rest from
+_NEIGHBORS = 8  # frames before and after that may contradict
 _IN_FRONT = 0.1  # share of a known depth by which a point in front of it hides it
-_COLOUR = 0.08  # difference of blurred colours between frames, in any channel, that one surface may show
+_COLOR = 0.08  # difference of blurred colors between frames, in any channel, that one surface may show
 
 
 class Backdrop:
-    """Gathers the guessed ground of one picture after the other."""
+    """Gathers the guessed ground of one image after the other."""
 
     def __init__(self, rec: Reconstruction, frames: Frames) -> None:
         assert rec.cloud is not None
@@ -36,14 +36,14 @@ class Backdrop:
         self._shown = [known[:: max(1, len(known) // _WITNESSES)].double()]
         self._pieces: list[DenseCloud] = []
 
-    def add(self, i: int, picture: RestoredPicture) -> None:
+    def add(self, i: int, image: RestoredImage) -> None:
         """The ground in frame i of the reconstruction that neither the cloud nor an earlier frame shows."""
         camera, name = self.rec.cameras[i], self.rec.names[i]
         f = self.frames.index(name)
         unknown = self.rec.depth[name].z_depth == 0
         if float(unknown.float().mean()) > 1 - _MEASURED:
             return
-        guessed = unknown & (picture.sea < _SURFACE) & self.frames.mask(f)
+        guessed = unknown & (image.sea < _SURFACE) & self.frames.mask(f)
         edge = max(camera.width, camera.height) / _CELLS
         row, column = _lattice(camera, edge / _POINTS)
         take = guessed[row, column]
@@ -54,14 +54,14 @@ class Backdrop:
             return
         pixel = torch.stack([column, row], -1).double() + 0.5
         ray = torch.nn.functional.normalize(directions(camera, pixel[None])[0], dim=-1)
-        in_camera = ray * picture.ray_depth[row, column, None].double()
+        in_camera = ray * image.ray_depth[row, column, None].double()
         xyz = in_camera @ camera.cam2world[0, :3, :3].mT + camera.cam2world[0, :3, 3]
         usable = xyz.isfinite().all(-1) & (in_camera[:, 2] > 0)
         row, column, xyz = row[usable], column[usable], xyz[usable]
         believed = ~self._contradicted(i, xyz, self._blurred(i)[row, column])
         row, column, xyz = row[believed], column[believed], xyz[believed]
         raw = self.frames.image(f)[row, column]
-        self._pieces.append(DenseCloud(xyz.float(), raw, picture.clear[row, column]))
+        self._pieces.append(DenseCloud(xyz.float(), raw, image.clear[row, column]))
         self._shown.append(xyz)
 
     def points(self) -> DenseCloud:
@@ -70,10 +70,10 @@ class Backdrop:
         pieces = [vars(piece) for piece in self._pieces] or [{"xyz": none, "raw": none, "restored": none}]
         return DenseCloud(*(torch.cat([piece[key] for piece in pieces]) for key in ("xyz", "raw", "restored")))
 
-    def _contradicted(self, i: int, xyz: Float[Tensor, "n 3"], colour: Float[Tensor, "n 3"]) -> Bool[Tensor, " n"]:
-        """More of the neighbouring frames that could see a point deny it than confirm it."""
+    def _contradicted(self, i: int, xyz: Float[Tensor, "n 3"], color: Float[Tensor, "n 3"]) -> Bool[Tensor, " n"]:
+        """More of the neighboring frames that could see a point deny it than confirm it."""
         votes = torch.zeros(len(xyz))
-        for j in range(max(0, i - _NEIGHBOURS), min(len(self.rec.names), i + _NEIGHBOURS + 1)):
+        for j in range(max(0, i - _NEIGHBORS), min(len(self.rec.names), i + _NEIGHBORS + 1)):
             if j == i:
                 continue
             camera = self.rec.cameras[j]
@@ -82,16 +82,16 @@ class Backdrop:
             column, row = pixels[0, at].long().unbind(-1)
             known = self.rec.depth[self.rec.names[j]].z_depth[row, column].double()
             nearness = z[0, at] / torch.where(known > 0, known, z[0, at])
-            differs = (self._blurred(j)[row, column] - colour[at]).abs().amax(-1) > _COLOUR
+            differs = (self._blurred(j)[row, column] - color[at]).abs().amax(-1) > _COLOR
             visible = (nearness < 1 + _IN_FRONT) & self.frames.mask(self.frames.index(self.rec.names[j]))[row, column]
             denied = differs | (nearness < 1 - _IN_FRONT)
             votes[at] += torch.where(visible, torch.where(denied, 1.0, -1.0), 0.0)
         return votes > 0
 
     def _blurred(self, i: int) -> Float[Tensor, "h w 3"]:
-        """A frame's picture without what is smaller than the distance between two points."""
-        picture = self.frames.image(self.frames.index(self.rec.names[i]))
-        return blur(picture, max(picture.shape[:2]) / _CELLS / _POINTS / 2)
+        """A frame's image without what is smaller than the distance between two points."""
+        image = self.frames.image(self.frames.index(self.rec.names[i]))
+        return blur(image, max(image.shape[:2]) / _CELLS / _POINTS / 2)
 
 
 def _lattice(camera: Cameras, step: float) -> tuple[Tensor, Tensor]:
@@ -103,7 +103,7 @@ def _lattice(camera: Cameras, step: float) -> tuple[Tensor, Tensor]:
 
 
 def _shown_cells(camera: Cameras, xyz: Tensor, edge: float) -> Bool[Tensor, "rows columns"]:
-    """Which square cells of a picture some point falls into."""
+    """Which square cells of an image some point falls into."""
     pixels, z = project(camera, xyz[None])
     column, row = (pixels[0][_inside(camera, pixels[0], z[0])] / edge).long().unbind(-1)
     cells = torch.zeros(int(camera.height / edge) + 1, int(camera.width / edge) + 1, dtype=torch.bool)

@@ -1,4 +1,4 @@
-"""One colour channel of the water: what its pixels say, and the bounded least squares that weighs it (see seathru.py).
+"""One color channel of the water: what its pixels say, and the bounded least squares that weighs it (see seathru.py).
 
 Cameras in video change exposure and white balance from frame to frame: I = g_f (J T_D + B). The gains g_f are estimated
 with the water, and the residuals of a frame are whitened against the gain error tau that is left,
@@ -34,7 +34,7 @@ class Pixels:
 
 
 @dataclass(frozen=True)
-class Sightings:
+class Observations:
     """Those samples that show points seen from several distances; `point` counts 0.. without gaps."""
 
     rows: np.ndarray  # into the samples
@@ -62,61 +62,61 @@ class _RangeBins:
 
 @dataclass(frozen=True)
 class _Evidence:
-    """What is known besides the sightings."""
+    """What is known besides the observations."""
 
     bins: _RangeBins
     Binf: tuple[float, float]  # median of open water, or else the mean of what is far, and its standard deviation
-    alone: bool  # no sightings
+    alone: bool  # no observations
     lower: np.ndarray
     upper: np.ndarray
 
 
 @dataclass(frozen=True)
 class _Noise:
-    """How the sightings err: weights are square roots of inverse variances."""
+    """How the observations err: weights are square roots of inverse variances."""
 
     weight: np.ndarray
     gain_std: float  # tau
 
 
-def fit_channel(pixels: Pixels, sightings: Sightings | None, settings: SeathruSettings) -> ChannelFit:
+def fit_channel(pixels: Pixels, observations: Observations | None, settings: SeathruSettings) -> ChannelFit:
     """The water of one channel, with frame gains only where steady exposure leaves far larger residuals.
 
     A camera that rises over flat ground with changing exposure looks like one with a steady exposure in other water:
     gains that are not needed would only blur the answer.
     """
-    if sightings is None:
+    if observations is None:
         evidence = _evidence(pixels, 0.0, True, settings)
         x = _best_start(evidence, None, 0.0, settings)
         return ChannelFit(x, _covariance(x, evidence, None, None, settings))
-    fit, spread = _fit_sightings(pixels, sightings, 0.0, settings)
-    if len(np.unique(sightings.frame)) > 2:
-        varying, smaller = _fit_sightings(pixels, sightings, settings.gain_std, settings)
+    fit, spread = _fit_observations(pixels, observations, 0.0, settings)
+    if len(np.unique(observations.frame)) > 2:
+        varying, smaller = _fit_observations(pixels, observations, settings.gain_std, settings)
         if smaller < settings.gain_evidence * spread:
             return varying
     return fit
 
 
-def _fit_sightings(
-    pixels: Pixels, sightings: Sightings, gain_std: float, settings: SeathruSettings
+def _fit_observations(
+    pixels: Pixels, observations: Observations, gain_std: float, settings: SeathruSettings
 ) -> tuple[ChannelFit, float]:
-    """Robust least squares from a grid of starts, refined on all sightings; and the spread of their residuals.
+    """Robust least squares from a grid of starts, refined on all observations; and the spread of their residuals.
 
     Residuals count in units of `scale * sqrt(redundancy)`: their spread, and how many of them repeat the same error
     (estimated from how much the gradients of whole frames scatter).
     """
     evidence = _evidence(pixels, 0.0, False, settings)
-    x = _best_start(evidence, sightings, gain_std, settings)
-    robust, redundancy = np.ones(len(sightings.z)), settings.min_redundancy
+    x = _best_start(evidence, observations, gain_std, settings)
+    robust, redundancy = np.ones(len(observations.z)), settings.min_redundancy
     gain, tau = np.ones(pixels.frame.max() + 1), gain_std
-    seen, noise = sightings, _Noise(robust, tau)
+    seen, noise = observations, _Noise(robust, tau)
     for _ in range(settings.reweightings):
         r = _residuals(x, seen, robust)
         scale = float(np.clip(1.4826 * np.median(np.abs(r)), 1e-3, settings.loss_scale))
         robust = 1 / np.sqrt(1 + (r / (2 * scale)) ** 2)
         if gain_std > 0:
-            gain, tau = _gains(x, sightings, robust / scale**2, tau, len(gain))
-            seen = replace(sightings, I=sightings.I / gain[sightings.frame])
+            gain, tau = _gains(x, observations, robust / scale**2, tau, len(gain))
+            seen = replace(observations, I=observations.I / gain[observations.frame])
             evidence = _evidence(replace(pixels, I=pixels.I / gain[pixels.frame]), tau, False, settings)
         noise = _Noise(np.sqrt(robust / redundancy) / scale, tau)
         x = _solve(x, evidence, seen, noise, settings)
@@ -126,12 +126,12 @@ def _fit_sightings(
 
 
 def _evidence(pixels: Pixels, gain_std: float, alone: bool, settings: SeathruSettings) -> _Evidence:
-    water = _open_water_colour(pixels.open_water, gain_std, settings)
+    water = _open_water_color(pixels.open_water, gain_std, settings)
     lower, upper = LOWER.copy(), UPPER.copy()
     upper[BINF] = _largest_Binf(pixels.I, pixels.z)
     if water is None:
         far = float(np.mean(pixels.I[pixels.z >= np.quantile(pixels.z, 0.9)]))
-        return _Evidence(_range_bins(pixels, settings), (far, settings.far_colour_std), alone, lower, upper)
+        return _Evidence(_range_bins(pixels, settings), (far, settings.far_color_std), alone, lower, upper)
     upper[BINF] = min(1.0, max(upper[BINF], water[0] + 3 * water[1]))
     return _Evidence(_range_bins(pixels, settings), water, alone, lower, upper)
 
@@ -155,7 +155,7 @@ def _range_bins(pixels: Pixels, settings: SeathruSettings) -> _RangeBins:
     return _RangeBins(*np.array(rows).T)
 
 
-def _open_water_colour(I: np.ndarray, gain_std: float, settings: SeathruSettings) -> tuple[float, float] | None:
+def _open_water_color(I: np.ndarray, gain_std: float, settings: SeathruSettings) -> tuple[float, float] | None:
     if len(I) < settings.min_open_water:
         return None
     spread = 1.4826 * np.median(np.abs(I - np.median(I)))
@@ -186,14 +186,14 @@ def _points(T_D: np.ndarray, direct: np.ndarray, point: np.ndarray, weight: np.n
     return J.clip(0.0, 1.0)
 
 
-def _residuals(x: np.ndarray, seen: Sightings, weight: np.ndarray) -> np.ndarray:
+def _residuals(x: np.ndarray, seen: Observations, weight: np.ndarray) -> np.ndarray:
     """I - B - J T_D with the J of every point eliminated."""
     T_D, B = _attenuations(x, seen.z)
     direct = seen.I - B
     return direct - _points(T_D, direct, seen.point, weight)[seen.point] * T_D
 
 
-def _whitened(x: np.ndarray, seen: Sightings, noise: _Noise) -> np.ndarray:
+def _whitened(x: np.ndarray, seen: Observations, noise: _Noise) -> np.ndarray:
     """The residuals in units of their noise, blind to a common gain of each frame as far as gains are uncertain."""
     residuals = _residuals(x, seen, noise.weight**2)
     r, p = noise.weight * residuals, noise.weight * (seen.I - residuals)
@@ -203,9 +203,9 @@ def _whitened(x: np.ndarray, seen: Sightings, noise: _Noise) -> np.ndarray:
 
 
 def _gains(
-    x: np.ndarray, seen: Sightings, weight: np.ndarray, gain_std: float, frames: int
+    x: np.ndarray, seen: Observations, weight: np.ndarray, gain_std: float, frames: int
 ) -> tuple[np.ndarray, float]:
-    """The gain of every frame, 1 on average and 1 where a frame has no sightings, and how much gains vary."""
+    """The gain of every frame, 1 on average and 1 where a frame has no observations, and how much gains vary."""
     T_D, B = _attenuations(x, seen.z)
     gain, present = np.ones(frames), np.unique(seen.frame)
     stay = 1 / gain_std**2
@@ -222,7 +222,7 @@ def _prior_residuals(x: np.ndarray, evidence: _Evidence, settings: SeathruSettin
     """Everything but the tracks, each in its own standard deviations.
 
     Light cannot be missing, so B above the dark envelope is a fault, and a bin without anything black is none. Without
-    sightings nothing tells J' from B: then the darkest pixels are taken for black, as Sea-Thru does.
+    observations nothing tells J' from B: then the darkest pixels are taken for black, as Sea-Thru does.
     """
     bins = evidence.bins
     T_D, B = _attenuations(x, bins.z_dark)
@@ -246,7 +246,7 @@ def _prior_residuals(x: np.ndarray, evidence: _Evidence, settings: SeathruSettin
 
 
 def _solve(
-    start: np.ndarray, evidence: _Evidence, seen: Sightings | None, noise: _Noise | None, settings: SeathruSettings
+    start: np.ndarray, evidence: _Evidence, seen: Observations | None, noise: _Noise | None, settings: SeathruSettings
 ) -> np.ndarray:
     """Levenberg-Marquardt within the bounds: unknowns that press against a bound are left out of the step.
 
@@ -281,10 +281,10 @@ def _solve(
 
 
 def _best_start(
-    evidence: _Evidence, sightings: Sightings | None, gain_std: float, settings: SeathruSettings
+    evidence: _Evidence, observations: Observations | None, gain_std: float, settings: SeathruSettings
 ) -> np.ndarray:
-    """The best local optimum from a grid of starts, on few sightings."""
-    few = None if sightings is None else _thinned(sightings, settings.start_observations)
+    """The best local optimum from a grid of starts, on few observations."""
+    few = None if observations is None else _thinned(observations, settings.start_observations)
     noise = None if few is None else _Noise(np.full(len(few.z), 1 / settings.loss_scale), gain_std)
     best, lowest = None, np.inf
     for start in _starts(evidence):
@@ -306,11 +306,11 @@ def _starts(evidence: _Evidence) -> list[np.ndarray]:
     ]
 
 
-def _thinned(seen: Sightings, count: int) -> Sightings:
-    """Every k-th point, so that about `count` sightings remain."""
+def _thinned(seen: Observations, count: int) -> Observations:
+    """Every k-th point, so that about `count` observations remain."""
     step = max(1, int(np.ceil(len(seen.z) / count)))
     rows = np.flatnonzero(seen.point % step == 0)
-    return Sightings(seen.rows[rows], seen.z[rows], seen.point[rows] // step, seen.frame[rows], seen.I[rows])
+    return Observations(seen.rows[rows], seen.z[rows], seen.point[rows] // step, seen.frame[rows], seen.I[rows])
 
 
 def _jacobian(residuals: Callable[[np.ndarray], np.ndarray], x: np.ndarray, at_x: np.ndarray) -> np.ndarray:
@@ -318,15 +318,15 @@ def _jacobian(residuals: Callable[[np.ndarray], np.ndarray], x: np.ndarray, at_x
     return np.stack([(residuals(x + 1e-6 * e) - at_x) / 1e-6 for e in np.eye(len(x))], -1)
 
 
-def _scores(x: np.ndarray, seen: Sightings, noise: _Noise) -> tuple[np.ndarray, np.ndarray]:
-    """Information of the sightings about the unknowns they see, and the gradient each frame contributes."""
+def _scores(x: np.ndarray, seen: Observations, noise: _Noise) -> tuple[np.ndarray, np.ndarray]:
+    """Information of the observations about the unknowns they see, and the gradient each frame contributes."""
     r = _whitened(x, seen, noise)
     rows = _jacobian(lambda y: _whitened(y, seen, noise), x, r)[:, :4]
     gradient = np.stack([np.bincount(seen.frame, rows[:, i] * r) for i in range(rows.shape[1])], -1)
     return rows.T @ rows, gradient[np.unique(seen.frame)]
 
 
-def _redundancy(x: np.ndarray, seen: Sightings, noise: _Noise) -> float:
+def _redundancy(x: np.ndarray, seen: Observations, noise: _Noise) -> float:
     """By how much the gradients of whole frames scatter more than independent residuals would let them."""
     information, gradient = _scores(x, seen, noise)
     gradient = gradient - gradient.mean(0)
@@ -337,11 +337,11 @@ def _redundancy(x: np.ndarray, seen: Sightings, noise: _Noise) -> float:
 
 
 def _covariance(
-    x: np.ndarray, evidence: _Evidence, seen: Sightings | None, noise: _Noise | None, settings: SeathruSettings
+    x: np.ndarray, evidence: _Evidence, seen: Observations | None, noise: _Noise | None, settings: SeathruSettings
 ) -> np.ndarray:
     """From the curvature at the optimum; unknowns at a bound keep their freedom to leave it.
 
-    On top comes what errors of depth do, which no residual shows: where sightings of a point differ by s in ln z and
+    On top comes what errors of depth do, which no residual shows: where observations of a point differ by s in ln z and
     each is wrong by `depth_error`, differences in depth are overrated by depth_error^2 / s^2, and the betas with them.
     """
     at_x = _prior_residuals(x, evidence, settings)

@@ -1,9 +1,9 @@
 """Dense tracks: the pixels of many depth maps that show the same piece of surface.
 
-A pixel's point is looked up in the other frames; it belongs to the same track where that frame's depth map agrees
-(|z_j - z| <= tolerance * z) and the colours do not contradict. Every pixel is in at most one track. The position of a
-track averages the positions its depth maps give, and the ray depths of its sightings are the distances from the camera
-centres to that one position: errors of single depth maps do not pass for differences in distance.
+A pixel's point is looked up in the other frames; it belongs to the same track where that frame's depth map agrees (|z_j
+- z| <= tolerance * z) and the colors do not contradict. Every pixel is in at most one track. The position of a track
+averages the positions its depth maps give, and the ray depths of its observations are the distances from the camera
+centers to that one position: errors of single depth maps do not pass for differences in distance.
 """
 
 from collections.abc import Iterator
@@ -22,13 +22,13 @@ from swimm3r.sfm.settings import TrackSettings
 
 @dataclass(frozen=True)
 class DenseTracks:
-    """n surface points and their o sightings; sightings of one track stand together."""
+    """n surface points and their o observations; observations of one track stand together."""
 
     xyz: Float[Tensor, "n 3"]  # world
     track: Int[Tensor, " o"]  # index into xyz
     frame: Int[Tensor, " o"]  # index into Reconstruction.names
     pixel: Int[Tensor, " o"]  # row-major index in the prepared frame
-    ray_depth: Float[Tensor, " o"]  # from that frame's camera centre to xyz
+    ray_depth: Float[Tensor, " o"]  # from that frame's camera center to xyz
     confidence: Float[Tensor, " o"]  # of that frame's depth map
 
 
@@ -37,7 +37,7 @@ def fuse_depth(
 ) -> DenseTracks:
     """The dense tracks of the frames that have a depth map; at most about `settings.max_tracks`.
 
-    Pictures and depth maps pass through the bounded caches of `frames` and `rec`; held are one bit per pixel and frame
+    Images and depth maps pass through the bounded caches of `frames` and `rec`; held are one bit per pixel and frame
     and the tracks found so far.
     """
     usable = [i for i, name in enumerate(rec.names) if name in rec.depth]
@@ -66,12 +66,12 @@ def _by_frame(
     free = {i: torch.ones(rec.cameras.height * rec.cameras.width, dtype=torch.bool) for i in usable}
     for done, i in enumerate(usable):
         progress("fusing depth", done, len(usable))
-        yield _tracks_from(i, _neighbours(overlap, i, usable, settings), rec, frames, free, stride, settings)
+        yield _tracks_from(i, _neighbors(overlap, i, usable, settings), rec, frames, free, stride, settings)
     progress("fusing depth", len(usable), len(usable))
 
 
 def frame_overlap(rec: Reconstruction, usable: list[int]) -> Float[Tensor, "f f"]:
-    """The share of frame i's surface (rows) that lies inside frame j's picture (columns); 0 on the diagonal.
+    """The share of frame i's surface (rows) that lies inside frame j's image (columns); 0 on the diagonal.
 
     Seen from the depth maps on a grid of 12 x 16 pixels, occlusion aside.
     """
@@ -110,10 +110,10 @@ def _inside(uv: Float[Tensor, "*points 2"], cameras: Cameras) -> Bool[Tensor, "*
     return ((uv >= 0) & (uv < size)).all(-1)
 
 
-def _neighbours(overlap: Float[Tensor, "f f"], i: int, usable: list[int], settings: TrackSettings) -> list[int]:
+def _neighbors(overlap: Float[Tensor, "f f"], i: int, usable: list[int], settings: TrackSettings) -> list[int]:
     """Other frames that see enough of the surface of frame i: half the best, half evenly from the rest.
 
-    The rest look from farther away or closer: sightings that tell most about the water.
+    The rest look from farther away or closer: observations that tell most about the water.
     """
     known = set(usable)
     order = [j for j in torch.argsort(overlap[i], descending=True, stable=True).tolist() if j in known]
@@ -134,7 +134,7 @@ def _seed_stride(rec: Reconstruction, usable: list[int], settings: TrackSettings
 
 def _tracks_from(
     i: int,
-    neighbours: list[int],
+    neighbors: list[int],
     rec: Reconstruction,
     frames: Frames,
     free: dict[int, Tensor],
@@ -151,12 +151,12 @@ def _tracks_from(
     seeds = torch.nonzero(lattice.reshape(-1) & (z_map > 0) & free[i] & usable)[:, 0]
     free[i][seeds] = False
     start = _unproject(cameras[i], seeds, z_map[seeds])
-    colour = frames.image(frames.index(names[i])).reshape(-1, 3)[seeds]
+    color = frames.image(frames.index(names[i])).reshape(-1, 3)[seeds]
     confidence = depth.confidence.reshape(-1)[seeds]
     weight = confidence.double().clamp(min=0.01)
     total, position = weight.clone(), start * weight[:, None]
-    sightings = [(torch.arange(len(seeds)), torch.full_like(seeds, i), seeds, confidence)]
-    for j in neighbours if len(seeds) else []:
+    observations = [(torch.arange(len(seeds)), torch.full_like(seeds, i), seeds, confidence)]
+    for j in neighbors if len(seeds) else []:
         uv, z = project(cameras[j], start[None])
         uv, z = uv[0], z[0]
         candidates = torch.nonzero(_inside(uv, cameras) & (z > 0))[:, 0]
@@ -164,31 +164,31 @@ def _tracks_from(
         other = rec.depth[names[j]]
         z_other = other.z_depth.reshape(-1)[pixel].double()
         index = frames.index(names[j])
-        change = (frames.image(index).reshape(-1, 3)[pixel] - colour[candidates]).abs().amax(-1)
+        change = (frames.image(index).reshape(-1, 3)[pixel] - color[candidates]).abs().amax(-1)
         agrees = (z_other > 0) & ((z_other - z[candidates]).abs() <= settings.tolerance * z[candidates])
-        agrees &= free[j][pixel] & frames.mask(index).reshape(-1)[pixel] & (change < settings.max_colour_change)
+        agrees &= free[j][pixel] & frames.mask(index).reshape(-1)[pixel] & (change < settings.max_color_change)
         candidates, pixel, z_other = candidates[agrees], pixel[agrees], z_other[agrees]
         first = torch.full((cameras.height * cameras.width,), len(seeds))
         first.scatter_reduce_(0, pixel, candidates, "amin")  # two points in one pixel: the first keeps it
         alone = first[pixel] == candidates
         candidates, pixel, z_other = candidates[alone], pixel[alone], z_other[alone]
         free[j][pixel] = False
-        centre = cameras.centres[j]
-        seen = centre + (start[candidates] - centre) * (z_other / z[candidates])[:, None]
+        center = cameras.centers[j]
+        seen = center + (start[candidates] - center) * (z_other / z[candidates])[:, None]
         trust = other.confidence.reshape(-1)[pixel]
         position.index_add_(0, candidates, seen * trust.double().clamp(min=0.01)[:, None])
         total.index_add_(0, candidates, trust.double().clamp(min=0.01))
-        sightings.append((candidates, torch.full_like(pixel, j), pixel, trust))
+        observations.append((candidates, torch.full_like(pixel, j), pixel, trust))
     xyz = position / total[:, None]
-    track, frame, pixel, confidence = (torch.cat(part) for part in zip(*sightings, strict=True))
+    track, frame, pixel, confidence = (torch.cat(part) for part in zip(*observations, strict=True))
     order = torch.argsort(track, stable=True)
     track, frame = track[order], frame[order]
-    ray_depth = torch.linalg.vector_norm(xyz[track] - cameras.centres[frame], dim=-1)
+    ray_depth = torch.linalg.vector_norm(xyz[track] - cameras.centers[frame], dim=-1)
     return DenseTracks(xyz.float(), track, frame, pixel[order], ray_depth.float(), confidence[order])
 
 
 def _unproject(camera: Cameras, pixel: Int[Tensor, " n"], z_depth: Float[Tensor, " n"]) -> Float[Tensor, "n 3"]:
-    """World points of the centres of row-major pixels, float64."""
+    """World points of the centers of row-major pixels, float64."""
     uv = torch.stack([pixel % camera.width + 0.5, pixel // camera.width + 0.5], -1).double()
     seen = directions(camera, uv[None])[0] * z_depth.double()[:, None]
     return seen @ camera.cam2world[0, :3, :3].mT + camera.cam2world[0, :3, 3]

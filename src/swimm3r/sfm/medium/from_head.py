@@ -31,9 +31,9 @@ from swimm3r.medium import AttenuationCurve, Medium, MediumFit, remove_water
 from swimm3r.progress import Progress, silent
 from swimm3r.scene.frames import Frames
 from swimm3r.scene.reconstruction import Reconstruction
-from swimm3r.sfm.mast3r_sfm.network_frames import NetworkPictures
+from swimm3r.sfm.mast3r_sfm.network_frames import NetworkImages
 from swimm3r.sfm.medium.dense_tracks import ray_depth_map, shared_rays
-from swimm3r.sfm.medium.restore import RestoredPicture
+from swimm3r.sfm.medium.restore import RestoredImage
 from swimm3r.sfm.settings import SeathruSettings
 from swimm3r.sfm.student.physics_head import HeadFacts, WaterMaps
 
@@ -48,10 +48,10 @@ class FrameWater:
 
     Binf: Float[Tensor, "3"]
     beta_B: Float[Tensor, "3"]
-    curve: Float[Tensor, "12 hc wc"]  # a, b, c, d of three channels each, on the network's picture in cells
+    curve: Float[Tensor, "12 hc wc"]  # a, b, c, d of three channels each, on the network's image in cells
 
     def at(self, ray_depth: Float[Tensor, " n"], place: Float[Tensor, "n 2"]) -> Medium:
-        """The medium of pixels; `place` is where they are in the network's picture, -1..1 from edge to edge."""
+        """The medium of pixels; `place` is where they are in the network's image, -1..1 from edge to edge."""
         grid = place.to(self.curve)[None, None]
         # outside of the network's crop the edge stands in
         sampled = F.grid_sample(self.curve[None], grid, padding_mode="border", align_corners=False)[0, :, 0].T
@@ -74,7 +74,7 @@ class PredictedWater:
     """The water of all frames of a reconstruction, read from disk frame by frame."""
 
     folder: Path
-    place: Float[Tensor, "pixels 2"]  # of the prepared frames' pixels in the network's picture, -1..1
+    place: Float[Tensor, "pixels 2"]  # of the prepared frames' pixels in the network's image, -1..1
     head: HeadFacts
 
     def frame(self, name: str) -> FrameWater:
@@ -99,15 +99,15 @@ def write(maps: WaterMaps, scale: float, folder: Path, name: str) -> None:
         )
 
 
-def read(folder: Path, pictures: NetworkPictures, head: HeadFacts) -> PredictedWater | None:
+def read(folder: Path, images: NetworkImages, head: HeadFacts) -> PredictedWater | None:
     """What `write` kept of a head in a folder; None where there is none, because the adapter has no head."""
     if not folder.is_dir():
         return None
-    frames, frame = pictures.frames, pictures.framing
+    frames, frame = images.frames, images.framing
     rows, columns = torch.arange(frames.height) + 0.5, torch.arange(frames.width) + 0.5
     pixels = torch.cartesian_prod(rows, columns).flip(-1).double()
     size = torch.tensor([frame.network_width, frame.network_height])
-    place = (2 * pictures.from_frame(pixels) / size - 1).nan_to_num(0.0).float()
+    place = (2 * images.from_frame(pixels) / size - 1).nan_to_num(0.0).float()
     return PredictedWater(folder, place, head)
 
 
@@ -159,20 +159,20 @@ def summed_up(readings: Sequence[FrameReading], settings: SeathruSettings, error
     return MediumFit(medium, curve, Medium(**std), known, (low, high), "srgb", "physics head")
 
 
-def predicted_pictures(
+def predicted_images(
     rec: Reconstruction,
     frames: Frames,
     water: PredictedWater,
     progress: Progress = silent,
     gains: Float[Tensor, "3"] | None = None,
-) -> Iterator[tuple[int, RestoredPicture]]:
+) -> Iterator[tuple[int, RestoredImage]]:
     """Every frame with depth, by its place in `rec`: the inverse of Eq. 3, clamped, by the frame's own water.
 
-    Unknown depth is filled in along the edges; open water keeps the colour it has. `gains` balance the images as shown.
+    Unknown depth is filled in along the edges; open water keeps the color it has. `gains` balance the images as shown.
     """
     rays = shared_rays(rec.cameras)
     for i, name in enumerate(rec.names):
-        progress("restoring pictures", i, len(rec.names))
+        progress("restoring images", i, len(rec.names))
         depth = rec.depth[name]
         if not bool((depth.z_depth > 0).any()):
             continue
@@ -185,14 +185,14 @@ def predicted_pictures(
         J = J.clamp(0, 1).reshape(image.shape)
         balanced = J if gains is None else (J * gains).clamp(0, 1)
         clear, shown = (surface + sea[..., None] * (image - surface) for surface in (J, balanced))
-        yield i, RestoredPicture(clear, shown, ray_depth, sea)
-    progress("restoring pictures", len(rec.names), len(rec.names))
+        yield i, RestoredImage(clear, shown, ray_depth, sea)
+    progress("restoring images", len(rec.names), len(rec.names))
 
 
 def _exponential(z: Float[Tensor, " n"], beta: Float[Tensor, "n 3"]) -> tuple[Float[Tensor, "3"], Float[Tensor, "3"]]:
     """Level and slope of beta = level e^{slope z}, slope <= 0, by least squares of the logarithm."""
     log_beta = beta.clamp(min=1e-9).log()
-    centred = z - z.mean()
-    slope = (centred[:, None] * log_beta).sum(0) / centred.square().sum().clamp(min=1e-12)
+    centerd = z - z.mean()
+    slope = (centerd[:, None] * log_beta).sum(0) / centerd.square().sum().clamp(min=1e-12)
     slope = slope.clamp(max=0.0)
     return torch.exp(log_beta.mean(0) - slope * z.mean()), slope

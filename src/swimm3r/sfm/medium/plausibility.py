@@ -1,15 +1,15 @@
-"""How far the water that was fitted can be believed: what restored pictures may show, and what their user must know.
+"""How far the water that was fitted can be believed: what restored images may show, and what their user must know.
 
 Coefficients trade against each other where the depths span a short range, while T_D and B within that range may still
-be right. So pictures are judged by the standard deviation of the optical depth (beta_D z at the middle z of the fit),
-and true colours by whether any coefficient is identifiable at all.
+be right. So images are judged by the standard deviation of the optical depth (beta_D z at the middle z of the fit),
+and true colors by whether any coefficient is identifiable at all.
 """
 
 from jaxtyping import Float
 from torch import Tensor
 
 from swimm3r.medium import MediumFit
-from swimm3r.scene.reconstruction import Caution
+from swimm3r.scene.reconstruction import QualityWarning
 
 _GUESS = 0.5  # standard deviation of the optical depth, in every channel, from which T_D is a guess: a factor of 1.6
 
@@ -22,64 +22,64 @@ def optical_depth(fit: MediumFit) -> tuple[Float[Tensor, "3"], Float[Tensor, "3"
 
 
 def attenuation_is_a_guess(fit: MediumFit) -> bool:
-    """Whether no channel's T_D is known: dividing by it would invent colours."""
+    """Whether no channel's T_D is known: dividing by it would invent colors."""
     return bool((optical_depth(fit)[1] > _GUESS).all())
 
 
 def any_determined(fit: MediumFit) -> bool:
-    """Whether the frames determine a single coefficient; where not, no restored colour is a surface's true one."""
+    """Whether the frames determine a single coefficient; where not, no restored color is a surface's true one."""
     return any(bool(flags.any()) for flags in fit.identifiable.values())
 
 
-def water_cautions(fit: MediumFit, *, grey: bool, predicted: bool = False) -> tuple[Caution, ...]:
-    """Everything that speaks against the water that restores a dive's pictures, or limits what it means.
+def water_warnings(fit: MediumFit, *, gray: bool, predicted: bool = False) -> tuple[QualityWarning, ...]:
+    """Everything that speaks against the water that restores a dive's images, or limits what it means.
 
     `predicted` by a physics head instead of fitted to the frames.
     """
-    found = (_grey(grey), _undetermined(fit, predicted), _red_lost_least(fit, grey))
-    return tuple(caution for caution in found if caution is not None)
+    found = (_gray(gray), _undetermined(fit, predicted), _red_lost_least(fit, gray))
+    return tuple(warning for warning in found if warning is not None)
 
 
-def _grey(grey: bool) -> Caution | None:
-    if not grey:
+def _gray(gray: bool) -> QualityWarning | None:
+    if not gray:
         return None
-    return Caution(
-        "The frames are grey: the water was fitted to their one channel, which stands for red, green and blue.",
-        "Its coefficients are those of the whole band the camera sees, and restored pictures stay grey; for colours, "
-        "give the footage in colour.",
+    return QualityWarning(
+        "The frames are gray: the water was fitted to their one channel, which stands for red, green and blue.",
+        "Its coefficients are those of the whole band the camera sees, and restored images stay gray; for colors, "
+        "give the footage in color.",
     )
 
 
-def _undetermined(fit: MediumFit, predicted: bool) -> Caution | None:
+def _undetermined(fit: MediumFit, predicted: bool) -> QualityWarning | None:
     advice = (
         "Train the adapter with held-out pairs, so that its head's error is known, or restore without one."
         if predicted
         else "Film the same ground from near and from far in one dive (1 to 4 m), with open water in view; coefficients"
-        " in grey or in brackets are not for a table."
+        " in gray or in brackets are not for a table."
     )
     factor = optical_depth(fit)[1].max().exp().item()
     if attenuation_is_a_guess(fit):
-        return Caution(
+        return QualityWarning(
             "The water is not determined: the light lost on the way is uncertain by a factor of up to"
-            f" {factor:.1f}, so the restored frames keep the colours as filmed.",
+            f" {factor:.1f}, so the restored frames keep the colors as filmed.",
             advice,
         )
     if any_determined(fit):
         return None
-    return Caution(
-        f"None of the water's coefficients is determined: restored colours (some {factor - 1:.0%} uncertain at the"
+    return QualityWarning(
+        f"None of the water's coefficients is determined: restored colors (some {factor - 1:.0%} uncertain at the"
         " middle distance) are not the true ones, and the restored frames are not white-balanced.",
         advice,
     )
 
 
-def _red_lost_least(fit: MediumFit, grey: bool) -> Caution | None:
+def _red_lost_least(fit: MediumFit, gray: bool) -> QualityWarning | None:
     """In every natural water, by Jerlov's types, red is attenuated as much as green at least, mostly far more."""
     depth = optical_depth(fit)[0]
-    if grey or not bool(depth[0] < depth[1:].min()):
+    if gray or not bool(depth[0] < depth[1:].min()):
         return None
-    return Caution(
-        "The water found attenuates red least, which no natural water does: its colours are implausible.",
-        "The footage may be colour-corrected, lit by lamps, or too hazy to tell; give the uncorrected original, and do"
-        " not read colours or coefficients off this result.",
+    return QualityWarning(
+        "The water found attenuates red least, which no natural water does: its colors are implausible.",
+        "The footage may be color-corrected, lit by lamps, or too hazy to tell; give the uncorrected original, and do"
+        " not read colors or coefficients off this result.",
     )

@@ -1,16 +1,16 @@
-"""Pictures and points as they would look without the water: the inverse of Eq. 2, kept from amplifying noise.
+"""Images and points as they would look without the water: the inverse of Eq. 2, kept from amplifying noise.
 
     D = I - B(z),   J = D / T_D(z)
 
 Where T_D is small the quotient is noise, so per channel with s = T_D:
 
     detail    J = S + s^2 / (s^2 + (noise / texture)^2) (J - S)     S: local linear fit of D / s to I's brightness
-    colour    J = w J + (1 - w) k G,  w = s^2 / (s^2 + (veil_error / colour_error)^2)
-              G: the channels weighted by how well they see; k: this channel's share of colour where it does see
-    horizon   in open water, and where no channel sees (max w -> 0), the picture's own veil remains
+    color    J = w J + (1 - w) k G,  w = s^2 / (s^2 + (veil_error / color_error)^2)
+              G: the channels weighted by how well they see; k: this channel's share of color where it does see
+    horizon   in open water, and where no channel sees (max w -> 0), the image's own veil remains
 
 Near the camera all weights are 1 and J is the plain inverse. Nothing is stretched; white balance serves the eye alone,
-and only where the frames say which colours the water took (`water_plausibility`).
+and only where the frames say which colors the water took (`water_plausibility`).
 """
 
 from collections.abc import Callable, Iterator
@@ -42,47 +42,47 @@ from swimm3r.sfm.settings import RestoreSettings
 
 MediumOfPixels = Callable[[str, Int[Tensor, " n"], Float[Tensor, " n"]], Medium]  # frame, pixels, ray depth
 
-_MAX_TINT = 1.0  # times the other channels, for blurred colours at a guessed distance
+_MAX_TINT = 1.0  # times the other channels, for blurred colors at a guessed distance
 _NEARLY_ALL = 0.95  # of the surfaces at known distance
 
 
 @dataclass(frozen=True)
-class RestoredPicture:
-    """One whole picture without its water, as stored values in 0..1."""
+class RestoredImage:
+    """One whole image without its water, as stored values in 0..1."""
 
     clear: Float[Tensor, "h w 3"]
     shown: Float[Tensor, "h w 3"]  # white-balanced for the eye where asked for
     ray_depth: Float[Tensor, "h w"]  # of the surface; filled in along the edges where the depth map has gaps
-    sea: Float[Tensor, "h w"]  # 0..1, how surely there is open water and no surface; it keeps the colour it has
+    sea: Float[Tensor, "h w"]  # 0..1, how surely there is open water and no surface; it keeps the color it has
 
 
-def restored_pictures(
+def restored_images(
     rec: Reconstruction, frames: Frames, settings: RestoreSettings, progress: Progress = silent
-) -> Iterator[tuple[int, RestoredPicture]]:
+) -> Iterator[tuple[int, RestoredImage]]:
     """Every registered frame with some known depth, by its place in `rec`; needs the medium and the cloud."""
     assert rec.medium is not None
     gains = shown_gains(rec, settings)
     rays = shared_rays(rec.cameras)
     for i, name in enumerate(rec.names):
-        progress("restoring pictures", i, len(rec.names))
+        progress("restoring images", i, len(rec.names))
         depth = rec.depth[name]
         if bool((depth.z_depth > 0).any()):
-            yield i, restore_picture(frames.image(frames.index(name)), depth, rays[i], rec.medium, settings, gains)
-    progress("restoring pictures", len(rec.names), len(rec.names))
+            yield i, restore_image(frames.image(frames.index(name)), depth, rays[i], rec.medium, settings, gains)
+    progress("restoring images", len(rec.names), len(rec.names))
 
 
-def restore_picture(
+def restore_image(
     image: Float[Tensor, "h w 3"],
     depth: DepthMap,
     rays: Float[Tensor, "h w 3"],
     fit: MediumFit,
     settings: RestoreSettings | None = None,
     gains: Float[Tensor, "3"] | None = None,
-) -> RestoredPicture:
-    """The whole picture without its water; unknown depth is filled in along the edges.
+) -> RestoredImage:
+    """The whole image without its water; unknown depth is filled in along the edges.
 
-    `rays` are the directions of the pixels with z = 1 (`cameras.image_directions`). `gains` (`display_gains`) colour
-    surfaces and not the open water behind them, which keeps the colour the diver saw.
+    `rays` are the directions of the pixels with z = 1 (`cameras.image_directions`). `gains` (`display_gains`) color
+    surfaces and not the open water behind them, which keeps the color the diver saw.
     """
     settings = settings or RestoreSettings()
     veil = srgb_from_linear(fit.medium.Binf) if fit.encoding == "linear" else fit.medium.Binf
@@ -96,9 +96,9 @@ def restore_picture(
     direct = I - backscatter(path, medium)
     J = _without_noise(direct, T_D, I @ LUMA, settings)
     stored = srgb_from_linear(J.clamp(min=0)) if fit.encoding == "linear" else J
-    clear = horizon(stored, T_D, image, sea, settings).clamp(0, 1)
-    shown = clear if gains is None else horizon(stored * gains, T_D, image, sea, settings).clamp(0, 1)
-    return RestoredPicture(clear, shown, ray_depth, sea)
+    clear = keep_open_water(stored, T_D, image, sea, settings).clamp(0, 1)
+    shown = clear if gains is None else keep_open_water(stored * gains, T_D, image, sea, settings).clamp(0, 1)
+    return RestoredImage(clear, shown, ray_depth, sea)
 
 
 def restored_cloud(
@@ -111,9 +111,9 @@ def restored_cloud(
     medium_at: MediumOfPixels | None = None,
     min_transmittance: float = 0.05,
 ) -> DenseCloud:
-    """The tracks as points: raw and restored colours averaged over the sightings, thinned by voxels.
+    """The tracks as points: raw and restored colors averaged over the observations, thinned by voxels.
 
-    Restored colours are weighted by confidence and mean T_D squared, the inverse variance of an amplified colour.
+    Restored colors are weighted by confidence and mean T_D squared, the inverse variance of an amplified color.
     `medium_at` gives each pixel its own water in the place of the dive's, in the encoding of `fit`, and
     `min_transmittance` bounds what is divided by (eps_inv).
     """
@@ -147,10 +147,10 @@ def restored_cloud(
 
 
 def shown_gains(rec: Reconstruction, settings: RestoreSettings) -> Float[Tensor, "3"]:
-    """White balance of a dive's clear pictures (`display_gains`).
+    """White balance of a dive's clear images (`display_gains`).
 
-    Ones where nobody asked for it, and where the frames determine nothing of the water: neutral greys would pass for
-    the true colours of surfaces.
+    Ones where nobody asked for it, and where the frames determine nothing of the water: neutral grays would pass for
+    the true colors of surfaces.
     """
     if rec.cloud is None or rec.medium is None or not settings.white_balance or not any_determined(rec.medium):
         return torch.ones(3)
@@ -158,11 +158,11 @@ def shown_gains(rec: Reconstruction, settings: RestoreSettings) -> Float[Tensor,
 
 
 def display_gains(restored: Float[Tensor, "n 3"]) -> Float[Tensor, "3"]:
-    """Gains that make a dive's restored colours grey, between 0.5 and 2; brightness stays.
+    """Gains that make a dive's restored colors gray, between 0.5 and 2; brightness stays.
 
     The inverse of the water gives surfaces under the light that reaches their depth, which is tinted. The tint is the
-    6-norm of the colours (Finlayson & Trezzi 2004): bright surfaces count most, weeds and shade hardly. This is for
-    pictures to look at and nothing else: it is no part of J.
+    6-norm of the colors (Finlayson & Trezzi 2004): bright surfaces count most, weeds and shade hardly. This is for
+    images to look at and nothing else: it is no part of J.
     """
     seen = restored[(restored < 0.99).all(-1)].double()
     if len(seen) == 0:
@@ -174,7 +174,7 @@ def display_gains(restored: Float[Tensor, "n 3"]) -> Float[Tensor, "3"]:
 def _not_beyond_white(
     I: Float[Tensor, "h w 3"], ray_depth: Float[Tensor, "h w"], guessed: Bool[Tensor, "h w"], fit: MediumFit
 ) -> Float[Tensor, "h w"]:
-    """Ray depth, shortened where it is a guess until the blurred J is a colour that surfaces have.
+    """Ray depth, shortened where it is a guess until the blurred J is a color that surfaces have.
 
     That is below 0.9, and in the channel that the water takes first not far above the others (nor more than nearly all
     surfaces of known depth are): too long a path shows as a glare of that channel first, mostly red.
@@ -206,22 +206,22 @@ def _without_noise(
     brightness: Float[Tensor, "h w"],
     settings: RestoreSettings,
 ) -> Float[Tensor, "h w 3"]:
-    """D / T_D with detail and then colour held back where T_D does not carry them."""
-    floor = settings.veil_error / settings.colour_error
+    """D / T_D with detail and then color held back where T_D does not carry them."""
+    floor = settings.veil_error / settings.color_error
     J = direct / T_D.clamp(min=floor / 2)
     smooth = local_linear(brightness, J, T_D**2 + 1e-6, settings.window * max(brightness.shape) / 2, settings.noise**2)
     J = smooth + T_D**2 / (T_D**2 + (settings.noise / settings.texture) ** 2) * (J - smooth)
     sees = T_D**2 / (T_D**2 + floor**2)
     weight = sees**2
-    grey = (weight * J).sum(-1, keepdim=True) / weight.sum(-1, keepdim=True).clamp(min=1e-6)
+    gray = (weight * J).sum(-1, keepdim=True) / weight.sum(-1, keepdim=True).clamp(min=1e-6)
     well = weight.prod(-1, keepdim=True) * ((J > 0) & (J < 1)).all(-1, keepdim=True)
     share = (well * J).sum((0, 1)) + 1e-3
     share = share / share.mean()
     used = (weight * share).sum(-1, keepdim=True) / weight.sum(-1, keepdim=True).clamp(min=1e-6)
-    return sees * J + (1 - sees) * share * grey / used.clamp(min=1e-3)
+    return sees * J + (1 - sees) * share * gray / used.clamp(min=1e-3)
 
 
-def horizon(
+def keep_open_water(
     surface: Float[Tensor, "h w 3"],
     T_D: Float[Tensor, "h w 3"],
     image: Float[Tensor, "h w 3"],
@@ -229,7 +229,7 @@ def horizon(
     settings: RestoreSettings,
 ) -> Float[Tensor, "h w 3"]:
     """The veil itself, as `image` has it, where there is no surface (`sea`, 0..1) or no channel that sees it."""
-    floor = settings.veil_error / settings.colour_error
+    floor = settings.veil_error / settings.color_error
     best = T_D.amax(-1, keepdim=True)
     sees = best**2 / (best**2 + floor**2) * (1 - sea[..., None])
     return sees * surface + (1 - sees) * image

@@ -1,8 +1,8 @@
 """The pixels from which the water is fitted: drawn from every training frame of a dive, with their ray depths.
 
-Single pixels serve the dark envelope and the averages. For the decay of colour differences the dense tracks are grouped
-into patches, cubes some pixels wide as seen from afar, and a sighting is the mean colour of one patch in one frame. A
-patch is the same piece of surface from every distance and slant; a single pixel is not, and the contrast it loses by
+Single pixels serve the dark envelope and the averages. For the decay of color differences the dense tracks are grouped
+into patches, cubes some pixels wide as seen from afar, and an observation is the mean color of one patch in one frame.
+A patch is the same piece of surface from every distance and slant; a single pixel is not, and the contrast it loses by
 averaging over more surface would pass for attenuation.
 """
 
@@ -21,8 +21,8 @@ from swimm3r.scene.reconstruction import DepthMap, Reconstruction
 from swimm3r.sfm.medium.dense_tracks import DenseTracks, cubes, ray_depth_map, shared_rays
 from swimm3r.sfm.settings import SeathruSettings
 
-_ONE_STEP = 1.5 / 255  # difference between channels that rounding leaves in a grey picture
-_COLOURED = 0.001  # share of the pixels of a grey clip that may have a colour: a logo, a time stamp
+_ONE_STEP = 1.5 / 255  # difference between channels that rounding leaves in a gray image
+_COLORED = 0.001  # share of the pixels of a gray clip that may have a color: a logo, a time stamp
 
 
 @dataclass(frozen=True)
@@ -31,15 +31,15 @@ class WaterSamples:
 
     I: Float[Tensor, "n 3"]  # as stored, 0..1
     ray_depth: Float[Tensor, " n"]  # > 0
-    frame: Int[Tensor, " n"]  # which picture: errors are shared within one
+    frame: Int[Tensor, " n"]  # which image: errors are shared within one
     track: Int[Tensor, " n"]  # which patch of surface; -1 for pixels on their own
     open_water: Float[Tensor, "m 3"]  # pixels beyond every surface; empty where the frames show none
 
     @property
-    def grey(self) -> bool:
+    def gray(self) -> bool:
         """Whether the three channels are one: equal up to rounding, in all but a few pixels."""
         spread = self.I.amax(-1) - self.I.amin(-1)
-        return len(spread) > 0 and float((spread > _ONE_STEP).float().mean()) <= _COLOURED
+        return len(spread) > 0 and float((spread > _ONE_STEP).float().mean()) <= _COLORED
 
 
 def gather_samples(
@@ -103,7 +103,7 @@ class _Patches:
 
 
 def _patches(rec: Reconstruction, tracks: DenseTracks, settings: SeathruSettings) -> _Patches:
-    """Cubes about `patch_pixels` wide for the farthest sighting of a track, in steps of powers of two."""
+    """Cubes about `patch_pixels` wide for the farthest observation of a track, in steps of powers of two."""
     n = len(tracks.xyz)
     far = torch.zeros(n).scatter_reduce_(0, tracks.track, tracks.ray_depth, "amax")
     focal = float(rec.cameras.K[:, 0, 0].median())
@@ -116,13 +116,13 @@ def _patches(rec: Reconstruction, tracks: DenseTracks, settings: SeathruSettings
 
 
 def _patch_means(
-    colours: Float[Tensor, "pixels 3"],
+    colors: Float[Tensor, "pixels 3"],
     tracks: DenseTracks,
     seen: Int[Tensor, " s"],
     patches: _Patches,
     settings: SeathruSettings,
 ) -> tuple[Float[Tensor, "k 3"], Float[Tensor, " k"], Int[Tensor, " k"]]:
-    """Mean colour and ray depth of each patch one frame shows; patches shown in part only are left out."""
+    """Mean color and ray depth of each patch one frame shows; patches shown in part only are left out."""
     patch, which = torch.unique(patches.of_track[tracks.track[seen]], return_inverse=True)
     count = torch.bincount(which, minlength=len(patch)).float()
 
@@ -130,8 +130,8 @@ def _patch_means(
         return torch.zeros(len(patch), x.shape[1]).index_add_(0, which, x) / count[:, None]
 
     offset = (mean(tracks.xyz[tracks.track[seen]]) - patches.middle[patch]).norm(dim=-1) / patches.size[patch]
-    whole = (count >= settings.patch_sightings) & (offset < settings.patch_offset)
-    I, z = mean(colours[tracks.pixel[seen]]), mean(tracks.ray_depth[seen, None])[:, 0]
+    whole = (count >= settings.patch_observations) & (offset < settings.patch_offset)
+    I, z = mean(colors[tracks.pixel[seen]]), mean(tracks.ray_depth[seen, None])[:, 0]
     return I[whole], z[whole], patch[whole]
 
 

@@ -1,4 +1,4 @@
-"""The water of a dive from its pictures and their ray depths, without weights (after Sea-Thru, Akkaynak 2019).
+"""The water of a dive from its images and their ray depths, without weights (after Sea-Thru, Akkaynak 2019).
 
 Per channel, an observation k of surface point t reads
 
@@ -7,9 +7,9 @@ Per channel, an observation k of surface point t reads
 and one bounded least-squares problem finds Binf, beta_B and beta_D(z) = a exp(b z) from four kinds of evidence:
 
     tracks      the same point seen from several distances; J_t is eliminated in closed form (variable projection), so
-                the decay of colour *differences* gives beta_D without any guess about the illuminant
+                the decay of color *differences* gives beta_D without any guess about the illuminant
     dark        the darkest pixels of each range bin are B plus J' T_D with a small common J' (Sea-Thru's B(z))
-    average     the average colour of a range bin decays as T_D from 1 / f (local space average colour, f = 2): decides
+    average     the average color of a range bin decays as T_D from 1 / f (local space average color, f = 2): decides
                 only what the tracks leave open
     open water  pixels that look past every surface show Binf; without any, Binf is not far from what is farthest
 
@@ -33,8 +33,8 @@ from swimm3r.sfm.medium.channel_fit import (
     LOWER,
     SLOPE,
     ChannelFit,
+    Observations,
     Pixels,
-    Sightings,
     fit_channel,
 )
 from swimm3r.sfm.medium.dense_tracks import fuse_depth
@@ -57,7 +57,7 @@ def estimate_medium(
 def fit_medium(samples: WaterSamples, settings: SeathruSettings, encoding: Encoding) -> MediumFit:
     """The water that explains the samples, on values as stored ("srgb") or in linear light.
 
-    Grey samples are one channel, which is fitted once and stands for all three. Raises InputError where fewer than
+    Gray samples are one channel, which is fitted once and stands for all three. Raises InputError where fewer than
     `settings.min_samples` pixels have a depth.
     """
     n = len(samples.ray_depth)
@@ -70,22 +70,22 @@ def fit_medium(samples: WaterSamples, settings: SeathruSettings, encoding: Encod
     values = [samples.I.double(), samples.open_water.double()]
     if encoding == "linear":
         values = [linear_from_srgb(v) for v in values]
-    if samples.grey:
+    if samples.gray:
         values = [v.mean(1, keepdim=True) for v in values]
-    colour, open_water = (v.numpy() for v in values)
+    color, open_water = (v.numpy() for v in values)
     ray_depth = samples.ray_depth.double().numpy()
     unit = float(np.median(ray_depth))
     z = ray_depth / unit
     frame = np.unique(samples.frame.numpy(), return_inverse=True)[1]
     chosen = _telling_rows(samples, z, settings)
     channels = []
-    for c in range(colour.shape[1]):
-        pixels = Pixels(colour[:, c], colour.mean(1), z, frame, open_water[:, c])
-        sightings = None
+    for c in range(color.shape[1]):
+        pixels = Pixels(color[:, c], color.mean(1), z, frame, open_water[:, c])
+        observations = None
         if chosen is not None:
             rows, point = chosen
-            sightings = Sightings(rows, z[rows], point, frame[rows], colour[rows, c])
-        channels.append(fit_channel(pixels, sightings, settings))
+            observations = Observations(rows, z[rows], point, frame[rows], color[rows, c])
+        channels.append(fit_channel(pixels, observations, settings))
     return _medium_fit(channels * (3 // len(channels)), unit, ray_depth, settings, encoding)
 
 

@@ -63,7 +63,7 @@ def agreement(q, others, H, e, H_back, e_back, tolerance, pose_error):
 @kernel
 @no_type_check
 def without_specks(q, similar, area):
-    """q without connected patches smaller than `area` pixels; neighbours connect where they differ by < `similar`."""
+    """q without connected patches smaller than `area` pixels; neighbors connect where they differ by < `similar`."""
     h, w = q.shape
     label = np.zeros((h, w), np.int32)
     stack = np.empty((h * w, 2), np.int32)

@@ -2,9 +2,9 @@
 
 For every frame: source views by baseline and shared points; a cost volume over planes even in inverse depth (1 - NCC,
 which neither contrast lost with distance nor veil added changes); semi-global smoothing (Hirschmueller 2008); slanted
-windows refined from neighbour to neighbour (Bleyer et al. 2011) at full size. Then, over all frames, a depth stays
+windows refined from neighbor to neighbor (Bleyer et al. 2011) at full size. Then, over all frames, a depth stays
 where it is well correlated, where moving it makes it worse, and where other frames' depths agree; open water and bare
-sand come out unknown (0), not invented. The work is done on undistorted pictures, the result lies on the frame's grid.
+sand come out unknown (0), not invented. The work is done on undistorted images, the result lies on the frame's grid.
 """
 
 import hashlib
@@ -30,7 +30,7 @@ from swimm3r.scene.frames import Frames
 from swimm3r.scene.reconstruction import DepthMap, DepthMaps, Reconstruction
 from swimm3r.sfm.plane_sweep import consistency, kernels
 from swimm3r.sfm.plane_sweep.views import (
-    View,
+    SweepView,
     choose_sources,
     depth_range,
     halved,
@@ -44,7 +44,7 @@ from swimm3r.sfm.settings import PlaneSweepSettings
 _RAW = ".raw"  # beside the finished maps: each frame's own opinion, removed once every frame is finished
 _RAW_LAYOUTS = {"inverse_depth": Layout("h w"), "correlation": Layout("h w")}
 _STAMP = ".made_from"  # of which cameras, points and settings the folder's maps were made
-_NEIGHBOURS = 8  # frames asked whether they agree
+_NEIGHBORS = 8  # frames asked whether they agree
 _MOST_SOURCES = 16
 _REACH = np.arange(-3, 4)  # the slanted windows' pixels, along each axis
 _ASIDE = 2.5  # source pixels beside a match where it must be worse; nearer, small errors of the poses blur it
@@ -69,19 +69,19 @@ def estimate_depth(
     folder = rec.depth.folder
     _claim(folder, _stamp(rec, frames, settings))
     canvas = undistorted_cameras(rec.cameras, settings.long_side)
-    sources = choose_sources(rec, max(settings.sources, _NEIGHBOURS), settings.angle_deg)
+    sources = choose_sources(rec, max(settings.sources, _NEIGHBORS), settings.angle_deg)
     pose_error = _pose_error(rec, canvas)
     position = {name: k for k, name in enumerate(frames.names)}
     views, raws = ArrayCache(max_bytes=256 << 20), ArrayCache(max_bytes=256 << 20)
 
-    def view(i: int) -> View:
+    def view(i: int) -> SweepView:
         def load() -> tuple[np.ndarray, ...]:
             k = position[rec.names[i]]
             made = make_view(frames.image(k), frames.mask(k), rec.cameras[i], canvas[i])
-            return made.grey.numpy(), made.detail.numpy(), made.seen.numpy()
+            return made.gray.numpy(), made.detail.numpy(), made.seen.numpy()
 
-        grey, detail, seen = (torch.from_numpy(a.copy()) for a in views.get(i, load))
-        return View(grey, detail, seen, canvas.K[i], canvas[i].world2cam[0])
+        gray, detail, seen = (torch.from_numpy(a.copy()) for a in views.get(i, load))
+        return SweepView(gray, detail, seen, canvas.K[i], canvas[i].world2cam[0])
 
     def raw_path(i: int) -> Path:
         return folder / _RAW / f"{rec.names[i]}.npz"
@@ -103,9 +103,9 @@ def estimate_depth(
 
     def agree_one(i: int) -> None:
         fused = consistent(raw_of(i), [raw_of(j) for j in sources[i]], canvas[[i, *sources[i]]], pose_error, settings)
-        picture = frames.image(position[rec.names[i]])
+        image = frames.image(position[rec.names[i]])
         q, confidence = on_frame_grid(
-            fused.inverse_depth, fused.correlation, view(i).grey, picture, rec.cameras[i], canvas[i]
+            fused.inverse_depth, fused.correlation, view(i).gray, image, rec.cameras[i], canvas[i]
         )
         usable = (q > 0) & frames.mask(position[rec.names[i]])
         z_depth = torch.where(usable, 1 / q.clamp(min=1e-12), 0.0)
@@ -123,20 +123,20 @@ def estimate_depth(
 
 
 def sweep(
-    reference: View, sources: Sequence[View], z_range: tuple[float, float], settings: PlaneSweepSettings
+    reference: SweepView, sources: Sequence[SweepView], z_range: tuple[float, float], settings: PlaneSweepSettings
 ) -> RawDepth:
-    """Depth of one view from the others, between two z depths; 0 where the pictures do not determine it."""
+    """Depth of one view from the others, between two z depths; 0 where the images do not determine it."""
     if not 1 <= len(sources) <= _MOST_SOURCES:
         raise ValueError(f"a sweep takes 1 to {_MOST_SOURCES} sources, got {len(sources)}")
     keep = (len(sources) + 1) // 2
-    noise, edge = settings.noise**2, likely_edge(reference.grey)
+    noise, edge = settings.noise**2, likely_edge(reference.gray)
     half, halves = halved(reference), [halved(source) for source in sources]
     H, e = _transfers(half, halves)
-    planes = _planes(half.grey.shape, H, e, z_range, settings.planes)
+    planes = _planes(half.gray.shape, H, e, z_range, settings.planes)
     volume = kernels.sweep_costs(
         half.detail.numpy(), *_stacked(halves, settings.window), H, e, planes, settings.window, noise, keep
     )
-    total = kernels.semi_global(volume, half.grey.numpy(), settings.smooth, 8 * settings.smooth, edge)
+    total = kernels.semi_global(volume, half.gray.numpy(), settings.smooth, 8 * settings.smooth, edge)
     surface = kernels.doubled(kernels.best_plane(total, planes))
 
     H, e = _transfers(reference, sources)
@@ -144,17 +144,17 @@ def sweep(
     every = np.stack(np.meshgrid(_REACH, _REACH), -1).reshape(-1, 2).astype(np.float32)
     chequered = every[np.abs(every).sum(1) % 2 == 0]  # half of the window judges as well as all of it
     odd = every[(np.abs(every) % 2 == 1).all(1)]  # and a third finds as well
-    cost = peak = np.zeros(reference.grey.shape, np.float32)
+    cost = peak = np.zeros(reference.gray.shape, np.float32)
     for n in range(settings.rounds + 1):
         offsets, step, reach = (odd, 0.5 if n else 1.0, (3, 1)[n % 2])
         if n == settings.rounds:  # no more moves: how good is it, and does leaving it make it worse
             offsets, step, reach = chequered, _ASIDE, 0
         surface, cost, peak = kernels.refine(
-            reference.detail.numpy(), reference.grey.numpy(), reference.seen.numpy(), detail, seen, H, e, surface,
+            reference.detail.numpy(), reference.gray.numpy(), reference.seen.numpy(), detail, seen, H, e, surface,
             offsets, noise, edge, keep, settings.smooth_fine, step, reach,
         )  # fmt: skip
     q = np.ascontiguousarray(surface[..., 0])
-    cost, peak = _with_neighbours(cost), _with_neighbours(peak)
+    cost, peak = _with_neighbors(cost), _with_neighbors(peak)
     sure = (1 - cost >= settings.min_ncc) & (peak >= settings.min_peak * (cost + 0.03)) & (q > 0)
     return RawDepth(torch.from_numpy(np.where(sure, q, 0)), torch.from_numpy(np.where(sure, 1 - cost, 0)))
 
@@ -183,7 +183,7 @@ def consistent(
     return RawDepth(torch.from_numpy(fused), torch.from_numpy(confidence))
 
 
-def _with_neighbours(values: np.ndarray) -> np.ndarray:
+def _with_neighbors(values: np.ndarray) -> np.ndarray:
     """Means of 3 x 3 pixels: one pixel's correlation is a lottery where lines or grains are missing."""
     padded = torch.nn.functional.pad(torch.from_numpy(values)[None, None], (1, 1, 1, 1), mode="replicate")
     return torch.nn.functional.avg_pool2d(padded, 3, stride=1)[0, 0].numpy()
@@ -199,21 +199,21 @@ def _pose_error(rec: Reconstruction, canvas: Cameras) -> float:
 
 def _transfer(K: np.ndarray, pose: np.ndarray, K_there: np.ndarray, pose_there: np.ndarray) -> tuple:
     """H and e that take a pixel index at inverse depth q to H x + q e in another view."""
-    half = np.array([[0, 0, 0.5], [0, 0, 0.5], [0, 0, 0]])  # pixel centres stand at +0.5, indices do not
+    half = np.array([[0, 0, 0.5], [0, 0, 0.5], [0, 0, 0]])  # pixel centers stand at +0.5, indices do not
     there = pose_there @ np.linalg.inv(pose)
     K_there = K_there - half
     return K_there @ there[:3, :3] @ np.linalg.inv(K - half), K_there @ there[:3, 3]
 
 
-def _transfers(reference: View, sources: Sequence[View]) -> tuple[np.ndarray, np.ndarray]:
+def _transfers(reference: SweepView, sources: Sequence[SweepView]) -> tuple[np.ndarray, np.ndarray]:
     pairs = [
         _transfer(*(t.double().numpy() for t in (reference.K, reference.world2cam, s.K, s.world2cam))) for s in sources
     ]
     return np.stack([H for H, _ in pairs]), np.stack([e for _, e in pairs])
 
 
-def _stacked(sources: Sequence[View], margin: int) -> tuple[np.ndarray, np.ndarray]:
-    """Pictures of the sources, and where a window of half width `margin` lies wholly in what they see."""
+def _stacked(sources: Sequence[SweepView], margin: int) -> tuple[np.ndarray, np.ndarray]:
+    """Images of the sources, and where a window of half width `margin` lies wholly in what they see."""
     detail = torch.stack([s.detail for s in sources])
     unseen = torch.stack([(~s.seen).float() for s in sources])[:, None]
     near = torch.nn.functional.max_pool2d(unseen, 2 * margin + 1, stride=1, padding=margin)[:, 0]

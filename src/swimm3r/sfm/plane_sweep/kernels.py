@@ -1,6 +1,6 @@
 """The loops of the plane sweep, compiled by Numba: cost volume, semi-global smoothing, slanted refinement.
 
-Pixels are indices here (centre of the first pixel = 0). A pixel x of the reference at inverse depth q = 1 / z lands in
+Pixels are indices here (center of the first pixel = 0). A pixel x of the reference at inverse depth q = 1 / z lands in
 a source at H x + q e, with H = K_s R K_r^-1 and e = K_s t (homogeneous). A plane in space is an affine function of the
 pixel in q, so a window on a slanted surface needs only the two slopes of q. Costs are 1 - NCC in 0..1: 1 where a source
 does not see the pixel, or where the window holds nothing above the noise.
@@ -270,11 +270,11 @@ def _extended(surface, y, x, j, i):
 @kernel
 @no_type_check
 def refine(reference, guide, usable, sources, seen, H, e, surface, offsets, noise, edge, keep, smooth, step, reach):
-    """One round of slanted-plane refinement: every pixel tries its neighbours' planes and small moves of its own.
+    """One round of slanted-plane refinement: every pixel tries its neighbors' planes and small moves of its own.
 
-    `surface` [h, w, 3] holds q and its slopes along x and y. Windows weigh pixels by likeness to their centre
-    (bilateral), which keeps depth edges on picture edges. `step` is the trial move in source pixels, `reach` the
-    distance of the neighbours asked (0: nothing moves, the surface is only judged), `smooth` the price of one source
+    `surface` [h, w, 3] holds q and its slopes along x and y. Windows weigh pixels by likeness to their center
+    (bilateral), which keeps depth edges on image edges. `step` is the trial move in source pixels, `reach` the
+    distance of the neighbors asked (0: nothing moves, the surface is only judged), `smooth` the price of one source
     pixel of disagreement with the four nearest. All pixels read the state of the round before, so order does not
     matter. Returns the new surface, its cost (1 - NCC), and `peak`: how much the cost of the old one rises by `step`.
     """
@@ -305,7 +305,7 @@ def refine(reference, guide, usable, sources, seen, H, e, surface, offsets, nois
             weights /= total
             mean /= total
             variance = max(square / total - mean * mean, 0.0)
-            total = inner = square = 0.0  # what resembles the centre must have texture of its own, not only a border
+            total = inner = square = 0.0  # what resembles the center must have texture of its own, not only a border
             for k in range(samples):
                 likeness = weights[k] * weights[k]
                 total += likeness
@@ -351,7 +351,7 @@ def refine(reference, guide, usable, sources, seen, H, e, surface, offsets, nois
             tries[6, 0] -= move
             tries[7, 1] = 0.25 * (surface[y, x + 2, 0] - surface[y, x - 2, 0])
             tries[7, 2] = 0.25 * (surface[y + 2, x, 0] - surface[y - 2, x, 0])
-            lowest, pick, centre, side, middle = 1e9, 0, 1.0, 1.0, 1.0
+            lowest, pick, center, side, middle = 1e9, 0, 1.0, 1.0, 1.0
             for n in range(8):
                 apart = abs(tries[n, 0] - q) + margin * (abs(tries[n, 1] - gx) + abs(tries[n, 2] - gy))
                 if tries[n, 0] <= 0 or (n > 0 and apart * speed < 0.05) or (reach == 0 and n not in (0, 5, 6)):
@@ -372,13 +372,13 @@ def refine(reference, guide, usable, sources, seen, H, e, surface, offsets, nois
                 if photometric + 0.25 * smooth * rough < lowest and (n == 0 or reach > 0):
                     lowest, pick, middle = photometric + 0.25 * smooth * rough, n, photometric
                 if n == 0:
-                    centre = photometric
+                    center = photometric
                 elif n == 5:
                     side = photometric
                 elif n == 6:
-                    peak[y, x] = min(side, photometric) - centre
+                    peak[y, x] = min(side, photometric) - center
                     if peak[y, x] > 0 and reach > 0:  # the own plane is a minimum: move to the parabola's
-                        tries[0, 0] += 0.5 * move * (photometric - side) / (side + photometric - 2 * centre)
+                        tries[0, 0] += 0.5 * move * (photometric - side) / (side + photometric - 2 * center)
             for k in range(3):
                 new[y, x, k] = tries[pick, k]
             cost[y, x] = middle

@@ -1,4 +1,4 @@
-"""What the plane sweep looks at: which frames to compare, how far to look, and undistorted pictures of one size.
+"""What the plane sweep looks at: which frames to compare, how far to look, and undistorted images of one size.
 
 Sweeping needs straight epipolar lines, so the work is done on a pinhole canvas at working size; depth along the optical
 axis is the same number on both grids, and `on_frame_grid` reads it back at every pixel of the distorted frame.
@@ -18,19 +18,19 @@ from swimm3r.scene.reconstruction import Reconstruction
 from swimm3r.sfm.plane_sweep import consistency
 
 _FEWEST_POINTS = 8  # in a frame, to know its depth range
-_WIDEST = 2.5  # tangent of the half angle that undistorted pictures cover at most: 136 degrees
+_WIDEST = 2.5  # tangent of the half angle that undistorted images cover at most: 136 degrees
 _CANDIDATES = 40  # frames sharing most points that are considered as sources
 _SLOW = 12.0  # pixels at working size: what varies slower is no surface texture
 _FAST = 0.7  # pixels: what varies faster is noise, or the lines of interlaced video
 
 
 @dataclass(frozen=True)
-class View:
-    """A picture as the sweep sees it: grey, undistorted, at working size."""
+class SweepView:
+    """An image as the sweep sees it: gray, undistorted, at working size."""
 
-    grey: Float[Tensor, "h w"]
-    detail: Float[Tensor, "h w"]  # grey without what varies slowly: veil and vignetting move with the camera
-    seen: Bool[Tensor, "h w"]  # inside the picture and its mask
+    gray: Float[Tensor, "h w"]
+    detail: Float[Tensor, "h w"]  # gray without what varies slowly: veil and vignetting move with the camera
+    seen: Bool[Tensor, "h w"]  # inside the image and its mask
     K: Float[Tensor, "3 3"]
     world2cam: Float[Tensor, "4 4"]
 
@@ -39,9 +39,9 @@ def choose_sources(rec: Reconstruction, count: int, angle_deg: float) -> list[li
     """For each frame the frames to compare it with, best first: each adds most to how well the shared points are seen.
 
     A point counts by its triangulation angle (a bell around `angle_deg`, three times wider above), fully where both
-    frames track it, a quarter where it only falls into the picture, and less the better it is covered already.
+    frames track it, a quarter where it only falls into the image, and less the better it is covered already.
     """
-    xyz, centres = rec.points.xyz.double(), rec.cameras.centres.double()
+    xyz, centers = rec.points.xyz.double(), rec.cameras.centers.double()
     frame, point = rec.tracks.frame.numpy(), rec.tracks.point.numpy()
     seen = np.unique(np.stack([frame, point]), axis=1)
     track = sparse.csr_matrix(
@@ -57,8 +57,8 @@ def choose_sources(rec: Reconstruction, count: int, angle_deg: float) -> list[li
         if not near_by:
             continue
         P = xyz[mine]
-        to_me = torch.nn.functional.normalize(centres[i] - P, dim=-1)
-        to_them = torch.nn.functional.normalize(centres[near_by][:, None] - P, dim=-1)
+        to_me = torch.nn.functional.normalize(centers[i] - P, dim=-1)
+        to_them = torch.nn.functional.normalize(centers[near_by][:, None] - P, dim=-1)
         angle = torch.rad2deg(torch.arccos((to_me * to_them).sum(-1).clamp(-1, 1)))
         width = torch.where(angle < angle_deg, 0.4 * angle_deg, 1.2 * angle_deg)
         pixels, z = project(rec.cameras[near_by], P.expand(len(near_by), -1, -1))
@@ -113,45 +113,45 @@ def undistorted_cameras(cameras: Cameras, long_side: int) -> Cameras:
     return Cameras(K[which], cameras.distortion[:, :0], cameras.cam2world, width, height)
 
 
-def make_view(picture: Float[Tensor, "h w 3"], mask: Bool[Tensor, "h w"], lens: Cameras, canvas: Cameras) -> View:
+def make_view(image: Float[Tensor, "h w 3"], mask: Bool[Tensor, "h w"], lens: Cameras, canvas: Cameras) -> SweepView:
     """A frame undistorted onto the canvas; `lens` and `canvas` are its own camera and its pinhole one."""
     import cv2
 
-    grey = (picture @ torch.tensor([0.299, 0.587, 0.114])).numpy()
+    gray = (image @ torch.tensor([0.299, 0.587, 0.114])).numpy()
     scale = float(canvas.K[0, 0, 0] / lens.K[0, 0, 0])
     if scale < 1:  # smaller first, by area, so that nothing aliases
         size = (max(2, round(lens.width * scale)), max(2, round(lens.height * scale)))
-        grey = cv2.resize(grey, size, interpolation=cv2.INTER_AREA)
+        gray = cv2.resize(gray, size, interpolation=cv2.INTER_AREA)
         usable = cv2.resize(mask.numpy().astype(np.float32), size, interpolation=cv2.INTER_AREA) > 0.999
         lens = resized(lens, *size)
     else:
         usable = mask.numpy()
     u, v, inside = _distorted_grid(_key(lens), _key(canvas))
-    grey = cv2.remap(grey, u, v, cv2.INTER_LINEAR, borderMode=cv2.BORDER_REPLICATE)
+    gray = cv2.remap(gray, u, v, cv2.INTER_LINEAR, borderMode=cv2.BORDER_REPLICATE)
     seen = inside & (cv2.remap(usable.astype(np.float32), u, v, cv2.INTER_LINEAR) > 0.999)
     share = cv2.GaussianBlur(seen.astype(np.float32), (0, 0), _SLOW, borderType=cv2.BORDER_REFLECT)
-    slow = cv2.GaussianBlur(np.where(seen, grey, 0), (0, 0), _SLOW, borderType=cv2.BORDER_REFLECT)
-    fine = cv2.GaussianBlur(grey, (0, 0), _FAST)
+    slow = cv2.GaussianBlur(np.where(seen, gray, 0), (0, 0), _SLOW, borderType=cv2.BORDER_REFLECT)
+    fine = cv2.GaussianBlur(gray, (0, 0), _FAST)
     detail = np.where(seen, fine - slow / np.maximum(share, 1e-6), 0).astype(np.float32)
-    return View(
-        torch.from_numpy(grey), torch.from_numpy(detail), torch.from_numpy(seen), canvas.K[0], canvas.world2cam[0]
+    return SweepView(
+        torch.from_numpy(gray), torch.from_numpy(detail), torch.from_numpy(seen), canvas.K[0], canvas.world2cam[0]
     )
 
 
-def halved(view: View) -> View:
+def halved(view: SweepView) -> SweepView:
     """The view at half its size; its sides are even."""
 
     def mean(values: Tensor) -> Tensor:
         return torch.nn.functional.avg_pool2d(values[None, None].float(), 2)[0, 0]
 
     K = torch.diag(torch.tensor([0.5, 0.5, 1.0], dtype=view.K.dtype)) @ view.K
-    return View(mean(view.grey), mean(view.detail), mean(view.seen) > 0.999, K, view.world2cam)
+    return SweepView(mean(view.gray), mean(view.detail), mean(view.seen) > 0.999, K, view.world2cam)
 
 
-def likely_edge(grey: Float[Tensor, "h w"]) -> float:
-    """A change of grey that makes a depth edge likely: 0.8 of the contrast that windows of 9 pixels usually have."""
-    window = min(9, *grey.shape)
-    mean, square = (torch.nn.functional.avg_pool2d(g[None, None], window, stride=4) for g in (grey, grey * grey))
+def likely_edge(gray: Float[Tensor, "h w"]) -> float:
+    """A change of gray that makes a depth edge likely: 0.8 of the contrast that windows of 9 pixels usually have."""
+    window = min(9, *gray.shape)
+    mean, square = (torch.nn.functional.avg_pool2d(g[None, None], window, stride=4) for g in (gray, gray * gray))
     return max(2 / 255, 0.8 * float((square - mean * mean).clamp(min=0).sqrt().median()))
 
 
@@ -159,15 +159,15 @@ def on_frame_grid(
     values: Float[Tensor, "h w"],
     also: Float[Tensor, "h w"],
     guide: Float[Tensor, "h w"],
-    picture: Float[Tensor, "fh fw 3"],
+    image: Float[Tensor, "fh fw 3"],
     lens: Cameras,
     canvas: Cameras,
 ) -> tuple[Float[Tensor, "fh fw"], Float[Tensor, "fh fw"]]:
-    """`values` and `also` of the canvas at the pixels of the frame, along the edges of the picture; 0 = unknown."""
+    """`values` and `also` of the canvas at the pixels of the frame, along the edges of the image; 0 = unknown."""
     u, v = _canvas_grid(_key(lens), _key(canvas))
-    wanted = (picture @ torch.tensor([0.299, 0.587, 0.114])).numpy().ravel()
+    wanted = (image @ torch.tensor([0.299, 0.587, 0.114])).numpy().ravel()
     out, read = consistency.look_up(values.numpy(), also.numpy(), guide.numpy(), u, v, wanted, likely_edge(guide), 0.03)
-    shape = picture.shape[:2]
+    shape = image.shape[:2]
     return torch.from_numpy(out.reshape(shape)), torch.from_numpy(read.reshape(shape))
 
 
@@ -225,7 +225,7 @@ def _lenses(cameras: Cameras) -> tuple[Cameras, torch.Tensor]:
 
 
 def _border(width: int, height: int) -> Float[Tensor, "n 2"]:
-    """Points along the outline of a picture, and the middle lines, where a bulging lens reaches farthest."""
+    """Points along the outline of an image, and the middle lines, where a bulging lens reaches farthest."""
     x = torch.linspace(0, width, 65, dtype=torch.float64)
     y = torch.linspace(0, height, 65, dtype=torch.float64)
     return torch.cat(

@@ -1,7 +1,7 @@
 """What training leaves behind: adapters and physics head in one safetensors file, without a single base weight.
 
 Tensors bear PEFT's names (`peft_format.py`) and `head.NAME`; the header says which base they were trained on (SHA-256
-over its tensors, whatever file they came from), that base's licence, which binds the adapter's use, and the settings.
+over its tensors, whatever file they came from), that base's license, which binds the adapter's use, and the settings.
 """
 
 import hashlib
@@ -37,7 +37,7 @@ class Base:
 
     name: str  # file name
     sha256: str  # of its tensors
-    licence: str
+    license: str
 
 
 @dataclass(frozen=True)
@@ -137,7 +137,7 @@ def load(path: Path, network: Mast3r, sha256: str | None = None) -> Student:
 
 
 def describe(path: Path) -> dict[str, Any]:
-    """The header of a file: base, licence, settings. Raises WeightsError as `load` does."""
+    """The header of a file: base, license, settings. Raises WeightsError as `load` does."""
     document, _ = _read(path)
     _checked(document, path)
     return document

@@ -1,4 +1,4 @@
-"""What medium-aware training minimises: the student's features against the teacher's, and the water against pictures.
+"""What medium-aware training minimizes: the student's features against the teacher's, and the water against images.
 
     L_geom = sum_k lambda_k |F_k - F~_k|^2       k: encoder, decoder, descriptors            (Eq. geom)
     L_for  = 1/N sum_n |I->_n - I_n|_1           I-> = add_water(J)                          (Eq. stage1_loss_for)
@@ -13,7 +13,7 @@ and where the augmentation drew the water, of weight 0 unless asked for, because
 Norms go over the three channels, N counts a frame's valid pixels. Every loss returns one number per frame or pair, so
 that a batch may be cut into parts, or spread over processes, without changing the mean.
 
-Q_0.05 is a pixel's colour, and dim pixels are near or black: in haze it lies below Binf, so the anchor biases Binf
+Q_0.05 is a pixel's color, and dim pixels are near or black: in haze it lies below Binf, so the anchor biases Binf
 downwards by construction. `benchmarks/veil_anchor.py` says by how much.
 """
 
@@ -29,10 +29,10 @@ from swimm3r.sfm.mast3r.settings import ObjectiveSettings
 
 
 @dataclass(frozen=True)
-class Features:
+class PairFeatures:
     """What the network makes of a batch of pairs, at the levels where the student follows the teacher."""
 
-    encoder: tuple[Float[Tensor, "b n c"], ...]  # normalised encoder output, one entry per view
+    encoder: tuple[Float[Tensor, "b n c"], ...]  # normalized encoder output, one entry per view
     decoder: tuple[Float[Tensor, "b n d"], ...]  # one entry per view and level
     descriptors: tuple[Float[Tensor, "b h w k"], ...]  # unit vectors, one entry per view
 
@@ -49,7 +49,7 @@ class LossTerms:
     overshoot: Float[Tensor, " b"]  # first part of L_sat
     anchor: Float[Tensor, " b"]  # second part, without its 0.5
     known_water: Float[Tensor, " b"]  # 0 where no water was drawn
-    clean: Float[Tensor, " b"]  # L_geom of the student on the clear pictures
+    clean: Float[Tensor, " b"]  # L_geom of the student on the clear images
 
     def total(self, s: ObjectiveSettings) -> Float[Tensor, " b"]:
         """L_SfM of each pair."""
@@ -61,7 +61,7 @@ class LossTerms:
 
 @dataclass(frozen=True)
 class PhysicsTerms:
-    """The four terms that compare the water with a frame's pictures, one number per frame."""
+    """The four terms that compare the water with a frame's images, one number per frame."""
 
     forward: Float[Tensor, " b"]
     inverse: Float[Tensor, " b"]
@@ -69,17 +69,17 @@ class PhysicsTerms:
     anchor: Float[Tensor, " b"]
 
 
-def features(network: Mast3r, view1: Encoded, view2: Encoded, settings: ObjectiveSettings) -> Features:
+def features(network: Mast3r, view1: Encoded, view2: Encoded, settings: ObjectiveSettings) -> PairFeatures:
     """The levels the objective asks for, of pairs in one direction; levels of weight 0 are not computed."""
     if not settings.decoder and not settings.descriptors:
-        return Features((view1.tokens, view2.tokens), (), ())
+        return PairFeatures((view1.tokens, view2.tokens), (), ())
     views = network.decode(view1, view2)
     levels = slice(-1, None) if settings.decoder_levels == "last" else slice(1, None)
     descriptors: tuple[Tensor, ...] = ()
     if settings.descriptors:
         descriptors = tuple(network.descriptors(v, which).descriptors for which, v in enumerate(views, start=1))
     decoder = tuple(t for v in views for t in v.tokens[levels]) if settings.decoder else ()
-    return Features((view1.tokens, view2.tokens), decoder, descriptors)
+    return PairFeatures((view1.tokens, view2.tokens), decoder, descriptors)
 
 
 def squared_distance(
@@ -109,14 +109,14 @@ def forward_loss(
     valid: Bool[Tensor, "b h w"],
     medium: Medium,
 ) -> Float[Tensor, " b"]:
-    """L_for: the clear picture through the water against the raw one."""
+    """L_for: the clear image through the water against the raw one."""
     return _mean_over((add_water(J, ray_depth, medium) - I).abs().sum(-1), valid)
 
 
 def inverse_loss(
     restored: Float[Tensor, "b h w 3"], J: Float[Tensor, "b h w 3"], valid: Bool[Tensor, "b h w"]
 ) -> Float[Tensor, " b"]:
-    """L_inv: the restored picture, not clamped, against the clear one."""
+    """L_inv: the restored image, not clamped, against the clear one."""
     return _mean_over((restored - J).abs().sum(-1), valid)
 
 
@@ -126,7 +126,7 @@ def overshoot_loss(restored: Float[Tensor, "b h w 3"], valid: Bool[Tensor, "b h 
     return _mean_over((above.square() + below.square()).sum(-1), valid)
 
 
-def dim_colour(
+def dim_color(
     I: Float[Tensor, "b h w 3"], valid: Bool[Tensor, "b h w"], quantile: float = 0.05
 ) -> Float[Tensor, "b 3"]:
     """Q_0.05: per channel the value below which that share of a frame's valid pixels lies; 0 for a frame of none."""
@@ -138,7 +138,7 @@ def dim_colour(
 
 
 def anchor_loss(Binf: Float[Tensor, "b 3"], dim: Float[Tensor, "b 3"]) -> Float[Tensor, " b"]:
-    """Second part of L_sat without its 0.5: the veiling light's distance to the dim pixels' colour, squared."""
+    """Second part of L_sat without its 0.5: the veiling light's distance to the dim pixels' color, squared."""
     return (Binf - dim).square().sum(-1)
 
 
@@ -152,13 +152,13 @@ def physics_terms(
 ) -> PhysicsTerms:
     """L_for, L_inv and the parts of L_sat of frames; ray depth and coefficients in one unit, pixel values as stored.
 
-    Where `valid` is False nothing is read: depth and colours may be anything there, NaN included. A frame without any
+    Where `valid` is False nothing is read: depth and colors may be anything there, NaN included. A frame without any
     valid pixel contributes 0.
     """
     z = torch.where(valid, ray_depth, 0.0)
-    I, J = (torch.where(valid[..., None], picture, 0.0) for picture in (I, J))
+    I, J = (torch.where(valid[..., None], image, 0.0) for image in (I, J))
     restored = remove_water(I, z, medium, settings.min_transmittance)
-    dim = dim_colour(I, valid, settings.anchor_quantile)
+    dim = dim_color(I, valid, settings.anchor_quantile)
     anchor = anchor_loss(medium.Binf[:, 0, 0], dim)
     return PhysicsTerms(
         forward=forward_loss(I, J, z, valid, medium),

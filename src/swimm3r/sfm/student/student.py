@@ -1,6 +1,6 @@
 """The trained part of medium-aware SfM: adapters on the frozen network, and the physics head on what it then encodes.
 
-One copy of the weights is both networks: with the adapters off it is the teacher, which sees the clear pictures.
+One copy of the weights is both networks: with the adapters off it is the teacher, which sees the clear images.
 """
 
 import torch
@@ -10,7 +10,14 @@ from torch import Tensor, nn
 from swimm3r.sfm.mast3r.network import Encoded, Mast3r
 from swimm3r.sfm.mast3r.settings import LoraSettings, ObjectiveSettings
 from swimm3r.sfm.student.lora import Adapters, attach
-from swimm3r.sfm.student.losses import Features, LossTerms, features, known_water_loss, physics_terms, squared_distance
+from swimm3r.sfm.student.losses import (
+    LossTerms,
+    PairFeatures,
+    features,
+    known_water_loss,
+    physics_terms,
+    squared_distance,
+)
 from swimm3r.sfm.student.physics_head import PhysicsHead, WaterMaps
 
 
@@ -43,12 +50,12 @@ class Student(nn.Module):
         ray_depth: Float[Tensor, "b 2 h w"],
         valid: Bool[Tensor, "b 2 h w"],
         drawn: Float[Tensor, "b 2 3 3"],
-        teacher: Features | None = None,
+        teacher: PairFeatures | None = None,
     ) -> dict[str, Float[Tensor, " b"]]:
-        """The fields of `LossTerms` of pairs of the network's pictures (-1..1); ray depth in m, read where valid.
+        """The fields of `LossTerms` of pairs of the network's images (-1..1); ray depth in m, read where valid.
 
         `drawn` is Binf, beta_D and beta_B of the water the augmentation drew, NaN where it drew none. `teacher` is what
-        it makes of the clear pictures, where that is known already.
+        it makes of the clear images, where that is known already.
         """
         s = self.objective
         if teacher is None:
@@ -70,8 +77,8 @@ class Student(nn.Module):
             terms |= {name: values.unflatten(0, (-1, 2)).mean(1) for name, values in water.items()}
         return terms
 
-    def teacher(self, clean: Float[Tensor, "b 2 3 h w"]) -> Features:
-        """What the network without its adapters makes of the clear pictures of pairs."""
+    def teacher(self, clean: Float[Tensor, "b 2 3 h w"]) -> PairFeatures:
+        """What the network without its adapters makes of the clear images of pairs."""
         with torch.no_grad(), self.adapters.off():
             return self._features(clean)[0]
 
@@ -79,13 +86,13 @@ class Student(nn.Module):
         """L_SfM of each pair."""
         return LossTerms(**terms).total(self.objective)
 
-    def _features(self, pictures: Float[Tensor, "b 2 3 h w"]) -> tuple[Features, Encoded]:
+    def _features(self, images: Float[Tensor, "b 2 3 h w"]) -> tuple[PairFeatures, Encoded]:
         network = self.network
-        both = network.encode(pictures.flatten(0, 1))
+        both = network.encode(images.flatten(0, 1))
         view1, view2 = (Encoded(both.tokens[k::2], both.positions[k::2], both.height, both.width) for k in (0, 1))
         return features(network, view1, view2, self.objective), both
 
-    def _distances(self, teacher: Features, student: Features) -> dict[str, Tensor]:
+    def _distances(self, teacher: PairFeatures, student: PairFeatures) -> dict[str, Tensor]:
         s = self.objective
         zero = student.encoder[0].new_zeros(len(student.encoder[0]), dtype=torch.float32)
         return {

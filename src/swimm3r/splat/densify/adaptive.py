@@ -1,7 +1,7 @@
-"""Gaussians multiply where their projected centres are pulled about (3DGS, Kerbl et al. 2023; AbsGS, Ye et al. 2024).
+"""Gaussians multiply where their projected centers are pulled about (3DGS, Kerbl et al. 2023; AbsGS, Ye et al. 2024).
 
 A small one that is pulled hard is doubled, a large one replaced by two of its own shape, drawn from it. The pull is the
-mean length of the projected centre's gradient, in half pictures, over the steps that had it in the picture.
+mean length of the projected center's gradient, in half images, over the steps that had it in the image.
 """
 
 import math
@@ -37,7 +37,7 @@ def nothing_seen(n: int, device: torch.device = CPU) -> dict[str, Tensor]:
 def remembered(
     memory: dict[str, Tensor], gradient: Float[Tensor, "n 2"], projection: Projection, view: Pinhole
 ) -> dict[str, Tensor]:
-    """The memory after one more step, whose centres' gradient (per pixel) and projection are given."""
+    """The memory after one more step, whose centers' gradient (per pixel) and projection are given."""
     size = torch.tensor([view.width, view.height]).to(gradient)
     at, reach = projection.primitives.mean2d.detach(), projection.radius[:, None]
     shown = ((at > -reach) & (at < size + reach)).all(-1) & (projection.radius > 0)
@@ -95,7 +95,7 @@ def unchanged(p: GaussianPrimitives) -> Changed:
 def dimmed(
     p: GaussianPrimitives, moments: dict[str, Moments], most: float
 ) -> tuple[GaussianPrimitives, dict[str, Moments]]:
-    """No opacity above `most`, and the optimiser's memory of opacities gone."""
+    """No opacity above `most`, and the optimizer's memory of opacities gone."""
     m = moments["opacity"]
     still = Moments(torch.zeros_like(m.first), torch.zeros_like(m.second), m.steps)
     return p._replace(opacity=p.opacity.clamp(max=math.log(most / (1 - most)))), {**moments, "opacity": still}

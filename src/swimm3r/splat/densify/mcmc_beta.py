@@ -3,8 +3,8 @@
     o' = 1 - (1 - o)^(1/n)
 
 is the opacity of each of the n copies that replace a primitive of opacity o; scale and exponent stay (UBS). Where the
-kernel is v, 1 at its centre and 0 at its rim, they let (1 - o' v)^n of the light pass instead of 1 - o v. The two are
-equal at centre and rim; in between the copies block more, for n = 2 by o'^2 v (1 - v). No o', scale and exponent mend
+kernel is v, 1 at its center and 0 at its rim, they let (1 - o' v)^n of the light pass instead of 1 - o v. The two are
+equal at center and rim; in between the copies block more, for n = 2 by o'^2 v (1 - v). No o', scale and exponent mend
 that for all v at once, as (1 - (1 - o v)^(1/n)) / o' is not a Beta kernel.
 """
 
@@ -24,7 +24,7 @@ _GATE = 100.0  # sharpness of the noise's gates
 
 @dataclass(frozen=True)
 class Densified:
-    """The primitives after a round, and which rows of the optimiser start anew."""
+    """The primitives after a round, and which rows of the optimizer start anew."""
 
     primitives: BetaPrimitives
     source: Int[Tensor, " n"]  # where each row came from
@@ -34,28 +34,28 @@ class Densified:
 
 
 def shared_opacity(opacity: Float[Tensor, "*n"], copies: Float[Tensor, "*n"], least: float) -> Float[Tensor, "*n"]:
-    """Opacity of each of `copies` primitives that take the place of one and block as much light at its centre."""
+    """Opacity of each of `copies` primitives that take the place of one and block as much light at its center."""
     return (1 - (1 - opacity) ** (1 / copies)).clamp(least, _LARGEST)
 
 
-def relocate_and_grow(p: BetaPrimitives, target: int, dead_opacity: float, rng: torch.Generator) -> Densified:
+def relocate_and_grow(p: BetaPrimitives, target: int, min_opacity: float, rng: torch.Generator) -> Densified:
     """Dead primitives take half of a live one, drawn by opacity; then more are drawn from all until `target` exist."""
     opacity = torch.sigmoid(p.opacity)
     n = len(opacity)
     source = torch.arange(n, device=opacity.device)
-    dead = (opacity <= dead_opacity).nonzero()[:, 0]
-    alive = (opacity > dead_opacity).nonzero()[:, 0]
+    dead = (opacity <= min_opacity).nonzero()[:, 0]
+    alive = (opacity > min_opacity).nonzero()[:, 0]
     restarted = [source[:0]]
     if len(dead) and len(alive):
         drawn = alive[draw_rows(opacity[alive], len(dead), rng)]
-        opacity = _shared(opacity, drawn, dead_opacity)
+        opacity = _shared(opacity, drawn, min_opacity)
         source[dead] = drawn
         opacity[dead] = opacity[drawn]
         restarted.append(drawn)
     added = max(0, target - n) if len(alive) else 0
     if added:
         drawn = draw_rows(opacity, added, rng)
-        opacity = _shared(opacity, drawn, dead_opacity)
+        opacity = _shared(opacity, drawn, min_opacity)
         source = torch.cat([source, source[drawn]])
         opacity = torch.cat([opacity, opacity[drawn]])
         restarted += [drawn, torch.arange(n, n + added, device=drawn.device)]
@@ -73,10 +73,10 @@ def noise(
 ) -> Float[Tensor, "n 3"]:
     """Random displacement within each primitive's own shape, V11 eps, of those near death only."""
     opacity = torch.sigmoid(p.opacity)
-    at = (opacity < settings.dead_opacity + 0.2).nonzero()[:, 0]  # both gates are below 1e-8 beyond
+    at = (opacity < settings.min_opacity + 0.2).nonzero()[:, 0]  # both gates are below 1e-8 beyond
     q, o = select(p, at), opacity[at]
     L = rotation_block(q.lower[:, :3], rotation) * torch.nn.functional.softplus(q.scale[:, None, :3])
-    gate = (1 - o) ** _GATE if settings.noise_gate == "power" else torch.sigmoid(-_GATE * (o - settings.dead_opacity))
+    gate = (1 - o) ** _GATE if settings.noise_gate == "power" else torch.sigmoid(-_GATE * (o - settings.min_opacity))
     eps = torch.randn(len(at), 3, 1, generator=rng).to(o) * rate * gate[:, None, None]
     moved = torch.zeros_like(p.xyz)
     moved[at] = (L @ (L.mT @ eps))[..., 0]

@@ -22,7 +22,7 @@ _GATE = 100.0  # sharpness of the noise's
 
 @dataclass(frozen=True)
 class Relocated:
-    """The Gaussians after a round, and which rows of the optimiser start anew."""
+    """The Gaussians after a round, and which rows of the optimizer start anew."""
 
     primitives: GaussianPrimitives
     restarted: Int[Tensor, " m"]
@@ -41,17 +41,17 @@ def scale_factor(opacity: Float[Tensor, "*n"], copies: Float[Tensor, "*n"]) -> F
     return o / total
 
 
-def relocate_and_grow(p: GaussianPrimitives, target: int, dead_opacity: float, rng: torch.Generator) -> Relocated:
+def relocate_and_grow(p: GaussianPrimitives, target: int, min_opacity: float, rng: torch.Generator) -> Relocated:
     """Dead Gaussians take a share of a live one, drawn by opacity; then more are drawn until `target` exist."""
     n = len(p.xyz)
     opacity = torch.sigmoid(p.opacity)
-    dead, alive = (opacity <= dead_opacity).nonzero()[:, 0], (opacity > dead_opacity).nonzero()[:, 0]
+    dead, alive = (opacity <= min_opacity).nonzero()[:, 0], (opacity > min_opacity).nonzero()[:, 0]
     if not len(alive):
         return Relocated(p, alive, 0, 0)
     restarted = []
     if len(dead):
         drawn = alive[draw_rows(opacity[alive], len(dead), rng)]
-        p = _shared(p, drawn, dead_opacity)
+        p = _shared(p, drawn, min_opacity)
         source = torch.arange(n, device=dead.device)
         source[dead] = drawn
         p = select(p, source)
@@ -59,19 +59,19 @@ def relocate_and_grow(p: GaussianPrimitives, target: int, dead_opacity: float, r
     added = max(0, target - n)
     if added:
         drawn = draw_rows(torch.sigmoid(p.opacity), added, rng)
-        p = _shared(p, drawn, dead_opacity)
+        p = _shared(p, drawn, min_opacity)
         p = select(p, torch.cat([torch.arange(n, device=drawn.device), drawn]))
         restarted += [drawn, torch.arange(n, n + added, device=drawn.device)]
     touched = torch.cat(restarted).unique() if restarted else alive[:0]
     return Relocated(p, touched, len(dead), added)
 
 
-def noise(p: GaussianPrimitives, rate: float, dead_opacity: float, rng: torch.Generator) -> Float[Tensor, "n 3"]:
+def noise(p: GaussianPrimitives, rate: float, min_opacity: float, rng: torch.Generator) -> Float[Tensor, "n 3"]:
     """Random displacement Sigma eps within each Gaussian's own shape, of those near death only."""
     opacity = torch.sigmoid(p.opacity)
-    at = (opacity < dead_opacity + 0.2).nonzero()[:, 0]  # the gate is below 1e-8 beyond
+    at = (opacity < min_opacity + 0.2).nonzero()[:, 0]  # the gate is below 1e-8 beyond
     L = shape_factor(select(p, at))
-    gate = torch.sigmoid(-_GATE * (opacity[at] - dead_opacity))
+    gate = torch.sigmoid(-_GATE * (opacity[at] - min_opacity))
     eps = torch.randn(len(at), 3, 1, generator=rng).to(gate) * rate * gate[:, None, None]
     moved = torch.zeros_like(p.xyz)
     moved[at] = (L @ (L.mT @ eps))[..., 0]

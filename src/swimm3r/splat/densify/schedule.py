@@ -8,52 +8,52 @@ from typing import Protocol, runtime_checkable
 
 
 @runtime_checkable  # so that the suite can check calls against it
-class Cadence(Protocol):
+class RefineCadence(Protocol):
     """What the densification settings of all recipes share."""
 
     @property
-    def every(self) -> float:
+    def refine_every(self) -> float:
         """Share of the run between two rounds."""
         ...
 
     @property
-    def min_every(self) -> int:
+    def min_refine_every(self) -> int:
         """Fewest steps between two rounds."""
         ...
 
 
 @runtime_checkable
-class Window(Cadence, Protocol):
+class RefineWindow(RefineCadence, Protocol):
     """A cadence that holds for a part of the run."""
 
     @property
-    def begin(self) -> float:
+    def refine_start(self) -> float:
         """Share of the run before the first round."""
         ...
 
     @property
-    def end(self) -> float:
+    def refine_stop(self) -> float:
         """Share of the run after the last one."""
         ...
 
 
-def steps_between(settings: Cadence, iterations: int) -> int:
+def steps_between(settings: RefineCadence, iterations: int) -> int:
     """Steps from one round to the next."""
-    return max(settings.min_every, round(settings.every * iterations))
+    return max(settings.min_refine_every, round(settings.refine_every * iterations))
 
 
-def has_round(settings: Window, step: int, iterations: int) -> bool:
+def has_round(settings: RefineWindow, step: int, iterations: int) -> bool:
     """Whether a step, counted from 1, densifies."""
-    in_window = settings.begin < step / iterations <= settings.end
+    in_window = settings.refine_start < step / iterations <= settings.refine_stop
     return in_window and step % steps_between(settings, iterations) == 0
 
 
-def grown(count: int, most: int, growth: float, settings: Cadence, iterations: int) -> int:
-    """Primitives after a round: `growth` times as many per round at `every`, at most `most`, never fewer.
+def grown(count: int, most: int, growth: float, settings: RefineCadence, iterations: int) -> int:
+    """Primitives after a round: `growth` times as many per round at `refine_every`, at most `most`, never fewer.
 
-    Where `min_every` leaves out rounds the next one makes up for them.
+    Where `min_refine_every` leaves out rounds the next one makes up for them.
     """
-    rounds = steps_between(settings, iterations) / (settings.every * iterations)
+    rounds = steps_between(settings, iterations) / (settings.refine_every * iterations)
     if most <= count or rounds * math.log(growth) > 1 + math.log(most / count):  # the power might overflow
         return max(count, most)
     return max(count, min(most, int(growth**rounds * count)))

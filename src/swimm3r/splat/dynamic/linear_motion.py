@@ -13,7 +13,7 @@ from swimm3r.splat.projection.conditioning import rotation_block
 LONGEST = 0.4  # scale in time of what travels, lengths of the clip
 
 
-def travelling(
+def traveling(
     xyz: Float[Tensor, "n 3"],
     velocity: Float[Tensor, "n 3"],
     direction: Float[Tensor, "n 3"],
@@ -27,7 +27,7 @@ def travelling(
     """Primitives, D = 7, which are at `xyz` at `time` and move at `velocity` (lengths per clip) while they last.
 
     Conditioned on time t their mean is xyz + velocity (t - time), exactly; their standard deviation is `radius`, up to
-    1.7 times as much across the travel, because I + A turns the long axis V11 = radius^2 I + duration^2 v v^T towards
+    1.7 times as much across the travel, because I + A turns the long axis V11 = radius^2 I + duration^2 v v^T toward
     the travel and stretches what it turns. `duration` is their scale in time, in lengths of the clip.
     """
     n, speed = len(xyz), torch.linalg.vector_norm(velocity, dim=-1)
@@ -68,7 +68,7 @@ class Ways:
 
 
 def ways(p: BetaPrimitives) -> Ways:
-    """Of primitives, D = 7; colour, opacity and the place at the middle of the time are no part of a way."""
+    """Of primitives, D = 7; color, opacity and the place at the middle of the time are no part of a way."""
     in_time = softplus(p.scale[:, 6]).square() + p.lower[:, 15:].square().sum(-1)  # V22's last entry
     rows = (in_time < (1.1 * LONGEST) ** 2).nonzero()[:, 0]
     return Ways(rows, {name: getattr(p, name)[rows].clone() for name in ("query_mean", "beta", "scale", "lower")})

@@ -1,7 +1,7 @@
 """Where a frame shows what moves: what neither the still map nor the other frames have there.
 
 Early in training a map shows the ground, and here and there already a ghost of what moved before it. So two questions
-are asked of a frame: does it differ from the map, and from the pictures of the same ground at other times? What does
+are asked of a frame: does it differ from the map, and from the images of the same ground at other times? What does
 both, much more than the other frames do at that ground, came between.
 """
 
@@ -20,9 +20,9 @@ from swimm3r.splat.primitives.beta import BetaPrimitives
 from swimm3r.splat.projection.pinhole import pinhole
 from swimm3r.splat.rendering import draw, expected_z_depth
 from swimm3r.splat.settings import UwbsSettings
-from swimm3r.splat.views import TrainingViews, View
+from swimm3r.splat.views import TrainingView, TrainingViews
 
-_LONG_SIDE = 160  # of the pictures in which movement is looked for, pixels
+_LONG_SIDE = 160  # of the images in which movement is looked for, pixels
 _BLUR = 5  # side of the square that differences are averaged over
 _OTHERS = 12  # frames at other times, spread over the clip, that are asked about a frame's ground
 _HIDDEN = 0.8  # of a point's depth in another frame: what is nearer there hides it
@@ -31,12 +31,12 @@ _SEEDS = 6  # pixels of a part that must differ clearly
 
 
 @dataclass(frozen=True)
-class Look:
-    """A small picture of a frame, how far it is off what was expected, and how far away the map's ground is."""
+class MotionView:
+    """A small image of a frame, how far it is off what was expected, and how far away the map's ground is."""
 
     camera: Cameras  # at most 160 pixels wide
     rgb: Float[Tensor, "3 h w"]
-    off: Float[Tensor, "h w"]  # of blurred pictures, as texture not yet learned averages out
+    off: Float[Tensor, "h w"]  # of blurred images, as texture not yet learned averages out
     z_depth: Float[Tensor, "h w"]  # of open water: far away
     reach: float  # z depth of the frame's far ground
     seen: Bool[Tensor, "h w"]
@@ -44,17 +44,20 @@ class Look:
 
 def moving_parts(
     p: BetaPrimitives, field: MediumField, views: TrainingViews, settings: UwbsSettings
-) -> tuple[list[Look], list[list[Bool[Tensor, "h w"]]]]:
+) -> tuple[list[MotionView], list[list[Bool[Tensor, "h w"]]]]:
     """All frames, and the masks of each one's moving parts."""
     m = settings.movers
-    looks = [look(p, field, views[k], settings) for k in range(len(views))]
-    others = [_spread([j for j in range(len(looks)) if j != k]) for k in range(len(looks))]
-    looks = [against_others(mine, [looks[j] for j in others[k]]) for k, mine in enumerate(looks)]
-    masks = [moving_pixels(mine, [looks[j] for j in others[k]], m.contrast, m.least) for k, mine in enumerate(looks)]
-    return looks, [_parts(mask) for mask in masks]
+    views_seen = [motion_view(p, field, views[k], settings) for k in range(len(views))]
+    others = [_spread([j for j in range(len(views_seen)) if j != k]) for k in range(len(views_seen))]
+    views_seen = [against_others(mine, [views_seen[j] for j in others[k]]) for k, mine in enumerate(views_seen)]
+    masks = [
+        moving_pixels(mine, [views_seen[j] for j in others[k]], m.contrast, m.least)
+        for k, mine in enumerate(views_seen)
+    ]
+    return views_seen, [_parts(mask) for mask in masks]
 
 
-def look(p: BetaPrimitives, field: MediumField, view: View, settings: UwbsSettings) -> Look:
+def motion_view(p: BetaPrimitives, field: MediumField, view: TrainingView, settings: UwbsSettings) -> MotionView:
     """A frame against the map at the frame's own time, without gradient."""
     scale = min(1.0, _LONG_SIDE / max(view.camera.width, view.camera.height))
     width, height = max(8, round(scale * view.camera.width)), max(8, round(scale * view.camera.height))
@@ -67,10 +70,10 @@ def look(p: BetaPrimitives, field: MediumField, view: View, settings: UwbsSettin
     z_depth = expected_z_depth(images)
     ground = images.alpha > 0.5
     reach = float(z_depth[ground].quantile(0.9)) if bool(ground.any()) else settings.working_depth
-    return Look(camera, target, off, torch.where(ground, z_depth, _BEYOND * reach), reach, seen)
+    return MotionView(camera, target, off, torch.where(ground, z_depth, _BEYOND * reach), reach, seen)
 
 
-def against_others(mine: Look, others: Sequence[Look]) -> Look:
+def against_others(mine: MotionView, others: Sequence[MotionView]) -> MotionView:
     """No further off than half of the other frames that see the same ground are from this one.
 
     That is asked twice, of the map's ground and of a plane as far away as the far ground, because a ghost in the map
@@ -90,7 +93,7 @@ def against_others(mine: Look, others: Sequence[Look]) -> Look:
     return replace(mine, off=off)
 
 
-def moving_pixels(mine: Look, others: Sequence[Look], contrast: float, least: float) -> Bool[Tensor, "h w"]:
+def moving_pixels(mine: MotionView, others: Sequence[MotionView], contrast: float, least: float) -> Bool[Tensor, "h w"]:
     """Where a frame is off `contrast` times as much as the others that see the same ground, or water.
 
     That is more than their median, of two frames at least, and by `least` of the full range. The regions around such
@@ -111,7 +114,7 @@ def moving_pixels(mine: Look, others: Sequence[Look], contrast: float, least: fl
 
 
 def _there(
-    mine: Look, other: Look, maps: Float[Tensor, "c h w"], z_depth: Float[Tensor, "h w"]
+    mine: MotionView, other: MotionView, maps: Float[Tensor, "c h w"], z_depth: Float[Tensor, "h w"]
 ) -> tuple[Float[Tensor, "c n"], Float[Tensor, " n"]]:
     """Another frame's maps where it sees what this one's pixels see at the z depths, 0 where it does not; z there."""
     height, width = z_depth.shape
@@ -126,8 +129,8 @@ def _spread(frames: Sequence[int]) -> list[int]:
     return [frames[i] for i in at]
 
 
-def _blurred(picture: Float[Tensor, "3 h w"]) -> Float[Tensor, "3 h w"]:
-    return avg_pool2d(picture, _BLUR, 1, _BLUR // 2, count_include_pad=False)
+def _blurred(image: Float[Tensor, "3 h w"]) -> Float[Tensor, "3 h w"]:
+    return avg_pool2d(image, _BLUR, 1, _BLUR // 2, count_include_pad=False)
 
 
 def _grown(seeds: Bool[Tensor, "h w"], region: Bool[Tensor, "h w"]) -> Bool[Tensor, "h w"]:

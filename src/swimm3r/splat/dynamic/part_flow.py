@@ -14,10 +14,10 @@ from torch.nn.functional import grid_sample, interpolate, pad
 
 from swimm3r.cameras import pixel_grid
 from swimm3r.splat.dynamic.part_tracks import Fit, Part
-from swimm3r.splat.views import View
+from swimm3r.splat.views import TrainingView
 
 _RETURN = 1.5  # pixels within which flow there and back must end where it began
-_FLOW_SIDE = 240  # flow is found on pictures halved until their long side is below twice as many pixels
+_FLOW_SIDE = 240  # flow is found on images halved until their long side is below twice as many pixels
 _LEADS = 30  # pixels that must be followed for the motion of a part to be more than it was laid over by
 
 
@@ -40,12 +40,12 @@ def carried(whole: Float[Tensor, "2 3"], pixels: Float[Tensor, "n 2"]) -> Float[
     return (pixels.to(whole) @ whole[:, :2].mT + whole[:, 2]).to(pixels)
 
 
-def passages(fit: Fit, a: Part, b: Part, first: View, second: View) -> tuple[Passage, Passage]:
+def passages(fit: Fit, a: Part, b: Part, first: TrainingView, second: TrainingView) -> tuple[Passage, Passage]:
     """From part a in one view to part b in another, and back."""
     scale = first.camera.width / a.mask.shape[1]
     there = torch.cat([fit.whole[:, :2], scale * fit.whole[:, 2:]], 1)
     back = _inverse(there)
-    mine, theirs = _on_grey(first, a.mask), _on_grey(second, b.mask)
+    mine, theirs = _on_gray(first, a.mask), _on_gray(second, b.mask)
     flow, return_flow = _flow(mine, theirs, there), _flow(theirs, mine, back)
     return (
         Passage(flow, return_flow, _as_a_whole(flow, return_flow, full_size(a.mask, first), there)),
@@ -58,24 +58,24 @@ def _inverse(whole: Float[Tensor, "2 3"]) -> Float[Tensor, "2 3"]:
     return torch.cat([turned, -turned @ whole[:, 2:]], 1)
 
 
-def full_size(values: Shaped[Tensor, "h w"], view: View) -> Float[Tensor, "H W"]:
-    """The values of a smaller picture's pixels, at the size of a view's own."""
+def full_size(values: Shaped[Tensor, "h w"], view: TrainingView) -> Float[Tensor, "H W"]:
+    """The values of a smaller image's pixels, at the size of a view's own."""
     return interpolate(values[None, None].float(), view.rgb.shape[1:], mode="nearest")[0, 0]
 
 
-def _on_grey(view: View, mask: Bool[Tensor, "h w"]) -> UInt8[np.ndarray, "H W"]:
-    """What moves in a frame, before an even grey: the ground, which moves otherwise, must not lead the flow astray."""
+def _on_gray(view: TrainingView, mask: Bool[Tensor, "h w"]) -> UInt8[np.ndarray, "H W"]:
+    """What moves in a frame, before an even gray: the ground, which moves otherwise, must not lead the flow astray."""
     import cv2
 
-    grey = cv2.cvtColor((255 * view.rgb).byte().permute(1, 2, 0).numpy(), cv2.COLOR_RGB2GRAY)
-    grey[full_size(mask, view).numpy() == 0] = 128
-    return grey
+    gray = cv2.cvtColor((255 * view.rgb).byte().permute(1, 2, 0).numpy(), cv2.COLOR_RGB2GRAY)
+    gray[full_size(mask, view).numpy() == 0] = 128
+    return gray
 
 
 def _flow(
     first: UInt8[np.ndarray, "h w"], second: UInt8[np.ndarray, "h w"], about: Float[Tensor, "2 3"]
 ) -> Float[Tensor, "2 h w"]:
-    """How far every pixel of one picture has gone in another, pixels (x, y), if it is `about` there."""
+    """How far every pixel of one image has gone in another, pixels (x, y), if it is `about` there."""
     import cv2
 
     height, width = first.shape
@@ -84,7 +84,7 @@ def _flow(
     column, row = (there - 0.5).numpy().transpose(2, 0, 1)
     brought = cv2.remap(second, column, row, cv2.INTER_LINEAR, borderMode=cv2.BORDER_REPLICATE)
     outside = ((there < 0) | (there > torch.tensor([width, height]))).any(-1).numpy()
-    brought[outside] = first[outside]  # what is out of the second picture goes with the rest
+    brought[outside] = first[outside]  # what is out of the second image goes with the rest
     flow = cv2.DISOpticalFlow.create(cv2.DISOPTICAL_FLOW_PRESET_MEDIUM)
     flow.setFinestScale(max(0, int(np.log2(max(first.shape) / _FLOW_SIDE))))
     found = pixels + torch.from_numpy(flow.calc(first, brought, None))  # pyright: ignore
@@ -95,7 +95,7 @@ def _flow(
 def _followed(
     flow: Float[Tensor, "2 h w"], back: Float[Tensor, "2 h w"], pixels: Float[Tensor, "n 2"]
 ) -> tuple[Float[Tensor, "n 2"], Bool[Tensor, " n"]]:
-    """Where the flow takes pixels, and whether that is within the picture and the flow back ends where it began."""
+    """Where the flow takes pixels, and whether that is within the image and the flow back ends where it began."""
     moved = pixels + _sampled(flow, pixels)
     returned = moved + _sampled(back, moved)
     size = torch.tensor([flow.shape[2], flow.shape[1]])

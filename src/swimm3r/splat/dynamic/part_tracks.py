@@ -1,7 +1,7 @@
 """What moves, from frame to frame: which part of one frame is which of the next, and how it has shifted.
 
 A camera that swims shifts what moves by more than its own length from one frame to the next, and what has a pattern
-looks alike a few pixels on. So parts are laid over each other, outlines and colours, wherever they may be.
+looks alike a few pixels on. So parts are laid over each other, outlines and colors, wherever they may be.
 """
 
 from collections.abc import Sequence
@@ -14,7 +14,7 @@ from torch.nn.functional import grid_sample
 
 from swimm3r.cameras import pixel_grid
 
-_OVERHANG = 0.03  # squared difference of colour that a pixel of one part counts which the other does not cover
+_OVERHANG = 0.03  # squared difference of color that a pixel of one part counts which the other does not cover
 _ALIKE = 0.8 * _OVERHANG  # mean cost of two parts, laid over each other, that may be the same
 _SIZES = (0.8, 0.9, 1.0, 1 / 0.9, 1 / 0.8)  # that a part may come to have in the next frame
 _OVERLAP = 0.3  # of the smaller part, at least
@@ -23,7 +23,7 @@ _MOST = 6  # parts of a frame that are followed: every two of two frames are com
 
 @dataclass(frozen=True)
 class Part:
-    """A moving region of one frame, in a small picture of it."""
+    """A moving region of one frame, in a small image of it."""
 
     frame: int
     time: float
@@ -36,7 +36,7 @@ class Fit:
     """How a part is best laid over another."""
 
     cost: float
-    whole: Float[Tensor, "2 3"]  # affine, of homogeneous pixels of the small pictures
+    whole: Float[Tensor, "2 3"]  # affine, of homogeneous pixels of the small images
 
 
 @dataclass(frozen=True)
@@ -78,8 +78,8 @@ def tracks(parts: Sequence[Sequence[Part]]) -> list[Track]:
 def laid_over(a: Part, b: Part) -> Fit | None:
     """The best fit of all shifts and some sizes; None if two parts do not fit each other.
 
-    Its cost is a mean over the pixels that either covers: squared difference of colour where both do, else a fixed
-    cost. What leaves the picture does not count.
+    Its cost is a mean over the pixels that either covers: squared difference of color where both do, else a fixed
+    cost. What leaves the image does not count.
     """
     tones = [part.rgb[:, part.mask].mean(1) for part in (a, b)]
     if float((tones[0] - tones[1]).square().mean()) > _ALIKE:
@@ -99,7 +99,7 @@ def _shifted(a: Part, b: Part, size: float) -> Fit | None:
     )
     shown, mine, *rgb, squares = grid_sample(maps[None].double(), at[None], align_corners=False)[0]
     theirs = b.mask.double()
-    everywhere, both, colour, covered = _correlations(
+    everywhere, both, color, covered = _correlations(
         [(mine, torch.ones_like(theirs))],
         [(mine, theirs)],
         [
@@ -110,7 +110,7 @@ def _shifted(a: Part, b: Part, size: float) -> Fit | None:
         [(shown, theirs)],
     )
     alone = everywhere + covered - 2 * both
-    cost = (colour / 3 + _OVERHANG * alone) / (both + alone).clamp(min=1)
+    cost = (color / 3 + _OVERHANG * alone) / (both + alone).clamp(min=1)
     cost[both < _OVERLAP * min(float(mine.sum()), float(theirs.sum()))] = torch.inf
     best = int(cost.argmin())
     if float(cost.flatten()[best]) > _ALIKE:

@@ -17,15 +17,15 @@ from torch.nn.functional import normalize
 
 from swimm3r.cameras import Cameras, directions, project, ray_depth_from_z, unproject
 from swimm3r.medium import Medium, remove_water
-from swimm3r.splat.dynamic.linear_motion import LONGEST, travelling
-from swimm3r.splat.dynamic.motion_masks import Look, moving_parts
+from swimm3r.splat.dynamic.linear_motion import LONGEST, traveling
+from swimm3r.splat.dynamic.motion_masks import MotionView, moving_parts
 from swimm3r.splat.dynamic.part_flow import Passage, carried, full_size, passages
 from swimm3r.splat.dynamic.part_tracks import Part, Track, tracks
 from swimm3r.splat.dynamic.trajectory import course
 from swimm3r.splat.medium.field import MediumField
 from swimm3r.splat.primitives.beta import BetaPrimitives
 from swimm3r.splat.settings import UwbsSettings
-from swimm3r.splat.views import TrainingViews, View
+from swimm3r.splat.views import TrainingView, TrainingViews
 
 _SPACING = 3.0  # pixels between primitives that are born, at least
 _RADIUS = 1.6  # of a primitive, in their spacing, and
@@ -35,7 +35,7 @@ _ALONE = 0.5  # intervals between frames that primitives last which nothing show
 
 
 @dataclass(frozen=True)
-class Sighting:
+class Observation:
     """A part in one frame, how far away it is, and its way to the frames before and after where it is followed."""
 
     part: Part
@@ -74,17 +74,17 @@ def born(
     interval = float(np.median(gaps[gaps > 0]))
     looks, masks = moving_parts(p, field, views, settings)
     parts = [[Part(k, float(times[k]), mask, looks[k].rgb) for mask in masks[k]] for k in order]
-    found = [s for track in tracks(parts) for s in _sightings(track, views, looks, interval, settings)]
+    found = [s for track in tracks(parts) for s in _observations(track, views, looks, interval, settings)]
     area = sum(float(s.part.mask.sum()) / s.part.mask.numel() * views[s.part.frame].seen.numel() for s in found)
-    most = round(settings.movers.share * settings.densify.max_primitives)
+    most = round(settings.movers.share * settings.densify.cap_max)
     spacing = max(_SPACING, (area / max(1, most)) ** 0.5)
     made = [_primitives(s, field, views[s.part.frame], spacing, interval, settings, rng) for s in found]
     return BetaPrimitives(*(torch.cat(values) for values in zip(none, *made, strict=True)))
 
 
-def _sightings(
-    track: Track, views: TrainingViews, looks: Sequence[Look], interval: float, settings: UwbsSettings
-) -> list[Sighting]:
+def _observations(
+    track: Track, views: TrainingViews, looks: Sequence[MotionView], interval: float, settings: UwbsSettings
+) -> list[Observation]:
     """A track's parts with their distances, by the course of the middle of its largest."""
     parts = track.parts
     frames = [part.frame for part in parts]
@@ -113,47 +113,47 @@ def _sightings(
         return Way(passage, cameras[j], z[j], float(times[j] - times[i]))
 
     near = [[j for j in (i - 1, i + 1) if 0 <= j < len(parts)] for i in range(len(parts))]
-    return [Sighting(part, z[i], tuple(way(i, j) for j in near[i])) for i, part in enumerate(parts)]
+    return [Observation(part, z[i], tuple(way(i, j) for j in near[i])) for i, part in enumerate(parts)]
 
 
-def _ground(part: Part, look: Look) -> float:
+def _ground(part: Part, motion_view: MotionView) -> float:
     """Z depth of the nearest ground that a part hides, but for a tenth."""
-    return float(look.z_depth.clamp(max=look.reach)[part.mask].quantile(0.1))
+    return float(motion_view.z_depth.clamp(max=motion_view.reach)[part.mask].quantile(0.1))
 
 
 def _primitives(
-    sighting: Sighting,
+    observation: Observation,
     field: MediumField,
-    view: View,
+    view: TrainingView,
     spacing: float,
     interval: float,
     settings: UwbsSettings,
     rng: torch.Generator,
 ) -> BetaPrimitives:
     """Primitives at random pixels of a part, `spacing` apart on average, freed from the water."""
-    width, z_depth = view.camera.width, sighting.z_depth
-    rows = ((full_size(sighting.part.mask, view) > 0) & view.seen).reshape(-1).nonzero()[:, 0]
+    width, z_depth = view.camera.width, observation.z_depth
+    rows = ((full_size(observation.part.mask, view) > 0) & view.seen).reshape(-1).nonzero()[:, 0]
     count = max(1, round(len(rows) / spacing**2))
     rows = rows[torch.randperm(len(rows), generator=rng)[:count]]
     pixels = torch.stack([rows % width, rows // width], -1) + torch.rand(len(rows), 2, generator=rng)
     z = torch.full((len(rows),), z_depth)
     xyz = unproject(view.camera, pixels[None], z[None])[0]
-    towards = normalize(xyz - view.camera.centres[0].to(xyz), dim=-1)
-    colours = view.rgb.reshape(3, -1).mT[rows]
+    toward = normalize(xyz - view.camera.centers[0].to(xyz), dim=-1)
+    colors = view.rgb.reshape(3, -1).mT[rows]
     if settings.medium.model == "network":
         with torch.no_grad():
-            Binf, beta_B, beta_D = field(towards[None].float(), view.time)[:, 0].mT.split(3, -1)
+            Binf, beta_B, beta_D = field(toward[None].float(), view.time)[:, 0].mT.split(3, -1)
         ray_depth = ray_depth_from_z(z, directions(view.camera, pixels[None])[0])
-        colours = remove_water(colours, ray_depth, Medium(Binf, beta_D, beta_B)).clamp(0, 1)
-    velocities = [way.velocity(pixels, xyz) for way in sighting.ways]
+        colors = remove_water(colors, ray_depth, Medium(Binf, beta_D, beta_B)).clamp(0, 1)
+    velocities = [way.velocity(pixels, xyz) for way in observation.ways]
     assert view.time is not None
-    return travelling(
+    return traveling(
         xyz,
         torch.stack(velocities).mean(0) if velocities else torch.zeros_like(xyz),
-        towards,
+        toward,
         float(view.time),
         radius=_RADIUS * spacing * z / float(view.camera.K[0, 0, 0]),
         duration=min(LONGEST, interval * (settings.movers.duration if velocities else _ALONE)),
-        rgb=colours,
+        rgb=colors,
         opacity=_OPACITY,
     )

@@ -32,7 +32,7 @@ def course(
     `times` count in intervals between frames, which the priors are made for. Levenberg-Marquardt over all positions.
     """
     assumed, pixels = z_depth.double(), pixels.double()
-    rotation, centres = cameras.cam2world[:, :3, :3].double(), cameras.centres.double()
+    rotation, centers = cameras.cam2world[:, :3, :3].double(), cameras.centers.double()
     bearing = directions(cameras, pixels[:, None])[:, 0, :2]
     focal = cameras.K[:, 0, 0].double()
     steady = _steadiness(times.double())
@@ -40,7 +40,7 @@ def course(
     around /= around.sum(1, keepdim=True)
 
     def errors(xyz: Float[Tensor, "n 3"]) -> Float[Tensor, " rows"]:
-        local = torch.einsum("nij,ni->nj", rotation, xyz - centres)
+        local = torch.einsum("nij,ni->nj", rotation, xyz - centers)
         z = local[:, 2]
         off = (local[:, :2] / z[:, None] - bearing) * focal[:, None] / _PIXEL
         unsteady = steady @ xyz / (around @ z)[:, None]

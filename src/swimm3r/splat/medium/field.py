@@ -76,13 +76,13 @@ class FieldGrid:
     """The field on a grid of one camera's pixels, corners included."""
 
     values: Float[Tensor, "9 gh gw"]
-    step: tuple[float, float]  # pixels between neighbours, down and right
+    step: tuple[float, float]  # pixels between neighbors, down and right
 
 
 def initial_field(
     medium: Medium | None, settings: MediumFieldSettings, rng: torch.Generator, dynamic: bool = False
 ) -> MediumField:
-    """A field that is `medium` (coefficients per working unit) everywhere; without one, grey and thin water.
+    """A field that is `medium` (coefficients per working unit) everywhere; without one, gray and thin water.
 
     Without biases it cannot be, and begins at random.
     """
@@ -98,8 +98,8 @@ def initial_field(
                     layer.bias.uniform_(-bound, bound, generator=rng)
         if not settings.biases:
             return field
-        grey = torch.full((3,), 0.5)
-        start = medium or Medium(grey, torch.full((3,), settings.prior), torch.full((3,), settings.prior))
+        gray = torch.full((3,), 0.5)
+        start = medium or Medium(gray, torch.full((3,), settings.prior), torch.full((3,), settings.prior))
         last = field.network[-1]
         assert isinstance(last, nn.Conv2d)
         assert last.bias is not None
@@ -150,20 +150,20 @@ def ray_lengths(view: Pinhole) -> Float[Tensor, "h w"]:
 
 
 def per_z_depth(maps: MediumMaps, view: Pinhole) -> MediumMaps:
-    """Betas for a rasteriser that blends z depth: times the length of the pixel's ray at z = 1, which is exact."""
+    """Betas for a rasterizer that blends z depth: times the length of the pixel's ray at z = 1, which is exact."""
     length = ray_lengths(view).to(maps.binf)
     return MediumMaps(maps.binf, maps.beta_b * length, maps.beta_d * length)
 
 
-def with_expected_horizon(fit: MediumFit, colour: Float[Tensor, "3"], std: float) -> MediumFit:
-    """The fit with Binf drawn to `colour` (0..1, within `std`) by what it does not know; backscatter in range stays.
+def with_binf_prior(fit: MediumFit, color: Float[Tensor, "3"], std: float) -> MediumFit:
+    """The fit with Binf drawn to `color` (0..1, within `std`) by what it does not know; backscatter in range stays.
 
     It stays as far as the new Binf can give it. Frames that never look far enough leave Binf open, and a map shows it
     wherever no frame has looked.
     """
     spread = fit.std.Binf.square()
     sure = std**2 / (std**2 + spread)
-    Binf = sure * fit.medium.Binf + (1 - sure) * colour.to(fit.medium.Binf)
+    Binf = sure * fit.medium.Binf + (1 - sure) * color.to(fit.medium.Binf)
     z = math.sqrt(fit.z_range[0] * fit.z_range[1])
     B = fit.medium.Binf * -torch.expm1(-fit.medium.beta_B * z)
     beta_B = -torch.log1p(-(B / Binf.clamp(min=1e-6)).clamp(max=0.999)) / z
@@ -208,10 +208,10 @@ def deviation(grid: FieldGrid, prior: WaterPrior) -> Float[Tensor, ""]:
 
 
 def smoothness(grid: FieldGrid) -> Float[Tensor, ""]:
-    """L_smooth (Eq. medium_smooth): mean absolute difference of neighbouring pixels, down plus right, of all nine maps.
+    """L_smooth (Eq. medium_smooth): mean absolute difference of neighboring pixels, down plus right, of all nine maps.
 
     Along an interpolated edge the differences between pixels add up to those between grid points, so those over the
-    step have the same mean wherever neighbouring edges slope the same way.
+    step have the same mean wherever neighboring edges slope the same way.
     """
     down, right = grid.values.diff(dim=1), grid.values.diff(dim=2)
     return down.abs().mean() / grid.step[0] + right.abs().mean() / grid.step[1]

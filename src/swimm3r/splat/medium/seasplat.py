@@ -1,9 +1,9 @@
-"""SeaSplat's water (Yang et al. 2024): one set of coefficients for a scene, applied to the finished clear picture.
+"""SeaSplat's water (Yang et al. 2024): one set of coefficients for a scene, applied to the finished clear image.
 
     I = clamp(J e^{-a d} + Binf (1 - e^{-b d}), 0, 1),   a, b >= 0
 
 J is the clear composite over black, d the expected z depth, brought to 0..1 by its least and largest value in the
-picture: a and b have no unit, and mean another coefficient per metre in every picture.
+image: a and b have no unit, and mean another coefficient per metre in every image.
 """
 
 from dataclasses import dataclass
@@ -32,7 +32,7 @@ class SceneWater(nn.Module):
 
     @property
     def Binf(self) -> Float[Tensor, "3"]:
-        """The colour of the open water, 0..1."""
+        """The color of the open water, 0..1."""
         return torch.sigmoid(self.veil)
 
 
@@ -46,15 +46,15 @@ def initial_scene_water(rng: torch.Generator) -> SceneWater:
 
 @dataclass(frozen=True)
 class WaterLayer:
-    """What the water does to one picture."""
+    """What the water does to one image."""
 
-    depth: Float[Tensor, "h w"]  # 0..1 over the picture; the farthest where nothing is seen
+    depth: Float[Tensor, "h w"]  # 0..1 over the image; the farthest where nothing is seen
     transmittance: Float[Tensor, "3 h w"]  # e^{-a d}
     backscatter: Float[Tensor, "3 h w"]  # Binf (1 - e^{-b d})
 
 
 def relative_depth(images: RasterOutput) -> Float[Tensor, "h w"]:
-    """Expected z depth, its range in the picture stretched to 0..1; 1 where nothing is seen."""
+    """Expected z depth, its range in the image stretched to 0..1; 1 where nothing is seen."""
     seen = images.alpha > _SEEN
     z = images.z_depth / torch.where(seen, images.alpha, 1.0)
     if not bool(seen.any()):
@@ -66,11 +66,11 @@ def relative_depth(images: RasterOutput) -> Float[Tensor, "h w"]:
 
 
 def layer(water: SceneWater, depth: Float[Tensor, "h w"]) -> WaterLayer:
-    """The water over a picture of relative depth."""
+    """The water over an image of relative depth."""
     a, b, Binf = (v[:, None, None] for v in (relu(water.attenuation), relu(water.backscatter), water.Binf))
     return WaterLayer(depth, torch.exp(-a * depth), Binf * (1 - torch.exp(-b * depth)))
 
 
 def seen_through(clear: Float[Tensor, "3 h w"], over: WaterLayer) -> Float[Tensor, "3 h w"]:
-    """I of a clear picture."""
+    """I of a clear image."""
     return (clear * over.transmittance + over.backscatter).clamp(0, 1)

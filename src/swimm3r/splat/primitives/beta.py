@@ -28,7 +28,7 @@ class BetaPrimitives(NamedTuple):
 
     xyz: Float[Tensor, "n 3"]  # world
     query_mean: Float[Tensor, "n c"]  # mean direction camera -> primitive (not of unit length), then time
-    rgb: Float[Tensor, "n 3"]  # clear colour, not bounded
+    rgb: Float[Tensor, "n 3"]  # clear color, not bounded
     opacity: Float[Tensor, " n"]
     beta: Float[Tensor, "n b"]  # 1 + c: spatial, then one per conditioned dimension
     scale: Float[Tensor, "n d"]  # 3 + c
@@ -45,7 +45,7 @@ class BetaPrimitives(NamedTuple):
 
 
 @runtime_checkable  # so that the suite can check calls against it
-class Rows(Protocol):
+class PrimitiveRows(Protocol):
     """Primitives of any kind: tensors with a row for each."""
 
     def __iter__(self) -> Iterator[Tensor]: ...
@@ -54,7 +54,7 @@ class Rows(Protocol):
     def _make(cls, iterable: Iterable[Tensor]) -> Any: ...
 
 
-OfKind = TypeVar("OfKind", bound=Rows)
+OfKind = TypeVar("OfKind", bound=PrimitiveRows)
 
 
 def select(p: OfKind, which: Int[Tensor, " m"] | Bool[Tensor, " n"]) -> OfKind:
@@ -75,7 +75,7 @@ def rescaled(p: BetaPrimitives, factor: float) -> BetaPrimitives:
 
 
 def initial_primitives(rec: Reconstruction, settings: InitialSettings, rng: torch.Generator) -> BetaPrimitives:
-    """Primitives on the restored cloud and its backdrop, D = 6; on the sparse points, raw colours, without a cloud.
+    """Primitives on the restored cloud and its backdrop, D = 6; on the sparse points, raw colors, without a cloud.
 
     Raises InputError for fewer than 4 points.
     """
@@ -115,7 +115,7 @@ class StartingPoints:
 
     xyz: Float[Tensor, "n 3"]  # float64
     rgb: Float[Tensor, "n 3"]
-    spacing: Float[Tensor, " n"]  # root mean square distance to the 3 nearest neighbours, float64
+    spacing: Float[Tensor, " n"]  # root mean square distance to the 3 nearest neighbors, float64
 
 
 def starting_points(rec: Reconstruction, settings: InitialSettings | GaussianInitialSettings) -> StartingPoints:
@@ -136,7 +136,7 @@ def starting_points(rec: Reconstruction, settings: InitialSettings | GaussianIni
 def _sampled(
     rec: Reconstruction, settings: InitialSettings | GaussianInitialSettings
 ) -> tuple[Float[Tensor, "n 3"], Float[Tensor, "n 3"]]:
-    """Positions, float64, and colours."""
+    """Positions, float64, and colors."""
     if rec.cloud is None:
         chosen = voxel_sample(rec.points.xyz.double(), settings.primitives)
         return rec.points.xyz[chosen].double(), rec.points.rgb[chosen].float()
@@ -144,8 +144,8 @@ def _sampled(
     behind = voxel_sample(backdrop.xyz.double(), round(settings.backdrop * settings.primitives))
     measured = voxel_sample(rec.cloud.xyz.double(), settings.primitives - len(behind))
     xyz = torch.cat([rec.cloud.xyz[measured], backdrop.xyz[behind]]).double()
-    colours = (getattr(cloud, settings.colours)[rows] for cloud, rows in ((rec.cloud, measured), (backdrop, behind)))
-    return xyz, torch.cat([*colours]).float()
+    colors = (getattr(cloud, settings.colors)[rows] for cloud, rows in ((rec.cloud, measured), (backdrop, behind)))
+    return xyz, torch.cat([*colors]).float()
 
 
 def voxel_sample(points: Float[Tensor, "p 3"], target: int) -> Int[Tensor, " n"]:
@@ -186,13 +186,13 @@ def _voxels(points: Float[Tensor, "p 3"], edge: float) -> Int[Tensor, " p"]:
 def mean_directions(xyz: Float[Tensor, "n 3"], rec: Reconstruction, max_views: int) -> Float[Tensor, "n 3"]:
     """Mean of the unit directions, camera -> point, over the frames that see each point; over all where none does.
 
-    A frame sees a point that falls into its picture, not behind its depth map.
+    A frame sees a point that falls into its image, not behind its depth map.
     """
     views = torch.linspace(0, len(rec.names) - 1, min(max_views, len(rec.names))).round().long().tolist()
     total, everywhere, seen_by = torch.zeros_like(xyz), torch.zeros_like(xyz), xyz.new_zeros(len(xyz), 1)
     for i in views:
         camera = rec.cameras[i]
-        direction = torch.nn.functional.normalize(xyz - camera.centres[0].to(xyz), dim=-1)
+        direction = torch.nn.functional.normalize(xyz - camera.centers[0].to(xyz), dim=-1)
         seen = _sees(rec, camera, rec.names[i], xyz)[:, None]
         total += torch.where(seen, direction, 0.0)
         everywhere += direction

@@ -1,4 +1,4 @@
-"""3D Gaussians with colours in spherical harmonics, the primitives of the peers (Kerbl et al. 2023).
+"""3D Gaussians with colors in spherical harmonics, the primitives of the peers (Kerbl et al. 2023).
 
     alpha = min(0.999, o exp(-r2 / 2)),   Sigma = R(q) diag(s^2) R(q)^T,   c = max(0, 1/2 + sum_lm k_lm Y_lm(d))
 
@@ -28,7 +28,7 @@ class GaussianPrimitives(NamedTuple):
     quaternion: Float[Tensor, "n 4"]
     scale: Float[Tensor, "n 3"]  # logarithms
     opacity: Float[Tensor, " n"]
-    colour: Float[Tensor, "n 3"]  # k_00
+    color: Float[Tensor, "n 3"]  # k_00
     harmonics: Float[Tensor, "n h 3"]  # the others, by degree: none, 3, 8 or 15
 
     @property
@@ -67,25 +67,25 @@ def covariance(p: GaussianPrimitives) -> Float[Tensor, "n 3 3"]:
     return factor @ factor.mT
 
 
-def coloured(
+def colored(
     mean: Float[Tensor, "n 3"], harmonics: Float[Tensor, "n h 3"], rays: Float[Tensor, "n 3"]
 ) -> Float[Tensor, "n 3"]:
-    """Colours along rays of any length, of the mean colour and the harmonics from degree 1 on; none is negative."""
+    """Colors along rays of any length, of the mean color and the harmonics from degree 1 on; none is negative."""
     if harmonics.shape[1]:
         Y = spherical_harmonics(normalize(rays, dim=-1))[:, 1 : 1 + harmonics.shape[1]]
         mean = mean + torch.einsum("nh,nhc->nc", Y, harmonics)
     return mean.clamp(min=0)
 
 
-def seen_colour(p: GaussianPrimitives, centre: Float[Tensor, "3"]) -> Float[Tensor, "n 3"]:
-    """Colours as a camera at `centre` sees them."""
-    return coloured(0.5 + Y_00 * p.colour, p.harmonics, p.xyz - centre)
+def seen_color(p: GaussianPrimitives, center: Float[Tensor, "3"]) -> Float[Tensor, "n 3"]:
+    """Colors as a camera at `center` sees them."""
+    return colored(0.5 + Y_00 * p.color, p.harmonics, p.xyz - center)
 
 
 def initial_gaussians(
     rec: Reconstruction, settings: GaussianInitialSettings, rng: torch.Generator
 ) -> GaussianPrimitives:
-    """Gaussians on the cloud that every recipe starts from, round and of one colour from all sides.
+    """Gaussians on the cloud that every recipe starts from, round and of one color from all sides.
 
     Raises InputError for fewer than 4 points.
     """
@@ -96,6 +96,6 @@ def initial_gaussians(
         quaternion=torch.randn(n, 4, generator=rng),
         scale=(settings.scale * start.spacing).log().float()[:, None].repeat(1, 3),
         opacity=torch.full((n,), settings.opacity).logit(),
-        colour=(start.rgb - 0.5) / Y_00,
+        color=(start.rgb - 0.5) / Y_00,
         harmonics=torch.zeros(n, harmonics_of_degree(settings.harmonics), 3),
     )

@@ -54,10 +54,10 @@ def factor(p: BetaPrimitives, rotation: str = "first_order") -> Float[Tensor, "n
 
 
 def queries(
-    xyz: Float[Tensor, "n 3"], centre: Float[Tensor, "3"], time: Float[Tensor, ""] | None = None
+    xyz: Float[Tensor, "n 3"], center: Float[Tensor, "3"], time: Float[Tensor, ""] | None = None
 ) -> Float[Tensor, "n c"]:
     """What primitives are conditioned on: unit direction camera -> primitive in world axes, then time in 0..1."""
-    direction = torch.nn.functional.normalize(xyz - centre, dim=-1)
+    direction = torch.nn.functional.normalize(xyz - center, dim=-1)
     return direction if time is None else torch.cat([direction, time.to(direction).expand(len(xyz), 1)], -1)
 
 
@@ -89,8 +89,8 @@ def symmetric(covariance: Float[Tensor, "n 3 3"], form: str) -> Float[Tensor, "n
 
 
 def conditioned_in_view(
-    p: BetaPrimitives, centre: Float[Tensor, "3"], settings: RenderSettings, time: Float[Tensor, ""] | None = None
+    p: BetaPrimitives, center: Float[Tensor, "3"], settings: RenderSettings, time: Float[Tensor, ""] | None = None
 ) -> Conditioned:
-    """Primitives as a camera at `centre` sees them, with symmetric covariances."""
-    seen = condition(p, queries(p.xyz, centre, time), settings.rotation)
+    """Primitives as a camera at `center` sees them, with symmetric covariances."""
+    seen = condition(p, queries(p.xyz, center, time), settings.rotation)
     return Conditioned(seen.mean, symmetric(seen.covariance, settings.covariance), seen.opacity)

@@ -80,9 +80,9 @@ def load(g, ids, first, count, xyz, query_mean, opacity, beta, scale, lower, cam
         o[q] = (ONE if o[q] >= ZERO else e) / (ONE + e)
         distance[q] = NEAREST
     for k in range(three):
-        d, at, centre = g[DIRECTION, k, 0], g[XYZ, k, 0], camera[12 + k]
+        d, at, center = g[DIRECTION, k, 0], g[XYZ, k, 0], camera[12 + k]
         for q in range(g.shape[3]):
-            d[q] = at[q] - centre
+            d[q] = at[q] - center
             distance[q] += d[q] * d[q]
     for q in range(g.shape[3]):
         distance[q] = np.sqrt(distance[q])
@@ -159,7 +159,7 @@ def condition(g, three, c):
 @no_type_check
 @inlined
 def conditioning_gradients(g, ids, start, count, three, c, d_opacity, d_exponent):
-    """D_S, D_L11 (of R in the end), D_L21, D_L22, D_X and D_B from D_MEAN, D_COV and what the rasteriser says."""
+    """D_S, D_L11 (of R in the end), D_L21, D_L22, D_X and D_B from D_MEAN, D_COV and what the rasterizer says."""
     product_bt(g, D_L11, D_MEAN, WX, three, 1, three, ONE, SET)
     product(g, SCRATCH, D_COV, L11, three, three, three, ONE, SET)
     product_bt(g, D_L11, SCRATCH, N, three, three, three, ONE, ADD)

@@ -66,8 +66,8 @@ kernel = njit(nogil=True, cache=True, error_model="numpy", fastmath=math.FLAGS)
 
 LEAST_SPREAD = np.float32(0.01)
 PX2 = np.float32(BLUR)
-POSE = 15  # gradient of R (9), t (3), centre (3)
-(FX, FY, CX, CY, X_LOW, X_HIGH, Y_LOW, Y_HIGH, NEAR, UPPER) = range(15, 25)  # of the camera array, after R, t, centre
+POSE = 15  # gradient of R (9), t (3), center (3)
+(FX, FY, CX, CY, X_LOW, X_HIGH, Y_LOW, Y_HIGH, NEAR, UPPER) = range(15, 25)  # of the camera array, after R, t, center
 # matrices after those of conditioning
 AT, J, RV, COV_SEEN, M, M_COV, PLANE, D_AT, D_M, D_J, D_PLANE, OUTER = range(MATRICES, MATRICES + 12)
 
@@ -111,7 +111,7 @@ def onto_plane(g, camera, three, two):
 @no_type_check
 @math.inlined
 def plane_gradients(g, ids, start, count, camera, three, two, d_mean2d, d_conic, d_depth):
-    """D_AT, D_M, D_COV and D_MEAN of what the rasteriser says about centres, conics and depths (uwbs.md 12.1)."""
+    """D_AT, D_M, D_COV and D_MEAN of what the rasterizer says about centers, conics and depths (uwbs.md 12.1)."""
     zero(g, D_AT, three, 1)
     zero(g, D_PLANE, two, two)
     fx, fy = camera[FX], camera[FY]
@@ -231,10 +231,10 @@ def run_blocks(
 
 @no_type_check
 @kernel
-def centre_blocks(
+def center_blocks(
     first, beyond, g, ids, on_plane, xyz, query_mean, opacity, beta, scale, lower, camera, time, d_xyz, sources=SOURCES
 ):  # fmt: skip
-    """Blocks of `ids`: d_xyz [n, k, 3] of what on_plane [n, k, 3] says about centres and depths, k times over."""
+    """Blocks of `ids`: d_xyz [n, k, 3] of what on_plane [n, k, 3] says about centers and depths, k times over."""
     three, c, two = xyz.shape[1], query_mean.shape[1], on_plane.shape[2] - 1
     fx, fy = camera[FX], camera[FY]
     for block in range(first, beyond):
@@ -295,7 +295,7 @@ class _Project(torch.autograd.Function):
 
 def _camera(view: Pinhole, settings: RenderSettings) -> np.ndarray:
     """The camera as the kernels read it."""
-    pose = np.concatenate([t.detach().numpy().ravel() for t in (view.R, view.t, view.centre)])
+    pose = np.concatenate([t.detach().numpy().ravel() for t in (view.R, view.t, view.center)])
     rest = (view.fx, view.fy, view.cx, view.cy, *ray_limits(view), settings.near, settings.covariance == "upper")
     return np.concatenate([pose, np.array(rest)]).astype(np.float32)
 
@@ -318,20 +318,20 @@ def project(
     """`projection.project` for float32 on the CPU; no gradient reaches `time`."""
     moment = 0.0 if time is None else float(time)
     *plane, radius = _Project.apply(
-        view, settings, moment, p.xyz, p.query_mean, p.opacity, p.beta, p.scale, p.lower, view.R, view.t, view.centre
+        view, settings, moment, p.xyz, p.query_mean, p.opacity, p.beta, p.scale, p.lower, view.R, view.t, view.center
     )
     mean2d, conic, opacity, exponent, depth = plane
     return Projection(Primitives2D(mean2d, conic, p.rgb, opacity, exponent, depth), radius)
 
 
-def centre_gradients(
+def center_gradients(
     p: BetaPrimitives,
     view: Pinhole,
     settings: RenderSettings,
     on_plane: Float[Tensor, "n k 3"],
     time: Float[Tensor, ""] | None = None,
 ) -> Float[Tensor, "n k 3"]:
-    """`projection.centre_gradients` for float32 on the CPU."""
+    """`projection.center_gradients` for float32 on the CPU."""
     ids = on_plane.flatten(1).any(-1).nonzero()[:, 0].numpy()
     d_xyz = torch.zeros(*on_plane.shape[:2], 3)
     stored = (p.xyz, p.query_mean, p.opacity, p.beta, p.scale, p.lower)
@@ -340,7 +340,7 @@ def centre_gradients(
 
     def work(first: int, beyond: int) -> None:
         workspace = np.zeros((OUTER + 1, 4, 4, LANES), np.float32)
-        centre_blocks(first, beyond, workspace, *arrays, *rest)
+        center_blocks(first, beyond, workspace, *arrays, *rest)
 
     spread(work, -(-len(ids) // LANES), at_least=8)
     return d_xyz

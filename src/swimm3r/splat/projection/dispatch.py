@@ -29,7 +29,7 @@ def project(
     return project_plainly(p, view, settings, time)
 
 
-def centre_gradients(
+def center_gradients(
     p: BetaPrimitives,
     view: Pinhole,
     settings: RenderSettings,
@@ -41,12 +41,12 @@ def centre_gradients(
     The direction that primitives are conditioned on follows xyz, as in `project`.
     """
     if _has_fast_form(p, settings):
-        return cpu_project.centre_gradients(p, view, settings, on_plane, time)
+        return cpu_project.center_gradients(p, view, settings, on_plane, time)
     with torch.enable_grad():
         xyz = p.xyz.detach().requires_grad_()
         seen = project_plainly(p._replace(xyz=xyz), view, settings, time).primitives
-        centre = torch.cat([seen.mean2d, seen.depth[:, None]], -1)
-        parts = [torch.autograd.grad(centre, xyz, v, retain_graph=True)[0] for v in on_plane.unbind(1)]
+        center = torch.cat([seen.mean2d, seen.depth[:, None]], -1)
+        parts = [torch.autograd.grad(center, xyz, v, retain_graph=True)[0] for v in on_plane.unbind(1)]
     return torch.stack(parts, 1)
 
 

@@ -11,7 +11,7 @@ from swimm3r.raster import Kernel, Primitives2D
 
 BLUR = 0.3
 """px^2, added to every covariance on the image plane."""
-_MARGIN = 0.3  # field tangents beyond the picture at which J is held
+_MARGIN = 0.3  # field tangents beyond the image at which J is held
 
 
 @dataclass(frozen=True)
@@ -20,7 +20,7 @@ class Pinhole:
 
     R: Float[Tensor, "3 3"]
     t: Float[Tensor, "3"]
-    centre: Float[Tensor, "3"]  # in the world
+    center: Float[Tensor, "3"]  # in the world
     fx: float
     fy: float
     cx: float
@@ -30,12 +30,12 @@ class Pinhole:
 
     def to(self, device: torch.device) -> "Pinhole":
         """The same camera for primitives on a device."""
-        return replace(self, R=self.R.to(device), t=self.t.to(device), centre=self.centre.to(device))
+        return replace(self, R=self.R.to(device), t=self.t.to(device), center=self.center.to(device))
 
 
 @dataclass(frozen=True)
 class Projection:
-    """What the rasteriser draws, and the radius of each primitive, px, without gradient."""
+    """What the rasterizer draws, and the radius of each primitive, px, without gradient."""
 
     primitives: Primitives2D
     radius: Float[Tensor, " n"]
@@ -51,12 +51,12 @@ def pinhole(camera: Cameras, dtype: torch.dtype = torch.float32) -> Pinhole:
             f"a map is rendered for pinhole cameras, got {camera.model} with distortion; camera.pinhole() leaves it out"
         )
     R = camera.cam2world[0, :3, :3].mT
-    centre = camera.cam2world[0, :3, 3]
+    center = camera.cam2world[0, :3, 3]
     K = camera.K[0].tolist()
     return Pinhole(
         R.to(dtype),
-        -(R @ centre).to(dtype),
-        centre.to(dtype),
+        -(R @ center).to(dtype),
+        center.to(dtype),
         K[0][0],
         K[1][1],
         K[0][2],

@@ -2,7 +2,7 @@
 
     mu = (fx x / z + cx, fy y / z + cy),   Sigma2 = J R S R^T J^T + 0.3 I,   conic = Sigma2^-1
 
-J is taken at the ray clamped to 0.3 field tangents beyond the picture. A Beta primitive covers the pixels with r2 < 1
+J is taken at the ray clamped to 0.3 field tangents beyond the image. A Beta primitive covers the pixels with r2 < 1
 under its conic; its uncapped radius is the square root of Sigma2's larger eigenvalue, 3.33 times that for a Gaussian,
 where an opaque one falls below 1/255.
 """
@@ -15,7 +15,7 @@ from torch import Tensor
 
 from swimm3r.raster import Primitives2D
 from swimm3r.splat.primitives.beta import BetaPrimitives
-from swimm3r.splat.primitives.gaussian import GaussianPrimitives, covariance, seen_colour
+from swimm3r.splat.primitives.gaussian import GaussianPrimitives, covariance, seen_color
 from swimm3r.splat.projection.conditioning import Conditioned, conditioned_in_view
 from swimm3r.splat.projection.pinhole import BLUR, Pinhole, Projection, ray_limits
 from swimm3r.splat.settings import RenderSettings
@@ -57,7 +57,7 @@ def project_plainly(
     p: BetaPrimitives, view: Pinhole, settings: RenderSettings, time: Float[Tensor, ""] | None = None
 ) -> Projection:
     """`project` in torch operations: any D, any dtype, every setting; the oracle of the fast form."""
-    seen = conditioned_in_view(p, view.centre, settings, time)
+    seen = conditioned_in_view(p, view.center, settings, time)
     return project_conditioned(seen, 4 * torch.exp(p.beta[:, 0]), p.rgb, view, settings.near)
 
 
@@ -65,5 +65,5 @@ def project_gaussians(p: GaussianPrimitives, view: Pinhole, near: float) -> Proj
     """Gaussians in one camera."""
     seen = Conditioned(p.xyz, covariance(p), torch.sigmoid(p.opacity))
     half = torch.full_like(seen.opacity, 0.5)
-    drawn = project_conditioned(seen, half, seen_colour(p, view.centre), view, near)
+    drawn = project_conditioned(seen, half, seen_color(p, view.center), view, near)
     return Projection(drawn.primitives, _GAUSSIAN_REACH * drawn.radius, "gaussian")

@@ -14,10 +14,10 @@ from swimm3r.splat.primitives.gaussian import GaussianPrimitives, initial_gaussi
 from swimm3r.splat.projection.pinhole import Pinhole
 from swimm3r.splat.rendering import Drawing, draw
 from swimm3r.splat.training import loop
-from swimm3r.splat.training.scene import Site
+from swimm3r.splat.training.scene import TrainingScene
 from swimm3r.splat.training.state import POSES, State, parameters_of
 from swimm3r.splat.training_poses import pose_rate
-from swimm3r.splat.views import View
+from swimm3r.splat.views import TrainingView
 
 # purposes of randomness (training.generator): 2 primitives, 3 water, 4 densification, 6 poses, 7 matches, 8 noise
 _MOST_HASTE = 4.0
@@ -27,62 +27,64 @@ InField = State[GaussianPrimitives, MediumField]
 
 
 @dataclass(frozen=True)
-class Look:
+class TrainingRender:
     """One view as drawn for training, and what its loss may be differentiated by."""
 
     p: GaussianPrimitives  # leaves
     drawing: Drawing
-    sight: Pinhole
+    pinhole_view: Pinhole
     parameters: dict[str, Tensor]  # the leaves by name, water and poses too
 
     def gradients(self, loss: Float[Tensor, ""]) -> dict[str, Tensor]:
-        """The loss's gradient by name; "mean2d" is that of the projected centres, px."""
+        """The loss's gradient by name; "mean2d" is that of the projected centers, px."""
         plane = self.drawing.projection.primitives.mean2d
         found = torch.autograd.grad(loss, [*self.parameters.values(), plane], materialize_grads=True)
         return dict(zip([*self.parameters, "mean2d"], found, strict=True))
 
 
-def first_gaussians(site: Site, settings: GaussianSettings) -> GaussianPrimitives:
+def first_gaussians(scene: TrainingScene, settings: GaussianSettings) -> GaussianPrimitives:
     """The Gaussians before step 1, in working units."""
-    p = initial_gaussians(site.rec, settings.initial, loop.generator(settings.seed, 0, 2))
-    return rescaled(p, site.scale)
+    p = initial_gaussians(scene.rec, settings.initial, loop.generator(settings.seed, 0, 2))
+    return rescaled(p, scene.scale)
 
 
-def look(site: Site, state: State, view: View, settings: GaussianSettings, step: int, sgg: bool = False) -> Look:
+def render_for_training(
+    scene: TrainingScene, state: State, view: TrainingView, settings: GaussianSettings, step: int, sgg: bool = False
+) -> TrainingRender:
     """Draw a view with the harmonics that this step has come to; `sgg` asks for the gradients' parts.
 
-    Water that lies over finished pictures is not in this one.
+    Water that lies over finished images is not in this one.
     """
     p = GaussianPrimitives(*(values.detach().requires_grad_() for values in state.primitives))
     degree = int((step - 1) / (settings.degree_every * settings.iterations))
-    sight = site.sight(view, state.poses)
+    pinhole_view = scene.pinhole_view(view, state.poses)
     field = state.field if isinstance(state.field, MediumField) else NO_WATER
-    drawing = draw(to_degree(p, min(degree, settings.initial.harmonics)), field, sight, settings, sgg=sgg)
-    return Look(p, drawing, sight, parameters_of(p, state.field, state.poses))
+    drawing = draw(to_degree(p, min(degree, settings.initial.harmonics)), field, pinhole_view, settings, sgg=sgg)
+    return TrainingRender(p, drawing, pinhole_view, parameters_of(p, state.field, state.poses))
 
 
 def with_matches(
-    site: Site, state: State, loss: Float[Tensor, ""], settings: GaussianSettings, step: int
+    scene: TrainingScene, state: State, loss: Float[Tensor, ""], settings: GaussianSettings, step: int
 ) -> tuple[Float[Tensor, ""], loop.Numbers]:
     """The loss, with the epipolar error of the training poses while it takes part, and that for the record."""
     rng = loop.generator(settings.seed, step, 7)
-    off = site.epipolar_error(state.poses, settings.poses, step / settings.iterations, rng)
+    off = scene.epipolar_error(state.poses, settings.poses, step / settings.iterations, rng)
     if off is None:
         return loss, {}
     return loss + settings.poses.epipolar * off.to(loss), {"epipolar_px": off}
 
 
-def haste(settings: GaussianSettings) -> float:
+def short_run_rate_exponent(settings: GaussianSettings) -> float:
     """How much larger some rates are than published, in a run this short."""
     published = type(settings).iterations
-    return min(_MOST_HASTE, max(1.0, published / settings.iterations) ** settings.rates.haste)
+    return min(_MOST_HASTE, max(1.0, published / settings.iterations) ** settings.rates.short_run_rate_exponent)
 
 
-def rates_of(site: Site, settings: GaussianSettings, step: int, names: Collection[str]) -> dict[str, float]:
+def rates_of(scene: TrainingScene, settings: GaussianSettings, step: int, names: Collection[str]) -> dict[str, float]:
     """Adam's rates of Gaussians and poses in a step; the water's are the recipe's own."""
-    r, faster = settings.rates, haste(settings)
-    position = site.radius * log_linear(r.xyz, r.xyz_end, step / settings.iterations)
-    hasty = {"xyz": position, "quaternion": r.quaternion, "colour": r.colour, "harmonics": r.harmonics}
+    r, faster = settings.rates, short_run_rate_exponent(settings)
+    position = scene.radius * log_linear(r.xyz, r.xyz_end, step / settings.iterations)
+    hasty = {"xyz": position, "quaternion": r.quaternion, "color": r.color, "harmonics": r.harmonics}
     poses = pose_rate(settings.poses, settings.iterations)
     return {
         **{name: faster * rate for name, rate in hasty.items()},
@@ -95,7 +97,7 @@ def rates_of(site: Site, settings: GaussianSettings, step: int, names: Collectio
 def with_rows(
     moments: dict[str, Moments], source: Int[Tensor, " n"], restarted: Int[Tensor, " m"]
 ) -> dict[str, Moments]:
-    """The optimiser's memory after row i of the Gaussians became what row source[i] was; zero in `restarted`."""
+    """The optimizer's memory after row i of the Gaussians became what row source[i] was; zero in `restarted`."""
     kept = dict(moments)
     for name in GaussianPrimitives._fields:
         m = moments[name]

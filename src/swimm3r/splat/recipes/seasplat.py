@@ -1,8 +1,8 @@
-"""SeaSplat (Yang et al. 2024): Gaussians first, then one set of water coefficients over their pictures.
+"""SeaSplat (Yang et al. 2024): Gaussians first, then one set of water coefficients over their images.
 
 For a third of the run I = J + b (1 - alpha) before a learned background b; then the water of `scene_water`, whose Binf
 begins as b. It learns in bursts that the run does not count: 1,000 steps of its own when it comes, followed by 2,000 of
-the colours alone, and 50 more every 100 steps; in between it stands still. Losses (uwbs.md 4.1), with d detached where
+the colors alone, and 50 more every 100 steps; in between it stands still. Losses (uwbs.md 4.1), with d detached where
 it weighs:
 
     0.8 L1 + 0.2 (1 - SSIM)                     mean |d (I - gt)|                0.01 mean alpha where I looks like Binf
@@ -10,8 +10,9 @@ it weighs:
     2 mean (relu(-J) + relu(J - 0.7))^2         mean relu(gt - B) + 1000 smooth-L1(relu(B - gt))
 
 Gaussians multiply, are culled and cut as in 3DGS. Where we depart from the publication: SSIM pads with zeros; the
-number of Gaussians has the bound that all recipes have; `clear` pictures are divided by alpha as everybody's are. In
-short runs rounds are `min_every` steps apart at least, rates grow (`haste`), and opacities are not cut (`with_recipe`).
+number of Gaussians has the bound that all recipes have; `clear` images are divided by alpha as everybody's are. In
+short runs rounds are `min_refine_every` steps apart at least, rates grow (`short_run_rate_exponent`), and opacities are
+not cut (`with_recipe`).
 """
 
 from dataclasses import dataclass
@@ -28,15 +29,15 @@ from swimm3r.splat.gaussian_settings import SeaSplatSettings, SeaSplatWeights
 from swimm3r.splat.medium.seasplat import SceneWater, initial_scene_water, layer, relative_depth, seen_through
 from swimm3r.splat.optimizer import Moments, adam_step, fresh
 from swimm3r.splat.primitives.gaussian import GaussianPrimitives
-from swimm3r.splat.recipes.gaussian_step import first_gaussians, look, rates_of, with_matches, with_rows
+from swimm3r.splat.recipes.gaussian_step import first_gaussians, rates_of, render_for_training, with_matches, with_rows
 from swimm3r.splat.training import loop, losses
-from swimm3r.splat.training.scene import Site
+from swimm3r.splat.training.scene import TrainingScene
 from swimm3r.splat.training.state import FIELD, State, first_state, parameters_of
-from swimm3r.splat.views import View
+from swimm3r.splat.views import TrainingView
 
 UnderWater = State[GaussianPrimitives, SceneWater]
 _SMOOTH = 0.2  # of smooth-L1
-_KEPT = 32  # pictures, of the Gaussians that stand still while the water learns
+_KEPT = 32  # images, of the Gaussians that stand still while the water learns
 
 
 @dataclass(frozen=True)
@@ -44,38 +45,38 @@ class SeaSplat:
     """The recipe for one scene (`training.Recipe`)."""
 
     settings: SeaSplatSettings
-    site: Site
+    scene: TrainingScene
 
     def start(self) -> UnderWater:
-        """Faint Gaussians on the cloud, coloured as filmed."""
+        """Faint Gaussians on the cloud, colored as filmed."""
         seed = self.settings.seed
-        p = first_gaussians(self.site, self.settings)
+        p = first_gaussians(self.scene, self.settings)
         water = initial_scene_water(loop.generator(seed, 0, 3))
-        codes = self.site.codes(self.settings.poses, loop.generator(seed, 0, 6))
+        codes = self.scene.codes(self.settings.poses, loop.generator(seed, 0, 6))
         return first_state(p, water, codes, adaptive.nothing_seen(len(p.xyz)))
 
-    def step(self, state: UnderWater, view: View, step: int) -> tuple[UnderWater, loop.Numbers]:
+    def step(self, state: UnderWater, view: TrainingView, step: int) -> tuple[UnderWater, loop.Numbers]:
         """Bursts where they are due, then one view: forward, adjoint, Adam, densification on its cadence."""
         settings, w, wet = self.settings, self.settings.weights, step > self._dry_steps()
         if step == self._dry_steps() + 1:
             state = self._filled(state, step)
         elif wet and step % self._share(settings.water.every) == 0:
             self._water_burst(state, step, settings.water.burst * settings.water.every * settings.iterations)
-        seen = look(self.site, state, view, settings, step)
+        seen = render_for_training(self.scene, state, view, settings, step)
         found = objective(seen.drawing.images, state.field, view, w, wet)
-        total, numbers = with_matches(self.site, state, found.total, settings, step)
+        total, numbers = with_matches(self.scene, state, found.total, settings, step)
         numbers |= found.numbers | {"loss": total, "primitives": float(len(seen.p.xyz))}
         gradients = seen.gradients(total)
         with torch.no_grad():
             still = () if wet else (f"{FIELD}veil",)
             parameters = parameters_of(state.primitives, state.field, state.poses)
             moving = {name: t for name, t in parameters.items() if not name.startswith(FIELD) or name in still}
-            rates = rates_of(self.site, settings, step, parameters) | dict.fromkeys(still, settings.water.rate)
+            rates = rates_of(self.scene, settings, step, parameters) | dict.fromkeys(still, settings.water.rate)
             adam_step(moving, gradients, state.moments, rates)
-            memory = adaptive.remembered(state.memory, gradients["mean2d"], seen.drawing.projection, seen.sight)
+            memory = adaptive.remembered(state.memory, gradients["mean2d"], seen.drawing.projection, seen.pinhole_view)
             state = State(state.primitives, state.field, state.poses, state.moments, memory)
             d, share = settings.densify, step / settings.iterations
-            if d.begin < share <= d.end:
+            if d.refine_start < share <= d.refine_stop:
                 state = self._round(state, step)
         return state, numbers
 
@@ -86,22 +87,22 @@ class SeaSplat:
         return int(self.settings.water.begin * self.settings.iterations)
 
     def _filled(self, state: UnderWater, step: int) -> UnderWater:
-        """The state when the water has come, with an optimiser of its own; then the colours without it."""
+        """The state when the water has come, with an optimizer of its own; then the colors without it."""
         names = [name for name in state.moments if name.startswith(FIELD)]
         moments: dict[str, Moments] = state.moments | {name: fresh(state.moments[name].first) for name in names}
         state = State(state.primitives, state.field, state.poses, moments, state.memory)
         water = self.settings.water
         self._water_burst(state, step, water.first_burst * self.settings.iterations)
-        for k in self._draws(step, 11, water.colour_burst * self.settings.iterations):
-            view = self.site.view(k)
-            seen = look(self.site, state, view, self.settings, step)
+        for k in self._draws(step, 11, water.color_burst * self.settings.iterations):
+            view = self.scene.view(k)
+            seen = render_for_training(self.scene, state, view, self.settings, step)
             gradients = seen.gradients(
                 objective(seen.drawing.images, state.field, view, self.settings.weights, True).total
             )
-            rates = rates_of(self.site, self.settings, step, state.moments)
-            colours = {name: getattr(state.primitives, name) for name in ("colour", "harmonics")}
+            rates = rates_of(self.scene, self.settings, step, state.moments)
+            colors = {name: getattr(state.primitives, name) for name in ("color", "harmonics")}
             with torch.no_grad():
-                adam_step(colours, gradients, state.moments, rates)
+                adam_step(colors, gradients, state.moments, rates)
         return state
 
     def _water_burst(self, state: UnderWater, step: int, count: float) -> None:
@@ -110,10 +111,10 @@ class SeaSplat:
         rates = dict.fromkeys(parameters, self.settings.water.rate)
 
         @lru_cache(maxsize=_KEPT)
-        def as_it_stands(k: int) -> tuple[View, RasterOutput]:
-            view = self.site.view(k)
+        def as_it_stands(k: int) -> tuple[TrainingView, RasterOutput]:
+            view = self.scene.view(k)
             with torch.no_grad():
-                return view, look(self.site, state, view, self.settings, step).drawing.images
+                return view, render_for_training(self.scene, state, view, self.settings, step).drawing.images
 
         for k in self._draws(step, 10, count):
             view, images = as_it_stands(k)
@@ -125,7 +126,7 @@ class SeaSplat:
     def _draws(self, step: int, purpose: int, count: float) -> list[int]:
         """Some views, drawn anew each time."""
         rng = loop.generator(self.settings.seed, step, purpose)
-        return torch.randint(len(self.site.views), (max(1, round(count)),), generator=rng).tolist()
+        return torch.randint(len(self.scene.views), (max(1, round(count)),), generator=rng).tolist()
 
     def _round(self, state: UnderWater, step: int) -> UnderWater:
         """Multiply and cull, and cut opacities back, each on its cadence."""
@@ -133,12 +134,12 @@ class SeaSplat:
         cut_every = self._share(d.reset_every) if d.reset_every else self.settings.iterations
         if step % schedule.steps_between(d, self.settings.iterations) == 0:
             rng = loop.generator(self.settings.seed, step, 4)
-            large, most = d.large * self.site.radius, self.settings.max_primitives
-            done = adaptive.multiply(p, memory, d.pull, large, most, rng)
+            large, most = d.grow_scale3d * self.scene.radius, self.settings.cap_max
+            done = adaptive.multiply(p, memory, d.grow_grad2d, large, most, rng)
             q = done.primitives
-            fit = torch.sigmoid(q.opacity) >= d.least_opacity
+            fit = torch.sigmoid(q.opacity) >= d.prune_opacity
             if step > cut_every:
-                fit &= q.scale.amax(-1).exp() <= d.largest * self.site.radius
+                fit &= q.scale.amax(-1).exp() <= d.prune_scale3d * self.scene.radius
                 fit &= memory["radius"][done.source] <= d.largest_radius
             if int(fit.sum()) >= 4:
                 done = adaptive.only(done, fit)
@@ -150,14 +151,16 @@ class SeaSplat:
 
 
 @dataclass(frozen=True)
-class Objective:
+class SeaSplatObjective:
     """The losses of one view."""
 
     total: Float[Tensor, ""]
     numbers: loop.Numbers  # unweighted, for the record
 
 
-def objective(images: RasterOutput, water: SceneWater, view: View, w: SeaSplatWeights, wet: bool) -> Objective:
+def objective(
+    images: RasterOutput, water: SceneWater, view: TrainingView, w: SeaSplatWeights, wet: bool
+) -> SeaSplatObjective:
     """The sum of the losses of a clear view, with the water over it once it is `wet`."""
     J, depth = images.clear, relative_depth(images)
     shown = seen_through(J, layer(water, depth)) if wet else J + water.Binf[:, None, None] * (1 - images.alpha)
@@ -169,7 +172,7 @@ def objective(images: RasterOutput, water: SceneWater, view: View, w: SeaSplatWe
     }
     if wet:
         terms |= {
-            "grey": (w.grey, (torch.stack([mean_seen(channel, view.seen) for channel in J]) - 0.5).square().mean()),
+            "gray": (w.gray, (torch.stack([mean_seen(channel, view.seen) for channel in J]) - 0.5).square().mean()),
             "saturation": (w.saturation, mean_seen((relu(-J) + relu(J - w.saturated)).square(), view.seen)),
             "dark": (w.dark, dark_channel(layer(water, depth.detach()).backscatter, view, w.negative)),
         }
@@ -177,7 +180,7 @@ def objective(images: RasterOutput, water: SceneWater, view: View, w: SeaSplatWe
     for weight, term in terms.values():
         total = total + weight * term
     numbers = {"l1": photo.l1, "ssim": photo.ssim} | {name: term for name, (_, term) in terms.items()}
-    return Objective(total, numbers)
+    return SeaSplatObjective(total, numbers)
 
 
 def mean_seen(values: Float[Tensor, "*c h w"], seen: Bool[Tensor, "h w"]) -> Float[Tensor, ""]:
@@ -186,16 +189,20 @@ def mean_seen(values: Float[Tensor, "*c h w"], seen: Bool[Tensor, "h w"]) -> Flo
 
 
 def covered_background(
-    shown: Float[Tensor, "3 h w"], alpha: Float[Tensor, "h w"], water: SceneWater, view: View, w: SeaSplatWeights
+    shown: Float[Tensor, "3 h w"],
+    alpha: Float[Tensor, "h w"],
+    water: SceneWater,
+    view: TrainingView,
+    w: SeaSplatWeights,
 ) -> Float[Tensor, ""]:
-    """Mean alpha of the pixels that have the colour of the open water: nothing should stand there. 0 without any."""
+    """Mean alpha of the pixels that have the color of the open water: nothing should stand there. 0 without any."""
     off = (shown.detach() - water.Binf.detach()[:, None, None]).square().sum(0)  # vector_norm is 30 times as slow
     open_water = (off < w.background_distance**2) & view.seen
     return torch.where(open_water, alpha, 0.0).sum() / open_water.sum().clamp(min=1)
 
 
-def depth_steps(depth: Float[Tensor, "h w"], view: View) -> Float[Tensor, ""]:
-    """Mean difference of neighbouring depths, the less the brighter the picture becomes (signed, as published)."""
+def depth_steps(depth: Float[Tensor, "h w"], view: TrainingView) -> Float[Tensor, ""]:
+    """Mean difference of neighboring depths, the less the brighter the image becomes (signed, as published)."""
     total = depth.new_zeros(())
     for axis in (0, 1):
         brighter = view.rgb.diff(dim=1 + axis).mean(0)
@@ -206,8 +213,8 @@ def depth_steps(depth: Float[Tensor, "h w"], view: View) -> Float[Tensor, ""]:
     return total
 
 
-def dark_channel(backscatter: Float[Tensor, "3 h w"], view: View, negative: float) -> Float[Tensor, ""]:
-    """Light left of the picture without its backscatter, which is to be small, and much more what is below 0."""
+def dark_channel(backscatter: Float[Tensor, "3 h w"], view: TrainingView, negative: float) -> Float[Tensor, ""]:
+    """Light left of the image without its backscatter, which is to be small, and much more what is below 0."""
     direct = torch.where(view.seen, view.rgb - backscatter, 0.0)
     beyond = smooth_l1_loss(relu(-direct), torch.zeros_like(direct), beta=_SMOOTH)
     return (relu(direct).mean() + negative * beyond) / view.seen.float().mean().clamp(min=1e-6)

@@ -3,7 +3,7 @@
 L = L_3DGS + lambda_opa L_opa + lambda_scale L_scale + lambda_depth L_depth + lambda_smooth L_smooth + lambda_rad L_rad
 
 and, beyond the paper, terms that hold the water to what structure from motion measured (`LossWeights.medium_prior`),
-known surfaces opaque (`coverage`), open water empty (`open_water`) and clear colours to those that there are (`gamut`).
+known surfaces opaque (`coverage`), open water empty (`open_water`) and clear colors to those that there are (`gamut`).
 """
 
 from collections.abc import Collection
@@ -25,20 +25,20 @@ from swimm3r.splat.medium.field import (
     initial_field,
     smoothness,
     water_prior,
-    with_expected_horizon,
+    with_binf_prior,
 )
 from swimm3r.splat.optimizer import Moments, adam_step, log_linear
 from swimm3r.splat.primitives.beta import BetaPrimitives, initial_primitives, rescaled, with_time
 from swimm3r.splat.rendering import Drawing, draw
 from swimm3r.splat.settings import UwbsSettings
 from swimm3r.splat.training import loop, losses
-from swimm3r.splat.training.scene import Site
+from swimm3r.splat.training.scene import TrainingScene
 from swimm3r.splat.training.sgg import differentiate
 from swimm3r.splat.training.state import FIELD, POSES, State, clip_field, first_state, parameters_of
 from swimm3r.splat.training_poses import pose_rate
-from swimm3r.splat.views import View
+from swimm3r.splat.views import TrainingView
 
-_HORIZON_STD = 0.2  # of the open water's colour around the scene's mean colour, as structure from motion assumes
+_HORIZON_STD = 0.2  # of the open water's color around the scene's mean color, as structure from motion assumes
 
 
 @dataclass(frozen=True)
@@ -55,12 +55,12 @@ class Uwbs:
     """The recipe for one scene (`training.Recipe`)."""
 
     settings: UwbsSettings
-    site: Site
+    scene: TrainingScene
     prior: WaterPrior | None = None  # None where the reconstruction has no water
 
     def start(self) -> State:
         """Primitives on the cloud, and the reconstruction's water in every direction."""
-        settings, rec, scale = self.settings, self.site.rec, self.site.scale
+        settings, rec, scale = self.settings, self.scene.rec, self.scene.scale
         p = initial_primitives(rec, settings.initial, loop.generator(settings.seed, 0, 2))
         if settings.dynamic:
             p = with_time(p, settings.initial, loop.generator(settings.seed, 0, 5))
@@ -71,9 +71,9 @@ class Uwbs:
             fit = water.medium
             medium = Medium(fit.Binf, fit.beta_D / scale, fit.beta_B / scale)
         field = initial_field(medium, settings.medium, loop.generator(settings.seed, 0, 3), settings.dynamic)
-        return first_state(p, field, self.site.codes(settings.poses, loop.generator(settings.seed, 0, 6)))
+        return first_state(p, field, self.scene.codes(settings.poses, loop.generator(settings.seed, 0, 6)))
 
-    def step(self, state: State, view: View, step: int) -> tuple[State, loop.Numbers]:
+    def step(self, state: State, view: TrainingView, step: int) -> tuple[State, loop.Numbers]:
         """One view: forward and adjoint, densification on its cadence, Adam."""
         if self._looks_for_movers(step):
             state = self._with_movers(state, step)
@@ -85,17 +85,17 @@ class Uwbs:
         self._descend(state, adjoint, rates, step)
         return state, adjoint.numbers
 
-    def _adjoint(self, state: State, view: View, step: int) -> _Adjoint:
+    def _adjoint(self, state: State, view: TrainingView, step: int) -> _Adjoint:
         """Gradients of the objective and the epipolar error in one view; the centers' by Alg. 1 while it lasts."""
         settings, share = self.settings, step / self.settings.iterations
         p = BetaPrimitives(*(values.detach().requires_grad_() for values in state.primitives))
         filtered = settings.sgg.enabled and share <= settings.sgg.end
-        sight = self.site.sight(view, state.poses)
-        drawing = draw(p, state.field, sight, settings, view.time, sgg=filtered)
-        loss = objective(p, drawing, view, settings, self.prior, self._regularised(share))
+        pinhole_view = self.scene.pinhole_view(view, state.poses)
+        drawing = draw(p, state.field, pinhole_view, settings, view.time, sgg=filtered)
+        loss = objective(p, drawing, view, settings, self.prior, self._regularized(share))
         numbers, total = loss.numbers | {"primitives": float(len(p.xyz))}, loss.total
         rng = loop.generator(settings.seed, step, 7)
-        off = self.site.epipolar_error(state.poses, settings.poses, share, rng)
+        off = self.scene.epipolar_error(state.poses, settings.poses, share, rng)
         if off is not None:
             total = total + settings.poses.epipolar * off.to(total)
             numbers |= {"epipolar_px": off}
@@ -103,7 +103,7 @@ class Uwbs:
         if not filtered:
             found = torch.autograd.grad(total, [*leaves.values()], materialize_grads=True)
             return _Adjoint(dict(zip(leaves, found, strict=True)), None, numbers)
-        sgg = differentiate(total, loss.depth, [*leaves.values()], p, drawing, sight, settings)
+        sgg = differentiate(total, loss.depth, [*leaves.values()], p, drawing, pinhole_view, settings)
         gradients = dict(zip(leaves, sgg.gradients, strict=True))
         gradients["xyz"] = gradients["xyz"] + sgg.xyz
         pulled = sgg.uncertainty > 0
@@ -127,7 +127,7 @@ class Uwbs:
             rng = loop.generator(self.settings.seed, step, 8)
             xyz.add_(self._noise(state.primitives, rates["xyz"], rng))
 
-    def _regularised(self, share: float) -> bool:
+    def _regularized(self, share: float) -> bool:
         return self.settings.weights.mcmc_begin < share <= self.settings.weights.mcmc_end
 
     def _looks_for_movers(self, step: int) -> bool:
@@ -139,10 +139,10 @@ class Uwbs:
         return m.share if self.settings.dynamic and step < m.at * self.settings.iterations else 0.0
 
     def _with_movers(self, state: State, step: int) -> State:
-        """Primitives for what moves, behind the others; their optimiser starts anew."""
+        """Primitives for what moves, behind the others; their optimizer starts anew."""
         rng = loop.generator(self.settings.seed, step, 9)
-        here = state.to(CPU)  # where the pictures are looked at
-        fresh_ones = born(here.primitives, here.field, self.site.views, self.settings, rng).to(self.site.device)
+        here = state.to(CPU)  # where the images are looked at
+        fresh_ones = born(here.primitives, here.field, self.scene.views, self.settings, rng).to(self.scene.device)
         moments = dict(state.moments)
         for name in BetaPrimitives._fields:
             m, count = moments[name], len(fresh_ones.xyz)
@@ -152,9 +152,11 @@ class Uwbs:
 
     def _rates(self, step: int, names: Collection[str]) -> dict[str, float]:
         r, share = self.settings.rates, step / self.settings.iterations
-        settled = log_linear(1.0, r.settle, max(0.0, (share - r.settle_begin) / (1 - r.settle_begin)))
+        settled = log_linear(
+            1.0, r.final_rate_factor, max(0.0, (share - r.rate_decay_start) / (1 - r.rate_decay_start))
+        )
         rates = {name: settled * getattr(r, name) for name in BetaPrimitives._fields}
-        rates["xyz"] = self.site.radius * log_linear(r.xyz, r.xyz_end, share)
+        rates["xyz"] = self.scene.radius * log_linear(r.xyz, r.xyz_end, share)
         medium = log_linear(r.medium, r.medium_end, share)
         if self.prior is not None and share <= self.settings.medium.begin:
             medium = 0.0
@@ -173,10 +175,10 @@ class Uwbs:
         """Relocation and growth, then noise; rows that start anew get no gradient of this step."""
         d = self.settings.densify
         n = len(state.primitives.xyz)
-        most = round((1 - self._kept_free(step)) * d.max_primitives)
+        most = round((1 - self._kept_free(step)) * d.cap_max)
         target = schedule.grown(n, most, d.growth, d, self.settings.iterations)
         rng = loop.generator(self.settings.seed, step, 4)
-        done = mcmc_beta.relocate_and_grow(state.primitives, target, d.dead_opacity, rng)
+        done = mcmc_beta.relocate_and_grow(state.primitives, target, d.min_opacity, rng)
         p = done.primitives
         if d.noise_cadence == "round":
             p = p._replace(xyz=p.xyz + self._noise(p, rate, rng))
@@ -199,23 +201,23 @@ class Uwbs:
 
 
 @dataclass(frozen=True)
-class Objective:
+class UwbsObjective:
     """Eq. 18 for one view."""
 
     total: Float[Tensor, ""]
-    depth: Float[Tensor, ""]  # the depth regulariser as it stands in the total
+    depth: Float[Tensor, ""]  # the depth regularizer as it stands in the total
     numbers: loop.Numbers  # the terms unweighted, for the record
 
 
 def objective(
     p: BetaPrimitives,
     drawing: Drawing,
-    view: View,
+    view: TrainingView,
     settings: UwbsSettings,
     prior: WaterPrior | None,
-    regularised: bool,
-) -> Objective:
-    """Eq. 18 and the terms beyond it. Opacity and scale count only while `regularised`."""
+    regularized: bool,
+) -> UwbsObjective:
+    """Eq. 18 and the terms beyond it. Opacity and scale count only while `regularized`."""
     w = settings.weights
     photo = losses.photometric(drawing.images.rgb, view.rgb, view.seen, w.ssim)
     edges = losses.edge_weight(view.rgb, w.depth_edges)
@@ -235,27 +237,27 @@ def objective(
         off = deviation(drawing.grid, prior)
         total = total + w.medium_prior * off
         numbers |= {"medium_prior": off}
-    if regularised:
+    if regularized:
         opacity, scale = losses.mean_opacity(p), losses.mean_scale(p, w.ubs_scale_reg_bug)
         total = total + w.opacity * opacity + w.scale * scale
         numbers |= {"opacity": opacity, "scale": scale}
-    return Objective(total, depth, {"loss": total} | numbers)
+    return UwbsObjective(total, depth, {"loss": total} | numbers)
 
 
 def measured_water(rec: Reconstruction) -> MediumFit | None:
-    """The reconstruction's water; where it leaves Binf open, that is near the scene's mean colour as filmed."""
+    """The reconstruction's water; where it leaves Binf open, that is near the scene's mean color as filmed."""
     if rec.medium is None or rec.cloud is None:
         return rec.medium
-    return with_expected_horizon(rec.medium, rec.cloud.raw.mean(0), _HORIZON_STD)
+    return with_binf_prior(rec.medium, rec.cloud.raw.mean(0), _HORIZON_STD)
 
 
-def known_water(site: Site, settings: UwbsSettings) -> WaterPrior | None:
+def known_water(scene: TrainingScene, settings: UwbsSettings) -> WaterPrior | None:
     """What structure from motion says about the water, per working unit; None for maps without water."""
-    fit = measured_water(site.rec)
+    fit = measured_water(scene.rec)
     if settings.medium.model == "none" or fit is None:
         return None
-    prior = water_prior(fit, 1 / site.scale, settings.medium)
-    return WaterPrior(prior.mean.to(site.device), prior.std.to(site.device))
+    prior = water_prior(fit, 1 / scene.scale, settings.medium)
+    return WaterPrior(prior.mean.to(scene.device), prior.std.to(scene.device))
 
 
 def _extended(rows: Tensor, count: int) -> Tensor:

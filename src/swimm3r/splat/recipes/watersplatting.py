@@ -2,16 +2,16 @@
 
     I = sum_i w_i c_i e^{-beta_D z_i} + Binf V,   L = 0.8 mean |(I - gt) / (sg(I) + eps)| + 0.2 (1 - SSIM)
 
-with both pictures of SSIM divided by sg(I) + eps, too (uwbs.md 3). The picture is formed as UWBS forms it.
+with both images of SSIM divided by sg(I) + eps, too (uwbs.md 3). The image is formed as UWBS forms it.
 Gaussians multiply by absolute gradients and are culled by opacity; opacities are cut back now and then.
 
-Where we depart from the publication: exact harmonics of the pixel's ray where its encoding sees 2 d - 1; pixel centres
+Where we depart from the publication: exact harmonics of the pixel's ray where its encoding sees 2 d - 1; pixel centers
 at +0.5; exact gradients where its backward pass leaves out depth and mistakes the cap on alpha; SSIM pads with zeros;
-the water's network is asked on a grid of pixels and interpolated, and keeps its optimiser's memory when Gaussians are
+the water's network is asked on a grid of pixels and interpolated, and keeps its optimizer's memory when Gaussians are
 culled; the number of Gaussians has the bound that all recipes have. Its schedule densifies only beyond n_train + 100 of
 every 500 steps, which long clips never reach: here never more than half of them are waited for. In short runs rounds
-are `min_every` steps apart at least, rates grow (`haste`), opacities are not cut, and culls are as after the last round
-(`with_recipe`): there is no time to grow back.
+are `min_refine_every` steps apart at least, rates grow (`short_run_rate_exponent`), opacities are not cut, and culls
+are as after the last round (`with_recipe`): there is no time to grow back.
 """
 
 from dataclasses import dataclass
@@ -24,11 +24,18 @@ from swimm3r.splat.densify import adaptive, schedule
 from swimm3r.splat.gaussian_settings import WaterSplattingSettings
 from swimm3r.splat.medium.field import initial_field
 from swimm3r.splat.optimizer import adam_step, log_linear
-from swimm3r.splat.recipes.gaussian_step import InField, first_gaussians, look, rates_of, with_matches, with_rows
+from swimm3r.splat.recipes.gaussian_step import (
+    InField,
+    first_gaussians,
+    rates_of,
+    render_for_training,
+    with_matches,
+    with_rows,
+)
 from swimm3r.splat.training import loop, losses
-from swimm3r.splat.training.scene import Site
+from swimm3r.splat.training.scene import TrainingScene
 from swimm3r.splat.training.state import FIELD, State, clip_field, first_state, parameters_of
-from swimm3r.splat.views import View, smaller
+from swimm3r.splat.views import TrainingView, smaller
 
 
 @dataclass(frozen=True)
@@ -36,23 +43,23 @@ class WaterSplatting:
     """The recipe for one scene (`training.Recipe`)."""
 
     settings: WaterSplattingSettings
-    site: Site
+    scene: TrainingScene
 
     def start(self) -> InField:
         """Faint Gaussians on the cloud, and a network at random."""
         seed = self.settings.seed
-        p = first_gaussians(self.site, self.settings)
+        p = first_gaussians(self.scene, self.settings)
         field = initial_field(None, self.settings.medium, loop.generator(seed, 0, 3))
-        codes = self.site.codes(self.settings.poses, loop.generator(seed, 0, 6))
+        codes = self.scene.codes(self.settings.poses, loop.generator(seed, 0, 6))
         return first_state(p, field, codes, adaptive.nothing_seen(len(p.xyz)))
 
-    def step(self, state: InField, view: View, step: int) -> tuple[InField, loop.Numbers]:
+    def step(self, state: InField, view: TrainingView, step: int) -> tuple[InField, loop.Numbers]:
         """One view at the resolution this step has come to: forward, adjoint, Adam, densification on its cadence."""
         settings = self.settings
         view = smaller(view, self._divisor(step))
-        seen = look(self.site, state, view, settings, step, sgg=True)
+        seen = render_for_training(self.scene, state, view, settings, step, sgg=True)
         photo = relative_photometric(seen.drawing.images.rgb, view, settings.weights.floor, settings.weights.ssim)
-        total, numbers = with_matches(self.site, state, photo.loss, settings, step)
+        total, numbers = with_matches(self.scene, state, photo.loss, settings, step)
         l1 = (seen.drawing.images.rgb.detach() - view.rgb)[:, view.seen].abs().mean()
         numbers |= {"loss": total, "l1": l1, "relative_l1": photo.l1, "ssim": photo.ssim}
         numbers |= {"primitives": float(len(seen.p.xyz))}
@@ -63,15 +70,17 @@ class WaterSplatting:
             parameters = parameters_of(state.primitives, state.field, state.poses)
             water = log_linear(settings.medium_rate, settings.medium_rate_end, step / settings.iterations)
             rates = dict.fromkeys((name for name in parameters if name.startswith(FIELD)), water)
-            adam_step(parameters, gradients, state.moments, rates | rates_of(self.site, settings, step, parameters))
-            memory = adaptive.remembered(state.memory, seen.drawing.sgg.full_abs, seen.drawing.projection, seen.sight)
+            adam_step(parameters, gradients, state.moments, rates | rates_of(self.scene, settings, step, parameters))
+            memory = adaptive.remembered(
+                state.memory, seen.drawing.sgg.full_abs, seen.drawing.projection, seen.pinhole_view
+            )
             state = State(state.primitives, state.field, state.poses, state.moments, memory)
-            if step % self._every() == 0 and step > settings.densify.begin * settings.iterations:
+            if step % self._every() == 0 and step > settings.densify.refine_start * settings.iterations:
                 state = self._round(state, step)
         return state, numbers
 
     def _divisor(self, step: int) -> int:
-        """By how much the training picture is smaller."""
+        """By how much the training image is smaller."""
         doublings = int((step - 1) / (self.settings.double_every * self.settings.iterations))
         return max(1, self.settings.first_divisor >> doublings)
 
@@ -81,23 +90,25 @@ class WaterSplatting:
     def _period(self) -> int:
         """Steps from one cut of the opacities to the next; all of the run where there is none."""
         d = self.settings.densify
-        return self._every() * max(1, round(d.reset_every / d.every)) if d.reset_every else self.settings.iterations
+        return (
+            self._every() * max(1, round(d.reset_every / d.refine_every)) if d.reset_every else self.settings.iterations
+        )
 
     def _round(self, state: InField, step: int) -> InField:
         """Multiply and cull; cut opacities back on their cadence."""
         d, p, moments, memory = self.settings.densify, state.primitives, state.moments, state.memory
         since = step % self._period()
-        growing = step < d.end * self.settings.iterations
-        waits = min(len(self.site.views) + self._every(), self._period() // 2) if d.reset_every else 0
+        growing = step < d.refine_stop * self.settings.iterations
+        waits = min(len(self.scene.views) + self._every(), self._period() // 2) if d.reset_every else 0
         if not growing or since > waits:
             done = adaptive.unchanged(p)
             if growing:
                 rng = loop.generator(self.settings.seed, step, 4)
-                large = d.large * self.site.radius
-                done = adaptive.multiply(p, memory, d.pull, large, self.settings.max_primitives, rng)
+                large = d.grow_scale3d * self.scene.radius
+                done = adaptive.multiply(p, memory, d.grow_grad2d, large, self.settings.cap_max, rng)
             q = done.primitives
-            fit = torch.sigmoid(q.opacity) >= (d.least_opacity if growing else d.least_opacity_late)
-            fit &= q.scale.amax(-1).exp() <= d.largest * self.site.radius
+            fit = torch.sigmoid(q.opacity) >= (d.prune_opacity if growing else d.prune_opacity_late)
+            fit &= q.scale.amax(-1).exp() <= d.prune_scale3d * self.scene.radius
             if int(fit.sum()) >= 4:
                 done = adaptive.only(done, fit)
             p, moments = done.primitives, with_rows(moments, done.source, done.restarted)
@@ -108,8 +119,8 @@ class WaterSplatting:
 
 
 def relative_photometric(
-    render: Float[Tensor, "3 h w"], view: View, floor: float, ssim_weight: float
+    render: Float[Tensor, "3 h w"], view: TrainingView, floor: float, ssim_weight: float
 ) -> losses.Photometric:
-    """reg-L1 and reg-SSIM: both pictures in units of the rendered value, so that dark water counts as much."""
+    """reg-L1 and reg-SSIM: both images in units of the rendered value, so that dark water counts as much."""
     unit = render.detach() + floor
     return losses.photometric(render / unit, view.rgb / unit, view.seen, ssim_weight)

@@ -18,9 +18,9 @@ from swimm3r.io.files.damage import guard
 from swimm3r.progress import Progress
 from swimm3r.splat.settings import SplatSettings
 from swimm3r.splat.training.checkpoint import StateHeader, read_state, state_remedy, write_state
-from swimm3r.splat.training.scene import Site
+from swimm3r.splat.training.scene import TrainingScene
 from swimm3r.splat.training.state import State, restored, stored
-from swimm3r.splat.views import View
+from swimm3r.splat.views import TrainingView
 
 log = logging.getLogger(__name__)
 
@@ -38,7 +38,7 @@ class Recipe(Protocol):
         ...
 
     @property
-    def site(self) -> Site:
+    def scene(self) -> TrainingScene:
         """The scene in working units, with the views to learn from."""
         ...
 
@@ -46,7 +46,7 @@ class Recipe(Protocol):
         """The state before step 1."""
         ...
 
-    def step(self, state: Any, view: View, step: int) -> tuple[State, Numbers]:
+    def step(self, state: Any, view: TrainingView, step: int) -> tuple[State, Numbers]:
         """The state after training on one view, and the numbers of the step; steps count from 1."""
         ...
 
@@ -79,12 +79,12 @@ def run(recipe: Recipe, schedule: Schedule, folder: Path, progress: Progress) ->
     path, metrics = folder / "checkpoint" / "state.safetensors", folder / "metrics.jsonl"
     folder.mkdir(parents=True, exist_ok=True)
     state, done = _resume(recipe, path, metrics, schedule)
-    state = state.to(recipe.site.device)
+    state = state.to(recipe.scene.device)
     started, cpu_started, first = time.perf_counter(), time.process_time(), done
     sums: dict[str, tuple[float | Tensor, int]] = {}
     for step in range(done + 1, schedule.iterations + 1):
         progress("training the map", step - 1, schedule.iterations)
-        view = recipe.site.view(view_of_step(step, len(recipe.site.views), schedule.seed))
+        view = recipe.scene.view(view_of_step(step, len(recipe.scene.views), schedule.seed))
         state, numbers = recipe.step(state, view, step)
         for name, value in numbers.items():
             total, count = sums.get(name, (0.0, 0))
@@ -110,7 +110,7 @@ def _resume(recipe: Recipe, path: Path, metrics: Path, schedule: Schedule) -> tu
         kept = read_state(path)
         if kept.about.fingerprint == schedule.fingerprint:
             with guard(path, state_remedy(path)):
-                state = restored(kept.tensors, recipe.settings, recipe.site.refined_cameras)
+                state = restored(kept.tensors, recipe.settings, recipe.scene.refined_cameras)
             done = kept.about.step
             log.info("going on from step %d", done)
         else:

@@ -1,4 +1,4 @@
-"""The terms of Eq. 18, each a mean; `recipes.uwbs` weighs and adds them. Pictures are channels first."""
+"""The terms of Eq. 18, each a mean; `recipes.uwbs` weighs and adds them. Images are channels first."""
 
 from dataclasses import dataclass
 from typing import Any
@@ -13,7 +13,7 @@ from swimm3r.splat.primitives.beta import BetaPrimitives
 from swimm3r.splat.training import ssim_cpu
 
 _NEAREST = 1e-3  # of the scene's unit: the least depth whose inverse is taken
-_LEAST_WEIGHT = 1e-12  # of a picture's edge-aware weights together, below which none of its depths counts
+_LEAST_WEIGHT = 1e-12  # of an image's edge-aware weights together, below which none of its depths counts
 
 
 @dataclass(frozen=True)
@@ -91,7 +91,7 @@ def oversize(p: BetaPrimitives, radius: Float[Tensor, " n"], limit: float) -> Fl
 
 
 def edge_weight(rgb: Float[Tensor, "3 h w"], scale: float) -> Float[Tensor, "h w"]:
-    """w_n of Eq. 13 before it is normalised: mean of e^(-scale |dI/dx|) and e^(-scale |dI/dy|), 1 where I is flat.
+    """w_n of Eq. 13 before it is normalized: mean of e^(-scale |dI/dx|) and e^(-scale |dI/dy|), 1 where I is flat.
 
     |dI| is the mean over the channels of the absolute difference to the next pixel.
     """
@@ -105,7 +105,7 @@ def depth_error(
 ) -> Float[Tensor, ""]:
     """L_depth (Eq. 13): sum of w_n log(1 + |1/D^ - 1/D|) over the pixels of known depth that the map covers.
 
-    D^ is the expected depth, `z_depth` D (0 = unknown). The weights are normalised to a sum of 1 over those pixels; the
+    D^ is the expected depth, `z_depth` D (0 = unknown). The weights are normalized to a sum of 1 over those pixels; the
     paper prints a sum beside means and so leaves their sum open.
     """
     counted = (z_depth > 0) & (images.alpha.detach() > least_alpha)
@@ -127,7 +127,7 @@ def drawn_on_water(images: RasterOutput, open_water: Bool[Tensor, "h w"]) -> Flo
 
 
 def outside_gamut(p: BetaPrimitives, radius: Float[Tensor, " n"]) -> Float[Tensor, ""]:
-    """Mean squared excess of clear colours over 0..1, of the primitives in view (`radius` > 0); 0 for none."""
+    """Mean squared excess of clear colors over 0..1, of the primitives in view (`radius` > 0); 0 for none."""
     in_view = (radius > 0)[:, None]
     excess = p.rgb - p.rgb.detach().clamp(0, 1)
     return torch.where(in_view, excess.square(), 0.0).sum() / (3 * in_view.sum()).clamp(min=1)

@@ -11,52 +11,52 @@ from swimm3r.devices import CPU
 from swimm3r.scene.reconstruction import Reconstruction
 from swimm3r.splat.projection.pinhole import Pinhole, pinhole
 from swimm3r.splat.shared_settings import TrainingPoseSettings
-from swimm3r.splat.training_poses import PoseCodes, Stations
-from swimm3r.splat.views import TrainingViews, View
+from swimm3r.splat.training_poses import PoseMlp, TrainingPoses
+from swimm3r.splat.views import TrainingView, TrainingViews
 
 
 @dataclass(frozen=True)
-class Site:
+class TrainingScene:
     """A reconstruction and what follows from it."""
 
     rec: Reconstruction
     scale: float  # working units per scene unit
     radius: float  # of the cameras' path, working units
     views: TrainingViews
-    stations: Stations | None = None  # None where poses are held
+    poses: TrainingPoses | None = None  # None where poses are held
     device: torch.device = CPU  # of primitives and water; frames and poses are on the processor
 
     @property
     def refined_cameras(self) -> int:
         """How many poses are refined."""
-        return 0 if self.stations is None else len(self.stations)
+        return 0 if self.poses is None else len(self.poses)
 
-    def codes(self, settings: TrainingPoseSettings, rng: torch.Generator) -> PoseCodes | None:
+    def codes(self, settings: TrainingPoseSettings, rng: torch.Generator) -> PoseMlp | None:
         """Poses as they are before the first step; None where they are held."""
-        return None if self.stations is None else PoseCodes(len(self.stations), settings, rng)
+        return None if self.poses is None else PoseMlp(len(self.poses), settings, rng)
 
-    def view(self, k: int) -> View:
-        """The k-th training picture, on the device."""
+    def view(self, k: int) -> TrainingView:
+        """The k-th training image, on the device."""
         return self.views[k].to(self.device)
 
-    def camera(self, view: View, codes: PoseCodes | None) -> Cameras:
+    def camera(self, view: TrainingView, codes: PoseMlp | None) -> Cameras:
         """A view's camera where training has moved it to."""
-        if self.stations is None or codes is None:
+        if self.poses is None or codes is None:
             return view.camera
-        place = torch.tensor([self.stations.names.index(view.name)])
-        return replace(view.camera, cam2world=self.stations.moved(codes, place))
+        place = torch.tensor([self.poses.names.index(view.name)])
+        return replace(view.camera, cam2world=self.poses.moved(codes, place))
 
-    def sight(self, view: View, codes: PoseCodes | None) -> Pinhole:
+    def pinhole_view(self, view: TrainingView, codes: PoseMlp | None) -> Pinhole:
         """That camera for drawing."""
         return pinhole(self.camera(view, codes)).to(self.device)
 
     def epipolar_error(
-        self, codes: PoseCodes | None, settings: TrainingPoseSettings, share: float, rng: torch.Generator
+        self, codes: PoseMlp | None, settings: TrainingPoseSettings, share: float, rng: torch.Generator
     ) -> Float[Tensor, ""] | None:
         """L_epi of some matches, pixels, while it takes part at this share of the run, else None."""
-        if self.stations is None or codes is None or share > settings.epipolar_end:
+        if self.poses is None or codes is None or share > settings.epipolar_end:
             return None
-        return self.stations.epipolar_error(codes, self.stations.matches.some(settings.matches, rng))
+        return self.poses.epipolar_error(codes, self.poses.matches.some(settings.matches, rng))
 
 
 def path_radius(rec: Reconstruction, scale: float, working_depth: float) -> float:
@@ -64,6 +64,6 @@ def path_radius(rec: Reconstruction, scale: float, working_depth: float) -> floa
 
     The floor keeps a camera that hardly moves from freezing its scene.
     """
-    centres = rec.cameras.centres
-    spread = float(torch.linalg.vector_norm(centres - centres.mean(0), dim=-1).max())
+    centers = rec.cameras.centers
+    spread = float(torch.linalg.vector_norm(centers - centers.mean(0), dim=-1).max())
     return max(1.1 * spread * scale, working_depth / 3)

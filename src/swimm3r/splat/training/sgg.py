@@ -1,14 +1,14 @@
-"""Scattering-aware geometric gradients (Alg. 1): water must not push the primitives' centres about.
+"""Scattering-aware geometric gradients (Alg. 1): water must not push the primitives' centers about.
 
-The gradient g0 of a projected centre is the sum of what a water-free render asks for and of what scattering does,
+The gradient g0 of a projected center is the sum of what a water-free render asks for and of what scattering does,
 g0 = geo + med (`raster.SggBuffers`). With L1 norms, and geo_abs the component-wise sum of absolute values over pixels,
 
     u = |med| / (|geo| + |med|)    kappa = (|geo_abs| - |geo|) / |geo_abs|    q = (1 - u) kappa
     g_sgg = sign(geo) ((1 - q) |geo| + q geo_abs) + eta u g0
 
-takes the place of g0 on its way to xyz. Cameras, shapes, opacities and colours keep the exact gradient. Once Adam has
+takes the place of g0 on its way to xyz. Cameras, shapes, opacities and colors keep the exact gradient. Once Adam has
 moved xyz, its displacement is multiplied by c = 1 + (c_max - 1) u s / (s + s_ref), s the length of the depth loss's own
-gradient and s_ref its median: uncertain centres move farther, but not those whose depth is already right.
+gradient and s_ref its median: uncertain centers move farther, but not those whose depth is already right.
 """
 
 from dataclasses import dataclass
@@ -19,7 +19,7 @@ from torch import Tensor
 
 from swimm3r.raster import SggBuffers, rasterize
 from swimm3r.splat.primitives.beta import BetaPrimitives
-from swimm3r.splat.projection.dispatch import centre_gradients
+from swimm3r.splat.projection.dispatch import center_gradients
 from swimm3r.splat.projection.pinhole import Pinhole
 from swimm3r.splat.rendering import Drawing
 from swimm3r.splat.settings import UwbsSettings
@@ -29,7 +29,7 @@ _EPS = 1e-12  # losses are means over pixels: gradients of 1e-7 are large
 
 @dataclass(frozen=True)
 class Branches:
-    """The gradients of projected centres, in parts; geo + med is the plain one."""
+    """The gradients of projected centers, in parts; geo + med is the plain one."""
 
     geo: Float[Tensor, "n 2"]
     med: Float[Tensor, "n 2"]
@@ -47,7 +47,7 @@ class Differentiated:
 
 
 def medium_uncertainty(b: Branches) -> Float[Tensor, " n"]:
-    """u: the share of a centre's gradient that the water makes; 0 where there is none."""
+    """u: the share of a center's gradient that the water makes; 0 where there is none."""
     geo, med = _length(b.geo), _length(b.med)
     return med / (geo + med + _EPS)
 
@@ -88,7 +88,7 @@ def differentiate(
     view: Pinhole,
     settings: UwbsSettings,
 ) -> Differentiated:
-    """Gradients of `total` in the leaves, and Alg. 1's for the centres of `p`, which was drawn with SggBuffers.
+    """Gradients of `total` in the leaves, and Alg. 1's for the centers of `p`, which was drawn with SggBuffers.
 
     `depth` is the depth loss as it stands in `total`.
     """
@@ -112,7 +112,7 @@ def differentiate(
         on_plane = on_plane + sgg.residual * medium_uncertainty(branches)[:, None] * alone[-1]
     by_depth = buffers.depth_iso if alone is None else torch.zeros_like(buffers.depth_iso)
     pulls = torch.stack([torch.nn.functional.pad(on_plane, (0, 1)), by_depth], 1)
-    xyz, isolated = centre_gradients(p, view, settings.render, pulls, drawing.time).unbind(1)
+    xyz, isolated = center_gradients(p, view, settings.render, pulls, drawing.time).unbind(1)
     u = medium_uncertainty(branches)
     multiplier = step_multiplier(u, isolated if alone is None else alone[-2], sgg.largest_step)
     return Differentiated(gradients, xyz, multiplier, u)
@@ -121,7 +121,7 @@ def differentiate(
 def _direct(drawing: Drawing, on_images: tuple[Tensor, ...], g0: Float[Tensor, "n 2"], alpha_min: float) -> Branches:
     """The other split: attenuated light counts as geometry, and only backscatter as medium.
 
-    Light without veil is what water of no colour shows, so one more pass through such water tells the two apart.
+    Light without veil is what water of no color shows, so one more pass through such water tells the two apart.
     """
     p, maps = drawing.projection.primitives, drawing.maps
     assert maps is not None

@@ -1,4 +1,4 @@
-"""L1 and SSIM of two pictures and their gradients in one pass on the CPU.
+"""L1 and SSIM of two images and their gradients in one pass on the CPU.
 
     S = (2 mx my + C1)(2 sxy + C2) / ((mx^2 + my^2 + C1)(sx^2 + sy^2 + C2))
 

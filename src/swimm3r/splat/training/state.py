@@ -17,7 +17,7 @@ from swimm3r.splat.primitives.beta import BetaPrimitives
 from swimm3r.splat.primitives.gaussian import GaussianPrimitives
 from swimm3r.splat.primitives.kinds import Primitives, primitives_from
 from swimm3r.splat.settings import SplatSettings
-from swimm3r.splat.training_poses import PoseCodes
+from swimm3r.splat.training_poses import PoseMlp
 
 FIELD, POSES = "field.", "poses."
 P = TypeVar("P", BetaPrimitives, GaussianPrimitives)
@@ -26,11 +26,11 @@ W = TypeVar("W", MediumField, SceneWater)
 
 @dataclass(frozen=True)
 class State(Generic[P, W]):
-    """Primitives, water and poses, the optimiser's memory of them, and what else a recipe remembers."""
+    """Primitives, water and poses, the optimizer's memory of them, and what else a recipe remembers."""
 
     primitives: P
     field: W
-    poses: PoseCodes | None  # None where poses are held
+    poses: PoseMlp | None  # None where poses are held
     moments: dict[str, Moments]  # of "xyz" ..., of the field's parameters by "field.*", of the poses' by "poses.*"
     memory: dict[str, Tensor] = dataclasses.field(default_factory=dict)
 
@@ -44,14 +44,14 @@ class State(Generic[P, W]):
         return State(self.primitives.to(device), copy.deepcopy(self.field).to(device), self.poses, moments, memory)
 
 
-def parameters_of(p: Primitives, field: Water, poses: PoseCodes | None = None) -> dict[str, Tensor]:
+def parameters_of(p: Primitives, field: Water, poses: PoseMlp | None = None) -> dict[str, Tensor]:
     """Everything that is trained, by the names of `State.moments`."""
     of_field: dict[str, Tensor] = {f"{FIELD}{name}": t for name, t in field.named_parameters()}
     of_poses = {} if poses is None else {f"{POSES}{name}": t for name, t in poses.named_parameters()}
     return {**p._asdict(), **of_field, **of_poses}
 
 
-def first_state(p: P, field: W, poses: PoseCodes | None, memory: dict[str, Tensor] | None = None) -> State[P, W]:
+def first_state(p: P, field: W, poses: PoseMlp | None, memory: dict[str, Tensor] | None = None) -> State[P, W]:
     """The state before step 1."""
     p = type(p)(*(values.contiguous() for values in p))
     moments = {name: fresh(values) for name, values in parameters_of(p, field, poses).items()}
@@ -73,7 +73,7 @@ def restored(tensors: dict[str, Tensor], settings: SplatSettings, cameras: int) 
     Raises KeyError or ValueError for tensors that are not of such a state.
     """
     parts = parts_of(settings)
-    poses = PoseCodes(cameras, settings.poses) if cameras else None
+    poses = PoseMlp(cameras, settings.poses) if cameras else None
     p: Any = primitives_from(tensors, parts.primitives, "parameter.")
     parameters = parameters_of(p, parts.field, poses)
     with torch.no_grad():

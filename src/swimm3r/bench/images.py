@@ -1,4 +1,4 @@
-"""Pictures of several methods side by side, each under its name."""
+"""Images of several methods side by side, each under its name."""
 
 from collections.abc import Sequence
 from dataclasses import dataclass
@@ -10,21 +10,21 @@ from numpy import ndarray
 
 from swimm3r.io import images
 
-_HEIGHT = 240  # of one picture in the grid, pixels
+_HEIGHT = 240  # of one image in the grid, pixels
 _BAR, _GAP = 22, 4
 _PAPER, _INK = 255, (30, 30, 30)
 
 
 @dataclass(frozen=True)
 class Panel:
-    """One picture of a grid; None is left white."""
+    """One image of a grid; None is left white."""
 
     label: str
-    picture: UInt8[np.ndarray, "h w 3"] | None
+    image: UInt8[np.ndarray, "h w 3"] | None
 
 
 def stored(label: str, path: Path) -> Panel:
-    """A picture file, or nothing where there is none."""
+    """An image file, or nothing where there is none."""
     if not path.is_file():
         return Panel(label, None)
     rgb = images.read_rgb(path)
@@ -42,15 +42,15 @@ def write_grid(path: Path, rows: Sequence[Sequence[Panel]]) -> None:
 def _strip(panels: Sequence[Panel]) -> UInt8[ndarray, "h w 3"]:
     import cv2
 
-    usual = next((p.picture.shape for p in panels if p.picture is not None), (_HEIGHT, _HEIGHT, 3))
+    usual = next((p.image.shape for p in panels if p.image is not None), (_HEIGHT, _HEIGHT, 3))
     parts = []
     for panel in panels:
-        height, width = (usual if panel.picture is None else panel.picture.shape)[:2]
+        height, width = (usual if panel.image is None else panel.image.shape)[:2]
         size = (max(1, round(width * _HEIGHT / height)), _HEIGHT)
         part = np.full((_HEIGHT + _BAR, size[0], 3), _PAPER, np.uint8)
-        if panel.picture is not None:
+        if panel.image is not None:
             way = cv2.INTER_AREA if height > _HEIGHT else cv2.INTER_LINEAR
-            part[_BAR:] = cv2.resize(np.ascontiguousarray(panel.picture), size, interpolation=way)
+            part[_BAR:] = cv2.resize(np.ascontiguousarray(panel.image), size, interpolation=way)
         cv2.putText(part, panel.label, (3, _BAR - 7), cv2.FONT_HERSHEY_SIMPLEX, 0.45, _INK, 1, cv2.LINE_AA)
         parts.append(np.pad(part, ((0, 0), (0, _GAP), (0, 0)), constant_values=_PAPER))
     return np.concatenate(parts, 1)
