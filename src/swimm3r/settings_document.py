@@ -5,6 +5,7 @@ A record is a mapping of its fields by name. Where a field may hold one of sever
 absent have their defaults; whatever else is not as declared is refused by its name in the document.
 """
 
+import difflib
 from dataclasses import MISSING, Field, fields
 from pathlib import Path
 from typing import Any, TypeVar, get_args
@@ -30,7 +31,8 @@ def from_document(document: Any, kind: type[Record], place: str = "") -> Record:
     document = _mapping(document, place)
     for key in document:
         if key not in known:
-            raise ValueError(f"there is no setting {place}{key}")
+            near = difflib.get_close_matches(str(key), known, 1)
+            raise ValueError(f"there is no setting {place}{key}" + "".join(f" (similar: {place}{n})" for n in near))
     values = {}
     for name, value in document.items():
         kinds, where = _kinds(kind, known[name]), f"{place}{name}"

@@ -5,13 +5,13 @@ from dataclasses import dataclass, replace
 from pathlib import Path
 
 from swimm3r.bench.settings import IMPORTED
-from swimm3r.bench.sfm_methods import on_model
 from swimm3r.datasets import layouts
 from swimm3r.errors import InputError
 from swimm3r.io.images import image_size
 from swimm3r.io.video import Video
 from swimm3r.pipeline.presets import RunSettings
 from swimm3r.pipeline.run import FinishedSfm, open_finished_sfm, run_pipeline
+from swimm3r.pipeline.run_settings import with_poses_of
 from swimm3r.prepare import check_source
 from swimm3r.prepare.image_folder import images_of
 from swimm3r.progress import Progress, silent
@@ -105,7 +105,7 @@ def _with_given_poses(scene: Path, settings: RunSettings) -> tuple[Path, RunSett
             hint="without --given-poses they are found anew",
         )
     assert isinstance(settings.sfm, ColmapSettings)
-    return images, replace(settings, sfm=on_model(model, settings.sfm))
+    return images, replace(settings, sfm=with_poses_of(model, settings.sfm))
 
 
 def original_pixels(source: Path, frames: Frames) -> float:

@@ -11,6 +11,7 @@ from swimm3r.bench.settings import SfmMethod, SfmMethods
 from swimm3r.evaluate import NotComputed
 from swimm3r.evaluate.matches import match_scores
 from swimm3r.evaluate.poses import pose_scores
+from swimm3r.pipeline.run_settings import with_poses_of
 from swimm3r.pipeline.summary import match_errors
 from swimm3r.progress import Progress
 from swimm3r.scene import reconstruction
@@ -108,10 +109,4 @@ def _imported(
     found = [folder / scene] if (folder / scene).exists() else sorted(folder.glob(f"{scene}.*"))
     if not found:
         return NotComputed(f"there is no {folder / scene}")
-    return on_model(found[0], colmap)
-
-
-def on_model(model: Path, colmap: ColmapSettings) -> ColmapModelSettings:
-    """A model's poses, with depth, water and cloud found as COLMAP's settings say."""
-    parts = {name: getattr(colmap, name) for name in ("features", "depth", "water", "restore")}
-    return ColmapModelSettings(model.resolve(), **parts)
+    return with_poses_of(found[0], colmap)

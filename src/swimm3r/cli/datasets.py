@@ -1,11 +1,9 @@
-"""`swimm3r datasets`: what a folder of published data holds, and what of it cannot be used."""
+"""`swimm3r datasets`: contents of a folder of published data, and the parts that cannot be used."""
 
-from pathlib import Path
-
-from tyro.conf import Positional
+from swimm3r.cli.terminal.options import DataRoot
 
 
-def datasets(root: Positional[Path], /) -> None:
+def datasets(root: DataRoot, /) -> None:
     """List the sequences below a folder, their raw and clean images, depth and poses, and what was left out.
 
     Args:

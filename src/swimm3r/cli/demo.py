@@ -5,27 +5,27 @@ from dataclasses import replace
 from pathlib import Path
 from typing import Annotated
 
-from tyro.conf import arg
-
-from swimm3r.cli.terminal.console import drawn_progress, print_next, print_summary
+from swimm3r.cli.pipeline.stages import RESULTS
+from swimm3r.cli.terminal.console import drawn_progress, print_next, print_results, print_summary
+from swimm3r.cli.terminal.options import FLAT, Out
 from swimm3r.pipeline.presets import PRESETS
 from swimm3r.splat.settings import RecipeName, UwbsSettings, with_recipe
 from swimm3r.synthetic.settings import DiveSettings
 
 
 def demo(
-    out: Path = Path("runs/demo"),
+    out: Out = Path("runs/demo"),
     recipe: RecipeName = "uwbs-static",
     redo: bool = False,
-    dive: Annotated[DiveSettings, arg(name="")] = DiveSettings(),  # noqa: B008
+    dive: Annotated[DiveSettings, FLAT] = DiveSettings(),  # noqa: B008
 ) -> None:
     """Make a synthetic dive and run the pipeline on it; needs no download and no GPU.
 
     Args:
-        out: the run folder; the dive itself goes to OUT-dive beside it.
-        recipe: uwbs-static; uwbs-dynamic, whose map changes with time; or another method on the same start.
-        redo: make stages again that were made with other settings; what is there moves to OUT/old.
-        dive: what the synthetic dive looks like.
+        out: Run folder that receives all results; the dive itself goes to OUT-dive beside it.
+        recipe: Kind of map: uwbs-static, uwbs-dynamic for scenes that change with time, or another published method.
+        redo: Repeat stages that were made with other settings; the earlier results move to OUT/old.
+        dive: The synthetic dive.
     """
     size = PRESETS["fast"].splat
     assert isinstance(size, UwbsSettings)
@@ -41,5 +41,6 @@ def demo(
         check_vacant(out)
         write_dive(dive, folder, progress)
         summary = run_pipeline(folder, out, settings, redo=redo, progress=progress)
-    print_summary(summary, out)
+    print_summary(summary)
+    print_results(out, RESULTS)
     print_next("other views of the map", "render", out)

@@ -2,14 +2,14 @@
 
 from pathlib import Path
 
-from tyro.conf import Positional
-
-from swimm3r.cli.terminal.console import drawn_progress, print_summary
+from swimm3r.cli.pipeline.stages import RESULTS
+from swimm3r.cli.terminal.console import drawn_progress, print_results, print_summary
+from swimm3r.cli.terminal.options import Run
 from swimm3r.settings import CountOrZero
 
 
 def evaluate(
-    run: Positional[Path],
+    run: Run,
     /,
     reference: Path | None = None,
     steps: CountOrZero | None = None,
@@ -20,12 +20,13 @@ def evaluate(
     summary.json, the views in RUN/renders/protocols.
 
     Args:
-        run: the run folder.
-        reference: a cameras.json with poses to compare with.
-        steps: of refinement for each test frame's pose; as in the run where not given.
+        run: Run folder with a finished map.
+        reference: File cameras.json with known poses to score the result against.
+        steps: Refinement steps for the pose of each test frame; those of the run by default.
     """
     from swimm3r.pipeline.run import evaluate_run
 
     with drawn_progress() as progress:
         summary = evaluate_run(run, steps=steps, reference=reference, progress=progress)
-    print_summary(summary, run)
+    print_summary(summary)
+    print_results(run, RESULTS)

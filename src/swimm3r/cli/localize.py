@@ -1,30 +1,32 @@
-"""`swimm3r localize`: where images were taken, in a run's map."""
+"""`swimm3r localize`: camera poses of images in a run's map."""
 
 from pathlib import Path
+from typing import Annotated
 
 from rich.table import Table
-from tyro.conf import Positional
+from tyro.conf import Positional, arg
 
 from swimm3r.cli.terminal.console import drawn_progress, outcome_console
+from swimm3r.cli.terminal.options import FLAT, OutOrDefault, Run
 from swimm3r.localization.settings import LocalizationSettings
 
 
 def localize(
-    run: Positional[Path],
-    images: Positional[tuple[Path, ...]] = (),
+    run: Run,
+    images: Positional[Annotated[tuple[Path, ...], arg(metavar="[IMAGE ...]")]] = (),
     /,
     lens: Path | None = None,
-    out: Path | None = None,
-    settings: LocalizationSettings = LocalizationSettings(),  # noqa: B008
+    out: OutOrDefault = None,
+    settings: Annotated[LocalizationSettings, FLAT] = LocalizationSettings(),  # noqa: B008
 ) -> None:
-    """Find where images were taken in a run's map; without images, its test frames.
+    """Find the camera poses of images in a run's map; without images, those of its test frames.
 
     Args:
-        run: the run folder.
-        images: images of the same place.
-        lens: a cameras.json whose first camera is the images' own; otherwise they share the run's lens.
-        out: where poses.json, poses.tum and the match images go; RUN/localization otherwise.
-        settings: the protocol.
+        run: Run folder with a finished map.
+        images: Images of the same place.
+        lens: File cameras.json whose first camera took the images; by default they share the run's lens.
+        out: Folder for poses.json, poses.tum and the match images; RUN/localization by default.
+        settings: The localization protocol.
     """
     from swimm3r.io.files.outputs import output_folder
     from swimm3r.localization.batch import localize_run
@@ -36,7 +38,7 @@ def localize(
     settings = with_checkpoint_of(settings, from_yaml(run / "settings.yaml").sfm)
     with output_folder(out or run / "localization"), drawn_progress() as progress:
         answers, folder = localize_run(run, images, lens, out, settings, progress)
-    table = Table("image", "place", "inliers", "median error, px", "seconds")
+    table = Table("image", "pose", "inliers", "median error, px", "seconds")
     for a in answers:
         if a.found is None:
             table.add_row(a.name, "not found", "", "", "")

@@ -1,42 +1,63 @@
 """`swimm3r COMMAND ...`: parses, runs one command and turns what users can mend into messages and exit codes."""
 
 import errno
-import logging
 import os
 import sys
-from collections.abc import Collection, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from io import TextIOWrapper
-from itertools import pairwise
 from pathlib import Path
-from typing import TypeVar
+from typing import Annotated, Any, Union
 
 import tyro
+from tyro.conf import arg, subcommand
 
-from swimm3r.cli import bench
+from swimm3r.cli.bench.ablation_uwbs import ablation_uwbs_command
+from swimm3r.cli.bench.flsea import ablation_sfm_command, flsea_command
+from swimm3r.cli.bench.on_runs import localization, restoration
+from swimm3r.cli.bench.render import render_command
+from swimm3r.cli.bench.sfm import sfm_command as bench_sfm_command
+from swimm3r.cli.bench.table import defaults_of
+from swimm3r.cli.brief import BRIEF
 from swimm3r.cli.datasets import datasets
 from swimm3r.cli.demo import demo
 from swimm3r.cli.doctor import doctor
 from swimm3r.cli.evaluate import evaluate
 from swimm3r.cli.export import export
 from swimm3r.cli.localize import localize
+from swimm3r.cli.pipeline.prepare import prepare_command
+from swimm3r.cli.pipeline.run import run_command
+from swimm3r.cli.pipeline.sfm import sfm_command
+from swimm3r.cli.pipeline.splat import splat_command
+from swimm3r.cli.pipeline.stages import starting_point
 from swimm3r.cli.render import render
 from swimm3r.cli.report import report
-from swimm3r.cli.run import commands_for_settings, held_settings
-from swimm3r.cli.terminal.console import MessagePrinter
+from swimm3r.cli.terminal.arguments import named
+from swimm3r.cli.terminal.help_views import View, brief_help, group_help
+from swimm3r.cli.terminal.output_level import FLAGS, begin_messages, with_output_level
 from swimm3r.cli.terminal.ranges import settings_with_ranges, with_ranges
-from swimm3r.cli.train_sfm import command_for_recipe
-from swimm3r.cli.weights import weights
+from swimm3r.cli.train_sfm import train_sfm_command
+from swimm3r.cli.weights import WEIGHTS
 from swimm3r.errors import InputError, StorageError, Swimm3rError, UsageError
 from swimm3r.memory import out_of_memory
 from swimm3r.pipeline.presets import PRESETS
-from swimm3r.pipeline.run_settings import starting_settings
-from swimm3r.sfm.distillation.settings import RECIPES as SFM_RECIPES
-from swimm3r.splat.settings import RECIPES as MAP_RECIPES
+from swimm3r.sfm.distillation.settings import RECIPES
 from swimm3r.weights.store import cache_folder
 
-Name = TypeVar("Name", bound=str)
 _INTERRUPTED, _UNREAD = 130, 141  # 128 + SIGINT, SIGPIPE
 _STORAGE_ERRORS = {errno.ENOSPC, errno.EDQUOT, errno.EROFS, errno.EACCES, errno.EPERM, errno.EFBIG}
+_DESCRIPTION = (
+    "Underwater video in; camera poses, water, a restored cloud and a map that renders out. "
+    "Options of a command: swimm3r COMMAND --help. Version: swimm3r --version."
+)
+
+Commands = Mapping[str, "Callable | Family"]
+
+
+class Family:
+    """Commands that follow another word: swimm3r bench render."""
+
+    def __init__(self, about: str, commands: Mapping[str, Callable]) -> None:
+        self.about, self.commands = about, commands
 
 
 def main(arguments: Sequence[str] | None = None) -> None:
@@ -49,8 +70,7 @@ def main(arguments: Sequence[str] | None = None) -> None:
     os.environ.setdefault("OMP_WAIT_POLICY", "PASSIVE")
     # before torch makes one among the temporary files
     os.environ.setdefault("TORCHINDUCTOR_CACHE_DIR", str(cache_folder() / "torchinductor"))
-    logging.basicConfig(level=logging.WARNING, format="%(message)s", handlers=[MessagePrinter()])
-    logging.getLogger("swimm3r").setLevel(logging.INFO)
+    begin_messages()
     try:
         _run_command(arguments)
     except SystemExit:
@@ -60,7 +80,7 @@ def main(arguments: Sequence[str] | None = None) -> None:
     except Swimm3rError as error:
         _fail(error)
     except KeyboardInterrupt:
-        print("\nInterrupted. What is finished is kept: the same command goes on from here.", file=sys.stderr)
+        print("\nInterrupted. Finished work is kept: the same command resumes from here.", file=sys.stderr)
         raise SystemExit(_INTERRUPTED) from None
     except BrokenPipeError:  # of `swimm3r ... | head`: nobody reads on
         os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
@@ -72,22 +92,44 @@ def main(arguments: Sequence[str] | None = None) -> None:
         _fail(told)
 
 
-def _run_command(arguments: Sequence[str]) -> None:
+def _run_command(arguments: list[str]) -> None:
     if "" in arguments or any(word.startswith("--") and word.endswith("=") for word in arguments):
         raise UsageError(
             "an argument is empty", cause="a variable of the shell that is not set", hint="a name in its place"
         )
-    named_preset = _named("--preset", arguments, PRESETS)
+    if arguments[:1] == ["--version"]:
+        from importlib.metadata import version
+
+        print(f"swimm3r {version('swimm3r')}")
+        return
+    while arguments and arguments[0] in FLAGS and len(arguments) > 1:  # swimm3r -q run ...
+        arguments = [*arguments[1:], arguments[0]]
+    with settings_with_ranges():
+        _parse_and_run(_commands(arguments), arguments)
+
+
+def _commands(arguments: Sequence[str]) -> dict[str, Callable | Family]:
+    """Every command, with the defaults that its command line decides."""
     is_pipeline = arguments[:1] and arguments[0] in ("run", "prepare", "sfm", "splat")
-    defaults = starting_settings(
-        named_preset,
-        _named("--backend", arguments, ("colmap", "mast3r", "swimm3r")),
-        _named("--recipe", arguments, MAP_RECIPES),
-        held_settings(arguments) if is_pipeline and named_preset is None else None,
-    )
-    commands = {
-        **commands_for_settings(defaults),
-        "bench": bench.command_for_preset(named_preset or "fast"),
+    start = starting_point(arguments if is_pipeline else ())
+    tables = defaults_of(named("--preset", arguments, PRESETS) or "fast")
+    protocols = {
+        "flsea": flsea_command(tables),
+        "sfm": bench_sfm_command(tables),
+        "restoration": restoration,
+        "render": render_command(tables),
+        "localization": localization,
+        "ablation-sfm": ablation_sfm_command(tables),
+        "ablation-uwbs": ablation_uwbs_command(tables),
+    }
+    return {
+        "run": run_command(start),
+        "prepare": prepare_command(start),
+        "sfm": sfm_command(start),
+        "splat": splat_command(start),
+        "bench": Family(
+            "The paper's tables on your own dives. Results stay in --out; re-run the same command to resume.", protocols
+        ),
         "demo": demo,
         "doctor": doctor,
         "eval": evaluate,
@@ -96,16 +138,77 @@ def _run_command(arguments: Sequence[str]) -> None:
         "localize": localize,
         "report": report,
         "datasets": datasets,
-        "train-sfm": command_for_recipe(_named("--recipe", arguments, SFM_RECIPES) or "swimm3r"),
-        "weights": weights,
+        "train-sfm": train_sfm_command(named("--recipe", arguments, RECIPES) or "swimm3r"),
+        "weights": Family(
+            "List, download, check and find model weights. Nothing but --backend mast3r and some scores needs any.",
+            WEIGHTS,
+        ),
     }
-    with settings_with_ranges():
-        tyro.extras.subcommand_cli_from_dict(
-            {name: with_ranges(command) for name, command in commands.items()},
-            prog="swimm3r",
-            description="Underwater video in; camera poses, water, a restored cloud and a map that renders out.",
-            args=arguments or ["--help"],
-        )
+
+
+def _parse_and_run(commands: Commands, arguments: list[str]) -> None:
+    """Parse the command line and run its command, or print the part of its help that is asked for."""
+    path = _command_path(commands, arguments)
+    view = _help_view(commands, path, arguments)
+    if view is None:
+        given = ["--help" if word == "--help-all" else word for word in arguments]
+        tyro.cli(_parser(commands), prog="swimm3r", description=_DESCRIPTION, args=given or ["--help"])
+        return
+    try:
+        tyro.cli(_parser(commands, path, view), prog="swimm3r", args=[*path, "--help"])
+    finally:  # help ends in SystemExit
+        print(view.footer)
+
+
+def _command_path(commands: Commands, arguments: Sequence[str]) -> tuple[str, ...]:
+    """The words that name the command: ("bench", "render"); none where there is no such command."""
+    first = commands.get(arguments[0]) if arguments else None
+    if isinstance(first, Family):
+        return tuple(arguments[:2]) if len(arguments) > 1 and arguments[1] in first.commands else ()
+    return () if first is None else (arguments[0],)
+
+
+def _help_view(commands: Commands, path: tuple[str, ...], arguments: Sequence[str]) -> View | None:
+    """The part of a command's help that is asked for; None for the whole help, or none."""
+    asked = next((number for number, word in enumerate(arguments) if word in ("-h", "--help")), None)
+    if asked is None or not path or "--help-all" in arguments:
+        return None
+    first = commands[path[0]]
+    command = _ready(first.commands[path[1]] if isinstance(first, Family) else first)
+    usage = " ".join(("swimm3r", *path))
+    after = arguments[asked + 1 :]
+    view = group_help(command, usage, after[0]) if after else None
+    if view is None and path in BRIEF:
+        view = brief_help(command, usage, BRIEF[path])
+    return view
+
+
+def _parser(commands: Commands, path: tuple[str, ...] = (), view: View | None = None) -> Any:
+    """The commands as tyro takes them: a union of constructors; the one at `path` is replaced by the view."""
+
+    def union(members: Commands, above: tuple[str, ...]) -> Any:
+        kinds = []
+        for name, member in members.items():
+            if isinstance(member, Family):
+                made = _family(member.about, union(member.commands, (*above, name)))
+            else:
+                made = view.command if view is not None and (*above, name) == path else _ready(member)
+            kinds.append(Annotated[Any, subcommand(name=name, constructor=made)])
+        return Union[tuple(kinds)]  # noqa: UP007 - of as many as there are
+
+    return union(commands, ())
+
+
+def _family(about: str, members: Any) -> Callable:
+    def family(action: Annotated[members, arg(name="")]) -> None:
+        pass
+
+    family.__doc__ = about
+    return family
+
+
+def _ready(command: Callable) -> Callable:
+    return with_ranges(with_output_level(command))
 
 
 def _file_failure(error: Exception) -> Swimm3rError | None:
@@ -121,7 +224,7 @@ def _file_failure(error: Exception) -> Swimm3rError | None:
     return StorageError(
         f"cannot write {error.filename or 'to the run folder'}: {error.strerror}",
         cause="the disk is full, over quota or read-only",
-        hint="free some space or choose another --out; the same command then goes on from here",
+        hint="free some space or choose another --out; the same command then resumes from here",
     )
 
 
@@ -135,14 +238,3 @@ def _readable(path: Path) -> bool:
 def _fail(error: Swimm3rError) -> None:
     print(f"swimm3r: {error}", file=sys.stderr)
     raise SystemExit(error.exit_code)
-
-
-def _named(option: str, arguments: Sequence[str], known: Collection[Name]) -> Name | None:
-    """What decides the defaults that --help shows is found before tyro parses; tyro checks the name."""
-    for here, after in pairwise([*arguments, ""]):
-        name = after if here == option else here.removeprefix(f"{option}=")
-        if name != here:
-            for one in known:
-                if one == name:
-                    return one
-    return None

@@ -2,17 +2,16 @@
 
 from pathlib import Path
 
-from tyro.conf import Positional
-
 from swimm3r.cli.terminal.console import drawn_progress
+from swimm3r.cli.terminal.options import OutOrDefault, Run
 from swimm3r.settings import ClipSecond, CountOrZero, LongSideOrOwn
 
 
 def render(
-    run: Positional[Path],
+    run: Run,
     /,
     cameras: Path | None = None,
-    out: Path | None = None,
+    out: OutOrDefault = None,
     long_side: LongSideOrOwn = 0,
     flight: CountOrZero = 0,
     time: ClipSecond | None = None,
@@ -20,13 +19,13 @@ def render(
     """Render a run's map: with its water, without it, the water alone, and depth.
 
     Args:
-        run: the run folder.
-        cameras: a cameras.json in the axes of RUN/sfm/cameras.json, whose cameras (lens distortion left out) are
-            rendered; the training cameras otherwise.
-        out: where the images go; RUN/renders/views otherwise.
-        long_side: longer side of the images, pixels, at most the cameras' own; 0 is the cameras' own.
-        flight: film a flight of this many images along the cameras, too: OUT/flythrough.mp4.
-        time: second of the clip that a dynamic map is shown at; each camera's, else its frame's, where none is given.
+        run: Run folder with a finished map.
+        cameras: File cameras.json, in the axes of RUN/sfm/cameras.json, with the cameras to render (without lens
+            distortion); the training cameras by default.
+        out: Folder for the images; RUN/renders/views by default.
+        long_side: Longer side of the images in pixels, at most the cameras' own; 0 uses the cameras' own.
+        flight: Number of frames of a flight along the cameras, written to OUT/flythrough.mp4; 0 writes none.
+        time: Second of the clip at which a dynamic map is rendered; each camera's own by default.
     """
     from swimm3r.io.files.outputs import output_folder
     from swimm3r.pipeline.presets import from_yaml

@@ -1,15 +1,13 @@
 """`swimm3r report`: writes the page of a finished run again."""
 
-from pathlib import Path
-
-from tyro.conf import Positional
+from swimm3r.cli.terminal.options import Run
 
 
-def report(run: Positional[Path], /) -> None:
-    """Write RUN/report.html from what the run folder holds.
+def report(run: Run, /) -> None:
+    """Write RUN/report.html from the contents of the run folder.
 
     Args:
-        run: the run folder.
+        run: Run folder with finished structure from motion.
     """
     from swimm3r.report import write_report
 

@@ -7,9 +7,8 @@ from contextlib import nullcontext
 from pathlib import Path
 from typing import Annotated, Literal
 
-from tyro.conf import Positional, arg
-
 from swimm3r.cli.terminal.console import drawn_progress, print_next
+from swimm3r.cli.terminal.options import FLAT, DataRoot, Out
 from swimm3r.sfm.distillation.settings import RECIPES, TrainSettings
 
 TrainingRecipeName = Literal[
@@ -23,31 +22,31 @@ TrainingRecipeName = Literal[
 ]
 
 
-def command_for_recipe(name: str) -> Callable:
+def train_sfm_command(name: str) -> Callable:
     """The command, with the defaults of a recipe."""
 
     def train_sfm(
-        data: Positional[Path],
+        data: DataRoot,
         /,
-        out: Path,
+        out: Out,
         weights: Path | None = None,
         base_license: str | None = None,
         recipe: TrainingRecipeName = "swimm3r",
         device: Literal["auto", "cpu", "cuda"] = "auto",
-        settings: Annotated[TrainSettings, arg(name="")] = RECIPES[name],
+        settings: Annotated[TrainSettings, FLAT] = RECIPES[name],
     ) -> None:
-        """Train adapters and physics head on pairs of raw and clean images. The same command again goes on.
+        """Train adapters and physics head on pairs of raw and clean images. Re-run the same command to resume.
 
         Under torchrun every process takes its share of each batch.
 
         Args:
-            data: a folder of data sets (swimm3r datasets shows what it holds).
-            out: the training's folder; OUT/adapter.safetensors is the result.
-            weights: the base checkpoint; by default the MASt3R weights of this computer.
-            base_license: the base checkpoint's license, where it is not one that Swimm3R knows.
-            recipe: what the other defaults aim at: the paper's system, one of its ablations, or Dark3R.
-            device: where the network runs.
-            settings: every number of the training.
+            data: Folder of data sets; `swimm3r datasets` lists its contents.
+            out: Folder of the training; the result is OUT/adapter.safetensors.
+            weights: Base checkpoint (.pth or .safetensors); by default the one `swimm3r weights path mast3r` prints.
+            base_license: License of the base checkpoint, if Swimm3R does not know it.
+            recipe: Recipe that supplies the other defaults: the paper's system, one of its ablations, or Dark3R.
+            device: Device that the network runs on; auto uses CUDA if a GPU is present.
+            settings: Settings of the training.
         """
         from swimm3r.io.files.folder_lock import folder_lock
         from swimm3r.io.files.outputs import output_folder

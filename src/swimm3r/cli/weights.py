@@ -3,11 +3,13 @@
 from pathlib import Path
 from typing import Annotated
 
-from tyro.conf import Positional, arg, subcommand
+from tyro.conf import Positional, arg
 
 from swimm3r import weights as store
 from swimm3r.cli.terminal.console import drawn_progress
 from swimm3r.errors import WeightsError
+
+Name = Annotated[str, arg(metavar="NAME")]
 
 
 def list_all() -> None:
@@ -18,24 +20,24 @@ def list_all() -> None:
     print(f"Downloads go to {store.directory()}")
 
 
-def get(name: Positional[str], /, accept_license: bool = False) -> None:
+def get(name: Positional[Name], /, accept_license: bool = False) -> None:
     """Download weights, or go on with an interrupted download, and print where they lie.
 
     Args:
-        name: as `swimm3r weights list` names them.
-        accept_license: you have read the license of non-commercial weights and your use is within it.
+        name: Name of the weights, as `swimm3r weights list` prints it.
+        accept_license: Confirm that you have read the license of non-commercial weights and your use is within it.
     """
     with drawn_progress() as progress:
         path = store.fetch(name, accept_license=accept_license, progress=progress)
     print(path)
 
 
-def verify(name: Positional[str], /, path: Path | None = None) -> None:
+def verify(name: Positional[Name], /, path: Path | None = None) -> None:
     """Read a whole file and compare its checksum with the published one, else with that of its first use.
 
     Args:
-        name: as `swimm3r weights list` names them.
-        path: the file, where it lies elsewhere.
+        name: Name of the weights, as `swimm3r weights list` prints it.
+        path: File to check, if it lies elsewhere.
     """
     checked = store.verify(name, path)
     outcome = {
@@ -46,25 +48,17 @@ def verify(name: Positional[str], /, path: Path | None = None) -> None:
     print(f"{checked.path} {outcome}: {checked.size:,} bytes, sha256 {checked.sha256}")
 
 
-def path(name: Positional[str] | None = None, /) -> None:
+def path(name: Positional[Annotated[str | None, arg(metavar="[NAME]")]] = None, /) -> None:
     """Print the path of weights, for scripts; without a name the folder downloads go to. No network.
 
     Args:
-        name: as `swimm3r weights list` names them.
+        name: Name of the weights, as `swimm3r weights list` prints it.
     """
     print(store.directory() if name is None else store.require(name))
 
 
-_Action = (
-    Annotated[None, subcommand("list", constructor=list_all)]
-    | Annotated[None, subcommand("get", constructor=get)]
-    | Annotated[None, subcommand("verify", constructor=verify)]
-    | Annotated[None, subcommand("path", constructor=path)]
-)
-
-
-def weights(action: Annotated[_Action, arg(name="")]) -> None:
-    """List, download, check and find model weights. Nothing but --backend mast3r and some scores needs any."""
+WEIGHTS = {"list": list_all, "get": get, "verify": verify, "path": path}
+"""The sub-commands by their names."""
 
 
 def whereabouts(name: str) -> str:

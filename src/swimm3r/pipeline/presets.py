@@ -2,12 +2,12 @@
 
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import Literal
+from typing import Any, Literal
 
-from swimm3r.errors import InputError
+from swimm3r.errors import InputError, Swimm3rError, UsageError
 from swimm3r.io.files.damage import Remedy, first_line, guard
 from swimm3r.scene.settings import FrameSettings
-from swimm3r.settings import Settings
+from swimm3r.settings import SettingError, Settings
 from swimm3r.settings_document import from_document, to_document
 from swimm3r.sfm.mast3r.settings import AlignmentSettings
 from swimm3r.sfm.settings import (
@@ -36,6 +36,11 @@ from swimm3r.splat.settings import (
 _REMEDY = Remedy(
     cause="it was edited, or written by another version of swimm3r",
     hint="correct it there; or the same swimm3r run command with its --preset, which writes it anew",
+)
+_CONFIG_REMEDY = Remedy(
+    cause="it is another file, or was cut off",
+    hint="the settings.yaml of a run folder, or a part of one",
+    fault="cannot be used",
 )
 
 # in short runs, and faster without (benchmarks/README.md): SGG costs 0.1 dB on the synthetic dive, and poses refined
@@ -69,9 +74,7 @@ def to_yaml(settings: RunSettings) -> str:
 
 
 def from_yaml(path: Path) -> RunSettings:
-    """The settings that `to_yaml` wrote to a file. Raises InputError."""
-    import yaml
-
+    """The settings that `to_yaml` wrote to a file of a run folder. Raises InputError."""
     if not path.is_file():
         raise InputError(
             f"{path.parent} holds no run",
@@ -79,11 +82,38 @@ def from_yaml(path: Path) -> RunSettings:
             hint="the folder that --out named when the run was made",
         )
     with guard(path, _REMEDY):
-        try:
-            document = yaml.safe_load(path.read_text(encoding="utf-8"))
-        except yaml.YAMLError as error:
-            raise ValueError(f"no YAML: {first_line(error)}") from error
-        return from_document(document, RunSettings)
+        return from_document(_document(path), RunSettings)
+
+
+def read_config(path: Path) -> RunSettings:
+    """The settings in a file that a user wrote or copied; those that it leaves out have their defaults.
+
+    Raises InputError where the file cannot be read, and UsageError, which a SettingError is, where it holds a setting
+    that does not exist or a value that is not allowed.
+    """
+    with guard(path, _CONFIG_REMEDY):
+        document = _document(path)
+    try:
+        return from_document({} if document is None else document, RunSettings)
+    except SettingError as error:
+        raise SettingError(f"{path}: {error.name}", error.expected, error.got) from error
+    except Swimm3rError as error:
+        raise UsageError(f"{path}: {error.what}", cause=error.cause, hint=error.hint) from error
+    except ValueError as error:
+        raise UsageError(
+            f"{path}: {first_line(error)}",
+            cause="a slip in the file, or another version of swimm3r wrote it",
+            hint="correct it there; the settings.yaml of any run folder shows every setting",
+        ) from error
+
+
+def _document(path: Path) -> Any:
+    import yaml
+
+    try:
+        return yaml.safe_load(path.read_text(encoding="utf-8"))
+    except yaml.YAMLError as error:
+        raise ValueError(f"no YAML: {first_line(error)}") from error
 
 
 Preset = Literal["fast", "default", "best", "paper"]

@@ -5,10 +5,12 @@ from pathlib import Path
 from typing import Any
 
 from swimm3r.pipeline.presets import MAST3R_PRESETS, PRESETS, Preset, RunSettings
-from swimm3r.sfm.settings import Mast3rSettings
+from swimm3r.sfm.settings import ColmapModelSettings, Mast3rSettings, SfmSettings
 from swimm3r.splat.settings import RecipeName, UwbsSettings, recipe_of, with_recipe
 
 _PARTS = {"prepare": "frames", "sfm": "sfm", "splat": "splat", "eval": "test"}  # of RunSettings, by the stage they make
+
+_BESIDE_POSES = ("features", "depth", "water", "restore")  # parts of structure from motion that do not find poses
 
 
 def settings_by_stage(settings: RunSettings) -> dict[str, dict[str, Any]]:
@@ -56,6 +58,12 @@ def starting_settings(
         assert isinstance(named.splat, UwbsSettings)
         splat = with_recipe(named.splat, recipe)
     return replace(base, sfm=sfm, splat=splat)
+
+
+def with_poses_of(model: Path, settings: SfmSettings) -> ColmapModelSettings:
+    """The poses of a model that another program made, with depth and medium estimated as these settings say."""
+    kept = {name: getattr(settings, name) for name in _BESIDE_POSES if hasattr(settings, name)}
+    return ColmapModelSettings(model.resolve(), **kept)
 
 
 def _flat(values: dict[str, Any], under: str) -> dict[str, Any]:

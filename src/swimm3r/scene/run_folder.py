@@ -9,7 +9,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, Literal
 
-from swimm3r.errors import InputError
+from swimm3r.errors import InputError, UsageError
 from swimm3r.io.files.damage import Remedy, damaged
 from swimm3r.io.files.folder_lock import LOCK
 from swimm3r.io.files.json_file import read_json
@@ -93,6 +93,22 @@ def read_run(folder: Path) -> RunFolder:
     if summary.schema > SCHEMA:
         raise damaged(path, f"its schema is {summary.schema}, and this version reads {SCHEMA}", _REMAKE)
     return RunFolder(folder, summary.input, summary.stages, json.loads(path.read_text(encoding="utf-8")))
+
+
+def input_and_folder(source: Path, folder: Path | None) -> tuple[Path, Path]:
+    """The input and the run folder; without a folder, the source is a run folder that lends its own input.
+
+    Raises UsageError where it is none.
+    """
+    if folder is not None:
+        return source, folder
+    if not is_run(source):
+        raise UsageError(
+            "the run folder is missing: --out RUN",
+            cause=f"{source} is not a run folder, which could be resumed without it",
+            hint="--out with a folder that does not exist yet",
+        )
+    return Path(read_run(source).input.path), source
 
 
 def open_run(folder: Path, stage: str) -> RunFolder:

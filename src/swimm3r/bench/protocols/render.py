@@ -16,18 +16,26 @@ from swimm3r.bench.cells import Result, ResultKey, Scores, check_choice, kept_ce
 from swimm3r.bench.images import Panel, stored, write_grid
 from swimm3r.bench.inputs import lpips_weights, reconstruction_of
 from swimm3r.bench.map_scores import map_scores, trained
-from swimm3r.bench.runs import POSES_REFINED, Clip, clips_of
+from swimm3r.bench.runs import POSES_REFINED, Clip, clips_of, made_runs
 from swimm3r.bench.scores import columns
 from swimm3r.bench.settings import JobSettings, Seeds
 from swimm3r.bench.tables import Table
 from swimm3r.evaluate import NotComputed
 from swimm3r.io.view_names import view_stems
 from swimm3r.pipeline import held_out
+from swimm3r.pipeline.presets import RunSettings
 from swimm3r.pipeline.run import FinishedSfm
 from swimm3r.progress import Progress, silent
 from swimm3r.scene.ground_truth import GroundTruth
 from swimm3r.settings import accepted
-from swimm3r.splat.settings import PoseRefinementSettings, RecipeName, SplatSettings, UwbsSettings, with_recipe
+from swimm3r.splat.settings import (
+    RECIPES,
+    PoseRefinementSettings,
+    RecipeName,
+    SplatSettings,
+    UwbsSettings,
+    with_recipe,
+)
 
 COLUMNS = columns(
     "psnr", "ssim_3dgs", "lpips_vgg", "sharpness", "blur4_psnr", "clear_psnr", "T_D_abs", "B_abs",
@@ -72,6 +80,35 @@ def compare_renderers(
     cells = over_scenes(clips, work, out, how or JobSettings(), progress)
     title = "Test frames rendered, by structure from motion and renderer"
     return Table("render", title, cells, COLUMNS, against or recipes[0])
+
+
+def compare_on_clips(
+    inputs: Sequence[Path],
+    out: Path,
+    settings: RunSettings,
+    recipes: Sequence[RecipeName] = RECIPES,
+    *,
+    seeds: int = 1,
+    poses: bool = False,
+    given_poses: bool = False,
+    against: str | None = None,
+    references: Path | None = None,
+    how: JobSettings | None = None,
+    progress: Progress = silent,
+) -> Table:
+    """`compare_renderers` on run folders and on clips, whose structure from motion is made first, in OUT/runs.
+
+    With `given_poses` clips are folders of images with a COLMAP model. What can be refused is refused before the
+    structure from motion.
+    """
+    check_choice("recipes", recipes, against)
+    accepted("seeds", seeds, Seeds)
+    reference.given(references, "")
+    assert isinstance(settings.splat, UwbsSettings), "recipes start from settings of UWBS"
+    runs = made_runs(inputs, out, settings, given_poses, progress)
+    return compare_renderers(
+        runs, out, recipes, settings.splat, seeds, poses, settings.test, against, references, how, progress
+    )
 
 
 def _cells_of_clip(

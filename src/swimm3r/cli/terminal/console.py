@@ -1,10 +1,9 @@
 """What the command line draws: progress with time left, the outcome in a few lines, and what to do next."""
 
-import logging
 import shlex
 import sys
 import time
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Mapping
 from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
@@ -14,24 +13,24 @@ from rich.progress import BarColumn, MofNCompleteColumn, TaskID, TextColumn, Tim
 from rich.progress import Progress as Bars
 from rich.table import Table
 
+from swimm3r.cli.terminal.output_level import is_quiet
 from swimm3r.cli.terminal.pace import Clock, Pace, WorkClock, compilation_watched
-from swimm3r.progress import Progress
+from swimm3r.progress import Progress, silent
 
 _LINE_EVERY_S = 10.0  # in logs, where a bar cannot be redrawn
 _COMPILING = "compiling kernels (first run only)"
 _UNWRAPPED = 1000  # columns of what is piped into a file: nobody's window ends there
 
 
-class MessagePrinter(logging.Handler):
-    """Prints messages to what stderr is at that moment: above the bars, while any are drawn."""
-
-    def emit(self, record: logging.LogRecord) -> None:
-        print(self.format(record), file=sys.stderr, flush=True)
-
-
 @contextmanager
 def drawn_progress() -> Iterator[Progress]:
-    """A `Progress` that draws one bar per step of work with its estimated time left, or prints lines into a log."""
+    """A `Progress` that draws one bar per step of work with its estimated time left, or prints lines into a log.
+
+    With --quiet it draws nothing.
+    """
+    if is_quiet():
+        yield silent
+        return
     console = Console(stderr=True)
     clock = WorkClock()
     if not console.is_terminal:
@@ -141,8 +140,8 @@ def outcome_console() -> Console:
     return console if console.is_terminal else Console(markup=False, highlight=False, width=_UNWRAPPED)
 
 
-def print_summary(summary: dict, folder: Path) -> None:
-    """The outcome of a run: what was registered, the water, what to be careful about, and where the report is."""
+def print_summary(summary: dict) -> None:
+    """The outcome of a run: registered frames, the water, scores, and cautions."""
     console = outcome_console()
     taken = summary.get("input", {})
     if "frames" in taken:
@@ -180,13 +179,22 @@ def print_summary(summary: dict, folder: Path) -> None:
         console.print(f"By the protocol {name}: PSNR {_shown(scores['psnr'], 1)} dB, SSIM {scores['ssim']:.3f}")
     for warning in summary.get("warnings", []):
         console.print("!", f"{warning['what']} {warning['advice']}".strip(), style="yellow")
-    if (folder / "report.html").is_file():
-        console.print(f"Report: {folder / 'report.html'}")
+
+
+def print_results(folder: Path, files: Mapping[str, str]) -> None:
+    """The files and folders of a result that exist, each with what it holds."""
+    there = {name: what for name, what in files.items() if (folder / name).exists()}
+    width = max(map(len, there), default=0)
+    console = outcome_console()
+    console.print(f"Results in {folder}:")
+    for name, what in there.items():
+        console.print(f"  {name:<{width}}  {what}")
 
 
 def print_next(what: str, *command: object) -> None:
-    """The next command, as it can be copied into a shell."""
-    outcome_console().print(f"Next, {what}: swimm3r {shlex.join(str(word) for word in command)}")
+    """The next command, as it can be copied into a shell; nothing with --quiet."""
+    if not is_quiet():
+        outcome_console().print(f"Next, {what}: swimm3r {shlex.join(str(word) for word in command)}")
 
 
 def _shown(value: float | None, digits: int) -> str:

@@ -1,15 +1,19 @@
-"""Ranges on the command line: declared with a setting or an argument, shown in its help, checked where it is parsed.
+"""Records and arguments on the command line, as help shows them and as they are checked.
+
+Ranges are declared with a setting or an argument, shown in its help, and checked where it is parsed.
 
 Tyro leaves foreign metadata of `Annotated` aside. Here every hint that declares a range gets a constructor beside it,
 so that a refusal names the option as it was written: --splat.rates.xyz.
 """
 
 from collections.abc import Callable
-from dataclasses import replace
-from functools import wraps
+from dataclasses import is_dataclass, replace
+from functools import partial, wraps
 from inspect import signature
-from typing import Annotated, Any, get_args, get_type_hints
+from types import NoneType
+from typing import Annotated, Any, get_args, get_origin, get_type_hints
 
+from tyro.conf import arg
 from tyro.constructors import (
     ConstructorRegistry,
     PrimitiveConstructorSpec,
@@ -19,17 +23,17 @@ from tyro.constructors import (
     UnsupportedTypeAnnotationError,
 )
 
-from swimm3r.settings import Settings, accepted, ranges_of
+from swimm3r.settings import accepted, ranges_of
 
 
 def settings_with_ranges() -> ConstructorRegistry:
-    """Tyro's rules, and one for settings records."""
+    """Tyro's rules, and one for records: ranges, and help strings without the line breaks of their source."""
     registry = ConstructorRegistry()
     inside: list[type] = []  # a record whose fields tyro's own rule is listing
 
     @registry.struct_rule
     def list_fields(info: StructTypeInfo) -> StructConstructorSpec | None:
-        if inside or not (isinstance(info.type, type) and issubclass(info.type, Settings)):
+        if inside or not is_dataclass(info.type):
             return None
         inside.append(info.type)
         try:
@@ -38,7 +42,11 @@ def settings_with_ranges() -> ConstructorRegistry:
             inside.pop()
         if not isinstance(record, StructConstructorSpec):
             return None
-        return replace(record, fields=tuple(replace(field, type=parsed(field.type)) for field in record.fields))
+        fields = (
+            replace(field, type=parsed(field.type), helptext=partial(_unbroken, field.helptext))
+            for field in record.fields
+        )
+        return replace(record, fields=tuple(fields))
 
     return registry
 
@@ -60,9 +68,14 @@ def with_ranges(command: Callable) -> Callable:
 
 
 def parsed(hint: Any) -> Any:
-    """A type hint with a constructor beside it where it holds a range."""
+    """A type hint with a constructor beside it where it holds a range, or None as one of its values.
+
+    None can be given but is not shown: as a default it stands for what the help string says.
+    """
     ranges = list(ranges_of(hint))
-    if not ranges or any(isinstance(part, PrimitiveConstructorSpec) for part in get_args(hint)):
+    kind = get_args(hint)[0] if get_origin(hint) is Annotated else hint
+    optional = NoneType in get_args(kind)
+    if not (ranges or optional) or any(isinstance(part, PrimitiveConstructorSpec) for part in get_args(hint)):
         return hint
     plain = ConstructorRegistry.get_primitive_spec(PrimitiveTypeInfo.make(hint, set()))
     assert not isinstance(plain, UnsupportedTypeAnnotationError)
@@ -70,7 +83,18 @@ def parsed(hint: Any) -> Any:
     def construct(words: list[str]) -> Any:
         return accepted("", plain.instance_from_str(words), hint)
 
-    metavar = plain.metavar
-    for kind in ("INT", "FLOAT"):
-        metavar = metavar.replace(kind, ranges[0].brief(kind))
-    return Annotated[hint, replace(plain, metavar=metavar, instance_from_str=construct)]
+    metavar = plain.metavar.replace("{None}|", "").replace("{None,", "{")
+    for number in ("INT", "FLOAT"):
+        metavar = metavar.replace(number, ranges[0].brief(number)) if ranges else metavar
+    spec = replace(plain, metavar=metavar, instance_from_str=construct if ranges else plain.instance_from_str)
+    return Annotated[hint, spec, arg(help_behavior_hint=_default_shown)] if optional else Annotated[hint, spec]
+
+
+def _default_shown(default: str) -> str:
+    return "(optional)" if default == "None" else f"(default: {default})"
+
+
+def _unbroken(text: str | Callable[[], str | None] | None) -> str | None:
+    """A help string as one line, which tyro breaks to the width of the terminal."""
+    found = text() if callable(text) else text
+    return None if found is None else " ".join(found.split())

@@ -1,0 +1,1 @@
+"""`swimm3r bench PROTOCOL`: the paper's tables on your own dives, one sub-command each."""

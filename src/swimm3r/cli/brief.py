@@ -1,0 +1,100 @@
+"""Options that `swimm3r COMMAND --help` shows: those most users touch, under titles of their purpose.
+
+--help-all shows every option. Commands that are not named here have few options, and show them all. An option that
+the chosen back end or recipe does not have is left out.
+"""
+
+from swimm3r.cli.terminal.help_views import Groups
+
+_INPUT = ("--fps", "--start", "--end", "--max-frames", "--masks")
+_OUTPUT = ("--out", "--redo")
+_SETTINGS = ("--preset", "--config")
+_CAMERA = ("--housing", "--focal", "--adapter", "--weights")
+_MESSAGES = ("--quiet", "--verbose")
+
+BRIEF: dict[tuple[str, ...], Groups] = {
+    ("run",): {
+        "input": _INPUT,
+        "output": _OUTPUT,
+        "speed and quality": (*_SETTINGS, "--recipe", "--map-device"),
+        "camera and poses": ("--backend", *_CAMERA),
+        "": _MESSAGES,
+    },
+    ("prepare",): {
+        "input": (*_INPUT, "--pick", "--long-side", "--odd-sizes"),
+        "output": _OUTPUT,
+        "settings": _SETTINGS,
+        "": _MESSAGES,
+    },
+    ("sfm",): {
+        "input": _INPUT,
+        "output": _OUTPUT,
+        "speed and quality": _SETTINGS,
+        "camera and poses": ("--backend", *_CAMERA, "--reference"),
+        "": _MESSAGES,
+    },
+    ("splat",): {
+        "poses of another program": ("--colmap", "--transforms", "--images"),
+        "output": _OUTPUT,
+        "speed and quality": (*_SETTINGS, "--recipe", "--splat.iterations", "--splat.long-side", "--map-device"),
+        "": _MESSAGES,
+    },
+    ("train-sfm",): {
+        "base network": ("--weights", "--base-license", "--device"),
+        "output": ("--out",),
+        "training": ("--recipe", "--epochs", "--batch", "--micro-batch", "--size", "--max-pairs", "--seed"),
+        "": _MESSAGES,
+    },
+    ("localize",): {
+        "input": ("--lens",),
+        "output": ("--out",),
+        "matching": ("--matcher", "--weights", "--device", "--candidates", "--rounds", "--min-inliers"),
+        "": _MESSAGES,
+    },
+    ("demo",): {
+        "output": _OUTPUT,
+        "dive": ("--frames", "--width", "--height", "--family", "--moving-object", "--seed"),
+        "map": ("--recipe",),
+        "": _MESSAGES,
+    },
+    ("bench", "flsea"): {
+        "input": ("--sequences", "--stride"),
+        "methods": ("--methods", "--adapters", "--imports"),
+        "output": ("--out",),
+        "speed and quality": ("--preset", "--jobs", "--slurm"),
+        "": _MESSAGES,
+    },
+    ("bench", "sfm"): {
+        "input": ("--fps", "--long-side", "--references"),
+        "methods": ("--methods", "--adapters", "--imports"),
+        "output": ("--out",),
+        "speed and quality": ("--preset", "--jobs", "--slurm"),
+        "": _MESSAGES,
+    },
+    ("bench", "render"): {
+        "input": ("--fps", "--given-poses", "--references"),
+        "methods": ("--recipes", "--against", "--poses", "--seeds"),
+        "output": ("--out",),
+        "speed and quality": ("--preset", "--splat.iterations", "--jobs", "--slurm"),
+        "": _MESSAGES,
+    },
+    ("bench", "localization"): {
+        "input": ("--maps", "--references"),
+        "methods": ("--matcher", "--weights", "--accept"),
+        "output": ("--out",),
+        "speed and quality": ("--jobs", "--slurm"),
+        "": _MESSAGES,
+    },
+    ("bench", "ablation-sfm"): {
+        "input": ("--sequences", "--stride", "--adapters"),
+        "output": ("--out",),
+        "speed and quality": ("--preset", "--jobs", "--slurm"),
+        "": _MESSAGES,
+    },
+    ("bench", "ablation-uwbs"): {
+        "methods": ("--seeds",),
+        "output": ("--out",),
+        "speed and quality": ("--preset", "--splat.iterations", "--jobs", "--slurm"),
+        "": _MESSAGES,
+    },
+}

@@ -1,0 +1,48 @@
+"""Options that the commands of the pipeline share, beside the settings of its stages."""
+
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Literal
+
+from swimm3r.cli.terminal.options import OutOrDefault
+from swimm3r.pipeline.presets import Preset
+from swimm3r.splat.settings import MapDevice, RecipeName
+
+Backend = Literal["colmap", "mast3r", "swimm3r"]
+
+
+@dataclass(frozen=True)
+class FolderOptions:
+    """The run folder, and the origin of the other options' defaults."""
+
+    out: OutOrDefault = None
+    """Run folder that receives all results; may be left out where SOURCE is a run folder."""
+    preset: Preset | None = None
+    """Preset that supplies the other defaults. Without it and --config they are those of the run folder, else
+    `default`."""
+    config: Path | None = None
+    """Settings file, such as the settings.yaml of another run, that supplies the other defaults."""
+    redo: bool = False
+    """Repeat stages that were made with other settings; the earlier results move to RUN/old."""
+
+
+@dataclass(frozen=True)
+class PoseOptions:
+    """The way to poses and depth, and poses to compare with."""
+
+    backend: Backend = "colmap"
+    """Method for poses and depth. mast3r needs weights, swimm3r an adapter too; `--backend mast3r --help-all` lists
+    its options."""
+    reference: Path | None = None
+    """File cameras.json with known poses to score the result against."""
+
+
+@dataclass(frozen=True)
+class MapOptions:
+    """The kind of map, and the device that trains it."""
+
+    recipe: RecipeName = "uwbs-static"
+    """Kind of map: uwbs-static, uwbs-dynamic for scenes that change with time, or another published method.
+    `--recipe NAME --help-all` lists its options."""
+    map_device: MapDevice = "auto"
+    """Device that trains and renders the map; auto uses CUDA if a GPU and NVIDIA Warp are present."""

@@ -1,0 +1,37 @@
+"""`swimm3r run`: every stage, from a clip to the report page."""
+
+from collections.abc import Callable
+from typing import Annotated
+
+from swimm3r.cli.pipeline.options import FolderOptions, MapOptions, PoseOptions
+from swimm3r.cli.pipeline.stages import backend_of, require_adapter, run_stages
+from swimm3r.cli.terminal.options import FLAT, Source
+from swimm3r.pipeline.presets import RunSettings
+from swimm3r.scene.settings import FrameSettings
+from swimm3r.splat.settings import PoseRefinementSettings, recipe_of
+
+
+def run_command(defaults: RunSettings) -> Callable:
+    """The command, with these settings as the defaults of its options."""
+
+    def run(
+        source: Source,
+        /,
+        folder: Annotated[FolderOptions, FLAT] = FolderOptions(),  # noqa: B008 - records are frozen
+        poses: Annotated[PoseOptions, FLAT] = PoseOptions(backend_of(defaults.sfm)),  # noqa: B008
+        map: Annotated[MapOptions, FLAT] = MapOptions(recipe_of(defaults.splat)),  # noqa: B008
+        frames: Annotated[FrameSettings, FLAT] = defaults.frames,
+        sfm: Annotated[type(defaults.sfm), FLAT] = defaults.sfm,
+        splat: type(defaults.splat) = defaults.splat,
+        test: PoseRefinementSettings = defaults.test,
+    ) -> None:
+        """Everything, from a clip to the report page. Re-run the same command to resume, or swimm3r run RUN.
+
+        Args:
+            source: Video, or folder of images; or a run folder, to resume with its own input and settings.
+        """
+        require_adapter(poses.backend, sfm)
+        settings = RunSettings(frames, sfm, splat, test)
+        run_stages(source, folder, settings, "eval", poses.reference, map.map_device)
+
+    return run
