@@ -284,7 +284,7 @@ def refused(capsys: pytest.CaptureFixture[str], *arguments: str) -> str:
         ("render x --time nan", "--time: must be"),
         ("export x --time inf", "--time: must be"),
         ("eval x --steps -1", "--steps: must be"),
-        ("localize x --settings.max-error -1", "--settings.max-error: must be"),
+        ("localize x --max-error -1", "--max-error: must be"),
         ("train-sfm x --out o --learning-rate 0", "--learning-rate: must be"),
         ("bench render x --out o --seeds 0", "--seeds: must be a whole number at least 1 and at most 1000, got 0"),
         ("bench ablation-uwbs x --out o --seeds -1", "--seeds: must be"),
@@ -305,11 +305,11 @@ def test_help_shows_the_ranges(capsys: pytest.CaptureFixture[str], monkeypatch: 
     monkeypatch.setenv("COLUMNS", "200")
     for _ in range(2):  # commands are made anew by every call
         with pytest.raises(SystemExit):
-            main(["run", "--help"])
+            main(["run", "--help-all"])
         shown = capsys.readouterr().out
         for option in (
             "--features.count 1..1000000", "--splat.rates.xyz 0<FLOAT<=1", "--splat.long-side 0|32..65536",
-            "--mapping.focal-ladder [0.1..20 [0.1..20 ...]]", "--focal {None}|FLOAT>0", "--depth.min-ncc 0<=FLOAT<1",
+            "--mapping.focal-ladder [0.1..20 [0.1..20 ...]]", "--focal FLOAT>0", "--depth.min-ncc 0<=FLOAT<1",
         ):  # fmt: skip
             assert option in shown
 

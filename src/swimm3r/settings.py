@@ -33,7 +33,7 @@ class SettingError(UsageError, ValueError):
         super().__init__(
             f"{name} must be {expected}, got {got}".lstrip(),
             cause="a slip in the command, the file or the call that gave it",
-            hint="leave it out for the default; swimm3r COMMAND --help shows the ranges",
+            hint="leave it out for the default; swimm3r COMMAND --help-all shows the ranges",
         )
         self.name, self.expected, self.got = name, expected, got
 

@@ -22,7 +22,7 @@ def cases(fixture: Fixture) -> Iterator[Case]:
         "prepare": ("prepare", dive, "--out", "{}"),
         "render": ("render", "copy", "--long-side", "40", "--out", "{}"),
         "localize": ("localize", "copy", str(frame), "--out", "{}"),
-        "export": ("export", "copy", "--ply", "{}"),
+        "export": ("export", "copy", "--out", "{}"),
         "bench": ("bench", "restoration", "copy", "--out", "{}"),
         "demo": ("demo", "--frames", "3", "--width", "32", "--height", "24", "--out", "{}"),
     }

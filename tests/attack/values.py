@@ -42,10 +42,10 @@ def cases(fixture: Fixture) -> Iterator[Case]:
         ("render", "copy", "--time", "{}"),
         ("export", "copy", "--time", "{}"),
         ("eval", "copy", "--steps", "{}"),
-        ("localize", "copy", str(frame), "--settings.max-error", "{}"),
-        ("localize", "copy", str(frame), "--settings.rounds", "{}"),
-        ("localize", "copy", str(frame), "--settings.border", "{}"),
-        ("localize", "copy", str(frame), "--settings.min-alpha", "{}"),
+        ("localize", "copy", str(frame), "--max-error", "{}"),
+        ("localize", "copy", str(frame), "--rounds", "{}"),
+        ("localize", "copy", str(frame), "--border", "{}"),
+        ("localize", "copy", str(frame), "--min-alpha", "{}"),
     ):
         for bad in ("-1", "nan", "inf", "x", "99999999999999999999999999"):
             name = f"{arguments[0]}{arguments[-2]}={bad}"

@@ -57,7 +57,7 @@ def test_ctrl_c_is_exit_130_and_says_that_nothing_is_lost(
     monkeypatch.setattr("swimm3r.pipeline.run.run_pipeline", interrupted)
     code, message = outcome(capsys, "run", str(tmp_path), "--out", str(tmp_path / "run"))
     assert code == 130
-    assert "goes on from here" in message
+    assert "resumes from here" in message
 
 
 @pytest.mark.parametrize(
@@ -97,7 +97,7 @@ def test_the_preset_sets_the_defaults(capsys: pytest.CaptureFixture[str]):
     shown = {}
     for preset in ("fast", "best"):
         with pytest.raises(SystemExit):
-            main(["run", "--preset", preset, "--help"])
+            main(["run", "--preset", preset, "--help-all"])
         shown[preset] = capsys.readouterr().out
     assert shown["fast"] != shown["best"]
 
@@ -108,9 +108,10 @@ def test_a_recipe_and_a_transforms_json_reach_the_pipeline(tmp_path: Path, monke
         "frames": [{"file_path": f"images/{k}.png", "transform_matrix": np.eye(4).tolist()} for k in range(3)],
     }  # fmt: skip
     (tmp_path / "transforms.json").write_text(json.dumps(document))
+    write_rgb(tmp_path / "images" / "0.png", np.zeros((48, 64, 3)))
     asked = []
     monkeypatch.setattr("swimm3r.pipeline.run.run_pipeline", lambda *given, **_: asked.append(given) or {})
-    monkeypatch.setattr("swimm3r.cli.run.print_summary", lambda *_: None)
+    monkeypatch.setattr("swimm3r.cli.pipeline.stages.print_summary", lambda *_: None)
     for recipe in RECIPES:
         main(["splat", "--transforms", str(tmp_path / "transforms.json"), "--recipe", recipe, "--out", "run"])
         source, _, settings = asked[-1]
@@ -194,8 +195,9 @@ def test_prepare_says_what_it_used_where_it_is_and_what_comes_next(
     told = capsys.readouterr().out.splitlines()
     assert told[0] == "4 frames of 32x24 (3 for training, 1 for testing, 4 with a mask)"
     assert told[1] == "! Masks: 4 of 4 frames have one; 1 masks match no frame ([stranger].png)."
-    assert told[2] == f"Frames: {tmp_path / 'run' / 'prepare'}"
-    assert shlex.split(told[3].split(": ", 1)[1]) == ["swimm3r", "sfm", str(dive), "--out", str(tmp_path / "run")]
+    assert told[2] == f"Results in {tmp_path / 'run'}:"
+    assert told[3].split() == ["prepare", "frames", "as", "they", "are", "used"]
+    assert shlex.split(told[4].split(": ", 1)[1]) == ["swimm3r", "sfm", str(dive), "--out", str(tmp_path / "run")]
 
 
 def test_the_doctor_tells_of_memory_disk_driver_and_weights(

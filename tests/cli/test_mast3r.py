@@ -192,7 +192,7 @@ def test_the_back_end_decides_which_options_there_are(capsys: pytest.CaptureFixt
     shown = {}
     for backend in ("colmap", "mast3r"):
         with pytest.raises(SystemExit):
-            main(["sfm", f"--backend={backend}", "--help"])
+            main(["sfm", f"--backend={backend}", "--help-all"])
         shown[backend] = capsys.readouterr().out
     assert "--graph" in shown["mast3r"]
     assert "--graph" not in shown["colmap"]

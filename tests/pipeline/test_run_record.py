@@ -298,7 +298,7 @@ def test_every_command_refuses_a_place_that_it_cannot_write_to(
     (tmp_path / "d").mkdir()
     for path in ("d",) if command == "export" else ("f", "f/x"):
         words = {"bench": ("bench", "restoration", run), "train-sfm": ("train-sfm", dive)}.get(command, (command, run))
-        code, said = outcome(capsys, *words, "--ply" if command == "export" else "--out", tmp_path / path)
+        code, said = outcome(capsys, *words, "--out", tmp_path / path)
         assert code == 2, said
         assert "cannot be written to" in said
     assert (tmp_path / "f").read_text() == "mine"

@@ -156,8 +156,9 @@ def _parse_and_run(commands: Commands, arguments: list[str]) -> None:
         return
     try:
         tyro.cli(_parser(commands, path, view), prog="swimm3r", args=[*path, "--help"])
-    finally:  # help ends in SystemExit
+    except SystemExit:
         print(view.footer)
+        raise
 
 
 def _command_path(commands: Commands, arguments: Sequence[str]) -> tuple[str, ...]:

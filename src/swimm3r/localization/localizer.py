@@ -155,7 +155,7 @@ class Localizer:
             raise RegistrationError(
                 f"the image could not be placed: fewer than {s.min_inliers} of its matches agree on a pose",
                 cause="it shows a place that the map does not, or too little of it, or through very different water",
-                hint="an image from nearer to the dive's path, or more --settings.candidates",
+                hint="an image from nearer to the dive's path, or more --candidates",
             )
         coarse_inliers = int(coarse.inlier.sum())
         best = Localization(coarse.cam2world, "coarse", candidates, coarse_inliers, 0, 0, None, None, seconds)

@@ -109,7 +109,7 @@ def test_the_numbers_are_the_printed_ones():
 @pytest.mark.parametrize("command", ["run", "prepare", "sfm", "splat", "bench render", "bench ablation-uwbs"])
 def test_every_command_with_presets_knows_it(command: str, capsys: pytest.CaptureFixture[str]):
     with pytest.raises(SystemExit) as stop:
-        main([*command.split(), "--preset", "paper", "--help"])
+        main([*command.split(), "--preset", "paper", "--help-all"])
     shown = capsys.readouterr().out
     assert stop.value.code == 0
     assert "fast,default,best,paper" in shown.replace("\n", "").replace(" ", "")
