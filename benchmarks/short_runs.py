@@ -15,6 +15,7 @@ from pathlib import Path
 import torch
 
 from swimm3r.evaluate.images import psnr
+from swimm3r.imaging.undistortion import undistorted
 from swimm3r.pipeline.presets import PRESETS
 from swimm3r.pipeline.run import FinishedSfm, open_finished_sfm
 from swimm3r.splat import train
@@ -30,7 +31,6 @@ from swimm3r.splat.settings import (
     watersplatting,
     with_recipe,
 )
-from swimm3r.splat.views import undistorted
 
 
 def variants(size: UwbsSettings) -> dict[str, SplatSettings]:

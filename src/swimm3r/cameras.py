@@ -257,20 +257,6 @@ def image_directions(camera: Cameras) -> Float[Tensor, "h w 3"]:
     return directions(camera, grid).reshape(camera.height, camera.width, 3)
 
 
-def distorted_grid(lens: Cameras, canvas: Cameras) -> tuple[Float[Tensor, "h w 2"], Bool[Tensor, "h w"]]:
-    """Where every pixel of a pinhole canvas lies in a lens's image, to undistort it, and whether it shows there."""
-    rays = image_directions(canvas).double()[..., :2]
-    pixels = distort(rays, lens.distortion[:, None], lens.model) @ lens.K[0, :2, :2].mT + lens.K[0, :2, 2]
-    x, y = torch.linspace(0, lens.width, 65).double(), torch.linspace(0, lens.height, 65).double()
-    outline = torch.cat([torch.stack([x, torch.full_like(x, v)], -1) for v in (0, lens.height)])
-    outline = torch.cat([outline, *(torch.stack([torch.full_like(y, u), y], -1) for u in (0, lens.width))])
-    edge = directions(lens, outline[None])[0, :, :2]
-    reach = torch.linalg.vector_norm(edge[edge.isfinite().all(-1)], dim=-1).max()
-    shown = ((pixels > 0) & (pixels < torch.tensor([lens.width, lens.height]))).all(-1)
-    # beyond the farthest ray of the outline the lens model may fold back into the image
-    return pixels, shown & (torch.linalg.vector_norm(rays, dim=-1) <= reach * 1.001)
-
-
 def ray_depth_from_z(z_depth: Float[Tensor, "*pixels"], rays: Float[Tensor, "*pixels 3"]) -> Float[Tensor, "*pixels"]:
     """Distance along the ray of points at a z depth; `rays` have z = 1."""
     return z_depth * torch.linalg.vector_norm(rays, dim=-1)

@@ -1,68 +1,23 @@
-"""Frames become pinhole images."""
+"""Registered training frames become views in working units."""
 
 from dataclasses import replace
 
 import pytest
 import torch
 
-from swimm3r.cameras import Cameras, image_directions
+from swimm3r.cameras import Cameras
 from swimm3r.errors import InputError
 from swimm3r.io.images import write_rgb
 from swimm3r.scene.frames import Frame, Frames
 from swimm3r.scene.reconstruction import DepthMap, DepthMaps
 from swimm3r.splat.settings import UwbsSettings
-from swimm3r.splat.views import TrainingViews, median_z_depth, undistorted, working_scale
+from swimm3r.splat.views import TrainingViews, median_z_depth, working_scale
 
 
 def lens(width: int = 96, height: int = 64, k: float = -0.15) -> Cameras:
     K = torch.tensor([[[70.0, 0, 49], [0, 70, 31], [0, 0, 1]]], dtype=torch.float64)
     pose = torch.eye(4, dtype=torch.float64)[None]
     return Cameras(K, torch.tensor([[k]], dtype=torch.float64), pose, width, height, "SIMPLE_RADIAL")
-
-
-def scenery(camera: Cameras) -> torch.Tensor:
-    """A smooth pattern at infinity, as a camera sees it."""
-    x, y, _ = image_directions(camera).float().unbind(-1)
-    return torch.stack(
-        [0.5 + 0.4 * torch.sin(4 * x + y), 0.5 + 0.4 * torch.cos(3 * y), 0.5 + 0.3 * torch.sin(5 * x)], -1
-    )
-
-
-@pytest.mark.parametrize("long_side", [0, 48])
-def test_an_undistorted_image_shows_what_a_pinhole_camera_would(long_side: int):
-    camera = lens()
-    canvas = camera.pinhole(long_side)
-    assert max(canvas.width, canvas.height) == (long_side or 96)
-    got, seen = undistorted(scenery(camera), torch.ones(64, 96, dtype=torch.bool), camera, canvas)
-    assert seen.double().mean() > 0.95
-    inner = seen[2:-2, 2:-2]
-    error = (got - scenery(canvas))[2:-2, 2:-2][inner].abs()
-    assert error.max() < (0.02 if long_side else 0.005)
-
-
-def test_a_image_without_distortion_keeps_its_bits():
-    camera = replace(lens(), distortion=torch.zeros(1, 1, dtype=torch.float64))
-    image = torch.rand(64, 96, 3)
-    got, seen = undistorted(image, torch.ones(64, 96, dtype=torch.bool), camera, camera.pinhole())
-    assert torch.equal(got, image)
-    assert seen.all()
-
-
-def test_what_the_lens_did_not_see_is_not_seen():
-    """A pincushion lens's image does not reach the corners of its pinhole canvas."""
-    camera = lens(k=0.3)
-    _, seen = undistorted(scenery(camera), torch.ones(64, 96, dtype=torch.bool), camera, camera.pinhole())
-    assert not seen[0, 0]
-    assert seen[32, 48]
-
-
-def test_a_mask_is_undistorted_with_its_image():
-    camera = lens()
-    mask = torch.ones(64, 96, dtype=torch.bool)
-    mask[:, :48] = False
-    _, seen = undistorted(scenery(camera), mask, camera, camera.pinhole())
-    assert not seen[:, :46].any()
-    assert seen[20:40, 52:80].all()
 
 
 def test_views_are_the_registered_training_frames_with_images_and_depth_in_working_units(tiny_dive):

@@ -5,6 +5,7 @@ from pathlib import Path
 from swimm3r import devices
 from swimm3r.bench.cells import Scores
 from swimm3r.evaluate import NotComputed
+from swimm3r.imaging.undistortion import undistorted
 from swimm3r.io import images
 from swimm3r.io.files.metrics_log import read_rows
 from swimm3r.io.view_names import view_stems
@@ -16,7 +17,6 @@ from swimm3r.splat import train
 from swimm3r.splat.map_file import load_map
 from swimm3r.splat.rendering import SplatMap
 from swimm3r.splat.settings import PoseRefinementSettings, SplatSettings
-from swimm3r.splat.views import undistorted
 
 
 def trained(sfm: FinishedSfm, settings: SplatSettings, folder: Path, progress: Progress = silent) -> SplatMap:

@@ -26,6 +26,7 @@ from torch import Tensor
 from swimm3r.cameras import Cameras, project, resized
 from swimm3r.errors import InputError, RegistrationError
 from swimm3r.geometry import pose_from, so3_exp
+from swimm3r.imaging.undistortion import undistorted
 from swimm3r.localization.matchers import Matcher, matcher_for
 from swimm3r.localization.references import FilmedReferences, Reference, References, RenderedReferences, rendered
 from swimm3r.localization.settings import LocalizationSettings
@@ -34,7 +35,6 @@ from swimm3r.scene.reconstruction import Reconstruction
 from swimm3r.sfm.colmap.poses import absolute_pose
 from swimm3r.splat.rendering import SplatMap
 from swimm3r.splat.training_poses import as_mapped, axes_of_map
-from swimm3r.splat.views import undistorted
 
 STAGES = ("retrieve", "coarse", "render", "match", "refine")
 

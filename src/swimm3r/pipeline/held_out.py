@@ -17,11 +17,12 @@ from jaxtyping import Bool, Float
 from torch import Tensor
 
 from swimm3r import weights
-from swimm3r.cameras import Cameras, distorted_grid, project, resized
+from swimm3r.cameras import Cameras, project
 from swimm3r.evaluate import NotComputed
 from swimm3r.evaluate.images import ViewScores, as_8_bit, blur4_psnr, mean_view_scores, psnr, view_scores
 from swimm3r.evaluate.lpips import Lpips, load_lpips
 from swimm3r.geometry import best_similarity
+from swimm3r.imaging.undistortion import shown_pixels, undistorted
 from swimm3r.io.view_names import view_stems
 from swimm3r.localization.interpolation import neighbors, pose_from_neighbors
 from swimm3r.localization.landmarks import landmarks_of, locate
@@ -35,7 +36,6 @@ from swimm3r.splat.pose_refinement import refine_pose
 from swimm3r.splat.rendering import SplatMap
 from swimm3r.splat.settings import PoseRefinementSettings
 from swimm3r.splat.training_poses import axes_of_map
-from swimm3r.splat.views import undistorted
 
 Source = Literal["reference", "2D-3D matches", "neighbors"]
 _GAP = 0.03  # of the image's width: gaps in the cloud up to this size are closed where coverage is asked
@@ -232,7 +232,7 @@ class Crop:
 
 def visible_window(lens: Cameras, canvas: Cameras) -> Crop:
     """The part of a lens's pinhole canvas that its image fills, cut straight."""
-    shown = distorted_grid(resized(lens, canvas.width, canvas.height), canvas)[1]
+    shown = shown_pixels(lens, canvas)
     top, bottom, left, right = 0, canvas.height, 0, canvas.width
     while True:
         part = shown[top:bottom, left:right]

@@ -7,7 +7,7 @@ import torch
 from jaxtyping import Bool, Float
 from torch import Tensor
 
-from swimm3r.cameras import Cameras, directions, distorted_grid, image_directions, ray_depth_from_z
+from swimm3r.cameras import image_directions, ray_depth_from_z
 from swimm3r.evaluate import NotComputed, summary_entries
 from swimm3r.evaluate.depth import depth_scores
 from swimm3r.evaluate.images import as_8_bit, psnr
@@ -15,6 +15,7 @@ from swimm3r.evaluate.matches import epipolar_errors, match_scores
 from swimm3r.evaluate.poses import absolute_pose_errors, pose_scores
 from swimm3r.evaluate.underwater import clear_psnr, water_scores, water_scores_from_views
 from swimm3r.geometry import DegenerateAlignmentError, align_poses, align_similarity
+from swimm3r.imaging.undistortion import nearest_pixels, undistorted, undistorted_matches
 from swimm3r.io.files.metrics_log import read_rows
 from swimm3r.medium import Medium, MediumFit, remove_water, rescale
 from swimm3r.pipeline.held_out import HeldOutView, cut, mean_covered, mean_scores, protocol
@@ -25,7 +26,6 @@ from swimm3r.scene.reconstruction import Matches, Reconstruction
 from swimm3r.splat.rendering import SplatMap, mean_water
 from swimm3r.splat.settings import PoseRefinementSettings, recipe_of
 from swimm3r.splat.training_poses import RefinedPoses
-from swimm3r.splat.views import undistorted
 
 _ASKED = 16  # training views that the map's mean water is taken over
 
@@ -68,8 +68,8 @@ def match_errors(rec: Reconstruction, matches: Matches) -> Float[Tensor, " m"]:
     return epipolar_errors(
         matches.i,
         matches.j,
-        _undistorted(rec.cameras, matches.i, matches.xy_i),
-        _undistorted(rec.cameras, matches.j, matches.xy_j),
+        undistorted_matches(rec.cameras, matches.i, matches.xy_i),
+        undistorted_matches(rec.cameras, matches.j, matches.xy_j),
         rec.cameras.K,
         rec.cameras.cam2world,
     )
@@ -189,16 +189,6 @@ def _medium_section(fit: MediumFit, metric: bool) -> dict[str, object]:
     }
 
 
-def _undistorted(cameras: Cameras, frame: Tensor, xy: Float[Tensor, "m 2"]) -> Float[Tensor, "m 2"]:
-    """Pixels as a pinhole camera with the same K would see them."""
-    straight = torch.empty_like(xy, dtype=torch.float64)
-    for i in range(len(cameras)):
-        rows = frame == i
-        rays = directions(cameras[i], xy[rows].double()[None])[0]
-        straight[rows] = (rays @ cameras.K[i].double().T)[:, :2]
-    return straight
-
-
 def _scale_to_truth(estimated: Float[Tensor, "n 4 4"], true: Float[Tensor, "n 4 4"]) -> float | NotComputed:
     """Length in the truth's unit per length of the reconstruction."""
     try:
@@ -257,10 +247,7 @@ def _map_water_section(
         rows, columns = view.window.rows, view.window.columns
         everything = torch.ones(clear.shape[:2], dtype=torch.bool)
         true_clear, shown = undistorted(clear, everything, view.lens, view.canvas)
-        pixels = distorted_grid(view.lens, view.canvas)[0]
-        x = pixels[..., 0].long().clamp(0, view.lens.width - 1)
-        y = pixels[..., 1].long().clamp(0, view.lens.height - 1)
-        true_z = torch.where(shown, z_depth[y, x], 0.0)
+        true_z = torch.where(shown, z_depth[nearest_pixels(view.lens, view.canvas)], 0.0)
         ray_depth = ray_depth_from_z(true_z, image_directions(view.canvas).float())[rows, columns]
         out = scene.render(cut(view.canvas, view.window), view.time)
         media.append((ray_depth, Medium(out.medium.Binf, out.medium.beta_D / scale, out.medium.beta_B / scale)))

@@ -18,7 +18,7 @@ import torch
 from jaxtyping import Float, Int
 from torch import Tensor, nn
 
-from swimm3r.cameras import Cameras, directions
+from swimm3r.cameras import Cameras
 from swimm3r.errors import InputError
 from swimm3r.geometry import (
     Similarity,
@@ -28,6 +28,7 @@ from swimm3r.geometry import (
     rotation_from_6d,
     symmetric_epipolar_error,
 )
+from swimm3r.imaging.undistortion import undistorted_matches
 from swimm3r.io import cameras_json
 from swimm3r.io.trajectory import write_tum
 from swimm3r.scene.frames import Frames
@@ -192,12 +193,8 @@ def epipolar_matches(rec: Reconstruction, names: tuple[str, ...], canvases: Came
     both = (view_of[m.i] >= 0) & (view_of[m.j] >= 0)
     frame = torch.cat([m.i[both], m.j[both]])
     xy = torch.cat([m.xy_i[both], m.xy_j[both]]).double()
-    view, straight = view_of[frame], torch.empty_like(xy)
-    for k in frame.unique().tolist():
-        rows = frame == k
-        rays = directions(rec.cameras[k], xy[rows][None])[0]
-        straight[rows] = (rays @ canvases.K[view_of[k]].double().T)[:, :2]
-    first, second = straight.chunk(2)
+    view = view_of[frame]
+    first, second = undistorted_matches(rec.cameras, frame, xy, canvases.K[view_of]).chunk(2)
     known = first.isfinite().all(-1) & second.isfinite().all(-1)
     return EpipolarMatches(
         view[: len(view) // 2][known], view[len(view) // 2 :][known], first[known], second[known],

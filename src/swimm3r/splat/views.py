@@ -6,7 +6,6 @@ does not show, or its mask excludes, is not `seen` and takes no part in any loss
 """
 
 from dataclasses import dataclass, replace
-from functools import lru_cache
 
 import numpy as np
 import torch
@@ -14,9 +13,10 @@ from jaxtyping import Bool, Float
 from torch import Tensor
 from torch.nn.functional import interpolate
 
-from swimm3r.cameras import Cameras, distorted_grid, project, resized
+from swimm3r.cameras import Cameras, project, resized
 from swimm3r.errors import InputError
 from swimm3r.imaging.open_water import sea_share
+from swimm3r.imaging.undistortion import nearest_pixels, undistorted
 from swimm3r.io.files.cache import ArrayCache
 from swimm3r.scene.frames import Frames
 from swimm3r.scene.reconstruction import Reconstruction
@@ -110,9 +110,7 @@ class TrainingViews:
             nothing = torch.zeros(canvas.height, canvas.width)
             return nothing, nothing > 0
         depth = self.rec.depth[name]
-        column, row, _ = _grid(_key(lens), _key(canvas))
-        row = np.clip(row.round().astype(np.int64), 0, lens.height - 1)
-        column = np.clip(column.round().astype(np.int64), 0, lens.width - 1)
+        row, column = nearest_pixels(lens, canvas)
         z_depth, confidence = depth.z_depth[row, column], depth.confidence[row, column]
         known = seen & z_depth.isfinite() & (z_depth > 0) & (confidence >= least)
         z_depth = torch.where(known, z_depth * self.scale, 0.0)
@@ -144,25 +142,6 @@ def moment(span: tuple[float, float], time: float) -> Float[Tensor, ""]:
     return torch.tensor((time - start) / (end - start) if end > start else 0.0)
 
 
-def undistorted(
-    image: Float[Tensor, "h w 3"], mask: Bool[Tensor, "h w"], lens: Cameras, canvas: Cameras
-) -> tuple[Float[Tensor, "ch cw 3"], Bool[Tensor, "ch cw"]]:
-    """A frame's image on its pinhole canvas, and which of its pixels the frame shows and its mask admits."""
-    import cv2
-
-    size = (canvas.width, canvas.height)
-    rgb, usable = image.numpy(), mask.numpy().astype(np.float32)
-    if (lens.width, lens.height) != size:  # smaller first, by area, so that nothing aliases
-        rgb = cv2.resize(rgb, size, interpolation=cv2.INTER_AREA)
-        usable = cv2.resize(usable, size, interpolation=cv2.INTER_AREA)
-        lens = resized(lens, *size)
-    if lens.distortion.numel() and bool(lens.distortion.any()):
-        column, row, inside = _grid(_key(lens), _key(canvas))
-        rgb = cv2.remap(rgb, column, row, cv2.INTER_LINEAR, borderMode=cv2.BORDER_REPLICATE)
-        usable = cv2.remap(usable, column, row, cv2.INTER_LINEAR) * inside
-    return torch.from_numpy(rgb), torch.from_numpy(usable > 0.999)
-
-
 def working_scale(rec: Reconstruction, settings: SplatSettings) -> float:
     """Working units per scene unit: 1 for a metric reconstruction, else what gives the scene its `working_depth`."""
     return 1.0 if rec.metric else settings.working_depth / median_z_depth(rec)
@@ -184,34 +163,3 @@ def median_z_depth(rec: Reconstruction) -> float:
             hint="a reconstruction with sparse points",
         )
     return float(z.median())
-
-
-_Key = tuple[tuple[float, ...], tuple[float, ...], int, int, str]
-
-
-def _key(camera: Cameras) -> _Key:
-    return (
-        tuple(camera.K[0].flatten().tolist()),
-        tuple(camera.distortion[0].tolist()),
-        camera.width,
-        camera.height,
-        camera.model,
-    )
-
-
-@lru_cache(maxsize=8)  # one lens per clip as a rule
-def _grid(lens: _Key, canvas: _Key) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """`distorted_grid` as columns and rows (index coordinates) and the pixels shown, for OpenCV."""
-
-    def camera(key: _Key) -> Cameras:
-        K, distortion, width, height, model = key
-        identity = torch.eye(4, dtype=torch.float64)[None]
-        return Cameras(
-            torch.tensor(K, dtype=torch.float64).reshape(1, 3, 3),
-            torch.tensor(distortion, dtype=torch.float64).reshape(1, -1),
-            identity, width, height, model,
-        )  # fmt: skip
-
-    pixels, shown = distorted_grid(camera(lens), camera(canvas))
-    column, row = (pixels - 0.5).float().unbind(-1)
-    return column.contiguous().numpy(), row.contiguous().numpy(), shown.numpy()

@@ -93,39 +93,6 @@ def test_thin_masked_line_survives_the_resize():
     assert small.sum() == small.numel() - 288
 
 
-@pytest.mark.parametrize(
-    ("model", "parameters"),
-    [("OPENCV", [-0.25, 0.05, 0.001, -0.002]), ("OPENCV_FISHEYE", [0.05, -0.01, 0.0, 0.0]), ("SIMPLE_RADIAL", [-0.1])],
-)
-def test_distortion_is_gone_before_the_network(model: str, parameters: list[float]):
-    width, height = 160, 120
-    K = torch.tensor([[[110.0, 0, 82], [0, 112, 59], [0, 0, 1]]], dtype=torch.float64)
-    pose = torch.eye(4, dtype=torch.float64)[None]
-    lens = Cameras(K, torch.tensor([parameters], dtype=torch.float64), pose, width, height, model)
-    # an image whose value at a pixel is the pixel: undistorted, it says where each pinhole pixel was seen
-    image = torch.cat([pixel_grid(height, width) / 160, torch.zeros(height, width, 1)], dim=-1)
-    flat, mask, pinhole = preprocess.remove_distortion(image, torch.ones(height, width, dtype=torch.bool), lens)
-    assert pinhole.model == "PINHOLE"
-    points = torch.tensor([[[x, y, 1.0] for x in (-0.4, 0.0, 0.3) for y in (-0.3, 0.1, 0.35)]], dtype=torch.float64)
-    at = project(pinhole, points)[0][0].floor().long()
-    centers = (at + 0.5).double()
-    rays = torch.cat([(centers - K[0, :2, 2]) / K[0, :2, :2].diagonal(), torch.ones(len(at), 1)], dim=1)
-    expected = project(lens, rays[None])[0][0]
-    seen = flat[at[:, 1], at[:, 0], :2].double() * 160
-    assert mask[at[:, 1], at[:, 0]].all()
-    torch.testing.assert_close(seen, expected, atol=0.01, rtol=0)
-
-
-def test_masked_pixels_stay_masked_without_distortion():
-    K = torch.tensor([[[110.0, 0, 80], [0, 110, 60], [0, 0, 1]]], dtype=torch.float64)
-    lens = Cameras(K, torch.tensor([[-0.2]]), torch.eye(4, dtype=torch.float64)[None], 160, 120, "SIMPLE_RADIAL")
-    mask = torch.ones(120, 160, dtype=torch.bool)
-    mask[50:70, 70:90] = False
-    _, kept, _ = preprocess.remove_distortion(torch.zeros(120, 160, 3), mask, lens)
-    assert not kept[52:68, 72:88].any()
-    assert kept[10:40].all()
-
-
 def test_wide_image_keeps_its_field_of_view():
     f = framing(1920, 1080)
     K = preprocess.K_to_network(torch.tensor([[1000.0, 0, 960], [0, 1000, 540], [0, 0, 1]]), f)

@@ -10,11 +10,12 @@ from jaxtyping import Float
 from torch import Tensor
 
 from swimm3r.cameras import Cameras, image_directions, project, unproject
+from swimm3r.imaging.undistortion import covering_pinholes
 from swimm3r.io import images
 from swimm3r.scene.frames import Frame, Frames
 from swimm3r.scene.reconstruction import DepthMaps, Matches, Points, Reconstruction, Tracks
 from swimm3r.sfm.plane_sweep.estimate import RawDepth, consistent, estimate_depth, sweep
-from swimm3r.sfm.plane_sweep.views import SweepView, choose_sources, depth_range, make_view, undistorted_cameras
+from swimm3r.sfm.plane_sweep.views import SweepView, choose_sources, depth_range, make_view
 from swimm3r.sfm.settings import PlaneSweepSettings
 
 WIDTH, HEIGHT = 128, 96
@@ -59,7 +60,7 @@ def photograph(camera: Cameras, plane: tuple[float, float, float]) -> Float[Tens
 def views_of(plane: tuple[float, float, float], change: tuple[float, float] = (1.0, 0.0)) -> list[SweepView]:
     """All views of the plane; every one but the middle has its brightness changed to gain * value + offset."""
     cameras, everywhere = dive(), torch.ones(HEIGHT, WIDTH, dtype=torch.bool)
-    canvas = undistorted_cameras(cameras, 640)
+    canvas = covering_pinholes(cameras, 640)
     views = []
     for i in range(5):
         gain, offset = (1.0, 0.0) if i == 2 else change
@@ -139,7 +140,7 @@ def test_open_water_stays_unknown():
 
 def test_a_depth_no_other_frame_shares_is_dropped_and_a_shared_one_stays():
     cameras = dive()
-    canvas = undistorted_cameras(cameras, 640)
+    canvas = covering_pinholes(cameras, 640)
     true = [1 / z_of_plane(cameras[i], SLANTED).float() for i in range(5)]
     wrong = true[2].clone()
     wrong[40:60, 40:80] *= 1.1
@@ -152,7 +153,7 @@ def test_a_depth_no_other_frame_shares_is_dropped_and_a_shared_one_stays():
 
 
 def test_frames_with_poor_poses_may_differ_by_what_the_poses_are_worth():
-    canvas = undistorted_cameras(dive(), 640)
+    canvas = covering_pinholes(dive(), 640)
     true = [1 / z_of_plane(dive()[i], FRONTAL).float() for i in range(5)]
     sure = torch.ones(HEIGHT, WIDTH)
     others = [RawDepth(true[i], sure) for i in (0, 1, 3, 4)]

@@ -21,7 +21,7 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
-from swimm3r.cameras import undistort
+from swimm3r.cameras import directions
 from swimm3r.geometry import rotation_angle
 from swimm3r.medium import remove_water
 from swimm3r.sfm.distillation.pairs import PairData, PairItem, TwoViews
@@ -138,10 +138,7 @@ def pose_error(matches: PixelMatches, truth: TwoViews) -> _PoseError:
 
 def _normalized(xy: Tensor, truth: TwoViews) -> np.ndarray:
     """Pixels, whole numbers, as points of the undistorted plane z = 1."""
-    K = truth.camera.K[0].double()
-    plane = torch.linalg.solve(K[:2, :2], (xy.double() + 0.5 - K[:2, 2]).mT).mT
-    straight = undistort(plane, truth.camera.distortion.double(), truth.camera.model)
-    return np.ascontiguousarray(straight.numpy())
+    return np.ascontiguousarray(directions(truth.camera, (xy.double() + 0.5)[None])[0, :, :2].numpy())
 
 
 def _matches(one: Descriptors, two: Descriptors) -> PixelMatches:

@@ -1,13 +1,13 @@
 """From an image to what the network sees, and every pixel's way there and back.
 
-undistort -> resize to a long side of 512 (Lanczos down, bicubic up) -> center crop to whole patches -> -1..1
+resize to a long side of 512 (Lanczos down, bicubic up) -> center crop to whole patches -> -1..1
 
 Resize and crop act on pixel coordinates with centers at +0.5, so that an image's edge stays an edge:
 
     u' = s_x u - x_0,   v' = s_y v - y_0,   K' = [[s_x, 0, -x_0], [0, s_y, -y_0], [0, 0, 1]] K
 """
 
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 
 import numpy as np
 import torch
@@ -15,8 +15,6 @@ from jaxtyping import Bool, Float
 from PIL import Image
 from torch import Tensor
 from torch.nn import functional as F
-
-from swimm3r.cameras import Cameras, distorted_grid
 
 
 @dataclass(frozen=True)
@@ -103,30 +101,6 @@ def pixels_to_image(xy: Float[Tensor, "*m 2"], frame: Framing) -> Float[Tensor, 
     """Pixels of the network's image -> of the image; add 0.5 to whole pixel numbers first."""
     matrix = frame.matrix.to(xy)
     return (xy - matrix[:2, 2]) / matrix.diagonal()[:2]
-
-
-def remove_distortion(
-    source: Float[Tensor, "h w 3"], mask: Bool[Tensor, "h w"], camera: Cameras
-) -> tuple[Float[Tensor, "h w 3"], Bool[Tensor, "h w"], Cameras]:
-    """The image a pinhole camera of the same K and size would take, where it is known, and that camera.
-
-    Of a fisheye only the part near the axis fits into such an image. Unknown pixels are False in the mask.
-    """
-    if len(camera) != 1:
-        raise ValueError(f"remove_distortion takes one camera, got {len(camera)}")
-    if camera.model == "PINHOLE":
-        return source, mask, camera
-    pinhole = replace(camera, model="PINHOLE", distortion=camera.distortion[:, :0])
-    source, inside = distorted_grid(camera, pinhole)
-    size = torch.tensor([camera.width, camera.height], dtype=source.dtype)
-    sampled = F.grid_sample(
-        torch.cat([source, mask[..., None].to(source)], dim=-1).permute(2, 0, 1)[None],
-        (source / size * 2 - 1).to(source)[None],
-        mode="bilinear",
-        padding_mode="border",
-        align_corners=False,
-    )[0].permute(1, 2, 0)
-    return sampled[..., :3], inside & (sampled[..., 3] > 0.999), pinhole
 
 
 def _crop(frame: Framing) -> tuple[slice, slice]:

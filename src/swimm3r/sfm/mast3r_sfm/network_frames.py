@@ -12,8 +12,9 @@ import torch
 from jaxtyping import Bool, Float
 from torch import Tensor
 
-from swimm3r.cameras import DISTORTION_PARAMETERS, Cameras, directions, project
+from swimm3r.cameras import DISTORTION_PARAMETERS, Cameras
 from swimm3r.errors import InputError, UsageError
+from swimm3r.imaging.undistortion import distorted_pixels, undistorted, undistorted_pixels
 from swimm3r.io.imports.read import read_foreign
 from swimm3r.scene.frames import Frames
 from swimm3r.sfm.imported.match_frames import model_cameras
@@ -25,7 +26,6 @@ from swimm3r.sfm.mast3r.preprocess import (
     mask_to_network,
     pixels_to_image,
     pixels_to_network,
-    remove_distortion,
     to_network,
 )
 from swimm3r.sfm.settings import Mast3rSettings
@@ -90,24 +90,14 @@ class NetworkImages:
 
     def to_frame(self, xy: Float[Tensor, "m 2"]) -> Float[Tensor, "m 2"]:
         """Pixels of the network's image (centers at +0.5) -> of the prepared frame, distorted as it is."""
-        straight = pixels_to_image(xy.double(), self.framing)
-        if self.lens.model == "PINHOLE":
-            return straight
-        pinhole = replace(self.lens, model="PINHOLE", distortion=self.lens.distortion[:, :0])
-        rays = directions(pinhole, straight[None])
-        return project(replace(self.lens, cam2world=torch.eye(4, dtype=torch.float64)[None]), rays)[0][0]
+        return distorted_pixels(self.lens, pixels_to_image(xy.double(), self.framing))
 
     def from_frame(self, xy: Float[Tensor, "m 2"]) -> Float[Tensor, "m 2"]:
         """The inverse of `to_frame`; NaN where the lens has no ray."""
-        straight = xy.double()
-        if self.lens.model != "PINHOLE":
-            K = self.lens.K[0].double()
-            straight = directions(self.lens, straight[None])[0, :, :2] @ K[:2, :2].T + K[:2, 2]
-        return pixels_to_network(straight, self.framing)
+        return pixels_to_network(undistorted_pixels(self.lens, xy), self.framing)
 
     def _undistorted(self, i: int) -> tuple[Tensor, Tensor]:
-        image, mask, _ = remove_distortion(self.frames.image(i), self.frames.mask(i), self.lens)
-        return image, mask
+        return undistorted(self.frames.image(i), self.frames.mask(i), self.lens, self.lens.pinhole())
 
 
 def network_images(frames: Frames, settings: Mast3rSettings) -> NetworkImages:

@@ -21,6 +21,7 @@ from jaxtyping import Float
 from torch import Tensor
 
 from swimm3r.cameras import Cameras
+from swimm3r.imaging.undistortion import covering_pinholes
 from swimm3r.io.files.array_file import Layout, read_arrays
 from swimm3r.io.files.atomic import atomic_path, write_text
 from swimm3r.io.files.cache import ArrayCache
@@ -37,7 +38,6 @@ from swimm3r.sfm.plane_sweep.views import (
     likely_edge,
     make_view,
     on_frame_grid,
-    undistorted_cameras,
 )
 from swimm3r.sfm.settings import PlaneSweepSettings
 
@@ -68,7 +68,7 @@ def estimate_depth(
     """
     folder = rec.depth.folder
     _claim(folder, _stamp(rec, frames, settings))
-    canvas = undistorted_cameras(rec.cameras, settings.long_side)
+    canvas = covering_pinholes(rec.cameras, settings.long_side)
     sources = choose_sources(rec, max(settings.sources, _NEIGHBORS), settings.angle_deg)
     pose_error = _pose_error(rec, canvas)
     position = {name: k for k, name in enumerate(frames.names)}

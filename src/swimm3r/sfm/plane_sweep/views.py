@@ -5,7 +5,6 @@ axis is the same number on both grids, and `on_frame_grid` reads it back at ever
 """
 
 from dataclasses import dataclass
-from functools import lru_cache
 
 import numpy as np
 import torch
@@ -13,12 +12,13 @@ from jaxtyping import Bool, Float
 from scipy import sparse
 from torch import Tensor
 
-from swimm3r.cameras import Cameras, directions, distort, image_directions, pixel_grid, project, resized
+from swimm3r.cameras import Cameras, project
+from swimm3r.imaging.filters import LUMA
+from swimm3r.imaging.undistortion import pinhole_grid, undistorted
 from swimm3r.scene.reconstruction import Reconstruction
 from swimm3r.sfm.plane_sweep import consistency
 
 _FEWEST_POINTS = 8  # in a frame, to know its depth range
-_WIDEST = 2.5  # tangent of the half angle that undistorted images cover at most: 136 degrees
 _CANDIDATES = 40  # frames sharing most points that are considered as sources
 _SLOW = 12.0  # pixels at working size: what varies slower is no surface texture
 _FAST = 0.7  # pixels: what varies faster is noise, or the lines of interlaced video
@@ -92,50 +92,17 @@ def depth_range(rec: Reconstruction, i: int) -> tuple[float, float] | None:
     return float(low) / 1.4, float(high) * 2.5
 
 
-def undistorted_cameras(cameras: Cameras, long_side: int) -> Cameras:
-    """Pinhole cameras of one common, even size that cover what the frames show, `long_side` setting the scale."""
-    scale = min(1.0, long_side / max(cameras.width, cameras.height))
-    work = resized(cameras, max(2, round(cameras.width * scale)), max(2, round(cameras.height * scale)))
-    lenses, which = _lenses(work)
-    border = _border(work.width, work.height)[None]
-    extents = []
-    for k in range(len(lenses)):
-        rays = directions(lenses[k], border)[0, :, :2]
-        rays = rays[rays.isfinite().all(-1)].clamp(-_WIDEST, _WIDEST)
-        extents.append(torch.cat([rays.amin(0), rays.amax(0)]))
-    extent = torch.stack(extents)
-    focal = torch.stack([lenses.K[:, 0, 0], lenses.K[:, 1, 1]], -1).to(extent)
-    size = ((extent[:, 2:] - extent[:, :2]) * focal).amax(0).tolist()
-    width, height = (2 * int(np.ceil(s / 2 - 1e-3)) for s in size)
-    K = torch.zeros(len(lenses), 3, 3, dtype=torch.float64)
-    K[:, 0, 0], K[:, 1, 1], K[:, 2, 2] = focal[:, 0], focal[:, 1], 1
-    K[:, :2, 2] = -extent[:, :2] * focal
-    return Cameras(K[which], cameras.distortion[:, :0], cameras.cam2world, width, height)
-
-
 def make_view(image: Float[Tensor, "h w 3"], mask: Bool[Tensor, "h w"], lens: Cameras, canvas: Cameras) -> SweepView:
     """A frame undistorted onto the canvas; `lens` and `canvas` are its own camera and its pinhole one."""
     import cv2
 
-    gray = (image @ torch.tensor([0.299, 0.587, 0.114])).numpy()
-    scale = float(canvas.K[0, 0, 0] / lens.K[0, 0, 0])
-    if scale < 1:  # smaller first, by area, so that nothing aliases
-        size = (max(2, round(lens.width * scale)), max(2, round(lens.height * scale)))
-        gray = cv2.resize(gray, size, interpolation=cv2.INTER_AREA)
-        usable = cv2.resize(mask.numpy().astype(np.float32), size, interpolation=cv2.INTER_AREA) > 0.999
-        lens = resized(lens, *size)
-    else:
-        usable = mask.numpy()
-    u, v, inside = _distorted_grid(_key(lens), _key(canvas))
-    gray = cv2.remap(gray, u, v, cv2.INTER_LINEAR, borderMode=cv2.BORDER_REPLICATE)
-    seen = inside & (cv2.remap(usable.astype(np.float32), u, v, cv2.INTER_LINEAR) > 0.999)
+    values, shown = undistorted(image @ LUMA, mask, lens, canvas)
+    gray, seen = values.numpy(), shown.numpy()
     share = cv2.GaussianBlur(seen.astype(np.float32), (0, 0), _SLOW, borderType=cv2.BORDER_REFLECT)
     slow = cv2.GaussianBlur(np.where(seen, gray, 0), (0, 0), _SLOW, borderType=cv2.BORDER_REFLECT)
     fine = cv2.GaussianBlur(gray, (0, 0), _FAST)
     detail = np.where(seen, fine - slow / np.maximum(share, 1e-6), 0).astype(np.float32)
-    return SweepView(
-        torch.from_numpy(gray), torch.from_numpy(detail), torch.from_numpy(seen), canvas.K[0], canvas.world2cam[0]
-    )
+    return SweepView(values, torch.from_numpy(detail), shown, canvas.K[0], canvas.world2cam[0])
 
 
 def halved(view: SweepView) -> SweepView:
@@ -164,71 +131,8 @@ def on_frame_grid(
     canvas: Cameras,
 ) -> tuple[Float[Tensor, "fh fw"], Float[Tensor, "fh fw"]]:
     """`values` and `also` of the canvas at the pixels of the frame, along the edges of the image; 0 = unknown."""
-    u, v = _canvas_grid(_key(lens), _key(canvas))
-    wanted = (image @ torch.tensor([0.299, 0.587, 0.114])).numpy().ravel()
+    u, v = pinhole_grid(lens, canvas)
+    wanted = (image @ LUMA).numpy().ravel()
     out, read = consistency.look_up(values.numpy(), also.numpy(), guide.numpy(), u, v, wanted, likely_edge(guide), 0.03)
     shape = image.shape[:2]
     return torch.from_numpy(out.reshape(shape)), torch.from_numpy(read.reshape(shape))
-
-
-_Key = tuple[tuple[float, ...], tuple[float, ...], int, int, str]
-
-
-def _key(camera: Cameras) -> _Key:
-    K, distortion = camera.K[0].flatten().tolist(), camera.distortion[0].tolist()
-    return tuple(K), tuple(distortion), camera.width, camera.height, camera.model
-
-
-def _camera(key: _Key) -> Cameras:
-    K, distortion, width, height, model = key
-    return Cameras(
-        torch.tensor(K, dtype=torch.float64).reshape(1, 3, 3),
-        torch.tensor(distortion, dtype=torch.float64).reshape(1, -1),
-        torch.eye(4, dtype=torch.float64)[None],
-        width,
-        height,
-        model,
-    )
-
-
-@lru_cache(maxsize=4)  # one lens per clip as a rule
-def _distorted_grid(lens_key: _Key, canvas_key: _Key) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """For every canvas pixel its place in the frame (index coordinates), and whether the frame shows it."""
-    lens, canvas = _camera(lens_key), _camera(canvas_key)
-    rays = image_directions(canvas).double()[..., :2]
-    pixels = distort(rays, lens.distortion[:, None], lens.model) @ lens.K[0, :2, :2].T + lens.K[0, :2, 2]
-    border = directions(lens, _border(lens.width, lens.height)[None])[0, :, :2]
-    reach = torch.linalg.vector_norm(border[border.isfinite().all(-1)], dim=-1).max()
-    inside = ((pixels > 0) & (pixels < torch.tensor([lens.width, lens.height]))).all(-1)
-    inside &= torch.linalg.vector_norm(rays, dim=-1) <= reach * 1.001  # beyond, the lens model may fold back
-    u, v = (pixels - 0.5).float().numpy().transpose(2, 0, 1)
-    return np.ascontiguousarray(u), np.ascontiguousarray(v), inside.numpy()
-
-
-@lru_cache(maxsize=4)
-def _canvas_grid(lens_key: _Key, canvas_key: _Key) -> tuple[np.ndarray, np.ndarray]:
-    """For every pixel of the frame its place on the canvas (index coordinates), -9 where it has none."""
-    lens, canvas = _camera(lens_key), _camera(canvas_key)
-    grid = pixel_grid(lens.height, lens.width).double().reshape(1, -1, 2)
-    rays = directions(lens, grid)[0]
-    at = (rays @ canvas.K[0].T)[:, :2] - 0.5
-    u, v = torch.where(rays.isfinite().all(-1, keepdim=True), at, -9.0).numpy().T
-    return np.ascontiguousarray(u), np.ascontiguousarray(v)
-
-
-def _lenses(cameras: Cameras) -> tuple[Cameras, torch.Tensor]:
-    """The distinct intrinsics among cameras, and which each camera has."""
-    rows = torch.cat([cameras.K.flatten(1), cameras.distortion], -1)
-    unique, which = torch.unique(rows, dim=0, return_inverse=True)
-    first = [int((which == k).nonzero()[0]) for k in range(len(unique))]
-    return cameras[first], which
-
-
-def _border(width: int, height: int) -> Float[Tensor, "n 2"]:
-    """Points along the outline of an image, and the middle lines, where a bulging lens reaches farthest."""
-    x = torch.linspace(0, width, 65, dtype=torch.float64)
-    y = torch.linspace(0, height, 65, dtype=torch.float64)
-    return torch.cat(
-        [torch.stack([x, torch.full_like(x, v)], -1) for v in (0, height)]
-        + [torch.stack([torch.full_like(y, u), y], -1) for u in (0, width)]
-    )
