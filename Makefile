@@ -3,7 +3,7 @@ PYTHON ?= python3
 VENV := .venv
 BIN := $(VENV)/bin
 
-.PHONY: setup demo test test-processors attack lint clean
+.PHONY: setup demo test test-processors attack lint site clean
 .DEFAULT_GOAL := demo
 
 $(VENV)/.installed: pyproject.toml
@@ -30,5 +30,8 @@ test: lint  ## Linters, type checker and the whole test suite
 test-processors: setup  ## The numerically delicate tests as other processors and thread counts see them
 	$(BIN)/python tests/processors.py $(PROFILES)
 
+site: setup  ## The documents as a web site: site/index.html (the test suite builds it, too)
+	$(BIN)/mkdocs build --strict
+
 clean:
-	rm -rf runs .pytest_cache .ruff_cache
+	rm -rf runs site .pytest_cache .ruff_cache

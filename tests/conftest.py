@@ -33,7 +33,7 @@ def seeded() -> None:
 
 @pytest.fixture(scope="session")
 def shared() -> Path:
-    """../shared: real footage and reference numbers that are not ours to commit."""
+    """The folder of real footage and reference numbers, which are not part of the repository ($SWIMM3R_SHARED)."""
     if not (SHARED / "data").is_dir():
         pytest.skip(f"{SHARED} is not here: nothing was checked against real footage or reference numbers")
     return SHARED

@@ -15,7 +15,7 @@ from pathlib import Path
 
 ROOT = Path(__file__).parents[1]
 DELICATE = (  # chains of searches and optimizations, where the last digit can decide
-    "tests/test_run.py",
+    "tests/pipeline/test_run.py",
     "tests/localization",
     "tests/sfm/colmap/test_poses.py",
     "tests/sfm/plane_sweep/test_estimate.py",

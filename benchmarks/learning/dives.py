@@ -1,6 +1,6 @@
 """The dives that the small experiment learns from and is tested on: OUT/train, OUT/test.
 
-    python benchmarks/learning/dives.py OUT [--train 48] [--test 8] [--frames 24] [--air ../shared/data/air_office_a]
+    python benchmarks/learning/dives.py OUT [--train 48] [--test 8] [--frames 24] [--air FOLDER]
 
 Every dive has a seafloor of its own and water drawn from one of the paper's four families in turn; `--air` adds
 images taken in air with depth and poses, which get their water in training.

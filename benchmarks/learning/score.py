@@ -1,7 +1,7 @@
 """What the small student learned: its matches, depth and poses beside the teacher's, and its water beside Sea-Thru's.
 
     python benchmarks/learning/score.py DIVES/test OUT/teacher.safetensors OUT/student/adapter.safetensors
-        [--real ../shared/data/ruie_teal_rocks ...] [--flsea ../shared/data/flsea_samples] [--sea-thru]
+        [--real CLIP ...] [--flsea FOLDER] [--sea-thru]
 
 On held-back dives everything is compared with the truth; a row is one network on one kind of image.
 

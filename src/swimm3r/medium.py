@@ -1,4 +1,4 @@
-"""What the water does to an image, and how to undo it (Akkaynak & Treibitz 2018, 2019; paper Eq. 1-3).
+"""What the water does to an image, and how to undo it (Akkaynak & Treibitz 2018, 2019; paper Eqs. 2-4).
 
     I = J * T_D + Binf * (1 - T_B),   T_D = exp(-beta_D * z),   T_B = exp(-beta_B * z)
 
@@ -71,7 +71,7 @@ class MediumFit:
 def transmittances(
     ray_depth: Float[Tensor, "*pixels"], medium: Medium
 ) -> tuple[Float[Tensor, "*pixels 3"], Float[Tensor, "*pixels 3"]]:
-    """T_D and T_B (Eq. 1): the shares of scene light kept, and of veiling light still missing, at each depth."""
+    """T_D and T_B (Eq. 2): the shares of scene light kept, and of veiling light still missing, at each depth."""
     z = ray_depth[..., None]
     return torch.exp(-medium.beta_D * z), torch.exp(-medium.beta_B * z)
 
@@ -84,7 +84,7 @@ def backscatter(ray_depth: Float[Tensor, "*pixels"], medium: Medium) -> Float[Te
 def add_water(
     J: Float[Tensor, "*pixels 3"], ray_depth: Float[Tensor, "*pixels"], medium: Medium
 ) -> Float[Tensor, "*pixels 3"]:
-    """The image a camera takes through the water (Eq. 2)."""
+    """The image a camera takes through the water (Eq. 3)."""
     T_D, _ = transmittances(ray_depth, medium)
     return J * T_D + backscatter(ray_depth, medium)
 
@@ -95,7 +95,7 @@ def remove_water(
     medium: Medium,
     min_transmittance: float = 0.05,
 ) -> Float[Tensor, "*pixels 3"]:
-    """The inverse of `add_water` (Eq. 3). Not clamped: who shows it clamps, losses that punish overshoot need it."""
+    """The inverse of `add_water` (Eq. 4). Not clamped: who shows it clamps, losses that punish overshoot need it."""
     T_D, _ = transmittances(ray_depth, medium)
     return (I - backscatter(ray_depth, medium)) / T_D.clamp(min=min_transmittance)
 

@@ -59,7 +59,7 @@ def gaussians(n: int = 5) -> Gaussians:
 
 
 def test_on_the_image_plane_mass_and_second_moments_are_those_of_the_beta_kernel():
-    """Uwbs.md 1.4, summed over pixels: one splat of exponent B against the Gaussian that stands for it."""
+    """Mass and moments summed over pixels: one splat of exponent B against the Gaussian that stands for it."""
     B, o, radius, size = 4.0, 0.4, 60.0, 200
     near = {"mean2d": torch.full((1, 2), size / 2), "color": torch.ones(1, 3), "depth": torch.ones(1)}
 

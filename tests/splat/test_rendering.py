@@ -24,7 +24,7 @@ def test_where_nothing_is_there_is_only_water(wall, camera):
 
 
 def test_a_surface_looks_as_the_water_makes_it_look_along_the_ray(wall, camera):
-    """One opaque primitive far off the axis: Eq. 2 at its *ray* depth, in the share that it covers."""
+    """One opaque primitive far off the axis: Eq. 3 at its *ray* depth, in the share that it covers."""
     view = camera()
     scene = wall(10)
     p = select(scene.primitives, torch.tensor([0]))

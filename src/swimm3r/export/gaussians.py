@@ -1,7 +1,8 @@
 """A map as Gaussians that 3DGS viewers show, without its water.
 
 Gaussians leave as they are, their harmonics with the Condon-Shortley sign that viewers expect. A Beta splat of exponent
-B on the ellipse of covariance S has on the image plane the mass and the second moments of a Gaussian with (uwbs.md 1.4)
+B on the ellipse of covariance S has on the image plane the mass and the second moments of a Gaussian with
+(docs/derivations/beta-primitives.md#a-gaussian-of-equal-moments)
 
     covariance S / (2 (B + 2)),   peak o (B + 2) / (B + 1), at most 0.999
 

@@ -1,4 +1,4 @@
-"""Placing an image in a map, by GS-CPR's protocol as the paper uses it (metrics.md 11).
+"""Placing an image in a map, by GS-CPR's protocol as the paper uses it (docs/derivations/localization.md).
 
 1. retrieve    the references that look most like the query;
 2. coarse      the query's matches with them, whose pixels have depth: PnP with RANSAC;

@@ -43,8 +43,8 @@ _CONFIG_REMEDY = Remedy(
     fault="cannot be used",
 )
 
-# in short runs, and faster without (benchmarks/README.md): SGG costs 0.1 dB on the synthetic dive, and poses refined
-# along with the map 0.5 dB on ruie_green_rock, whose poses were good
+# better without in short runs, and faster (docs/experiments/sgg.md, docs/experiments/training-poses.md): SGG costs
+# 0.1 dB on the synthetic dive, and poses refined along with the map 0.5 dB on ruie_green_rock
 WITHOUT_SGG, HELD_POSES = SggSettings(enabled=False), TrainingPoseSettings(enabled=False)
 LAPTOP = UwbsSettings(  # the paper's settings are made for a GPU
     iterations=5000,
@@ -144,7 +144,7 @@ PRESETS: dict[Preset, RunSettings] = {
             long_side=480,
             initial=InitialSettings(primitives=25_000),
             densify=DensifySettings(cap_max=50_000),
-            # UBS's rates are made for ten times as many steps (benchmarks/README.md says what these are worth)
+            # UBS's rates are made for ten times as many steps (docs/experiments/short-runs.md)
             rates=LearningRates(
                 xyz=1e-3, query_mean=3e-3, rgb=1e-2, beta=4e-3, scale=1e-2, lower=4e-3, final_rate_factor=0.1
             ),

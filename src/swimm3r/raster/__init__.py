@@ -2,7 +2,7 @@
 
     I = B_inf + sum_i w_i (c_i e^{-beta_D z_i} - B_inf e^{-beta_B z_i}),   w_i = T_i alpha_i
 
-which is the paper's Eqs. ugs_veil and ugs_render after summation by parts (raster.md 1). `numba` runs on the CPU,
+which is the paper's Eqs. 11 and 12 after summation by parts (docs/derivations/compositing.md). `numba` runs on the CPU,
 `warp` on CUDA, `reference` is the literal float64 oracle for tiny scenes.
 """
 
@@ -76,10 +76,10 @@ def rasterize(
 
     `medium=None` is clear water: no veil, no attenuation. Pairs fainter than `alpha_min` are skipped; a Gaussian has no
     other end, so it needs one. `sgg` is added to in place when the gradient is taken. Without `medium_depth_grad` only
-    `z_depth` moves a primitive in depth, not the light that the water takes and adds (uwbs.md 6.7). `auto` takes Numba
-    on the CPU and Warp on CUDA, both in float32; `reference` keeps the inputs' precision. Outputs and gradients have
-    the inputs' dtype.
-    Raises ValueError where shapes, or `bins` made for another image, do not fit.
+    `z_depth` moves a primitive in depth, not the light that the water takes and adds
+    (docs/derivations/compositing.md#readings-of-the-paper). `auto` takes Numba on the CPU and Warp on CUDA, both in
+    float32; `reference` keeps the inputs' precision. Outputs and gradients have the inputs' dtype. Raises ValueError
+    where shapes, or `bins` made for another image, do not fit.
     """
     _check(p, medium, height, width)
     _check_cut(alpha_min, kernel)

@@ -9,7 +9,7 @@ Both kernels are f = 2^(b l), l = log2(1 - r2) or -r2 log2 e, and fall by b f / 
 The adjoint walks front to back again. With a payload e_i = dL/dw_i per branch of Alg. 1 and R_i = sum_{j > i} w_j e_j,
 which is the total known from the forward images minus the running sum,
 
-    dL/dalpha_i = T_i e_i - R_i / (1 - alpha_i)                                                         (uwbs.md 6.3)
+    dL/dalpha_i = T_i e_i - R_i / (1 - alpha_i)              (docs/derivations/compositing.md#the-adjoint-of-alpha)
 
 `make` is called with numba.njit and with warp's wp.func: plain scalars, no loops, no branches, no arrays.
 """

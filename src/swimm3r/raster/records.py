@@ -15,11 +15,11 @@ TILE = 16
 ALPHA_MIN = 1 / 255
 """Pairs fainter than this are skipped by default; the paper and the vectors cut nothing (alpha_min=0)."""
 ALPHA_MAX = 0.999
-"""Opacity of one pair is capped here; a capped pair has no gradient toward its shape (uwbs.md 1.4)."""
+"""Opacity of one pair is capped here; a capped pair has no gradient toward its shape."""
 Kernel = Literal["beta", "gaussian"]
 """How a primitive fades from its center: (1 - r2)^b within r2 < 1, or e^{-b r2}, which only `alpha_min` ends."""
 T_MIN = 1e-4
-"""A pixel ends *before* the primitive that would bring its transmittance to this or below (uwbs.md 1.5)."""
+"""A pixel ends *before* the primitive that would bring its transmittance to this or below."""
 
 
 class Primitives2D(NamedTuple):
@@ -44,7 +44,7 @@ class MediumMaps(NamedTuple):
 class RasterOutput(NamedTuple):
     """The images of one camera. The expected depth is z_depth / alpha."""
 
-    rgb: Float[Tensor, "3 h w"]  # with its water (Eq. ugs_render)
+    rgb: Float[Tensor, "3 h w"]  # with its water (Eq. 12)
     clear: Float[Tensor, "3 h w"]  # without: sum_i w_i c_i
     z_depth: Float[Tensor, "h w"]  # sum_i w_i z_i, not normalized
     alpha: Float[Tensor, "h w"]  # 1 - T_{K+1}
@@ -54,7 +54,7 @@ class SggBuffers(NamedTuple):
     """Parts of the projected-center gradient (Alg. 1), added to in place by the adjoint; start from `zeros`.
 
     The clear-object, clear-image, depth and alpha branches make `geo`, attenuation and backscatter `med`;
-    geo + med is the plain gradient of mean2d. (uwbs.md 6.4)
+    geo + med is the plain gradient of mean2d (docs/derivations/compositing.md#branches-of-the-adjoint).
     """
 
     geo: Float[Tensor, "n 2"]

@@ -1,7 +1,7 @@
 """The rasterizer as the paper writes it, in torch: slow, dense, the oracle of the fast ones.
 
-    V(u) = sum_i T_i (e^{-beta_B z_{i-1}} - e^{-beta_B z_i}) + T_{K+1} e^{-beta_B z_K},  z_0 = 0       (Eq. ugs_veil)
-    I(u) = sum_i T_i alpha_i c_i e^{-beta_D z_i} + B_inf V(u),  T_i = prod_{j<i} (1 - alpha_j)         (Eq. ugs_render)
+    V(u) = sum_i T_i (e^{-beta_B z_{i-1}} - e^{-beta_B z_i}) + T_{K+1} e^{-beta_B z_K},  z_0 = 0       (Eq. 11)
+    I(u) = sum_i T_i alpha_i c_i e^{-beta_D z_i} + B_inf V(u),  T_i = prod_{j<i} (1 - alpha_j)         (Eq. 12)
 
 Every pixel meets every primitive, so memory is pixels x primitives: for scenes of a few hundred primitives.
 """
@@ -31,7 +31,7 @@ class Blend:
 
 @dataclass(frozen=True)
 class AlphaAdjoint:
-    """dL/dalpha_i by the branch it comes through (uwbs.md 6.4); the branches add up to the full adjoint."""
+    """dL/dalpha_i by branch (docs/derivations/compositing.md#branches-of-the-adjoint); they add up to the full one."""
 
     clear: Float[Tensor, "*pixels k"]  # the image loss, as if it looked at the water-free image
     attenuation: Float[Tensor, "*pixels k"]
@@ -70,7 +70,7 @@ def transmittance(alpha: Float[Tensor, "*pixels k"]) -> Float[Tensor, "*pixels k
 def blend(
     alpha: Float[Tensor, "*pixels k"], color: Float[Tensor, "k 3"], z: Float[Tensor, " k"], medium: MediumMaps
 ) -> Blend:
-    """Eqs. ugs_veil and ugs_render, literally. Primitives stand front to back; medium maps are [*pixels, 3] here.
+    """Eqs. 11 and 12, literally. Primitives stand front to back; medium maps are [*pixels, 3] here.
 
     A pair with alpha = 0 changes nothing, so skipped pairs may stay in the list.
     """
@@ -92,7 +92,9 @@ def split_alpha_adjoint(
     medium: MediumMaps,
     cotangent: RasterOutput,
 ) -> AlphaAdjoint:
-    """dL/dalpha of each branch, in closed form (uwbs.md 6.3-6.4); maps are [*pixels, 3] or [*pixels].
+    """dL/dalpha of each branch, in closed form; maps are [*pixels, 3] or [*pixels].
+
+    Derived in docs/derivations/compositing.md#the-adjoint-of-alpha.
 
     The loss depends on alpha only through sum_i w_i e_i, with a payload e_i per branch; back to front,
     dL/dalpha_i = T_i (e_i - R_{i+1}),  R_i = alpha_i e_i + (1 - alpha_i) R_{i+1}.
@@ -147,7 +149,7 @@ class _Pairs:
 
 
 def _pairs(p: Primitives2D, height: int, width: int, alpha_min: float, kernel: Kernel) -> _Pairs:
-    """Alpha of every pair, with the cut-offs of uwbs.md 1.4 and 1.5."""
+    """Alpha of every pair, with the cut-offs of docs/derivations/beta-primitives.md#kernel."""
     A, B, C = p.conic.unbind(-1)
     drawn = (p.depth > 0) & p.depth.isfinite() & (A * C - B * B > 0) & (A > 0)
     order = torch.argsort(p.depth, stable=True)

@@ -1,4 +1,6 @@
-"""A camera's pose refined against a frozen map: the protocol that test frames are scored under (uwbs.md 4.2).
+"""A camera's pose refined against a frozen map: the protocol that test frames are scored under.
+
+The protocol is that of 3R-GS (docs/derivations/compared-methods.md#3r-gs):
 
     cam2world' = cam2world [R(w) | length v]
 

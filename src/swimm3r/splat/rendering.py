@@ -42,7 +42,7 @@ class RenderOutput:
 
     rgb: Float[Tensor, "h w 3"]  # as the camera sees it
     clear: Float[Tensor, "h w 3"]  # J, without the water: the color of what covers a pixel; black where nothing does
-    backscatter: Float[Tensor, "h w 3"]  # Binf V, the light of the water alone (Eq. ugs_veil)
+    backscatter: Float[Tensor, "h w 3"]  # Binf V, the light of the water alone (Eq. 11)
     z_depth: Float[Tensor, "h w"]  # expected, scene units; 0 where nothing is
     alpha: Float[Tensor, "h w"]
     medium: Medium  # per pixel, [h, w, 3], per scene unit of ray depth

@@ -8,7 +8,7 @@ from swimm3r.settings import Count, NotNegative, Range, Rate, Settings, Share
 
 @dataclass(frozen=True)
 class MediumFieldSettings(Settings):
-    """The ambient field A_phi of Eq. ambient_medium."""
+    """The ambient field A_phi of Eq. 10."""
 
     model: Literal["network", "none"] = "network"
     """none is clear water before black: Beta splatting without the underwater part (UBS)."""

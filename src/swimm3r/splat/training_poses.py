@@ -1,4 +1,4 @@
-"""The training frames' poses, refined together with the map (3R-GS; uwbs.md 4.2).
+"""The training frames' poses, refined together with the map (docs/derivations/compared-methods.md#3r-gs).
 
     cam2world_i' = cam2world_i [R(w_i) | spread v_i],   (v_i, w_i) = MLP(code_i)
 

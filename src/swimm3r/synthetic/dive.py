@@ -1,6 +1,6 @@
 """A synthetic dive: images through known water, with everything about them known.
 
-    raw = add_water(clear, ray_depth, medium), and Binf where a ray meets nothing      (paper Eq. 1-3)
+    raw = add_water(clear, ray_depth, medium), and Binf where a ray meets nothing      (paper Eqs. 2-4)
 
 on values as stored (sRGB), before fish, snow, vignetting and noise. Truth is of the still scene: depth and `clear` are
 what lies behind the fish, and `usable` is False wherever it shows. Caustics are light, not water: `clear` has them.

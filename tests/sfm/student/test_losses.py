@@ -156,7 +156,7 @@ def test_far_away_the_inverse_divides_by_the_floor_and_stays_finite():
 
 
 def test_beyond_the_floor_under_t_d_the_inverse_loss_pulls_the_true_veil_down_and_leaves_beta_d_alone():
-    """A bias of Eq. stage1_loss_inv itself: where T_D < eps_inv the true water restores too dark an image."""
+    """A bias of Eq. 6 itself: where T_D < eps_inv the true water restores too dark an image."""
     J, z, medium = scene()
     far = z + 30
     I = add_water(J, far, medium)

@@ -30,7 +30,7 @@ def view_of(dive, k: int = 3):
 
 
 def test_the_image_is_the_one_that_its_kernel_adds_up(tiny_dive):
-    """Uwbs.md 3.2, pair by pair in depth order: sums with z_{i-1}, and the medium behind the last."""
+    """The published sums, pair by pair in depth order: with z_{i-1}, and the medium behind the last."""
     start = recipe(tiny_dive)
     state, view = start.start(), view_of(tiny_dive)
     sight = pinhole(view.camera)

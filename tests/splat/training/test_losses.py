@@ -149,7 +149,7 @@ def test_the_weights_are_normalized_so_that_lambda_depth_is_what_it_says(tiny_di
 
 
 def test_an_edge_of_a_tenth_counts_half_or_less_by_default():
-    """On ruie_teal_rocks the depth maps step twice as far there as where the image is flat (benchmarks/README.md)."""
+    """Real depth maps step twice as far there as where the image is flat (docs/experiments/objective.md)."""
     rgb = torch.zeros(3, 6, 8)
     rgb[:, :, 4:] += 0.1
     rgb[:, 3:] += 0.1

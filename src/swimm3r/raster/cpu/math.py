@@ -1,8 +1,8 @@
 """Scalar functions that LLVM can vectorize across pixels, and the flags the kernels need for that.
 
-libm's exp2 and log2 are calls and stop the vectorizer, so both are polynomials here (raster.md 6), good to 3e-7 with
-float32's rounding. `contract` and the no-NaN flags are on everywhere, but `reassoc` only for the sums of the adjoint:
-both passes must round alike to take the same decisions.
+libm's exp2 and log2 are calls and stop the vectorizer, so both are polynomials here
+(docs/derivations/raster-kernels.md), good to 3e-7 with float32's rounding. `contract` and the no-NaN flags are on
+everywhere, but `reassoc` only for the sums of the adjoint: both passes must round alike to take the same decisions.
 """
 
 from typing import Any, no_type_check

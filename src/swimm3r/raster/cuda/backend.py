@@ -6,7 +6,8 @@ coalesced atomic. No thread leaves a loop before its warp does, so pixels outsid
 atomics make the last bits of GPU gradients vary from run to run. The same source runs on the CPU, one thread after the
 other, for tests.
 
-Warp's own adjoint of a loop that carries T is wrong (raster.md 3.6): ours is written by hand, and its is switched off.
+Warp's own adjoint of a loop that carries T is wrong (docs/derivations/raster-kernels.md): ours is written by hand, and
+its is switched off.
 """
 
 import inspect

@@ -10,7 +10,7 @@ from swimm3r.sfm.mast3r.settings import LoraSettings, ObjectiveSettings
 
 @dataclass(frozen=True)
 class TrainSettings(Settings):
-    """Distillation of the frozen network into its low-rank student, with the physics head (`sfm/training.py`)."""
+    """Distillation of the frozen network into a low-rank student with the physics head (`sfm/distillation/loop.py`)."""
 
     lora: LoraSettings = field(default_factory=LoraSettings)
     objective: ObjectiveSettings = field(default_factory=ObjectiveSettings)

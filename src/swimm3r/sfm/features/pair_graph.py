@@ -29,8 +29,10 @@ Pairs = list[tuple[int, int]]
 
 
 def parse_graph(text: str) -> PairGraph:
-    """The graph a command line names: complete, swin[-K][-cyclic], logwin[-K][-cyclic], oneref[-FRAME],
-    retrieval[-KEYS-K], video[-WINDOW-CLOSURES].
+    """The graph that a text names.
+
+        complete    swin[-K][-cyclic]    logwin[-K][-cyclic]    oneref[-FRAME]    retrieval[-KEYS-K]
+        video[-WINDOW-CLOSURES]
 
     Raises UsageError for anything else, a number that does not parse included.
     """

@@ -135,7 +135,7 @@ class LoraSettings(Settings):
 
 @dataclass(frozen=True)
 class ObjectiveSettings(Settings):
-    """What is minimized (`sfm/student/losses.py`); the defaults are the paper's, Eq. geom to stage1_objective."""
+    """What is minimized (`sfm/student/losses.py`); the defaults are the paper's, Eqs. 1 to 8."""
 
     encoder: NotNegative = 0.5
     decoder: NotNegative = 0.5
@@ -158,7 +158,7 @@ class ObjectiveSettings(Settings):
     """Weight of the head's mistake in T_D and B themselves, in images whose water the augmentation drew. Not in the
     paper: L_inv makes a head that is not sure err on the side of clear water, and this does not."""
     min_transmittance: PositiveShare = 0.05
-    """eps_inv of Eq. swimm3r_render_inverse; the paper gives none. At 1/20 a noise of 1/255 stays below 0.08."""
+    """eps_inv of Eq. 4; the paper gives none. At 1/20 a noise of 1/255 stays below 0.08."""
 
     @property
     def physics(self) -> bool:

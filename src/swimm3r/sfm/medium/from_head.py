@@ -166,7 +166,7 @@ def predicted_images(
     progress: Progress = silent,
     gains: Float[Tensor, "3"] | None = None,
 ) -> Iterator[tuple[int, RestoredImage]]:
-    """Every frame with depth, by its place in `rec`: the inverse of Eq. 3, clamped, by the frame's own water.
+    """Every frame with depth, by its place in `rec`: Eq. 4, clamped, by the frame's own water.
 
     Unknown depth is filled in along the edges; open water keeps the color it has. `gains` balance the images as shown.
     """

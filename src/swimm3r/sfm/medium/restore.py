@@ -1,4 +1,4 @@
-"""Images and points as they would look without the water: the inverse of Eq. 2, kept from amplifying noise.
+"""Images and points as they would look without the water: the inverse of Eq. 3, kept from amplifying noise.
 
     D = I - B(z),   J = D / T_D(z)
 

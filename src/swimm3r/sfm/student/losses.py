@@ -1,10 +1,10 @@
 """What medium-aware training minimizes: the student's features against the teacher's, and the water against images.
 
-    L_geom = sum_k lambda_k |F_k - F~_k|^2       k: encoder, decoder, descriptors            (Eq. geom)
-    L_for  = 1/N sum_n |I->_n - I_n|_1           I-> = add_water(J)                          (Eq. stage1_loss_for)
-    L_inv  = 1/N sum_n |J<-_n - J_n|_1           J<- = remove_water(I), not clamped          (Eq. stage1_loss_inv)
-    L_sat  = 1/N sum_n |[J<- - 1]+|^2 + |[-J<-]+|^2 + 0.5 |Binf - Q_0.05(I)|^2               (Eq. stage1_loss_sat)
-    L_SfM  = L_geom + L_for + L_inv + L_sat                                                  (Eq. stage1_objective)
+    L_geom = sum_k lambda_k |F_k - F~_k|^2       k: encoder, decoder, descriptors            (Eq. 1)
+    L_for  = 1/N sum_n |I->_n - I_n|_1           I-> = add_water(J)                          (Eq. 5)
+    L_inv  = 1/N sum_n |J<-_n - J_n|_1           J<- = remove_water(I), not clamped          (Eq. 6)
+    L_sat  = 1/N sum_n |[J<- - 1]+|^2 + |[-J<-]+|^2 + 0.5 |Binf - Q_0.05(I)|^2               (Eq. 7)
+    L_SfM  = L_geom + L_for + L_inv + L_sat                                                  (Eq. 8)
 
 and where the augmentation drew the water, of weight 0 unless asked for, because the paper has no such term:
 

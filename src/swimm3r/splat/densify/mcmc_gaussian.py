@@ -1,4 +1,4 @@
-"""Relocation, growth and noise for Gaussians (3DGS-MCMC; uwbs.md 2.6, 5).
+"""Relocation, growth and noise for Gaussians (3DGS-MCMC; docs/derivations/compared-methods.md#mcmc-gs).
 
 A Gaussian of opacity o that n of them replace gives each o' = 1 - (1 - o)^(1/n), and so that together they look as
 before along a line through their middle, scales times

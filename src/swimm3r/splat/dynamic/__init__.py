@@ -1,1 +1,1 @@
-"""What moves: found (`movement`), followed (`tracking`, `passages`), placed (`courses`), born (`births`, `travel`)."""
+"""Moving objects: found, tracked, located by trajectory triangulation, and given primitives that travel with them."""

@@ -1,4 +1,4 @@
-"""The water as a field over ray directions: A_phi of Eq. ambient_medium.
+"""The water as a field over ray directions: A_phi of Eq. 10.
 
     (Binf, beta_B, beta_D)(u, t) = sigma_med[A_phi(SH(d(u)), gamma(t))]
 
@@ -208,7 +208,7 @@ def deviation(grid: FieldGrid, prior: WaterPrior) -> Float[Tensor, ""]:
 
 
 def smoothness(grid: FieldGrid) -> Float[Tensor, ""]:
-    """L_smooth (Eq. medium_smooth): mean absolute difference of neighboring pixels, down plus right, of all nine maps.
+    """L_smooth (Eq. 16): mean absolute difference of neighboring pixels, down plus right, of all nine maps.
 
     Along an interpolated edge the differences between pixels add up to those between grid points, so those over the
     step have the same mean wherever neighboring edges slope the same way.

@@ -1,4 +1,6 @@
-"""Beta primitives: what one stores, its activations, and the set that training starts from (uwbs.md 1.1, 1.2, 1.6).
+"""Beta primitives: what one stores, its activations, and the set that training starts from.
+
+Derived in docs/derivations/beta-primitives.md.
 
     V = L L^T,   L = [[R diag(s_1..3), 0], [L21, L22]],   R = I + A,   A antisymmetric
 

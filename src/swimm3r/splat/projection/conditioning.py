@@ -1,4 +1,6 @@
-"""A primitive as seen from one direction: the conditional of its joint Gaussian, and of its Beta opacity (uwbs.md 1.3).
+"""A primitive as seen from one direction: the conditional of its joint Gaussian, and of its Beta opacity.
+
+Derived in docs/derivations/beta-primitives.md#conditioning.
 
 With V = [[V11, V12], [V21, V22]], G = V12 V22^-1, x = q - mu_q, lambda = min(B_q / 4, 1), V22 = Lc Lc^T, y = Lc^-1 x:
 

@@ -1,11 +1,13 @@
 """Conditioning for a block of primitives at a time, and its closed-form gradient: the fast form of `conditioning`.
 
-With W = L21^T V22^-1 diag(lambda) and V22 = Lc Lc^T, the conditional of uwbs.md 1.3 never forms V12:
+With W = L21^T V22^-1 diag(lambda) and V22 = Lc Lc^T, the conditional of
+docs/derivations/beta-primitives.md#conditioning never forms V12:
 
     m = mu + L11 W x,   S = L11 (I - W L21) L11^T,   opacity = o exp(sum_j B_j (ln 2 - softplus(2 y_j^2)))
 
 float32, R = I + A. `load`, `condition` and `conditioning_gradients` are inlined into the kernel of `projection_cpu`.
-The gradient is uwbs.md 12.2 for the factored form; D_ names the loss's gradient by a quantity.
+The gradient is that of docs/derivations/gradients.md#conditioning in factored form; D_ names the loss's gradient by a
+quantity.
 """
 
 from typing import no_type_check

@@ -1,8 +1,9 @@
 """From stored primitives to the image plane and back in one pass on the CPU: `conditioning` and `projection` fused.
 
 One kernel runs blocks of LANES primitives through a small workspace (`lanes`), forward, and, where gradients are asked
-for, back again by the closed forms of uwbs.md 12.1 and 12.2; nothing per primitive is kept in between. Only primitives
-with a gradient go back. The pose's is summed block by block, so that no result depends on the number of threads.
+for, back again by the closed forms of docs/derivations/gradients.md; nothing per primitive is kept in between. Only
+primitives with a gradient go back. The pose's is summed block by block, so that no result depends on the number of
+threads.
 """
 
 import zlib
@@ -111,7 +112,7 @@ def onto_plane(g, camera, three, two):
 @no_type_check
 @math.inlined
 def plane_gradients(g, ids, start, count, camera, three, two, d_mean2d, d_conic, d_depth):
-    """D_AT, D_M, D_COV and D_MEAN of what the rasterizer says about centers, conics and depths (uwbs.md 12.1)."""
+    """D_AT, D_M, D_COV and D_MEAN of centers, conics and depths (docs/derivations/gradients.md#projection)."""
     zero(g, D_AT, three, 1)
     zero(g, D_PLANE, two, two)
     fx, fy = camera[FX], camera[FY]

@@ -1,4 +1,4 @@
-"""Primitives on the image plane of a real pinhole camera (uwbs.md 2.1, 1.4).
+"""Primitives on the image plane of a real pinhole camera (docs/derivations/beta-primitives.md#projection).
 
     mu = (fx x / z + cx, fy y / z + cy),   Sigma2 = J R S R^T J^T + 0.3 I,   conic = Sigma2^-1
 

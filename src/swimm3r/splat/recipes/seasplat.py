@@ -2,8 +2,8 @@
 
 For a third of the run I = J + b (1 - alpha) before a learned background b; then the water of `scene_water`, whose Binf
 begins as b. It learns in bursts that the run does not count: 1,000 steps of its own when it comes, followed by 2,000 of
-the colors alone, and 50 more every 100 steps; in between it stands still. Losses (uwbs.md 4.1), with d detached where
-it weighs:
+the colors alone, and 50 more every 100 steps; in between it stands still. Losses
+(docs/derivations/compared-methods.md#seasplat), with d detached where it weighs:
 
     0.8 L1 + 0.2 (1 - SSIM)                     mean |d (I - gt)|                0.01 mean alpha where I looks like Binf
     2 mean |grad d| e^{-grad gt}                and with water: 0.1 mean_c (mean J_c - 0.5)^2

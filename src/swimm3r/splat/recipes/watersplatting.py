@@ -2,8 +2,9 @@
 
     I = sum_i w_i c_i e^{-beta_D z_i} + Binf V,   L = 0.8 mean |(I - gt) / (sg(I) + eps)| + 0.2 (1 - SSIM)
 
-with both images of SSIM divided by sg(I) + eps, too (uwbs.md 3). The image is formed as UWBS forms it.
-Gaussians multiply by absolute gradients and are culled by opacity; opacities are cut back now and then.
+with both images of SSIM divided by sg(I) + eps, too (docs/derivations/compared-methods.md#watersplatting). The image is
+formed as UWBS forms it. Gaussians multiply by absolute gradients and are culled by opacity; opacities are cut back now
+and then.
 
 Where we depart from the publication: exact harmonics of the pixel's ray where its encoding sees 2 d - 1; pixel centers
 at +0.5; exact gradients where its backward pass leaves out depth and mistakes the cap on alpha; SSIM pads with zeros;

@@ -1,1 +1,1 @@
-"""The training of a map: its scene, its loop, its losses and scene-guided gradients."""
+"""The training of a map: its scene, its loop, its losses and scattering-aware gradients."""
