@@ -105,10 +105,10 @@ def _run_command(arguments: list[str]) -> None:
     while arguments and arguments[0] in FLAGS and len(arguments) > 1:  # swimm3r -q run ...
         arguments = [*arguments[1:], arguments[0]]
     with settings_with_ranges():
-        _parse_and_run(_commands(arguments), arguments)
+        _parse_and_run(commands_for(arguments), arguments)
 
 
-def _commands(arguments: Sequence[str]) -> dict[str, Callable | Family]:
+def commands_for(arguments: Sequence[str]) -> dict[str, Callable | Family]:
     """Every command, with the defaults that its command line decides."""
     is_pipeline = arguments[:1] and arguments[0] in ("run", "prepare", "sfm", "splat")
     start = starting_point(arguments if is_pipeline else ())
