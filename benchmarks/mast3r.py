@@ -1,4 +1,4 @@
-"""What the full-size MASt3R network costs: CPU seconds per encoding, pair and head, and memory; weights are random.
+"""Cost of the full-size MASt3R network: CPU seconds per encoding, pair and head, and memory; weights are random.
 
     python benchmarks/mast3r.py [--device cpu|cuda|mps] [--dtypes float32 bfloat16] [--height 384 --width 512]
 

@@ -1,4 +1,4 @@
-"""How good and how fast the plane sweep is, on clips whose depth is known; images of its depth maps on any clip.
+"""Accuracy and speed of the plane sweep on clips of known depth; images of its depth maps on any clip.
 
     python benchmarks/plane_sweep.py CLIP [CLIP ...] [--every N] [--frames N] [--out DIR] [--set min_ncc=0.5 ...]
 

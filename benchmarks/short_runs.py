@@ -1,4 +1,4 @@
-"""What the published schedules do to a short run, and what the `fast` preset and `with_recipe` do about it.
+"""The published schedules in short runs, and the changes that the `fast` preset and `with_recipe` make.
 
     python benchmarks/short_runs.py RUN [--iterations 400] [--long-side 160] [--primitives 4000] [--only NAME ...]
 

@@ -1,4 +1,4 @@
-"""What the physics losses themselves do to the water: L_sat's anchor and the floor under T_D, on exact images.
+"""The effect of the physics losses on the water: L_sat's anchor and the floor under T_D, on exact images.
 
 Nothing is learned here. Frames of synthetic dives are seen through water of each family; Binf, beta_B and a constant
 beta_D minimize L_for + L_inv + L_sat by Adam from the head's start: as printed, without the anchor, and with a floor

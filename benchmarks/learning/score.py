@@ -1,4 +1,4 @@
-"""What the small student learned: its matches, depth and poses beside the teacher's, and its water beside Sea-Thru's.
+"""Scores of the small student: matches, depth and poses beside the teacher's, and its water beside Sea-Thru's.
 
     python benchmarks/learning/score.py DIVES/test OUT/teacher.safetensors OUT/student/adapter.safetensors
         [--real CLIP ...] [--flsea FOLDER] [--sea-thru]
@@ -65,7 +65,7 @@ WaterRows = dict[str, np.ndarray]  # what was looked at -> errors of T_D and B
 
 @dataclass(frozen=True)
 class Looked:
-    """What a network says of two views."""
+    """The outputs of a network for two views."""
 
     points: tuple[Tensor, Tensor]  # [h, w, 3] of view 1 and 2 in camera 1
     descriptors: tuple[Tensor, Tensor]  # [h, w, d]

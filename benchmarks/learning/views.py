@@ -82,7 +82,7 @@ def _in_memory(sequence: Sequence, size: int, settings: PairSettings) -> Shots:
 
 
 def true_partners(shots: Shots, i: int, j: int, xy: Float[Tensor, "m 2"]) -> tuple[Tensor, Bool[Tensor, " m"]]:
-    """Where pixels of shot i (centers at +0.5) are in shot j, and whether j sees the same surface there."""
+    """Positions in image j of the pixels of image i (centers at +0.5), and whether j sees the same surface there."""
     height, width = shots.z_depth.shape[1:]
     column, row = xy.long().unbind(-1)
     z = shots.z_depth[i, row, column]

@@ -159,7 +159,7 @@ def _require(holds: Bool[Tensor, " c"], what: str) -> None:
 def distort(
     xy: Float[Tensor, "*points 2"], distortion: Float[Tensor, "*#points d"], model: str
 ) -> Float[Tensor, "*points 2"]:
-    """Where a point (x, y) of the plane z = 1 appears on the distorted plane (equations above)."""
+    """Position on the distorted plane of a point (x, y) of the plane z = 1 (equations above)."""
     r2 = (xy * xy).sum(-1, keepdim=True)
     k = distortion.unbind(-1)
     match model:

@@ -1,4 +1,4 @@
-"""Where tensors live: the processor, or an accelerator where there is one."""
+"""Devices: the CPU, or an accelerator where there is one."""
 
 import importlib.util
 import logging
@@ -32,7 +32,7 @@ def chosen(name: str, accelerators: Sequence[str] = ("cuda", "mps"), option: str
 
 
 def for_maps(name: str = "auto") -> torch.device:
-    """Where a map is trained and rendered: on CUDA by NVIDIA Warp, else on the processor.
+    """The device that trains and renders maps: CUDA with NVIDIA Warp, else the CPU.
 
     Raises DeviceError where "cuda" was asked for and a part of it is missing; "auto" says so in the log.
     """
@@ -46,7 +46,7 @@ def for_maps(name: str = "auto") -> torch.device:
 
 
 def without_warp(instead: str) -> DeviceError:
-    """What is said where a GPU was asked for and its kernels cannot be; `instead` does without."""
+    """The error for a requested GPU whose kernels cannot run; `instead` names the alternative."""
     return DeviceError(
         "the GPU rasterizer needs NVIDIA Warp, which is not installed",
         cause="Swimm3R was installed without its cuda extra",

@@ -105,7 +105,7 @@ def rotation_to_6d(R: Float[Tensor, "*b 3 3"]) -> Float[Tensor, "*b 6"]:
 
 
 def rotation_angle(R: Float[Tensor, "*b 3 3"]) -> Float[Tensor, "*b"]:
-    """How far each rotation turns, radians, 0..pi; accurate at both ends, unlike acos of the trace."""
+    """Angle of each rotation, radians, 0..pi; accurate at both ends, unlike acos of the trace."""
     twice_axis = torch.stack(
         (R[..., 2, 1] - R[..., 1, 2], R[..., 0, 2] - R[..., 2, 0], R[..., 1, 0] - R[..., 0, 1]), -1
     )

@@ -1,4 +1,4 @@
-"""How long work tells its caller how far it is; drawn only by the command line."""
+"""Progress of long work, reported to its caller; drawn only by the command line."""
 
 from typing import Protocol, runtime_checkable
 

@@ -19,7 +19,7 @@ Interval = tuple[float, float]
 
 @dataclass(frozen=True)
 class WaterType:
-    """Where the coefficients of one family lie, per RGB channel."""
+    """Ranges of the coefficients of one family, per RGB channel."""
 
     Binf: tuple[Interval, Interval, Interval]
     beta_D: tuple[Interval, Interval, Interval]  # 1/m

@@ -53,7 +53,7 @@ class Outcome:
 
 @dataclass(frozen=True)
 class Fixture:
-    """What cases damage copies of: a dive's images with its truth, and a finished run of it."""
+    """The undamaged files of all cases: a dive's images with its truth, and a finished run of it."""
 
     dive: Path
     run: Path

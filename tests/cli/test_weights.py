@@ -13,7 +13,7 @@ BODY = b"not a network, but long enough to have a checksum"
 
 @pytest.fixture(autouse=True)
 def home(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
-    """Where downloads go, empty, with the outside world switched off."""
+    """An empty folder for downloads, without network."""
     monkeypatch.setenv("SWIMM3R_WEIGHTS_DIR", str(tmp_path / "weights"))
     monkeypatch.setenv("SWIMM3R_CACHE", str(tmp_path / "cache"))
     monkeypatch.setenv("HF_HUB_OFFLINE", "1")

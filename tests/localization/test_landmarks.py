@@ -1,4 +1,4 @@
-"""Where an image was taken, by its keypoints."""
+"""Localization by keypoints."""
 
 from dataclasses import replace
 

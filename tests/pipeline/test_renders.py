@@ -1,4 +1,4 @@
-"""How a map's views are shown: like the restored frames of the same dive."""
+"""Views of a map are displayed like the restored frames of the same dive."""
 
 import subprocess
 import sys

@@ -1,4 +1,4 @@
-"""What becomes of a run folder: what a changed setting, another process, a kill and a damaged record do to it."""
+"""A run folder under changed settings, another process, a kill and a damaged record."""
 
 import json
 import os

@@ -1,4 +1,4 @@
-"""What may stand in the place of a source or of one of its images, and what names they may have."""
+"""Kinds of files in the place of a source or of its images, and their names."""
 
 import json
 import os

@@ -20,7 +20,7 @@ _MAY_MIX = {"aten::copy_", "aten::_to_copy"}  # what goes from one place to the 
 _INDICES_FROM_ANYWHERE = {"aten::index", "aten::index_put", "aten::index_put_"}
 _WAITS = {"aten::_local_scalar_dense", "aten::nonzero", "aten::_unique2", "aten::repeat_interleave", "aten::bincount"}
 waits: list[str] = []
-"""Where in the package the processor has waited for the device, in turn; whoever counts them empties it first."""
+"""Places in the package where the CPU has waited for the device, in order; a test that counts them empties it first."""
 
 
 class Elsewhere(Tensor):

@@ -44,7 +44,7 @@ class Result:
 
 @dataclass(frozen=True)
 class ResultKey:
-    """Where in the table a cell stands, and so where its folder lies."""
+    """The place of a result in the table, which is also its folder's."""
 
     scene: str
     method: str  # parts that are varied separately stand apart: "colmap / uwbs-static"
@@ -56,7 +56,7 @@ class ResultKey:
 
 
 def scene_folder(out: Path, scene: str) -> Path:
-    """Where the cells of a scene lie."""
+    """The folder of a scene's results."""
     return out / _plain(scene)
 
 

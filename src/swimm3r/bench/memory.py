@@ -1,4 +1,4 @@
-"""What a piece of work costs apart from what ran before it."""
+"""The cost of a piece of work, measured in a process of its own."""
 
 import sys
 from collections.abc import Callable
@@ -19,7 +19,7 @@ _RESET = Path("/proc/self/clear_refs")
 
 
 def in_own_process(work: Callable[..., Result], *given: object) -> Result:
-    """What `work(*given)` returns where nothing has run before: kernels that others loaded, memory that they left.
+    """The result of `work(*given)` in a fresh process: no kernels are loaded yet, no memory is left over.
 
     All of it is sent between processes, so `work` is a module's function or a `partial` of one. Raises its errors, and
     DeviceError where the process was ended from outside.

@@ -35,7 +35,7 @@ class SfmRun:
     frames: str  # the same for runs that took the same frames in the same way
 
     def open(self) -> FinishedSfm:
-        """What its map's training finds."""
+        """The inputs of a map's training."""
         return open_finished_sfm(self.folder)
 
 
@@ -116,7 +116,7 @@ def original_pixels(source: Path, frames: Frames) -> float:
 
 
 def sfm_label(settings: RunSettings, backend: str) -> str:
-    """How poses were found, in a word."""
+    """The name of the method that estimated the poses."""
     match settings.sfm:
         case ColmapSettings(mapping=mapping) if mapping.method != "auto":
             return f"{backend}-{mapping.method}"

@@ -46,7 +46,7 @@ def settings_for(
 
 @dataclass(frozen=True)
 class Uncapped:
-    """What a map was made from and found, before it was thinned to what later stages need."""
+    """The counts of a map before its points and matches are thinned for later stages."""
 
     matches: Matches
     dense_points: int
@@ -60,7 +60,7 @@ class Uncapped:
 def model_scores(
     rec: Reconstruction | None, uncapped: Uncapped | None, frames: int, pixels: float
 ) -> dict[str, float | NotComputed]:
-    """What a map says of itself (the paper's Tab. sfm_metrics); None where no map came about.
+    """Scores of a reconstruction by its own data (the paper's SfM metrics); None without a reconstruction.
 
     `frames` were asked for; `pixels` is original pixels per pixel of the frames.
     """

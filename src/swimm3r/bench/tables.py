@@ -161,7 +161,7 @@ def _missing(table: Table) -> str:
 
 
 def _notes(table: Table) -> str:
-    """What the columns mean, those that mean the same but for a threshold together."""
+    """The meaning of the columns; columns that differ only by a threshold share a line."""
     notes: dict[str, list[str]] = {}
     for c in table.shown:
         notes.setdefault(c.note, []).append(f"{c.label} (`{c.score}`)")

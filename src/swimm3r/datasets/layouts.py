@@ -1,4 +1,4 @@
-"""What the readers of the published layouts share: folders whatever their case, files by number, what was left over."""
+"""Helpers of the layout readers: folders regardless of case, files by number, and files left over."""
 
 import re
 from collections.abc import Iterable

@@ -81,7 +81,7 @@ class Skipped:
 
 @dataclass(frozen=True)
 class Survey:
-    """What a folder holds."""
+    """The contents of a folder."""
 
     root: Path
     sequences: tuple[Sequence, ...]

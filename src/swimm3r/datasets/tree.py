@@ -49,7 +49,7 @@ def read_tree(root: Path) -> Survey:
 
 
 def describe(survey: Survey) -> str:
-    """What was found and what was left out, for people."""
+    """A readable list of the sequences found and the files left out."""
     lines = [f"{counted(len(survey.sequences), 'sequence')} under {survey.root}"]
     for s in survey.sequences:
         have = [

@@ -1,4 +1,4 @@
-"""How well two-view matches agree with the poses and intrinsics a method gives its own map.
+"""Agreement of two-view matches with the poses and intrinsics of a method's own reconstruction.
 
     F = K_j^-T [t]x R K_i^-1,   d_j = dist(x_j, F x_i),   d_i = dist(x_i, F^T x_j),   error = (d_i + d_j) / 2
 

@@ -1,4 +1,4 @@
-"""How far estimated camera poses are from reference poses, up to one similarity of the world.
+"""Errors of estimated camera poses against reference poses, up to one similarity of the world.
 
 Relative errors take every pair i < j. The relative pose is W_i W_j^-1 (the VGGT convention: the baseline as camera i
 sees it; seen from j its direction error is another number wherever rotations are wrong). RRA and RTA are the shares
@@ -56,7 +56,7 @@ class AbsolutePoseErrors:
 
 @dataclass(frozen=True)
 class PoseScores:
-    """What the tables and `summary.json` print; percentages over all pairs, unregistered frames counted as failures."""
+    """Scores of the tables and `summary.json`; percentages over all pairs, unregistered frames count as failures."""
 
     rra15: float  # %
     rta15: float  # %

@@ -1,4 +1,4 @@
-"""How well colors come out of the water: scores without reference, and scores against a true water.
+"""Scores of restored colors: without a reference, and against known water.
 
 UIQM (Panetta et al. 2015) in the variant of the FUnIE-GAN code, which the paper's table follows, two slips included;
 UCIQE (Yang & Sowmya 2015) in CIELAB's own units. Both reward contrast stretching, so read them beside images.

@@ -58,7 +58,7 @@ class Gaussians:
 
 @dataclass(frozen=True)
 class ClearDifference:
-    """How the Gaussians' clear images differ from the map's own, over some cameras."""
+    """Difference between the clear images of the Gaussians and of the map, over some cameras."""
 
     psnr: float  # dB, of colors blended over black
     alpha: float  # mean difference of opacity, Gaussians minus map
@@ -140,7 +140,7 @@ def write_ply(path: Path, g: Gaussians) -> None:
 
 
 def draw_gaussians(g: Gaussians, camera: Cameras, near: float) -> RasterOutput:
-    """What a 3DGS viewer shows of them: exp(-r2 / 2) under the image plane's covariance with its 0.3 px^2 of blur."""
+    """The image of a 3DGS viewer: exp(-r2 / 2) under the image plane's covariance with its 0.3 px^2 of blur."""
     view = pinhole(camera)
     half = torch.full_like(g.opacity, 0.5)
     rgb = colored(g.rgb, g.harmonics, g.xyz - view.center)
@@ -165,7 +165,7 @@ def clear_difference(scene: SplatMap, g: Gaussians, cameras: Cameras, time: floa
 
 @dataclass(frozen=True)
 class Exported:
-    """What was written."""
+    """The result of an export."""
 
     path: Path
     gaussians: int

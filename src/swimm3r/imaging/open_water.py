@@ -1,4 +1,4 @@
-"""Where an image looks past every surface into open water.
+"""Open water: the pixels of an image that show no surface.
 
 Such a region has no depth and next to no texture (the local standard deviation, after removing slopes, of any channel
 in 7 x 7 pixels), is large, reaches the upper or a side edge of the image, is in its brightest channel brighter than
@@ -73,7 +73,7 @@ def open_water_mask(
 def sea_share(
     image: Float[Tensor, "h w 3"], z_depth: Float[Tensor, "h w"], veil: Float[Tensor, "3"] | None = None
 ) -> Float[Tensor, "h w"]:
-    """How surely a pixel shows water only: open water, unknown depth around it in the same color; soft where hazy."""
+    """Probability that a pixel shows water only: open water, or unknown depth of the same color; soft where hazy."""
     water = open_water_mask(image, z_depth, veil).float()
     if not water.any():
         return water

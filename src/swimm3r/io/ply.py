@@ -82,7 +82,7 @@ def read_points(path: Path, remedy: Remedy = _REMEDY) -> tuple[Float32[np.ndarra
 
 
 def _vertices(lines: list[str]) -> tuple[int, np.dtype]:
-    """How many vertices, and how each one lies in the file."""
+    """The number of vertices, and the layout of one in the file."""
     words = [line.split() for line in lines if not line.startswith(("comment", "obj_info"))]
     if not words or words[0][:2] != ["element", "vertex"] or len(words[0]) != 3:
         raise ValueError("the vertices were expected first")

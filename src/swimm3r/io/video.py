@@ -22,7 +22,7 @@ if TYPE_CHECKING:
     from av.container import InputContainer
 
 VIDEO_SUFFIXES = (".mp4", ".mov", ".m4v", ".mkv", ".webm", ".avi", ".mts", ".m2ts", ".mpg", ".mpeg", ".wmv", ".3gp")
-"""What a folder without images is searched for; FFmpeg reads more."""
+"""Suffixes of videos that are searched for in a folder without images; FFmpeg reads more."""
 
 _NOT_VIDEO = ("tty", "image2", "_pipe")  # FFmpeg's readers of text and of single images
 _INDEXED = ("mov,mp4,m4a,3gp,3g2,mj2", "matroska,webm")  # the containers whose seeking can be relied on
@@ -120,7 +120,7 @@ class Video:
             self.seconds = None if file.duration is None else file.duration / 1e6
 
     def _decode(self, start: float) -> "Iterator[av.VideoFrame]":
-        """What decodes, from a key frame before second `start` on."""
+        """The frames that decode, from a key frame before second `start` on."""
         from av.error import FFmpegError
 
         with self._open() as file:

@@ -1,4 +1,4 @@
-"""Where an image was taken, in a map: `localize` for one image, `Localizer` for many, by the paper's protocol."""
+"""Localization of images in a map by the paper's protocol: `localize` for one image, `Localizer` for many."""
 
 from typing import TYPE_CHECKING
 

@@ -46,7 +46,7 @@ class Query:
 
 @dataclass(frozen=True)
 class Answer:
-    """What became of a query."""
+    """The result of a query."""
 
     name: str
     time: float

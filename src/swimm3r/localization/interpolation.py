@@ -1,4 +1,4 @@
-"""Where a frame was taken, by the frames before and after it."""
+"""Pose of a frame interpolated between the frames before and after it."""
 
 from jaxtyping import Float
 from torch import Tensor

@@ -1,4 +1,4 @@
-"""Where an image was taken, from pixels that match points of the reconstruction: PnP with RANSAC over SIFT.
+"""Pose of an image from pixels that match points of the reconstruction: PnP with RANSAC over SIFT.
 
 A *landmark* is a keypoint of a registered frame that lies on the observation of a triangulated point. An image's
 keypoints are matched with the landmarks of frames that may show the same place; its pose reprojects most of them.
@@ -22,7 +22,7 @@ from swimm3r.sfm.features.sift import extract_features, match_descriptors, unit_
 from swimm3r.sfm.settings import FeatureSettings
 
 MIN_INLIERS = 12
-"""Landmarks that agree on a pose before it is believed: 6 of them fix it, and strangers agree on a few more."""
+"""Landmarks that agree on a pose before it is believed: 6 of them fix it, and wrong matches agree on a few more."""
 _MAX_ERROR = 4.0  # pixels of an image of 1000; never less than _LEAST_ERROR
 _LEAST_ERROR = 2.5
 _SAME_KEYPOINT = 1.0  # pixels between an observation and the keypoint that it is
@@ -30,7 +30,7 @@ _SAME_KEYPOINT = 1.0  # pixels between an observation and the keypoint that it i
 
 @dataclass(frozen=True)
 class Landmarks:
-    """What one registered frame knows about its points."""
+    """The points that one registered frame observes."""
 
     descriptors: Float[Tensor, "n 128"]  # of unit length
     xyz: Float[Tensor, "n 3"]  # world
@@ -86,7 +86,7 @@ def locate(
     if sum(len(part) for part in pixels) < MIN_INLIERS:
         return None
     max_error = max(_LEAST_ERROR, _MAX_ERROR * max(lens.width, lens.height) / 1000)
-    # one point seen by several frames is one witness
+    # one point seen by several frames counts once
     both = torch.unique(torch.cat([torch.cat(pixels), torch.cat(points)], -1), dim=0)
     estimate = absolute_pose(both[:, :2], both[:, 2:], lens, max_error)
     if estimate is None or int(estimate[1].sum()) < MIN_INLIERS:

@@ -52,7 +52,7 @@ class Evidence:
 
 @dataclass(frozen=True)
 class Localization:
-    """Where an image was taken, and why that is believed."""
+    """The pose of an image and the evidence for it."""
 
     cam2world: Float[Tensor, "4 4"]
     stage: Literal["coarse", "refined"]

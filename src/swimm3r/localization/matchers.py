@@ -1,4 +1,4 @@
-"""What localization asks of features: which images look alike, and which of their pixels show the same.
+"""Matchers of localization: similarity of images, and correspondences between their pixels.
 
 SIFT needs no weights: keypoints matched by their descriptors, images compared by VLAD over a vocabulary learned from
 the references. MASt3R matches every pixel, and compares images by their encoder's tokens, as the paper does.
@@ -36,11 +36,11 @@ class Matcher(Protocol):
     name: str
 
     def describe(self, image: Float[Tensor, "h w 3"], usable: Bool[Tensor, "h w"]) -> Any:
-        """What the other methods need to know of an image."""
+        """The data of an image that the other methods take."""
         ...
 
     def index(self, names: Sequence[str], described: Callable[[str], Any]) -> Likeness:
-        """How much an image looks like each of the references, which are asked for one at a time."""
+        """Similarity of an image to each of the references, which are read one at a time."""
         ...
 
     def match(self, a: Any, b: Any) -> tuple[Pixels, Pixels]:
@@ -152,7 +152,7 @@ def _tokens(seen: _Seen) -> Float[Tensor, "k c"]:
 
 
 def chosen_matcher(settings: LocalizationSettings) -> Literal["mast3r", "sift"]:
-    """What "auto" stands for here. Raises WeightsError for weights that are named and not there."""
+    """The matcher that "auto" selects. Raises WeightsError for weights that are named and not there."""
     if settings.matcher != "auto":
         return settings.matcher
     return "sift" if weights.find("mast3r", settings.weights) is None else "mast3r"

@@ -1,4 +1,4 @@
-"""How well a map shows the frames it never saw: where they were taken, how the map looks from there, the scores.
+"""Held-out views: poses of the test frames, the map rendered from there, and its scores.
 
 A frame's first pose comes from a reference where one is given, else from its matches with points of the reconstruction,
 else from its neighbors in time. Then it is refined on the frozen map (`splat.poses`), for a score should be about the
@@ -39,12 +39,12 @@ from swimm3r.splat.training_poses import axes_of_map
 
 Source = Literal["reference", "2D-3D matches", "neighbors"]
 _GAP = 0.03  # of the image's width: gaps in the cloud up to this size are closed where coverage is asked
-_WITNESSES = 6  # registered frames, the nearest in time, that a held-out frame is matched with
+_REFERENCES = 6  # registered frames, the nearest in time, that a held-out frame is matched with
 
 
 @dataclass(frozen=True)
 class FirstPose:
-    """Where a frame's refinement starts."""
+    """The pose from which a frame's refinement starts."""
 
     cam2world: Float[Tensor, "4 4"]
     source: Source
@@ -89,7 +89,7 @@ def first_poses(
         if frame.name in known:
             poses[frame.name] = FirstPose(known[frame.name], "reference")
             continue
-        near = neighbors(rec, frames, frame.name, _WITNESSES)
+        near = neighbors(rec, frames, frame.name, _REFERENCES)
         f, lens = frames.index(frame.name), rec.cameras[rec.index(near[0])]
         located = locate(frames.image(f), frames.mask(f), lens, [landmarks(name) for name in near], features)
         if located is None:

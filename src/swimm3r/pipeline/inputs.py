@@ -35,7 +35,7 @@ def check_inputs(source: Path, settings: RunSettings, reference: Path | None = N
 
 
 def truth_of(source: Path, reference: Path | None) -> GroundTruth | None:
-    """What is known for certain of a clip: the reference where one is given, else what a synthetic dive brings."""
+    """The ground truth of a clip: the given reference, else the truth of a synthetic dive."""
     if reference is not None:
         return read_ground_truth(reference)
     beside = source / FOLDER

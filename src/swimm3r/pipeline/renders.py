@@ -50,7 +50,7 @@ _SMOOTH = 1.5  # frames of the dive over which the flight's hand steadies
 
 @dataclass(frozen=True)
 class DisplayStyle:
-    """How a dive's images are shown: its restored frames, and the clear views and depths of its map."""
+    """Display of a dive's restored frames, and of the clear views and depths of its map."""
 
     gains: Float[Tensor, "3"]  # white balance of clear images
     near_far: tuple[float, float]  # z depths that are red and blue, scene units
@@ -202,11 +202,11 @@ def moments_of(scene: SplatMap, table: CameraTable, frames: Frames, time: float 
         return [time or 0.0] * len(table.names)
     if table.times is not None:
         return table.times
-    strangers = [name for name in table.names if name not in set(frames.names)]
-    if strangers:
+    unknown = [name for name in table.names if name not in set(frames.names)]
+    if unknown:
         start, end = scene.span
         raise InputError(
-            f"{strangers[0]} is no frame of the dive, so it is not known when it would have been taken",
+            f"{unknown[0]} is no frame of the dive, so it is not known when it would have been taken",
             cause="the map changes with time, and the cameras are not those of its frames",
             hint=f"--time SECONDS, {start:g} to {end:g}, or a time for every frame of the file",
         )

@@ -137,7 +137,7 @@ class FinishedSfm:
     key: str  # another one where anything before the map is another
 
     def first_poses(self, progress: Progress = silent) -> dict[str, held_out.FirstPose]:
-        """Where the test frames' refinement starts, in the reconstruction's axes."""
+        """Poses from which the refinement of the test frames starts, in the reconstruction's axes."""
         return start_poses(self.rec, self.frames, self.settings, self.truth, progress)
 
 

@@ -260,7 +260,7 @@ class RunRecord:
 
 
 def stage_keys(fingerprint: str, settings: RunSettings, reference: Path | None) -> dict[str, str]:
-    """What tells a stage's result from that of other settings: a hash of them and of everything before the stage."""
+    """Key of a stage's result: a hash of its settings and of everything before the stage."""
     keys, before = {}, fingerprint
     for stage, values in settings_by_stage(settings).items():
         if stage == "eval":

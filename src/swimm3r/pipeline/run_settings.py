@@ -29,7 +29,7 @@ def with_stages_of(settings: RunSettings, other: RunSettings, stages: tuple[str,
 
 
 def differences(old: RunSettings, new: RunSettings, stages: list[str]) -> list[str]:
-    """What differs in the settings of some stages, by the names in settings.yaml: "splat.iterations: 2000 -> 5000"."""
+    """Differences in the settings of some stages, by the names in settings.yaml: "splat.iterations: 2000 -> 5000"."""
     lines = []
     for part in (_PARTS[stage] for stage in stages):
         before, after = getattr(old, part), getattr(new, part)

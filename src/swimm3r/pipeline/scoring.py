@@ -31,13 +31,13 @@ _FLIGHT = 90  # images of the fly-through
 
 @dataclass(frozen=True)
 class Protocol:
-    """How the test frames are placed before they are scored."""
+    """Placement of the test frames before they are scored."""
 
     test: PoseRefinementSettings
     reference: Path | None = None  # a cameras.json that poses start at and are compared with
 
     def key_beside(self, own: "Protocol") -> str:
-        """What differs from a run's own protocol, fit for a folder's name: steps-20; empty where nothing does."""
+        """Differences from a run's own protocol as a folder's name: steps-20; empty without any."""
         parts = [
             f"{name.replace('_', '-')}-{value}"
             for name, value in asdict(self.test).items()
@@ -63,7 +63,7 @@ class MappedRun:
 def start_poses(
     rec: Reconstruction, frames: Frames, settings: RunSettings, truth: GroundTruth | None, progress: Progress = silent
 ) -> dict[str, held_out.FirstPose]:
-    """Where the test frames' refinement starts, in the reconstruction's axes: at the truth's poses where it has them.
+    """Poses from which the refinement of the test frames starts, in the reconstruction's axes: the truth's where known.
 
     Without a truth, at those of the model that the reconstruction was imported from.
     """

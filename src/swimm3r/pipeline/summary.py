@@ -287,7 +287,7 @@ def _moving_section(
 
 
 def _identifiable(rec: Reconstruction) -> dict[str, Bool[Tensor, "3"]]:
-    """What the frames determine, by the fit of structure from motion; training sees the same frames."""
+    """The coefficients that the frames determine, by the fit of structure from motion."""
     if rec.medium is not None:
         return rec.medium.identifiable
     return {name: torch.zeros(3, dtype=torch.bool) for name in ("Binf", "beta_D", "beta_B")}

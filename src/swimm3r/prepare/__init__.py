@@ -31,7 +31,7 @@ def read_frames(
 
 
 def load_frames(folder: Path) -> "swimm3r.scene.frames.Frames":
-    """What `read_frames` prepared in a folder. Raises InputError where that is not whole."""
+    """Load the frames that `read_frames` prepared in a folder. Raises InputError where they are incomplete."""
     from swimm3r.prepare import frames_folder
 
     return frames_folder.load_frames(folder)

@@ -1,4 +1,4 @@
-"""What preparing a video and preparing stills share: the records, the sharpness measure, the size."""
+"""Candidate images of a video or of a folder: their records, sharpness and size."""
 
 from collections.abc import Sequence
 from dataclasses import dataclass
@@ -32,7 +32,7 @@ class SourceImage:
 
 @dataclass(frozen=True)
 class SelectedImages:
-    """What was written into the draft folder, and what there is to say about it."""
+    """The images in the draft folder, and the warnings about them."""
 
     images: list[SourceImage]
     ordered: bool
@@ -93,7 +93,7 @@ def thinned(items: Sequence[Item], most: int) -> list[Item]:
 
 
 def blank_warning(count: int, of: str) -> str:
-    """What to say about frames without contents."""
+    """The warning about frames without content."""
     return f"{count} {of} show nothing (black, or one even color) and were left out."
 
 

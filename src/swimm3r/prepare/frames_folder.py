@@ -99,7 +99,7 @@ class _Document:
 
 
 def load_frames(folder: Path) -> Frames:
-    """What `read_frames` prepared in a folder. Raises InputError where that is not whole."""
+    """Load the frames that `read_frames` prepared in a folder. Raises InputError where they are incomplete."""
     path, remedy = folder / "frames.json", remake(folder)
     document = read_json(path, _Document, remedy)
     with guard(path, remedy):
@@ -253,6 +253,6 @@ def _whole_folder(folder: Path) -> Iterator[Path]:
 
 
 def _cache_folder(source: Path, settings: FrameSettings) -> Path:
-    """Where frames go that were given no folder: the same source and settings find them again."""
+    """Folder in the cache for frames that were given none; the same source and settings find it again."""
     key = cache_key(str(source.resolve()), stat_digest(source), settings)[:16]
     return Path(os.environ.get("XDG_CACHE_HOME") or Path.home() / ".cache") / "swimm3r" / "frames" / key

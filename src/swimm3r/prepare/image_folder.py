@@ -140,7 +140,7 @@ def _root_of(source: Path) -> Path:
 
 
 def _left_out(refused: dict[Path, InputError], folder: ImageFolder) -> list[str]:
-    """What to say about files and folders that could not be read."""
+    """The warning about files and folders that could not be read."""
     warnings = []
     too_large = [error for error in refused.values() if isinstance(error, ImageSizeError)]
     damaged = [path for path, error in refused.items() if not isinstance(error, ImageSizeError)]

@@ -75,7 +75,7 @@ def prepare_clip(source: Path, draft: Path, settings: FrameSettings, progress: P
 
 
 def _warnings(video: Video, last: float, reached: float) -> list[str]:
-    """What is wrong with a video that was read up to second `reached` and should last until `last`."""
+    """The warning about a video that was read up to second `reached` and should last until `last`."""
     name, warnings = video.path.name, []
     if video.damaged:
         warnings.append(

@@ -1,4 +1,4 @@
-"""What one primitive does to one pixel, forward and adjoint, written once for every back end.
+"""The contribution of one primitive to one pixel, forward and adjoint, written once for every back end.
 
     alpha = min(0.999, o f(r2)),  f = (1 - r2)^b or e^{-b r2}           F = c e^{-beta_D z} - B_inf e^{-beta_B z}
     w = T alpha,  T <- T (1 - alpha)                                    I = B_inf + sum w F,  J = sum w c,  D = sum w z

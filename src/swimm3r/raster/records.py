@@ -1,4 +1,4 @@
-"""What goes into the rasterizer and what comes out: one camera's projected primitives, the water per pixel, the images.
+"""Inputs and outputs of the rasterizer: one camera's projected primitives, the water per pixel, the images.
 
 Pixel (x, y) has its center at (x + 0.5, y + 0.5). Images are [3, H, W]; depths are camera z in the units of the betas.
 """
@@ -17,7 +17,7 @@ ALPHA_MIN = 1 / 255
 ALPHA_MAX = 0.999
 """Opacity of one pair is capped here; a capped pair has no gradient toward its shape."""
 Kernel = Literal["beta", "gaussian"]
-"""How a primitive fades from its center: (1 - r2)^b within r2 < 1, or e^{-b r2}, which only `alpha_min` ends."""
+"""Falloff of a primitive from its center: (1 - r2)^b within r2 < 1, or e^{-b r2}, which only `alpha_min` ends."""
 T_MIN = 1e-4
 """A pixel ends *before* the primitive that would bring its transmittance to this or below."""
 
@@ -71,7 +71,7 @@ class SggBuffers(NamedTuple):
 
 @dataclass(frozen=True)
 class CpuBins:
-    """How the pairs of a primitive lie, for the CPU's kernels."""
+    """Layout of the pairs of a primitive, for the CPU's kernels."""
 
     order: Int[Tensor, " drawn"]  # the primitives that may be seen, by depth
     blocks: Int[Tensor, " pairs"]  # bit 4 r + c: the ellipse may cover a pixel of the tile's 4 x 4 block (r, c)

@@ -92,7 +92,7 @@ def write(folder: Path) -> Path:
 
 
 def _shown_as(fit: MediumFit) -> str:
-    """How the restored frames differ from those filmed, which depends on what is known of the water."""
+    """Difference between the restored and the filmed frames, which depends on the knowledge of the water."""
     if attenuation_is_a_guess(fit):
         return "left as filmed: the water is not determined"
     return "without the water" + (", white-balanced for display" if any_determined(fit) else ", not white-balanced")

@@ -1,4 +1,4 @@
-"""What is known for certain about a dive: reference poses, and for synthetic dives depth, clear colors and the water.
+"""Ground truth of a dive: reference poses, and for synthetic dives depth, clear colors and the water.
 
 On disk a folder beside the images: cameras.json; z_depth/NAME.npz (key z_depth), clear/NAME.png, masks/NAME.png (0
 where something moves) and medium.json where they exist. A cameras.json alone is a reference, too.

@@ -1,4 +1,4 @@
-"""What structure from motion knows about a dive; the one record every back end fills and every later stage reads.
+"""The result of structure from motion: the one record that every back end fills and every later stage reads.
 
 On disk (`save`, `load`) it is a folder: sparse/ (COLMAP model), cameras.json, trajectory.tum, z_depth/NAME.npz,
 matches.npz, medium.json, points.ply (restored colors), points_raw.ply, backdrop.ply (guessed ground, restored
@@ -83,7 +83,7 @@ class DepthMaps:
     folder: Path
 
     def path(self, name: str) -> Path:
-        """Where the map of a frame is stored."""
+        """Path of a frame's depth map."""
         return self.folder / f"{name}.npz"
 
     def __contains__(self, name: str) -> bool:

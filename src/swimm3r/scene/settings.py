@@ -10,7 +10,7 @@ from swimm3r.settings import ClipSecond, CountOrZero, LongSideOrOwn, Range, Sett
 
 @dataclass(frozen=True)
 class FrameSettings(Settings):
-    """How `prepare.read_frames` samples a video and checks a folder of stills."""
+    """Sampling of a video, and checks of a folder of images, by `swimm3r.read_frames`."""
 
     fps: Annotated[float, Range(0, 1000)] = 5.0
     """Frames per second taken from a video; 0 takes every frame. Of stills every one is taken."""

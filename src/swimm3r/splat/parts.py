@@ -23,7 +23,7 @@ class Parts:
 
 
 def parts_of(settings: SplatSettings) -> Parts:
-    """What the maps of a recipe consist of."""
+    """The parts of the maps of a recipe."""
     match settings:
         case UwbsSettings():
             return Parts(BetaPrimitives, MediumField(settings.medium, settings.dynamic))

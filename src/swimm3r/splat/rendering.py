@@ -62,7 +62,7 @@ class SplatMap:
 
     @property
     def device(self) -> torch.device:
-        """Where it is rendered."""
+        """The device that renders it."""
         return self.primitives.xyz.device
 
     @property

@@ -356,7 +356,7 @@ def settings_of(recipe: RecipeName) -> type[SplatSettings]:
 
 
 def recipe_of(settings: SplatSettings) -> RecipeName:
-    """What the settings train."""
+    """The name of the recipe of the settings."""
     match settings:
         case WaterSplattingSettings():
             return "watersplatting"

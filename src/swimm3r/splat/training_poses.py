@@ -103,7 +103,7 @@ class EpipolarMatches:
 
 @dataclass(frozen=True)
 class RefinedPoses:
-    """Where the training frames' cameras stood when the map was finished."""
+    """Poses of the training frames at the end of the training."""
 
     names: tuple[str, ...]
     cam2world: Float[Tensor, "c 4 4"]  # float64, scene units

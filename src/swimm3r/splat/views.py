@@ -1,4 +1,4 @@
-"""What a map is trained on: undistorted images of one size, their masks and depth, in working units.
+"""Training views of a map: undistorted images of one size, their masks and depth, in working units.
 
 Every frame becomes a pinhole image with its own K at the training size. Depth along the optical axis is the same
 number on both grids. Time runs from 0 at the clip's first frame to 1 at its last, test frames included. What the frame

@@ -1,4 +1,4 @@
-"""What the seafloor's surface looks like in clear water: albedo, light, caustics, in linear light.
+"""Appearance of the seafloor in clear water: albedo, light, caustics, in linear light.
 
     radiance = albedo * (sky_share * SKY + sun_share * max(0, n . sun) * SUNLIGHT * caustics)
 

@@ -1,4 +1,4 @@
-"""What comes between a clean image and a camera's: a fish, marine snow, vignetting, sensor noise."""
+"""Disturbances between a clean image and a camera's: a fish, marine snow, vignetting, sensor noise."""
 
 from dataclasses import dataclass
 
@@ -30,7 +30,7 @@ class Fish:
 
 @dataclass(frozen=True)
 class Swimmer:
-    """Where the fish is and how it is turned."""
+    """Position and orientation of the fish."""
 
     middle: Float[Tensor, "3"]
     axes: Float[Tensor, "3 3"]  # rows: along, up, across

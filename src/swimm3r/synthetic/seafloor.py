@@ -238,7 +238,7 @@ def _add_rim(height: np.ndarray, x0: float, y0: float, cell: float, seed: int) -
 @numba.njit(cache=True)
 @no_type_check
 def _sun_share(height: np.ndarray, cell: float, sun: np.ndarray) -> np.ndarray:
-    """How much of the sun's disc each node sees, 0..1: light under water is diffuse, so shadows are soft."""
+    """Share of the sun's disc that each node sees, 0..1: light under water is diffuse, so shadows are soft."""
     n = height.shape[0]
     share = np.ones((n, n), np.float64)
     horizontal = np.hypot(sun[0], sun[1])

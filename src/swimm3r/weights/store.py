@@ -26,28 +26,28 @@ class Checked:
     size: int
     sha256: str
     against: Literal["published", "first use", "nothing"]
-    """What it was compared with; "nothing": it is now the first use."""
+    """The source of the expected digest; "nothing" on first use."""
 
 
 def directory() -> Path:
-    """Where downloads go: $SWIMM3R_WEIGHTS_DIR, else `weights` in the cache."""
+    """Folder of downloads: $SWIMM3R_WEIGHTS_DIR, else `weights` in the cache."""
     return directories()[0]
 
 
 def directories() -> list[Path]:
-    """Where weights are looked for, in turn."""
+    """Folders that are searched for weights, in order."""
     given = os.environ.get("SWIMM3R_WEIGHTS_DIR")
     return [*([Path(given)] if given else []), cache_folder() / "weights"]
 
 
 def cache_folder() -> Path:
-    """Where files are kept that can be had again."""
+    """Folder of files that can be downloaded or computed again."""
     given = os.environ.get("SWIMM3R_CACHE")
     return Path(given) if given else Path(os.environ.get("XDG_CACHE_HOME") or Path.home() / ".cache") / "swimm3r"
 
 
 def find(name: str, explicit: Path | None = None, manifest: tuple[Weights, ...] = MANIFEST) -> Path | None:
-    """Where the weights lie, or None. Never touches the network.
+    """Path of the weights, or None. Never uses the network.
 
     Raises WeightsError for an explicit path without a file, a folder that cannot be read, and a file of the wrong size.
     """
@@ -103,7 +103,7 @@ def verify(name: str, explicit: Path | None = None, manifest: tuple[Weights, ...
 
 
 def compare(weights: Weights, path: Path) -> Checked:
-    """What `verify` says of one file; one that is just arriving is deleted where it is not the right one."""
+    """The result of `verify` for one file; a file just downloaded is deleted if its digest is wrong."""
     check_size(path, weights)
     with path.open("rb") as file:
         digest = hashlib.file_digest(file, "sha256").hexdigest()

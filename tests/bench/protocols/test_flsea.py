@@ -49,7 +49,7 @@ def tree(run: Path, truth: GroundTruth, tmp_path_factory: pytest.TempPathFactory
 
 
 def known(frames: Frames, truth: GroundTruth, rec: Reconstruction, folder: Path) -> Reconstruction:
-    """What perfect structure from motion would find, at another scale."""
+    """The result of perfect structure from motion, at another scale."""
     rows = [(int(Path(name).stem) - FIRST) // 1_000_000 for name in frames.names]
     depth = DepthMaps(folder / "z_depth")
     for name, row in zip(frames.names, rows, strict=True):

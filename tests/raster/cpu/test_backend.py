@@ -1,4 +1,4 @@
-"""What only the CPU back end promises: threads do not change a bit, the inner loops are SIMD, tiles are exact."""
+"""Promises of the CPU back end alone: threads do not change a bit, inner loops are SIMD, tiles are exact."""
 
 import inspect
 import platform

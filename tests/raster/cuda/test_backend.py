@@ -1,4 +1,4 @@
-"""What only the GPU back end promises: its source compiles for every card named, and its warp-level sums are right."""
+"""Promises of the GPU back end alone: its source compiles for every card named, its warp-level sums are right."""
 
 import re
 import sys

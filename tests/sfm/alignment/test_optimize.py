@@ -60,7 +60,7 @@ def surface(cameras: Cameras) -> torch.Tensor:
 
 
 def make_scene(n: int = 4, noise: float = 0.0, scales: torch.Tensor | None = None, center: float = 0.5) -> Scene:
-    """What a perfect (or noisy) network would say about n frames; `scales` are its errors of scale per frame."""
+    """Predictions of a perfect (or noisy) network for n frames; `scales` are its errors of scale per frame."""
     generator = torch.Generator().manual_seed(0)
     cameras = truth(n)
     z = surface(cameras)

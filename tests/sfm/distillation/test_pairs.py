@@ -1,4 +1,4 @@
-"""What training sees: one crop for teacher and student, water at ray depth, and scores that know the truth."""
+"""Training pairs: one crop for teacher and student, water at ray depth, and scores that know the truth."""
 
 from dataclasses import replace
 from pathlib import Path

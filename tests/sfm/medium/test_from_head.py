@@ -32,7 +32,7 @@ def images(dive) -> NetworkImages:
 
 
 def maps(medium: Medium, images: NetworkImages, metres: float = 1.0) -> WaterMaps:
-    """What a perfect head would say, per `metres` of the scene's unit; half of the attenuation in each exponential."""
+    """Predictions of a perfect head, per `metres` of the scene's unit; half of the attenuation in each exponential."""
     frame = images.framing
     half = (0.5 * metres * medium.beta_D).expand(1, frame.network_height, frame.network_width, 3)
     zero = torch.zeros_like(half)

@@ -139,7 +139,7 @@ def test_beta_D_is_the_curve_at_the_median_depth(teal):
 
 
 def test_surfaces_hundreds_of_times_as_far_as_the_rest_do_no_harm(teal):
-    """Where T_D is too small for a number; numerical warnings are errors here."""
+    """T_D below the smallest number; numerical warnings are errors here."""
     near, g = draw_samples(teal, points=400), torch.Generator().manual_seed(0)
     far = torch.linspace(100.0, 2000.0, 1000)
     nothing = torch.zeros(len(far), dtype=torch.long)

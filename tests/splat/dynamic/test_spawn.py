@@ -1,4 +1,4 @@
-"""What moves before a still scene: found where one frame alone differs, and born as primitives that travel."""
+"""Moving objects before a static scene: detected where one frame alone differs, added as moving primitives."""
 
 from dataclasses import dataclass, replace
 
@@ -91,7 +91,7 @@ def others_than(k: int, looks: list[MotionView]) -> list[MotionView]:
 
 
 def patch_in(k: int, like: torch.Tensor) -> torch.Tensor:
-    """Where the patch is in view k; the first frame of the dive is held back."""
+    """Position of the patch in view k; the first frame of the dive is held back."""
     column = LEFT + STEP * (k + 1)
     patch = torch.zeros_like(like, dtype=torch.bool)
     patch[TOP : TOP + SIDE, column : column + SIDE] = True

@@ -1,4 +1,4 @@
-"""How far away a moving thing is, by the course it takes before a moving camera."""
+"""Distance of a moving object by its trajectory before a moving camera."""
 
 import math
 

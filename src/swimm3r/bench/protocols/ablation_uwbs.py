@@ -1,4 +1,4 @@
-"""What scattering-aware gradients and the depth regularizer gain (the paper's Tab. ablation_compact), with its spread.
+"""Ablation of scattering-aware gradients and the depth regularizer (the paper's ablation table), with its spread.
 
 From one structure from motion each variant is trained under several seeds and scored on the held-out frames. Our own
 terms (the water's prior, coverage) stay as they are in every variant, and need the depth maps.

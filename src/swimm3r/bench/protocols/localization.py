@@ -1,4 +1,4 @@
-"""How well maps place the frames they never saw (the paper's Tab. visloc_base), by map and by structure from motion.
+"""Localization of held-out frames (the paper's localization table), by map and by structure from motion.
 
 Every test frame of a run is a query. Its pose is judged against the structure from motion of all frames, training and
 test, by relative poses: of test frame and training frame, where the map's training frames anchor the answer, and of two
@@ -175,7 +175,7 @@ def _answers(localizer: Localizer, sfm: FinishedSfm, folder: Path) -> list[Answe
 
 
 def localization_scores(answers: Sequence[Answer]) -> dict[str, float | NotComputed]:
-    """What needs no reference: how many were placed, on what evidence, how fast."""
+    """The scores that need no reference: localized frames, their evidence, and speed."""
     found = [a.found for a in answers if a.found is not None]
     nothing = NotComputed("no test frame was located")
     refined = [f.reprojection_px for f in found if f.reprojection_px is not None]

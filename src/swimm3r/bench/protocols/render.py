@@ -1,4 +1,4 @@
-"""How maps show the frames they never saw: structure from motion x renderer (the paper's Tab. quantitative_comparison).
+"""Held-out views: structure from motion x renderer (the paper's quantitative comparison).
 
 Every recipe is trained on the same reconstruction and frames. A test frame's pose comes from the structure from motion
 of all frames, brought into the reconstruction's axes by the similarity of the training cameras, and is then refined on

@@ -1,4 +1,4 @@
-"""How good the images without water look to scores that need no reference (the paper's Tab. barbados_color_noref).
+"""No-reference scores of restored images (the paper's restoration table).
 
 The restored training frames of run folders in physical colors, before any white balance; as rows of their own the same
 frames as shown, with the white balance, and the frames as filmed: what a score gives an image from which nothing was

@@ -1,4 +1,4 @@
-"""What the command line draws: progress with time left, the outcome in a few lines, and what to do next."""
+"""Output of the command line: progress with the time left, the result in a few lines, and the next command."""
 
 import shlex
 import sys
@@ -135,7 +135,7 @@ def _compilation_told(clock: WorkClock, begin: Callable[[], Any], end: Callable[
 
 
 def outcome_console() -> Console:
-    """Where outcomes are printed: as wide as the terminal, and unwrapped where they are piped into a file."""
+    """The console for results: as wide as the terminal, and not wrapped when piped into a file."""
     console = Console(markup=False, highlight=False)
     return console if console.is_terminal else Console(markup=False, highlight=False, width=_UNWRAPPED)
 

@@ -1,4 +1,4 @@
-"""How long a step of work will take yet, from the time that its items took so far.
+"""Remaining time of a step, estimated from the time of its items so far.
 
 Kernels are compiled in the middle of the first item that needs them, and take longer than hundreds of items. That time
 does not count (`WorkClock`), and neither does that of the item that took longest (`Pace`).

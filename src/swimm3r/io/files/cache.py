@@ -20,7 +20,7 @@ class ArrayCache:
 
     @property
     def nbytes(self) -> int:
-        """What is held now."""
+        """The entries held now."""
         with self._lock:
             return sum(array.nbytes for arrays in self._held.values() for array in arrays)
 

@@ -96,7 +96,7 @@ def _is_text(node: Any) -> bool:
 
 
 def _plain(value: object) -> object:
-    """What JSON can hold, dataclasses with the names of their types: two of the same fields are not the same."""
+    """The value as JSON can hold it; dataclasses carry the name of their type, which is a part of their identity."""
     if is_dataclass(value) and not isinstance(value, type):
         return {type(value).__name__: _plain(asdict(value))}
     if isinstance(value, dict):

@@ -101,7 +101,7 @@ def read(path: Path, document: dict[str, Any]) -> ForeignModel:
 
 
 def images_folder(path: Path) -> Path:
-    """Where the images of a transforms.json lie. Raises InputError for a file that is not one."""
+    """The folder of the images of a transforms.json. Raises InputError for any other file."""
     file = path / "transforms.json" if path.is_dir() else path
     document = read_json(file, _Document, REMEDY)
     names, first = _names(document), _relative(document.frames[0])

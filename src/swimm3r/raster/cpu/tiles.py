@@ -1,4 +1,4 @@
-"""What both sweeps over a tile share on the CPU: inner loops over the pixels of a block that LLVM turns into SIMD.
+"""Inner loops of both passes over a tile on the CPU: pixels of a block, which LLVM turns into SIMD.
 
 A tile's 256 pixels live in a workspace, one row per quantity, in the order of its 4 x 4 blocks: a block is one vector
 of 512 bits where the machine has them. Only the blocks that an ellipse may touch, and that have not ended, are gone

@@ -1,4 +1,4 @@
-"""What all passes of the network say about one frame, as running sums: memory does not grow with the number of pairs.
+"""Canonical view of one frame from all passes of the network, as running sums: memory does not grow with the pairs.
 
 Every pair (i, m) yields a pointmap X of frame i in its own camera with confidence C. With w = C - 0.999:
 
@@ -47,7 +47,7 @@ class CanonicalView:
 
 @dataclass(frozen=True)
 class AnchoredFrame:
-    """What the alignment keeps of a frame."""
+    """The data of a frame that the alignment keeps."""
 
     height: int
     width: int

@@ -132,7 +132,7 @@ class _Parameters:
         return [self.quaternion, self.translation, self.log_size]
 
     def camera(self, settings: AlignmentSettings) -> list[Tensor]:
-        """What the fine phase moves besides."""
+        """The unknowns that the fine phase adds."""
         chosen = []
         if settings.intrinsics != "fixed":
             chosen.append(self.log_focal)

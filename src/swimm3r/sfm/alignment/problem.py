@@ -1,4 +1,4 @@
-"""What a sparse global alignment is given: frames, matches, what is known; checked, and laid out flat for `alignment`.
+"""The problem of a sparse global alignment: frames, matches and priors, checked, and laid out flat for the optimizer.
 
 Frames may differ in size, pairs in their number of matches: everything is concatenated over frames (n), anchors (a) and
 points (p = 2 m: the sides i of all matches, then the sides j), with the frame each entry belongs to beside it.
@@ -22,7 +22,7 @@ from swimm3r.sfm.mast3r.settings import AlignmentSettings
 
 @dataclass(frozen=True)
 class Predicted:
-    """Where one frame's anchors are in another frame's camera, as the network says: for pairs that match nowhere."""
+    """Anchors of one frame in another frame's camera as the network predicts them, for pairs without matches."""
 
     points: Float[Tensor, "a 3"]
     confidence: Float[Tensor, " a"]
@@ -56,7 +56,7 @@ def anchored_pair(
 
 @dataclass(frozen=True)
 class Known:
-    """What is known beforehand; pixels are the network's, their centers at +0.5."""
+    """Prior knowledge; pixels are the network's, their centers at +0.5."""
 
     K: Float[Tensor, "n 3 3"] | None = None
     cam2world: Float[Tensor, "n 4 4"] | None = None

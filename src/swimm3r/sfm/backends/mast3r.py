@@ -311,7 +311,7 @@ def _write_depth(
 
 
 def _scale_to_points(z_depth: Float[Tensor, "h w"], rec: Reconstruction, canvas: Cameras, k: int) -> float:
-    """How much farther the sparse points of frame k are than its depth map says."""
+    """Ratio of the depths of frame k's sparse points to its depth map."""
     mine = rec.tracks.point[rec.tracks.frame == k]
     uv, z = project(canvas, rec.points.xyz[mine].double()[None])
     column, row = uv[0].nan_to_num(-1, -1, -1).clamp(-1, max(z_depth.shape)).floor().long().unbind(-1)

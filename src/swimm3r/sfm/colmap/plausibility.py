@@ -29,7 +29,7 @@ _FOCAL_BOUNDS = (0.35, 3.0)  # focal length over image width: 110 degrees to 19 
 
 
 def implausible(rec: Reconstruction, store: FeatureDatabase, frames: Frames) -> tuple[QualityWarning, ...]:
-    """What speaks against a reconstruction, in plain words; empty where nothing does."""
+    """Doubts about a reconstruction, in plain words; empty without any."""
     checks = (
         _repeated_texture(store),
         _bad_lens(rec),

@@ -61,7 +61,7 @@ class Workers:
 
 @dataclass(frozen=True)
 class Estimate:
-    """What a training will take, measured on its first pairs."""
+    """Time of a training, measured on its first pairs."""
 
     pairs: int
     steps: int

@@ -128,7 +128,7 @@ class PairData:
 
 @dataclass(frozen=True)
 class TwoViews:
-    """What is known about the geometry of a pair."""
+    """The known geometry of a pair."""
 
     camera: Cameras  # one, with K of the network's images; its size is that of the files
     second_from_first: Float[Tensor, "4 4"]  # float64; the unit is the sequence's

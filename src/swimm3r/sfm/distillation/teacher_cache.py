@@ -30,7 +30,7 @@ class TeacherCache:
         self._room = max_bytes - sum(path.stat().st_size for path in folder.glob("*.safetensors"))
 
     def features(self, student: Student, clean: Float[Tensor, "b 2 3 h w"]) -> PairFeatures:
-        """What the student's teacher makes of the clear images of pairs, on their device."""
+        """The teacher's features of the clear images of pairs, on their device."""
         stored = [self._read(images) for images in clean]
         missing = [k for k, found in enumerate(stored) if found is None]
         if missing:

@@ -1,4 +1,4 @@
-"""What the network itself is trained with, before any water: pointmaps and descriptors against the truth (MASt3R, 3.2).
+"""Training losses of the network without water: pointmaps and descriptors against the truth (MASt3R, 3.2).
 
     l_regr  = |X / s - X* / s*|                    per pixel of both views, all points in the frame of camera 1
     s       = mean |X| over the known pixels of both views; where lengths are metres, s* stands for both
@@ -32,7 +32,7 @@ has it; 0 has no bound."""
 
 @dataclass(frozen=True)
 class TruePoints:
-    """Where the surface of every pixel of one view is, in the frame of camera 1."""
+    """The surface point of every pixel of one view, in the frame of camera 1."""
 
     points: Float[Tensor, "b h w 3"]
     valid: Bool[Tensor, "b h w"]

@@ -117,7 +117,7 @@ def psnr(image: Float[Tensor, "n 3"], target: Float[Tensor, "n 3"]) -> float:
 
 
 def pose_error(matches: PixelMatches, truth: TwoViews) -> _PoseError:
-    """How far the relative pose that explains the matches is from the true one."""
+    """Error of the relative pose that explains the matches."""
     import cv2
 
     if len(matches.xy1) < _MIN_MATCHES:

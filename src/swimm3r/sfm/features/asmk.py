@@ -109,7 +109,7 @@ def asmk_similarity(
     settings: AsmkSettings = AsmkSettings(),
     progress: Progress = silent,
 ) -> Float[Tensor, "n n"]:
-    """What every frame finds among all: row = the asking frame; larger is more alike, below 1 even for itself."""
+    """Similarity of every frame to all frames: row = the query; larger is more similar, below 1 even for itself."""
     kept = [strongest(f, settings.features) for f in features]
     found = [aggregate(f, codebook, settings.words_when_found) for f in kept]
     index = _InvertedIndex.of(found)

@@ -19,7 +19,7 @@ from swimm3r.sfm.settings import FeatureSettings
 if TYPE_CHECKING:
     import pycolmap
 
-_MAX_ANGLE = 0.7  # radians between descriptors beyond which the nearest neighbor is a stranger (COLMAP's limit)
+_MAX_ANGLE = 0.7  # radians between descriptors beyond which the nearest neighbor is no match (COLMAP's limit)
 _UPSAMPLE_BELOW = 700  # long side in pixels; small images have their detail at half a pixel's blur, large ones do not
 
 

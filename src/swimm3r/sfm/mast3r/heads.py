@@ -1,4 +1,4 @@
-"""What is read off the tokens of one view: a pointmap with confidence (DPT) and pixel descriptors (MLP).
+"""Output heads for the tokens of one view: a pointmap with confidence (DPT) and pixel descriptors (MLP).
 
     points      = x / |x| * (e^|x| - 1)        metres, in the frame of camera 1
     confidence  = 1 + e^c                      in [1, inf)

@@ -56,7 +56,7 @@ class EncodingCache:
 
     @property
     def bytes(self) -> int:
-        """What the held tokens take, on the network's device."""
+        """Memory of the held tokens on the network's device."""
         return sum(e.tokens.nbytes + e.positions.nbytes for e in self._held.values())
 
 

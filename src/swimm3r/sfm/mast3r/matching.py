@@ -34,7 +34,7 @@ class PixelMatches:
 
 @dataclass(frozen=True)
 class ReciprocalPairs:
-    """Where the walks of one search ended, as flat pixel numbers y * w + x, sorted by the first."""
+    """End points of the walks of one search, as flat pixel numbers y * w + x, sorted by the first."""
 
     index1: Int64[Tensor, " m"]
     index2: Int64[Tensor, " m"]

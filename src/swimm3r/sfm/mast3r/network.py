@@ -68,7 +68,7 @@ class Decoded:
 
 @dataclass(frozen=True)
 class Pointmap:
-    """Where every pixel's surface is, in the frame of camera 1 of the pass, metres; and how sure (>= 1)."""
+    """The surface point of every pixel in the frame of camera 1 of the pass, metres, and its confidence (>= 1)."""
 
     points: Float[Tensor, "b h w 3"]
     confidence: Float[Tensor, "b h w"]
@@ -229,7 +229,7 @@ class Mast3r(nn.Module):
 
     @property
     def device(self) -> torch.device:
-        """Where the weights are."""
+        """The device of the weights."""
         return self.mask_token.device
 
     def set_precision(self, dtype: torch.dtype) -> "Mast3r":

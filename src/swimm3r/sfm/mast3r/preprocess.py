@@ -19,7 +19,7 @@ from torch.nn import functional as F
 
 @dataclass(frozen=True)
 class Framing:
-    """How an image of one size becomes the network's."""
+    """Resize and crop from an image of one size to the network's."""
 
     width: int  # of the image, pixels
     height: int

@@ -1,4 +1,4 @@
-"""What a run of the MASt3R front end will take, said before it starts: pairs, minutes, memory, disk.
+"""Cost estimate of the MASt3R front end before it starts: pairs, minutes, memory, disk.
 
 The network's share follows from its sizes (multiplications per token) and the time one encoding was measured to take;
 matching and alignment from constants measured on two x86 cores. It is an estimate: the progress that follows is exact.
@@ -80,7 +80,7 @@ def make_plan(network: Mast3r, images: NetworkImages, graph: PairGraph, settings
 
 
 def most_pairs(n: int, graph: PairGraph) -> int:
-    """How many pairs a graph over n frames has at most."""
+    """Largest number of pairs of a graph over n frames."""
     match graph:
         case Complete():
             found = n * (n - 1) // 2

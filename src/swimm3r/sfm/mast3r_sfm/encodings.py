@@ -42,7 +42,7 @@ class EncodingStore:
         return self._keys[i]
 
     def path(self, i: int) -> Path:
-        """Where the encoding of frame i is kept."""
+        """File of the encoding of frame i."""
         return self.folder / f"{self.key(i)}.safetensors"
 
     def __getitem__(self, i: int) -> Encoded:
@@ -83,7 +83,7 @@ def fingerprint(network: Mast3r) -> str:
 
 
 def frame_similarity(store: EncodingStore, method: str = "cosine", progress: Progress = silent) -> Float[Tensor, "n n"]:
-    """How alike frames look to the encoder; rows ask. Frames are read one at a time.
+    """Similarity of frames to the encoder; rows are queries. Frames are read one at a time.
 
     `cosine` compares sums of the tokens' deviations from the dive's mean token, each weighted by its length; `asmk`
     (with the published whitening and codebook, else WeightsError) aggregates them by visual words.

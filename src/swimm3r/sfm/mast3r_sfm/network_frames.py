@@ -36,7 +36,7 @@ _ASSUMED = 0.75  # focal length over width of an unknown lens; only says how to 
 
 @dataclass(frozen=True)
 class KnownPoses:
-    """Where frames were, for those that the user's file names."""
+    """Known poses of the frames that the user's file names."""
 
     cam2world: Float[Tensor, "n 4 4"]  # float64; anything for the others
     posed: Bool[Tensor, " n"]
@@ -64,7 +64,7 @@ class NetworkImages:
         return mask_to_network(self._undistorted(i)[1], self.framing)
 
     def digest(self, i: int) -> str:
-        """What tells frame i, as the network sees it, from any other image."""
+        """Digest of frame i as the network sees it."""
         frame = self.frames.frames[i]
         parts = [frame.path.read_bytes(), repr(self.framing).encode()]
         if frame.mask is not None:

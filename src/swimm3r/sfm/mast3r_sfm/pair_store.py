@@ -1,4 +1,4 @@
-"""What the network said, on disk and no larger than needed: matches per pair, one canonical view per frame.
+"""The network's results on disk: matches per pair, one canonical view per frame.
 
 Pointmaps are 6 MB each and every pair has four, so none is kept: they are added to their frame's running sums
 (`canonical`) and forgotten. Sums of frames whose pairs are not all done are held in memory up to a bound, then on disk;
@@ -35,7 +35,7 @@ _FLUSH_SECONDS = 60.0  # of work that a kill may cost
 
 @dataclass(frozen=True)
 class PairRecord:
-    """What is kept of a pair; predicted anchors only where its matches are too weak for the alignment."""
+    """The stored record of a pair; predicted anchors only where its matches are too weak for the alignment."""
 
     matches: PixelMatches
     i_in_j: Predicted | None = None
@@ -44,7 +44,7 @@ class PairRecord:
 
 @dataclass(frozen=True)
 class FrameRecord:
-    """What is kept of a frame once all its pairs are done."""
+    """The stored record of a frame once all its pairs are done."""
 
     anchored: AnchoredFrame
     view: CanonicalView  # its points are not kept: zero
@@ -58,7 +58,7 @@ class PairStore:
         self.settings_key = settings_key  # of everything but the frames that decides the matches
 
     def path(self, name_i: str, name_j: str) -> Path:
-        """Where the record of a pair is kept."""
+        """File of the record of a pair."""
         return self.folder / f"{_short(name_i, name_j, self.settings_key)}.npz"
 
     def has(self, name_i: str, name_j: str) -> bool:

@@ -53,7 +53,7 @@ def apply_adapter(network: Mast3r, adapter: Path, settings: Mast3rSettings) -> P
 
 @dataclass(frozen=True)
 class PairResults:
-    """What the network said about frames, on disk: names and stores to read it with."""
+    """The network's results for frames, on disk: names and the stores to read them with."""
 
     pairs: Pairs
     names: tuple[str, ...]  # hashes of the frames

@@ -1,4 +1,4 @@
-"""What follows once cameras and dense depth are known, whoever found them: the water, and everything without it."""
+"""The water of a reconstruction with known cameras and depth, and everything restored with it."""
 
 from dataclasses import replace
 from pathlib import Path

@@ -18,7 +18,7 @@ from swimm3r.sfm.medium.restore import RestoredImage
 
 _CELLS = 48  # cells along the long side of an image in which ground is looked for
 _POINTS = 2  # along each side of a cell
-_WITNESSES = 200_000  # points of the cloud, at most, that are asked which cells it shows
+_MAX_CLOUD = 200_000  # points of the cloud, at most, that are asked which cells it shows
 _SURFACE = 0.5  # share of open water from which there is no ground
 _MEASURED = 0.1  # share of an image below which its known depth is too little to guess the rest from
 _NEIGHBORS = 8  # frames before and after that may contradict
@@ -33,7 +33,7 @@ class Backdrop:
         assert rec.cloud is not None
         self.rec, self.frames = rec, frames
         known = rec.cloud.xyz
-        self._shown = [known[:: max(1, len(known) // _WITNESSES)].double()]
+        self._shown = [known[:: max(1, len(known) // _MAX_CLOUD)].double()]
         self._pieces: list[DenseCloud] = []
 
     def add(self, i: int, image: RestoredImage) -> None:

@@ -62,7 +62,7 @@ class _RangeBins:
 
 @dataclass(frozen=True)
 class _Evidence:
-    """What is known besides the observations."""
+    """Evidence besides the observations."""
 
     bins: _RangeBins
     Binf: tuple[float, float]  # median of open water, or else the mean of what is far, and its standard deviation
@@ -73,7 +73,7 @@ class _Evidence:
 
 @dataclass(frozen=True)
 class _Noise:
-    """How the observations err: weights are square roots of inverse variances."""
+    """Noise of the observations; weights are square roots of inverse variances."""
 
     weight: np.ndarray
     gain_std: float  # tau

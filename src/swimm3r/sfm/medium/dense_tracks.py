@@ -53,7 +53,7 @@ def fuse_depth(
 
 
 def count_tracks(rec: Reconstruction, frames: Frames, settings: TrackSettings, progress: Progress = silent) -> int:
-    """How many dense tracks there are in all, where every pixel of known depth may start one; none is held."""
+    """Number of dense tracks in all, where every pixel of known depth may start one; none is stored."""
     usable = [i for i, name in enumerate(rec.names) if name in rec.depth]
     return sum(len(piece.xyz) for piece in _by_frame(rec, frames, usable, 1, settings, progress))
 

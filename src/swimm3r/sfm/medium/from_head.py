@@ -44,7 +44,7 @@ _UNMEASURED = 1.0  # relative error of a head whose error nobody has measured
 
 @dataclass(frozen=True)
 class FrameWater:
-    """What the head reads in one frame, in the reconstruction's unit."""
+    """The head's prediction for one frame, in the reconstruction's unit."""
 
     Binf: Float[Tensor, "3"]
     beta_B: Float[Tensor, "3"]
@@ -61,7 +61,7 @@ class FrameWater:
 
 @dataclass(frozen=True)
 class FrameReading:
-    """What one frame tells about the dive's water, at some of its pixels of known depth, at least one."""
+    """One frame's contribution to the dive's water, at some of its pixels of known depth, at least one."""
 
     Binf: Float[Tensor, "3"]
     beta_B: Float[Tensor, "3"]
@@ -100,7 +100,7 @@ def write(maps: WaterMaps, scale: float, folder: Path, name: str) -> None:
 
 
 def read(folder: Path, images: NetworkImages, head: HeadFacts) -> PredictedWater | None:
-    """What `write` kept of a head in a folder; None where there is none, because the adapter has no head."""
+    """Read the predictions that `write` stored; None where the adapter has no head."""
     if not folder.is_dir():
         return None
     frames, frame = images.frames, images.framing

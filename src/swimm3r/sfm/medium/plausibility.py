@@ -1,4 +1,4 @@
-"""How far the water that was fitted can be believed: what restored images may show, and what their user must know.
+"""Plausibility of the fitted water: whether images may be restored with it, and the warnings for the user.
 
 Coefficients trade against each other where the depths span a short range, while T_D and B within that range may still
 be right. So images are judged by the standard deviation of the optical depth (beta_D z at the middle z of the fit),

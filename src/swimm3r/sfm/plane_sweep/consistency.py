@@ -1,4 +1,4 @@
-"""What frames make of each other's depth maps, compiled by Numba: agreement, specks, reading off another pixel grid.
+"""Cross-view depth consistency, compiled by Numba: agreement, specks, resampling to another pixel grid.
 
 Maps hold q = 1 / z_depth, 0 where unknown; pixels are indices, and H, e take them between views as in `sweep_kernels`.
 """
@@ -13,7 +13,7 @@ from swimm3r.sfm.plane_sweep.kernels import kernel
 @kernel
 @no_type_check
 def agreement(q, others, H, e, H_back, e_back, tolerance, pose_error):
-    """How many other frames see the same surface, and the mean of what they and this frame say.
+    """Number of other frames that see the same surface, and the mean depth of all of them.
 
     A point agrees where the other frame's own depth there differs by less than `tolerance` (relative) and its point
     falls back within 1.5 pixels of where it came from; or within `pose_error` pixels, which is all that the poses are

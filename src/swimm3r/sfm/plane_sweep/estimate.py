@@ -184,7 +184,7 @@ def consistent(
 
 
 def _with_neighbors(values: np.ndarray) -> np.ndarray:
-    """Means of 3 x 3 pixels: one pixel's correlation is a lottery where lines or grains are missing."""
+    """Means of 3 x 3 pixels: single-pixel NCC is too noisy without texture."""
     padded = torch.nn.functional.pad(torch.from_numpy(values)[None, None], (1, 1, 1, 1), mode="replicate")
     return torch.nn.functional.avg_pool2d(padded, 3, stride=1)[0, 0].numpy()
 

@@ -1,4 +1,4 @@
-"""What the plane sweep looks at: which frames to compare, how far to look, and undistorted images of one size.
+"""Inputs of the plane sweep: the frames to compare, the range of depths, and undistorted images of one size.
 
 Sweeping needs straight epipolar lines, so the work is done on a pinhole canvas at working size; depth along the optical
 axis is the same number on both grids, and `on_frame_grid` reads it back at every pixel of the distorted frame.

@@ -1,4 +1,4 @@
-"""What training leaves behind: adapters and physics head in one safetensors file, without a single base weight.
+"""Adapters and physics head in one safetensors file, without any base weight.
 
 Tensors bear PEFT's names (`peft_format.py`) and `head.NAME`; the header says which base they were trained on (SHA-256
 over its tensors, whatever file they came from), that base's license, which binds the adapter's use, and the settings.
@@ -144,7 +144,7 @@ def describe(path: Path) -> dict[str, Any]:
 
 
 def head_facts(path: Path) -> HeadFacts:
-    """How the water of a file's physics head is to be used. Raises WeightsError as `load` does."""
+    """Settings of the water of a file's physics head. Raises WeightsError as `load` does."""
     document, _ = _read(path)
     header = _checked(document, path)
     error = header.trained.validation.water_error

@@ -64,11 +64,11 @@ class LowRank(nn.Module):
         return self.alpha / self.rank
 
     def forward(self, x: Float[Tensor, " b *inner"]) -> Float[Tensor, " b *outer"]:
-        """What is added to the layer's output."""
+        """The term that is added to the layer's output."""
         return self.scale * self.lora_B(self.lora_A(x.to(self.lora_A.weight.dtype)))
 
     def weight_update(self) -> Float[Tensor, " out *inner"]:
-        """What would have to be added to the layer's weight to the same effect."""
+        """The matrix that has the same effect when added to the layer's weight."""
         A, B = self.lora_A.weight, self.lora_B.weight
         return self.scale * (B.flatten(1) @ A.flatten(1)).unflatten(1, A.shape[1:])
 

@@ -1,4 +1,4 @@
-"""What medium-aware training minimizes: the student's features against the teacher's, and the water against images.
+"""Losses of medium-aware training: the student's features against the teacher's, and the water against images.
 
     L_geom = sum_k lambda_k |F_k - F~_k|^2       k: encoder, decoder, descriptors            (Eq. 1)
     L_for  = 1/N sum_n |I->_n - I_n|_1           I-> = add_water(J)                          (Eq. 5)
@@ -30,7 +30,7 @@ from swimm3r.sfm.mast3r.settings import ObjectiveSettings
 
 @dataclass(frozen=True)
 class PairFeatures:
-    """What the network makes of a batch of pairs, at the levels where the student follows the teacher."""
+    """Features of a batch of pairs at the levels where the student follows the teacher."""
 
     encoder: tuple[Float[Tensor, "b n c"], ...]  # normalized encoder output, one entry per view
     decoder: tuple[Float[Tensor, "b n d"], ...]  # one entry per view and level

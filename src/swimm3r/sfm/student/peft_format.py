@@ -2,7 +2,7 @@
 
     base_model.model.LAYER.lora_A.weight, base_model.model.LAYER.lora_B.weight
 
-What PEFT trains on this network can be used here, and the other way round. Variants that are more than W + s B A
+Adapters trained with PEFT on this network can be used here, and ours in PEFT. Variants that are more than W + s B A
 (DoRA, trained biases, whole modules) are refused by name.
 """
 

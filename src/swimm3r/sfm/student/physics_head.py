@@ -50,7 +50,7 @@ class WaterMaps:
 
 @dataclass(frozen=True)
 class HeadFacts:
-    """How the water of a trained head is to be used, beside its weights."""
+    """Settings for the water of a trained head, stored beside its weights."""
 
     min_transmittance: float  # eps_inv of Eq. 4, as in its training
     error: Medium | None = None  # one relative standard error per coefficient and channel, [3]; None: never measured

@@ -38,7 +38,7 @@ class Student(nn.Module):
         return self._network[0]
 
     def water(self, encoded: Encoded) -> WaterMaps:
-        """What the head reads from the student's tokens. Raises ValueError for a student without one."""
+        """The head's prediction from the student's tokens. Raises ValueError for a student without a head."""
         if self.head is None:
             raise ValueError("this student was trained without the physics head")
         return self.head(encoded)
@@ -78,7 +78,7 @@ class Student(nn.Module):
         return terms
 
     def teacher(self, clean: Float[Tensor, "b 2 3 h w"]) -> PairFeatures:
-        """What the network without its adapters makes of the clear images of pairs."""
+        """Features of the clear images of pairs, from the network without its adapters."""
         with torch.no_grad(), self.adapters.off():
             return self._features(clean)[0]
 

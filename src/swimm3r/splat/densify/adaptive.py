@@ -30,7 +30,7 @@ class Changed:
 
 
 def nothing_seen(n: int, device: torch.device = CPU) -> dict[str, Tensor]:
-    """What is remembered of n Gaussians before any step: sums of pulls, how many they are, and the largest radius."""
+    """Statistics of n Gaussians before any step: sums and counts of gradients, and the largest radius."""
     return {name: torch.zeros(n, device=device) for name in ("pull", "times", "radius")}
 
 

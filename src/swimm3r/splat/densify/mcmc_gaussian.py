@@ -31,7 +31,7 @@ class Relocated:
 
 
 def scale_factor(opacity: Float[Tensor, "*n"], copies: Float[Tensor, "*n"]) -> Float[Tensor, "*n"]:
-    """What scales are multiplied by where `copies` Gaussians take the place of one; in float64."""
+    """Factor of the scales where `copies` Gaussians replace one; in float64."""
     o, n = opacity.double(), copies.double()
     share = 1 - (1 - o) ** (1 / n)
     total, choose = torch.zeros_like(o), torch.ones_like(o)

@@ -9,7 +9,7 @@ from typing import Protocol, runtime_checkable
 
 @runtime_checkable  # so that the suite can check calls against it
 class RefineCadence(Protocol):
-    """What the densification settings of all recipes share."""
+    """The settings that all recipes' densification shares."""
 
     @property
     def refine_every(self) -> float:

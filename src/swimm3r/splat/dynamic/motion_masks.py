@@ -1,4 +1,4 @@
-"""Where a frame shows what moves: what neither the still map nor the other frames have there.
+"""Motion masks: pixels that neither the static map nor the other frames explain.
 
 Early in training a map shows the ground, and here and there already a ghost of what moved before it. So two questions
 are asked of a frame: does it differ from the map, and from the images of the same ground at other times? What does
@@ -94,7 +94,7 @@ def against_others(mine: MotionView, others: Sequence[MotionView]) -> MotionView
 
 
 def moving_pixels(mine: MotionView, others: Sequence[MotionView], contrast: float, least: float) -> Bool[Tensor, "h w"]:
-    """Where a frame is off `contrast` times as much as the others that see the same ground, or water.
+    """Pixels whose error is `contrast` times that of the other frames which see the same ground, or water.
 
     That is more than their median, of two frames at least, and by `least` of the full range. The regions around such
     pixels that are off half as much are part of what moves: it may here and there look like the ground.
@@ -145,7 +145,7 @@ def _grown(seeds: Bool[Tensor, "h w"], region: Bool[Tensor, "h w"]) -> Bool[Tens
 
 
 def _parts(mask: Bool[Tensor, "h w"]) -> list[Bool[Tensor, "h w"]]:
-    """What hangs together."""
+    """The connected components."""
     import cv2
 
     count, number = cv2.connectedComponents(mask.numpy().astype(np.uint8))

@@ -1,4 +1,4 @@
-"""Where the pixels of a moving part go, from one frame to another.
+"""Optical flow of a moving part from one frame to another.
 
 Parts that are laid over each other (`tracking`) are near each other up to their turning and bending; optical flow says
 that, and where it leads nowhere the motion of the whole part says enough.
@@ -23,7 +23,7 @@ _LEADS = 30  # pixels that must be followed for the motion of a part to be more 
 
 @dataclass(frozen=True)
 class Passage:
-    """Where the pixels of a part are in another frame, both at full size."""
+    """Positions of the pixels of a part in another frame, both at full size."""
 
     flow: Float[Tensor, "2 h w"]
     back: Float[Tensor, "2 h w"]
@@ -64,7 +64,7 @@ def full_size(values: Shaped[Tensor, "h w"], view: TrainingView) -> Float[Tensor
 
 
 def _on_gray(view: TrainingView, mask: Bool[Tensor, "h w"]) -> UInt8[np.ndarray, "H W"]:
-    """What moves in a frame, before an even gray: the ground, which moves otherwise, must not lead the flow astray."""
+    """The moving pixels of a frame on an even gray, so that the ground's motion does not enter the flow."""
     import cv2
 
     gray = cv2.cvtColor((255 * view.rgb).byte().permute(1, 2, 0).numpy(), cv2.COLOR_RGB2GRAY)
@@ -75,7 +75,7 @@ def _on_gray(view: TrainingView, mask: Bool[Tensor, "h w"]) -> UInt8[np.ndarray,
 def _flow(
     first: UInt8[np.ndarray, "h w"], second: UInt8[np.ndarray, "h w"], about: Float[Tensor, "2 3"]
 ) -> Float[Tensor, "2 h w"]:
-    """How far every pixel of one image has gone in another, pixels (x, y), if it is `about` there."""
+    """Displacement of every pixel of one image in another, pixels (x, y), starting from `about`."""
     import cv2
 
     height, width = first.shape
@@ -95,7 +95,7 @@ def _flow(
 def _followed(
     flow: Float[Tensor, "2 h w"], back: Float[Tensor, "2 h w"], pixels: Float[Tensor, "n 2"]
 ) -> tuple[Float[Tensor, "n 2"], Bool[Tensor, " n"]]:
-    """Where the flow takes pixels, and whether that is within the image and the flow back ends where it began."""
+    """Targets of the flow, and whether they lie inside the image and the backward flow returns to the start."""
     moved = pixels + _sampled(flow, pixels)
     returned = moved + _sampled(back, moved)
     size = torch.tensor([flow.shape[2], flow.shape[1]])

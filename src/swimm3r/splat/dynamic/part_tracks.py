@@ -1,4 +1,4 @@
-"""What moves, from frame to frame: which part of one frame is which of the next, and how it has shifted.
+"""Tracks of moving parts: association from frame to frame, and the shifts between.
 
 A camera that swims shifts what moves by more than its own length from one frame to the next, and what has a pattern
 looks alike a few pixels on. So parts are laid over each other, outlines and colors, wherever they may be.
@@ -33,7 +33,7 @@ class Part:
 
 @dataclass(frozen=True)
 class Fit:
-    """How a part is best laid over another."""
+    """The best alignment of a part with another."""
 
     cost: float
     whole: Float[Tensor, "2 3"]  # affine, of homogeneous pixels of the small images

@@ -1,4 +1,4 @@
-"""How far away is what moves: its course through space, from where one moving camera sees it at many times.
+"""Trajectory triangulation: the path of a moving object from the rays of one moving camera at many times.
 
 At every time it lies on a known ray; of all courses along the rays the slow and steady one is taken, the minimum of
 

@@ -176,7 +176,7 @@ def with_binf_prior(fit: MediumFit, color: Float[Tensor, "3"], std: float) -> Me
 
 @dataclass(frozen=True)
 class WaterPrior:
-    """What the reconstruction knows about the water: Binf, then ln beta_B and ln beta_D, as the field orders them."""
+    """Prior of the water from the reconstruction: Binf, then ln beta_B and ln beta_D, in the field's order."""
 
     mean: Float[Tensor, "9"]
     std: Float[Tensor, "9"]

@@ -46,7 +46,7 @@ def initial_scene_water(rng: torch.Generator) -> SceneWater:
 
 @dataclass(frozen=True)
 class WaterLayer:
-    """What the water does to one image."""
+    """The effect of the water on one image."""
 
     depth: Float[Tensor, "h w"]  # 0..1 over the image; the farthest where nothing is seen
     transmittance: Float[Tensor, "3 h w"]  # e^{-a d}

@@ -113,7 +113,7 @@ def with_time(p: BetaPrimitives, settings: InitialSettings, rng: torch.Generator
 
 @dataclass(frozen=True)
 class StartingPoints:
-    """Where primitives start, whatever their kind."""
+    """Initial positions of primitives of any kind."""
 
     xyz: Float[Tensor, "n 3"]  # float64
     rgb: Float[Tensor, "n 3"]

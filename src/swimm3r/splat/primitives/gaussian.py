@@ -47,7 +47,7 @@ def rescaled(p: GaussianPrimitives, factor: float) -> GaussianPrimitives:
 
 
 def harmonics_of_degree(degree: int) -> int:
-    """How many harmonics there are above the constant one."""
+    """Number of harmonics above the constant one."""
     return (degree + 1) ** 2 - 1
 
 

@@ -9,7 +9,7 @@ from swimm3r.splat.primitives.beta import BetaPrimitives
 from swimm3r.splat.primitives.gaussian import GaussianPrimitives, harmonics_of_degree
 
 Primitives = BetaPrimitives | GaussianPrimitives
-"""What can be projected."""
+"""Primitives that can be projected."""
 
 
 def primitives_from(tensors: Mapping[str, Tensor], kind: type[Primitives], prefix: str) -> Primitives:

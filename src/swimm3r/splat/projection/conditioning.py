@@ -58,7 +58,7 @@ def factor(p: BetaPrimitives, rotation: str = "first_order") -> Float[Tensor, "n
 def queries(
     xyz: Float[Tensor, "n 3"], center: Float[Tensor, "3"], time: Float[Tensor, ""] | None = None
 ) -> Float[Tensor, "n c"]:
-    """What primitives are conditioned on: unit direction camera -> primitive in world axes, then time in 0..1."""
+    """The query of the conditioning: unit direction camera -> primitive in world axes, then time in 0..1."""
     direction = torch.nn.functional.normalize(xyz - center, dim=-1)
     return direction if time is None else torch.cat([direction, time.to(direction).expand(len(xyz), 1)], -1)
 

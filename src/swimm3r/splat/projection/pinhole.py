@@ -35,7 +35,7 @@ class Pinhole:
 
 @dataclass(frozen=True)
 class Projection:
-    """What the rasterizer draws, and the radius of each primitive, px, without gradient."""
+    """Primitives for the rasterizer, and the radius of each, px, without gradient."""
 
     primitives: Primitives2D
     radius: Float[Tensor, " n"]

@@ -1,1 +1,1 @@
-"""What each published method trains: its losses and its schedule."""
+"""The recipes: losses and schedule of each published method."""

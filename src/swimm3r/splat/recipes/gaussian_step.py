@@ -1,4 +1,4 @@
-"""What a step of every recipe with Gaussians begins and ends with: one view drawn, rates, rows that come and go."""
+"""Steps that all recipes with Gaussians share: rendering one view, learning rates, and rows added or removed."""
 
 from collections.abc import Collection
 from dataclasses import dataclass
@@ -75,7 +75,7 @@ def with_matches(
 
 
 def short_run_rate_exponent(settings: GaussianSettings) -> float:
-    """How much larger some rates are than published, in a run this short."""
+    """Factor on some published learning rates in a run this short."""
     published = type(settings).iterations
     return min(_MOST_HASTE, max(1.0, published / settings.iterations) ** settings.rates.short_run_rate_exponent)
 

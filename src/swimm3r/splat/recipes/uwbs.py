@@ -43,7 +43,7 @@ _HORIZON_STD = 0.2  # of the open water's color around the scene's mean color, a
 
 @dataclass(frozen=True)
 class _Adjoint:
-    """What one view asks of the parameters."""
+    """Gradients of one view."""
 
     gradients: dict[str, Tensor]  # by the names of `parameters_of`
     multiplier: Float[Tensor, " n"] | None  # of the centers' displacement (Alg. 1); None for Adam's own
@@ -252,7 +252,7 @@ def measured_water(rec: Reconstruction) -> MediumFit | None:
 
 
 def known_water(scene: TrainingScene, settings: UwbsSettings) -> WaterPrior | None:
-    """What structure from motion says about the water, per working unit; None for maps without water."""
+    """The reconstruction's water, per working unit; None for maps without water."""
     fit = measured_water(scene.rec)
     if settings.medium.model == "none" or fit is None:
         return None

@@ -25,12 +25,12 @@ from swimm3r.splat.views import TrainingView
 log = logging.getLogger(__name__)
 
 Numbers = dict[str, float | Tensor]
-"""What a step says for the record; tensors stay on their device until the record is written."""
+"""Scalars logged by one step; tensors stay on their device until the log is written."""
 
 
 @runtime_checkable  # so that the suite can check calls against it
 class Recipe(Protocol):
-    """What a method brings to the loop: one scene's first state and every step."""
+    """A method in the training loop: one scene's first state and every step."""
 
     @property
     def settings(self) -> SplatSettings:
@@ -53,7 +53,7 @@ class Recipe(Protocol):
 
 @dataclass(frozen=True)
 class Schedule:
-    """How long, and how often something is written."""
+    """Length of a training, and its intervals for logs and checkpoints."""
 
     iterations: int
     log_every: int

@@ -28,7 +28,7 @@ class TrainingScene:
 
     @property
     def refined_cameras(self) -> int:
-        """How many poses are refined."""
+        """Number of refined poses."""
         return 0 if self.poses is None else len(self.poses)
 
     def codes(self, settings: TrainingPoseSettings, rng: torch.Generator) -> PoseMlp | None:

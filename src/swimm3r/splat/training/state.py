@@ -90,7 +90,7 @@ def restored(tensors: dict[str, Tensor], settings: SplatSettings, cameras: int) 
 
 
 def in_scene_units(state: State, length: float) -> tuple[Primitives, Water]:
-    """What a map keeps of a finished state: primitives and water, `length` scene units to a working unit; no gradient.
+    """Primitives and water of a finished state, `length` scene units to a working unit; no gradient.
 
     SceneWater has no length.
     """
