@@ -1,4 +1,4 @@
-"""What the water does to an image, and how to undo it (Akkaynak & Treibitz 2018, 2019; paper Eqs. 2-4).
+"""Image formation in water and its inverse (Akkaynak & Treibitz 2018, 2019; paper Eqs. 2-4).
 
     I = J * T_D + Binf * (1 - T_B),   T_D = exp(-beta_D * z),   T_B = exp(-beta_B * z)
 

@@ -26,8 +26,7 @@ _SKY_ERROR = 2.0
 _TEMPERATURE = 0.05
 _LEAST = 1e-8
 LEAST_SHARE = 1e-8
-"""What each share e_ii / sum is at least: a match rarer than this costs no more, and teaches nothing. As the reference
-has it; 0 has no bound."""
+"""Lower bound of each share e_ii / sum, as the reference has it: a rarer match costs no more and has no gradient."""
 
 
 @dataclass(frozen=True)
