@@ -94,7 +94,7 @@ def main() -> None:
             B_error.append((backscatter(z, found) - backscatter(z, draw.medium)).abs().mean(0).max())
             for name in errors:
                 truth = getattr(draw.medium, name)
-                errors[name].append(((getattr(fit.medium, name) - truth).abs() / truth).numpy())
+                errors[name].append(((getattr(fit, name) - truth).abs() / truth).numpy())
                 flags[name].append(fit.identifiable[name].numpy())
         for name in errors:
             flag, error = np.stack(flags[name]), np.stack(errors[name])

@@ -49,12 +49,13 @@ class AttenuationCurve:
 class MediumFit:
     """A medium estimated from images, with what is known about the estimate.
 
-    `medium.beta_D` is the one number that stands for the curve: -ln T_D(z_med) / z_med at the median depth.
     `std` holds one standard deviation of each coefficient; `identifiable` says per coefficient and channel ("Binf",
     "beta_D", "beta_B" -> 3 flags) whether the frames determine it, which a short depth range often does not.
     """
 
-    medium: Medium  # fields of shape [3]
+    Binf: Float[Tensor, "3"]  # veiling light, 0..1
+    beta_D: Float[Tensor, "3"]  # the one number that stands for the curve: -ln T_D(z_med) / z_med at the median depth
+    beta_B: Float[Tensor, "3"]  # build-up of backscatter, 1/unit of ray depth
     curve: AttenuationCurve
     std: Medium
     identifiable: dict[str, Bool[Tensor, "3"]]
@@ -65,7 +66,11 @@ class MediumFit:
     def at(self, ray_depth: Float[Tensor, "*pixels"]) -> Medium:
         """The medium as each pixel sees it: beta_D follows the curve, held constant outside `z_range`."""
         beta_D = self.curve.at(ray_depth.clamp(*self.z_range))
-        return Medium(self.medium.Binf.expand_as(beta_D), beta_D, self.medium.beta_B.expand_as(beta_D))
+        return Medium(self.Binf.expand_as(beta_D), beta_D, self.beta_B.expand_as(beta_D))
+
+    def constant(self) -> Medium:
+        """The three numbers per channel alone, without the curve."""
+        return Medium(self.Binf, self.beta_D, self.beta_B)
 
 
 def transmittances(
@@ -111,7 +116,7 @@ def rescale(fit: MediumFit, scale: float) -> MediumFit:
     c = fit.curve
     return replace(
         fit,
-        medium=per_length(fit.medium),
+        **vars(per_length(fit.constant())),
         std=per_length(fit.std),
         curve=AttenuationCurve(c.a / scale, c.b / scale, c.c / scale, c.d / scale),
         z_range=(fit.z_range[0] * scale, fit.z_range[1] * scale),

@@ -60,8 +60,8 @@ def test_the_students_water_restores_the_dive(place: Path, tmp_path: Path, capsy
     rec = reconstruction.load(run / "sfm")
     assert len(list((run / "sfm" / "water").glob("*.npz"))) == len(rec.names) == 4
     fit = medium_json.read_fits(run / "sfm" / "medium.json", remake(run / "sfm"))["stored"]
-    assert ((fit.medium.Binf > 0) & (fit.medium.Binf < 1)).all()
-    assert (fit.medium.beta_D > 0).all()
+    assert ((fit.Binf > 0) & (fit.Binf < 1)).all()
+    assert (fit.beta_D > 0).all()
     assert len(list((run / "sfm" / "restored").glob("*.png"))) == 4
     assert (run / "sfm" / "points.ply").is_file()
 

@@ -31,7 +31,7 @@ def fit_of(medium: Medium) -> MediumFit:
     """A fit that found exactly this water."""
     zero = torch.zeros(3)
     return MediumFit(
-        medium=medium,
+        **vars(medium),
         curve=AttenuationCurve(medium.beta_D, zero, zero, zero),
         std=Medium(zero, zero, zero),
         identifiable={name: torch.ones(3, dtype=torch.bool) for name in ("Binf", "beta_D", "beta_B")},

@@ -41,7 +41,7 @@ def step(
     """A pass with a fixed random cotangent for each of the four images; float32 except in the reference."""
     dtype = torch.float64 if backend == "reference" else torch.float32
     leaves = [t.to(dtype).requires_grad_() for t in (*p, *medium)]
-    height, width = medium.binf.shape[1:]
+    height, width = medium.Binf.shape[1:]
     sgg = SggBuffers(*(b.to(dtype) for b in SggBuffers.zeros(len(p.depth))))
     out = rasterize(
         Primitives2D(*leaves[:6]), MediumMaps(*leaves[6:]), height, width,
@@ -152,9 +152,9 @@ def test_depth_may_be_left_to_what_looks_at_depth(backend: Backend, scene: Scene
 def test_without_primitives_every_pixel_is_open_water(backend: Backend, scene: Scene):
     p, medium = scene(0, 20, 33)
     got = step(backend, p, medium)
-    torch.testing.assert_close(got.out.rgb.double(), medium.binf, rtol=0, atol=1e-6)
+    torch.testing.assert_close(got.out.rgb.double(), medium.Binf, rtol=0, atol=1e-6)
     assert not got.out.alpha.any()
-    assert not got.grads[NAMES.index("beta_b")].any()
+    assert not got.grads[NAMES.index("beta_B")].any()
 
 
 @backends
@@ -199,7 +199,7 @@ def test_a_one_pixel_image_reproduces_the_published_pixel(backend: Backend, case
         torch.full((n,), 2.0), x["z"],
     )  # fmt: skip
     medium = MediumMaps(
-        *(torch.from_numpy(VECTORS[f"{case}_in_{k}"]).float()[:, None, None] for k in ("Binf", "bB", "bD"))
+        *(torch.from_numpy(VECTORS[f"{case}_in_{k}"]).float()[:, None, None] for k in ("Binf", "bD", "bB"))
     )
     leaves = [p.opacity.requires_grad_(), p.color.requires_grad_(), p.depth.requires_grad_(), *medium]
     for leaf in leaves:
@@ -217,7 +217,7 @@ def test_a_one_pixel_image_reproduces_the_published_pixel(backend: Backend, case
         for k, image in zip(("gI", "gJ", "gZ", "gA"), out, strict=True)
     ]
     grads = torch.autograd.grad(out, leaves, cotangent)
-    for key, grad in zip(("dalpha", "dc", "dz", "dBinf", "dbB", "dbD"), grads, strict=True):
+    for key, grad in zip(("dalpha", "dc", "dz", "dBinf", "dbD", "dbB"), grads, strict=True):
         expected = torch.from_numpy(VECTORS[f"{case}_out_{key}"])
         torch.testing.assert_close(grad.double().reshape(expected.shape), expected, rtol=1e-4, atol=1e-5)
 
@@ -277,7 +277,7 @@ def test_the_depth_branch_alone_is_the_isolated_depth_gradient(backend: Backend,
 
 def test_maps_of_another_size_are_refused(scene: Scene):
     p, medium = scene(5, 8, 8)
-    with pytest.raises(ValueError, match=r"binf must have shape \(3, 8, 9\)"):
+    with pytest.raises(ValueError, match=r"Binf must have shape \(3, 8, 9\)"):
         rasterize(p, medium, 8, 9)
 
 

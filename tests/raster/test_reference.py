@@ -25,7 +25,7 @@ class Pixel:
     def __init__(self, name: str) -> None:
         self.name = name
         self.alpha, self.color, self.z = (self.input(k).requires_grad_() for k in ("alpha", "c", "z"))
-        self.medium = MediumMaps(*(self.input(k).requires_grad_() for k in ("Binf", "bB", "bD")))
+        self.medium = MediumMaps(*(self.input(k).requires_grad_() for k in ("Binf", "bD", "bB")))
         self.cotangent = RasterOutput(*(self.input(k) for k in ("gI", "gJ", "gZ", "gA")))
 
     def input(self, key: str) -> torch.Tensor:
@@ -53,7 +53,7 @@ def test_autograd_of_the_blend_gives_the_published_gradients(name: str):
     leaves = [pixel.alpha, pixel.color, pixel.z, *pixel.medium]
     images = [out.rgb, out.clear, out.z_depth, out.alpha]
     grads = torch.autograd.grad(images, leaves, list(pixel.cotangent), materialize_grads=True)
-    for key, grad in zip(("dalpha", "dc", "dz", "dBinf", "dbB", "dbD"), grads, strict=True):
+    for key, grad in zip(("dalpha", "dc", "dz", "dBinf", "dbD", "dbB"), grads, strict=True):
         close(grad, pixel.out(key))
 
 
@@ -81,7 +81,7 @@ def test_the_veil_is_one_minus_the_blended_backscatter_transmittance():
     alpha, z = torch.rand(7, 20, generator=rng).double(), torch.rand(20, generator=rng).double().sort().values * 9
     medium = MediumMaps(*(torch.rand(7, 3, generator=rng).double() for _ in range(3)))
     out = blend(alpha, torch.rand(20, 3, generator=rng).double(), z, medium)
-    identity = 1 - (out.w[..., None] * torch.exp(-medium.beta_b[:, None] * z[:, None])).sum(1)
+    identity = 1 - (out.w[..., None] * torch.exp(-medium.beta_B[:, None] * z[:, None])).sum(1)
     torch.testing.assert_close(out.V, identity, rtol=1e-13, atol=1e-13)
 
 
@@ -111,13 +111,13 @@ def test_geometry_and_medium_branches_add_up_to_the_plain_center_gradient(kernel
 
 def test_water_without_coefficients_is_alpha_blending_over_the_veiling_light(scene: Scene):
     p, medium = scene(30, 13, 18)
-    clear_water = MediumMaps(medium.binf, torch.zeros_like(medium.binf), torch.zeros_like(medium.binf))
+    clear_water = MediumMaps(medium.Binf, torch.zeros_like(medium.Binf), torch.zeros_like(medium.Binf))
     out = rasterize(p, clear_water, 13, 18, backend="reference")
-    torch.testing.assert_close(out.rgb, out.clear + (1 - out.alpha) * medium.binf)
+    torch.testing.assert_close(out.rgb, out.clear + (1 - out.alpha) * medium.Binf)
 
 
 def test_no_primitive_leaves_the_veiling_light(scene: Scene):
     p, medium = scene(0, 4, 5)
     out = rasterize(p, medium, 4, 5, backend="reference")
-    torch.testing.assert_close(out.rgb, medium.binf)
+    torch.testing.assert_close(out.rgb, medium.Binf)
     assert not out.alpha.any()

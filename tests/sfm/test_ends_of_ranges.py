@@ -48,7 +48,7 @@ def changed(settings: Settings, name: str, number: float) -> Any:
 
 
 def finite(fit: MediumFit) -> bool:
-    values = [*vars(fit.medium).values(), *vars(fit.curve).values(), *vars(fit.std).values()]
+    values = [*vars(fit.constant()).values(), *vars(fit.curve).values(), *vars(fit.std).values()]
     return all(bool(value.isfinite().all()) for value in values)
 
 
@@ -57,7 +57,12 @@ def known_water(teal: Medium) -> MediumFit:
     zero, yes = torch.zeros(3), torch.ones(3, dtype=torch.bool)
     known = dict.fromkeys(("Binf", "beta_D", "beta_B"), yes)
     return MediumFit(
-        teal, AttenuationCurve(teal.beta_D, zero, zero, zero), Medium(zero, zero, zero), known, (0.1, 50.0), "srgb"
+        **vars(teal),
+        curve=AttenuationCurve(teal.beta_D, zero, zero, zero),
+        std=Medium(zero, zero, zero),
+        identifiable=known,
+        z_range=(0.1, 50.0),
+        encoding="srgb",
     )
 
 

@@ -126,7 +126,7 @@ def tiny_dive(tmp_path_factory: pytest.TempPathFactory) -> TinyDive:
         backend="truth",
         metric=True,
         medium=MediumFit(
-            WATER, AttenuationCurve(WATER.beta_D, flat, flat, flat), Medium(flat, flat, flat),
+            *vars(WATER).values(), AttenuationCurve(WATER.beta_D, flat, flat, flat), Medium(flat, flat, flat),
             {name: torch.ones(3, dtype=torch.bool) for name in ("Binf", "beta_D", "beta_B")}, (1.0, 4.0), "srgb",
         ),
         cloud=DenseCloud(xyz, rgb, rgb),

@@ -20,8 +20,8 @@ TIME = torch.tensor(0.4, dtype=torch.float64)
 
 def water() -> MediumMaps:
     rng = torch.Generator().manual_seed(5)
-    binf, beta_b, beta_d = torch.rand(3, 3, HEIGHT, WIDTH, generator=rng, dtype=torch.float64)
-    return MediumMaps(binf, 0.4 * beta_b, 0.4 * beta_d)
+    Binf, beta_D, beta_B = torch.rand(3, 3, HEIGHT, WIDTH, generator=rng, dtype=torch.float64)
+    return MediumMaps(Binf, 0.4 * beta_D, 0.4 * beta_B)
 
 
 def turned(view: Pinhole, world2cam: torch.Tensor) -> Pinhole:

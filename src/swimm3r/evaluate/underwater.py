@@ -106,7 +106,7 @@ def water_scores(
     """
     if fit.encoding != encoding:
         raise ValueError(f"the fit explains {fit.encoding} values, the true water {encoding} ones")
-    return water_scores_from_views(((z, fit.at(z)) for z in ray_depths), fit.medium, fit.identifiable, true)
+    return water_scores_from_views(((z, fit.at(z)) for z in ray_depths), fit.constant(), fit.identifiable, true)
 
 
 def water_scores_from_views(

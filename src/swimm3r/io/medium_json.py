@@ -20,7 +20,7 @@ def write_fits(path: Path, fits: dict[str, MediumFit]) -> None:
 
     document = {
         name: {
-            "medium": plain(fit.medium),
+            "medium": plain(fit.constant()),
             "curve": plain(fit.curve),
             "std": plain(fit.std),
             "identifiable": {key: flags.tolist() for key, flags in fit.identifiable.items()},
@@ -88,7 +88,7 @@ def read_fits(path: Path, remedy: Remedy) -> dict[str, MediumFit]:
 
     return {
         name: MediumFit(
-            medium=fit.medium.medium(),
+            **vars(fit.medium.medium()),
             curve=AttenuationCurve(**tensors(fit.curve)),
             std=fit.std.medium(),
             identifiable=tensors(fit.identifiable),

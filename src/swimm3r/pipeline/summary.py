@@ -181,7 +181,7 @@ def _refined_section(poses: RefinedPoses, truth: GroundTruth) -> dict[str, objec
 
 def _medium_section(fit: MediumFit, metric: bool) -> dict[str, object]:
     return {
-        **{name: value.tolist() for name, value in vars(fit.medium).items()},
+        **{name: value.tolist() for name, value in vars(fit.constant()).items()},
         "identifiable": {name: flags.tolist() for name, flags in fit.identifiable.items()},
         "unit": "1/m" if metric else "per scene unit",
         "encoding": fit.encoding,

@@ -79,12 +79,12 @@ def make(jit: Any, exp2: Any, log2: Any, minimum: Any, maximum: Any, select: Any
         return vec3(exp2(k[0] * z), exp2(k[1] * z), exp2(k[2] * z))
 
     @jit
-    def seen_color(color, binf, E_B, E_D):
+    def seen_color(color, Binf, E_B, E_D):
         """F: what a primitive adds to open water, per unit of weight."""
         return vec3(
-            color[0] * E_D[0] - binf[0] * E_B[0],
-            color[1] * E_D[1] - binf[1] * E_B[1],
-            color[2] * E_D[2] - binf[2] * E_B[2],
+            color[0] * E_D[0] - Binf[0] * E_B[0],
+            color[1] * E_D[1] - Binf[1] * E_B[1],
+            color[2] * E_D[2] - Binf[2] * E_B[2],
         )
 
     @jit

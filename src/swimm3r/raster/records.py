@@ -36,9 +36,9 @@ class Primitives2D(NamedTuple):
 class MediumMaps(NamedTuple):
     """The water at every pixel. For ray depth, scale both betas with the length of the pixel's ray at z = 1."""
 
-    binf: Float[Tensor, "3 h w"]  # veiling light B_inf
-    beta_b: Float[Tensor, "3 h w"]  # backscatter coefficient, per unit of depth
-    beta_d: Float[Tensor, "3 h w"]  # attenuation coefficient, per unit of depth
+    Binf: Float[Tensor, "3 h w"]  # veiling light B_inf
+    beta_D: Float[Tensor, "3 h w"]  # attenuation coefficient, per unit of depth
+    beta_B: Float[Tensor, "3 h w"]  # backscatter coefficient, per unit of depth
 
 
 class RasterOutput(NamedTuple):

@@ -74,15 +74,15 @@ def blend(
 
     A pair with alpha = 0 changes nothing, so skipped pairs may stay in the list.
     """
-    binf, beta_b, beta_d = medium
+    Binf, beta_D, beta_B = medium
     T = transmittance(alpha)
     w = T[..., :-1] * alpha
     z_with_0 = torch.cat([z.new_zeros(1), z])
-    E_B = torch.exp(-beta_b[..., None, :] * z_with_0[:, None])  # [*pixels, k + 1, 3]
-    E_D = torch.exp(-beta_d[..., None, :] * z[:, None])
+    E_B = torch.exp(-beta_B[..., None, :] * z_with_0[:, None])  # [*pixels, k + 1, 3]
+    E_D = torch.exp(-beta_D[..., None, :] * z[:, None])
     V = (T[..., :-1, None] * (E_B[..., :-1, :] - E_B[..., 1:, :])).sum(-2) + T[..., -1:] * E_B[..., -1, :]
     attenuated = (w[..., None] * color * E_D).sum(-2)
-    return Blend(w, T, V, attenuated, w @ color, attenuated + binf * V, w @ z, 1 - T[..., -1])
+    return Blend(w, T, V, attenuated, w @ color, attenuated + Binf * V, w @ z, 1 - T[..., -1])
 
 
 def split_alpha_adjoint(
@@ -99,15 +99,15 @@ def split_alpha_adjoint(
     The loss depends on alpha only through sum_i w_i e_i, with a payload e_i per branch; back to front,
     dL/dalpha_i = T_i (e_i - R_{i+1}),  R_i = alpha_i e_i + (1 - alpha_i) R_{i+1}.
     """
-    binf, beta_b, beta_d = medium
+    Binf, beta_D, beta_B = medium
     g = cotangent.rgb
     T = transmittance(alpha)
-    E_B = torch.exp(-beta_b[..., None, :] * z[:, None])
-    E_D = torch.exp(-beta_d[..., None, :] * z[:, None])
+    E_B = torch.exp(-beta_B[..., None, :] * z[:, None])
+    E_D = torch.exp(-beta_D[..., None, :] * z[:, None])
     payloads = (
         g @ color.T,
         (g[..., None, :] * color * (E_D - 1)).sum(-1),
-        -((g * binf)[..., None, :] * E_B).sum(-1),
+        -((g * Binf)[..., None, :] * E_B).sum(-1),
         cotangent.z_depth[..., None] * z,
         cotangent.clear @ color.T + cotangent.alpha[..., None],
     )

@@ -181,7 +181,7 @@ def _water(rec: Reconstruction) -> dict[str, object]:
     fit = rec.medium
     unit = "m" if rec.metric else "scene units"
     return {
-        "swatch": "rgb({:.0f},{:.0f},{:.0f})".format(*(fit.medium.Binf * 255).tolist()),
+        "swatch": "rgb({:.0f},{:.0f},{:.0f})".format(*(fit.Binf * 255).tolist()),
         "backscatter": _chart(fit, "B(z), backscatter", unit, lambda z: backscatter(z, fit.at(z))),
         "transmittance": _chart(fit, "T_D(z), direct light kept", unit, lambda z: transmittances(z, fit.at(z))[0]),
         "tables": [_table(f, rec.metric) for f in (rec.medium_linear, rec.medium) if f is not None],
@@ -198,7 +198,7 @@ def _table(fit: MediumFit, metric: bool) -> dict[str, object]:
     }
     rows = []
     for name, label in labels.items():
-        values, errors = getattr(fit.medium, name).tolist(), getattr(fit.std, name).tolist()
+        values, errors = getattr(fit, name).tolist(), getattr(fit.std, name).tolist()
         known = fit.identifiable[name].tolist()
         cells = [{"text": f"{v:.3f} \u00b1 {e:.3f}", "known": k} for v, e, k in zip(values, errors, known, strict=True)]
         rows.append({"label": label, "cells": cells})

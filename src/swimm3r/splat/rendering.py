@@ -197,9 +197,9 @@ def render(scene: SplatMap, camera: Cameras, time: float | None = None) -> Rende
         z_depth=expected_z_depth(images).to(there),
         alpha=images.alpha.to(there),
         medium=Medium(
-            Binf=medium.binf.permute(1, 2, 0).to(there),
-            beta_D=medium.beta_d.permute(1, 2, 0).to(there),
-            beta_B=medium.beta_b.permute(1, 2, 0).to(there),
+            Binf=medium.Binf.permute(1, 2, 0).to(there),
+            beta_D=medium.beta_D.permute(1, 2, 0).to(there),
+            beta_B=medium.beta_B.permute(1, 2, 0).to(there),
         ),
     )
 
@@ -223,4 +223,4 @@ def _as_coefficients(water: SceneWater, over: WaterLayer, images: RasterOutput, 
     ray = (torch.where(z > 0, z, z.max()) * ray_lengths(view)).clamp(min=1e-6)
     shares = over.depth / ray
     a, b, Binf = (v[:, None, None] for v in (relu(water.attenuation), relu(water.backscatter), water.Binf))
-    return MediumMaps(Binf.expand(3, *shares.shape), b * shares, a * shares)
+    return MediumMaps(Binf.expand(3, *shares.shape), a * shares, b * shares)

@@ -115,7 +115,7 @@ class TrainingViews:
         known = seen & z_depth.isfinite() & (z_depth > 0) & (confidence >= least)
         z_depth = torch.where(known, z_depth * self.scale, 0.0)
         fit = self.rec.medium
-        open_water = sea_share(rgb, z_depth, None if fit is None else fit.medium.Binf) > 0.5
+        open_water = sea_share(rgb, z_depth, None if fit is None else fit.Binf) > 0.5
         return z_depth, open_water & seen
 
 

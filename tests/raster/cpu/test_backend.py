@@ -26,7 +26,7 @@ def full_pass(p: Primitives2D, medium: MediumMaps, kernel: Kernel = "beta") -> l
     """Everything a training step reads from the rasterizer."""
     leaves = [t.detach().requires_grad_() for t in (*p, *medium)]
     sgg = SggBuffers.zeros(len(p.depth))
-    height, width = medium.binf.shape[1:]
+    height, width = medium.Binf.shape[1:]
     out = rasterize(Primitives2D(*leaves[:6]), MediumMaps(*leaves[6:]), height, width, kernel=kernel, sgg=sgg)
     rng = torch.Generator().manual_seed(1)
     grads = torch.autograd.grad(out, leaves, [torch.randn(image.shape, generator=rng) for image in out])

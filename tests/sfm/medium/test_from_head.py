@@ -52,7 +52,7 @@ def water(dive, images: NetworkImages, tmp_path: Path) -> PredictedWater:
 def test_the_dives_water_is_what_the_frames_say(dive, water: PredictedWater):
     fit = dive_fit(water, dive.rec, SeathruSettings())
     for name in ("Binf", "beta_D", "beta_B"):
-        torch.testing.assert_close(getattr(fit.medium, name), getattr(dive.medium, name), atol=1e-4, rtol=1e-4)
+        torch.testing.assert_close(getattr(fit, name), getattr(dive.medium, name), atol=1e-4, rtol=1e-4)
         assert fit.identifiable[name].all()
     assert fit.encoding == "srgb"
     z = torch.linspace(*fit.z_range, 5)

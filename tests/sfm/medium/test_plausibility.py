@@ -25,7 +25,7 @@ def fit_of(medium: Medium, std: float, known: bool, z_range: tuple[float, float]
     of_beta = torch.full((3,), std / (z_range[0] * z_range[1]) ** 0.5)
     flags = {name: torch.full((3,), known) for name in ("Binf", "beta_D", "beta_B")}
     curve = AttenuationCurve(medium.beta_D, zero, zero, zero)
-    return MediumFit(medium, curve, Medium(zero, of_beta, zero), flags, z_range, "srgb")
+    return MediumFit(*vars(medium).values(), curve, Medium(zero, of_beta, zero), flags, z_range, "srgb")
 
 
 def said(fit: MediumFit, *, gray: bool = False) -> str:
@@ -131,7 +131,7 @@ def test_a_gray_clip_is_called_gray_and_stays_gray(dive, tmp_path: Path):
     assert [warning.what.startswith("The frames are gray") for warning in rec.warnings].count(True) == 1
     assert rec.cloud is not None
     assert rec.medium is not None
-    torch.testing.assert_close(rec.medium.medium.beta_D, rec.medium.medium.beta_D[:1].expand(3))
+    torch.testing.assert_close(rec.medium.beta_D, rec.medium.beta_D[:1].expand(3))
     torch.testing.assert_close(rec.cloud.restored[:, 0], rec.cloud.restored[:, 2])
     shown = images.read_rgb(tmp_path / "restored" / f"{rec.names[2]}.png").astype(int)
     assert abs(shown[..., 0] - shown[..., 2]).max() <= 1

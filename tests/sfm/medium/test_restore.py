@@ -19,7 +19,7 @@ def exact(medium: Medium) -> MediumFit:
     zero = torch.zeros(3)
     known = {name: torch.ones(3, dtype=torch.bool) for name in ("Binf", "beta_D", "beta_B")}
     curve = AttenuationCurve(medium.beta_D, zero, zero, zero)
-    return MediumFit(medium, curve, Medium(zero, zero, zero), known, (0.1, 50.0), "srgb")
+    return MediumFit(*vars(medium).values(), curve, Medium(zero, zero, zero), known, (0.1, 50.0), "srgb")
 
 
 def rays_of(camera: Cameras) -> torch.Tensor:
@@ -75,7 +75,7 @@ def test_surfaces_of_unknown_depth_in_green_water_look_like_those_of_known_depth
 
 def test_a_linear_fit_restores_light_that_was_lost_in_linear_light(dive):
     fit = exact(dive.medium)
-    linear = MediumFit(fit.medium, fit.curve, fit.std, fit.identifiable, fit.z_range, "linear")
+    linear = replace(fit, encoding="linear")
     z = torch.full((dive.frames.height, dive.frames.width), 1.7)
     near = torch.ones_like(z)
     camera = dive.rec.cameras[2]

@@ -81,7 +81,7 @@ def test_stretching_the_scene_divides_the_coefficients(teal):
     one, eight = (fit_medium(s, SETTINGS, "srgb") for s in (samples, longer))
     expected = rescale(one, 8.0)
     for name in ("Binf", "beta_D", "beta_B"):
-        torch.testing.assert_close(getattr(eight.medium, name), getattr(expected.medium, name), rtol=1e-3, atol=1e-5)
+        torch.testing.assert_close(getattr(eight, name), getattr(expected, name), rtol=1e-3, atol=1e-5)
         torch.testing.assert_close(getattr(eight.std, name), getattr(expected.std, name), rtol=1e-2, atol=1e-5)
         assert torch.equal(eight.identifiable[name], one.identifiable[name])
 
@@ -89,7 +89,7 @@ def test_stretching_the_scene_divides_the_coefficients(teal):
 def test_the_same_samples_give_the_same_water(teal):
     samples = draw_samples(teal)
     a, b = (fit_medium(samples, SETTINGS, "srgb") for _ in range(2))
-    assert torch.equal(a.medium.beta_D, b.medium.beta_D)
+    assert torch.equal(a.beta_D, b.beta_D)
     assert torch.equal(a.std.Binf, b.std.Binf)
 
 
@@ -99,7 +99,7 @@ def test_swapping_channels_swaps_the_coefficients(teal):
         samples.I.flip(-1), samples.ray_depth, samples.frame, samples.track, samples.open_water.flip(-1)
     )
     a, b = (fit_medium(s, SETTINGS, "srgb") for s in (samples, swapped))
-    torch.testing.assert_close(a.medium.beta_D, b.medium.beta_D.flip(-1), rtol=1e-4, atol=1e-6)
+    torch.testing.assert_close(a.beta_D, b.beta_D.flip(-1), rtol=1e-4, atol=1e-6)
 
 
 def test_a_single_distance_identifies_no_attenuation(teal):
@@ -111,7 +111,7 @@ def test_a_single_distance_identifies_no_attenuation(teal):
 def test_many_distances_identify_attenuation_and_what_is_identified_is_right(teal):
     fit = fit_medium(draw_samples(teal, spread=0.4, open_water=1000), SETTINGS, "srgb")
     assert fit.identifiable["beta_D"].all()
-    assert ((fit.medium.beta_D - teal.beta_D).abs() / teal.beta_D < 0.15).all()
+    assert ((fit.beta_D - teal.beta_D).abs() / teal.beta_D < 0.15).all()
 
 
 def test_open_water_settles_the_veiling_light(teal):
@@ -119,7 +119,7 @@ def test_open_water_settles_the_veiling_light(teal):
     shown = draw_samples(teal, spread=0.1, open_water=1000)
     blind, seeing = (fit_medium(s, SETTINGS, "srgb") for s in (near, shown))
     assert (seeing.std.Binf < blind.std.Binf).all()
-    assert ((seeing.medium.Binf - teal.Binf).abs() < 0.03).all()
+    assert ((seeing.Binf - teal.Binf).abs() < 0.03).all()
 
 
 def test_backscatter_stays_below_the_dark_envelope_where_pixels_are_seen_once(teal):
@@ -135,7 +135,7 @@ def test_beta_D_is_the_curve_at_the_median_depth(teal):
     samples = draw_samples(teal)
     fit = fit_medium(samples, SETTINGS, "srgb")
     middle = samples.ray_depth.double().median().float()
-    torch.testing.assert_close(fit.medium.beta_D, fit.curve.at(middle), rtol=1e-3, atol=1e-5)
+    torch.testing.assert_close(fit.beta_D, fit.curve.at(middle), rtol=1e-3, atol=1e-5)
 
 
 def test_surfaces_hundreds_of_times_as_far_as_the_rest_do_no_harm(teal):
@@ -173,7 +173,7 @@ def test_of_a_gray_clip_one_channel_is_fitted_and_stands_for_all(teal, monkeypat
     samples = draw_samples(Medium(*(v.mean().expand(3) for v in vars(teal).values())), open_water=1000)
     fit = fit_medium(gray_copy(samples), SETTINGS, "srgb")
     assert len(fitted) == 1
-    for value in (fit.medium.Binf, fit.medium.beta_D, fit.medium.beta_B, fit.std.beta_D, fit.curve.a):
+    for value in (fit.Binf, fit.beta_D, fit.beta_B, fit.std.beta_D, fit.curve.a):
         assert torch.equal(value, value[:1].expand(3))
     assert torch.equal(fit.identifiable["beta_D"], torch.ones(3, dtype=torch.bool))
     fit_medium(samples, SETTINGS, "srgb")

@@ -39,7 +39,7 @@ def test_the_image_is_the_one_that_its_kernel_adds_up(tiny_dive):
     y, x = 20, 31
     center = torch.tensor([x + 0.5, y + 0.5])
     T, z_before = 1.0, 0.0
-    color, (binf, beta_b, beta_d) = torch.zeros(3), (m[:, y, x].detach() for m in maps)
+    color, (Binf, beta_D, beta_B) = torch.zeros(3), (m[:, y, x].detach() for m in maps)
     for i in torch.argsort(p.depth).tolist():
         if p.depth[i] <= 0:
             continue
@@ -51,10 +51,10 @@ def test_the_image_is_the_one_that_its_kernel_adds_up(tiny_dive):
         if T * (1 - alpha) <= 1e-4:
             break
         z = float(p.depth[i])
-        color += T * alpha * p.color[i] * torch.exp(-beta_d * z)
-        color += T * binf * (torch.exp(-beta_b * z_before) - torch.exp(-beta_b * z))
+        color += T * alpha * p.color[i] * torch.exp(-beta_D * z)
+        color += T * Binf * (torch.exp(-beta_B * z_before) - torch.exp(-beta_B * z))
         T, z_before = T * (1 - alpha), z
-    color += T * binf * torch.exp(-beta_b * z_before)
+    color += T * Binf * torch.exp(-beta_B * z_before)
     assert T < 0.9
     torch.testing.assert_close(drawing.images.rgb[:, y, x].detach(), color, rtol=1e-4, atol=1e-5)
 

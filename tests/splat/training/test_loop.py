@@ -117,7 +117,7 @@ def test_the_water_waits_for_the_primitives(tiny_dive, tmp_path):
         train(tiny_dive.rec, tiny_dive.frames, settings, tmp_path / str(i)).render(tiny_dive.cameras[0]).medium.beta_D
         for i, settings in enumerate((still, moving))
     ]
-    known = tiny_dive.rec.medium.medium.beta_D.expand_as(water[0])
+    known = tiny_dive.rec.medium.beta_D.expand_as(water[0])
     torch.testing.assert_close(water[0], known)
     assert (water[1] - known).abs().max() > 1e-4
 

@@ -177,8 +177,8 @@ def oracle(drawing, p: BetaPrimitives, view: TrainingView, settings: UwbsSetting
         return torch.autograd.grad(outputs, exact.xyz, cotangents, retain_graph=True)[0]
 
     (g0,), own = pull(maps, on_images)
-    nothing = torch.zeros_like(maps.binf)
-    dark = MediumMaps(nothing, *((maps.beta_b, maps.beta_d) if settings.sgg.split == "direct" else (nothing, nothing)))
+    nothing = torch.zeros_like(maps.Binf)
+    dark = MediumMaps(nothing, *((maps.beta_D, maps.beta_B) if settings.sgg.split == "direct" else (nothing, nothing)))
     (geo,), parts = pull(dark, on_images)
     b = Branches(geo, g0 - geo, parts.full_abs)
     u = gradients.medium_uncertainty(b)

@@ -108,7 +108,7 @@ def begin_adjoint(ws, tile_y, tile_x, g_rgb, g_clear, g_z, g_alpha, rgb, clear, 
 
 @no_type_check
 @math.inlined
-def end_adjoint(ws, tile_y, tile_x, d_binf, d_beta_b, d_beta_d):
+def end_adjoint(ws, tile_y, tile_x, d_Binf, d_beta_D, d_beta_B):
     """Gradients of a tile's water: g V, g B_inf sum w z E_B, -g sum w z c E_D."""
     for k in range(3):
         row = np.uintp(k * STRIDE)
@@ -116,14 +116,14 @@ def end_adjoint(ws, tile_y, tile_x, d_binf, d_beta_b, d_beta_d):
             ws[VB0 + q] = ws[G0 + q] * (ONE - ws[VB0 + q])
             ws[ZB0 + q] *= ws[B0 + q]
             ws[ZD0 + q] *= -ws[G0 + q]
-        put_back(ws, VB0 + row, d_binf[k], tile_y, tile_x)
-        put_back(ws, ZB0 + row, d_beta_b[k], tile_y, tile_x)
-        put_back(ws, ZD0 + row, d_beta_d[k], tile_y, tile_x)
+        put_back(ws, VB0 + row, d_Binf[k], tile_y, tile_x)
+        put_back(ws, ZB0 + row, d_beta_B[k], tile_y, tile_x)
+        put_back(ws, ZD0 + row, d_beta_D[k], tile_y, tile_x)
 
 
 @no_type_check
 @math.inlined
-def take_light(ws, pairs, blocks, n, color, z, middle, at_middle, with_sgg, d_binf, far):
+def take_light(ws, pairs, blocks, n, color, z, middle, at_middle, with_sgg, d_Binf, far):
     """The adjoint of `add_light`: slopes of the pairs, and sums of the pixels."""
     full_width_vectors()
     for j in range(n):
@@ -147,7 +147,7 @@ def take_light(ws, pairs, blocks, n, color, z, middle, at_middle, with_sgg, d_bi
             pairs[S2 + c] = w * slope[2]
             pairs[SW + c] = w * depth_slope(color, E_B, E_D, g, g_veil, k_b, k_d)
             pairs[SZ + c] = w * ws[GZ + q]
-            if d_binf is not None:
+            if d_Binf is not None:
                 ws[VB0 + q] += w * E_B[0]
                 ws[VB1 + q] += w * E_B[1]
                 ws[VB2 + q] += w * E_B[2]
@@ -179,12 +179,12 @@ def put_sums(slots, own, column, sums):
 @no_type_check
 @adjoint_kernel
 def adjoint_tiles(
-    first_tile, beyond, packed, tile_start, ids, masks, slot, binf, beta_b, beta_d, g_rgb, g_clear, g_z, g_alpha,
-    rgb, clear, z_depth, alpha_out, slots, d_binf, d_beta_b, d_beta_d, with_sgg, gaussian, sources=SOURCES,
+    first_tile, beyond, packed, tile_start, ids, masks, slot, Binf, beta_D, beta_B, g_rgb, g_clear, g_z, g_alpha,
+    rgb, clear, z_depth, alpha_out, slots, d_Binf, d_beta_D, d_beta_B, with_sgg, gaussian, sources=SOURCES,
 ):  # fmt: skip
     """Slots and water gradients of the tiles first_tile..beyond-1.
 
-    None for `with_sgg` or `d_binf` leaves that part out; without water, None for the maps, rgb and g_rgb.
+    None for `with_sgg` or `d_Binf` leaves that part out; without water, None for the maps, rgb and g_rgb.
     """
     full_width_vectors()
     height, width = z_depth.shape
@@ -192,7 +192,7 @@ def adjoint_tiles(
     ws, pairs, blocks = workspace(ROWS), workspace(PAIR_ROWS), np.empty(BLOCKS, np.uintp)
     for tile in range(first_tile, beyond):
         tile_y, tile_x = (tile // columns) * TILE, (tile % columns) * TILE
-        spread = begin_tile(ws, tile_y, tile_x, height, width, binf, beta_b, beta_d)
+        spread = begin_tile(ws, tile_y, tile_x, height, width, Binf, beta_D, beta_B)
         begin_adjoint(ws, tile_y, tile_x, g_rgb, g_clear, g_z, g_alpha, rgb, clear, z_depth, alpha_out)
         begin, end = tile_start[tile], tile_start[tile + 1]
         live = live_blocks(ws)
@@ -224,15 +224,15 @@ def adjoint_tiles(
                     w, ws[T + q] = advance(before, alpha)
                     pairs[DX + c], pairs[DY + c], pairs[U + c], pairs[LOG_F + c], pairs[PW + c] = dx, dy, u, log_f, w
                     pairs[P + c], pairs[Q + c] = shape_slopes(w, before, alpha, shaped, u)
-            if binf is None:
-                take_light(ws, pairs, blocks, n, color, z, None, None, with_sgg, d_binf, None)
+            if Binf is None:
+                take_light(ws, pairs, blocks, n, color, z, None, None, with_sgg, d_Binf, None)
             else:
                 middle = middle_of(ws)
                 at_middle = transmittance(middle[0], z), transmittance(middle[1], z)
                 if z * spread <= HALF:
-                    take_light(ws, pairs, blocks, n, color, z, middle, at_middle, with_sgg, d_binf, None)
+                    take_light(ws, pairs, blocks, n, color, z, middle, at_middle, with_sgg, d_Binf, None)
                 else:
-                    take_light(ws, pairs, blocks, n, color, z, middle, at_middle, with_sgg, d_binf, True)
+                    take_light(ws, pairs, blocks, n, color, z, middle, at_middle, with_sgg, d_Binf, True)
             for c in range(BLOCK * np.uintp(n)):
                 dx, dy, t = pairs[DX + c], pairs[DY + c], pairs[TF + c]
                 half_x, half_y = half_slope(dx, dy, conic)
@@ -262,8 +262,8 @@ def adjoint_tiles(
             put_sums(slots, own, MEAN, (mx, my, xx, xy, yy, red, green, blue, opacity, beta, z_water, z_direct))
             if with_sgg is not None:
                 put_sums(slots, own, GEO, (geo_x, geo_y, abs_geo_x, abs_geo_y, abs_x, abs_y, depth_x, depth_y))
-        if d_binf is not None:
-            end_adjoint(ws, tile_y, tile_x, d_binf, d_beta_b, d_beta_d)
+        if d_Binf is not None:
+            end_adjoint(ws, tile_y, tile_x, d_Binf, d_beta_D, d_beta_B)
 
 
 @no_type_check

@@ -85,9 +85,9 @@ def forward_tiles(
     tile_start,
     ids,
     masks,
-    binf,
-    beta_b,
-    beta_d,
+    Binf,
+    beta_D,
+    beta_B,
     rgb,
     clear,
     z_depth,
@@ -102,7 +102,7 @@ def forward_tiles(
     ws, blocks = workspace(ROWS), np.empty(BLOCKS, np.uintp)
     for tile in range(first_tile, beyond):
         tile_y, tile_x = (tile // columns) * TILE, (tile % columns) * TILE
-        spread = begin_tile(ws, tile_y, tile_x, height, width, binf, beta_b, beta_d)
+        spread = begin_tile(ws, tile_y, tile_x, height, width, Binf, beta_D, beta_B)
         ws[I0:] = ZERO
         begin, end = tile_start[tile], tile_start[tile + 1]
         live = live_blocks(ws)
@@ -124,7 +124,7 @@ def forward_tiles(
                     _, log_f = falloff(r2, gaussian)
                     alpha, _ = coverage(r2, log_f, log2_o, exponent, r2_max)
                     ws[W + q], ws[T + q] = advance(ws[T + q], alpha)
-            if binf is None:
+            if Binf is None:
                 add_light(ws, blocks, n, color, z, None, None, None)
             else:
                 middle = middle_of(ws)
@@ -136,7 +136,7 @@ def forward_tiles(
         for q in range(np.uintp(PIXELS)):
             ws[T + q] = ONE - abs(ws[T + q])
         for k in range(3):
-            if binf is not None:
+            if Binf is not None:
                 I, B = I0 + np.uintp(k * STRIDE), B0 + np.uintp(k * STRIDE)
                 for q in range(np.uintp(PIXELS)):
                     ws[I + q] += ws[B + q]

@@ -181,7 +181,7 @@ def through_water(departure, z, middle, at_middle, far):
 
 @no_type_check
 @math.inlined
-def begin_tile(ws, tile_y, tile_x, height, width, binf, beta_b, beta_d):
+def begin_tile(ws, tile_y, tile_x, height, width, Binf, beta_D, beta_B):
     """Pixel centers, T = 1, B_inf, and the water around its middle, which is returned (`centerd`)."""
     for y in range(TILE):
         for x in range(TILE):
@@ -189,13 +189,13 @@ def begin_tile(ws, tile_y, tile_x, height, width, binf, beta_b, beta_d):
             ws[X + q], ws[Y + q] = np.float32(x) + HALF, np.float32(y) + HALF
             # a pixel outside the image has ended before it begins
             ws[T + q] = ONE if tile_y + y < height and tile_x + x < width else -ONE
-    if binf is None:
+    if Binf is None:
         return ZERO
     for k in range(3):
         row = np.uintp(k * STRIDE)
-        gather(ws, B0 + row, binf[k], tile_y, tile_x)
-        gather(ws, KB0 + row, beta_b[k], tile_y, tile_x)
-        gather(ws, KD0 + row, beta_d[k], tile_y, tile_x)
+        gather(ws, B0 + row, Binf[k], tile_y, tile_x)
+        gather(ws, KB0 + row, beta_B[k], tile_y, tile_x)
+        gather(ws, KD0 + row, beta_D[k], tile_y, tile_x)
     for q in range(KB0, B0):
         ws[q] *= NEG_LOG2_E
     return centerd(ws)

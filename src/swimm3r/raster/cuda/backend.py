@@ -33,7 +33,7 @@ VALUES = 20
 """Sums per primitive: mean 2, conic 3, color 3, opacity, beta, z through the water, z direct, geo 2, |geo| 2,
 |full| 2, depth branch 2."""
 LN_2, LOG2_E = wp.constant(pairmath.LN_2), wp.constant(pairmath.LOG2_E)
-CHANNELS = {"conic", "color", "binf", "E_B", "E_D", "slope", "g", "g_veil", "g_clear", "k", "k_b", "k_d"}
+CHANNELS = {"conic", "color", "Binf", "E_B", "E_D", "slope", "g", "g_veil", "g_clear", "k", "k_b", "k_d"}
 
 
 def _function(f: Callable[..., Any]) -> Any:
@@ -156,7 +156,7 @@ def _pixel_kernels(falloff: Any) -> PixelKernels:
     @wp.kernel(enable_backward=False)
     def forward_kernel(
         packed: wp.array2d(dtype=float), tile_start: wp.array(dtype=int), ids: wp.array(dtype=int),
-        binf: wp.array3d(dtype=float), beta_b: wp.array3d(dtype=float), beta_d: wp.array3d(dtype=float),
+        Binf: wp.array3d(dtype=float), beta_D: wp.array3d(dtype=float), beta_B: wp.array3d(dtype=float),
         rgb: wp.array3d(dtype=float), clear: wp.array3d(dtype=float), z_depth: wp.array2d(dtype=float),
         alpha_out: wp.array2d(dtype=float),
     ):  # fmt: skip
@@ -167,7 +167,7 @@ def _pixel_kernels(falloff: Any) -> PixelKernels:
         inside = pixel_x < width and pixel_y < height
         x, y = wp.min(pixel_x, width - 1), wp.min(pixel_y, height - 1)
         center_x, center_y = float(x) + 0.5, float(y) + 0.5
-        B, k_b, k_d = channels(binf, y, x), -LOG2_E * channels(beta_b, y, x), -LOG2_E * channels(beta_d, y, x)
+        B, k_b, k_d = channels(Binf, y, x), -LOG2_E * channels(beta_B, y, x), -LOG2_E * channels(beta_D, y, x)
         T = wp.where(inside, 1.0, -1.0)
         image = wp.vec3(0.0, 0.0, 0.0)
         J = wp.vec3(0.0, 0.0, 0.0)
@@ -201,13 +201,13 @@ def _pixel_kernels(falloff: Any) -> PixelKernels:
     @wp.kernel(enable_backward=False)
     def adjoint_kernel(
         packed: wp.array2d(dtype=float), tile_start: wp.array(dtype=int), ids: wp.array(dtype=int),
-        binf: wp.array3d(dtype=float), beta_b: wp.array3d(dtype=float), beta_d: wp.array3d(dtype=float),
+        Binf: wp.array3d(dtype=float), beta_D: wp.array3d(dtype=float), beta_B: wp.array3d(dtype=float),
         g_rgb: wp.array3d(dtype=float), g_clear: wp.array3d(dtype=float), g_z: wp.array2d(dtype=float),
         g_alpha: wp.array2d(dtype=float),
         rgb: wp.array3d(dtype=float), clear: wp.array3d(dtype=float), z_depth: wp.array2d(dtype=float),
         alpha_out: wp.array2d(dtype=float),
-        sums: wp.array(dtype=float), d_binf: wp.array3d(dtype=float), d_beta_b: wp.array3d(dtype=float),
-        d_beta_d: wp.array3d(dtype=float),
+        sums: wp.array(dtype=float), d_Binf: wp.array3d(dtype=float), d_beta_D: wp.array3d(dtype=float),
+        d_beta_B: wp.array3d(dtype=float),
     ):  # fmt: skip
         """Sums of every primitive and gradients of the water, front to back again (pairmath.py)."""
         tile, thread = wp.tid()
@@ -216,7 +216,7 @@ def _pixel_kernels(falloff: Any) -> PixelKernels:
         inside = pixel_x < width and pixel_y < height
         x, y = wp.min(pixel_x, width - 1), wp.min(pixel_y, height - 1)
         center_x, center_y = float(x) + 0.5, float(y) + 0.5
-        B, k_b, k_d = channels(binf, y, x), -LOG2_E * channels(beta_b, y, x), -LOG2_E * channels(beta_d, y, x)
+        B, k_b, k_d = channels(Binf, y, x), -LOG2_E * channels(beta_B, y, x), -LOG2_E * channels(beta_D, y, x)
         g, gc = channels(g_rgb, y, x), channels(g_clear, y, x)
         gz, ga = g_z[y, x], g_alpha[y, x]
         g_veil = wp.cw_mul(g, B)
@@ -266,9 +266,9 @@ def _pixel_kernels(falloff: Any) -> PixelKernels:
                 if warp_any(wp.where(T > 0.0, 1, 0)) == 0:
                     entry = end
         if inside:
-            store(d_binf, y, x, wp.cw_mul(g, wp.vec3(1.0, 1.0, 1.0) - veil))
-            store(d_beta_b, y, x, wp.cw_mul(g_veil, z_veil))
-            store(d_beta_d, y, x, -wp.cw_mul(g, z_direct))
+            store(d_Binf, y, x, wp.cw_mul(g, wp.vec3(1.0, 1.0, 1.0) - veil))
+            store(d_beta_B, y, x, wp.cw_mul(g_veil, z_veil))
+            store(d_beta_D, y, x, -wp.cw_mul(g, z_direct))
 
     return PixelKernels(forward_kernel, adjoint_kernel)
 
@@ -331,7 +331,7 @@ def bin_primitives(p: Primitives2D, height: int, width: int, alpha_min: float, k
 
 def forward(bins: Bins, p: Primitives2D, medium: MediumMaps) -> RasterOutput:
     """The four images."""
-    like, height, width = medium.binf, bins.height, bins.width
+    like, height, width = medium.Binf, bins.height, bins.width
     shapes = ((3, height, width), (3, height, width), (height, width), (height, width))
     out = RasterOutput(*(like.new_empty(shape) for shape in shapes))
     _launch(_PASSES[bins.kernel].forward, bins, [bins.packed, bins.tile_start, bins.ids, *medium, *out])

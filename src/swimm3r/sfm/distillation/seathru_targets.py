@@ -88,7 +88,7 @@ def _made(sequence: Sequence, folder: Path, progress: Progress) -> Sequence:
         except InputError as error:  # one scene without water must not stop the training on all others
             return replace(sequence, notes=(*sequence.notes, f"not for training: {error.what}"))
         _make(sequence, water, folder, progress)
-        medium = {name: value.tolist() for name, value in vars(water.medium).items()}
+        medium = {name: value.tolist() for name, value in vars(water.constant()).items()}
         about = {
             "made_by": "swimm3r sfm/distillation/seathru_targets.py, after Sea-Thru",
             "images": names,

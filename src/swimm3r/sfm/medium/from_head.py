@@ -156,7 +156,15 @@ def summed_up(readings: Sequence[FrameReading], settings: SeathruSettings, error
     std = {k: (spread[k] ** 2 + (getattr(relative, k) * getattr(medium, k)) ** 2).sqrt() for k in spread}
     known = {k: std[k] < settings.identifiable_std * getattr(medium, k) for k in std}
     low, high = torch.quantile(z[:: max(1, len(z) // 1_000_000)], torch.tensor([0.002, 0.998]).double()).tolist()
-    return MediumFit(medium, curve, Medium(**std), known, (low, high), "srgb", "physics head")
+    return MediumFit(
+        **vars(medium),
+        curve=curve,
+        std=Medium(**std),
+        identifiable=known,
+        z_range=(low, high),
+        encoding="srgb",
+        estimator="physics head",
+    )
 
 
 def predicted_images(

@@ -18,7 +18,7 @@ def optical_depth(fit: MediumFit) -> tuple[Float[Tensor, "3"], Float[Tensor, "3"
     """-ln T_D at the middle of the depths the fit has seen, and its standard deviation."""
     near, far = fit.z_range
     middle = (near * far) ** 0.5
-    return fit.medium.beta_D * middle, fit.std.beta_D * middle
+    return fit.beta_D * middle, fit.std.beta_D * middle
 
 
 def attenuation_is_a_guess(fit: MediumFit) -> bool:

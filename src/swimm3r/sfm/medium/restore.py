@@ -85,7 +85,7 @@ def restore_image(
     surfaces and not the open water behind them, which keeps the color the diver saw.
     """
     settings = settings or RestoreSettings()
-    veil = srgb_from_linear(fit.medium.Binf) if fit.encoding == "linear" else fit.medium.Binf
+    veil = srgb_from_linear(fit.Binf) if fit.encoding == "linear" else fit.Binf
     sea = sea_share(image, depth.z_depth, veil)
     z_depth = fill_z_depth(image, depth, sea)
     ray_depth = ray_depth_map(z_depth, rays)
@@ -179,7 +179,7 @@ def _not_beyond_white(
     That is below 0.9, and in the channel that the water takes first not far above the others (nor more than nearly all
     surfaces of known depth are): too long a path shows as a glare of that channel first, mostly red.
     """
-    first = int(fit.medium.beta_D.argmax())
+    first = int(fit.beta_D.argmax())
     reach = 0.01 * max(I.shape[:2])
     blurred = blur(I, reach)
     smooth, far = blurred[guessed], ray_depth[guessed]

@@ -139,7 +139,9 @@ def _medium_fit(
         return torch.from_numpy(np.asarray(value, dtype=np.float32))
 
     return MediumFit(
-        medium=Medium(tensor(x[:, BINF]), tensor(beta_D / unit), tensor(beta_B / unit)),
+        Binf=tensor(x[:, BINF]),
+        beta_D=tensor(beta_D / unit),
+        beta_B=tensor(beta_B / unit),
         curve=AttenuationCurve(
             tensor(np.exp(x[:, LOG_BETA_D]) / unit), tensor(x[:, SLOPE] / unit), torch.zeros(3), torch.zeros(3)
         ),

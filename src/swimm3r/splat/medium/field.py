@@ -139,7 +139,7 @@ def medium_at_pixels(grid: FieldGrid, height: int, width: int) -> MediumMaps:
         maps = interpolate(grid.values[None], (height, width), mode="bilinear", align_corners=True)[0]
     else:
         maps = grid.values
-    return MediumMaps(maps[:3], maps[3:6], maps[6:])
+    return MediumMaps(maps[:3], beta_B=maps[3:6], beta_D=maps[6:])
 
 
 def ray_lengths(view: Pinhole) -> Float[Tensor, "h w"]:
@@ -151,8 +151,8 @@ def ray_lengths(view: Pinhole) -> Float[Tensor, "h w"]:
 
 def per_z_depth(maps: MediumMaps, view: Pinhole) -> MediumMaps:
     """Betas for a rasterizer that blends z depth: times the length of the pixel's ray at z = 1, which is exact."""
-    length = ray_lengths(view).to(maps.binf)
-    return MediumMaps(maps.binf, maps.beta_b * length, maps.beta_d * length)
+    length = ray_lengths(view).to(maps.Binf)
+    return MediumMaps(maps.Binf, maps.beta_D * length, maps.beta_B * length)
 
 
 def with_binf_prior(fit: MediumFit, color: Float[Tensor, "3"], std: float) -> MediumFit:
@@ -163,13 +163,14 @@ def with_binf_prior(fit: MediumFit, color: Float[Tensor, "3"], std: float) -> Me
     """
     spread = fit.std.Binf.square()
     sure = std**2 / (std**2 + spread)
-    Binf = sure * fit.medium.Binf + (1 - sure) * color.to(fit.medium.Binf)
+    Binf = sure * fit.Binf + (1 - sure) * color.to(fit.Binf)
     z = math.sqrt(fit.z_range[0] * fit.z_range[1])
-    B = fit.medium.Binf * -torch.expm1(-fit.medium.beta_B * z)
+    B = fit.Binf * -torch.expm1(-fit.beta_B * z)
     beta_B = -torch.log1p(-(B / Binf.clamp(min=1e-6)).clamp(max=0.999)) / z
     return replace(
         fit,
-        medium=Medium(Binf, fit.medium.beta_D, beta_B),
+        Binf=Binf,
+        beta_B=beta_B,
         std=replace(fit.std, Binf=(sure * spread).sqrt()),
     )
 
@@ -186,15 +187,13 @@ def water_prior(fit: MediumFit, length: float, settings: MediumFieldSettings) ->
     """The prior of a fit for a field whose betas are per `length` scene units."""
 
     def logs(name: str) -> tuple[Float[Tensor, "3"], Float[Tensor, "3"]]:
-        beta = getattr(fit.medium, name).double().clamp(min=1e-6)
+        beta = getattr(fit, name).double().clamp(min=1e-6)
         return torch.log(beta * length), getattr(fit.std, name).double() / beta
 
     mean_B, std_B = logs("beta_B")
     mean_D, std_D = logs("beta_D")
     std = torch.cat([fit.std.Binf.double(), std_B, std_D])
-    return WaterPrior(
-        torch.cat([fit.medium.Binf.double(), mean_B, mean_D]).float(), std.clamp(min=settings.least_std).float()
-    )
+    return WaterPrior(torch.cat([fit.Binf.double(), mean_B, mean_D]).float(), std.clamp(min=settings.least_std).float())
 
 
 def deviation(grid: FieldGrid, prior: WaterPrior) -> Float[Tensor, ""]:

@@ -66,9 +66,8 @@ class Uwbs:
             p = with_time(p, settings.initial, loop.generator(settings.seed, 0, 5))
         p = rescaled(p, scale)
         medium = None
-        water = measured_water(rec)
-        if water is not None:
-            fit = water.medium
+        fit = measured_water(rec)
+        if fit is not None:
             medium = Medium(fit.Binf, fit.beta_D / scale, fit.beta_B / scale)
         field = initial_field(medium, settings.medium, loop.generator(settings.seed, 0, 3), settings.dynamic)
         return first_state(p, field, self.scene.codes(settings.poses, loop.generator(settings.seed, 0, 6)))

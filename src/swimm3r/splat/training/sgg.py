@@ -127,9 +127,9 @@ def _direct(drawing: Drawing, on_images: tuple[Tensor, ...], g0: Float[Tensor, "
     assert maps is not None
     p = p._replace(**{name: t.detach() for name, t in p._asdict().items()})
     p = p._replace(mean2d=p.mean2d.requires_grad_())
-    dark = maps._replace(binf=torch.zeros_like(maps.binf), beta_b=maps.beta_b.detach(), beta_d=maps.beta_d.detach())
+    dark = maps._replace(Binf=torch.zeros_like(maps.Binf), beta_B=maps.beta_B.detach(), beta_D=maps.beta_D.detach())
     buffers = SggBuffers.zeros(len(p.mean2d), p.mean2d.device)
-    height, width = maps.binf.shape[1:]
+    height, width = maps.Binf.shape[1:]
     images = rasterize(p, dark, height, width, alpha_min=alpha_min, sgg=buffers)
     (geo,) = torch.autograd.grad(images, p.mean2d, on_images)
     return Branches(geo, g0 - geo, buffers.full_abs)
