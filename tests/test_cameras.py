@@ -8,8 +8,10 @@ from swimm3r.cameras import (
     Cameras,
     directions,
     image_directions,
+    inside_image,
     pixel_grid,
     project,
+    project_visible,
     ray_depth_from_z,
     resized,
     unproject,
@@ -72,6 +74,21 @@ def test_ray_depth_is_the_distance_from_the_center():
     distance = torch.linalg.vector_norm(points - cameras.centers[1].float(), dim=-1).reshape(300, 400)
     torch.testing.assert_close(ray_depth_from_z(z, rays), distance)
     torch.testing.assert_close(z_depth_from_ray(ray_depth_from_z(z, rays), rays), z)
+
+
+def test_a_point_is_visible_before_the_camera_and_inside_its_image():
+    cameras = two_cameras("OPENCV_FISHEYE")[0]
+    pixels = torch.tensor([[[0.0, 0.0], [399.9, 299.9], [-0.1, 50.0], [50.0, 300.1], [200.0, 150.0]]]).double()
+    points = unproject(cameras, pixels, torch.tensor([[2.0, 2.0, 2.0, 2.0, -2.0]]).double())
+    again, z, visible = project_visible(cameras, points + 1e-9)
+    assert visible[0].tolist() == [True, True, False, False, False]
+    assert torch.equal(again, project(cameras, points + 1e-9)[0])
+    assert z[0, -1] < 0
+
+
+def test_a_pixel_inside_an_image_is_a_row_and_a_column_of_it():
+    at = torch.tensor([[0.0, 0.0], [4.0, 1.0], [3.99, 2.99], [1.0, 3.0], [torch.nan, 1.0], [1.0, -1e-9]])
+    assert inside_image(at, 4, 3).tolist() == [True, False, True, False, False, False]
 
 
 def test_resizing_keeps_the_rays():

@@ -232,6 +232,19 @@ def project(cameras: Cameras, points: Float[Tensor, "c p 3"]) -> tuple[Float[Ten
     return xy @ K[:, :2, :2].mT + K[:, None, :2, 2], z
 
 
+def inside_image(pixels: Float[Tensor, "*points 2"], width: int, height: int) -> Bool[Tensor, "*points"]:
+    """Which pixels lie in an image of this size, so that rounded down they are a column and a row of it."""
+    return ((pixels >= 0) & (pixels < torch.tensor([width, height]).to(pixels))).all(-1)
+
+
+def project_visible(
+    cameras: Cameras, points: Float[Tensor, "c p 3"]
+) -> tuple[Float[Tensor, "c p 2"], Float[Tensor, "c p"], Bool[Tensor, "c p"]]:
+    """`project`, and which points lie before the camera and inside its image."""
+    pixels, z = project(cameras, points)
+    return pixels, z, (z > 0) & inside_image(pixels, cameras.width, cameras.height)
+
+
 def directions(cameras: Cameras, pixels: Float[Tensor, "c p 2"]) -> Float[Tensor, "c p 3"]:
     """The rays of pixels in camera axes, scaled to z = 1."""
     K = cameras.K.to(pixels)

@@ -12,7 +12,7 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
-from swimm3r.cameras import Cameras, directions, project
+from swimm3r.cameras import Cameras, project_visible, unproject
 from swimm3r.datasets.sequences import Sequence
 from swimm3r.datasets.settings import PairSettings
 from swimm3r.io.depth import read_depth
@@ -89,15 +89,12 @@ def overlap(seen: _Posed, other: _Posed) -> float:
     known = z > 0
     if not bool(known.any()):
         return 0.0
-    rays = directions(seen.camera, pixels[known][None]) * z[known][None, :, None].double()
-    world = rays @ seen.camera.cam2world[:, :3, :3].mT + seen.camera.cam2world[:, None, :3, 3]
-    xy, expected = project(other.camera, world)
-    h, w = other.z_depth.shape
-    inside = (xy > 0).all(-1) & (xy < torch.tensor([w, h])).all(-1) & (expected > 0)
-    column, row = (xy[..., k].clamp(0, n - 1).long() for k, n in ((0, w), (1, h)))
-    measured = other.z_depth[row, column].double()
-    agrees = inside & (measured > 0) & ((measured - expected).abs() <= _TOLERANCE * expected)
-    return float(agrees.double().mean())
+    world = unproject(seen.camera, pixels[known][None], z[known].double()[None])
+    xy, expected, visible = project_visible(other.camera, world)
+    column, row = xy[visible].long().unbind(-1)
+    measured, expected = other.z_depth[row, column].double(), expected[visible]
+    agrees = (measured > 0) & ((measured - expected).abs() <= _TOLERANCE * expected)
+    return float(agrees.sum() / visible.numel())
 
 
 def _posed(sequence: Sequence, i: int) -> _Posed:

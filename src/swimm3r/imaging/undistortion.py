@@ -13,7 +13,7 @@ import torch
 from jaxtyping import Bool, Float, Int
 from torch import Tensor
 
-from swimm3r.cameras import Cameras, directions, distort, image_directions, pixel_grid, resized
+from swimm3r.cameras import Cameras, directions, distort, image_directions, inside_image, pixel_grid, resized
 
 _WIDEST = 2.5  # tangent of the half angle that covering pinhole images show at most: 136 degrees
 
@@ -107,7 +107,7 @@ def distorted_grid(camera: Cameras, pinhole: Cameras) -> tuple[Float[Tensor, "h 
     pixels = _through_lens(camera, rays)
     edge = directions(camera, _outline(camera.width, camera.height)[None])[0, :, :2]
     reach = torch.linalg.vector_norm(edge[edge.isfinite().all(-1)], dim=-1).max()
-    shown = ((pixels > 0) & (pixels < torch.tensor([camera.width, camera.height]))).all(-1)
+    shown = inside_image(pixels, camera.width, camera.height)
     # beyond the farthest ray of the outline the lens model may fold back into the image
     return pixels, shown & (torch.linalg.vector_norm(rays, dim=-1) <= reach * 1.001)
 

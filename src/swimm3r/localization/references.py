@@ -7,7 +7,7 @@ import torch
 from jaxtyping import Bool, Float
 from torch import Tensor
 
-from swimm3r.cameras import Cameras, directions
+from swimm3r.cameras import Cameras, unproject
 from swimm3r.scene.frames import Frames
 from swimm3r.scene.reconstruction import Reconstruction
 from swimm3r.splat.rendering import SplatMap
@@ -27,9 +27,7 @@ class Reference:
         column, row = pixels.long().unbind(-1)
         z = self.z_depth[row.clamp(0, self.camera.height - 1), column.clamp(0, self.camera.width - 1)].double()
         known = z > 0
-        in_camera = directions(self.camera, pixels[known].double()[None])[0] * z[known, None]
-        pose = self.camera.cam2world[0].double()
-        return in_camera @ pose[:3, :3].mT + pose[:3, 3], known
+        return unproject(self.camera, pixels[known].double()[None], z[None, known])[0], known
 
 
 @runtime_checkable  # so that the suite can check calls against it

@@ -17,7 +17,7 @@ from jaxtyping import Bool, Float
 from torch import Tensor
 
 from swimm3r import weights
-from swimm3r.cameras import Cameras, project
+from swimm3r.cameras import Cameras, project_visible
 from swimm3r.evaluate import NotComputed
 from swimm3r.evaluate.images import ViewScores, as_8_bit, blur4_psnr, mean_view_scores, psnr, view_scores
 from swimm3r.evaluate.lpips import Lpips, load_lpips
@@ -181,9 +181,8 @@ def covered_by_training(rec: Reconstruction, canvas: Cameras) -> Bool[Tensor, "h
     import cv2
 
     xyz = rec.points.xyz if rec.cloud is None else rec.cloud.xyz
-    pixels, z = project(canvas, xyz[None].double())
-    inside = (z[0] > 0) & (pixels[0] > 0).all(-1) & (pixels[0] < torch.tensor([canvas.width, canvas.height])).all(-1)
-    column, row = pixels[0][inside].long().unbind(-1)
+    pixels, _, visible = project_visible(canvas, xyz[None].double())
+    column, row = pixels[visible].long().unbind(-1)
     hit = torch.zeros(canvas.height, canvas.width, dtype=torch.uint8)
     hit[row, column] = 1
     reach = max(3, round(_GAP * canvas.width)) | 1

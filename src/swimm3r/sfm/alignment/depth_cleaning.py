@@ -12,7 +12,7 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
-from swimm3r.cameras import Cameras, project, unproject
+from swimm3r.cameras import Cameras, pixel_grid, project_visible, unproject
 from swimm3r.io.files.cache import ArrayCache
 from swimm3r.progress import Progress, silent
 
@@ -33,15 +33,14 @@ def clean_confidence(
     """The confidence of frame i, 0 where its points are in a neighbor's way; `view` gives z depth and confidence."""
     z_depth, confidence = view(i)
     height, width = z_depth.shape
-    y, x = torch.meshgrid(torch.arange(height) + 0.5, torch.arange(width) + 0.5, indexing="ij")
-    grid = torch.stack([x, y], -1).reshape(1, -1, 2).double()
+    grid = pixel_grid(height, width).reshape(1, -1, 2).double()
     points = unproject(cameras[i], grid, z_depth.reshape(1, -1).double())[0]
     mine = confidence.reshape(-1).clone()
     for j in neighbors:
-        uv, z = project(cameras[j], points[None])
-        column, row = uv[0].floor().nan_to_num(-1, -1, -1).clamp(-1, max(height, width)).long().unbind(-1)
-        seen = (z[0] > 0) & (column >= 0) & (column < width) & (row >= 0) & (row < height)
-        at = (row * width + column)[seen]
+        uv, z, visible = project_visible(cameras[j], points[None])
+        seen = visible[0]
+        column, row = uv[0, seen].long().unbind(-1)
+        at = row * width + column
         other_z, other_confidence = (value.reshape(-1) for value in view(j))
         in_front = z[0][seen] < (1 - _IN_FRONT) * other_z[at]
         hit = torch.nonzero(seen)[:, 0][in_front & (mine[seen] < other_confidence[at])]

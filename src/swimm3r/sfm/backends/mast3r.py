@@ -13,7 +13,7 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
-from swimm3r.cameras import Cameras, project
+from swimm3r.cameras import Cameras, project_visible
 from swimm3r.errors import RegistrationError
 from swimm3r.imaging.filters import LUMA
 from swimm3r.progress import Progress, silent
@@ -313,9 +313,8 @@ def _write_depth(
 def _scale_to_points(z_depth: Float[Tensor, "h w"], rec: Reconstruction, canvas: Cameras, k: int) -> float:
     """Ratio of the depths of frame k's sparse points to its depth map."""
     mine = rec.tracks.point[rec.tracks.frame == k]
-    uv, z = project(canvas, rec.points.xyz[mine].double()[None])
-    column, row = uv[0].nan_to_num(-1, -1, -1).clamp(-1, max(z_depth.shape)).floor().long().unbind(-1)
-    seen = (z[0] > 0) & (column >= 0) & (column < canvas.width) & (row >= 0) & (row < canvas.height)
-    if not seen.any():
+    uv, z, visible = project_visible(canvas, rec.points.xyz[mine].double()[None])
+    if not visible.any():
         return 1.0
-    return float((z[0][seen] / z_depth[row[seen], column[seen]]).median())
+    column, row = uv[visible].long().unbind(-1)
+    return float((z[visible] / z_depth[row, column]).median())

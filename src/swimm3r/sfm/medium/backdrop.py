@@ -10,7 +10,7 @@ import torch
 from jaxtyping import Bool, Float
 from torch import Tensor
 
-from swimm3r.cameras import Cameras, directions, project
+from swimm3r.cameras import Cameras, directions, project_visible
 from swimm3r.imaging.filters import blur
 from swimm3r.scene.frames import Frames
 from swimm3r.scene.reconstruction import DenseCloud, Reconstruction
@@ -77,8 +77,8 @@ class Backdrop:
             if j == i:
                 continue
             camera = self.rec.cameras[j]
-            pixels, z = project(camera, xyz[None])
-            at = _inside(camera, pixels[0], z[0]).nonzero()[:, 0]
+            pixels, z, visible = project_visible(camera, xyz[None])
+            at = visible[0].nonzero()[:, 0]
             column, row = pixels[0, at].long().unbind(-1)
             known = self.rec.depth[self.rec.names[j]].z_depth[row, column].double()
             nearness = z[0, at] / torch.where(known > 0, known, z[0, at])
@@ -104,13 +104,8 @@ def _lattice(camera: Cameras, step: float) -> tuple[Tensor, Tensor]:
 
 def _shown_cells(camera: Cameras, xyz: Tensor, edge: float) -> Bool[Tensor, "rows columns"]:
     """Which square cells of an image some point falls into."""
-    pixels, z = project(camera, xyz[None])
-    column, row = (pixels[0][_inside(camera, pixels[0], z[0])] / edge).long().unbind(-1)
+    pixels, _, visible = project_visible(camera, xyz[None])
+    column, row = (pixels[visible] / edge).long().unbind(-1)
     cells = torch.zeros(int(camera.height / edge) + 1, int(camera.width / edge) + 1, dtype=torch.bool)
     cells[row, column] = True
     return cells
-
-
-def _inside(camera: Cameras, pixels: Float[Tensor, "n 2"], z: Float[Tensor, " n"]) -> Bool[Tensor, " n"]:
-    size = torch.tensor([camera.width, camera.height]).to(pixels)
-    return (z > 0) & (pixels > 0).all(-1) & (pixels < size).all(-1)

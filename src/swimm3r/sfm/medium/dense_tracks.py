@@ -10,10 +10,10 @@ from collections.abc import Iterator
 from dataclasses import dataclass
 
 import torch
-from jaxtyping import Bool, Float, Int
+from jaxtyping import Float, Int
 from torch import Tensor
 
-from swimm3r.cameras import Cameras, directions, image_directions, project, ray_depth_from_z
+from swimm3r.cameras import Cameras, image_directions, project_visible, ray_depth_from_z, unproject
 from swimm3r.progress import Progress, silent
 from swimm3r.scene.frames import Frames
 from swimm3r.scene.reconstruction import Reconstruction
@@ -84,11 +84,9 @@ def frame_overlap(rec: Reconstruction, usable: list[int]) -> Float[Tensor, "f f"
         z = rec.depth[rec.names[i]].z_depth[rows][:, columns].reshape(-1).double()
         if not (z > 0).any():
             continue
-        camera = cameras[i]
-        seen = directions(camera, grid[:, z > 0]) * z[z > 0][None, :, None]
-        xyz = seen @ camera.cam2world[:, :3, :3].mT + camera.cam2world[:, None, :3, 3]
-        uv, ahead = project(cameras, xyz.expand(len(cameras), -1, -1))
-        shares[i] = (_inside(uv, cameras) & (ahead > 0)).double().mean(-1).float()
+        xyz = unproject(cameras[i], grid[:, z > 0], z[None, z > 0])
+        _, _, visible = project_visible(cameras, xyz.expand(len(cameras), -1, -1))
+        shares[i] = visible.double().mean(-1).float()
         shares[i, i] = 0
     return shares
 
@@ -103,11 +101,6 @@ def shared_rays(cameras: Cameras) -> list[Float[Tensor, "h w 3"]]:
             rays[lens] = image_directions(cameras[i]).float()
         result.append(rays[lens])
     return result
-
-
-def _inside(uv: Float[Tensor, "*points 2"], cameras: Cameras) -> Bool[Tensor, "*points"]:
-    size = torch.tensor([cameras.width, cameras.height]).to(uv)
-    return ((uv >= 0) & (uv < size)).all(-1)
 
 
 def _neighbors(overlap: Float[Tensor, "f f"], i: int, usable: list[int], settings: TrackSettings) -> list[int]:
@@ -150,16 +143,15 @@ def _tracks_from(
     usable = frames.mask(frames.index(names[i])).reshape(-1)
     seeds = torch.nonzero(lattice.reshape(-1) & (z_map > 0) & free[i] & usable)[:, 0]
     free[i][seeds] = False
-    start = _unproject(cameras[i], seeds, z_map[seeds])
+    start = _world_points(cameras[i], seeds, z_map[seeds])
     color = frames.image(frames.index(names[i])).reshape(-1, 3)[seeds]
     confidence = depth.confidence.reshape(-1)[seeds]
     weight = confidence.double().clamp(min=0.01)
     total, position = weight.clone(), start * weight[:, None]
     observations = [(torch.arange(len(seeds)), torch.full_like(seeds, i), seeds, confidence)]
     for j in neighbors if len(seeds) else []:
-        uv, z = project(cameras[j], start[None])
-        uv, z = uv[0], z[0]
-        candidates = torch.nonzero(_inside(uv, cameras) & (z > 0))[:, 0]
+        uv, z, visible = (values[0] for values in project_visible(cameras[j], start[None]))
+        candidates = torch.nonzero(visible)[:, 0]
         pixel = uv[candidates, 1].long() * cameras.width + uv[candidates, 0].long()
         other = rec.depth[names[j]]
         z_other = other.z_depth.reshape(-1)[pixel].double()
@@ -187,11 +179,10 @@ def _tracks_from(
     return DenseTracks(xyz.float(), track, frame, pixel[order], ray_depth.float(), confidence[order])
 
 
-def _unproject(camera: Cameras, pixel: Int[Tensor, " n"], z_depth: Float[Tensor, " n"]) -> Float[Tensor, "n 3"]:
+def _world_points(camera: Cameras, pixel: Int[Tensor, " n"], z_depth: Float[Tensor, " n"]) -> Float[Tensor, "n 3"]:
     """World points of the centers of row-major pixels, float64."""
     uv = torch.stack([pixel % camera.width + 0.5, pixel // camera.width + 0.5], -1).double()
-    seen = directions(camera, uv[None])[0] * z_depth.double()[:, None]
-    return seen @ camera.cam2world[0, :3, :3].mT + camera.cam2world[0, :3, 3]
+    return unproject(camera, uv[None], z_depth.double()[None])[0]
 
 
 def ray_depth_map(z_depth: Float[Tensor, "h w"], rays: Float[Tensor, "h w 3"]) -> Float[Tensor, "h w"]:

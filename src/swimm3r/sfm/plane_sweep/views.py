@@ -12,7 +12,7 @@ from jaxtyping import Bool, Float
 from scipy import sparse
 from torch import Tensor
 
-from swimm3r.cameras import Cameras, project
+from swimm3r.cameras import Cameras, project, project_visible
 from swimm3r.imaging.filters import LUMA
 from swimm3r.imaging.undistortion import pinhole_grid, undistorted
 from swimm3r.scene.reconstruction import Reconstruction
@@ -61,8 +61,7 @@ def choose_sources(rec: Reconstruction, count: int, angle_deg: float) -> list[li
         to_them = torch.nn.functional.normalize(centers[near_by][:, None] - P, dim=-1)
         angle = torch.rad2deg(torch.arccos((to_me * to_them).sum(-1).clamp(-1, 1)))
         width = torch.where(angle < angle_deg, 0.4 * angle_deg, 1.2 * angle_deg)
-        pixels, z = project(rec.cameras[near_by], P.expand(len(near_by), -1, -1))
-        inside = (z > 0) & ((pixels > 0) & (pixels < torch.tensor([rec.cameras.width, rec.cameras.height]))).all(-1)
+        _, _, inside = project_visible(rec.cameras[near_by], P.expand(len(near_by), -1, -1))
         both = torch.from_numpy(track[near_by][:, mine].toarray() > 0)
         weight = torch.exp(-0.5 * ((angle - angle_deg) / width) ** 2)
         weight = weight * torch.where(both, 1.0, torch.where(inside, 0.25, 0.0))

@@ -12,7 +12,7 @@ from jaxtyping import Bool, Float, Shaped, UInt8
 from torch import Tensor
 from torch.nn.functional import grid_sample, interpolate, pad
 
-from swimm3r.cameras import pixel_grid
+from swimm3r.cameras import inside_image, pixel_grid
 from swimm3r.splat.dynamic.part_tracks import Fit, Part
 from swimm3r.splat.views import TrainingView
 
@@ -98,8 +98,7 @@ def _followed(
     """Targets of the flow, and whether they lie inside the image and the backward flow returns to the start."""
     moved = pixels + _sampled(flow, pixels)
     returned = moved + _sampled(back, moved)
-    size = torch.tensor([flow.shape[2], flow.shape[1]])
-    inside = ((moved > 0) & (moved < size)).all(-1)
+    inside = inside_image(moved, flow.shape[2], flow.shape[1])
     return moved, inside & (torch.linalg.vector_norm(returned - pixels, dim=-1) < _RETURN)
 
 

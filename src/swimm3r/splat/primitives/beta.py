@@ -18,7 +18,7 @@ from scipy.spatial import KDTree
 from torch import Tensor
 from torch.nn.functional import softplus
 
-from swimm3r.cameras import Cameras, project
+from swimm3r.cameras import Cameras, project_visible
 from swimm3r.errors import InputError
 from swimm3r.scene.reconstruction import DenseCloud, Reconstruction
 from swimm3r.splat.gaussian_settings import GaussianInitialSettings
@@ -203,9 +203,7 @@ def mean_directions(xyz: Float[Tensor, "n 3"], rec: Reconstruction, max_views: i
 
 
 def _sees(rec: Reconstruction, camera: Cameras, name: str, xyz: Float[Tensor, "n 3"]) -> Bool[Tensor, " n"]:
-    pixels, z = project(camera, xyz[None])
-    pixels, z = pixels[0], z[0]
-    inside = (z > 0) & (pixels > 0).all(-1) & (pixels[:, 0] < camera.width) & (pixels[:, 1] < camera.height)
+    pixels, z, inside = (values[0] for values in project_visible(camera, xyz[None]))
     if name in rec.depth:
         z_depth = rec.depth[name].z_depth
         column, row = torch.where(inside[:, None], pixels, 0.0).long().unbind(-1)
