@@ -198,13 +198,12 @@ class MappingSettings(Settings):
 
 
 @dataclass(frozen=True)
-class ColmapSettings(Settings):
-    """Structure from motion without weights: pycolmap, plane sweep, Sea-Thru."""
+class LensSettings(Settings):
+    """The one lens of a clip, as far as it is known (`sfm/lens.py`)."""
 
-    camera: Literal["auto", "SIMPLE_RADIAL", "OPENCV", "OPENCV_FISHEYE"] = "auto"
-    """One lens for the whole clip. Auto: SIMPLE_RADIAL, or OPENCV where it explains the matches clearly better."""
     focal: Positive | None = None
-    """Focal length, pixels of the prepared frames; measured in water unless `housing` is flat."""
+    """Focal length, pixels of the prepared frames, measured in water, or in air where `housing` is flat: a start value,
+    which `intrinsics` or `alignment.intrinsics` can hold. The MASt3R back end always holds a lens with distortion."""
     k1: LensParameter | None = None
     k2: LensParameter | None = None
     k3: LensParameter | None = None
@@ -212,6 +211,14 @@ class ColmapSettings(Settings):
     k4: LensParameter | None = None
     p1: LensParameter | None = None
     p2: LensParameter | None = None
+
+
+@dataclass(frozen=True)
+class ColmapSettings(LensSettings):
+    """Structure from motion without weights: pycolmap, plane sweep, Sea-Thru."""
+
+    camera: Literal["auto", "SIMPLE_RADIAL", "OPENCV", "OPENCV_FISHEYE"] = "auto"
+    """One lens for the whole clip. Auto: SIMPLE_RADIAL, or OPENCV where it explains the matches clearly better."""
     intrinsics: Literal["prior", "fixed"] = "prior"
     """Whether the numbers above are a start for refinement or the truth."""
     housing: Literal["none", "flat", "dome"] = "none"
@@ -233,7 +240,7 @@ class ColmapSettings(Settings):
 
 
 @dataclass(frozen=True)
-class Mast3rSettings(Settings):
+class Mast3rSettings(LensSettings):
     """Structure from motion by the MASt3R network: pointmaps and matches of pairs of frames, aligned; Sea-Thru."""
 
     weights: Path | None = None
@@ -253,16 +260,6 @@ class Mast3rSettings(Settings):
     """Of the network's trunk; its heads are always float32."""
     camera: Literal["PINHOLE", "SIMPLE_RADIAL", "OPENCV", "OPENCV_FISHEYE"] = "PINHOLE"
     """One lens for the whole clip; its distortion is removed before the network sees an image."""
-    focal: Positive | None = None
-    """Focal length, pixels of the prepared frames, in water: where the alignment starts from; `alignment.intrinsics`
-    says whether it stays there. A lens with distortion stays."""
-    k1: LensParameter | None = None
-    k2: LensParameter | None = None
-    k3: LensParameter | None = None
-    """OPENCV_FISHEYE only, as k4."""
-    k4: LensParameter | None = None
-    p1: LensParameter | None = None
-    p2: LensParameter | None = None
     known: Path | None = None
     """Cameras that are known: a cameras.json, a COLMAP model or another program's file. Frames it names keep its poses
     (and its unit), the others find theirs; its lens takes the place of the numbers above."""

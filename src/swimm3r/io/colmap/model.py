@@ -1,9 +1,7 @@
 """COLMAP models on disk <-> arrays: cameras, poses, points and tracks of registered images.
 
 COLMAP's pixel grid is ours: the center of the first pixel is (0.5, 0.5). It stores world-to-camera; here poses are
-cam2world. A pinhole or radial lens that `cameras` does not name is the same lens written as OPENCV with zeros:
-
-    SIMPLE_PINHOLE f cx cy -> PINHOLE        RADIAL k1 k2 -> OPENCV k1 k2 0 0
+cam2world.
 """
 
 from dataclasses import dataclass
@@ -14,6 +12,7 @@ import numpy as np
 
 from swimm3r.cameras import cameras_of, check_cameras
 from swimm3r.errors import InputError
+from swimm3r.io.colmap.cameras import common_model, from_pycolmap_camera, to_pycolmap_camera
 from swimm3r.io.colmap.integrity import damaged_file
 from swimm3r.io.files.atomic import atomic_folder
 from swimm3r.io.files.damage import Remedy, first_line, guard
@@ -32,7 +31,6 @@ _NOT_FOUND = Remedy(
     "give the folder that COLMAP wrote, for example my_dive/sparse/0",
     cause="cameras, images and points3D (.bin or .txt) are not all in it, nor in its 0/ or sparse/0/",
 )
-_FOCALS = {"SIMPLE_PINHOLE": 1, "SIMPLE_RADIAL": 1, "RADIAL": 1, "PINHOLE": 2, "OPENCV": 2, "OPENCV_FISHEYE": 2}
 
 
 def silence_log() -> None:
@@ -131,8 +129,8 @@ def from_pycolmap(model: "pycolmap.Reconstruction") -> ColmapModel:
             cause="images of several cameras or crops were reconstructed together",
             hint="reconstruct the images of one size, or resize them first",
         )
-    lens = _common_lens({camera.model.name for camera in cameras})
-    intrinsics = [_intrinsics(camera, lens) for camera in cameras]
+    lens = common_model({camera.model.name for camera in cameras})
+    intrinsics = [from_pycolmap_camera(camera, lens) for camera in cameras]
     cam2world = np.tile(np.eye(4), (len(images), 1, 1))
     for pose, image in zip(cam2world, images, strict=True):
         world2cam = image.cam_from_world()
@@ -173,7 +171,7 @@ def to_pycolmap(model: ColmapModel) -> "pycolmap.Reconstruction":
     out = pycolmap.Reconstruction()
     shared = bool(np.ptp(model.K, axis=0).max() == 0 and np.all(np.ptp(model.distortion, axis=0) == 0))
     for i in range(1 if shared else len(model.names)):
-        out.add_camera_with_trivial_rig(_camera(model, i))
+        out.add_camera_with_trivial_rig(to_pycolmap_camera(model, i))
 
     order = np.argsort(model.track_frame, kind="stable")
     starts = np.searchsorted(model.track_frame[order], np.arange(len(model.names) + 1))
@@ -198,40 +196,3 @@ def to_pycolmap(model: ColmapModel) -> "pycolmap.Reconstruction":
         point.xyz, point.color, point.error, point.track = xyz, rgb, error, track
         out.add_point3D_with_id(p + 1, point)
     return out
-
-
-def _common_lens(models: set[str]) -> str:
-    unknown = models - set(_FOCALS)
-    if unknown or ("OPENCV_FISHEYE" in models and len(models) > 1):
-        raise InputError(
-            f"the COLMAP model has lenses that cannot be read together: {', '.join(sorted(models))}",
-            cause=f"readable are {', '.join(sorted(_FOCALS))}, fisheye not mixed with others",
-            hint="undistort the images first (colmap image_undistorter), which leaves PINHOLE cameras",
-        )
-    if models <= {"SIMPLE_PINHOLE", "PINHOLE"}:
-        return "PINHOLE"
-    return models.pop() if len(models) == 1 and "RADIAL" not in models else "OPENCV"
-
-
-def _intrinsics(camera: "pycolmap.Camera", lens: str) -> tuple[np.ndarray, np.ndarray]:
-    focals = _FOCALS[camera.model.name]
-    f, c, k = camera.params[:focals], camera.params[focals : focals + 2], camera.params[focals + 2 :]
-    K = np.array([[f[0], 0, c[0]], [0, f[-1], c[1]], [0, 0, 1]])
-    length = {"PINHOLE": 0, "SIMPLE_RADIAL": 1, "OPENCV": 4, "OPENCV_FISHEYE": 4}[lens]
-    return K, np.concatenate([k, np.zeros(length - len(k))])
-
-
-def _camera(model: ColmapModel, i: int) -> "pycolmap.Camera":
-    import pycolmap
-
-    K, distortion, lens = model.K[i], model.distortion[i], model.model
-    if lens == "SIMPLE_RADIAL" and K[0, 0] != K[1, 1]:  # after an uneven resize; COLMAP's has one focal length
-        lens, distortion = "OPENCV", np.concatenate([distortion, np.zeros(3)])
-    focal = [K[0, 0]] if lens == "SIMPLE_RADIAL" else [K[0, 0], K[1, 1]]
-    return pycolmap.Camera(
-        model=lens,
-        width=model.width,
-        height=model.height,
-        params=np.array([*focal, K[0, 2], K[1, 2], *distortion]),
-        camera_id=i + 1,
-    )

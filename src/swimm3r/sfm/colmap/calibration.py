@@ -11,11 +11,13 @@ from typing import TYPE_CHECKING
 import numpy as np
 import torch
 
-from swimm3r.cameras import DISTORTION_PARAMETERS, distort
+from swimm3r.cameras import distort
 from swimm3r.errors import UsageError
+from swimm3r.io.colmap.cameras import from_pycolmap_camera, to_pycolmap_camera, under_model
 from swimm3r.progress import Progress
 from swimm3r.sfm.colmap.pair_focal import focal_of_pairs
 from swimm3r.sfm.features.database import MIN_INLIERS, FeatureDatabase
+from swimm3r.sfm.lens import check_lens_settings, lens_of
 from swimm3r.sfm.settings import ColmapSettings
 
 if TYPE_CHECKING:
@@ -43,20 +45,7 @@ def first_camera(width: int, height: int, settings: ColmapSettings) -> "pycolmap
     Raises UsageError where the settings contradict themselves.
     """
     name = _model_name(settings)
-    known = {k for k in ("k1", "k2", "k3", "k4", "p1", "p2") if getattr(settings, k) is not None}
-    foreign = sorted(known - set(DISTORTION_PARAMETERS[name]))
-    if foreign:
-        raise UsageError(
-            f"{name} has no {', '.join(foreign)}",
-            cause=f"its parameters are {', '.join(DISTORTION_PARAMETERS[name])}",
-            hint="choose the camera model that the numbers were calibrated with (--camera)",
-        )
-    if settings.focal is not None and not 0.1 * width < settings.focal < 20 * width:
-        raise UsageError(
-            f"a focal length of {settings.focal:g} px does not fit images {width} px wide",
-            cause="it may be in millimetres, or belong to another image size",
-            hint="give it in pixels of the prepared frames: millimetres / sensor width in millimetres * image width",
-        )
+    check_lens_settings(settings, name, width)
     if settings.intrinsics == "fixed" and settings.focal is None:
         raise UsageError(
             "fixed intrinsics need a focal length",
@@ -68,8 +57,6 @@ def first_camera(width: int, height: int, settings: ColmapSettings) -> "pycolmap
 
 def ladder(width: int, height: int, settings: ColmapSettings) -> "list[pycolmap.Camera]":
     """The lenses to try in turn, likelier ones first."""
-    import pycolmap
-
     name = _model_name(settings)
     port = WATER if settings.housing == "flat" else 1.0
     if settings.focal is not None:
@@ -81,15 +68,9 @@ def ladder(width: int, height: int, settings: ColmapSettings) -> "list[pycolmap.
         if settings.housing == "flat":
             focals.sort(key=lambda f: abs(f / width - 1.0))  # 0.75 in air is a common lens
     assumed = settings.mapping.k1 if name != "OPENCV_FISHEYE" and settings.focal is None else 0.0
-    k = []
-    for parameter in DISTORTION_PARAMETERS[name]:
-        given = getattr(settings, parameter)
-        k.append(given if given is not None else (assumed if parameter == "k1" else 0.0))
     out = []
     for f in focals:
-        focal = [f] if name == "SIMPLE_RADIAL" else [f, f]
-        params = np.array([*focal, width / 2, height / 2, *k])
-        camera = pycolmap.Camera(model=name, width=width, height=height, params=params, camera_id=1)
+        camera = to_pycolmap_camera(lens_of(settings, name, width, height, f, assumed))
         camera.has_prior_focal_length = settings.focal is not None or name == "OPENCV_FISHEYE"
         out.append(camera)
     return out
@@ -163,7 +144,7 @@ def is_lens(camera: "pycolmap.Camera") -> bool:
     fx, fy = camera.focal_length_x, camera.focal_length_y
     if not (0.3 < fx / width < 4 and 0.5 < fx / fy < 2):
         return False
-    k = torch.from_numpy(np.asarray(camera.params)[-len(DISTORTION_PARAMETERS[name]) :].copy())
+    k = torch.from_numpy(from_pycolmap_camera(camera, name)[1])
     corner = torch.tensor([width / 2 / fx, height / 2 / fy], dtype=torch.float64)
     # along every half diagonal the image radius must grow with the ray's angle, by a share a lens can have
     reach = torch.linspace(0, 1, 50, dtype=torch.float64)[1:, None, None]
@@ -178,11 +159,7 @@ def is_lens(camera: "pycolmap.Camera") -> bool:
 
 def set_camera(store: FeatureDatabase, camera: "pycolmap.Camera") -> None:
     """Make a lens the one that the mapper reads from the database."""
-    import pycolmap
-
-    known = pycolmap.Camera(
-        model=camera.model.name, width=camera.width, height=camera.height, params=camera.params, camera_id=1
-    )
+    known = under_model(camera, camera.model.name)
     known.has_prior_focal_length = True  # else the mapper guesses its own from the first pair
     with store.open() as database:
         database.update_camera(known)
@@ -210,14 +187,7 @@ def _adjust(
 ) -> "pycolmap.Reconstruction":
     import pycolmap
 
-    camera = model.cameras[1]
-    params = list(camera.params)
-    if name == "OPENCV" and camera.model.name == "SIMPLE_RADIAL":
-        f, cx, cy, k1 = params
-        params = [f, f, cx, cy, k1, 0.0, 0.0, 0.0]
-    changed = pycolmap.Camera(
-        model=name, width=camera.width, height=camera.height, params=np.array(params), camera_id=1
-    )
+    changed = under_model(model.cameras[1], name)
     set_camera(store, changed)  # the cache below and the model must agree on the lens
     options = pycolmap.DatabaseCacheOptions()
     options.min_num_matches = MIN_INLIERS

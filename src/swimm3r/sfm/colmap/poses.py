@@ -20,6 +20,7 @@ from torch import Tensor
 
 from swimm3r.cameras import Cameras, cameras_of
 from swimm3r.errors import InputError, RegistrationError, StorageError
+from swimm3r.io.colmap.cameras import to_pycolmap_camera
 from swimm3r.io.colmap.model import ColmapModel, from_pycolmap, silence_log, to_pycolmap
 from swimm3r.io.files.atomic import atomic_path
 from swimm3r.progress import Progress, silent
@@ -70,8 +71,8 @@ def reconstruct(
     if lens is None:
         camera = calibration.first_camera(frames.width, frames.height, settings)
     else:
-        camera, settings = _lens(lens), replace(settings, intrinsics="fixed")
-        camera.camera_id, camera.has_prior_focal_length = 1, True
+        camera, settings = to_pycolmap_camera(lens), replace(settings, intrinsics="fixed")
+        camera.has_prior_focal_length = True
     with _full_disk_said_plainly(folder):
         store = start_database(folder, frames, camera, settings.features)
         fill_features(store, frames, settings.features, threads, progress)
@@ -127,7 +128,7 @@ def absolute_pose(
     options = pycolmap.AbsolutePoseEstimationOptions()
     options.ransac.max_error = max_error
     options.ransac.random_seed = 0
-    lens = _lens(camera)
+    lens = to_pycolmap_camera(camera)
     found = pycolmap.estimate_and_refine_absolute_pose(
         points2d.double().numpy(), points3d.double().numpy(), lens, estimation_options=options
     )
@@ -260,20 +261,6 @@ def verified_matches(store: FeatureDatabase, index: list[int]) -> Matches:
         xy_j=torch.from_numpy(np.concatenate([_NOWHERE, *xy_j])).float(),
         confidence=torch.ones(len(first)),
     )
-
-
-def _lens(camera: Cameras) -> "pycolmap.Camera":
-    import pycolmap
-
-    if len(camera) != 1:
-        raise ValueError(f"one camera is expected, got {len(camera)}")
-    K, k = camera.K[0].double(), camera.distortion[0].double().tolist()
-    name = camera.model
-    if name == "SIMPLE_RADIAL" and K[0, 0] != K[1, 1]:
-        name, k = "OPENCV", [*k, 0.0, 0.0, 0.0]
-    focal = [K[0, 0]] if name == "SIMPLE_RADIAL" else [K[0, 0], K[1, 1]]
-    params = np.array([*map(float, focal), float(K[0, 2]), float(K[1, 2]), *k])
-    return pycolmap.Camera(model=name, width=camera.width, height=camera.height, params=params)
 
 
 def _registration_warnings(placed: int, sizes: list[int], frames: Frames) -> list[QualityWarning]:

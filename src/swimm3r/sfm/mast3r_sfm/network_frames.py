@@ -5,19 +5,20 @@ prepared frame (its lens) -> undistorted, same K (pinhole) -> resized and croppe
 
 from dataclasses import dataclass, replace
 from functools import cached_property
-from hashlib import sha256
 from pathlib import Path
 
 import torch
 from jaxtyping import Bool, Float
 from torch import Tensor
 
-from swimm3r.cameras import DISTORTION_PARAMETERS, Cameras
+from swimm3r.cameras import Cameras
 from swimm3r.errors import InputError, UsageError
 from swimm3r.imaging.undistortion import distorted_pixels, undistorted, undistorted_pixels
+from swimm3r.io.files.cache_key import bytes_digest
 from swimm3r.io.imports.read import read_foreign
 from swimm3r.scene.frames import Frames
 from swimm3r.sfm.imported.match_frames import model_cameras
+from swimm3r.sfm.lens import DISTORTION, check_lens_settings, lens_of
 from swimm3r.sfm.mast3r.preprocess import (
     Framing,
     K_to_image,
@@ -71,7 +72,7 @@ class NetworkImages:
             parts.append(frame.mask.read_bytes())
         if self.lens.model != "PINHOLE":
             parts += [self.lens.K.numpy().tobytes(), self.lens.distortion.numpy().tobytes(), self.lens.model.encode()]
-        return sha256(b"".join(sha256(part).digest() for part in parts)).hexdigest()[:24]
+        return bytes_digest(*parts)
 
     @cached_property
     def K(self) -> Float[Tensor, "3 3"] | None:
@@ -119,7 +120,7 @@ def network_images(frames: Frames, settings: Mast3rSettings) -> NetworkImages:
 
 def _from_file(frames: Frames, settings: Mast3rSettings, path: Path) -> tuple[Cameras, KnownPoses]:
     """Lens and poses of a file of known cameras."""
-    given = [name for name in ("focal", "k1", "k2", "k3", "k4", "p1", "p2") if getattr(settings, name) is not None]
+    given = [name for name in ("focal", *DISTORTION) if getattr(settings, name) is not None]
     if given or settings.bundle_adjustment:
         other = given[0] if given else "bundle-adjustment"
         raise UsageError(
@@ -152,28 +153,12 @@ def _from_file(frames: Frames, settings: Mast3rSettings, path: Path) -> tuple[Ca
 
 
 def _lens(width: int, height: int, settings: Mast3rSettings) -> Cameras:
-    names = DISTORTION_PARAMETERS[settings.camera]
-    given = [k for k in ("k1", "k2", "k3", "k4", "p1", "p2") if getattr(settings, k) is not None]
-    if foreign := sorted(set(given) - set(names)):
-        raise UsageError(
-            f"{settings.camera} has no {', '.join(foreign)}",
-            cause=f"its distortion is {', '.join(names) or 'none'}",
-            hint="choose the camera model that the numbers were calibrated with (--camera)",
-        )
-    focal = settings.focal
-    if focal is None and settings.camera != "PINHOLE":
+    check_lens_settings(settings, settings.camera, width)
+    if settings.focal is None and settings.camera != "PINHOLE":
         raise UsageError(
             f"a lens with distortion ({settings.camera}) must be known before the network sees its images",
             cause="--camera was given without --focal",
             hint="add --focal and the distortion of a calibration, or leave --camera at PINHOLE",
         )
-    if focal is not None and not 0.1 * width < focal < 20 * width:
-        raise UsageError(
-            f"a focal length of {focal:g} px does not fit images {width} px wide",
-            cause="it may be in millimetres, or belong to another image size",
-            hint="give it in pixels of the prepared frames: millimetres / sensor width in millimetres * image width",
-        )
-    f = _ASSUMED * width if focal is None else focal
-    K = torch.tensor([[[f, 0, width / 2], [0, f, height / 2], [0, 0, 1]]], dtype=torch.float64)
-    k = torch.tensor([[getattr(settings, name) or 0.0 for name in names]], dtype=torch.float64)
-    return Cameras(K, k, torch.eye(4, dtype=torch.float64)[None], width, height, settings.camera)
+    focal = _ASSUMED * width if settings.focal is None else settings.focal
+    return lens_of(settings, settings.camera, width, height, focal)
