@@ -36,6 +36,7 @@ def main(arguments: Sequence[str] | None = None) -> None:
     if rec.medium is not None:
         print(f"beta_D {rec.medium.beta_D.tolist()}, determined: {rec.medium.identifiable['beta_D'].tolist()}")
 
+    assert isinstance(preset.splat, swimm3r.UwbsSettings)
     settings = smaller(preset.splat, given.steps, given.primitives, given.long_side)
     scene = swimm3r.train(rec, frames, settings, folder=given.out / "splat")
 

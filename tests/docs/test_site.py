@@ -30,7 +30,7 @@ def test_the_site_builds_strictly_and_asks_no_other_server(tmp_path: Path):
 def test_the_page_lists_every_room():
     listed, above = [], [PACKAGE]
     for line in blocks()[0].splitlines()[1:]:
-        indent, name = re.match(r"( *)(\w+)/", line).groups()
+        indent, name = re.findall(r"^( *)(\w+)/", line)[0]
         above = [*above[: len(indent) // 4], above[len(indent) // 4 - 1] / name]
         listed.append(above[-1])
     assert sorted(listed) == sorted({path.parent for path in PACKAGE.rglob("__init__.py")} - {PACKAGE})
