@@ -23,6 +23,23 @@ READ = (3,)  # damage that must be named
 MAYBE = (0, 3)  # damage that a command may not meet, or may repair
 IN_THE_WAY = (0, 2, 3)  # a folder where a file is to be written
 
+READERS = {  # file -> commands that read it
+    "summary.json": ("report", "eval", "resume", "bench"),
+    "settings.yaml": ("report", "eval", "resume"),
+    "versions.json": ("report",),
+    "prepare/frames.json": ("report", "render", "eval", "localize", "resume"),
+    "sfm/cameras.json": ("render",),
+    "sfm/medium.json": ("report", "eval", "render"),
+    "sfm/reconstruction.json": ("report", "render", "eval"),
+    "sfm/matches.npz": ("report", "render", "eval", "resume"),
+    "sfm/points.ply": ("report", "render"),
+    "sfm/sparse/images.bin": ("report", "render"),
+    "sfm/sparse/cameras.bin": ("report", "render"),
+    "sfm/sparse/points3D.bin": ("report", "render"),
+    "splat/map.safetensors": ("render", "export", "eval", "localize", "resume"),
+    "splat/metrics.jsonl": ("resume",),
+}
+
 
 def cases(fixture: Fixture) -> Iterator[Case]:
     """Every file, kind of damage and command."""
@@ -33,23 +50,7 @@ def cases(fixture: Fixture) -> Iterator[Case]:
         arguments = tuple(word.format(dive=fixture.dive, frame=frame) for word in COMMANDS[command])
         return Case(f"{name}-{command}", arguments, codes, partial(_copied, fixture.run, change))
 
-    for path, commands in {
-        "summary.json": ("report", "eval", "resume", "bench"),
-        "settings.yaml": ("report", "eval", "resume"),
-        "versions.json": ("report",),
-        "prepare/frames.json": ("report", "render", "eval", "localize", "resume"),
-        "sfm/cameras.json": ("render",),
-        "sfm/medium.json": ("report", "eval", "render"),
-        "sfm/reconstruction.json": ("report", "render", "eval"),
-        "sfm/matches.npz": ("report", "render", "eval", "resume"),
-        "sfm/points.ply": ("report", "render"),
-        "sfm/sparse/images.bin": ("report", "render"),
-        "sfm/sparse/cameras.bin": ("report", "render"),
-        "sfm/sparse/points3D.bin": ("report", "render"),
-        "splat/map.safetensors": ("render", "export", "eval", "localize", "resume"),
-        "splat/metrics.jsonl": ("resume",),
-        depth: ("report", "eval"),
-    }.items():
+    for path, commands in {**READERS, depth: ("report", "eval")}.items():
         kinds = damage.ANY | (damage.JSON_KINDS if path.endswith(".json") else {})
         for kind, change in kinds.items():
             for command in commands:
@@ -61,6 +62,20 @@ def cases(fixture: Fixture) -> Iterator[Case]:
     for name, (path, change, commands) in _arrays(depth).items():
         for command in commands:
             yield case(name, command, MAYBE, partial(_at, path, change))
+    for command in ("render", "export", "eval", "localize"):
+        yield case("no-map", command, READ, lambda run: shutil.rmtree(run / "splat"))
+    for name, change in _half_made().items():
+        yield Case(
+            f"sfm-halfway-{name}",
+            ("sfm", str(fixture.dive), "--out", "run", "--preset", "fast"),
+            MAYBE,
+            partial(_copied_halfway, fixture.run, change),
+        )
+    yield from _without_run(frame)
+
+
+def _without_run(frame: str) -> Iterator[Case]:
+    """Every command on a folder that is none, empty, or a file."""
     for name, words in {"no-folder": "none", "empty-folder": "nothing", "a-file": "file"}.items():
         for command, arguments in COMMANDS.items():
             if command == "resume":
@@ -71,15 +86,6 @@ def cases(fixture: Fixture) -> Iterator[Case]:
                 (2, 3),
                 _odd_folders,
             )
-    for command in ("render", "export", "eval", "localize"):
-        yield case("no-map", command, READ, lambda run: shutil.rmtree(run / "splat"))
-    for name, change in _half_made().items():
-        yield Case(
-            f"sfm-halfway-{name}",
-            ("sfm", str(fixture.dive), "--out", "run", "--preset", "fast"),
-            MAYBE,
-            partial(_copied_halfway, fixture.run, change),
-        )
 
 
 def _copied(run: Path, change: Callable[[Path], None], folder: Path) -> None:

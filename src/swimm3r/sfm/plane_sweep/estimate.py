@@ -30,6 +30,7 @@ from swimm3r.progress import Progress, silent
 from swimm3r.scene.frames import Frames
 from swimm3r.scene.reconstruction import DepthMap, DepthMaps, Reconstruction
 from swimm3r.sfm.plane_sweep import consistency, kernels
+from swimm3r.sfm.plane_sweep.refinement import refine
 from swimm3r.sfm.plane_sweep.views import (
     SweepView,
     choose_sources,
@@ -149,7 +150,7 @@ def sweep(
         offsets, step, reach = (odd, 0.5 if n else 1.0, (3, 1)[n % 2])
         if n == settings.rounds:  # no more moves: how good is it, and does leaving it make it worse
             offsets, step, reach = chequered, _ASIDE, 0
-        surface, cost, peak = kernels.refine(
+        surface, cost, peak = refine(
             reference.detail.numpy(), reference.gray.numpy(), reference.seen.numpy(), detail, seen, H, e, surface,
             offsets, noise, edge, keep, settings.smooth_fine, step, reach,
         )  # fmt: skip
