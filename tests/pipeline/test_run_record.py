@@ -149,17 +149,28 @@ def test_a_damaged_record_is_told_and_redo_starts_anew(dive: Path, run: Path, te
     assert from_yaml(run / "settings.yaml") == FAST
 
 
-@pytest.mark.parametrize("spoil", ["stages", "status", "newer"])
+@pytest.mark.parametrize("spoil", ["stages", "status"])
 def test_a_record_that_is_not_what_it_should_be_is_told(run: Path, spoil: str):
     document = json.loads((run / "summary.json").read_text())
     if spoil == "stages":
         document["stages"] = []
-    elif spoil == "status":
-        document["stages"]["prepare"] = {"status": "perhaps", "key": "x"}
     else:
-        document["schema"] = 99
+        document["stages"]["prepare"] = {"status": "perhaps", "key": "x"}
     (run / "summary.json").write_text(json.dumps(document))
     with pytest.raises(InputError, match=r"summary.json"):
+        read_run(run)
+
+
+@pytest.mark.parametrize(("schema", "version"), [(1, "0.1.0"), (99, "7.0")])
+def test_a_run_of_another_version_is_refused_with_the_version_that_wrote_it(run: Path, schema: int, version: str):
+    for name, changes in {"summary.json": {"schema": schema}, "versions.json": {"swimm3r": version}}.items():
+        document = json.loads((run / name).read_text()) | changes
+        (run / name).write_text(json.dumps(document))
+    with pytest.raises(InputError, match=rf"written by Swimm3R {version} \(schema {schema}\)") as refused:
+        read_run(run)
+    assert f"swimm3r=={version}" in refused.value.hint
+    (run / "versions.json").unlink()
+    with pytest.raises(InputError, match="of an unknown version"):
         read_run(run)
 
 

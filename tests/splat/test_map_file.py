@@ -41,7 +41,7 @@ def test_a_file_that_is_no_map_is_refused(tmp_path, wall):
     save_file({"x": torch.zeros(2)}, path)
     with pytest.raises(InputError, match="header"):
         load_map(path)
-    write_tensors(path, {"x": torch.zeros(2)}, {"schema": 1, "recipe": "splatfacto"})
+    write_tensors(path, {"x": torch.zeros(2)}, {"schema": 2, "recipe": "splatfacto"})
     with pytest.raises(InputError, match="not a map"):
         load_map(path)
     save_map(path, wall(10))
@@ -55,7 +55,7 @@ def test_a_file_that_is_no_map_is_refused(tmp_path, wall):
 
 def rewritten(path: Path, tensors: dict[str, Tensor], about: dict[str, Any]) -> None:
     """The same map with some tensors and header entries replaced, or left out where they are None."""
-    stored = read_tensors(path, dict[str, Any], remake(path.parent), 1)
+    stored = read_tensors(path, dict[str, Any], remake(path.parent), None)
 
     def merged(old: dict, new: dict) -> dict:
         return {k: v for k, v in {**old, **new}.items() if v is not None}
@@ -66,7 +66,8 @@ def rewritten(path: Path, tensors: dict[str, Tensor], about: dict[str, Any]) -> 
 @pytest.mark.parametrize(
     ("tensors", "about", "said"),
     [
-        ({}, {"schema": 2}, "newer Swimm3R: its schema is 2, this version reads 1"),
+        ({}, {"schema": 3}, "newer Swimm3R: its schema is 3, this version reads 2"),
+        ({}, {"schema": 1}, "an older Swimm3R: its schema is 1, this version reads 2"),
         ({}, {"schema": None}, "its schema is None"),
         ({}, {"recipe": "splatfacto"}, "splatfacto"),
         ({}, {"recipe": []}, "recipe: a text is expected"),

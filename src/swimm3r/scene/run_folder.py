@@ -6,15 +6,16 @@ docs/conventions.md shows the layout.
 import json
 import os
 from dataclasses import dataclass
+from importlib.metadata import version
 from pathlib import Path
 from typing import Any, Literal
 
 from swimm3r.errors import InputError, UsageError
-from swimm3r.io.files.damage import Remedy, damaged
+from swimm3r.io.files.damage import Remedy
 from swimm3r.io.files.folder_lock import LOCK
 from swimm3r.io.files.json_file import read_json
 
-SCHEMA = 1
+SCHEMA = 2  # 1: Swimm3R 0.1, whose settings and files have other names
 STAGES = ("prepare", "sfm", "splat", "eval")
 MARKERS = {  # what each of them leaves last, or at least
     "prepare": "prepare/frames.json",
@@ -90,9 +91,24 @@ def read_run(folder: Path) -> RunFolder:
             hint="the folder that --out named when the run was made",
         )
     summary = read_json(path, _Summary, _REMAKE)
-    if summary.schema > SCHEMA:
-        raise damaged(path, f"its schema is {summary.schema}, and this version reads {SCHEMA}", _REMAKE)
+    if summary.schema != SCHEMA:
+        author = _version_of(folder)
+        raise InputError(
+            f"{folder} was written by Swimm3R {author} (schema {summary.schema}); this is {version('swimm3r')}, which"
+            f" reads schema {SCHEMA}",
+            cause="the names of settings and files changed between the two",
+            hint=f"pip install 'swimm3r=={author}' to read it, or {_REMAKE.hint}",
+        )
     return RunFolder(folder, summary.input, summary.stages, json.loads(path.read_text(encoding="utf-8")))
+
+
+def _version_of(folder: Path) -> str:
+    """The version of Swimm3R that wrote a run, by its versions.json; "of an unknown version" where that is missing."""
+    path = folder / "versions.json"
+    if not path.is_file():
+        return "of an unknown version"
+    found = read_json(path, dict[str, str], _REMAKE).get("swimm3r")
+    return found or "of an unknown version"
 
 
 def input_and_folder(source: Path, folder: Path | None) -> tuple[Path, Path]:

@@ -1,6 +1,6 @@
 """Maps and training states on disk, as safetensors: tensors under their names, everything else in the header.
 
-map.safetensors (`schema` 1) holds the primitives as stored (before activation), the water, and in its header
+map.safetensors (`schema` 2) holds the primitives as stored (before activation), the water, and in its header
 the recipe, its settings, the metric flag, the working unit and when the clip begins and ends; also the training
 frames' poses where they were refined. A checkpoint adds the optimizer's moments and the step.
 """
@@ -23,7 +23,7 @@ from swimm3r.splat.rendering import SplatMap
 from swimm3r.splat.settings import RECIPES, RecipeName, recipe_of, settings_of
 from swimm3r.splat.training_poses import RefinedPoses
 
-SCHEMA = 1
+SCHEMA = 2  # 1: Swimm3R 0.1, whose settings have other names
 
 
 @dataclass(frozen=True)

@@ -61,6 +61,7 @@ def _check_schema(document: Any, known: int) -> None:
     found = document.get("schema") if isinstance(document, dict) else None
     if found == known:
         return
-    newer = isinstance(found, int) and found > known
-    by_whom = "it was written by a newer Swimm3R: " if newer else ""
+    by_whom = (
+        f"it was written by {'a newer' if found > known else 'an older'} Swimm3R: " if isinstance(found, int) else ""
+    )
     raise ValueError(f"{by_whom}its schema is {found}, this version reads {known}")
