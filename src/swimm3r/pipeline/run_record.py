@@ -11,12 +11,12 @@ import shutil
 import time
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import ExitStack, contextmanager
-from hashlib import sha256
 from pathlib import Path
 from typing import Any, TypeVar
 
 from swimm3r.errors import DeviceError, InputError, StorageError, Swimm3rError, UsageError
 from swimm3r.io.files.atomic import remove_drafts, write_text
+from swimm3r.io.files.cache_key import cache_key
 from swimm3r.io.files.folder_lock import folder_lock
 from swimm3r.io.files.outputs import check_file, output_folder
 from swimm3r.memory import available_mb, peak_mb
@@ -265,8 +265,7 @@ def stage_keys(fingerprint: str, settings: RunSettings, reference: Path | None) 
     for stage, values in settings_by_stage(settings).items():
         if stage == "eval":
             values = {"reference": str(reference), "test": values}
-        text = json.dumps([stage, before, values], sort_keys=True, default=str)  # paths are all that JSON does not know
-        keys[stage] = before = sha256(text.encode()).hexdigest()[:16]
+        keys[stage] = before = cache_key(stage, before, values)[:16]
     return keys
 
 

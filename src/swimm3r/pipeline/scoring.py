@@ -6,9 +6,9 @@ settings and its reference; scores by any other stand beside its own, never in t
 
 import re
 from dataclasses import asdict, dataclass
-from hashlib import sha256
 from pathlib import Path
 
+from swimm3r.io.files.cache_key import cache_key
 from swimm3r.io.imports.read import read_foreign
 from swimm3r.io.view_names import view_stems
 from swimm3r.pipeline import held_out
@@ -44,7 +44,7 @@ class Protocol:
             if value != getattr(own.test, name)
         ]
         if self.reference != own.reference:
-            digest = sha256(str(self.reference).encode()).hexdigest()[:8]
+            digest = cache_key(self.reference)[:8]
             parts.append("no-reference" if self.reference is None else f"reference-{self.reference.stem}-{digest}")
         return re.sub(r"[^\w.-]+", "-", "_".join(parts))
 

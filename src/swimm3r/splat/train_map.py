@@ -1,7 +1,5 @@
 """From a reconstruction to a map: the recipe of the settings, its run, and the map in the scene's own unit."""
 
-import hashlib
-import json
 import math
 from dataclasses import asdict
 from pathlib import Path
@@ -11,6 +9,7 @@ import torch
 from swimm3r import devices
 from swimm3r.devices import CPU
 from swimm3r.errors import UsageError
+from swimm3r.io.files.cache_key import cache_key
 from swimm3r.progress import Progress, silent
 from swimm3r.scene.frames import Frames
 from swimm3r.scene.reconstruction import Reconstruction
@@ -82,14 +81,14 @@ def _recipe(settings: SplatSettings, training_scene: TrainingScene) -> loop.Reci
 
 
 def _schedule(settings: SplatSettings, rec: Reconstruction, views: TrainingViews) -> loop.Schedule:
-    everything = [asdict(settings), views.names, views.times, rec.cameras.cam2world.tolist(), rec.cameras.K.tolist()]
+    cameras = [rec.cameras.cam2world.tolist(), rec.cameras.K.tolist()]
+    matches = []
     if settings.poses.enabled:
-        everything.append(float(rec.matches.xy_i.double().sum() + rec.matches.xy_j.double().sum()))
-    digest = hashlib.sha256(json.dumps(everything, sort_keys=True).encode()).hexdigest()[:16]
+        matches.append(float(rec.matches.xy_i.double().sum() + rec.matches.xy_j.double().sum()))
     return loop.Schedule(
         iterations=settings.iterations,
         log_every=max(1, math.ceil(settings.log_every * settings.iterations)),
         checkpoint_every=max(1, math.ceil(settings.checkpoint_every * settings.iterations)),
         seed=settings.seed,
-        fingerprint=digest,
+        fingerprint=cache_key(asdict(settings), views.names, views.times, *cameras, *matches)[:16],
     )

@@ -90,7 +90,7 @@ def test_streamed_views_are_the_ones_of_everything_in_memory(
         torch.testing.assert_close(record.anchored.anchor_depth, frame.anchor_depth, atol=1e-6, rtol=0)
         assert record.anchored.focal == pytest.approx(frame.focal, rel=1e-6)
         assert record.anchored.confidence == pytest.approx(frame.confidence, rel=1e-6)
-    assert not list(tmp_path.glob("*.sums.npz"))
+    assert not list(tmp_path.glob("*.sums.safetensors"))
 
 
 @pytest.mark.parametrize(("iterations", "tolerance"), [(3, 1e-4), (300, 1e-3)])

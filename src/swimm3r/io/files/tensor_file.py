@@ -3,10 +3,12 @@
 import json
 from collections.abc import Mapping
 from dataclasses import dataclass
+from hashlib import sha256
 from pathlib import Path
 from types import GenericAlias
 from typing import Any, Generic, TypeVar
 
+import numpy as np
 import torch
 from safetensors import safe_open
 from safetensors.torch import save_file
@@ -32,11 +34,13 @@ def write_tensors(path: Path, tensors: Mapping[str, Tensor], about: Mapping[str,
     """Write tensors and header, whole or not at all."""
     stored = {name: values.detach().cpu().contiguous() for name, values in tensors.items()}
     with atomic_path(path) as draft:
-        save_file(stored, draft, {_KEY: json.dumps(about, sort_keys=True)})
+        save_file(stored, draft, {"format": "pt", _KEY: json.dumps(about, sort_keys=True)})
 
 
-def read_tensors(path: Path, kind: type[T] | GenericAlias, remedy: Remedy, schema: int | None) -> TensorFile[T]:
-    """Finite tensors, and the header as a record of `json_file`; its `schema` must be the one given, if any.
+def read_tensors(
+    path: Path, kind: type[T] | GenericAlias, remedy: Remedy, schema: int | None, *, finite: bool = True
+) -> TensorFile[T]:
+    """Tensors, finite ones unless told otherwise, and the header as a record of `json_file`, of this `schema` if any.
 
     Raises the remedy's error, which names the file and the fault.
     """
@@ -52,9 +56,19 @@ def read_tensors(path: Path, kind: type[T] | GenericAlias, remedy: Remedy, schem
             about = structure(document, kind)
             tensors = {name: file.get_tensor(name) for name in file.keys()}  # noqa: SIM118
         for name, values in tensors.items():
-            if values.is_floating_point() and not bool(torch.isfinite(values).all()):
+            if finite and values.is_floating_point() and not bool(torch.isfinite(values).all()):
                 raise ValueError(f"{name} has values that are not finite")
         return TensorFile(tensors, about)
+
+
+def tensors_digest(tensors: Mapping[str, Tensor]) -> str:
+    """SHA-256 of tensors and their names, as float32: the same in whatever order and precision a file holds them."""
+    digest = sha256()
+    for name in sorted(tensors):
+        values = np.ascontiguousarray(tensors[name].detach().float().cpu().numpy(), dtype="<f4")
+        digest.update(f"{name}{values.shape}".encode())
+        digest.update(values.data)
+    return digest.hexdigest()
 
 
 def _check_schema(document: Any, known: int) -> None:

@@ -11,8 +11,6 @@ the gradients; the losses are means over pairs, so the curve is that of one proc
     FOLDER/teacher/              what the teacher says of each pair (teacher_cache.py), where asked for
 """
 
-import hashlib
-import json
 import os
 import time
 from collections.abc import Callable, Iterator
@@ -28,6 +26,7 @@ from torch import Tensor
 from torch.nn.parallel import DistributedDataParallel
 
 from swimm3r.errors import InputError, UsageError
+from swimm3r.io.files.cache_key import cache_key
 from swimm3r.io.files.metrics_log import drop_rows_after
 from swimm3r.memory import MB, peak_mb
 from swimm3r.progress import Progress, silent
@@ -289,8 +288,7 @@ def _mean_over_workers(terms: dict[str, Tensor], workers: Workers) -> dict[str, 
 
 def _fingerprint(settings: TrainSettings, base: Base, data: PairData) -> str:
     same = replace(settings, log_every=1, checkpoint_every=1, tensorboard=False)  # they change nothing that is learned
-    described = json.dumps([asdict(same), base.sha256, data.fingerprint()], sort_keys=True)
-    return hashlib.sha256(described.encode()).hexdigest()
+    return cache_key(same, base.sha256, data.fingerprint())
 
 
 def _generator(seed: int, step: int, purpose: int) -> torch.Generator:

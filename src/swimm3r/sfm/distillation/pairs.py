@@ -7,7 +7,6 @@ acts at ray depth. Where depth is unknown no loss looks, but the student sees it
 image is black, because nothing is there, and else water at the nearest known depth.
 """
 
-import hashlib
 from collections.abc import Sequence as Items
 from dataclasses import dataclass, replace
 
@@ -23,6 +22,7 @@ from swimm3r.datasets.pairs import Pair
 from swimm3r.datasets.sequences import Sequence, load
 from swimm3r.errors import InputError
 from swimm3r.geometry import relative_poses
+from swimm3r.io.files.cache_key import cache_key
 from swimm3r.io.images import image_size
 from swimm3r.medium import Medium, add_water
 from swimm3r.sfm.mast3r.preprocess import Framing, K_to_network, framing, to_network
@@ -72,7 +72,7 @@ class PairData:
     def fingerprint(self) -> str:
         """Of the pairs, by name: two sets of the same fingerprint have the same pairs in the same order."""
         names = [(self.sequences[s].name, p.i, p.j, len(self.sequences[s])) for s, p in self.pairs]
-        return hashlib.sha256(repr((names, self.size)).encode()).hexdigest()
+        return cache_key(names, self.size)
 
     def two_views(self, index: int) -> "TwoViews | None":
         """Intrinsics of the network's images and the true pose of a pair; None where they are not known."""

@@ -6,16 +6,16 @@ precision, and rounded to it before their first use, too: every epoch compares w
 that was interrupted ends with the same bits.
 """
 
-from hashlib import blake2b
 from pathlib import Path
 
 import torch
 from jaxtyping import Float
-from safetensors import SafetensorError
-from safetensors.torch import load_file, save_file
 from torch import Tensor
 
-from swimm3r.io.files.atomic import atomic_path
+from swimm3r.errors import InputError
+from swimm3r.io.files.cache_key import bytes_digest
+from swimm3r.io.files.damage import remake
+from swimm3r.io.files.tensor_file import read_tensors, write_tensors
 from swimm3r.sfm.student.losses import PairFeatures
 from swimm3r.sfm.student.student import Student
 
@@ -52,15 +52,15 @@ class TeacherCache:
 
     def _path(self, images: Tensor) -> Path:
         pixels = images.detach().cpu().contiguous().numpy().tobytes()
-        return self._folder / f"{blake2b(pixels, digest_size=12).hexdigest()}.safetensors"
+        return self._folder / f"{bytes_digest(pixels)}.safetensors"
 
     def _read(self, images: Tensor) -> dict[str, Tensor] | None:
         path = self._path(images)
         if not path.is_file():
             return None
         try:
-            return load_file(path)
-        except (SafetensorError, OSError):  # damaged: made anew, which gives the same numbers
+            return read_tensors(path, dict[str, str], remake(path), None, finite=False).tensors
+        except InputError:  # damaged: made anew, which gives the same numbers
             return None
 
     def _write(self, images: Tensor, features: dict[str, Tensor]) -> None:
@@ -68,5 +68,4 @@ class TeacherCache:
         if size > self._room:
             return
         self._room -= size
-        with atomic_path(self._path(images)) as draft:
-            save_file({name: value.cpu().contiguous() for name, value in features.items()}, draft)
+        write_tensors(self._path(images), features, {})

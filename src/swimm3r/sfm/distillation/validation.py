@@ -22,6 +22,7 @@ from jaxtyping import Float
 from torch import Tensor
 
 from swimm3r.cameras import directions
+from swimm3r.evaluate.images import psnr
 from swimm3r.geometry import rotation_angle
 from swimm3r.medium import remove_water
 from swimm3r.sfm.distillation.pairs import PairData, PairItem, TwoViews
@@ -33,6 +34,7 @@ from swimm3r.sfm.student.student import Student
 
 _MIN_MATCHES = 8
 _LOST = 180.0  # degrees
+_BEST_PSNR = 100.0  # dB; equal images have an infinite one, which no mean survives
 _ONE_STD = 0.683  # share of a normal distribution within one standard deviation
 _COEFFICIENTS = ("Binf", "beta_D", "beta_B")
 
@@ -97,7 +99,10 @@ def _score_pair(student: Student, item: PairItem, truth: TwoViews | None) -> dic
         I, J = (((on_device[n][0] + 1) / 2).permute(0, 2, 3, 1) for n in ("raw", "clean"))
         restored = remove_water(I, on_device["ray_depth"][0], medium, student.objective.min_transmittance).clamp(0, 1)
         seen = on_device["valid"][0]
-        scores |= {"restored_psnr": psnr(restored[seen], J[seen]), "raw_psnr": psnr(I[seen], J[seen])}
+        scores |= {
+            "restored_psnr": min(_BEST_PSNR, psnr(restored[seen], J[seen])),
+            "raw_psnr": min(_BEST_PSNR, psnr(I[seen], J[seen])),
+        }
     if truth is not None:
         matches = _matches(network.descriptors(view1, 1), network.descriptors(view2, 2))
         error = pose_error(matches, truth)
@@ -109,11 +114,6 @@ def absolute_relative(depth: Float[Tensor, " n"], truth: Float[Tensor, " n"]) ->
     """Mean relative error of depths after their medians were made equal."""
     scale = truth.median() / depth.median().clamp(min=1e-9)
     return float(((scale * depth - truth).abs() / truth).mean())
-
-
-def psnr(image: Float[Tensor, "n 3"], target: Float[Tensor, "n 3"]) -> float:
-    """Peak signal-to-noise ratio of values in 0..1, dB; 100 for equal ones."""
-    return min(100.0, -10 * math.log10(max(1e-10, float((image - target).square().mean()))))
 
 
 def pose_error(matches: PixelMatches, truth: TwoViews) -> _PoseError:

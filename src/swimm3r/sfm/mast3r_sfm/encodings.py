@@ -4,18 +4,16 @@ A file is named by a hash of the image as the network sees it and of the network
 stale: another image or another checkpoint is another name.
 """
 
-from hashlib import blake2b, sha256
 from pathlib import Path
 
 import torch
 from jaxtyping import Bool, Float
-from safetensors import safe_open
-from safetensors.torch import save_file
 from torch import Tensor
 
 from swimm3r import weights
-from swimm3r.io.files.atomic import atomic_path
+from swimm3r.io.files.cache_key import cache_key
 from swimm3r.io.files.damage import guard, remake
+from swimm3r.io.files.tensor_file import read_tensors, tensors_digest, write_tensors
 from swimm3r.progress import Progress, silent
 from swimm3r.sfm.features import asmk
 from swimm3r.sfm.mast3r.network import Encoded, Mast3r
@@ -38,7 +36,7 @@ class EncodingStore:
     def key(self, i: int) -> str:
         """The name of frame i: its image and the network."""
         if i not in self._keys:
-            self._keys[i] = sha256(f"{self.images.digest(i)} {self.network_key}".encode()).hexdigest()[:24]
+            self._keys[i] = cache_key(self.images.digest(i), self.network_key)
         return self._keys[i]
 
     def path(self, i: int) -> Path:
@@ -49,19 +47,13 @@ class EncodingStore:
         """The encoding of frame i on the network's device."""
         path, frame = self.path(i), self.images.framing
         if path.is_file():
-            with (
-                guard(path, remake(path)),
-                safe_open(path, "pt") as stored,
-            ):
-                tokens, positions = (
-                    stored.get_tensor(name).to(self.network.device) for name in ("tokens", "positions")
-                )
+            with guard(path, remake(path)):
+                stored = read_tensors(path, dict[str, str], remake(path), None, finite=False).tensors
+                tokens, positions = (stored[name].to(self.network.device) for name in ("tokens", "positions"))
             return Encoded(tokens, positions, frame.network_height, frame.network_width)
         with torch.no_grad():  # not inference_mode: its tensors could never meet a gradient
             encoded = self.network.encode(self.images.image(i)[None].to(self.network.device))
-        with atomic_path(path) as draft:
-            kept = {"tokens": encoded.tokens, "positions": encoded.positions}
-            save_file({name: value.cpu().contiguous() for name, value in kept.items()}, draft)
+        write_tensors(path, {"tokens": encoded.tokens, "positions": encoded.positions}, {})
         return encoded
 
     def fill(self, progress: Progress = silent) -> None:
@@ -74,12 +66,9 @@ class EncodingStore:
 
 
 def fingerprint(network: Mast3r) -> str:
-    """A hash of all weights and of the precision they run in."""
-    digest = blake2b(digest_size=12)
-    for name, value in network.named_parameters():
-        digest.update(f"{name} {tuple(value.shape)} {value.dtype}".encode())
-        digest.update(value.detach().cpu().contiguous().view(torch.uint8).numpy().data)
-    return digest.hexdigest()
+    """Of all weights and of the precision they run in."""
+    weights_by_name = dict(network.named_parameters())
+    return cache_key(tensors_digest(weights_by_name), [str(value.dtype) for value in weights_by_name.values()])
 
 
 def frame_similarity(store: EncodingStore, method: str = "cosine", progress: Progress = silent) -> Float[Tensor, "n n"]:

@@ -8,17 +8,16 @@ they carry the names of the partners already added, so that a killed run adds no
 import time
 from collections import OrderedDict
 from collections.abc import Sequence
-from dataclasses import dataclass, fields
-from hashlib import sha256
+from dataclasses import asdict, dataclass, fields
 from pathlib import Path
 
-import numpy as np
 import torch
 from jaxtyping import Float
 from torch import Tensor
 
-from swimm3r.io.files.atomic import atomic_path
+from swimm3r.io.files.cache_key import cache_key
 from swimm3r.io.files.damage import guard, remake
+from swimm3r.io.files.tensor_file import read_tensors, write_tensors
 from swimm3r.sfm.alignment.canonical import (
     AnchoredFrame,
     CanonicalSums,
@@ -50,6 +49,17 @@ class FrameRecord:
     view: CanonicalView  # its points are not kept: zero
 
 
+@dataclass(frozen=True)
+class _ViewHeader:
+    focal: float
+    mean_confidence: float
+
+
+@dataclass(frozen=True)
+class _SumsHeader:
+    done: tuple[str, ...]  # names of the partners already added
+
+
 class PairStore:
     """Matches of pairs, by the names of both frames."""
 
@@ -59,7 +69,7 @@ class PairStore:
 
     def path(self, name_i: str, name_j: str) -> Path:
         """File of the record of a pair."""
-        return self.folder / f"{_short(name_i, name_j, self.settings_key)}.npz"
+        return self.folder / f"{cache_key(name_i, name_j, self.settings_key)}.safetensors"
 
     def has(self, name_i: str, name_j: str) -> bool:
         """Whether a pair is done."""
@@ -68,30 +78,25 @@ class PairStore:
     def write(self, name_i: str, name_j: str, record: PairRecord) -> None:
         """Keep a pair."""
         m = record.matches
-        arrays = {
-            "xy1": m.xy1.cpu().numpy().astype(np.uint16),
-            "xy2": m.xy2.cpu().numpy().astype(np.uint16),
-            "confidence": m.confidence.float().cpu().numpy(),
-        }
+        kept = {"xy1": m.xy1.to(torch.uint16), "xy2": m.xy2.to(torch.uint16), "confidence": m.confidence.float()}
         for side in ("i_in_j", "j_in_i"):
             predicted = getattr(record, side)
             if predicted is not None:
-                arrays[f"{side}_points"] = predicted.points.float().cpu().numpy()
-                arrays[f"{side}_confidence"] = predicted.confidence.float().cpu().numpy()
-        with atomic_path(self.path(name_i, name_j)) as draft:
-            np.savez(draft, **arrays)
+                kept[f"{side}_points"] = predicted.points.float()
+                kept[f"{side}_confidence"] = predicted.confidence.float()
+        write_tensors(self.path(name_i, name_j), kept, {})
 
     def read(self, name_i: str, name_j: str) -> PairRecord:
         """A pair that is done."""
         path = self.path(name_i, name_j)
-        with guard(path, remake(path)), np.load(path, allow_pickle=False) as stored:
-            arrays = {name: torch.from_numpy(stored[name]) for name in stored.files if not name.startswith("xy")}
-            xy1, xy2 = (torch.from_numpy(stored[name].astype(np.int64)) for name in ("xy1", "xy2"))
-        sides = [
-            Predicted(arrays[f"{side}_points"], arrays[f"{side}_confidence"]) if f"{side}_points" in arrays else None
-            for side in ("i_in_j", "j_in_i")
-        ]
-        return PairRecord(PixelMatches(xy1, xy2, arrays["confidence"]), *sides)
+        with guard(path, remake(path)):
+            kept = read_tensors(path, dict[str, str], remake(path), None).tensors
+            sides = [
+                Predicted(kept[f"{side}_points"], kept[f"{side}_confidence"]) if f"{side}_points" in kept else None
+                for side in ("i_in_j", "j_in_i")
+            ]
+            matches = PixelMatches(kept["xy1"].long(), kept["xy2"].long(), kept["confidence"])
+        return PairRecord(matches, *sides)
 
 
 class FrameStore:
@@ -149,10 +154,11 @@ class FrameStore:
     def read(self, i: int) -> FrameRecord:
         """A frame all of whose partners were added."""
         path = self._view_path(i)
-        with guard(path, remake(path)), np.load(path, allow_pickle=False) as stored:
-            relative, confidence = (torch.from_numpy(stored[name]) for name in ("relative_depth", "confidence"))
-            focal, mean = stored["focal_and_mean"].tolist()
-            anchors = torch.from_numpy(stored["anchor_depth"])
+        with guard(path, remake(path)):
+            stored = read_tensors(path, _ViewHeader, remake(path), None)
+            names = ("relative_depth", "confidence", "anchor_depth")
+            relative, confidence, anchors = (stored.tensors[name] for name in names)
+        focal, mean = stored.about.focal, stored.about.mean_confidence
         view = CanonicalView(torch.zeros(1, 1, 1).expand(*confidence.shape, 3), relative, confidence)
         height, width = confidence.shape
         return FrameRecord(AnchoredFrame(height, width, focal, anchors, mean), view)
@@ -164,9 +170,10 @@ class FrameStore:
         path = self._sums_path(i)
         if not path.is_file():
             return None
-        with guard(path, remake(path)), np.load(path, allow_pickle=False) as stored:
-            arrays = [torch.from_numpy(stored[field.name]) for field in fields(CanonicalSums)[1:]]
-            done = set(stored["done"].tolist())
+        with guard(path, remake(path)):
+            stored = read_tensors(path, _SumsHeader, remake(path), None)
+            arrays = [stored.tensors[field.name] for field in fields(CanonicalSums)[1:]]
+        done = set(stored.about.done)
         here = {p for p in self.partners[i] if self.names[p] in done}
         self._held[i] = (CanonicalSums(len(done), *arrays), here)
         return self._held[i]
@@ -175,9 +182,9 @@ class FrameStore:
         if i not in self._unsaved:
             return
         sums, done = self._held[i]
-        arrays = {field.name: getattr(sums, field.name).numpy() for field in fields(sums)[1:]}
-        with atomic_path(self._sums_path(i)) as draft:
-            np.savez(draft, done=np.array([self.names[p] for p in sorted(done)]), **arrays)
+        arrays = {field.name: getattr(sums, field.name) for field in fields(sums)[1:]}
+        header = _SumsHeader(tuple(self.names[p] for p in sorted(done)))
+        write_tensors(self._sums_path(i), arrays, asdict(header))
         self._unsaved.discard(i)
 
     def _finish(self, i: int) -> None:
@@ -185,32 +192,26 @@ class FrameStore:
         self._unsaved.discard(i)
         view = canonical_view(sums, self.subsample)
         frame = anchored_frame(view, self.subsample, self.pixel_center)
-        with atomic_path(self._view_path(i)) as draft:
-            np.savez(
-                draft,
-                relative_depth=view.relative_depth.numpy(),
-                confidence=view.confidence.numpy(),
-                anchor_depth=frame.anchor_depth.numpy(),
-                focal_and_mean=np.array([frame.focal, frame.confidence]),
-            )
+        kept = {
+            "relative_depth": view.relative_depth,
+            "confidence": view.confidence,
+            "anchor_depth": frame.anchor_depth,
+        }
+        write_tensors(self._view_path(i), kept, asdict(_ViewHeader(frame.focal, frame.confidence)))
         self._sums_path(i).unlink(missing_ok=True)
         self._finished.add(i)
 
     def _view_path(self, i: int) -> Path:
-        return self.folder / f"{self._name(i)}.view.npz"
+        return self.folder / f"{self._name(i)}.view.safetensors"
 
     def _sums_path(self, i: int) -> Path:
-        return self.folder / f"{self._name(i)}.sums.npz"
+        return self.folder / f"{self._name(i)}.sums.safetensors"
 
     def _name(self, i: int) -> str:
         """Of the frame and everything it is averaged over."""
         others = sorted(self.names[p] for p in self.partners[i])
-        return _short(self.names[i], *others, f"{self.subsample} {self.pixel_center}")
+        return cache_key(self.names[i], *others, self.subsample, self.pixel_center)
 
 
 def _bytes(sums: CanonicalSums) -> int:
     return sum(value.nbytes for value in vars(sums).values() if isinstance(value, Tensor))
-
-
-def _short(*parts: str) -> str:
-    return sha256("\n".join(parts).encode()).hexdigest()[:24]

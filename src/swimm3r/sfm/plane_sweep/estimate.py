@@ -7,7 +7,6 @@ where it is well correlated, where moving it makes it worse, and where other fra
 sand come out unknown (0), not invented. The work is done on undistorted images, the result lies on the frame's grid.
 """
 
-import hashlib
 import os
 import shutil
 from collections.abc import Callable, Sequence
@@ -25,6 +24,7 @@ from swimm3r.imaging.undistortion import covering_pinholes
 from swimm3r.io.files.array_file import Layout, read_arrays
 from swimm3r.io.files.atomic import atomic_path, write_text
 from swimm3r.io.files.cache import ArrayCache
+from swimm3r.io.files.cache_key import bytes_digest, cache_key
 from swimm3r.io.files.damage import remake
 from swimm3r.progress import Progress, silent
 from swimm3r.scene.frames import Frames
@@ -233,12 +233,11 @@ def _planes(shape: torch.Size, H: np.ndarray, e: np.ndarray, z_range: tuple[floa
 
 
 def _stamp(rec: Reconstruction, frames: Frames, settings: PlaneSweepSettings) -> str:
-    digest = hashlib.sha256(repr((settings, rec.names, rec.cameras.width, rec.cameras.height)).encode())
-    masks = [str(frame.mask) for frame in frames if frame.name in set(rec.names)]
-    digest.update(repr(masks).encode())
-    for tensor in (rec.cameras.K, rec.cameras.distortion, rec.cameras.cam2world, rec.points.xyz, rec.tracks.point):
-        digest.update(np.ascontiguousarray(tensor.numpy()).tobytes())
-    return digest.hexdigest()
+    names = set(rec.names)
+    masks = [frame.mask for frame in frames if frame.name in names]
+    seen = (rec.cameras.K, rec.cameras.distortion, rec.cameras.cam2world, rec.points.xyz, rec.tracks.point)
+    numbers = bytes_digest(*(np.ascontiguousarray(tensor.numpy()).tobytes() for tensor in seen))
+    return cache_key(settings, rec.names, rec.cameras.width, rec.cameras.height, masks, numbers)
 
 
 def _claim(folder: Path, stamp: str) -> None:

@@ -4,23 +4,18 @@ Tensors bear PEFT's names (`peft_format.py`) and `head.NAME`; the header says wh
 over its tensors, whatever file they came from), that base's license, which binds the adapter's use, and the settings.
 """
 
-import hashlib
-import json
 from collections.abc import Mapping
 from dataclasses import asdict, dataclass, field
 from pathlib import Path
 from typing import Any, Literal
 
-import numpy as np
 import torch
-from safetensors import SafetensorError, safe_open
-from safetensors.torch import save_file
 from torch import Tensor
 
-from swimm3r.errors import WeightsError
-from swimm3r.io.files.atomic import atomic_path
-from swimm3r.io.files.damage import first_line
+from swimm3r.errors import Swimm3rError, WeightsError
+from swimm3r.io.files.damage import Remedy, damaged, guard
 from swimm3r.io.files.json_file import structure
+from swimm3r.io.files.tensor_file import TensorFile, read_tensors, tensors_digest, write_tensors
 from swimm3r.medium import Medium
 from swimm3r.sfm.mast3r.network import Mast3r
 from swimm3r.sfm.mast3r.settings import ObjectiveSettings
@@ -29,6 +24,12 @@ from swimm3r.sfm.student.physics_head import HeadFacts, PhysicsHead
 from swimm3r.sfm.student.student import Student
 
 _SCHEMA, _HEAD = 1, "head."
+_REMEDY = Remedy(
+    "the adapter.safetensors that swimm3r train-sfm wrote, with the weights it was trained on",
+    cause="the file is damaged, of another program, or trained on another base",
+    error=WeightsError,
+    fault="cannot be used as an adapter",
+)
 
 
 @dataclass(frozen=True)
@@ -73,15 +74,9 @@ class _Header:
 
 
 def fingerprint(state: Mapping[str, Tensor]) -> str:
-    """SHA-256 of a state dict's tensors in float32, each once: the same for .pth and .safetensors of one network."""
-    digest = hashlib.sha256()
-    for key in sorted(state):
-        if ".layer_rn." in key:  # another name of layer1_rn .. layer4_rn
-            continue
-        values = np.ascontiguousarray(state[key].detach().float().cpu().numpy(), dtype="<f4")
-        digest.update(f"{key}{values.shape}".encode())
-        digest.update(values.data)
-    return digest.hexdigest()
+    """`tensors_digest` of a state dict's tensors, each once: the same for .pth and .safetensors of one network."""
+    aliased = ".layer_rn."  # another name of layer1_rn .. layer4_rn
+    return tensors_digest({name: values for name, values in state.items() if aliased not in name})
 
 
 def trained_parameters(student: Student) -> dict[str, torch.nn.Parameter]:
@@ -97,7 +92,6 @@ def trained_parameters(student: Student) -> dict[str, torch.nn.Parameter]:
 
 def save(student: Student, base: Base, path: Path, about: Mapping[str, Any]) -> None:
     """Writes adapters and head, whole or not at all; `about` says how they were trained, in plain values."""
-    stored = {name: p.detach().cpu().contiguous() for name, p in trained_parameters(student).items()}
     header = {
         "schema": _SCHEMA,
         "kind": "swimm3r sfm adapter",
@@ -106,8 +100,7 @@ def save(student: Student, base: Base, path: Path, about: Mapping[str, Any]) -> 
         "objective": asdict(student.objective),
         "trained": dict(about),
     }
-    with atomic_path(path) as draft:
-        save_file(stored, draft, metadata={"format": "pt", "swimm3r": json.dumps(header, sort_keys=True)})
+    write_tensors(path, trained_parameters(student), header)
 
 
 def load(path: Path, network: Mast3r, sha256: str | None = None) -> Student:
@@ -116,8 +109,8 @@ def load(path: Path, network: Mast3r, sha256: str | None = None) -> Student:
     `sha256` is the network's `fingerprint`, None to trust the caller. Raises WeightsError for a file that is missing or
     damaged, and for adapters of another base.
     """
-    document, stored = _read(path)
-    header = _checked(document, path)
+    found = _read(path)
+    header, stored = _checked(found.about, path), found.tensors
     base = header.base
     if sha256 is not None and sha256 != base.sha256:
         raise _unfit(path, f"it was trained on {base.name} ({base.sha256[:12]}), this network is {sha256[:12]}")
@@ -138,42 +131,27 @@ def load(path: Path, network: Mast3r, sha256: str | None = None) -> Student:
 
 def describe(path: Path) -> dict[str, Any]:
     """The header of a file: base, license, settings. Raises WeightsError as `load` does."""
-    document, _ = _read(path)
+    document = _read(path).about
     _checked(document, path)
     return document
 
 
 def head_facts(path: Path) -> HeadFacts:
     """Settings of the water of a file's physics head. Raises WeightsError as `load` does."""
-    document, _ = _read(path)
-    header = _checked(document, path)
+    header = _checked(_read(path).about, path)
     error = header.trained.validation.water_error
     measured = None if error is None else Medium(*(torch.tensor(getattr(error, name)) for name in vars(error)))
     return HeadFacts(header.objective.min_transmittance, measured)
 
 
-def _read(path: Path) -> tuple[Any, dict[str, Tensor]]:
-    try:
-        with safe_open(path, "pt") as file:
-            document = json.loads((file.metadata() or {}).get("swimm3r", "null"))
-            stored = {name: file.get_tensor(name) for name in file.keys()}  # noqa: SIM118
-    except (OSError, SafetensorError, ValueError, RecursionError) as error:
-        raise _unfit(path, first_line(error)) from error
-    if not isinstance(document, dict) or document.get("schema") != _SCHEMA:
-        raise _unfit(path, "it is no adapter file of this version")
-    return document, stored
+def _read(path: Path) -> TensorFile[dict[str, Any]]:
+    return read_tensors(path, dict[str, Any], _REMEDY, _SCHEMA)
 
 
-def _checked(document: Any, path: Path) -> _Header:
-    try:
+def _checked(document: dict[str, Any], path: Path) -> _Header:
+    with guard(path, _REMEDY):
         return structure(document, _Header)
-    except (ValueError, RecursionError) as error:
-        raise _unfit(path, f"its header: {first_line(error)}") from error
 
 
-def _unfit(path: Path, why: str) -> WeightsError:
-    return WeightsError(
-        f"{path} cannot be used as an adapter: {why}",
-        cause="the file is damaged, of another program, or trained on another base",
-        hint="the adapter.safetensors that swimm3r train-sfm wrote, with the weights it was trained on",
-    )
+def _unfit(path: Path, why: str) -> Swimm3rError:
+    return damaged(path, why, _REMEDY)
