@@ -13,6 +13,7 @@ from PIL import Image
 from swimm3r.cli.main import main
 from swimm3r.errors import InputError
 from swimm3r.prepare import check_source, read_frames
+from swimm3r.prepare.candidates import is_gray
 
 NOBODY = 65534
 
@@ -169,6 +170,16 @@ def test_of_several_videos_none_is_chosen(tmp_path):
 def test_images_come_before_a_video_beside_them(dive):
     (dive / "a.mp4").write_bytes(b"a video")
     assert check_source(dive) == dive
+
+
+def test_a_time_stamp_in_color_leaves_an_image_gray_and_a_tint_does_not():
+    gray = np.repeat(image(0)[..., :1], 3, 2)
+    stamped = gray.copy()
+    stamped[0, : gray.shape[0] * gray.shape[1] // 1100, 0] ^= 64
+    assert is_gray(gray)
+    assert is_gray(stamped)
+    assert not is_gray(np.clip(gray * np.array([1.0, 0.9, 1.0]) + 4, 0, 255).astype(np.uint8))
+    assert not is_gray(image(0))
 
 
 def test_equal_channels_are_said_to_be_gray(dive, tmp_path, write_video):

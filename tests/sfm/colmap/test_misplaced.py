@@ -97,16 +97,16 @@ def test_a_part_of_the_clip_that_agrees_with_itself_but_not_with_the_rest_is_pla
     assert_same(rotations(mapping.replace_misplaced(store, wrong, SETTINGS, silent)), rotations(model))
 
 
-@pytest.mark.parametrize("wrong_one", ["_climb", "_map_globally"])
+@pytest.mark.parametrize("wrong_one", ["_try_focal_lengths", "_map_globally"])
 def test_of_two_ways_to_place_a_small_clip_the_one_that_explains_more_is_kept(
     store: FeatureDatabase, model: pycolmap.Reconstruction, monkeypatch: pytest.MonkeyPatch, wrong_one: str
 ):
     wrong = moved(model, 25, (1, 2, 3, 4))
     wrong.update_point_3d_errors()
-    for way in ("_climb", "_map_globally"):
+    for way in ("_try_focal_lengths", "_map_globally"):
         monkeypatch.setattr(mapping, way, lambda *_, found=wrong if way == wrong_one else model: [found])
     monkeypatch.setattr(mapping, "replace_misplaced", lambda store, model, *_: model)
-    for thin_points, kept in ((1, model), (100_000, wrong if wrong_one == "_climb" else model)):
+    for thin_points, kept in ((1, model), (100_000, wrong if wrong_one == "_try_focal_lengths" else model)):
         settings = replace(SETTINGS, mapping=replace(SETTINGS.mapping, thin_points=thin_points))
         assert mapping.map_frames(store, settings, silent) == [kept]
 

@@ -126,7 +126,7 @@ def test_a_gray_clip_is_called_gray_and_stays_gray(dive, tmp_path: Path):
         image = dive.frames.image(i).mean(-1, keepdim=True).expand(-1, -1, 3)
         images.write_rgb(tmp_path / frame.name, image.numpy())
         gray.append(replace(frame, path=tmp_path / frame.name))
-    frames = Frames(tuple(gray), dive.frames.width, dive.frames.height, ordered=True)
+    frames = Frames(tuple(gray), dive.frames.width, dive.frames.height, ordered=True, gray=True)
     rec = apply.with_water(dive.rec, frames, ColmapSettings(), tmp_path)
     assert [warning.what.startswith("The frames are gray") for warning in rec.warnings].count(True) == 1
     assert rec.cloud is not None

@@ -21,9 +21,6 @@ from swimm3r.scene.reconstruction import DepthMap, Reconstruction
 from swimm3r.sfm.medium.dense_tracks import DenseTracks, cubes, ray_depth_map, shared_rays
 from swimm3r.sfm.settings import SeathruSettings
 
-_ONE_STEP = 1.5 / 255  # difference between channels that rounding leaves in a gray image
-_COLORED = 0.001  # share of the pixels of a gray clip that may have a color: a logo, a time stamp
-
 
 @dataclass(frozen=True)
 class WaterSamples:
@@ -34,12 +31,7 @@ class WaterSamples:
     frame: Int[Tensor, " n"]  # which image: errors are shared within one
     track: Int[Tensor, " n"]  # which patch of surface; -1 for pixels on their own
     open_water: Float[Tensor, "m 3"]  # pixels beyond every surface; empty where the frames show none
-
-    @property
-    def gray(self) -> bool:
-        """Whether the three channels are one: equal up to rounding, in all but a few pixels."""
-        spread = self.I.amax(-1) - self.I.amin(-1)
-        return len(spread) > 0 and float((spread > _ONE_STEP).float().mean()) <= _COLORED
+    gray: bool = False  # the three channels are one (`Frames.gray`)
 
 
 def gather_samples(
@@ -71,9 +63,10 @@ def gather_samples(
     progress("sampling the water", len(usable), len(usable))
     if not parts:
         none = torch.zeros(0)
-        return WaterSamples(none.reshape(0, 3), none, none.long(), none.long(), none.reshape(0, 3))
+        return WaterSamples(none.reshape(0, 3), none, none.long(), none.long(), none.reshape(0, 3), frames.gray)
     I, ray_depth, frame, track = (torch.cat(p) for p in zip(*parts, strict=True))
-    return WaterSamples(I, ray_depth, frame, track, _plausible_water(torch.cat(water), I, ray_depth))
+    plausible = _plausible_water(torch.cat(water), I, ray_depth)
+    return WaterSamples(I, ray_depth, frame, track, plausible, frames.gray)
 
 
 def _ray_depth_nearby(
