@@ -14,6 +14,7 @@ from swimm3r.errors import InputError
 from swimm3r.geometry import rotation_from_quaternion
 from swimm3r.raster import rasterize
 from swimm3r.splat.densify import adaptive, mcmc_gaussian
+from swimm3r.splat.densify.rows import only
 from swimm3r.splat.gaussian_settings import GaussianInitialSettings, GaussianRenderSettings
 from swimm3r.splat.optimizer import Moments
 from swimm3r.splat.primitives.gaussian import (
@@ -244,7 +245,7 @@ def test_culled_rows_leave_and_the_others_keep_their_place():
     done = adaptive.multiply(small_and_large(), pulled(40, [3, 25]), 0.5, 0.1, 100, torch.Generator())
     kept = torch.ones(42, dtype=torch.bool)
     kept[[0, 25]] = False
-    left = adaptive.only(done, kept)
+    left = only(done, kept)
     assert len(left.primitives.xyz) == 40
     assert left.source.tolist() == [*range(1, 25), *range(26, 40), 3, 25]
     assert torch.equal(left.primitives.xyz, done.primitives.xyz[kept])

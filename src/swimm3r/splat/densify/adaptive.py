@@ -5,28 +5,19 @@ mean length of the projected center's gradient, in half images, over the steps t
 """
 
 import math
-from dataclasses import dataclass
 
 import torch
-from jaxtyping import Bool, Float, Int
+from jaxtyping import Float
 from torch import Tensor
 
 from swimm3r.devices import CPU
+from swimm3r.splat.densify.rows import Round
 from swimm3r.splat.optimizer import Moments
 from swimm3r.splat.primitives.beta import select
 from swimm3r.splat.primitives.gaussian import GaussianPrimitives, shape_factor
 from swimm3r.splat.projection.pinhole import Pinhole, Projection
 
 _SHRINK = math.log(1.6)
-
-
-@dataclass(frozen=True)
-class Changed:
-    """The Gaussians after a round."""
-
-    primitives: GaussianPrimitives
-    source: Int[Tensor, " n"]  # where each row came from
-    restarted: Int[Tensor, " m"]  # rows whose moments are zeroed
 
 
 def nothing_seen(n: int, device: torch.device = CPU) -> dict[str, Tensor]:
@@ -56,7 +47,7 @@ def multiply(
     large: float,
     most: int,
     rng: torch.Generator,
-) -> Changed:
+) -> Round[GaussianPrimitives]:
     """Double the small and split the `large` among those pulled harder than `least_pull`, up to `most` in all.
 
     Where there is no room for all, the hardest pulled come first.
@@ -76,20 +67,8 @@ def multiply(
     eps = torch.randn(len(both), 3, 1, generator=rng).to(q.xyz)
     q.xyz[both] += (shape_factor(part) @ eps)[..., 0]
     q.scale[both] -= _SHRINK
-    return Changed(q, source, torch.cat([split, torch.arange(n, len(source), device=split.device)]))
-
-
-def only(changed: Changed, kept: Bool[Tensor, " n"]) -> Changed:
-    """The rows that are kept."""
-    place = kept.cumsum(0) - 1
-    restarted = changed.restarted[kept[changed.restarted]]
-    return Changed(select(changed.primitives, kept), changed.source[kept], place[restarted])
-
-
-def unchanged(p: GaussianPrimitives) -> Changed:
-    """A round that has done nothing yet."""
-    rows = torch.arange(len(p.xyz), device=p.xyz.device)
-    return Changed(p, rows, rows[:0])
+    restarted = torch.cat([split, torch.arange(n, len(source), device=split.device)])
+    return Round(q, source, source, restarted, added=len(asked))
 
 
 def dimmed(

@@ -8,12 +8,11 @@ equal at center and rim; in between the copies block more, for n = 2 by o'^2 v (
 that for all v at once, as (1 - (1 - o v)^(1/n)) / o' is not a Beta kernel.
 """
 
-from dataclasses import dataclass
-
 import torch
 from jaxtyping import Float, Int
 from torch import Tensor
 
+from swimm3r.splat.densify.rows import Round, in_place
 from swimm3r.splat.primitives.beta import BetaPrimitives, select
 from swimm3r.splat.projection.conditioning import rotation_block
 from swimm3r.splat.settings import DensifySettings
@@ -22,23 +21,14 @@ _LARGEST = 1 - 2.0**-23
 _GATE = 100.0  # sharpness of the noise's gates
 
 
-@dataclass(frozen=True)
-class Densified:
-    """The primitives after a round, and which rows of the optimizer start anew."""
-
-    primitives: BetaPrimitives
-    source: Int[Tensor, " n"]  # where each row came from
-    restarted: Int[Tensor, " m"]  # rows whose moments are zeroed
-    relocated: int
-    added: int
-
-
 def shared_opacity(opacity: Float[Tensor, "*n"], copies: Float[Tensor, "*n"], least: float) -> Float[Tensor, "*n"]:
     """Opacity of each of `copies` primitives that take the place of one and block as much light at its center."""
     return (1 - (1 - opacity) ** (1 / copies)).clamp(least, _LARGEST)
 
 
-def relocate_and_grow(p: BetaPrimitives, target: int, min_opacity: float, rng: torch.Generator) -> Densified:
+def relocate_and_grow(
+    p: BetaPrimitives, target: int, min_opacity: float, rng: torch.Generator
+) -> Round[BetaPrimitives]:
     """Dead primitives take half of a live one, drawn by opacity; then more are drawn from all until `target` exist."""
     opacity = torch.sigmoid(p.opacity)
     n = len(opacity)
@@ -65,7 +55,8 @@ def relocate_and_grow(p: BetaPrimitives, target: int, min_opacity: float, rng: t
     raw = moved.opacity.clone()
     rows = torch.cat([touched, changed.nonzero()[:, 0]]).unique()
     raw[rows] = opacity[rows].logit()  # untouched rows keep their bits
-    return Densified(moved._replace(opacity=raw), source, touched, len(dead) if len(alive) else 0, added)
+    # as UBS: sources and copies start anew, not the places of the dead
+    return in_place(moved._replace(opacity=raw), source, n, touched, len(dead) if len(alive) else 0)
 
 
 def noise(

@@ -6,28 +6,17 @@ before along a line through their middle, scales times
     o / sum_{j=1..n} C(n, j) (-1)^(j-1) o'^j / sqrt(j)
 """
 
-from dataclasses import dataclass
-
 import torch
 from jaxtyping import Float, Int
 from torch import Tensor
 
 from swimm3r.splat.densify.mcmc_beta import draw_rows, shared_opacity
+from swimm3r.splat.densify.rows import Round, in_place, unchanged
 from swimm3r.splat.primitives.beta import select
 from swimm3r.splat.primitives.gaussian import GaussianPrimitives, shape_factor
 
 _MOST_COPIES = 51
 _GATE = 100.0  # sharpness of the noise's
-
-
-@dataclass(frozen=True)
-class Relocated:
-    """The Gaussians after a round, and which rows of the optimizer start anew."""
-
-    primitives: GaussianPrimitives
-    restarted: Int[Tensor, " m"]
-    relocated: int
-    added: int
 
 
 def scale_factor(opacity: Float[Tensor, "*n"], copies: Float[Tensor, "*n"]) -> Float[Tensor, "*n"]:
@@ -41,18 +30,20 @@ def scale_factor(opacity: Float[Tensor, "*n"], copies: Float[Tensor, "*n"]) -> F
     return o / total
 
 
-def relocate_and_grow(p: GaussianPrimitives, target: int, min_opacity: float, rng: torch.Generator) -> Relocated:
+def relocate_and_grow(
+    p: GaussianPrimitives, target: int, min_opacity: float, rng: torch.Generator
+) -> Round[GaussianPrimitives]:
     """Dead Gaussians take a share of a live one, drawn by opacity; then more are drawn until `target` exist."""
     n = len(p.xyz)
     opacity = torch.sigmoid(p.opacity)
     dead, alive = (opacity <= min_opacity).nonzero()[:, 0], (opacity > min_opacity).nonzero()[:, 0]
     if not len(alive):
-        return Relocated(p, alive, 0, 0)
-    restarted = []
+        return unchanged(p)
+    source = torch.arange(n, device=dead.device)
+    restarted = [source[:0]]
     if len(dead):
         drawn = alive[draw_rows(opacity[alive], len(dead), rng)]
         p = _shared(p, drawn, min_opacity)
-        source = torch.arange(n, device=dead.device)
         source[dead] = drawn
         p = select(p, source)
         restarted.append(drawn)
@@ -61,9 +52,10 @@ def relocate_and_grow(p: GaussianPrimitives, target: int, min_opacity: float, rn
         drawn = draw_rows(torch.sigmoid(p.opacity), added, rng)
         p = _shared(p, drawn, min_opacity)
         p = select(p, torch.cat([torch.arange(n, device=drawn.device), drawn]))
+        source = torch.cat([source, source[drawn]])
         restarted += [drawn, torch.arange(n, n + added, device=drawn.device)]
-    touched = torch.cat(restarted).unique() if restarted else alive[:0]
-    return Relocated(p, touched, len(dead), added)
+    # the places of the dead keep their memory, as gsplat has it
+    return in_place(p, source, n, torch.cat(restarted).unique(), len(dead))
 
 
 def noise(p: GaussianPrimitives, rate: float, min_opacity: float, rng: torch.Generator) -> Float[Tensor, "n 3"]:

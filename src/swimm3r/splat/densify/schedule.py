@@ -42,10 +42,24 @@ def steps_between(settings: RefineCadence, iterations: int) -> int:
     return max(settings.min_refine_every, round(settings.refine_every * iterations))
 
 
+def is_due(settings: RefineCadence, step: int, iterations: int) -> bool:
+    """Whether a step, counted from 1, is one of the cadence's."""
+    return step % steps_between(settings, iterations) == 0
+
+
+def has_begun(settings: RefineWindow, step: int, iterations: int) -> bool:
+    """Whether a step lies behind the start of the window."""
+    return step / iterations > settings.refine_start
+
+
+def is_open(settings: RefineWindow, step: int, iterations: int) -> bool:
+    """Whether a step lies in the window."""
+    return has_begun(settings, step, iterations) and step / iterations <= settings.refine_stop
+
+
 def has_round(settings: RefineWindow, step: int, iterations: int) -> bool:
     """Whether a step, counted from 1, densifies."""
-    in_window = settings.refine_start < step / iterations <= settings.refine_stop
-    return in_window and step % steps_between(settings, iterations) == 0
+    return is_open(settings, step, iterations) and is_due(settings, step, iterations)
 
 
 def grown(count: int, most: int, growth: float, settings: RefineCadence, iterations: int) -> int:

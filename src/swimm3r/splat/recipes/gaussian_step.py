@@ -4,12 +4,12 @@ from collections.abc import Collection
 from dataclasses import dataclass
 
 import torch
-from jaxtyping import Float, Int
+from jaxtyping import Float
 from torch import Tensor
 
 from swimm3r.splat.gaussian_settings import GaussianSettings
 from swimm3r.splat.medium.field import NO_WATER, MediumField
-from swimm3r.splat.optimizer import Moments, log_linear
+from swimm3r.splat.optimizer import log_linear
 from swimm3r.splat.primitives.gaussian import GaussianPrimitives, initial_gaussians, rescaled, to_degree
 from swimm3r.splat.projection.pinhole import Pinhole
 from swimm3r.splat.rendering import Drawing, draw
@@ -92,16 +92,3 @@ def rates_of(scene: TrainingScene, settings: GaussianSettings, step: int, names:
         "opacity": r.opacity,
         **{name: poses for name in names if name.startswith(POSES)},
     }
-
-
-def with_rows(
-    moments: dict[str, Moments], source: Int[Tensor, " n"], restarted: Int[Tensor, " m"]
-) -> dict[str, Moments]:
-    """The optimizer's memory after row i of the Gaussians became what row source[i] was; zero in `restarted`."""
-    kept = dict(moments)
-    for name in GaussianPrimitives._fields:
-        m = moments[name]
-        first, second = m.first[source], m.second[source]
-        first[restarted], second[restarted] = 0, 0
-        kept[name] = Moments(first, second, m.steps)
-    return kept

@@ -14,6 +14,7 @@ from dataclasses import dataclass
 import torch
 
 from swimm3r.splat.densify import mcmc_gaussian, schedule
+from swimm3r.splat.densify.rows import moments_after
 from swimm3r.splat.gaussian_settings import McmcGsSettings
 from swimm3r.splat.medium.field import MediumField
 from swimm3r.splat.optimizer import adam_step
@@ -23,7 +24,6 @@ from swimm3r.splat.recipes.gaussian_step import (
     rates_of,
     render_for_training,
     with_matches,
-    with_rows,
 )
 from swimm3r.splat.shared_settings import MediumFieldSettings
 from swimm3r.splat.training import loop, losses
@@ -74,8 +74,4 @@ class McmcGs:
         target = schedule.grown(n, self.settings.cap_max, d.growth, d, self.settings.iterations)
         rng = loop.generator(self.settings.seed, step, 4)
         done = mcmc_gaussian.relocate_and_grow(state.primitives, target, d.min_opacity, rng)
-        rows = torch.arange(target, device=state.primitives.xyz.device)
-        rows = rows.clamp(max=n - 1)  # the slots of the dead keep their memory, as gsplat has it
-        moments = with_rows(state.moments, rows, done.restarted)
-        counts = {"relocated": float(done.relocated), "added": float(done.added)}
-        return State(done.primitives, state.field, state.poses, moments), counts
+        return State(done.primitives, state.field, state.poses, moments_after(state.moments, done)), done.numbers

@@ -25,11 +25,12 @@ from torch.nn.functional import relu, smooth_l1_loss
 
 from swimm3r.raster import RasterOutput
 from swimm3r.splat.densify import adaptive, schedule
+from swimm3r.splat.densify.rows import moments_after, only
 from swimm3r.splat.gaussian_settings import SeaSplatSettings, SeaSplatWeights
 from swimm3r.splat.medium.seasplat import SceneWater, initial_scene_water, layer, relative_depth, seen_through
 from swimm3r.splat.optimizer import Moments, adam_step, fresh
 from swimm3r.splat.primitives.gaussian import GaussianPrimitives
-from swimm3r.splat.recipes.gaussian_step import first_gaussians, rates_of, render_for_training, with_matches, with_rows
+from swimm3r.splat.recipes.gaussian_step import first_gaussians, rates_of, render_for_training, with_matches
 from swimm3r.splat.training import loop, losses
 from swimm3r.splat.training.scene import TrainingScene
 from swimm3r.splat.training.state import FIELD, State, first_state, parameters_of
@@ -75,8 +76,7 @@ class SeaSplat:
             adam_step(moving, gradients, state.moments, rates)
             memory = adaptive.remembered(state.memory, gradients["mean2d"], seen.drawing.projection, seen.pinhole_view)
             state = State(state.primitives, state.field, state.poses, state.moments, memory)
-            d, share = settings.densify, step / settings.iterations
-            if d.refine_start < share <= d.refine_stop:
+            if schedule.is_open(settings.densify, step, settings.iterations):
                 state = self._round(state, step)
         return state, numbers
 
@@ -132,7 +132,7 @@ class SeaSplat:
         """Multiply and cull, and cut opacities back, each on its cadence."""
         d, p, moments, memory = self.settings.densify, state.primitives, state.moments, state.memory
         cut_every = self._share(d.reset_every) if d.reset_every else self.settings.iterations
-        if step % schedule.steps_between(d, self.settings.iterations) == 0:
+        if schedule.is_due(d, step, self.settings.iterations):
             rng = loop.generator(self.settings.seed, step, 4)
             large, most = d.grow_scale3d * self.scene.radius, self.settings.cap_max
             done = adaptive.multiply(p, memory, d.grow_grad2d, large, most, rng)
@@ -142,8 +142,8 @@ class SeaSplat:
                 fit &= q.scale.amax(-1).exp() <= d.prune_scale3d * self.scene.radius
                 fit &= memory["radius"][done.source] <= d.largest_radius
             if int(fit.sum()) >= 4:
-                done = adaptive.only(done, fit)
-            p, moments = done.primitives, with_rows(moments, done.source, done.restarted)
+                done = only(done, fit)
+            p, moments = done.primitives, moments_after(moments, done)
             memory = adaptive.nothing_seen(len(p.xyz), p.xyz.device)
         if d.reset_every and step % cut_every == 0:
             p, moments = adaptive.dimmed(p, moments, d.reset_opacity)

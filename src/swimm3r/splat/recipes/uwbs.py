@@ -17,6 +17,7 @@ from swimm3r.devices import CPU
 from swimm3r.medium import Medium, MediumFit
 from swimm3r.scene.reconstruction import Reconstruction
 from swimm3r.splat.densify import mcmc_beta, schedule
+from swimm3r.splat.densify.rows import appended, moments_after
 from swimm3r.splat.dynamic.linear_motion import ways
 from swimm3r.splat.dynamic.spawn import born
 from swimm3r.splat.medium.field import (
@@ -27,7 +28,7 @@ from swimm3r.splat.medium.field import (
     water_prior,
     with_binf_prior,
 )
-from swimm3r.splat.optimizer import Moments, adam_step, log_linear
+from swimm3r.splat.optimizer import adam_step, log_linear
 from swimm3r.splat.primitives.beta import BetaPrimitives, initial_primitives, rescaled, with_time
 from swimm3r.splat.rendering import Drawing, draw
 from swimm3r.splat.settings import UwbsSettings
@@ -142,12 +143,8 @@ class Uwbs:
         rng = loop.generator(self.settings.seed, step, 9)
         here = state.to(CPU)  # where the images are looked at
         fresh_ones = born(here.primitives, here.field, self.scene.views, self.settings, rng).to(self.scene.device)
-        moments = dict(state.moments)
-        for name in BetaPrimitives._fields:
-            m, count = moments[name], len(fresh_ones.xyz)
-            moments[name] = Moments(_extended(m.first, count), _extended(m.second, count), m.steps)
-        p = BetaPrimitives(*(torch.cat(pair) for pair in zip(state.primitives, fresh_ones, strict=True)))
-        return State(p, state.field, state.poses, moments)
+        done = appended(state.primitives, fresh_ones)
+        return State(done.primitives, state.field, state.poses, moments_after(state.moments, done))
 
     def _rates(self, step: int, names: Collection[str]) -> dict[str, float]:
         r, share = self.settings.rates, step / self.settings.iterations
@@ -181,22 +178,15 @@ class Uwbs:
         p = done.primitives
         if d.noise_cadence == "round":
             p = p._replace(xyz=p.xyz + self._noise(p, rate, rng))
-        moments, gradients, multiplier = dict(state.moments), dict(adjoint.gradients), adjoint.multiplier
-        appended = len(p.xyz) - n
-        rows = torch.arange(len(done.source), device=done.source.device)
-        stale = torch.cat([done.restarted, (done.source != rows).nonzero()[:, 0]]).unique()
-        for name in BetaPrimitives._fields:
-            m = moments[name]
-            first, second = _extended(m.first, appended), _extended(m.second, appended)
-            gradient = _extended(gradients[name], appended)
-            first[done.restarted], second[done.restarted] = 0, 0  # as UBS: sources and copies, not the slots reused
-            gradient[stale] = 0
-            moments[name], gradients[name] = Moments(first, second, m.steps), gradient
+        gradients, multiplier, stale = dict(adjoint.gradients), adjoint.multiplier, done.changed
+        for name in p._fields:
+            gradients[name] = gradients[name][done.memory]
+            gradients[name][stale] = 0
         if multiplier is not None:
-            multiplier = _extended(multiplier, appended)
+            multiplier = multiplier[done.memory]
             multiplier[stale] = 1
-        counts = {"relocated": float(done.relocated), "added": float(done.added)}
-        return State(p, state.field, state.poses, moments), _Adjoint(gradients, multiplier, adjoint.numbers | counts)
+        state = State(p, state.field, state.poses, moments_after(state.moments, done))
+        return state, _Adjoint(gradients, multiplier, adjoint.numbers | done.numbers)
 
 
 @dataclass(frozen=True)
@@ -257,7 +247,3 @@ def known_water(scene: TrainingScene, settings: UwbsSettings) -> WaterPrior | No
         return None
     prior = water_prior(fit, 1 / scene.scale, settings.medium)
     return WaterPrior(prior.mean.to(scene.device), prior.std.to(scene.device))
-
-
-def _extended(rows: Tensor, count: int) -> Tensor:
-    return torch.cat([rows, rows.new_zeros(count, *rows.shape[1:])])

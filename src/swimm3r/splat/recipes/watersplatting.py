@@ -22,6 +22,7 @@ from jaxtyping import Float
 from torch import Tensor
 
 from swimm3r.splat.densify import adaptive, schedule
+from swimm3r.splat.densify.rows import moments_after, only, unchanged
 from swimm3r.splat.gaussian_settings import WaterSplattingSettings
 from swimm3r.splat.medium.field import initial_field
 from swimm3r.splat.optimizer import adam_step, log_linear
@@ -31,7 +32,6 @@ from swimm3r.splat.recipes.gaussian_step import (
     rates_of,
     render_for_training,
     with_matches,
-    with_rows,
 )
 from swimm3r.splat.training import loop, losses
 from swimm3r.splat.training.scene import TrainingScene
@@ -76,7 +76,8 @@ class WaterSplatting:
                 state.memory, seen.drawing.sgg.full_abs, seen.drawing.projection, seen.pinhole_view
             )
             state = State(state.primitives, state.field, state.poses, state.moments, memory)
-            if step % self._every() == 0 and step > settings.densify.refine_start * settings.iterations:
+            d, n = settings.densify, settings.iterations
+            if schedule.has_begun(d, step, n) and schedule.is_due(d, step, n):
                 state = self._round(state, step)
         return state, numbers
 
@@ -102,7 +103,7 @@ class WaterSplatting:
         growing = step < d.refine_stop * self.settings.iterations
         waits = min(len(self.scene.views) + self._every(), self._period() // 2) if d.reset_every else 0
         if not growing or since > waits:
-            done = adaptive.unchanged(p)
+            done = unchanged(p)
             if growing:
                 rng = loop.generator(self.settings.seed, step, 4)
                 large = d.grow_scale3d * self.scene.radius
@@ -111,8 +112,8 @@ class WaterSplatting:
             fit = torch.sigmoid(q.opacity) >= (d.prune_opacity if growing else d.prune_opacity_late)
             fit &= q.scale.amax(-1).exp() <= d.prune_scale3d * self.scene.radius
             if int(fit.sum()) >= 4:
-                done = adaptive.only(done, fit)
-            p, moments = done.primitives, with_rows(moments, done.source, done.restarted)
+                done = only(done, fit)
+            p, moments = done.primitives, moments_after(moments, done)
             memory = adaptive.nothing_seen(len(p.xyz), p.xyz.device)
         if growing and d.reset_every and since == self._every():
             p, moments = adaptive.dimmed(p, moments, d.reset_opacity)
