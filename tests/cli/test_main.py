@@ -13,7 +13,7 @@ from swimm3r.cli.main import main
 from swimm3r.errors import InputError
 from swimm3r.io.images import write_mask, write_rgb
 from swimm3r.localization.batch import localize_run
-from swimm3r.splat.settings import RECIPES, recipe_of
+from swimm3r.splat.settings import RECIPES
 
 
 def outcome(capsys: pytest.CaptureFixture[str], *arguments: str) -> tuple[int, str]:
@@ -117,7 +117,7 @@ def test_a_recipe_and_a_transforms_json_reach_the_pipeline(tmp_path: Path, monke
         source, _, settings = asked[-1]
         assert source == tmp_path / "images"
         assert settings.sfm.model == tmp_path / "transforms.json"
-        assert recipe_of(settings.splat) == recipe
+        assert settings.splat.recipe == recipe
 
 
 def test_two_models_at_once_are_exit_2(capsys: pytest.CaptureFixture[str], tmp_path: Path):

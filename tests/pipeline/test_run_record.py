@@ -18,7 +18,6 @@ from swimm3r.pipeline.presets import PRESETS, RunSettings, from_yaml
 from swimm3r.pipeline.run import run_pipeline
 from swimm3r.pipeline.run_settings import differences, starting_settings
 from swimm3r.scene.run_folder import open_run, read_run
-from swimm3r.splat.settings import recipe_of
 from swimm3r.synthetic import write_dive
 from swimm3r.synthetic.settings import DiveSettings
 
@@ -351,9 +350,9 @@ def test_options_start_from_the_preset_that_is_named_else_from_the_folder():
     assert starting_settings("fast", None, None, held) == FAST
     assert starting_settings(None, "colmap", "uwbs-static", held) == held
     other = starting_settings(None, None, "ubs", held)
-    assert recipe_of(other.splat) == "ubs"
+    assert other.splat.recipe == "ubs"
     assert (other.frames, other.sfm, other.test) == (held.frames, held.sfm, held.test)
-    assert recipe_of(starting_settings(None, None, "uwbs-static", other).splat) == "uwbs-static"
+    assert starting_settings(None, None, "uwbs-static", other).splat.recipe == "uwbs-static"
     assert "Mast3rSettings" in differences(held, starting_settings(None, "mast3r", None, held), ["sfm"])[0]
 
 

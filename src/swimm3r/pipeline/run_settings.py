@@ -6,7 +6,7 @@ from typing import Any
 
 from swimm3r.pipeline.presets import MAST3R_PRESETS, PRESETS, Preset, RunSettings
 from swimm3r.sfm.settings import ColmapModelSettings, Mast3rSettings, SfmSettings
-from swimm3r.splat.settings import RecipeName, UwbsSettings, recipe_of, with_recipe
+from swimm3r.splat.settings import RecipeName, UwbsSettings, with_recipe
 
 _PARTS = {"prepare": "frames", "sfm": "sfm", "splat": "splat", "eval": "test"}  # of RunSettings, by the stage they make
 
@@ -54,7 +54,7 @@ def starting_settings(
     sfm, splat = base.sfm, base.splat
     if backend is not None and (backend == "colmap") == isinstance(sfm, Mast3rSettings):
         sfm = named.sfm if backend == "colmap" else MAST3R_PRESETS[preset or "default"]
-    if recipe is not None and recipe_of(splat) != recipe:
+    if recipe is not None and splat.recipe != recipe:
         assert isinstance(named.splat, UwbsSettings)
         splat = with_recipe(named.splat, recipe)
     return replace(base, sfm=sfm, splat=splat)

@@ -24,7 +24,7 @@ from swimm3r.scene.frames import Frames
 from swimm3r.scene.ground_truth import GroundTruth
 from swimm3r.scene.reconstruction import Matches, Reconstruction
 from swimm3r.splat.rendering import SplatMap, mean_water
-from swimm3r.splat.settings import PoseRefinementSettings, recipe_of
+from swimm3r.splat.settings import PoseRefinementSettings
 from swimm3r.splat.training_poses import RefinedPoses
 
 _ASKED = 16  # training views that the map's mean water is taken over
@@ -80,7 +80,7 @@ def splat_sections(scene: SplatMap, rec: Reconstruction, frames: Frames, folder:
     rows = read_rows(folder / "metrics.jsonl")
     lost = NotComputed("the record of the training, metrics.jsonl, is lost")
     section = {
-        "recipe": recipe_of(scene.settings),
+        "recipe": scene.settings.recipe,
         "primitives": len(scene.primitives.xyz),
         "iterations": scene.settings.iterations,
         "seconds_per_iteration": rows[-1].get("seconds_per_step", lost) if rows else lost,

@@ -23,7 +23,7 @@ from swimm3r.settings import (
     Settings,
     Share,
 )
-from swimm3r.splat.shared_settings import MediumFieldSettings, TrainingPoseSettings
+from swimm3r.splat.shared_settings import MediumFieldSettings, RecipeName, TrainingPoseSettings
 
 
 @dataclass(frozen=True)
@@ -137,6 +137,11 @@ class McmcGsSettings(GaussianSettings):
         default_factory=lambda: TrainingPoseSettings(rate=2.25e-4, epipolar_end=0.1)  # 1.5e-4 and 3,000 in 30,000
     )
 
+    @property
+    def recipe(self) -> RecipeName:
+        """The name of the method."""
+        return "threers_gs" if self.poses.enabled else "mcmc_gs"
+
 
 @dataclass(frozen=True)
 class AbsGradSettings(Settings):
@@ -191,6 +196,11 @@ class WaterSplattingSettings(GaussianSettings):
     """By how much the training images are smaller at first,"""
     double_every: Cadence = 0.2  # 3,000 of 15,000
     """and the share of the run after which they double."""
+
+    @property
+    def recipe(self) -> RecipeName:
+        """The name of the method."""
+        return "watersplatting"
 
 
 @dataclass(frozen=True)
@@ -266,3 +276,8 @@ class SeaSplatSettings(GaussianSettings):
     weights: SeaSplatWeights = field(default_factory=SeaSplatWeights)
     densify: GradientSettings = field(default_factory=GradientSettings)
     water: SceneWaterSettings = field(default_factory=SceneWaterSettings)
+
+    @property
+    def recipe(self) -> RecipeName:
+        """The name of the method."""
+        return "seasplat"

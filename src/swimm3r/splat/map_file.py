@@ -17,10 +17,10 @@ from swimm3r.io.files.damage import Remedy, guard
 from swimm3r.io.files.safe_names import check_names
 from swimm3r.io.files.tensor_file import read_tensors, write_tensors
 from swimm3r.settings_document import from_document, to_document
-from swimm3r.splat.parts import parts_of
 from swimm3r.splat.primitives.kinds import primitives_from
+from swimm3r.splat.recipes import recipe_parts
 from swimm3r.splat.rendering import SplatMap
-from swimm3r.splat.settings import RECIPES, RecipeName, recipe_of, settings_of
+from swimm3r.splat.settings import RECIPES, RecipeName, settings_of
 from swimm3r.splat.training_poses import RefinedPoses
 
 SCHEMA = 2  # 1: Swimm3R 0.1, whose settings have other names
@@ -51,7 +51,7 @@ def save_map(path: Path, scene: SplatMap) -> None:
     tensors |= {f"field.{name}": values for name, values in scene.field.state_dict().items()}
     about = {
         "schema": SCHEMA,
-        "recipe": recipe_of(scene.settings),
+        "recipe": scene.settings.recipe,
         "settings": to_document(scene.settings),
         "metric": scene.metric,
         "length": scene.length,
@@ -74,7 +74,7 @@ def load_map(path: Path) -> SplatMap:
     about = stored.about
     with guard(path, remedy):
         settings = from_document(about.settings, settings_of(cast(RecipeName, about.recipe)))
-        parts = parts_of(settings)
+        parts = recipe_parts(settings)
         field, primitives = parts.field, primitives_from(stored.tensors, parts.primitives, "primitives.")
         try:
             field.load_state_dict(

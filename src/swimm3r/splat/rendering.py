@@ -23,8 +23,8 @@ from swimm3r.splat.medium.field import (
     per_z_depth,
     ray_lengths,
 )
+from swimm3r.splat.medium.kinds import Water
 from swimm3r.splat.medium.seasplat import SceneWater, WaterLayer, layer, relative_depth, seen_through
-from swimm3r.splat.parts import Water
 from swimm3r.splat.primitives.kinds import Primitives
 from swimm3r.splat.projection.dispatch import project
 from swimm3r.splat.projection.pinhole import Pinhole, Projection, pinhole

@@ -25,7 +25,7 @@ from swimm3r.settings import (
     Share,
 )
 from swimm3r.splat.gaussian_settings import GaussianSettings, McmcGsSettings, SeaSplatSettings, WaterSplattingSettings
-from swimm3r.splat.shared_settings import MediumFieldSettings, TrainingPoseSettings
+from swimm3r.splat.shared_settings import MediumFieldSettings, RecipeName, TrainingPoseSettings
 
 
 @dataclass(frozen=True)
@@ -219,6 +219,13 @@ class UwbsSettings(Settings):
     checkpoint_every: Cadence = 0.1
 
     @property
+    def recipe(self) -> RecipeName:
+        """The name of the method."""
+        if self.medium.model == "none":
+            return "ubs"
+        return "uwbs-dynamic" if self.dynamic else "uwbs-static"
+
+    @property
     def depth_confidence(self) -> float | None:
         """Least confidence of a depth that training reads; None reads no depth."""
         return self.weights.depth_confidence
@@ -248,7 +255,6 @@ uwbs = UwbsSettings  # as the Python API calls it: swimm3r.train(rec, frames, sw
 MapDevice = Literal["auto", "cpu", "cuda"]
 """Where maps are trained and rendered; no part of the settings, for a map can go from one to the other."""
 
-RecipeName = Literal["uwbs-static", "uwbs-dynamic", "ubs", "watersplatting", "seasplat", "threers_gs", "mcmc_gs"]
 RECIPES: tuple[RecipeName, ...] = get_args(RecipeName)
 
 
@@ -343,28 +349,5 @@ def mcmc_gs(**changes: Any) -> McmcGsSettings:
 
 
 def settings_of(recipe: RecipeName) -> type[SplatSettings]:
-    """The kind of settings that a recipe has."""
-    match recipe:
-        case "uwbs-static" | "uwbs-dynamic" | "ubs":
-            return UwbsSettings
-        case "watersplatting":
-            return WaterSplattingSettings
-        case "seasplat":
-            return SeaSplatSettings
-        case "threers_gs" | "mcmc_gs":
-            return McmcGsSettings
-
-
-def recipe_of(settings: SplatSettings) -> RecipeName:
-    """The name of the recipe of the settings."""
-    match settings:
-        case WaterSplattingSettings():
-            return "watersplatting"
-        case SeaSplatSettings():
-            return "seasplat"
-        case McmcGsSettings():
-            return "threers_gs" if settings.poses.enabled else "mcmc_gs"
-        case UwbsSettings():
-            if settings.medium.model == "none":
-                return "ubs"
-            return "uwbs-dynamic" if settings.dynamic else "uwbs-static"
+    """The settings that a recipe has."""
+    return type(with_recipe(UwbsSettings(), recipe))

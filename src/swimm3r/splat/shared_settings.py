@@ -5,6 +5,8 @@ from typing import Annotated, Literal
 
 from swimm3r.settings import Count, NotNegative, Range, Rate, Settings, Share
 
+RecipeName = Literal["uwbs-static", "uwbs-dynamic", "ubs", "watersplatting", "seasplat", "threers_gs", "mcmc_gs"]
+
 
 @dataclass(frozen=True)
 class MediumFieldSettings(Settings):

@@ -14,12 +14,9 @@ from swimm3r.progress import Progress, silent
 from swimm3r.scene.frames import Frames
 from swimm3r.scene.reconstruction import Reconstruction
 from swimm3r.splat import map_file
-from swimm3r.splat.recipes.mcmc_gs import McmcGs
-from swimm3r.splat.recipes.seasplat import SeaSplat
-from swimm3r.splat.recipes.uwbs import Uwbs, known_water
-from swimm3r.splat.recipes.watersplatting import WaterSplatting
+from swimm3r.splat.recipes import recipe_parts
 from swimm3r.splat.rendering import SplatMap
-from swimm3r.splat.settings import McmcGsSettings, SeaSplatSettings, SplatSettings, UwbsSettings, WaterSplattingSettings
+from swimm3r.splat.settings import SplatSettings
 from swimm3r.splat.training import loop
 from swimm3r.splat.training.scene import TrainingScene, path_radius
 from swimm3r.splat.training.state import in_scene_units
@@ -46,7 +43,7 @@ def train(
     radius = path_radius(rec, scale, settings.working_depth)
     training_scene = TrainingScene(rec, scale, radius, views, poses_in_training, device)
     with devices.memory_for("this map", "fewer primitives, a smaller --splat.long-side, or --map-device cpu"):
-        final = loop.run(_recipe(settings, training_scene), _schedule(settings, rec, views), folder, progress)
+        final = loop.run(recipe_parts(settings), training_scene, _schedule(settings, rec, views), folder, progress)
     primitives, field = in_scene_units(final, 1 / scale)
     poses = None
     if poses_in_training is not None and final.poses is not None:
@@ -66,18 +63,6 @@ def _check_near(settings: SplatSettings, median_depth: float) -> None:
             cause="it was given in another unit than metres, or than thirds of the median depth",
             hint="leave --splat.render.near out for the default",
         )
-
-
-def _recipe(settings: SplatSettings, training_scene: TrainingScene) -> loop.Recipe:
-    match settings:
-        case UwbsSettings():
-            return Uwbs(settings, training_scene, known_water(training_scene, settings))
-        case McmcGsSettings():
-            return McmcGs(settings, training_scene)
-        case WaterSplattingSettings():
-            return WaterSplatting(settings, training_scene)
-        case SeaSplatSettings():
-            return SeaSplat(settings, training_scene)
 
 
 def _schedule(settings: SplatSettings, rec: Reconstruction, views: TrainingViews) -> loop.Schedule:

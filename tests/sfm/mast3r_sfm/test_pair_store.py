@@ -149,14 +149,15 @@ def test_other_partners_are_another_view(passes: dict, tmp_path: Path):
 
 def test_a_pair_comes_back_as_it_was_kept(tmp_path: Path):
     matches = PixelMatches(torch.tensor([[3, 500], [7, 9]]), torch.tensor([[0, 1], [511, 2]]), torch.tensor([0.5, 9.0]))
-    weak = Predicted(torch.rand(6, 3), torch.rand(6))
+    weak, back = (Predicted(torch.rand(6, 3), torch.rand(6)) for _ in range(2))
     store = PairStore(tmp_path, "settings")
     store.write("a", "b", PairRecord(matches))
-    store.write("a", "c", PairRecord(matches, weak, weak))
+    store.write("a", "c", PairRecord(matches, weak, back))
     plain, full = store.read("a", "b"), store.read("a", "c")
     assert torch.equal(plain.matches.xy2, matches.xy2)
     assert torch.equal(plain.matches.confidence, matches.confidence)
     assert plain.i_in_j is None
-    assert torch.equal(full.j_in_i.points, weak.points)
+    assert torch.equal(full.j_in_i.points, back.points)
+    assert torch.equal(full.i_in_j.confidence, weak.confidence)
     assert not store.has("b", "c")
     assert not PairStore(tmp_path, "other settings").has("a", "b")

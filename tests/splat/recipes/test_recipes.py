@@ -17,7 +17,6 @@ from swimm3r.splat.settings import (
     InitialSettings,
     UwbsSettings,
     mcmc_gs,
-    recipe_of,
     settings_of,
     threers_gs,
     ubs,
@@ -34,13 +33,13 @@ FEW = UwbsSettings(
 @pytest.mark.parametrize("recipe", RECIPES)
 def test_settings_know_their_recipe(recipe):
     settings = with_recipe(FEW, recipe)
-    assert recipe_of(settings) == recipe
+    assert settings.recipe == recipe
     assert type(settings) is settings_of(recipe)
     assert (settings.iterations, settings.initial.primitives) == (60, 500)
 
 
 def test_ubs_as_the_python_api_has_it():
-    assert recipe_of(ubs(iterations=7)) == "ubs"
+    assert ubs(iterations=7).recipe == "ubs"
     assert ubs(iterations=7).iterations == 7
     assert not ubs().poses.enabled
     assert not ubs().sgg.enabled
@@ -49,7 +48,7 @@ def test_ubs_as_the_python_api_has_it():
 def test_ubs_paints_the_water_onto_the_scene(tiny_dive, tmp_path):
     """Nothing is known of the water afterwards: the clear image is the filmed one."""
     scene = train(tiny_dive.rec, tiny_dive.frames, with_recipe(FEW, "ubs"), tmp_path)
-    assert recipe_of(load_map(tmp_path / "map.safetensors").settings) == "ubs"
+    assert load_map(tmp_path / "map.safetensors").settings.recipe == "ubs"
     view = tiny_dive.cameras[4]
     out = load_map(tmp_path / "map.safetensors").render(view)
     assert torch.equal(out.rgb, scene.render(view).rgb)
@@ -81,8 +80,8 @@ def test_settings_from_before_there_were_peers_are_uwbs(tmp_path):
 
 
 def test_the_peers_as_the_python_api_has_them():
-    assert recipe_of(threers_gs(iterations=7)) == "threers_gs"
-    assert recipe_of(mcmc_gs(iterations=7)) == "mcmc_gs"
+    assert threers_gs(iterations=7).recipe == "threers_gs"
+    assert mcmc_gs(iterations=7).recipe == "mcmc_gs"
     assert mcmc_gs(iterations=7).iterations == 7
 
 

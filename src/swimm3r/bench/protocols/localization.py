@@ -41,7 +41,6 @@ from swimm3r.progress import Progress, silent
 from swimm3r.scene.ground_truth import GroundTruth
 from swimm3r.scene.reconstruction import Reconstruction
 from swimm3r.splat.map_file import load_map
-from swimm3r.splat.settings import recipe_of
 
 _PAIRS = [f"{score}_{pairs}" for pairs in ("map", "queries") for score in ("rra2", "rta5", "rra15", "rta15")]
 _PAIRS += ["rra2_training", "rta5_training"]
@@ -89,7 +88,7 @@ def maps_of(run: SfmRun, maps: Path | None) -> list[FoundMap]:
     found = []
     own = run.folder / "splat" / "map.safetensors"
     if own.is_file() and maps is None:
-        found.append(FoundMap(own, f"{run.sfm} / {recipe_of(load_map(own).settings)}", 0))
+        found.append(FoundMap(own, f"{run.sfm} / {load_map(own).settings.recipe}", 0))
     if maps is not None:
         for path in sorted(scene_folder(maps, run.scene).glob("*/*/*/map.safetensors")):
             record = path.parent / "scores.json"

@@ -8,7 +8,7 @@ from swimm3r.cli.pipeline.stages import backend_of, require_adapter, run_stages
 from swimm3r.cli.terminal.options import FLAT, Source
 from swimm3r.pipeline.presets import RunSettings
 from swimm3r.scene.settings import FrameSettings
-from swimm3r.splat.settings import PoseRefinementSettings, recipe_of
+from swimm3r.splat.settings import PoseRefinementSettings
 
 
 def run_command(defaults: RunSettings) -> Callable:
@@ -19,7 +19,7 @@ def run_command(defaults: RunSettings) -> Callable:
         /,
         folder: Annotated[FolderOptions, FLAT] = FolderOptions(),  # noqa: B008 - records are frozen
         poses: Annotated[PoseOptions, FLAT] = PoseOptions(backend_of(defaults.sfm)),  # noqa: B008
-        map: Annotated[MapOptions, FLAT] = MapOptions(recipe_of(defaults.splat)),  # noqa: B008
+        map: Annotated[MapOptions, FLAT] = MapOptions(defaults.splat.recipe),  # noqa: B008
         frames: Annotated[FrameSettings, FLAT] = defaults.frames,
         sfm: Annotated[type(defaults.sfm), FLAT] = defaults.sfm,
         splat: type(defaults.splat) = defaults.splat,

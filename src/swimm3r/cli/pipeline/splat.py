@@ -14,7 +14,7 @@ from swimm3r.errors import UsageError
 from swimm3r.pipeline.presets import RunSettings
 from swimm3r.pipeline.run_settings import with_poses_of
 from swimm3r.scene.settings import FrameSettings
-from swimm3r.splat.settings import PoseRefinementSettings, recipe_of
+from swimm3r.splat.settings import PoseRefinementSettings
 
 
 @dataclass(frozen=True)
@@ -39,7 +39,7 @@ def splat_command(defaults: RunSettings) -> Callable:
         /,
         folder: Annotated[FolderOptions, FLAT] = FolderOptions(),  # noqa: B008 - records are frozen
         model: Annotated[ModelOptions, FLAT] = ModelOptions(),
-        map: Annotated[MapOptions, FLAT] = MapOptions(recipe_of(defaults.splat)),  # noqa: B008
+        map: Annotated[MapOptions, FLAT] = MapOptions(defaults.splat.recipe),  # noqa: B008
         frames: Annotated[FrameSettings, FLAT] = defaults.frames,
         sfm: Annotated[type(defaults.sfm), FLAT] = defaults.sfm,
         splat: type(defaults.splat) = defaults.splat,

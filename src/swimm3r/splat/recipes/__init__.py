@@ -1,1 +1,35 @@
-"""The recipes: losses and schedule of each published method."""
+"""The published methods that maps are trained by: losses and schedule of each, and the one choice between them."""
+
+from functools import partial
+from typing import TYPE_CHECKING
+
+from swimm3r.splat.settings import McmcGsSettings, SeaSplatSettings, SplatSettings, UwbsSettings, WaterSplattingSettings
+from swimm3r.splat.shared_settings import MediumFieldSettings
+
+if TYPE_CHECKING:
+    import swimm3r.splat.training.loop
+
+__all__ = ["recipe_parts"]
+
+
+def recipe_parts(settings: SplatSettings) -> "swimm3r.splat.training.loop.RecipeParts":
+    """The primitives, the water and the training that settings ask for."""
+    from swimm3r.splat.medium.field import MediumField
+    from swimm3r.splat.medium.seasplat import SceneWater
+    from swimm3r.splat.primitives.beta import BetaPrimitives
+    from swimm3r.splat.primitives.gaussian import GaussianPrimitives
+    from swimm3r.splat.recipes import mcmc_gs, seasplat, uwbs, watersplatting
+    from swimm3r.splat.training.loop import RecipeParts
+
+    match settings:
+        case UwbsSettings():
+            field = MediumField(settings.medium, settings.dynamic)
+            return RecipeParts(BetaPrimitives, field, partial(uwbs.recipe, settings))
+        case McmcGsSettings():
+            field = MediumField(MediumFieldSettings(model="none"))
+            return RecipeParts(GaussianPrimitives, field, partial(mcmc_gs.McmcGs, settings))
+        case WaterSplattingSettings():
+            field = MediumField(settings.medium)
+            return RecipeParts(GaussianPrimitives, field, partial(watersplatting.WaterSplatting, settings))
+        case SeaSplatSettings():
+            return RecipeParts(GaussianPrimitives, SceneWater(), partial(seasplat.SeaSplat, settings))

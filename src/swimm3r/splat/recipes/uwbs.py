@@ -189,6 +189,11 @@ class Uwbs:
         return state, _Adjoint(gradients, multiplier, adjoint.numbers | done.numbers)
 
 
+def recipe(settings: UwbsSettings, scene: TrainingScene) -> Uwbs:
+    """The recipe for one scene, held to the water that structure from motion measured."""
+    return Uwbs(settings, scene, known_water(scene, settings))
+
+
 @dataclass(frozen=True)
 class UwbsObjective:
     """Eq. 18 for one view."""

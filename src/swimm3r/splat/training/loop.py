@@ -6,6 +6,7 @@ and a run that was interrupted ends with the same bits as one that was not (at t
 
 import logging
 import time
+from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, Protocol, runtime_checkable
@@ -16,10 +17,13 @@ from torch import Tensor
 from swimm3r.io.files import metrics_log
 from swimm3r.io.files.damage import guard
 from swimm3r.progress import Progress
+from swimm3r.splat.medium.kinds import Water
+from swimm3r.splat.primitives.kinds import Primitives
 from swimm3r.splat.settings import SplatSettings
 from swimm3r.splat.training.checkpoint import StateHeader, read_state, state_remedy, write_state
 from swimm3r.splat.training.scene import TrainingScene
 from swimm3r.splat.training.state import State, restored, stored
+from swimm3r.splat.training_poses import PoseMlp
 from swimm3r.splat.views import TrainingView
 
 log = logging.getLogger(__name__)
@@ -52,6 +56,15 @@ class Recipe(Protocol):
 
 
 @dataclass(frozen=True)
+class RecipeParts:
+    """A recipe's kind of primitives, its water (untrained), and its training of one scene."""
+
+    primitives: type[Primitives]
+    field: Water
+    build: Callable[[TrainingScene], Recipe]
+
+
+@dataclass(frozen=True)
 class Schedule:
     """Length of a training, and its intervals for logs and checkpoints."""
 
@@ -74,11 +87,12 @@ def view_of_step(step: int, views: int, seed: int) -> int:
     return int(torch.randperm(views, generator=generator(seed, epoch, 1))[place])
 
 
-def run(recipe: Recipe, schedule: Schedule, folder: Path, progress: Progress) -> State:
+def run(parts: RecipeParts, scene: TrainingScene, schedule: Schedule, folder: Path, progress: Progress) -> State:
     """Train from the checkpoint in `folder`, if there is one of this training, else from the start."""
+    recipe = parts.build(scene)
     path, metrics = folder / "checkpoint" / "state.safetensors", folder / "metrics.jsonl"
     folder.mkdir(parents=True, exist_ok=True)
-    state, done = _resume(recipe, path, metrics, schedule)
+    state, done = _resume(recipe, parts, path, metrics, schedule)
     state = state.to(recipe.scene.device)
     started, cpu_started, first = time.perf_counter(), time.process_time(), done
     sums: dict[str, tuple[float | Tensor, int]] = {}
@@ -102,7 +116,7 @@ def run(recipe: Recipe, schedule: Schedule, folder: Path, progress: Progress) ->
     return state
 
 
-def _resume(recipe: Recipe, path: Path, metrics: Path, schedule: Schedule) -> tuple[State, int]:
+def _resume(recipe: Recipe, parts: RecipeParts, path: Path, metrics: Path, schedule: Schedule) -> tuple[State, int]:
     """The state to go on from, and its step; rows of metrics beyond it are dropped."""
     done = 0
     state = None
@@ -110,7 +124,9 @@ def _resume(recipe: Recipe, path: Path, metrics: Path, schedule: Schedule) -> tu
         kept = read_state(path)
         if kept.about.fingerprint == schedule.fingerprint:
             with guard(path, state_remedy(path)):
-                state = restored(kept.tensors, recipe.settings, recipe.scene.refined_cameras)
+                cameras = recipe.scene.refined_cameras
+                poses = PoseMlp(cameras, recipe.settings.poses) if cameras else None
+                state = restored(kept.tensors, parts.primitives, parts.field, poses)
             done = kept.about.step
             log.info("going on from step %d", done)
         else:

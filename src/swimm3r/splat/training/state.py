@@ -9,14 +9,13 @@ import torch
 from torch import Tensor
 
 from swimm3r.splat.medium.field import MediumField, in_unit
+from swimm3r.splat.medium.kinds import Water
 from swimm3r.splat.medium.seasplat import SceneWater
 from swimm3r.splat.optimizer import Moments, fresh
-from swimm3r.splat.parts import Water, parts_of
 from swimm3r.splat.primitives import beta, gaussian
 from swimm3r.splat.primitives.beta import BetaPrimitives
 from swimm3r.splat.primitives.gaussian import GaussianPrimitives
 from swimm3r.splat.primitives.kinds import Primitives, primitives_from
-from swimm3r.splat.settings import SplatSettings
 from swimm3r.splat.training_poses import PoseMlp
 
 FIELD, POSES = "field.", "poses."
@@ -67,15 +66,15 @@ def stored(state: State) -> dict[str, Tensor]:
     return tensors | {f"memory.{name}": t for name, t in state.memory.items()}
 
 
-def restored(tensors: dict[str, Tensor], settings: SplatSettings, cameras: int) -> State[Any, Any]:
-    """The inverse of `stored`; `cameras` are those whose poses are refined, 0 where they are held.
+def restored(
+    tensors: dict[str, Tensor], kind: type[Primitives], field: Water, poses: PoseMlp | None
+) -> State[Any, Any]:
+    """The inverse of `stored`; it fills an untrained `field`, and `poses` where they are refined.
 
     Raises KeyError or ValueError for tensors that are not of such a state.
     """
-    parts = parts_of(settings)
-    poses = PoseMlp(cameras, settings.poses) if cameras else None
-    p: Any = primitives_from(tensors, parts.primitives, "parameter.")
-    parameters = parameters_of(p, parts.field, poses)
+    p: Any = primitives_from(tensors, kind, "parameter.")
+    parameters = parameters_of(p, field, poses)
     with torch.no_grad():
         for name, parameter in parameters.items():
             values = tensors[f"parameter.{name}"]
@@ -85,8 +84,8 @@ def restored(tensors: dict[str, Tensor], settings: SplatSettings, cameras: int) 
             parameter.copy_(values)
     moments = {k: Moments(tensors[f"first.{k}"], tensors[f"second.{k}"], tensors[f"steps.{k}"]) for k in parameters}
     memory = {k.removeprefix("memory."): t for k, t in tensors.items() if k.startswith("memory.")}
-    field: Any = parts.field
-    return State(p, field, poses, moments, memory)
+    filled: Any = field
+    return State(p, filled, poses, moments, memory)
 
 
 def in_scene_units(state: State, length: float) -> tuple[Primitives, Water]:
