@@ -1,5 +1,6 @@
 """Beta primitives as Gaussians of the same moments, in the file that 3DGS viewers read."""
 
+import math
 from dataclasses import replace
 
 import numpy as np
@@ -8,12 +9,12 @@ import torch
 
 from swimm3r.cameras import Cameras
 from swimm3r.errors import UsageError
+from swimm3r.export import GaussiansSettings, export_run
 from swimm3r.export.gaussians import (
     Gaussians,
     clear_difference,
     clear_gaussians,
     draw_gaussians,
-    export_run,
     moment_matched,
     write_ply,
 )
@@ -175,3 +176,9 @@ def test_a_file_of_another_kind_is_not_replaced(tmp_path):
     with pytest.raises(UsageError, match="no PLY file"):
         export_run(tmp_path / "run", tmp_path / "notes.txt")
     assert (tmp_path / "notes.txt").read_text() == "mine"
+
+
+@pytest.mark.parametrize("time", [-1.0, math.nan, 1e9])
+def test_a_time_outside_of_any_clip_is_refused(time: float):
+    with pytest.raises(ValueError, match="time"):
+        GaussiansSettings(time)

@@ -12,13 +12,13 @@ def export(run: Run, /, out: OutOrDefault = None, time: ClipSecond | None = None
         out: PLY file to write; RUN/splat/gaussians.ply by default.
         time: Second of the clip at which a dynamic map is exported; half way by default.
     """
-    from swimm3r.export.gaussians import export_run
+    from swimm3r.export import GaussiansSettings, export_run
     from swimm3r.io.files.outputs import output_file
     from swimm3r.scene.run_folder import open_run
 
     open_run(run, "splat")
     with output_file(out or run / "splat" / "gaussians.ply", "--out") as path:
-        done = export_run(run, path, time)
+        done = export_run(run, path, GaussiansSettings(time))
     print(
         f"{done.path}: {done.gaussians:,} Gaussians of {done.primitives:,} primitives.\n"
         f"Beside the map's own clear images: {done.difference.psnr:.1f} dB, mean alpha {done.difference.alpha:+.3f}."

@@ -27,7 +27,6 @@ from swimm3r.io import cameras_json
 from swimm3r.io.ply import is_ply, write_vertices
 from swimm3r.raster import ALPHA_MAX, ALPHA_MIN, RasterOutput, rasterize
 from swimm3r.scene.run_folder import open_run
-from swimm3r.settings import ClipSecond, accepted
 from swimm3r.splat.map_file import load_map
 from swimm3r.splat.primitives.beta import BetaPrimitives, select
 from swimm3r.splat.primitives.gaussian import colored, covariance
@@ -179,7 +178,6 @@ def export_run(folder: Path, path: Path, time: float | None = None) -> Exported:
     A dynamic map is exported at `time`, seconds of the clip; half way by default. Raises InputError without a map,
     UsageError where `path` is a file that is no PLY file: it would be replaced.
     """
-    accepted("time", time, ClipSecond | None)
     if path.is_file() and not is_ply(path):
         raise UsageError(
             f"{path} exists and is no PLY file: it is not replaced",

@@ -5,7 +5,7 @@ from pathlib import Path
 from typing import Any
 
 from swimm3r.pipeline.presets import MAST3R_PRESETS, PRESETS, Preset, RunSettings
-from swimm3r.sfm.settings import ColmapModelSettings, Mast3rSettings, SfmSettings
+from swimm3r.sfm.settings import ColmapModelSettings, SfmSettings
 from swimm3r.splat.settings import RecipeName, UwbsSettings, with_recipe
 
 _PARTS = {"prepare": "frames", "sfm": "sfm", "splat": "splat", "eval": "test"}  # of RunSettings, by the stage they make
@@ -52,7 +52,7 @@ def starting_settings(
     named = PRESETS[preset or "default"]
     base = named if preset is not None or held is None else held
     sfm, splat = base.sfm, base.splat
-    if backend is not None and (backend == "colmap") == isinstance(sfm, Mast3rSettings):
+    if backend is not None and (backend == "colmap") != (sfm.backend == "colmap"):
         sfm = named.sfm if backend == "colmap" else MAST3R_PRESETS[preset or "default"]
     if recipe is not None and splat.recipe != recipe:
         assert isinstance(named.splat, UwbsSettings)

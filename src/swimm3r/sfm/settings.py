@@ -21,6 +21,8 @@ from swimm3r.settings import (
 )
 from swimm3r.sfm.mast3r.settings import AlignmentSettings, MatchingSettings
 
+BackendName = Literal["colmap", "mast3r", "swimm3r"]
+
 
 @dataclass(frozen=True)
 class PlaneSweepSettings(Settings):
@@ -238,6 +240,11 @@ class ColmapSettings(LensSettings):
     water: SeathruSettings = field(default_factory=SeathruSettings)
     restore: RestoreSettings = field(default_factory=RestoreSettings)
 
+    @property
+    def backend(self) -> BackendName:
+        """The back end as --backend names it."""
+        return "colmap"
+
 
 @dataclass(frozen=True)
 class Mast3rSettings(LensSettings):
@@ -289,6 +296,11 @@ class Mast3rSettings(LensSettings):
     water: SeathruSettings = field(default_factory=SeathruSettings)
     restore: RestoreSettings = field(default_factory=RestoreSettings)
 
+    @property
+    def backend(self) -> BackendName:
+        """The back end as --backend names it."""
+        return "mast3r" if self.adapter is None else "swimm3r"
+
 
 @dataclass(frozen=True)
 class ColmapModelSettings(Settings):
@@ -301,6 +313,11 @@ class ColmapModelSettings(Settings):
     depth: PlaneSweepSettings = field(default_factory=PlaneSweepSettings)
     water: SeathruSettings = field(default_factory=SeathruSettings)
     restore: RestoreSettings = field(default_factory=RestoreSettings)
+
+    @property
+    def backend(self) -> BackendName:
+        """The back end as --backend names it: the one whose depth and water these settings share."""
+        return "colmap"
 
 
 SfmSettings = ColmapSettings | Mast3rSettings | ColmapModelSettings

@@ -2,13 +2,11 @@
 
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Literal
 
 from swimm3r.cli.terminal.options import OutOrDefault
 from swimm3r.pipeline.presets import Preset
+from swimm3r.sfm.settings import BackendName
 from swimm3r.splat.settings import MapDevice, RecipeName
-
-Backend = Literal["colmap", "mast3r", "swimm3r"]
 
 
 @dataclass(frozen=True)
@@ -30,7 +28,7 @@ class FolderOptions:
 class PoseOptions:
     """The way to poses and depth, and poses to compare with."""
 
-    backend: Backend = "colmap"
+    backend: BackendName = "colmap"
     """Method for poses and depth. mast3r needs weights, swimm3r an adapter too; `--backend mast3r --help-all` lists
     its options."""
     reference: Path | None = None

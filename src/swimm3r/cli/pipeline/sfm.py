@@ -5,7 +5,7 @@ from dataclasses import replace
 from typing import Annotated
 
 from swimm3r.cli.pipeline.options import FolderOptions, PoseOptions
-from swimm3r.cli.pipeline.stages import backend_of, require_adapter, run_stages
+from swimm3r.cli.pipeline.stages import require_adapter, run_stages
 from swimm3r.cli.terminal.options import FLAT, Source
 from swimm3r.pipeline.presets import RunSettings
 from swimm3r.scene.settings import FrameSettings
@@ -18,7 +18,7 @@ def sfm_command(defaults: RunSettings) -> Callable:
         source: Source,
         /,
         folder: Annotated[FolderOptions, FLAT] = FolderOptions(),  # noqa: B008 - records are frozen
-        poses: Annotated[PoseOptions, FLAT] = PoseOptions(backend_of(defaults.sfm)),  # noqa: B008
+        poses: Annotated[PoseOptions, FLAT] = PoseOptions(defaults.sfm.backend),  # noqa: B008
         frames: Annotated[FrameSettings, FLAT] = defaults.frames,
         sfm: Annotated[type(defaults.sfm), FLAT] = defaults.sfm,
     ) -> None:

@@ -7,14 +7,14 @@ folder holds: a command without settings resumes with them, and one with a few c
 from collections.abc import Sequence
 from pathlib import Path
 
-from swimm3r.cli.pipeline.options import Backend, FolderOptions
+from swimm3r.cli.pipeline.options import FolderOptions
 from swimm3r.cli.terminal.arguments import named, values_of
 from swimm3r.cli.terminal.console import drawn_progress, print_next, print_results, print_summary
 from swimm3r.errors import UsageError
 from swimm3r.pipeline.presets import PRESETS, RunSettings, from_yaml, read_config
 from swimm3r.pipeline.run_settings import starting_settings
 from swimm3r.scene.run_folder import input_and_folder, is_run
-from swimm3r.sfm.settings import Mast3rSettings, SfmSettings
+from swimm3r.sfm.settings import BackendName, Mast3rSettings, SfmSettings
 from swimm3r.splat.settings import RECIPES, MapDevice
 
 RESULTS = {  # of the stages, as far as the folder holds them
@@ -58,12 +58,7 @@ def _held_settings(arguments: Sequence[str]) -> RunSettings | None:
     return from_yaml(path) if path is not None and path.is_file() else None
 
 
-def backend_of(settings: SfmSettings) -> Backend:
-    """The back end that settings are for, as --backend names it."""
-    return "mast3r" if isinstance(settings, Mast3rSettings) else "colmap"
-
-
-def require_adapter(backend: Backend, settings: SfmSettings) -> None:
+def require_adapter(backend: BackendName, settings: SfmSettings) -> None:
     """Raise UsageError where the back end that was named needs an adapter, and none was."""
     if backend == "swimm3r" and isinstance(settings, Mast3rSettings) and settings.adapter is None:
         raise UsageError(

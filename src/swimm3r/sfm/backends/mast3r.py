@@ -116,7 +116,7 @@ def _place(
         tracks=observations,
         matches=_on_frames(matches, images),
         depth=DepthMaps(folder / "z_depth"),
-        backend="mast3r" if settings.adapter is None else "swimm3r",
+        backend=settings.backend,
         metric=_is_metric(images, kept),
         warnings=tuple(warnings),
         points_found=len(found.xyz),
