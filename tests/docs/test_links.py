@@ -54,8 +54,8 @@ def test_no_text_names_the_folders_that_only_its_authors_have():
 
 
 def _of_a_user(path: str) -> bool:
-    """Files that commands, tests or users make, in folders of their own."""
-    return path.split("/")[0] in ("RUN", "OUT", "DIR", "runs", "tables", "reference")
+    """Files that commands, tests or users make, in folders of their own, and placeholders."""
+    return Path(path).stem == "NAME" or path.split("/")[0] in ("RUN", "OUT", "DIR", "runs", "tables", "reference")
 
 
 def test_a_broken_link_and_a_missing_file_are_seen(tmp_path: Path):
