@@ -16,21 +16,21 @@ import pytest
 import torch
 
 import swimm3r
-from swimm3r import sfm
+from swimm3r import export, sfm
 from swimm3r.bench import protocols, scores
 from swimm3r.cameras import DISTORTION_PARAMETERS, CameraModel, Cameras, distort, undistort
 from swimm3r.cli import export as export_command
-from swimm3r.cli.pipeline.options import Backend
 from swimm3r.datasets import tree
+from swimm3r.export.settings import ExportSettings
 from swimm3r.io.cameras_json import CameraTable, read_cameras, write_cameras
 from swimm3r.io.colmap.cameras import from_pycolmap_camera, to_pycolmap_camera
 from swimm3r.pipeline import inputs
 from swimm3r.pipeline.run_settings import starting_settings, with_poses_of
 from swimm3r.settings import declarations
 from swimm3r.settings_document import from_document, to_document
-from swimm3r.sfm.settings import ColmapSettings, SfmSettings
-from swimm3r.splat import parts, train_map
-from swimm3r.splat.settings import RECIPES, RecipeName, SplatSettings, UwbsSettings, recipe_of, settings_of, with_recipe
+from swimm3r.sfm.settings import BackendName, ColmapSettings, SfmSettings
+from swimm3r.splat import recipes
+from swimm3r.splat.settings import RECIPES, RecipeName, SplatSettings, UwbsSettings, settings_of, with_recipe
 
 PACKAGE = Path(swimm3r.__file__).parent
 DOCS = PACKAGE.parents[1] / "docs"
@@ -71,7 +71,7 @@ def modules(package: ModuleType) -> dict[str, ModuleType]:
 def test_a_back_end_is_dispatched_checked_offered_and_described(settings: type):
     assert settings.__name__ in cases(sfm)
     assert settings.__name__ in cases(inputs)
-    offered = {type(starting_settings(None, backend, None, None).sfm) for backend in get_args(Backend)}
+    offered = {type(starting_settings(None, backend, None, None).sfm) for backend in get_args(BackendName)}
     assert settings in offered | {type(with_poses_of(Path("model"), ColmapSettings()))}
     assert any(f"`{settings.__module__}.{settings.__name__}`" in row for row in rows(page("method.md")))
 
@@ -93,9 +93,9 @@ def test_a_recipe_has_settings_parts_a_public_maker_and_a_description(recipe: Re
     settings = with_recipe(UwbsSettings(iterations=300, long_side=200), recipe)
     assert (settings.iterations, settings.long_side) == (300, 200)
     assert isinstance(settings, settings_of(recipe))
-    assert recipe_of(settings) == recipe
+    assert settings.recipe == recipe
     assert from_document(to_document(settings), settings_of(recipe)) == settings
-    assert parts.parts_of(settings).primitives.__name__.endswith("Primitives")
+    assert recipes.recipe_parts(settings).primitives.__name__.endswith("Primitives")
     if not recipe.startswith("uwbs"):
         assert type(getattr(swimm3r, recipe)()) is settings_of(recipe)
     assert any(f"`{recipe}`" in row for row in rows(page("method.md"))), recipe
@@ -104,8 +104,7 @@ def test_a_recipe_has_settings_parts_a_public_maker_and_a_description(recipe: Re
 def test_every_kind_of_map_settings_has_its_training():
     kinds = {kind.__name__ for kind in get_args(SplatSettings)}
     assert kinds == {settings_of(recipe).__name__ for recipe in RECIPES}
-    assert kinds <= cases(train_map)
-    assert kinds <= cases(parts)
+    assert kinds == cases(recipes)
 
 
 # a camera model
@@ -150,13 +149,15 @@ def _options(settings: type) -> set[str]:
 # an export format
 
 
-def test_every_export_format_is_a_module_that_the_command_offers():
-    formats = modules(import_module("swimm3r.export"))
-    offered = inspect.getsource(export_command)
+def test_every_export_format_is_chosen_by_its_settings_offered_and_described():
+    kinds = {kind.__name__ for kind in get_args(ExportSettings) or (ExportSettings,)}
+    formats = {name: module for name, module in modules(export).items() if name != "settings"}
+    assert len(formats) == len(kinds)
+    assert kinds == cases(export)
+    assert all(kind in inspect.getsource(export_command) for kind in kinds)
     for name, module in formats.items():
         assert list(inspect.signature(module.export_run).parameters)[:2] == ["folder", "path"], name
-        assert f"swimm3r.export.{name}" in offered, name
-        assert f"`swimm3r.export.{name}`" in page("guides/export.md"), name
+        assert any(f"`{module.__name__}`" in row for row in rows(page("guides/export.md"))), name
 
 
 # a score
