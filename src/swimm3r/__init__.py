@@ -16,14 +16,17 @@ from typing import TYPE_CHECKING
 if TYPE_CHECKING:
     from swimm3r.cameras import Cameras
     from swimm3r.errors import Swimm3rError
+    from swimm3r.io.cameras_json import load_cameras
+    from swimm3r.io.medium_json import load_medium
     from swimm3r.localization import localize
     from swimm3r.localization.settings import LocalizationSettings
     from swimm3r.medium import Medium, MediumFit, add_water, remove_water
     from swimm3r.pipeline.presets import PRESETS, RunSettings
     from swimm3r.pipeline.run import run_pipeline
-    from swimm3r.prepare import read_frames
+    from swimm3r.prepare import load_frames, read_frames
     from swimm3r.scene.frames import Frames
     from swimm3r.scene.reconstruction import Reconstruction
+    from swimm3r.scene.reconstruction_io import load_reconstruction
     from swimm3r.scene.settings import FrameSettings
     from swimm3r.sfm import reconstruct
     from swimm3r.sfm.settings import ColmapSettings, Mast3rSettings
@@ -46,6 +49,10 @@ if TYPE_CHECKING:
 
 _HOME = {
     "Cameras": "cameras",
+    "load_cameras": "io.cameras_json",
+    "load_frames": "prepare",
+    "load_medium": "io.medium_json",
+    "load_reconstruction": "scene.reconstruction_io",
     "Frames": "scene.frames",
     "Swimm3rError": "errors",
     "FrameSettings": "scene.settings",
@@ -100,7 +107,11 @@ __all__ = [
     "UwbsSettings",
     "WaterSplattingSettings",
     "add_water",
+    "load_cameras",
+    "load_frames",
     "load_map",
+    "load_medium",
+    "load_reconstruction",
     "localize",
     "mcmc_gs",
     "read_frames",

@@ -10,13 +10,20 @@ follows COLMAP's models, for (x, y) on the plane z = 1, r^2 = x^2 + y^2 and thet
     OPENCV_FISHEYE (k1, k2, k3, k4)    (x, y) theta / r (1 + k1 theta^2 + k2 theta^4 + k3 theta^6 + k4 theta^8)
 """
 
+import json
+import math
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
+from pathlib import Path
 from typing import Literal, Protocol, get_args, runtime_checkable
 
 import numpy as np
 import torch
 from jaxtyping import Bool, Float, Int
 from torch import Tensor
+
+from swimm3r.io.files.atomic import write_text
+from swimm3r.io.files.safe_names import check_names
 
 CameraModel = Literal["PINHOLE", "SIMPLE_RADIAL", "OPENCV", "OPENCV_FISHEYE"]
 DISTORTION_PARAMETERS: dict[str, tuple[str, ...]] = {
@@ -62,6 +69,16 @@ class Cameras:
             index = [index]
         return replace(self, K=self.K[index], distortion=self.distortion[index], cam2world=self.cam2world[index])
 
+    def __repr__(self) -> str:
+        size = f"{self.width}x{self.height}"
+        if not len(self):
+            return f"Cameras(none, {size}, {self.model})"
+        fx, fy = self.K[:, [0, 1], [0, 1]].double().mean(0).tolist()
+        across, down = (math.degrees(2 * math.atan2(n, 2 * f)) for n, f in ((self.width, fx), (self.height, fy)))
+        # of a fisheye lens the angle would be another
+        view = "" if self.model == "OPENCV_FISHEYE" else f", {across:.0f}x{down:.0f} degrees"
+        return f"Cameras({len(self)} of {size}, {self.model}, focal length {fx:.1f} px{view})"
+
     @property
     def world2cam(self) -> Float[Tensor, "c 4 4"]:
         """Inverse poses."""
@@ -81,6 +98,48 @@ class Cameras:
         scale = min(1.0, long_side / max(self.width, self.height)) if long_side else 1.0
         small = resized(self, max(2, round(self.width * scale)), max(2, round(self.height * scale)))
         return replace(small, distortion=small.distortion[:, :0], model="PINHOLE")
+
+    def save(
+        self,
+        path: str | Path,
+        names: Sequence[str] | None = None,
+        times: Sequence[float] | None = None,
+        units: str = "scene units",
+    ) -> None:
+        """Write a cameras.json (layout: `io.cameras_json`), whole or not at all; `swimm3r.load_cameras` reads it.
+
+        Without `names` the cameras are numbered; `times` are seconds since the start of the clip. Raises ValueError
+        where the cameras are none (`check_cameras`), or not as many as the names.
+        """
+        names = [f"{i:06d}" for i in range(len(self))] if names is None else names
+        check_names(names)
+        check_cameras(self)
+        lenses = [_intrinsics(self, i) for i in range(len(self))]
+        shared = lenses[0] if lenses and all(lens == lenses[0] for lens in lenses) else None
+        document = {
+            "width": self.width,
+            "height": self.height,
+            "model": self.model,
+            **(shared or {}),
+            "units": units,
+            "convention": "OpenCV camera axes, camera-to-world; center of the first pixel at (0.5, 0.5)",
+            "frames": [
+                {
+                    "name": name,
+                    **({} if times is None else {"time": times[i]}),
+                    "c2w": pose,
+                    **({} if shared else lenses[i]),
+                }
+                for i, (name, pose) in enumerate(zip(names, self.cam2world.tolist(), strict=True))
+            ],
+        }
+        write_text(Path(path), json.dumps(document, indent=1) + "\n")
+
+
+def _intrinsics(cameras: Cameras, i: int) -> dict[str, float | list[float]]:
+    """The entries of one camera's lens in a cameras.json."""
+    (fx, _, cx), (_, fy, cy), _ = cameras.K[i].tolist()
+    return {"fx": fx, "fy": fy, "cx": cx, "cy": cy, "distortion": cameras.distortion[i].tolist()}
 
 
 @runtime_checkable  # so that the suite can check calls against it

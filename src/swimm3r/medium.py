@@ -7,12 +7,18 @@ when the reconstruction is metric, else in its own unit; the coefficients are pe
 the medium was fitted in.
 """
 
+import json
+from collections.abc import Mapping
 from dataclasses import dataclass, replace
+from pathlib import Path
 from typing import Literal
 
 import torch
 from jaxtyping import Bool, Float
 from torch import Tensor
+
+from swimm3r import notebook
+from swimm3r.io.files.atomic import write_text
 
 Encoding = Literal["srgb", "linear"]
 Estimator = Literal["Sea-Thru", "physics head"]
@@ -26,6 +32,27 @@ class Medium:
     beta_D: Float[Tensor, "*#pixels 3"]  # attenuation of the scene's light, 1/unit of ray depth
     beta_B: Float[Tensor, "*#pixels 3"]  # build-up of backscatter, 1/unit of ray depth
 
+    def save(self, path: str | Path) -> None:
+        """Write the coefficients of a scene as JSON, whole or not at all; `swimm3r.load_medium` reads them in float32.
+
+        Raises ValueError for a medium per pixel.
+        """
+        if self.Binf.shape != (3,):
+            raise ValueError(
+                f"a medium of one scene has 3 values per coefficient, got the shape {list(self.Binf.shape)}"
+            )
+        write_text(Path(path), json.dumps(_plain(self), indent=2) + "\n")
+
+    def __repr__(self) -> str:
+        return f"Medium({_coefficients(self)})" if self.Binf.shape == (3,) else notebook.shapes(self)
+
+    def _repr_html_(self) -> str:
+        if self.Binf.shape == (3,):
+            return notebook.table("Medium", _rows(self, "per unit of ray depth"), _HEADER)
+        mean = Medium(*(values.flatten(0, -2).mean(0) for values in vars(self).values()))
+        title = f"Medium per pixel, {list(self.Binf.shape[:-1])}: means"
+        return notebook.table(title, _rows(mean, "per unit of ray depth"), _HEADER)
+
 
 @dataclass(frozen=True)
 class AttenuationCurve:
@@ -38,6 +65,9 @@ class AttenuationCurve:
     b: Float[Tensor, "*#pixels 3"]  # 1/unit
     c: Float[Tensor, "*#pixels 3"]  # 1/unit
     d: Float[Tensor, "*#pixels 3"]  # 1/unit
+
+    def __repr__(self) -> str:
+        return notebook.shapes(self)
 
     def at(self, ray_depth: Float[Tensor, "*pixels"]) -> Float[Tensor, "*pixels 3"]:
         """beta_D at each depth, 1/unit."""
@@ -71,6 +101,69 @@ class MediumFit:
     def constant(self) -> Medium:
         """The three numbers per channel alone, without the curve."""
         return Medium(self.Binf, self.beta_D, self.beta_B)
+
+    def save(self, path: str | Path) -> None:
+        """Write a medium.json that holds this fit, whole or not at all; `swimm3r.load_medium` reads it."""
+        save_fits(Path(path), {"linear" if self.encoding == "linear" else "stored": self})
+
+    def __repr__(self) -> str:
+        near, far = self.z_range
+        about = f"{self.encoding}, ray depths {near:.3g} to {far:.3g}, by {self.estimator}"
+        return f"MediumFit({_coefficients(self)},\n  {about})"
+
+    def _repr_html_(self) -> str:
+        return self.table("per unit of ray depth")
+
+    def table(self, unit: str) -> str:
+        """An HTML table of the coefficients with their standard deviations; `unit` is that of the betas."""
+        rows = _rows(self, unit)
+        near, far = self.z_range
+        title = f"Water by {self.estimator}, {self.encoding} values, ray depths {near:.3g} to {far:.3g}"
+        bracketed = not all(bool(flags.all()) for flags in self.identifiable.values())
+        return notebook.table(title + "; in brackets: not determined" * bracketed, rows, _HEADER)
+
+
+_HEADER = ("", "red", "green", "blue")
+_LABELS = {"Binf": "veiling light Binf", "beta_D": "attenuation beta_D", "beta_B": "backscatter beta_B"}
+
+
+def _coefficients(water: Medium | MediumFit) -> str:
+    """Binf, beta_D and beta_B of a scene in a line."""
+    return ", ".join(f"{name}={notebook.channels(getattr(water, name).tolist())}" for name in _LABELS)
+
+
+def _rows(water: Medium | MediumFit, unit: str) -> list[tuple[str, ...]]:
+    """The rows of a table: a coefficient and its values, with what a fit knows about them."""
+    rows = []
+    for name, label in _LABELS.items():
+        cells = [f"{value:.3f}" for value in getattr(water, name).tolist()]
+        if isinstance(water, MediumFit):
+            std, known = getattr(water.std, name).tolist(), water.identifiable[name].tolist()
+            cells = [f"{cell} \u00b1 {each:.3f}" for cell, each in zip(cells, std, strict=True)]
+            cells = [cell if sure else f"({cell})" for cell, sure in zip(cells, known, strict=True)]
+        rows.append((label if name == "Binf" else f"{label}, {unit}", *cells))
+    return rows
+
+
+def save_fits(path: Path, fits: Mapping[str, MediumFit]) -> None:
+    """Write a medium.json of named fits ("stored", "linear"); lists are R, G, B."""
+    document = {
+        name: {
+            "medium": _plain(fit.constant()),
+            "curve": _plain(fit.curve),
+            "std": _plain(fit.std),
+            "identifiable": {key: flags.tolist() for key, flags in fit.identifiable.items()},
+            "z_range": list(fit.z_range),
+            "encoding": fit.encoding,
+            "estimator": fit.estimator,
+        }
+        for name, fit in fits.items()
+    }
+    write_text(path, json.dumps(document, indent=2) + "\n")
+
+
+def _plain(record: Medium | AttenuationCurve) -> dict[str, list[float]]:
+    return {name: value.tolist() for name, value in vars(record).items()}
 
 
 def transmittances(

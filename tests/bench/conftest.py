@@ -9,7 +9,6 @@ import torch
 from swimm3r.cameras import pixel_grid, unproject
 from swimm3r.pipeline.presets import PRESETS, to_yaml
 from swimm3r.prepare import read_frames
-from swimm3r.scene import reconstruction
 from swimm3r.scene.ground_truth import FOLDER, read_ground_truth
 from swimm3r.scene.reconstruction import DepthMap, DepthMaps, Matches, Points, Reconstruction, Tracks
 from swimm3r.scene.settings import FrameSettings
@@ -51,7 +50,7 @@ def run(tmp_path_factory: pytest.TempPathFactory) -> Path:
         Tracks(none, none, torch.zeros(0, 2, dtype=torch.float64)),
         Matches(none, none, torch.zeros(0, 2), torch.zeros(0, 2), torch.zeros(0)), depth, "truth", metric=True,
     )  # fmt: skip
-    reconstruction.save(rec, frames, out / "sfm")
+    rec.save(out / "sfm", frames)
     about = {
         "schema": 1,
         "input": {"path": str(folder / "dive"), "fingerprint": "f"},

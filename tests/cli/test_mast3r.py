@@ -9,7 +9,7 @@ import pytest
 import torch
 
 from swimm3r.cli.main import main
-from swimm3r.scene import reconstruction
+from swimm3r.scene.reconstruction_io import load_reconstruction
 from swimm3r.sfm.mast3r import checkpoint
 from swimm3r.sfm.mast3r.network import Architecture, Mast3r
 from swimm3r.synthetic import DiveSettings, write_dive
@@ -66,7 +66,7 @@ def test_a_checkpoint_goes_from_the_clip_to_the_record(
     summary = json.loads((run / "summary.json").read_text())
     assert summary["sfm"]["backend"] == "mast3r"
     assert summary["sfm"]["registered"] == summary["sfm"]["frames"] == 4
-    rec = reconstruction.load(run / "sfm")
+    rec = load_reconstruction(run / "sfm")
     assert len(rec.matches.i) > 0
     assert (rec.cameras.width, rec.cameras.height) == (64, 48)
     assert "graph: video-2-1" in (run / "settings.yaml").read_text()

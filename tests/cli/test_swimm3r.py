@@ -9,7 +9,7 @@ import torch
 from swimm3r.cli.main import main
 from swimm3r.io import medium_json
 from swimm3r.io.files.damage import remake
-from swimm3r.scene import reconstruction
+from swimm3r.scene.reconstruction_io import load_reconstruction
 from swimm3r.sfm.mast3r import checkpoint
 from swimm3r.sfm.mast3r.network import Architecture, Mast3r
 from swimm3r.synthetic import DiveSettings, write_dive
@@ -57,7 +57,7 @@ def test_the_students_water_restores_the_dive(place: Path, tmp_path: Path, capsy
     assert code == 0, said
     summary = json.loads((run / "summary.json").read_text())
     assert summary["sfm"]["backend"] == "swimm3r"
-    rec = reconstruction.load(run / "sfm")
+    rec = load_reconstruction(run / "sfm")
     assert len(list((run / "sfm" / "water").glob("*.npz"))) == len(rec.names) == 4
     fit = medium_json.read_fits(run / "sfm" / "medium.json", remake(run / "sfm"))["stored"]
     assert ((fit.Binf > 0) & (fit.Binf < 1)).all()

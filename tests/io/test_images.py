@@ -1,5 +1,6 @@
 """Images keep their bits, stand upright, and say which file is broken."""
 
+import base64
 from pathlib import Path
 
 import cv2
@@ -9,7 +10,7 @@ import tifffile
 from PIL import Image
 
 from swimm3r.errors import InputError
-from swimm3r.io.images import image_size, read_mask, read_rgb, write_rgb
+from swimm3r.io.images import image_size, jpeg_uri, read_mask, read_rgb, write_rgb
 
 GRADIENT = np.stack(np.meshgrid(np.arange(24) * 10, np.arange(16) * 15), -1).astype(np.uint8)
 RGB = np.concatenate([GRADIENT, np.full((16, 24, 1), 77, np.uint8)], -1)
@@ -162,3 +163,12 @@ def test_sixteen_bit_lzw_tiff_stands_upright(tmp_path):
     Image.fromarray(RGB16[..., 0]).save(tmp_path / "p.tif", compression="tiff_lzw", tiffinfo={274: 6})
     read = read_rgb(tmp_path / "p.tif")
     np.testing.assert_array_equal(read, np.rot90(RGB16[..., [0, 0, 0]], -1))
+
+
+def test_an_image_in_a_page_is_its_own_data_scaled_to_fit():
+    image = np.zeros((300, 800, 3), np.uint8)
+    image[..., 0] = 200
+    uri = jpeg_uri(image, long_side=400)
+    stored = cv2.imdecode(np.frombuffer(base64.b64decode(uri.split(",")[1]), np.uint8), cv2.IMREAD_COLOR)
+    assert stored.shape == (150, 400, 3)
+    assert abs(int(stored[70, 200, 2]) - 200) <= 2  # BGR

@@ -27,8 +27,8 @@ from swimm3r.pipeline.presets import MAST3R_PRESETS, PRESETS, RunSettings, from_
 from swimm3r.pipeline.renders import KINDS, render_run
 from swimm3r.pipeline.run import evaluate_run, run_pipeline
 from swimm3r.prepare import load_frames
-from swimm3r.scene import reconstruction
 from swimm3r.scene.ground_truth import read_ground_truth
+from swimm3r.scene.reconstruction_io import load_reconstruction
 from swimm3r.sfm.settings import ColmapModelSettings
 from swimm3r.splat.settings import (
     DensifySettings,
@@ -94,7 +94,7 @@ def test_the_run_folder_holds_what_the_conventions_promise(finished: tuple[Path,
         assert (folder / name).stat().st_size > 0, name
     for name in ("cameras.json", "matches.npz", "medium.json", "points.ply", "points_raw.ply", "sparse/images.bin"):
         assert (folder / "sfm" / name).stat().st_size > 0, name
-    frames, names = load_frames(folder / "prepare"), reconstruction.load(folder / "sfm").names
+    frames, names = load_frames(folder / "prepare"), load_reconstruction(folder / "sfm").names
     table = json.loads((folder / "sfm" / "cameras.json").read_text())["frames"]
     assert {entry["name"]: entry["time"] for entry in table} == dict(zip(names, frames.times_of(names), strict=True))
     trajectory = np.loadtxt(folder / "sfm" / "trajectory.tum")
@@ -170,7 +170,7 @@ def test_scores_by_another_protocol_stand_beside_the_runs_own(dive: Path, finish
 
 def test_the_test_frames_are_localized_in_the_map(dive: Path, finished: tuple[Path, dict], tmp_path: Path):
     answers, out = localize_run(finished[0], out=tmp_path / "places", settings=LocalizationSettings(matcher="sift"))
-    frames, rec = load_frames(finished[0] / "prepare"), reconstruction.load(finished[0] / "sfm")
+    frames, rec = load_frames(finished[0] / "prepare"), load_reconstruction(finished[0] / "sfm")
     assert [a.name for a in answers] == list(frames.test.names)
     record = json.loads((out / "poses.json").read_text())
     assert record["located"] == len(answers)
@@ -246,7 +246,7 @@ def test_test_frames_never_reach_structure_from_motion(finished: tuple[Path, dic
     frames = json.loads((folder / "prepare" / "frames.json").read_text())["frames"]
     held_back = {frame["name"] for frame in frames if frame["split"] == "test"}
     assert len(held_back) == 2
-    assert not held_back & set(reconstruction.load(folder / "sfm").names)
+    assert not held_back & set(load_reconstruction(folder / "sfm").names)
 
 
 def test_the_report_needs_no_network(finished: tuple[Path, dict]):
@@ -339,7 +339,7 @@ def test_a_killed_run_goes_on(marker: str, dive: Path, finished: tuple[Path, dic
     before = digests(folder / "prepare")
     run_pipeline(dive, folder, PRESETS["fast"], last_stage="sfm")
     assert digests(folder / "prepare") == before
-    again, first = (reconstruction.load(f / "sfm") for f in (folder, finished[0]))
+    again, first = (load_reconstruction(f / "sfm") for f in (folder, finished[0]))
     assert again.names == first.names
     assert absolute_pose_errors(again.cameras.cam2world, first.cameras.cam2world).rotation_deg < 0.05
     assert torch.isfinite(again.cloud.xyz).all()

@@ -1,8 +1,5 @@
 """The page's charts and images."""
 
-import base64
-
-import cv2
 import numpy as np
 import pytest
 
@@ -24,15 +21,6 @@ def test_a_curve_is_dashed_beyond_what_was_seen():
     assert svg.count("<polyline") == 2
     assert svg.count("stroke-dasharray") == 1
     assert ">z<" in svg
-
-
-def test_a_image_is_its_own_data_scaled_to_fit():
-    image = np.zeros((300, 800, 3), np.uint8)
-    image[..., 0] = 200
-    uri = charts.image(image, long_side=400)
-    stored = cv2.imdecode(np.frombuffer(base64.b64decode(uri.split(",")[1]), np.uint8), cv2.IMREAD_COLOR)
-    assert stored.shape == (150, 400, 3)
-    assert abs(int(stored[70, 200, 2]) - 200) <= 2  # BGR
 
 
 def test_near_is_warm_far_is_cold_and_unknown_is_gray():

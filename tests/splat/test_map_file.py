@@ -13,7 +13,7 @@ from swimm3r.errors import InputError
 from swimm3r.io.files.damage import remake
 from swimm3r.io.files.tensor_file import read_tensors, write_tensors
 from swimm3r.settings_document import from_document, to_document
-from swimm3r.splat.map_file import load_map, save_map
+from swimm3r.splat.map_file import load_map
 from swimm3r.splat.settings import RenderSettings, UwbsSettings
 from swimm3r.splat.training.checkpoint import StateHeader, read_state, write_state
 from swimm3r.splat.training_poses import RefinedPoses
@@ -44,7 +44,7 @@ def test_a_file_that_is_no_map_is_refused(tmp_path, wall):
     write_tensors(path, {"x": torch.zeros(2)}, {"schema": 2, "recipe": "splatfacto"})
     with pytest.raises(InputError, match="not a map"):
         load_map(path)
-    save_map(path, wall(10))
+    wall(10).save(path)
     path.write_bytes(path.read_bytes()[:-100])
     with pytest.raises(InputError, match="not a map"):
         load_map(path)
@@ -103,7 +103,7 @@ def rewritten(path: Path, tensors: dict[str, Tensor], about: dict[str, Any]) -> 
 def test_a_map_that_is_damaged_is_refused(tmp_path, wall, tensors, about, said):
     path = tmp_path / "map.safetensors"
     poses = RefinedPoses(("a.png", "b.png"), torch.eye(4, dtype=torch.float64).repeat(2, 1, 1))
-    save_map(path, replace(wall(10), poses=poses))
+    replace(wall(10), poses=poses).save(path)
     load_map(path)
     rewritten(path, tensors, about)
     with pytest.raises(InputError, match=said) as raised:

@@ -18,7 +18,6 @@ from pathlib import Path
 from swimm3r.cameras import Cameras
 from swimm3r.errors import InputError, RegistrationError
 from swimm3r.evaluate import NotComputed
-from swimm3r.io import cameras_json
 from swimm3r.io.files.atomic import write_text
 from swimm3r.io.files.cache_key import cache_key, code_version
 from swimm3r.pipeline.run import FinishedSfm
@@ -83,18 +82,7 @@ def whole_clip(
     except RegistrationError as error:
         failed = f"no reference: {error.what}"
     else:
-        table = cameras_json.CameraTable(
-            names=found.names,
-            width=found.cameras.width,
-            height=found.cameras.height,
-            model=found.cameras.model,
-            K=found.cameras.K.numpy(),
-            distortion=found.cameras.distortion.numpy(),
-            cam2world=found.cameras.cam2world.numpy(),
-            units="scene units",
-            times=frames.times_of(found.names),
-        )
-        cameras_json.write_cameras(cameras, table)
+        found.cameras.save(cameras, found.names, frames.times_of(found.names))
     shutil.rmtree(folder / "work", ignore_errors=True)
     write_text(record, json.dumps({"key": key, "failed": failed, "frames": len(frames)}, indent=2) + "\n")
     return NotComputed(failed) if failed else read_ground_truth(cameras)

@@ -14,10 +14,10 @@ from swimm3r.evaluate.poses import pose_scores
 from swimm3r.pipeline.run_settings import with_poses_of
 from swimm3r.pipeline.summary import match_errors
 from swimm3r.progress import Progress
-from swimm3r.scene import reconstruction
 from swimm3r.scene.frames import Frames
 from swimm3r.scene.ground_truth import GroundTruth
 from swimm3r.scene.reconstruction import Matches, Reconstruction
+from swimm3r.scene.reconstruction_io import unfiltered_matches
 from swimm3r.sfm.medium.dense_tracks import count_tracks
 from swimm3r.sfm.settings import ColmapModelSettings, ColmapSettings, Mast3rSettings, SfmSettings, TrackSettings
 
@@ -54,7 +54,7 @@ class Uncapped:
     @staticmethod
     def of(folder: Path, rec: Reconstruction, frames: Frames, tracks: TrackSettings, progress: Progress) -> "Uncapped":
         """Of a run's sfm folder; the dense points are counted over every pixel of known depth."""
-        return Uncapped(reconstruction.unfiltered_matches(folder, rec), count_tracks(rec, frames, tracks, progress))
+        return Uncapped(unfiltered_matches(folder, rec), count_tracks(rec, frames, tracks, progress))
 
 
 def model_scores(

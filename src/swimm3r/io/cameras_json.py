@@ -3,19 +3,17 @@
     {"width", "height", "model", "fx", "fy", "cx", "cy", "distortion": [...], "units", "convention",
      "frames": [{"name", "time", "c2w": 4x4 or 3x4}]}
 
-`time` is in seconds since the start of the clip, and absent where it is not known.
+`Cameras.save` writes it. `time` is in seconds since the start of the clip, and absent where it is not known.
 
 Another distortion key is read too: dist_k1_k2_p1_p2_k3, whose k3 is dropped: it is no part of COLMAP's OPENCV model.
 """
 
-import json
 from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
 
-from swimm3r.cameras import cameras_of, check_cameras, check_lens
-from swimm3r.io.files.atomic import write_text
+from swimm3r.cameras import Cameras, cameras_of, check_cameras, check_lens
 from swimm3r.io.files.damage import Remedy, guard
 from swimm3r.io.files.json_file import read_json
 from swimm3r.io.files.safe_names import check_names
@@ -46,40 +44,6 @@ class CameraTable:
         check_cameras(cameras_of(self))
 
 
-def write_cameras(path: Path, table: CameraTable) -> None:
-    """Write a table; intrinsics that differ between frames are repeated inside each frame."""
-    shared = bool(np.ptp(table.K, axis=0).max() == 0 and np.all(np.ptp(table.distortion, axis=0) == 0))
-
-    def intrinsics(i: int) -> dict[str, float | list[float]]:
-        K = table.K[i]
-        return {
-            "fx": float(K[0, 0]),
-            "fy": float(K[1, 1]),
-            "cx": float(K[0, 2]),
-            "cy": float(K[1, 2]),
-            "distortion": table.distortion[i].tolist(),
-        }
-
-    document = {
-        "width": table.width,
-        "height": table.height,
-        "model": table.model,
-        **(intrinsics(0) if shared else {}),
-        "units": table.units,
-        "convention": "OpenCV camera axes, camera-to-world; center of the first pixel at (0.5, 0.5)",
-        "frames": [
-            {
-                "name": name,
-                **({} if table.times is None else {"time": table.times[i]}),
-                "c2w": pose.tolist(),
-                **({} if shared else intrinsics(i)),
-            }
-            for i, (name, pose) in enumerate(zip(table.names, table.cam2world, strict=True))
-        ],
-    }
-    write_text(path, json.dumps(document, indent=1) + "\n")
-
-
 @dataclass(frozen=True)
 class _Lens:
     """Intrinsics of a frame, or of every frame that has none of its own."""
@@ -106,6 +70,14 @@ class _Document(_Lens):
     height: int
     frames: tuple[_Frame, ...]
     units: str = "scene units"
+
+
+def load_cameras(path: str | Path) -> Cameras:
+    """The cameras that `Cameras.save` wrote, in the file's order; `read_cameras` tells their names and times, too.
+
+    Raises InputError where the file is no cameras.json.
+    """
+    return cameras_of(read_cameras(Path(path)))
 
 
 def read_cameras(path: Path, remedy: Remedy = _REMEDY) -> CameraTable:

@@ -4,6 +4,7 @@ Arrays are [h, w, 3] RGB, upright (the EXIF orientation is applied), in the dept
 and tifffile decode, for Pillow turns 16-bit color into 8 bits without a word.
 """
 
+import base64
 import io
 from pathlib import Path
 from typing import Any
@@ -71,6 +72,18 @@ def write_rgb_16(path: Path, image: Float[np.ndarray, "h w 3"]) -> None:
 def write_mask(path: Path, usable: Bool[np.ndarray, "h w"]) -> None:
     """Write a mask as a PNG of 255 where the frame may be used and 0 elsewhere, whole or not at all."""
     _write_png(path, usable.astype(np.uint8) * 255)
+
+
+def jpeg_uri(image: UInt8[np.ndarray, "h w 3"], long_side: int = 640, quality: int = 88) -> str:
+    """A data URI for a page: a JPEG of the image, scaled down to at most `long_side` pixels."""
+    import cv2
+
+    height, width = image.shape[:2]
+    scale = min(1.0, long_side / max(height, width))
+    size = (max(1, round(width * scale)), max(1, round(height * scale)))
+    small = cv2.resize(np.ascontiguousarray(image), size, interpolation=cv2.INTER_AREA)
+    encoded = cv2.imencode(".jpg", small[..., ::-1], [cv2.IMWRITE_JPEG_QUALITY, quality])[1]
+    return "data:image/jpeg;base64," + base64.b64encode(encoded.tobytes()).decode()
 
 
 def _write_png(path: Path, stored: np.ndarray) -> None:

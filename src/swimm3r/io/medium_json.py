@@ -1,38 +1,23 @@
-"""medium.json: the fitted water, per encoding, with its uncertainty."""
+"""medium.json read back: the fitted water per encoding with its uncertainty, or bare coefficients.
 
-import json
+`medium.save_fits` writes the first, `Medium.save` the second.
+"""
+
 from dataclasses import dataclass
 from pathlib import Path
+from typing import Literal
 
 import torch
 
-from swimm3r.io.files.atomic import write_text
-from swimm3r.io.files.damage import Remedy
-from swimm3r.io.files.json_file import read_json
+from swimm3r.io.files.damage import Remedy, guard
+from swimm3r.io.files.json_file import decode, structure
 from swimm3r.medium import AttenuationCurve, Encoding, Estimator, Medium, MediumFit
 
-
-def write_fits(path: Path, fits: dict[str, MediumFit]) -> None:
-    """Write named fits ("stored", "linear"); lists are R, G, B."""
-
-    def plain(record: Medium | AttenuationCurve) -> dict[str, list[float]]:
-        return {name: value.tolist() for name, value in vars(record).items()}
-
-    document = {
-        name: {
-            "medium": plain(fit.constant()),
-            "curve": plain(fit.curve),
-            "std": plain(fit.std),
-            "identifiable": {key: flags.tolist() for key, flags in fit.identifiable.items()},
-            "z_range": list(fit.z_range),
-            "encoding": fit.encoding,
-            "estimator": fit.estimator,
-        }
-        for name, fit in fits.items()
-    }
-    write_text(path, json.dumps(document, indent=2) + "\n")
-
-
+_REMEDY = Remedy(
+    "RUN/sfm/medium.json of any run is an example",
+    cause="it is of another format, or a crash or an editor damaged it",
+    fault="is not a medium.json",
+)
 _Channels = tuple[float, float, float]
 _Flags = tuple[bool, bool, bool]
 
@@ -80,8 +65,31 @@ class _Fit:
             raise ValueError(f"a range of depths grows from 0 on, got {list(self.z_range)}")
 
 
+def load_medium(path: str | Path, name: Literal["stored", "linear"] | None = None) -> Medium | MediumFit:
+    """The medium that `MediumFit.save` or `Medium.save` wrote, or that a run keeps in RUN/sfm/medium.json.
+
+    Of several fits in a file the one of that `name`: on pixel values as stored (by default), or in linear light.
+    Raises InputError where the file holds no such medium.
+    """
+    path = Path(path)
+    with guard(path, _REMEDY):
+        document = decode(path.read_bytes())
+        if isinstance(document, dict) and "Binf" in document and name is None:
+            return structure(document, MediumRecord).medium()
+        fits = _fits(document)
+        if not fits or name not in (None, *fits):
+            raise ValueError(f"it holds no medium named {name}" if name else "it holds no medium")
+        return fits[name or ("stored" if "stored" in fits else next(iter(fits)))]
+
+
 def read_fits(path: Path, remedy: Remedy) -> dict[str, MediumFit]:
-    """Read what `write_fits` wrote. Raises the remedy's error, which names the file and the fault."""
+    """Read what `medium.save_fits` wrote. Raises the remedy's error, which names the file and the fault."""
+    with guard(path, remedy):
+        return _fits(decode(path.read_bytes()))
+
+
+def _fits(document: object) -> dict[str, MediumFit]:
+    """The fits of a decoded medium.json. Raises ValueError that names the place of the fault."""
 
     def tensors(record: _Curve | _Identifiable) -> dict[str, torch.Tensor]:
         return {name: torch.tensor(values) for name, values in vars(record).items()}
@@ -96,5 +104,5 @@ def read_fits(path: Path, remedy: Remedy) -> dict[str, MediumFit]:
             encoding=fit.encoding,
             estimator=fit.estimator,
         )
-        for name, fit in read_json(path, dict[str, _Fit], remedy).items()
+        for name, fit in structure(document, dict[str, _Fit]).items()
     }

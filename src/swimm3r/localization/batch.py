@@ -26,7 +26,7 @@ from swimm3r.localization.localizer import STAGES, Evidence, Localization, Local
 from swimm3r.localization.settings import LocalizationSettings
 from swimm3r.prepare import load_frames
 from swimm3r.progress import Progress, silent
-from swimm3r.scene import reconstruction
+from swimm3r.scene.reconstruction_io import load_reconstruction
 from swimm3r.scene.run_folder import open_run
 from swimm3r.splat.map_file import load_map
 
@@ -74,7 +74,7 @@ def localize_run(
     open_run(folder, "splat")
     scene = load_map(folder / "splat" / "map.safetensors").to(devices.for_maps())
     frames = load_frames(folder / "prepare")
-    rec = reconstruction.load(folder / "sfm", frames)
+    rec = load_reconstruction(folder / "sfm", frames)
     localizer = Localizer(scene, rec, frames, settings)
     out = out or folder / "localization"
     answers = []

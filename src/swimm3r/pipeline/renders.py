@@ -28,9 +28,9 @@ from swimm3r.medium import transmittances
 from swimm3r.prepare import load_frames
 from swimm3r.progress import Progress, silent
 from swimm3r.report.charts import depth_image
-from swimm3r.scene import reconstruction
 from swimm3r.scene.frames import Frames
 from swimm3r.scene.reconstruction import Reconstruction
+from swimm3r.scene.reconstruction_io import load_reconstruction
 from swimm3r.scene.run_folder import open_run
 from swimm3r.settings import ClipSecond, CountOrZero, LongSideOrOwn, accepted
 from swimm3r.sfm.medium.restore import keep_open_water, shown_gains
@@ -171,7 +171,7 @@ def render_run(
     open_run(folder, "splat")
     scene = load_map(folder / "splat" / "map.safetensors").to(devices.for_maps())
     frames = load_frames(folder / "prepare")
-    rec = reconstruction.load(folder / "sfm", frames)
+    rec = load_reconstruction(folder / "sfm", frames)
     refined = folder / "splat" / "cameras.json"
     own = refined if refined.is_file() else folder / "sfm" / "cameras.json"
     table = cameras_json.read_cameras(cameras or own)

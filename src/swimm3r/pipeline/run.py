@@ -23,10 +23,10 @@ from swimm3r.pipeline.scoring import MappedRun, Protocol, film_flight, score_map
 from swimm3r.prepare import check_source, load_frames, read_frames
 from swimm3r.progress import Progress, silent
 from swimm3r.report import write_report
-from swimm3r.scene import reconstruction
 from swimm3r.scene.frames import Frames
 from swimm3r.scene.ground_truth import GroundTruth
 from swimm3r.scene.reconstruction import Reconstruction
+from swimm3r.scene.reconstruction_io import load_reconstruction, unfiltered_matches
 from swimm3r.scene.run_folder import open_run
 from swimm3r.sfm import reconstruct
 from swimm3r.splat import train
@@ -106,8 +106,8 @@ def _make_stages(
     record.stage(
         "sfm", keys["sfm"], make=lambda: reconstruct(frames, settings.sfm, folder / "sfm", progress), reuse=lambda: None
     )
-    rec = reconstruction.load(folder / "sfm", frames)
-    record.add(sections.sfm_sections(rec, frames, reconstruction.unfiltered_matches(folder / "sfm", rec)))
+    rec = load_reconstruction(folder / "sfm", frames)
+    record.add(sections.sfm_sections(rec, frames, unfiltered_matches(folder / "sfm", rec)))
     if last_stage == "sfm":
         return
 
@@ -147,7 +147,7 @@ def open_finished_sfm(folder: Path, reference: Path | None = None) -> FinishedSf
     frames = load_frames(folder / "prepare")
     return FinishedSfm(
         frames,
-        reconstruction.load(folder / "sfm", frames),
+        load_reconstruction(folder / "sfm", frames),
         from_yaml(folder / "settings.yaml"),
         truth_of(Path(run.input.path), reference),
         run.stages["sfm"].key,
@@ -177,7 +177,7 @@ def evaluate_run(
         record.summary |= before.sections
         scene = load_map(folder / "splat" / "map.safetensors").to(devices.for_maps())
         frames = load_frames(folder / "prepare")
-        run = MappedRun(folder, frames, reconstruction.load(folder / "sfm", frames), scene, settings)
+        run = MappedRun(folder, frames, load_reconstruction(folder / "sfm", frames), scene, settings)
         truth = truth_of(source, asked.reference)
         if beside := asked.key_beside(own):
             record.add_protocol(beside, _other_scores(run, asked, truth, f"renders/protocols/{beside}", progress))

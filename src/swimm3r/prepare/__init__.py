@@ -30,7 +30,7 @@ def read_frames(
     return frames_folder.read_frames(source, settings, folder, progress, **changes)
 
 
-def load_frames(folder: Path) -> "swimm3r.scene.frames.Frames":
+def load_frames(folder: str | Path) -> "swimm3r.scene.frames.Frames":
     """Load the frames that `read_frames` prepared in a folder. Raises InputError where they are incomplete."""
     from swimm3r.prepare import frames_folder
 

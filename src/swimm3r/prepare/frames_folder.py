@@ -4,7 +4,6 @@ The folder appears when it is complete, and not before. frames.json holds name, 
 frame, and width, height, ordered, gray, masks (how many are used and unused), source and warnings of them all.
 """
 
-import json
 import logging
 import os
 import shutil
@@ -16,7 +15,7 @@ from typing import Any, Literal
 
 from swimm3r.errors import InputError
 from swimm3r.io import images
-from swimm3r.io.files.atomic import DRAFT, write_text
+from swimm3r.io.files.atomic import DRAFT
 from swimm3r.io.files.cache_key import cache_key, stat_digest
 from swimm3r.io.files.damage import guard, remake
 from swimm3r.io.files.json_file import read_json
@@ -27,7 +26,7 @@ from swimm3r.prepare.image_folder import images_of, only_video, prepare_stills
 from swimm3r.prepare.masks import check_masks, prepare_masks
 from swimm3r.prepare.video import prepare_clip
 from swimm3r.progress import Progress, silent
-from swimm3r.scene.frames import Frame, Frames
+from swimm3r.scene.frames import Frame, Frames, write_index
 from swimm3r.scene.settings import FrameSettings
 
 log = logging.getLogger(__name__)
@@ -186,28 +185,20 @@ def _write_frames(dive: SelectedImages, draft: Path, source: Path, settings: Fra
             "The frames are gray: their three channels are equal. The water's coefficients are those of one channel, "
             "and removing the water restores contrast, not color."
         )
-    document = {
-        "schema": 1,
-        "source": str(source.resolve()),
-        "width": size[0],
-        "height": size[1],
-        "ordered": dive.ordered,
-        "gray": gray,
-        "masks": {"used": sum(image.name in masks.places for image in kept), "unused": masks.unused},
-        "warnings": warnings,
-        "frames": [
-            {
-                "name": image.name,
-                "time": round(image.time, 6),
-                "split": "test" if i % TEST_EVERY == 0 else "train",
-                "sharpness": round(image.sharpness, 3),
-                "mask": masks.places.get(image.name),
-            }
-            for i, image in enumerate(kept)
-        ],
-    }
-    _remove_all_but(draft, {entry[key] for entry in document["frames"] for key in ("name", "mask") if entry[key]})
-    write_text(draft / "frames.json", json.dumps(document, indent=1) + "\n")
+    listed = tuple(
+        Frame(
+            name=image.name,
+            path=draft / image.name,
+            time=round(image.time, 6),
+            sharpness=round(image.sharpness, 3),
+            split="test" if i % TEST_EVERY == 0 else "train",
+            mask=draft / masks.places[image.name] if image.name in masks.places else None,
+        )
+        for i, image in enumerate(kept)
+    )
+    _remove_all_but(draft, {path for frame in listed for path in (frame.path, frame.mask)})
+    frames = Frames(listed, *size, dive.ordered, tuple(warnings), gray=gray, unused_masks=masks.unused)
+    write_index(draft, frames, str(source.resolve()))
 
 
 def _inside(folder: Path, name: str) -> Path:
@@ -219,10 +210,10 @@ def _inside(folder: Path, name: str) -> Path:
     return path
 
 
-def _remove_all_but(folder: Path, names: set[str]) -> None:
+def _remove_all_but(folder: Path, kept: set[Path | None]) -> None:
     """Drop what was written for frames that were left out in the end."""
     for path in folder.rglob("*"):
-        if path.is_file() and path.relative_to(folder).as_posix() not in names:
+        if path.is_file() and path not in kept:
             path.unlink()
 
 

@@ -9,9 +9,8 @@ from jaxtyping import Bool
 from swimm3r.errors import InputError
 from swimm3r.io import image_folder, images
 from swimm3r.prepare.candidates import SelectedImages, SourceImage, some_names
+from swimm3r.scene.frames import MASKS
 from swimm3r.scene.settings import FrameSettings
-
-FOLDER = "masks"  # of the prepared ones, within the folder of the frames
 
 
 @dataclass(frozen=True)
@@ -49,7 +48,7 @@ def prepare_masks(
         usable = _read(found[image.original], image, size)
         if not usable.any():
             covered.add(image.name)
-        places[image.name] = f"{FOLDER}/{image.name}.png"  # COLMAP's way of naming
+        places[image.name] = f"{MASKS}/{image.name}.png"  # COLMAP's way of naming
         images.write_mask(draft / places[image.name], usable)
     if unused or (found and len(places) < len(dive.images)):
         names = f" ({some_names(unused, unused[0].parent)})" if unused else ""

@@ -1,6 +1,5 @@
-"""Charts as inline SVG and images as data URIs: the page needs no script and no network."""
+"""Charts as inline SVG and images that show depth or the path: the page needs no script and no network."""
 
-import base64
 import math
 from dataclasses import dataclass
 
@@ -61,15 +60,6 @@ def ticks(largest: float) -> list[float]:
     step = 10 ** math.floor(math.log10(largest / 2))
     step *= next(m for m in (1, 2, 5, 10) if largest / (step * m) <= 5.5)
     return [round(float(step * i), 10) for i in range(int(largest / step + 1e-9) + 1)]
-
-
-def image(rgb: np.ndarray, long_side: int = 640, quality: int = 88) -> str:
-    """A data URI of an RGB uint8 image, scaled down to fit."""
-    scale = min(1.0, long_side / max(rgb.shape[:2]))
-    size = (round(rgb.shape[1] * scale), round(rgb.shape[0] * scale))
-    small = cv2.resize(np.ascontiguousarray(rgb), size, interpolation=cv2.INTER_AREA)
-    encoded = cv2.imencode(".jpg", small[..., ::-1], [cv2.IMWRITE_JPEG_QUALITY, quality])[1]
-    return "data:image/jpeg;base64," + base64.b64encode(encoded.tobytes()).decode()
 
 
 def depth_image(z_depth: np.ndarray, near: float, far: float) -> np.ndarray:

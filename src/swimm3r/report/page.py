@@ -17,9 +17,9 @@ from swimm3r.io.view_names import view_stems
 from swimm3r.medium import MediumFit, backscatter, transmittances
 from swimm3r.prepare import load_frames
 from swimm3r.report import charts
-from swimm3r.scene import reconstruction
 from swimm3r.scene.frames import Frames
 from swimm3r.scene.reconstruction import Reconstruction
+from swimm3r.scene.reconstruction_io import load_reconstruction
 from swimm3r.scene.run_folder import open_run
 from swimm3r.sfm.medium.plausibility import any_determined, attenuation_is_a_guess
 
@@ -62,7 +62,7 @@ def write(folder: Path) -> Path:
             raise ValueError("names and numbers of versions are expected")
     frames = load_frames(folder / "prepare")
     sfm = folder / "sfm"
-    rec = reconstruction.load(sfm, frames) if (sfm / "reconstruction.json").is_file() else None
+    rec = load_reconstruction(sfm, frames) if (sfm / "reconstruction.json").is_file() else None
     template = jinja2.Environment(autoescape=True, undefined=jinja2.StrictUndefined, trim_blocks=True).from_string(
         files("swimm3r.report").joinpath("page.html.j2").read_text(encoding="utf-8")
     )
@@ -112,9 +112,9 @@ def _triptychs(rec: Reconstruction, frames: Frames, folder: Path) -> list[Tripty
         rows.append(
             Triptych(
                 name,
-                charts.image(raw),
-                charts.image(images.read_rgb(restored)) if restored.is_file() else None,
-                charts.image(charts.depth_image(depths[name], near, far)) if name in depths else None,
+                images.jpeg_uri(raw),
+                images.jpeg_uri(images.read_rgb(restored)) if restored.is_file() else None,
+                images.jpeg_uri(charts.depth_image(depths[name], near, far)) if name in depths else None,
             )
         )
     return rows
@@ -128,7 +128,7 @@ def _test_rows(frames: Frames, folder: Path) -> list[TestRow]:
     for name in (names[i] for i in chosen):
         taken = (frames.image(frames.index(name)).numpy() * 255).round().astype(np.uint8)
         seen = (images.read_rgb(folder / "renders" / "test" / f"{stems[name]}_{kind}.png") for kind in _KINDS)
-        rows.append(TestRow(name, charts.image(taken, 480), *(charts.image(image, 480) for image in seen)))
+        rows.append(TestRow(name, images.jpeg_uri(taken, 480), *(images.jpeg_uri(image, 480) for image in seen)))
     return rows
 
 
@@ -168,8 +168,8 @@ def _plan(rec: Reconstruction) -> dict[str, str]:
         rec.cloud.xyz.numpy(), rec.cloud.raw.numpy(), rec.cloud.restored.numpy(), rec.cameras.cam2world.numpy()
     )
     return {
-        "raw": charts.image(view.raw, 760, 90),
-        "restored": charts.image(view.restored, 760, 90),
+        "raw": images.jpeg_uri(view.raw, 760, 90),
+        "restored": images.jpeg_uri(view.restored, 760, 90),
         "overlay": charts.path_overlay(view),
         "unit": "metres" if rec.metric else "scene units",
     }

@@ -4,6 +4,8 @@ Images stay on disk as prepared (`read_frames` makes them) and are loaded one at
 eighth frame (index % 8 == 0) is a test frame, as the paper and 3DGS count; SfM and training see `train` only.
 """
 
+import json
+import shutil
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
@@ -14,11 +16,17 @@ import torch
 from jaxtyping import Bool, Float
 from torch import Tensor
 
+from swimm3r import notebook
 from swimm3r.errors import InputError
 from swimm3r.io import images
+from swimm3r.io.files.atomic import atomic_folder, write_text
 from swimm3r.io.files.cache import ArrayCache
+from swimm3r.io.files.outputs import check_empty
 
 _CACHE = ArrayCache(max_bytes=1 << 30)  # 1 GiB of 8-bit images: 170 frames of 1080p
+MASKS = "masks"  # the folder of the masks beside the frames
+_SHOWN = 6  # frames in a notebook
+_SHOWN_PIXELS = 12e6  # decoded for it, at most
 
 
 @dataclass(frozen=True)
@@ -47,6 +55,30 @@ class Frames:
 
     def __len__(self) -> int:
         return len(self.frames)
+
+    def __repr__(self) -> str:
+        if not self.frames:
+            return f"Frames(none, {self.width}x{self.height})"
+        masked = sum(frame.mask is not None for frame in self.frames)
+        split = f"{len(self.train)} for training, {len(self.test)} for testing" + f", {masked} masked" * (masked > 0)
+        first, last = self.span
+        return (
+            f"Frames({len(self)} of {self.width}x{self.height}, {split},\n"
+            f"  {self.names[0]} to {self.names[-1]}, {first:.1f} to {last:.1f} s)"
+        )
+
+    def _repr_html_(self) -> str:
+        """A strip of a few frames, evenly spread over the dive. Raises InputError where one of them is damaged."""
+        count = min(len(self), _SHOWN, max(2, int(_SHOWN_PIXELS / (self.width * self.height))))
+        chosen = sorted({round(i) for i in np.linspace(0, len(self) - 1, count)}) if count else []
+        split = f"{len(self.train)} for training, {len(self.test)} for testing"
+        title = f"{len(self)} frames of {self.width}x{self.height}: {split}"
+        shown = [(images.jpeg_uri(self._eight_bits(i), 160, 80), self._caption(i)) for i in chosen]
+        return notebook.image_row(title, shown)
+
+    def _caption(self, i: int) -> str:
+        frame = self.frames[i]
+        return f"{frame.name}, {frame.time:.1f} s" + ", test" * (frame.split == "test")
 
     def __iter__(self) -> Iterator[Frame]:
         return iter(self.frames)
@@ -86,9 +118,7 @@ class Frames:
 
     def image(self, i: int) -> Float[Tensor, "h w 3"]:
         """Image i as stored (sRGB-encoded unless the input was linear), 0..1. Raises InputError on a damaged one."""
-        path = self.frames[i].path
-        (stored,) = _CACHE.get(_version(path), lambda: (images.read_rgb(path),))
-        self._check_size(stored, path)
+        stored = self._stored(i)
         scale = 255.0 if stored.dtype == np.uint8 else 65535.0
         return torch.from_numpy(stored.astype(np.float32)) / scale
 
@@ -101,6 +131,32 @@ class Frames:
         self._check_size(usable, path)
         return torch.from_numpy(usable.copy())
 
+    def save(self, folder: str | Path) -> None:
+        """Copy images and masks into a folder with a frames.json beside them; `swimm3r.load_frames` reads it.
+
+        The folder is new or empty, and appears once it is whole. Raises StorageError where other things lie there.
+        """
+        folder = Path(folder)
+        check_empty(folder)
+        with atomic_folder(folder) as draft:
+            copied = []
+            for frame in self.frames:
+                path = _copied(frame.path, draft / frame.name)
+                mask = None if frame.mask is None else _copied(frame.mask, draft / MASKS / f"{frame.name}.png")
+                copied.append(replace(frame, path=path, mask=mask))
+            write_index(draft, replace(self, frames=tuple(copied)))
+
+    def _eight_bits(self, i: int) -> np.ndarray:
+        stored = self._stored(i)
+        return stored if stored.dtype == np.uint8 else (stored >> 8).astype(np.uint8)
+
+    def _stored(self, i: int) -> np.ndarray:
+        """The pixel values of image i, of 8 or 16 bits. Raises InputError on a damaged one."""
+        path = self.frames[i].path
+        (stored,) = _CACHE.get(_version(path), lambda: (images.read_rgb(path),))
+        self._check_size(stored, path)
+        return stored
+
     def _check_size(self, stored: np.ndarray, path: Path) -> None:
         height, width = stored.shape[:2]
         if (width, height) != (self.width, self.height):
@@ -109,6 +165,37 @@ class Frames:
                 cause="the file was replaced or resized after the frames were prepared",
                 hint="put the prepared one back; or another --out, which prepares the frames anew",
             )
+
+
+def write_index(folder: Path, frames: Frames, source: str = "") -> None:
+    """Write frames.json beside images and masks that are in the folder; `source` is what they were prepared from."""
+    document = {
+        "schema": 1,
+        "source": source,
+        "width": frames.width,
+        "height": frames.height,
+        "ordered": frames.ordered,
+        "gray": frames.gray,
+        "masks": {"used": sum(frame.mask is not None for frame in frames), "unused": frames.unused_masks},
+        "warnings": list(frames.warnings),
+        "frames": [
+            {
+                "name": frame.name,
+                "time": frame.time,
+                "split": frame.split,
+                "sharpness": frame.sharpness,
+                "mask": None if frame.mask is None else frame.mask.relative_to(folder).as_posix(),
+            }
+            for frame in frames
+        ],
+    }
+    write_text(folder / "frames.json", json.dumps(document, indent=1) + "\n")
+
+
+def _copied(source: Path, target: Path) -> Path:
+    target.parent.mkdir(parents=True, exist_ok=True)
+    shutil.copyfile(source, target)
+    return target
 
 
 def _version(path: Path) -> tuple[Path, int]:

@@ -1,12 +1,13 @@
 """The result of structure from motion: the one record that every back end fills and every later stage reads.
 
-On disk (`save`, `load`) it is a folder: sparse/ (COLMAP model), cameras.json, trajectory.tum, z_depth/NAME.npz,
-matches.npz, medium.json, points.ply (restored colors), points_raw.ply, backdrop.ply (guessed ground, restored
-colors), backdrop_raw.ply, reconstruction.json (back end, metric flag, warnings, points found). Where matches that
-contradict the result were dropped, matches_unfiltered.npz has all of them: what epipolar scores are taken over.
+On disk (`Reconstruction.save`, `reconstruction_io.load_reconstruction`) it is a folder: sparse/ (COLMAP model),
+cameras.json, trajectory.tum, z_depth/NAME.npz, matches.npz, medium.json, points.ply (restored colors), points_raw.ply,
+backdrop.ply (guessed ground, restored colors), backdrop_raw.ply, reconstruction.json (back end, metric flag, warnings,
+points found).
 """
 
 import json
+import shutil
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -15,28 +16,22 @@ import torch
 from jaxtyping import Float, Int
 from torch import Tensor
 
-from swimm3r.cameras import Cameras, cameras_of
-from swimm3r.io import cameras_json, medium_json, ply
+from swimm3r import notebook
+from swimm3r.cameras import Cameras
+from swimm3r.io import ply
 from swimm3r.io.colmap import model as colmap
 from swimm3r.io.files.array_file import Layout, read_arrays
 from swimm3r.io.files.atomic import atomic_path, write_text
 from swimm3r.io.files.cache import ArrayCache
-from swimm3r.io.files.damage import guard, remake
-from swimm3r.io.files.json_file import read_json
+from swimm3r.io.files.damage import remake
+from swimm3r.io.files.outputs import check_empty
 from swimm3r.io.trajectory import write_tum
-from swimm3r.medium import MediumFit
+from swimm3r.medium import MediumFit, save_fits
 from swimm3r.scene.frames import Frames
 
 _CACHE = ArrayCache(max_bytes=1 << 30)
-_UNFILTERED = "matches_unfiltered.npz"
+_SHOWN_WARNINGS = 10  # in a notebook
 _DEPTH = {"z_depth": Layout("h w"), "confidence": Layout("h w")}
-_MATCHES = {
-    "i": Layout("matches", "int"),
-    "j": Layout("matches", "int"),
-    "xy_i": Layout("matches 2"),
-    "xy_j": Layout("matches 2"),
-    "confidence": Layout("matches"),
-}
 
 
 @dataclass(frozen=True)
@@ -47,6 +42,9 @@ class Points:
     rgb: Float[Tensor, "p 3"]  # raw, 0..1
     error: Float[Tensor, " p"]  # mean reprojection error, pixels
 
+    def __repr__(self) -> str:
+        return notebook.shapes(self)
+
 
 @dataclass(frozen=True)
 class Tracks:
@@ -55,6 +53,9 @@ class Tracks:
     point: Int[Tensor, " o"]  # index into Points
     frame: Int[Tensor, " o"]  # index into Reconstruction.names
     xy: Float[Tensor, "o 2"]  # pixels of the prepared frame
+
+    def __repr__(self) -> str:
+        return notebook.shapes(self)
 
 
 @dataclass(frozen=True)
@@ -67,6 +68,14 @@ class Matches:
     xy_j: Float[Tensor, "m 2"]
     confidence: Float[Tensor, " m"]  # 1 for verified feature matches, the network's own for learned ones
 
+    def __repr__(self) -> str:
+        return notebook.shapes(self)
+
+    def save(self, path: Path) -> None:
+        """Write them as NumPy arrays, whole or not at all."""
+        with atomic_path(path) as draft:
+            np.savez_compressed(draft, **{name: tensor.numpy() for name, tensor in vars(self).items()})
+
 
 @dataclass(frozen=True)
 class DepthMap:
@@ -74,6 +83,9 @@ class DepthMap:
 
     z_depth: Float[Tensor, "h w"]  # along the optical axis, scene units
     confidence: Float[Tensor, "h w"]  # 0..1
+
+    def __repr__(self) -> str:
+        return notebook.shapes(self)
 
 
 @dataclass(frozen=True)
@@ -116,6 +128,9 @@ class DenseCloud:
     raw: Float[Tensor, "n 3"]  # 0..1
     restored: Float[Tensor, "n 3"]  # 0..1
 
+    def __repr__(self) -> str:
+        return notebook.shapes(self)
+
 
 @dataclass(frozen=True)
 class QualityWarning:
@@ -144,145 +159,87 @@ class Reconstruction:
     warnings: tuple[QualityWarning, ...] = ()
     points_found: int | None = None  # sparse ones, before the settings' cap; None: nothing was left out
 
+    def __repr__(self) -> str:
+        dense = "" if self.cloud is None else f", {len(self.cloud.xyz):,} dense points"
+        unit = "metres" if self.metric else "scene units"
+        water = "no water" if self.medium is None else f"water by {self.medium.estimator}"
+        return (
+            f"Reconstruction({len(self.names)} frames by {self.backend}, {len(self.points.xyz):,} points{dense},\n"
+            f"  {unit}, {water}, {len(self.warnings)} warnings)"
+        )
+
+    def _repr_html_(self) -> str:
+        """Tables of what was found, of the water, and of the warnings."""
+        with_depth = sum(name in self.depth for name in self.names)
+        rows = [
+            ("frames registered", f"{len(self.names)}, {with_depth} of them with depth"),
+            ("cameras", repr(self.cameras)),
+            ("sparse points", f"{len(self.points.xyz):,}, {len(self.tracks.point):,} observations"),
+            ("matches", f"{len(self.matches.i):,}"),
+            ("dense points", "none" if self.cloud is None else f"{len(self.cloud.xyz):,}"),
+            ("unit of length", "metre" if self.metric else "of the scene, not metric"),
+        ]
+        parts = [notebook.table(f"Reconstruction by {self.backend}", rows)]
+        if self.medium is not None:
+            parts.append(self.medium.table("1/m" if self.metric else "per scene unit"))
+        if self.warnings:
+            shown = [(each.what, each.advice) for each in self.warnings[:_SHOWN_WARNINGS]]
+            parts.append(notebook.table(f"{len(self.warnings)} warnings", shown))
+        return f"<div>{''.join(parts)}</div>"
+
     def index(self, name: str) -> int:
         """The position of a registered frame by its name."""
         return self.names.index(name)
 
-
-def colmap_model(rec: Reconstruction) -> colmap.ColmapModel:
-    """Cameras, points and tracks as io/colmap writes them."""
-    return colmap.ColmapModel(
-        names=rec.names,
-        model=rec.cameras.model,
-        width=rec.cameras.width,
-        height=rec.cameras.height,
-        K=rec.cameras.K.numpy(),
-        distortion=rec.cameras.distortion.numpy(),
-        cam2world=rec.cameras.cam2world.numpy(),
-        xyz=rec.points.xyz.numpy(),
-        rgb=(rec.points.rgb.numpy() * 255).round().astype(np.uint8),
-        error=rec.points.error.numpy(),
-        track_point=rec.tracks.point.numpy(),
-        track_frame=rec.tracks.frame.numpy(),
-        track_xy=rec.tracks.xy.numpy(),
-    )
-
-
-def save(rec: Reconstruction, frames: Frames, folder: Path) -> None:
-    """Write a reconstruction of some frames into a folder; depth maps already live under it."""
-    colmap.write_model(folder / "sparse", colmap_model(rec))
-    times = frames.times_of(rec.names)
-    write_tum(folder / "trajectory.tum", times, rec.cameras.cam2world.numpy())
-    cameras_json.write_cameras(
-        folder / "cameras.json",
-        cameras_json.CameraTable(
-            names=rec.names,
-            width=rec.cameras.width,
-            height=rec.cameras.height,
-            model=rec.cameras.model,
-            K=rec.cameras.K.numpy(),
-            distortion=rec.cameras.distortion.numpy(),
-            cam2world=rec.cameras.cam2world.numpy(),
-            units="metres" if rec.metric else "scene units",
-            times=times,
-        ),
-    )
-    _write_matches(folder / "matches.npz", rec.matches)
-    fits = {"stored": rec.medium, "linear": rec.medium_linear}
-    medium_json.write_fits(folder / "medium.json", {name: fit for name, fit in fits.items() if fit is not None})
-    for stem, cloud in (("points", rec.cloud), ("backdrop", rec.backdrop)):
-        if cloud is not None:
-            ply.write_points(folder / f"{stem}.ply", cloud.xyz.numpy(), cloud.restored.numpy())
-            ply.write_points(folder / f"{stem}_raw.ply", cloud.xyz.numpy(), cloud.raw.numpy())
-    about = {"backend": rec.backend, "metric": rec.metric, "warnings": [vars(warning) for warning in rec.warnings]}
-    about["points_found"] = rec.points_found
-    write_text(folder / "reconstruction.json", json.dumps(about, indent=2) + "\n")
-
-
-@dataclass(frozen=True)
-class _About:
-    """reconstruction.json."""
-
-    backend: str
-    metric: bool
-    warnings: tuple[QualityWarning, ...]
-    points_found: int | None = None  # earlier versions did not count
-
-
-def load(folder: Path, frames: Frames | None = None) -> Reconstruction:
-    """Read what `save` wrote. Raises InputError where it is damaged, or not of the training frames in `frames`."""
-    remedy = remake(folder)
-    sparse = colmap.read_model(folder / "sparse", remedy)
-    if frames is not None:
-        with guard(folder / "sparse", remedy):
-            _check_frames(sparse, frames)
-    about = read_json(folder / "reconstruction.json", _About, remedy)
-    fits = medium_json.read_fits(folder / "medium.json", remedy)
-    return Reconstruction(
-        names=sparse.names,
-        cameras=cameras_of(sparse),
-        points=Points(
-            torch.from_numpy(sparse.xyz),
-            torch.from_numpy(sparse.rgb.astype(np.float32)) / 255,
-            torch.from_numpy(sparse.error),
-        ),
-        tracks=Tracks(*(torch.from_numpy(a) for a in (sparse.track_point, sparse.track_frame, sparse.track_xy))),
-        matches=_read_matches(folder / "matches.npz", len(sparse.names)),
-        depth=DepthMaps(folder / "z_depth"),
-        backend=about.backend,
-        metric=about.metric,
-        medium=fits.get("stored"),
-        medium_linear=fits.get("linear"),
-        cloud=_load_cloud(folder, "points"),
-        backdrop=_load_cloud(folder, "backdrop"),
-        warnings=about.warnings,
-        points_found=about.points_found,
-    )
-
-
-def _check_frames(sparse: colmap.ColmapModel, frames: Frames) -> None:
-    unknown = set(sparse.names) - set(frames.train.names)
-    if unknown:
-        raise ValueError(f"it places {min(unknown)}, which is no training frame of prepare/")
-    if (sparse.width, sparse.height) != (frames.width, frames.height):
-        raise ValueError(
-            f"its images have {sparse.width}x{sparse.height} pixels, the frames {frames.width}x{frames.height}"
+    def colmap_model(self) -> colmap.ColmapModel:
+        """Cameras, points and tracks as io/colmap writes them."""
+        return colmap.ColmapModel(
+            names=self.names,
+            model=self.cameras.model,
+            width=self.cameras.width,
+            height=self.cameras.height,
+            K=self.cameras.K.numpy(),
+            distortion=self.cameras.distortion.numpy(),
+            cam2world=self.cameras.cam2world.numpy(),
+            xyz=self.points.xyz.numpy(),
+            rgb=(self.points.rgb.numpy() * 255).round().astype(np.uint8),
+            error=self.points.error.numpy(),
+            track_point=self.tracks.point.numpy(),
+            track_frame=self.tracks.frame.numpy(),
+            track_xy=self.tracks.xy.numpy(),
         )
 
+    def save(self, folder: str | Path, frames: Frames | None = None) -> None:
+        """Write everything into a folder, depth maps included; `swimm3r.load_reconstruction` reads it.
 
-def write_unfiltered_matches(folder: Path, matches: Matches) -> None:
-    """Keep the matches that a reconstruction was made from, before those that contradict it are dropped."""
-    _write_matches(folder / _UNFILTERED, matches)
+        With the `frames` it was made from, cameras.json has their times, and trajectory.tum is written. The folder is
+        new or empty, or the one that already holds the depth maps. Raises StorageError where other things lie there.
+        """
+        folder = Path(folder)
+        self._place_depth(folder)
+        times = None if frames is None else frames.times_of(self.names)
+        colmap.write_model(folder / "sparse", self.colmap_model())
+        if times is not None:
+            write_tum(folder / "trajectory.tum", times, self.cameras.cam2world.numpy())
+        units = "metres" if self.metric else "scene units"
+        self.cameras.save(folder / "cameras.json", self.names, times, units)
+        self.matches.save(folder / "matches.npz")
+        fits = {"stored": self.medium, "linear": self.medium_linear}
+        save_fits(folder / "medium.json", {name: fit for name, fit in fits.items() if fit is not None})
+        for stem, cloud in (("points", self.cloud), ("backdrop", self.backdrop)):
+            if cloud is not None:
+                ply.write_points(folder / f"{stem}.ply", cloud.xyz.numpy(), cloud.restored.numpy())
+                ply.write_points(folder / f"{stem}_raw.ply", cloud.xyz.numpy(), cloud.raw.numpy())
+        about = {"backend": self.backend, "metric": self.metric, "warnings": [vars(each) for each in self.warnings]}
+        about["points_found"] = self.points_found
+        write_text(folder / "reconstruction.json", json.dumps(about, indent=2) + "\n")
 
-
-def unfiltered_matches(folder: Path, rec: Reconstruction) -> Matches:
-    """All matches that a reconstruction was made from: its own, where none of them was dropped."""
-    path = folder / _UNFILTERED
-    return _read_matches(path, len(rec.names)) if path.is_file() else rec.matches
-
-
-def _write_matches(path: Path, matches: Matches) -> None:
-    with atomic_path(path) as draft:
-        np.savez_compressed(draft, **{name: tensor.numpy() for name, tensor in vars(matches).items()})
-
-
-def _read_matches(path: Path, frames: int) -> Matches:
-    remedy = remake(path.parent)
-    stored = read_arrays(path, _MATCHES, remedy)
-    with guard(path, remedy):
-        for index in (stored["i"], stored["j"]):
-            if len(index) and not 0 <= int(index.min()) <= int(index.max()) < frames:
-                raise ValueError(f"its matches point beyond the {frames} registered frames")
-    return Matches(**{name: torch.from_numpy(values) for name, values in stored.items()})
-
-
-def _load_cloud(folder: Path, stem: str) -> DenseCloud | None:
-    if not (folder / f"{stem}.ply").is_file():
-        return None
-    remedy = remake(folder)
-    xyz, restored = ply.read_points(folder / f"{stem}.ply", remedy)
-    _, raw = ply.read_points(folder / f"{stem}_raw.ply", remedy)
-    with guard(folder / f"{stem}_raw.ply", remedy):
-        if len(raw) != len(xyz):
-            raise ValueError(f"it has {len(raw)} points, {stem}.ply {len(xyz)}")
-    return DenseCloud(torch.from_numpy(xyz), torch.from_numpy(raw), torch.from_numpy(restored))
+    def _place_depth(self, folder: Path) -> None:
+        """Copy the depth maps into a folder that is to hold the reconstruction, unless they are there already."""
+        if self.depth.folder.resolve() == (folder / "z_depth").resolve():
+            return
+        check_empty(folder)
+        for name in self.names:
+            if name in self.depth:
+                with atomic_path(folder / "z_depth" / f"{name}.npz") as draft:
+                    shutil.copyfile(self.depth.path(name), draft)

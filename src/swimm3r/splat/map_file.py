@@ -2,7 +2,8 @@
 
 map.safetensors (`schema` 2) holds the primitives as stored (before activation), the water, and in its header
 the recipe, its settings, the metric flag, the working unit and when the clip begins and ends; also the training
-frames' poses where they were refined. A checkpoint adds the optimizer's moments and the step.
+frames' poses where they were refined, and the camera that notebooks show the map from. A checkpoint adds the
+optimizer's moments and the step.
 """
 
 from collections.abc import Mapping
@@ -12,18 +13,22 @@ from typing import Any, cast
 
 from torch import Tensor
 
-from swimm3r.cameras import check_poses
+from swimm3r.cameras import Cameras, check_cameras, check_poses
 from swimm3r.io.files.damage import Remedy, guard
 from swimm3r.io.files.safe_names import check_names
-from swimm3r.io.files.tensor_file import read_tensors, write_tensors
-from swimm3r.settings_document import from_document, to_document
+from swimm3r.io.files.tensor_file import read_tensors
+from swimm3r.settings_document import from_document
 from swimm3r.splat.primitives.kinds import primitives_from
 from swimm3r.splat.recipes import recipe_parts
-from swimm3r.splat.rendering import SplatMap
+from swimm3r.splat.rendering import SCHEMA, SplatMap
 from swimm3r.splat.settings import RECIPES, RecipeName, settings_of
 from swimm3r.splat.training_poses import RefinedPoses
 
-SCHEMA = 2  # 1: Swimm3R 0.1, whose settings have other names
+
+@dataclass(frozen=True)
+class _ImageSize:
+    width: int
+    height: int
 
 
 @dataclass(frozen=True)
@@ -34,6 +39,7 @@ class _MapHeader:
     length: float
     span: tuple[float, float] = (0.0, 1.0)  # static maps of earlier versions have none
     frames: tuple[str, ...] | None = None  # whose poses were refined
+    viewpoint: _ImageSize | None = None  # of its images; None of a map without one
 
     def __post_init__(self) -> None:
         if self.recipe not in RECIPES:
@@ -45,26 +51,9 @@ class _MapHeader:
         check_names(self.frames or ())
 
 
-def save_map(path: Path, scene: SplatMap) -> None:
-    """Write a map, whole or not at all."""
-    tensors = {f"primitives.{name}": values for name, values in scene.primitives._asdict().items()}
-    tensors |= {f"field.{name}": values for name, values in scene.field.state_dict().items()}
-    about = {
-        "schema": SCHEMA,
-        "recipe": scene.settings.recipe,
-        "settings": to_document(scene.settings),
-        "metric": scene.metric,
-        "length": scene.length,
-        "span": scene.span,
-    }
-    if scene.poses is not None:
-        tensors["poses.cam2world"] = scene.poses.cam2world
-        about["frames"] = scene.poses.names
-    write_tensors(path, tensors, about)
-
-
-def load_map(path: Path) -> SplatMap:
-    """Read what `save_map` wrote. Raises InputError for a file that is damaged or of another kind."""
+def load_map(path: str | Path) -> SplatMap:
+    """Read what `SplatMap.save` wrote. Raises InputError for a file that is damaged or of another kind."""
+    path = Path(path)
     remedy = Remedy(
         f"remove {path.parent}; the swimm3r command that trained the map trains it again",
         cause="the file is damaged, of another version, or of another program",
@@ -85,8 +74,18 @@ def load_map(path: Path) -> SplatMap:
         poses = None
         if about.frames is not None:
             poses = RefinedPoses(about.frames, _poses(stored.tensors, len(about.frames)))
+        viewpoint = None if about.viewpoint is None else _viewpoint(stored.tensors, about.viewpoint)
     field.requires_grad_(False)
-    return SplatMap(primitives, field, settings, about.metric, about.length, about.span, poses)
+    return SplatMap(primitives, field, settings, about.metric, about.length, about.span, poses, viewpoint)
+
+
+def _viewpoint(tensors: Mapping[str, Tensor], size: _ImageSize) -> Cameras:
+    K, cam2world = tensors["viewpoint.K"], tensors["viewpoint.cam2world"]
+    if K.shape != (1, 3, 3) or cam2world.shape != (1, 4, 4):
+        raise ValueError(f"its viewpoint has the shapes {tuple(K.shape)} and {tuple(cam2world.shape)}")
+    camera = Cameras(K, K.new_zeros(1, 0), cam2world, size.width, size.height)
+    check_cameras(camera)
+    return camera
 
 
 def _poses(tensors: Mapping[str, Tensor], count: int) -> Tensor:

@@ -2,6 +2,7 @@
 
 import copy
 from dataclasses import dataclass, replace
+from pathlib import Path
 from typing import TypeVar
 
 import torch
@@ -9,10 +10,13 @@ from jaxtyping import Float
 from torch import Tensor
 from torch.nn.functional import relu
 
-from swimm3r import devices
+from swimm3r import devices, notebook
 from swimm3r.cameras import Cameras
+from swimm3r.io.files.tensor_file import write_tensors
+from swimm3r.io.images import jpeg_uri
 from swimm3r.medium import Medium
 from swimm3r.raster import MediumMaps, RasterOutput, SggBuffers, rasterize
+from swimm3r.settings_document import to_document
 from swimm3r.splat.gaussian_settings import GaussianSettings
 from swimm3r.splat.medium.field import (
     NO_WATER,
@@ -32,6 +36,8 @@ from swimm3r.splat.settings import SplatSettings, UwbsSettings
 from swimm3r.splat.training_poses import RefinedPoses
 from swimm3r.splat.views import moment
 
+SCHEMA = 2  # of a map's file; 1: Swimm3R 0.1, whose settings have other names
+_SHOWN_SIDE = 320  # pixels of a view in a notebook
 _SEEN = 1e-3  # alpha below which a pixel has no depth
 _COVERED = 0.5  # alpha from which on a pixel's clear color is that of a surface
 
@@ -47,6 +53,13 @@ class RenderOutput:
     alpha: Float[Tensor, "h w"]
     medium: Medium  # per pixel, [h, w, 3], per scene unit of ray depth
 
+    def __repr__(self) -> str:
+        return notebook.shapes(self)
+
+    def _repr_html_(self) -> str:
+        shown = (("with the water", self.rgb), ("without", self.clear))
+        return notebook.image_row("View of a map", [(_uri(image), caption) for caption, image in shown])
+
 
 @dataclass(frozen=True)
 class SplatMap:
@@ -59,6 +72,23 @@ class SplatMap:
     length: float = 1.0  # scene units per working unit (`settings.py`)
     span: tuple[float, float] = (0.0, 1.0)  # of the clip it was trained on, seconds
     poses: RefinedPoses | None = None  # of the training frames; None where they were held
+    viewpoint: Cameras | None = None  # the pinhole camera of a training frame, from where notebooks show the map
+
+    def __repr__(self) -> str:
+        moving = f", {self.span[0]:.1f} to {self.span[1]:.1f} s" if self.primitives.dynamic else ""
+        unit = "metres" if self.metric else "scene units"
+        return (
+            f"SplatMap({self.settings.recipe}, {len(self.primitives.xyz):,} primitives, {unit}{moving},"
+            f" on {self.device})"
+        )
+
+    def _repr_html_(self) -> str:
+        """A view of the map with its water and without, in the middle of its clip; of older files, the text alone."""
+        if self.viewpoint is None:
+            return notebook.table(repr(self), [])
+        seen = self.render(self.viewpoint.pinhole(_SHOWN_SIDE), sum(self.span) / 2)
+        shown = ((seen.rgb, "with the water"), (seen.clear, "without"))
+        return notebook.image_row(repr(self), [(_uri(image), caption) for image, caption in shown])
 
     @property
     def device(self) -> torch.device:
@@ -83,6 +113,26 @@ class SplatMap:
         """
         with torch.no_grad():
             return render(self, camera, time)
+
+    def save(self, path: str | Path) -> None:
+        """Write a map.safetensors (layout: `splat.map_file`), whole or not at all; `swimm3r.load_map` reads it."""
+        tensors = {f"primitives.{name}": values for name, values in self.primitives._asdict().items()}
+        tensors |= {f"field.{name}": values for name, values in self.field.state_dict().items()}
+        about = {
+            "schema": SCHEMA,
+            "recipe": self.settings.recipe,
+            "settings": to_document(self.settings),
+            "metric": self.metric,
+            "length": self.length,
+            "span": self.span,
+        }
+        if self.poses is not None:
+            tensors["poses.cam2world"] = self.poses.cam2world
+            about["frames"] = self.poses.names
+        if self.viewpoint is not None:
+            tensors |= {"viewpoint.K": self.viewpoint.K, "viewpoint.cam2world": self.viewpoint.cam2world}
+            about["viewpoint"] = {"width": self.viewpoint.width, "height": self.viewpoint.height}
+        write_tensors(Path(path), tensors, about)
 
     def moment(self, time: float | None) -> Float[Tensor, ""] | None:
         """A time of the clip as the map's own parts take it: None in static maps, 0..1 in dynamic ones."""
@@ -153,6 +203,11 @@ def surface_color(images: RasterOutput) -> Float[Tensor, "3 h w"]:
     The blended clear color itself is as dark as the pixel is transparent: the light of what lies behind is missing.
     """
     return images.clear / images.alpha.clamp(min=_COVERED)
+
+
+def _uri(image: Float[Tensor, "h w 3"]) -> str:
+    """An image for a page."""
+    return jpeg_uri((image.clamp(0, 1) * 255).round().to(torch.uint8).cpu().numpy())
 
 
 OfMethod = TypeVar("OfMethod", bound=SplatSettings)

@@ -1,26 +1,26 @@
 """From a reconstruction to a map: the recipe of the settings, its run, and the map in the scene's own unit."""
 
 import math
-from dataclasses import asdict
+from dataclasses import asdict, replace
 from pathlib import Path
 
 import torch
 
 from swimm3r import devices
+from swimm3r.cameras import Cameras
 from swimm3r.devices import CPU
 from swimm3r.errors import UsageError
 from swimm3r.io.files.cache_key import cache_key
 from swimm3r.progress import Progress, silent
 from swimm3r.scene.frames import Frames
 from swimm3r.scene.reconstruction import Reconstruction
-from swimm3r.splat import map_file
 from swimm3r.splat.recipes import recipe_parts
 from swimm3r.splat.rendering import SplatMap
 from swimm3r.splat.settings import SplatSettings
 from swimm3r.splat.training import loop
 from swimm3r.splat.training.scene import TrainingScene, path_radius
 from swimm3r.splat.training.state import in_scene_units
-from swimm3r.splat.training_poses import training_poses_of, write_refined
+from swimm3r.splat.training_poses import RefinedPoses, training_poses_of, write_refined
 from swimm3r.splat.views import TrainingViews, median_z_depth, working_scale
 
 
@@ -49,9 +49,19 @@ def train(
     if poses_in_training is not None and final.poses is not None:
         poses = poses_in_training.refined(final.poses)
         write_refined(folder, rec, frames, poses)
-    scene = SplatMap(primitives, field, settings, rec.metric, 1 / scale, frames.span, poses)
-    map_file.save_map(folder / "map.safetensors", scene)
+    viewpoint = _viewpoint(rec, views, poses)
+    scene = SplatMap(primitives, field, settings, rec.metric, 1 / scale, frames.span, poses, viewpoint)
+    scene.save(folder / "map.safetensors")
     return scene
+
+
+def _viewpoint(rec: Reconstruction, views: TrainingViews, poses: RefinedPoses | None) -> Cameras:
+    """The pinhole camera of the middle training frame, where the training left it, scene units."""
+    name = views.names[len(views) // 2]
+    camera = rec.cameras[rec.index(name)].pinhole(views.settings.long_side)
+    if poses is None:
+        return camera
+    return replace(camera, cam2world=poses.cam2world[[poses.names.index(name)]])
 
 
 def _check_near(settings: SplatSettings, median_depth: float) -> None:

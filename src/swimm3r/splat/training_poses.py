@@ -29,7 +29,6 @@ from swimm3r.geometry import (
     symmetric_epipolar_error,
 )
 from swimm3r.imaging.undistortion import undistorted_matches
-from swimm3r.io import cameras_json
 from swimm3r.io.trajectory import write_tum
 from swimm3r.scene.frames import Frames
 from swimm3r.scene.reconstruction import Reconstruction
@@ -176,13 +175,7 @@ def write_refined(folder: Path, rec: Reconstruction, frames: Frames, poses: Refi
     write_tum(folder / "trajectory.tum", times, poses.cam2world.numpy())
     lenses = rec.cameras[[rec.index(name) for name in poses.names]]
     units = "metres" if rec.metric else "scene units"
-    cameras_json.write_cameras(
-        folder / "cameras.json",
-        cameras_json.CameraTable(
-            poses.names, lenses.width, lenses.height, lenses.model,
-            lenses.K.numpy(), lenses.distortion.numpy(), poses.cam2world.numpy(), units, times,
-        ),
-    )  # fmt: skip
+    replace(lenses, cam2world=poses.cam2world).save(folder / "cameras.json", poses.names, times, units)
 
 
 def epipolar_matches(rec: Reconstruction, names: tuple[str, ...], canvases: Cameras) -> EpipolarMatches:

@@ -22,7 +22,7 @@ from torch import Tensor
 from swimm3r import water_types
 from swimm3r.cameras import Cameras, directions, pixel_grid, ray_depth_from_z, resized
 from swimm3r.errors import InputError
-from swimm3r.io import cameras_json, images
+from swimm3r.io import images
 from swimm3r.io.files.atomic import atomic_path, write_text
 from swimm3r.io.files.damage import Remedy, guard
 from swimm3r.medium import Medium, add_water, srgb_from_linear
@@ -130,22 +130,8 @@ def write_dive(settings: DiveSettings, folder: Path, progress: Progress = silent
             images.write_rgb(truth / "masks" / f"{name}.png", mask)
             if settings.give_masks:
                 images.write_rgb(folder / "masks" / f"{name}.png", mask)
-    write_text(
-        truth / "medium.json", json.dumps({k: v.tolist() for k, v in vars(dive.medium).items()}, indent=2) + "\n"
-    )
-    cameras_json.write_cameras(
-        truth / "cameras.json",
-        cameras_json.CameraTable(
-            names=dive.names,
-            width=settings.width,
-            height=settings.height,
-            model=dive.cameras.model,
-            K=dive.cameras.K.numpy(),
-            distortion=dive.cameras.distortion.numpy(),
-            cam2world=dive.cameras.cam2world.numpy(),
-            units="metres",
-        ),
-    )
+    dive.medium.save(truth / "medium.json")
+    dive.cameras.save(truth / "cameras.json", dive.names, units="metres")
     write_text(record, json.dumps({**described, "whole": True}, indent=2) + "\n")
     progress("rendering", len(dive), len(dive))
 

@@ -24,8 +24,8 @@ from swimm3r.pipeline.presets import PRESETS, RunSettings
 from swimm3r.pipeline.run import open_finished_sfm
 from swimm3r.prepare import load_frames
 from swimm3r.progress import silent
-from swimm3r.scene import reconstruction
 from swimm3r.scene.reconstruction import DepthMaps, Matches, Reconstruction
+from swimm3r.scene.reconstruction_io import write_unfiltered_matches
 from swimm3r.sfm.medium.dense_tracks import count_tracks, fuse_depth
 from swimm3r.sfm.settings import ColmapModelSettings, ColmapSettings, Mast3rSettings, TrackSettings
 
@@ -68,7 +68,7 @@ def test_no_cap_and_no_filter_by_its_own_result_flatters_a_map(run: Path, tmp_pa
     sfm = open_finished_sfm(run)
     shutil.copytree(run / "sfm", tmp_path / "sfm")
     handed = with_matches(sfm.rec, 5.0).matches
-    reconstruction.write_unfiltered_matches(tmp_path / "sfm", handed)
+    write_unfiltered_matches(tmp_path / "sfm", handed)
     rec = replace(with_matches(sfm.rec, 0.0), points_found=1_010_000, depth=DepthMaps(tmp_path / "sfm" / "z_depth"))
     uncapped = Uncapped.of(tmp_path / "sfm", rec, sfm.frames, TrackSettings(max_tracks=10), silent)
     scores = model_scores(rec, uncapped, 7, 1.0)
@@ -186,7 +186,7 @@ def with_water(run: Path, folder: Path, estimator: Estimator = "Sea-Thru") -> Pa
     shutil.copytree(run, folder)
     sfm = open_finished_sfm(folder)
     rec = replace(sfm.rec, medium=water(estimator), depth=DepthMaps(folder / "sfm" / "z_depth"))
-    reconstruction.save(rec, sfm.frames, folder / "sfm")
+    rec.save(folder / "sfm", sfm.frames)
     return folder
 
 

@@ -8,10 +8,10 @@ import numpy as np
 import pytest
 import torch
 
-from swimm3r.cameras import Cameras, project
+from swimm3r.cameras import Cameras, cameras_of, project
 from swimm3r.errors import InputError
 from swimm3r.io import images, ply
-from swimm3r.io.cameras_json import CameraTable, write_cameras
+from swimm3r.io.cameras_json import CameraTable
 from swimm3r.io.colmap import model as colmap
 from swimm3r.io.colmap.model import ColmapModel
 from swimm3r.io.imports.nerfstudio import images_folder
@@ -104,7 +104,7 @@ def test_our_own_cameras_json_is_read_by_name_and_never_hides_the_model_beside_i
     table = CameraTable(
         NAMES, WIDTH, HEIGHT, "OPENCV", np.tile(K, (N, 1, 1)), np.tile(OPENCV, (N, 1)), scene.cam2world, "metres"
     )
-    write_cameras(tmp_path / "cameras.json", table)
+    cameras_of(table).save(tmp_path / "cameras.json", table.names, table.times, table.units)
     found = read_foreign(tmp_path / "cameras.json")
     assert found.metric
     assert len(found.model.xyz) == 0

@@ -7,16 +7,16 @@ import numpy as np
 import pytest
 import torch
 
-from swimm3r.cameras import project
+from swimm3r.cameras import cameras_of, project
 from swimm3r.errors import InputError
 from swimm3r.io import images
-from swimm3r.io.cameras_json import CameraTable, write_cameras
+from swimm3r.io.cameras_json import CameraTable
 from swimm3r.io.colmap.model import ColmapModel
 from swimm3r.io.imports.read import read_foreign
 from swimm3r.io.imports.record import ForeignDepth, ForeignModel
-from swimm3r.scene import reconstruction
 from swimm3r.scene.frames import Frame, Frames
 from swimm3r.scene.reconstruction import Tracks
+from swimm3r.scene.reconstruction_io import load_reconstruction
 from swimm3r.sfm.backends import imported as imported_backend
 from swimm3r.sfm.colmap.triangulation import triangulate
 from swimm3r.sfm.settings import ColmapModelSettings, FeatureSettings
@@ -63,8 +63,8 @@ def test_cameras_points_scale_and_observations_are_those_of_the_file(dive, model
     assert len(rec.points.xyz) == 30
     uv, _ = project(rec.cameras, rec.points.xyz.expand(len(rec.names), -1, -1))
     torch.testing.assert_close(uv[rec.tracks.frame, rec.tracks.point], rec.tracks.xy, atol=1e-9, rtol=0)
-    reconstruction.save(rec, dive.frames, tmp_path)
-    again = reconstruction.load(tmp_path)
+    rec.save(tmp_path, dive.frames)
+    again = load_reconstruction(tmp_path)
     torch.testing.assert_close(again.points.xyz, rec.points.xyz)
     assert torch.equal(again.matches.xy_i, rec.matches.xy_i)
 
@@ -127,7 +127,7 @@ def posed_dive(tmp_path: Path) -> tuple[Frames, Path]:
         tuple(f.name for f in frames), 240, 160, "PINHOLE", cameras.K.numpy(), cameras.distortion.numpy(),
         cameras.cam2world.numpy(), "metres",
     )  # fmt: skip
-    write_cameras(tmp_path / "cameras.json", table)
+    cameras_of(table).save(tmp_path / "cameras.json", table.names, table.times, table.units)
     return Frames(tuple(frames), 240, 160, True), tmp_path / "cameras.json"
 
 
@@ -154,8 +154,8 @@ def test_a_cloud_without_observations_stays_beside_the_triangulated_points(posed
     found = triangulate(rec, frames, FeatureSettings(), tmp_path / "sfm")
     assert found.points.xyz[:3].tolist() == np.ones((3, 3)).tolist()
     assert found.tracks.point.min() == 3
-    reconstruction.save(found, frames, tmp_path / "sfm")
-    assert len(reconstruction.load(tmp_path / "sfm").points.xyz) == len(found.points.xyz)
+    found.save(tmp_path / "sfm", frames)
+    assert len(load_reconstruction(tmp_path / "sfm").points.xyz) == len(found.points.xyz)
 
 
 def test_images_that_match_nowhere_come_with_a_warning(posed_dive, tmp_path: Path):

@@ -11,16 +11,16 @@ import torch
 from torch import Tensor
 
 import swimm3r
-from swimm3r.cameras import Cameras, image_directions, project, resized
+from swimm3r.cameras import Cameras, cameras_of, image_directions, project, resized
 from swimm3r.errors import DeviceError, InputError, RegistrationError, Swimm3rError, UsageError, WeightsError
 from swimm3r.evaluate.poses import absolute_pose_errors
 from swimm3r.geometry import align_similarity
-from swimm3r.io import cameras_json, images
+from swimm3r.io import images
 from swimm3r.io.cameras_json import CameraTable
-from swimm3r.scene import reconstruction
 from swimm3r.scene.frames import Frames
 from swimm3r.scene.ground_truth import GroundTruth, read_ground_truth
 from swimm3r.scene.reconstruction import Reconstruction
+from swimm3r.scene.reconstruction_io import load_reconstruction, unfiltered_matches
 from swimm3r.sfm.backends import mast3r as mast3r_backend
 from swimm3r.sfm.mast3r.network import Architecture, Decoded, Descriptors, Encoded, Mast3r, Pointmap
 from swimm3r.sfm.mast3r.settings import AlignmentSettings, MatchingSettings
@@ -210,7 +210,7 @@ def test_all_training_frames_and_no_other_are_placed(small: Dive, finished: tupl
 
 def test_what_is_stored_is_what_other_back_ends_store(finished: tuple[Reconstruction, Path]):
     rec, folder = finished
-    again = reconstruction.load(folder)
+    again = load_reconstruction(folder)
     assert again.backend == "mast3r"
     assert not again.metric  # the network's metres are a guess
     torch.testing.assert_close(again.cameras.cam2world, rec.cameras.cam2world, atol=1e-6, rtol=0)
@@ -297,7 +297,7 @@ def test_known_cameras_of_a_file_are_kept_and_the_others_found_in_its_unit(
         tuple(names[k] for k in named), 128, 96, "PINHOLE", small.cameras.K[named].numpy(),
         small.cameras.distortion[named].numpy(), moved[named].numpy(), "metres",
     )  # fmt: skip
-    cameras_json.write_cameras(tmp_path / "cameras.json", table)
+    cameras_of(table).save(tmp_path / "cameras.json", table.names, table.times, table.units)
     take(small.network())
     settings = replace(small.settings, known=tmp_path / "cameras.json", alignment=replace(QUICK, intrinsics="fixed"))
     rec = swimm3r.reconstruct(small.frames, settings, tmp_path / "sfm")
@@ -325,7 +325,7 @@ def test_known_cameras_that_do_not_fit_are_refused(
     table = CameraTable(
         ("reef.jpg",), 128, 96, "PINHOLE", small.cameras.K[:1].numpy(), np.zeros((1, 0)), np.eye(4)[None]
     )
-    cameras_json.write_cameras(tmp_path / "cameras.json", table)
+    cameras_of(table).save(tmp_path / "cameras.json", table.names, table.times, table.units)
     with pytest.raises(error, match=message):
         swimm3r.reconstruct(small.frames, replace(small.settings, known=tmp_path / "cameras.json", **change), tmp_path)
 
@@ -505,8 +505,8 @@ def test_capped_points_and_dropped_matches_are_still_counted(
     take(small.network())
     capped = swimm3r.reconstruct(small.frames, replace(small.settings, max_points=100), tmp_path)
     assert len(capped.points.xyz) == 100
-    assert reconstruction.load(tmp_path).points_found == capped.points_found == whole.points_found
-    handed = reconstruction.unfiltered_matches(folder, whole)
+    assert load_reconstruction(tmp_path).points_found == capped.points_found == whole.points_found
+    handed = unfiltered_matches(folder, whole)
     assert len(handed.i) >= len(whole.matches.i)
     kept = set(zip(whole.matches.i.tolist(), map(tuple, whole.matches.xy_i.tolist()), strict=True))
     assert kept <= set(zip(handed.i.tolist(), map(tuple, handed.xy_i.tolist()), strict=True))

@@ -28,9 +28,9 @@ from swimm3r.pipeline.run import run_pipeline
 from swimm3r.prepare import check_source, load_frames
 from swimm3r.progress import Progress, silent
 from swimm3r.report.charts import plan_view
-from swimm3r.scene import reconstruction
 from swimm3r.scene.ground_truth import GroundTruth
 from swimm3r.scene.reconstruction import Reconstruction
+from swimm3r.scene.reconstruction_io import load_reconstruction
 from swimm3r.sfm.settings import ColmapSettings, Mast3rSettings
 
 COLUMNS = columns(
@@ -105,7 +105,7 @@ def _scores(
     run, rec, uncapped = folder / "run", None, None
     try:
         summary = run_pipeline(clip, run, settings, redo=True, last_stage="sfm", progress=progress)
-        rec = reconstruction.load(run / "sfm")
+        rec = load_reconstruction(run / "sfm")
         seconds = summary["stages"]["sfm"]["cpu_seconds"]
     except RegistrationError as failure:  # no frame counts as registered, and the row says why
         seconds = NotComputed(failure.what)
@@ -130,7 +130,7 @@ def _cloud_grid(out: Path, scene: str, methods: Sequence[str]) -> None:
             filmed.append(Panel(method, None))
             restored.append(Panel("without the water", None))
             continue
-        rec = reconstruction.load(folder)
+        rec = load_reconstruction(folder)
         first = first or rec
         raw, clear = _from_above(rec, first)
         filmed.append(Panel(method, raw))

@@ -55,6 +55,16 @@ def check_file(path: Path, option: str = "--out") -> None:
             raise _unusable(path, option, "it is a folder" if path.is_dir() else "it is no ordinary file")
 
 
+def check_empty(folder: Path) -> None:
+    """Raises StorageError where a folder to be written holds anything, or is a file."""
+    if folder.exists() and (not folder.is_dir() or any(folder.iterdir())):
+        raise StorageError(
+            f"{folder} is not written to: " + ("other things lie in it" if folder.is_dir() else "it is a file"),
+            cause="the name of a folder that is in use",
+            hint="a folder that does not exist yet",
+        )
+
+
 @contextmanager
 def _explained(path: Path, option: str) -> Iterator[None]:
     try:

@@ -3,9 +3,9 @@
 from pathlib import Path
 
 from swimm3r.progress import Progress, silent
-from swimm3r.scene import reconstruction
 from swimm3r.scene.frames import Frames
 from swimm3r.scene.reconstruction import Reconstruction
+from swimm3r.scene.reconstruction_io import load_reconstruction
 from swimm3r.sfm.colmap import poses
 from swimm3r.sfm.medium.apply import with_water
 from swimm3r.sfm.plane_sweep.estimate import estimate_depth
@@ -15,9 +15,9 @@ from swimm3r.sfm.settings import ColmapSettings
 def reconstruct(frames: Frames, settings: ColmapSettings, folder: Path, progress: Progress = silent) -> Reconstruction:
     """Poses first, and saved at once: what comes after reads them from there when an interrupted run goes on."""
     if not (folder / "reconstruction.json").is_file():
-        reconstruction.save(poses.reconstruct(frames, settings, folder, progress), frames, folder)
-    rec = reconstruction.load(folder, frames)  # also where it was just made: the same bits as after an interruption
+        poses.reconstruct(frames, settings, folder, progress).save(folder, frames)
+    rec = load_reconstruction(folder, frames)  # also where it was just made: the same bits as after an interruption
     estimate_depth(rec, frames, settings.depth, progress)
     rec = with_water(rec, frames, settings, folder, progress)
-    reconstruction.save(rec, frames, folder)
+    rec.save(folder, frames)
     return rec

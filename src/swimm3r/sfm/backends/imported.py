@@ -19,7 +19,6 @@ from swimm3r.io.colmap.model import ColmapModel
 from swimm3r.io.imports.read import read_foreign
 from swimm3r.io.imports.record import ForeignModel
 from swimm3r.progress import Progress, silent
-from swimm3r.scene import reconstruction
 from swimm3r.scene.frames import Frames
 from swimm3r.scene.reconstruction import DepthMap, DepthMaps, Matches, Points, QualityWarning, Reconstruction, Tracks
 from swimm3r.sfm.colmap.triangulation import triangulate
@@ -39,13 +38,13 @@ def reconstruct(
     rec = from_foreign(frames, foreign, folder)
     if len(rec.tracks.point) == 0 and foreign.depth is None:
         rec = _with_points(rec, frames, foreign, settings, folder, progress)
-    reconstruction.save(rec, frames, folder)
+    rec.save(folder, frames)
     if foreign.depth is None:
         estimate_depth(rec, frames, settings.depth, progress)
     else:
         write_depth(rec, frames, foreign, progress)
     rec = with_water(rec, frames, settings, folder, progress)
-    reconstruction.save(rec, frames, folder)
+    rec.save(folder, frames)
     return rec
 
 

@@ -17,9 +17,9 @@ from swimm3r.cameras import Cameras, project_visible
 from swimm3r.errors import RegistrationError
 from swimm3r.imaging.filters import LUMA
 from swimm3r.progress import Progress, silent
-from swimm3r.scene import reconstruction
 from swimm3r.scene.frames import Frames
 from swimm3r.scene.reconstruction import DepthMap, DepthMaps, Matches, QualityWarning, Reconstruction
+from swimm3r.scene.reconstruction_io import load_reconstruction, write_unfiltered_matches
 from swimm3r.sfm import tracks as match_tracks
 from swimm3r.sfm.alignment import depth_cleaning
 from swimm3r.sfm.alignment.canonical import AnchoredFrame, anchors_of
@@ -62,15 +62,15 @@ def reconstruct(frames: Frames, settings: Mast3rSettings, folder: Path, progress
             encodings = EncodingStore(network, images, cache / "encodings")
             read_water = _WaterReader(head, encodings, folder / _WATER)
         rec = _place(said, images, settings, folder, progress, read_water)
-        reconstruction.save(rec, frames, folder)
-    rec = reconstruction.load(folder, frames)  # also where it was just made: the same bits as after an interruption
+        rec.save(folder, frames)
+    rec = load_reconstruction(folder, frames)  # also where it was just made: the same bits as after an interruption
     if settings.adapter is None:
         rec = with_water(rec, frames, settings, folder, progress)
     else:
         facts = adapter_file.head_facts(settings.adapter)
         predicted = from_head.read(folder / _WATER, network_images(frames, settings), facts)
         rec = with_water(rec, frames, settings, folder, progress, predicted)
-    reconstruction.save(rec, frames, folder)
+    rec.save(folder, frames)
     if settings.cache is None:
         shutil.rmtree(cache, ignore_errors=True)
     return rec
@@ -107,7 +107,7 @@ def _place(
     matches = aligned.matches.select(match_tracks.consistent(aligned.matches, canvas, settings.max_error))
     found = _tracks(matches, canvas, settings)
     tracks = match_tracks.most_seen(found, settings.max_points)
-    reconstruction.write_unfiltered_matches(folder, _on_frames(aligned.matches, images))
+    write_unfiltered_matches(folder, _on_frames(aligned.matches, images))
     points, observations = match_tracks.as_points(tracks, images.to_frame(tracks.xy + 0.5), lens, frames, kept)
     rec = Reconstruction(
         names=tuple(frames.names[f] for f in kept),

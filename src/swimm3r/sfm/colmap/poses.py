@@ -32,7 +32,6 @@ from swimm3r.scene.reconstruction import (
     QualityWarning,
     Reconstruction,
     Tracks,
-    colmap_model,
 )
 from swimm3r.sfm.colmap import calibration, mapping
 from swimm3r.sfm.colmap.plausibility import implausible
@@ -148,7 +147,7 @@ def bundle_adjust(rec: Reconstruction, *, lens: bool = False) -> Reconstruction:
     options.print_summary = False
     options.ceres.loss_function_type = pycolmap.LossFunctionType.SOFT_L1
     options.ceres.solver_options.num_threads = 1  # as in mapping: the same sums in the same order
-    model = to_pycolmap(colmap_model(rec))
+    model = to_pycolmap(rec.colmap_model())
     pycolmap.bundle_adjustment(model, options)
     model.update_point_3d_errors()
     table = from_pycolmap(model)

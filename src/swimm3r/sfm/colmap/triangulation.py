@@ -16,7 +16,7 @@ from swimm3r.io.colmap.model import from_pycolmap, silence_log, to_pycolmap
 from swimm3r.io.files.atomic import DRAFT
 from swimm3r.progress import Progress, silent
 from swimm3r.scene.frames import Frames
-from swimm3r.scene.reconstruction import Points, Reconstruction, Tracks, colmap_model
+from swimm3r.scene.reconstruction import Points, Reconstruction, Tracks
 from swimm3r.sfm.colmap import poses
 from swimm3r.sfm.features.database import fill_features, match_pairs, start_database
 from swimm3r.sfm.settings import ColmapSettings, FeatureSettings
@@ -35,7 +35,7 @@ def triangulate(
     silence_log()
     order = [frames.index(name) for name in rec.names]
     placed, threads = frames.select(order), os.cpu_count() or 1
-    table = colmap_model(rec)
+    table = rec.colmap_model()
     bare = replace(
         table, names=tuple(f"{i:06d}" for i in range(len(rec.names))),
         xyz=np.zeros((0, 3)), rgb=np.zeros((0, 3), np.uint8), error=np.zeros(0),

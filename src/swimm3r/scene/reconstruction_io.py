@@ -1,0 +1,117 @@
+"""A reconstruction read back from the folder that `Reconstruction.save` wrote.
+
+Where matches that contradict the result were dropped, matches_unfiltered.npz has all of them: what epipolar scores are
+taken over.
+"""
+
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+import torch
+
+from swimm3r.cameras import cameras_of
+from swimm3r.io import medium_json, ply
+from swimm3r.io.colmap import model as colmap
+from swimm3r.io.files.array_file import Layout, read_arrays
+from swimm3r.io.files.damage import guard, remake
+from swimm3r.io.files.json_file import read_json
+from swimm3r.scene.frames import Frames
+from swimm3r.scene.reconstruction import DenseCloud, DepthMaps, Matches, Points, QualityWarning, Reconstruction, Tracks
+
+_UNFILTERED = "matches_unfiltered.npz"
+_MATCHES = {
+    "i": Layout("matches", "int"),
+    "j": Layout("matches", "int"),
+    "xy_i": Layout("matches 2"),
+    "xy_j": Layout("matches 2"),
+    "confidence": Layout("matches"),
+}
+
+
+@dataclass(frozen=True)
+class _About:
+    """reconstruction.json."""
+
+    backend: str
+    metric: bool
+    warnings: tuple[QualityWarning, ...]
+    points_found: int | None = None  # earlier versions did not count
+
+
+def load_reconstruction(folder: str | Path, frames: Frames | None = None) -> Reconstruction:
+    """Read what `Reconstruction.save` wrote, or RUN/sfm of a run.
+
+    Raises InputError where it is damaged, or not of the training frames in `frames`.
+    """
+    folder = Path(folder)
+    remedy = remake(folder)
+    sparse = colmap.read_model(folder / "sparse", remedy)
+    if frames is not None:
+        with guard(folder / "sparse", remedy):
+            _check_frames(sparse, frames)
+    about = read_json(folder / "reconstruction.json", _About, remedy)
+    fits = medium_json.read_fits(folder / "medium.json", remedy)
+    return Reconstruction(
+        names=sparse.names,
+        cameras=cameras_of(sparse),
+        points=Points(
+            torch.from_numpy(sparse.xyz),
+            torch.from_numpy(sparse.rgb.astype(np.float32)) / 255,
+            torch.from_numpy(sparse.error),
+        ),
+        tracks=Tracks(*(torch.from_numpy(a) for a in (sparse.track_point, sparse.track_frame, sparse.track_xy))),
+        matches=_read_matches(folder / "matches.npz", len(sparse.names)),
+        depth=DepthMaps(folder / "z_depth"),
+        backend=about.backend,
+        metric=about.metric,
+        medium=fits.get("stored"),
+        medium_linear=fits.get("linear"),
+        cloud=_load_cloud(folder, "points"),
+        backdrop=_load_cloud(folder, "backdrop"),
+        warnings=about.warnings,
+        points_found=about.points_found,
+    )
+
+
+def _check_frames(sparse: colmap.ColmapModel, frames: Frames) -> None:
+    unknown = set(sparse.names) - set(frames.train.names)
+    if unknown:
+        raise ValueError(f"it places {min(unknown)}, which is no training frame of prepare/")
+    if (sparse.width, sparse.height) != (frames.width, frames.height):
+        raise ValueError(
+            f"its images have {sparse.width}x{sparse.height} pixels, the frames {frames.width}x{frames.height}"
+        )
+
+
+def write_unfiltered_matches(folder: Path, matches: Matches) -> None:
+    """Keep the matches that a reconstruction was made from, before those that contradict it are dropped."""
+    matches.save(folder / _UNFILTERED)
+
+
+def unfiltered_matches(folder: Path, rec: Reconstruction) -> Matches:
+    """All matches that a reconstruction was made from: its own, where none of them was dropped."""
+    path = folder / _UNFILTERED
+    return _read_matches(path, len(rec.names)) if path.is_file() else rec.matches
+
+
+def _read_matches(path: Path, frames: int) -> Matches:
+    remedy = remake(path.parent)
+    stored = read_arrays(path, _MATCHES, remedy)
+    with guard(path, remedy):
+        for index in (stored["i"], stored["j"]):
+            if len(index) and not 0 <= int(index.min()) <= int(index.max()) < frames:
+                raise ValueError(f"its matches point beyond the {frames} registered frames")
+    return Matches(**{name: torch.from_numpy(values) for name, values in stored.items()})
+
+
+def _load_cloud(folder: Path, stem: str) -> DenseCloud | None:
+    if not (folder / f"{stem}.ply").is_file():
+        return None
+    remedy = remake(folder)
+    xyz, restored = ply.read_points(folder / f"{stem}.ply", remedy)
+    _, raw = ply.read_points(folder / f"{stem}_raw.ply", remedy)
+    with guard(folder / f"{stem}_raw.ply", remedy):
+        if len(raw) != len(xyz):
+            raise ValueError(f"it has {len(raw)} points, {stem}.ply {len(xyz)}")
+    return DenseCloud(torch.from_numpy(xyz), torch.from_numpy(raw), torch.from_numpy(restored))
