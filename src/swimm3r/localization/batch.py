@@ -75,7 +75,7 @@ def localize_run(
     scene = load_map(folder / "splat" / "map.safetensors").to(devices.for_maps())
     frames = load_frames(folder / "prepare")
     rec = load_reconstruction(folder / "sfm", frames)
-    localizer = Localizer(scene, rec, frames, settings)
+    localizer = Localizer(scene, rec, frames, settings, progress=progress)
     out = out or folder / "localization"
     answers = []
     names = [path.name for path in image_files] or list(frames.test.names)

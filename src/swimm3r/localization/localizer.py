@@ -30,6 +30,7 @@ from swimm3r.imaging.undistortion import undistorted
 from swimm3r.localization.matchers import Matcher, matcher_for
 from swimm3r.localization.references import FilmedReferences, Reference, References, RenderedReferences, rendered
 from swimm3r.localization.settings import LocalizationSettings
+from swimm3r.progress import Progress, silent
 from swimm3r.scene.frames import Frames
 from swimm3r.scene.reconstruction import Reconstruction
 from swimm3r.sfm.colmap.poses import absolute_pose
@@ -111,6 +112,7 @@ class Localizer:
         frames: Frames | None = None,
         settings: LocalizationSettings | None = None,
         matcher: Matcher | None = None,
+        progress: Progress = silent,
     ) -> None:
         to_map, rec = axes_of_map(rec, scene.poses), as_mapped(rec, scene.poses)
         self.scene, self.rec = scene, rec
@@ -124,7 +126,14 @@ class Localizer:
             else FilmedReferences(rec, frames)
         )
         self._reference = lru_cache(maxsize=64)(self._described_reference)
-        self._likeness = self.matcher.index(rec.names, lambda name: self._reference(name)[1])
+        described: set[str] = set()
+
+        def description(name: str) -> Any:
+            described.add(name)
+            progress("describing references", len(described), len(rec.names))
+            return self._reference(name)[1]
+
+        self._likeness = self.matcher.index(rec.names, description)
 
     def locate(
         self,

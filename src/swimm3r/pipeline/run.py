@@ -21,7 +21,7 @@ from swimm3r.pipeline.presets import RunSettings, from_yaml, to_yaml
 from swimm3r.pipeline.run_record import RunRecord, open_record, stage_keys
 from swimm3r.pipeline.scoring import MappedRun, Protocol, film_flight, score_map, score_restored_frames, start_poses
 from swimm3r.prepare import check_source, load_frames, read_frames
-from swimm3r.progress import Progress, silent
+from swimm3r.progress import Progress, silent, watched
 from swimm3r.report import write_report
 from swimm3r.scene.frames import Frames
 from swimm3r.scene.ground_truth import GroundTruth
@@ -35,15 +35,15 @@ from swimm3r.splat.settings import MapDevice
 
 
 def run_pipeline(
-    source: Path,
-    folder: Path,
+    source: str | Path,
+    folder: str | Path,
     settings: RunSettings | None = None,
     *,
     redo: bool = False,
     reference: Path | None = None,
     last_stage: str = "eval",
     map_device: MapDevice = "auto",
-    progress: Progress = silent,
+    progress: Progress | None = None,
 ) -> dict:
     """Run the stages up to `last_stage` and return the summary (layout: docs/conventions.md).
 
@@ -51,18 +51,21 @@ def run_pipeline(
     settings are refused, or with `redo` moved to `folder`/old and made again. `reference` is a cameras.json to score
     against; a synthetic dive brings its own truth. `map_device` is where the map is trained and rendered. Raises the
     errors of its stages (`swimm3r.errors`), UsageError where settings differ, the folder cannot be written to or
-    another process works in it, and InputError where it belongs to another input.
+    another process works in it, and InputError where it belongs to another input. A terminal or a notebook shows how
+    far it is, unless `progress` is given (`swimm3r.progress.silent`: nothing).
     """
+    source, folder = Path(source), Path(folder)
     check_source(source)
     devices.for_maps(map_device)  # before there is a folder, and minutes of structure from motion
-    with open_record(folder, source, stat_digest(source, leave_out=folder), redo=redo) as record:
+    digest = stat_digest(source, leave_out=folder)
+    with watched(progress) as told, open_record(folder, source, digest, redo=redo) as record:
         settings, reference = record.settle(settings, reference, last_stage)
         check_inputs(source, settings, reference)
         record.make_room(settings, reference)
         record.write()
         write_text(folder / "settings.yaml", to_yaml(settings))
         write_text(folder / "versions.json", json.dumps(_versions(), indent=2) + "\n")
-        _make_stages(record, source, settings, reference, last_stage, map_device, progress)
+        _make_stages(record, source, settings, reference, last_stage, map_device, told)
         summary = record.write()
         if last_stage == "eval":
             write_report(folder)
@@ -159,7 +162,7 @@ def evaluate_run(
     *,
     steps: int | None = None,
     reference: Path | None = None,
-    progress: Progress = silent,
+    progress: Progress | None = None,
 ) -> dict:
     """Score a finished run again, its test frames' poses found anew, and return the summary.
 
@@ -173,16 +176,16 @@ def evaluate_run(
     asked = Protocol(
         settings.test if steps is None else replace(settings.test, steps=steps), reference or own.reference
     )
-    with open_record(folder, source, before.input.fingerprint) as record:
+    with watched(progress) as told, open_record(folder, source, before.input.fingerprint) as record:
         record.summary |= before.sections
         scene = load_map(folder / "splat" / "map.safetensors").to(devices.for_maps())
         frames = load_frames(folder / "prepare")
         run = MappedRun(folder, frames, load_reconstruction(folder / "sfm", frames), scene, settings)
         truth = truth_of(source, asked.reference)
         if beside := asked.key_beside(own):
-            record.add_protocol(beside, _other_scores(run, asked, truth, f"renders/protocols/{beside}", progress))
+            record.add_protocol(beside, _other_scores(run, asked, truth, f"renders/protocols/{beside}", told))
         else:
-            _own_scores(record, run, asked, truth, progress)
+            _own_scores(record, run, asked, truth, told)
         summary = record.write()
         write_report(folder)
         return summary

@@ -3,7 +3,7 @@
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from swimm3r.progress import Progress, silent
+from swimm3r.progress import Progress, watched
 from swimm3r.scene.settings import FrameSettings
 
 if TYPE_CHECKING:
@@ -15,26 +15,29 @@ __all__ = ["check_source", "load_frames", "read_frames"]
 def read_frames(
     source: str | Path,
     settings: FrameSettings | None = None,
-    folder: Path | None = None,
-    progress: Progress = silent,
+    folder: str | Path | None = None,
+    progress: Progress | None = None,
     **changes: Any,
 ) -> "swimm3r.scene.frames.Frames":
     """The frames of a video or a folder of stills, prepared into `folder`.
 
     Without a folder they go into the user's cache and are found there the next time. `changes` replace single settings:
     `read_frames("dive.mp4", fps=2)`. What `folder` held of an earlier preparation is replaced. Raises InputError on
-    what cannot be used, and OSError where the disk refuses; then nothing is left behind.
+    what cannot be used, and OSError where the disk refuses; then nothing is left behind. A terminal or a notebook shows
+    how far it is, unless `progress` is given (`swimm3r.progress.silent`: nothing).
     """
     from swimm3r.prepare import frames_folder
 
-    return frames_folder.read_frames(source, settings, folder, progress, **changes)
+    folder = None if folder is None else Path(folder)
+    with watched(progress) as told:
+        return frames_folder.read_frames(source, settings, folder, told, **changes)
 
 
 def load_frames(folder: str | Path) -> "swimm3r.scene.frames.Frames":
-    """Load the frames that `read_frames` prepared in a folder. Raises InputError where they are incomplete."""
+    """The frames that `read_frames` or `Frames.save` left in a folder. Raises InputError where they are incomplete."""
     from swimm3r.prepare import frames_folder
 
-    return frames_folder.load_frames(folder)
+    return frames_folder.load_frames(Path(folder))
 
 
 def check_source(source: Path) -> Path:

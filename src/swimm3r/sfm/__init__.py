@@ -5,7 +5,7 @@ from tempfile import mkdtemp
 from typing import TYPE_CHECKING
 
 from swimm3r.errors import InputError
-from swimm3r.progress import Progress, silent
+from swimm3r.progress import Progress, watched
 from swimm3r.sfm.settings import ColmapModelSettings, ColmapSettings, Mast3rSettings, SfmSettings
 
 if TYPE_CHECKING:
@@ -18,12 +18,14 @@ __all__ = ["ColmapModelSettings", "ColmapSettings", "Mast3rSettings", "SfmSettin
 def reconstruct(
     frames: "swimm3r.scene.frames.Frames",
     settings: SfmSettings | None = None,
-    folder: Path | None = None,
-    progress: Progress = silent,
+    folder: str | Path | None = None,
+    progress: Progress | None = None,
 ) -> "swimm3r.scene.reconstruction.Reconstruction":
     """Cameras, points, dense depth, water and restored cloud of a set of frames, of which only `frames.train` is used.
 
-    Works in `folder` (a new temporary one by default) and goes on from what an interrupted call left there.
+    `settings` choose the method: `ColmapSettings()` by default, `swimm3r.PRESETS["fast"].sfm` the quickest. Works in
+    `folder` (a new temporary one by default) and goes on from what an interrupted call left there. A terminal or a
+    notebook shows how far it is, unless `progress` is given (`swimm3r.progress.silent`: nothing).
     Raises InputError for fewer than 2 frames and RegistrationError where too few can be placed.
     """
     settings = settings or ColmapSettings()
@@ -34,7 +36,13 @@ def reconstruct(
             cause="the clip is too short or the sampling too coarse",
             hint="a longer clip or a higher --fps",
         )
-    folder = folder or Path(mkdtemp(prefix="swimm3r-sfm-"))
+    with watched(progress) as told:
+        return _reconstruct(frames, settings, Path(folder or mkdtemp(prefix="swimm3r-sfm-")), told)
+
+
+def _reconstruct(
+    frames: "swimm3r.scene.frames.Frames", settings: SfmSettings, folder: Path, progress: Progress
+) -> "swimm3r.scene.reconstruction.Reconstruction":
     match settings:
         case ColmapSettings():
             from swimm3r.sfm.backends import colmap as colmap_backend

@@ -4,7 +4,7 @@ from pathlib import Path
 from tempfile import mkdtemp
 from typing import TYPE_CHECKING
 
-from swimm3r.progress import Progress, silent
+from swimm3r.progress import Progress, watched
 from swimm3r.splat.settings import MapDevice, SplatSettings, UwbsSettings
 
 if TYPE_CHECKING:
@@ -19,19 +19,24 @@ def train(
     reconstruction: "swimm3r.scene.reconstruction.Reconstruction",
     frames: "swimm3r.scene.frames.Frames",
     settings: SplatSettings | None = None,
-    folder: Path | None = None,
-    progress: Progress = silent,
+    folder: str | Path | None = None,
+    progress: Progress | None = None,
     device: MapDevice = "auto",
 ) -> "swimm3r.splat.rendering.SplatMap":
     """A map of the reconstruction, trained on the registered of `frames.train`.
 
+    `settings` choose size and method: `swimm3r.PRESETS["fast"].splat` takes minutes on a laptop, and
+    `dataclasses.replace` changes single ones; without any they are the paper's, which take hours without a GPU.
+
     Works in `folder` (a new temporary one by default) and goes on exactly from what an interrupted call left there.
     It is trained on `device`, where the map then stays: CUDA where it is here and NVIDIA Warp installed, by default.
+    A terminal or a notebook shows how far it is, unless `progress` is given (`swimm3r.progress.silent`: nothing).
     Raises InputError where no training frame is registered, DeviceError where `device` is not here.
     """
     from swimm3r import devices
     from swimm3r.splat import train_map
 
-    folder = folder or Path(mkdtemp(prefix="swimm3r-splat-"))
     place = devices.for_maps(device)
-    return train_map.train(reconstruction, frames, settings or UwbsSettings(), folder, progress, place)
+    folder = Path(folder or mkdtemp(prefix="swimm3r-splat-"))
+    with watched(progress) as told:
+        return train_map.train(reconstruction, frames, settings or UwbsSettings(), folder, told, place)

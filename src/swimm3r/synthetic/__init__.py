@@ -3,7 +3,7 @@
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from swimm3r.progress import Progress, silent
+from swimm3r.progress import Progress, watched
 from swimm3r.synthetic.settings import Coefficients, DiveSettings
 
 if TYPE_CHECKING:
@@ -19,8 +19,9 @@ def make_dive(settings: DiveSettings) -> "swimm3r.synthetic.dive.Dive":
     return dive.make_dive(settings)
 
 
-def write_dive(settings: DiveSettings, folder: Path, progress: Progress = silent) -> None:
+def write_dive(settings: DiveSettings, folder: str | Path, progress: Progress | None = None) -> None:
     """Render a dive into a folder: images/ and truth/. Raises InputError where another dive's images lie there."""
     from swimm3r.synthetic import dive
 
-    dive.write_dive(settings, folder, progress)
+    with watched(progress) as told:
+        dive.write_dive(settings, Path(folder), told)
