@@ -81,14 +81,22 @@ def load_cameras(path: str | Path) -> Cameras:
 
 
 def read_cameras(path: Path, remedy: Remedy = _REMEDY) -> CameraTable:
-    """Read a table. Raises InputError where the file is not one."""
+    """Read a table of any program. Raises InputError where the file is not one, or its lenses are none."""
+    table = read_own_cameras(path, remedy)
+    with guard(path, remedy):
+        check_lens(cameras_of(table))
+    return table
+
+
+def read_own_cameras(path: Path, remedy: Remedy) -> CameraTable:
+    """Read a table that Swimm3R wrote, whatever distortion it found. Raises the remedy's error."""
     document = read_json(path, _Document, remedy)
     with guard(path, remedy):
         lenses = [_intrinsics(frame, document) for frame in document.frames]
         if len({model for model, _, _ in lenses}) != 1:
             raise ValueError("its frames have several camera models" if lenses else "it names no frames")
         times = tuple(frame.time for frame in document.frames if frame.time is not None)
-        table = CameraTable(
+        return CameraTable(
             names=tuple(frame.name for frame in document.frames),
             width=document.width,
             height=document.height,
@@ -99,8 +107,6 @@ def read_cameras(path: Path, remedy: Remedy = _REMEDY) -> CameraTable:
             units=document.units,
             times=times if len(times) == len(lenses) else None,
         )
-        check_lens(cameras_of(table))
-        return table
 
 
 def _intrinsics(frame: _Frame, document: _Document) -> tuple[str, np.ndarray, tuple[float, ...]]:

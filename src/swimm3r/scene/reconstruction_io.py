@@ -10,8 +10,8 @@ from pathlib import Path
 import numpy as np
 import torch
 
-from swimm3r.cameras import cameras_of
-from swimm3r.io import medium_json, ply
+from swimm3r.cameras import Cameras, cameras_of
+from swimm3r.io import cameras_json, medium_json, ply
 from swimm3r.io.colmap import model as colmap
 from swimm3r.io.files.array_file import Layout, read_arrays
 from swimm3r.io.files.damage import guard, remake
@@ -54,7 +54,7 @@ def load_reconstruction(folder: str | Path, frames: Frames | None = None) -> Rec
     fits = medium_json.read_fits(folder / "medium.json", remedy)
     return Reconstruction(
         names=sparse.names,
-        cameras=cameras_of(sparse),
+        cameras=_read_cameras(folder / "cameras.json", sparse.names),
         points=Points(
             torch.from_numpy(sparse.xyz),
             torch.from_numpy(sparse.rgb.astype(np.float32)) / 255,
@@ -72,6 +72,16 @@ def load_reconstruction(folder: str | Path, frames: Frames | None = None) -> Rec
         warnings=about.warnings,
         points_found=about.points_found,
     )
+
+
+def _read_cameras(path: Path, names: tuple[str, ...]) -> Cameras:
+    """The cameras to the last bit: COLMAP's model rounds rotations to quaternions."""
+    remedy = remake(path.parent)
+    table = cameras_json.read_own_cameras(path, remedy)
+    with guard(path, remedy):
+        if table.names != names:
+            raise ValueError("its frames are not those of sparse/")
+    return cameras_of(table)
 
 
 def _check_frames(sparse: colmap.ColmapModel, frames: Frames) -> None:

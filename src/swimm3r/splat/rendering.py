@@ -54,7 +54,8 @@ class RenderOutput:
     medium: Medium  # per pixel, [h, w, 3], per scene unit of ray depth
 
     def __repr__(self) -> str:
-        return notebook.shapes(self)
+        height, width = self.alpha.shape
+        return f"RenderOutput({', '.join(vars(self))} of {width}x{height} pixels)"
 
     def _repr_html_(self) -> str:
         shown = (("with the water", self.rgb), ("without", self.clear))
