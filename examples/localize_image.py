@@ -16,8 +16,6 @@ import torch
 import swimm3r
 from swimm3r.io.images import read_rgb
 from swimm3r.localization.localizer import Localizer
-from swimm3r.prepare import load_frames
-from swimm3r.scene import reconstruction
 
 
 def main(arguments: Sequence[str] | None = None) -> list[torch.Tensor]:
@@ -28,8 +26,8 @@ def main(arguments: Sequence[str] | None = None) -> list[torch.Tensor]:
     parser.add_argument("--time", type=float, help="second of the clip at which a dynamic map is rendered")
     given = parser.parse_args(arguments)
 
-    frames = load_frames(given.run / "prepare")
-    rec = reconstruction.load(given.run / "sfm", frames)
+    frames = swimm3r.load_frames(given.run / "prepare")
+    rec = swimm3r.load_reconstruction(given.run / "sfm", frames)
     scene = swimm3r.load_map(given.run / "splat" / "map.safetensors")
     localizer = Localizer(scene, rec, frames)  # features of the references are computed once
     poses = []

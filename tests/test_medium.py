@@ -21,7 +21,8 @@ ray_depth = torch.linspace(0.2, 3.0, 35).reshape(7, 5)
 def fit(scale: float = 1.0) -> MediumFit:
     curve = AttenuationCurve(*(torch.full((3,), v) for v in (0.6, -0.4, 0.3, -0.1)))
     flags = {name: torch.ones(3, dtype=torch.bool) for name in ("Binf", "beta_D", "beta_B")}
-    return rescale(MediumFit(*vars(medium).values(), curve, medium, flags, (0.5, 4.0), "srgb"), scale)
+    found = MediumFit(**vars(medium), curve=curve, std=medium, identifiable=flags, z_range=(0.5, 4.0), encoding="srgb")
+    return rescale(found, scale)
 
 
 def test_remove_water_undoes_add_water():

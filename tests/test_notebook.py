@@ -88,7 +88,9 @@ def fit() -> swimm3r.MediumFit:
     zero = torch.zeros(3)
     curve = AttenuationCurve(WATER.beta_D, zero, zero, zero)
     std = swimm3r.Medium(zero + 0.01, zero + 0.02, zero + 0.03)
-    return swimm3r.MediumFit(*vars(WATER).values(), curve, std, FLAGS, (0.5, 4.0), "srgb")
+    return swimm3r.MediumFit(
+        **vars(WATER), curve=curve, std=std, identifiable=FLAGS, z_range=(0.5, 4.0), encoding="srgb"
+    )
 
 
 @pytest.fixture

@@ -1,10 +1,11 @@
-"""The README's Python is run as it is printed."""
+"""The Python of the README and of the package's docstring is run as it is printed."""
 
 import re
 from collections.abc import Callable
 from dataclasses import replace
 from importlib.metadata import version
 from pathlib import Path
+from textwrap import dedent
 
 import numpy as np
 import pytest
@@ -12,6 +13,7 @@ import torch
 
 import swimm3r
 from swimm3r.io.images import read_rgb
+from swimm3r.sfm.settings import PlaneSweepSettings
 from swimm3r.splat.projection.pinhole import pinhole
 from swimm3r.splat.settings import DensifySettings, InitialSettings, MediumFieldSettings, UwbsSettings
 
@@ -35,7 +37,8 @@ def beside_a_dive(tmp_path: Path, write_video: Callable[..., Path], monkeypatch:
         densify=DensifySettings(cap_max=2000),
         medium=MediumFieldSettings(hidden=16),
     )
-    monkeypatch.setitem(swimm3r.PRESETS, "fast", replace(swimm3r.PRESETS["fast"], splat=tiny))
+    coarse = replace(swimm3r.PRESETS["fast"].sfm, depth=PlaneSweepSettings(long_side=120, sources=2))
+    monkeypatch.setitem(swimm3r.PRESETS, "fast", replace(swimm3r.PRESETS["fast"], sfm=coarse, splat=tiny))
     monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path / "cache"))
     monkeypatch.chdir(tmp_path)
     return tmp_path
@@ -53,6 +56,21 @@ def test_the_readmes_python_runs_as_printed(beside_a_dive: Path):
     assert names["pose"].shape == (4, 4)
     assert torch.isfinite(names["pose"]).all()
     np.testing.assert_allclose(names["pose"][:3, :3] @ names["pose"][:3, :3].mT, np.eye(3), atol=1e-5)
+
+
+def test_the_docstrings_python_runs_as_printed(beside_a_dive: Path):
+    blocks = re.findall(r"^    .*(?:\n+    .*)*", swimm3r.__doc__ or "", re.MULTILINE)
+    assert len(blocks) == 1
+    names: dict = {"swimm3r": swimm3r}
+    exec(compile(dedent(blocks[0]), "swimm3r.__doc__", "exec"), names)
+    out, scene, rec = names["out"], names["scene"], names["rec"]
+    again = swimm3r.load_map("dive.safetensors").render(rec.cameras[0].pinhole())
+    assert torch.equal(again.rgb, out.rgb)
+    assert not torch.equal(out.rgb, out.clear)
+    assert torch.equal(swimm3r.load_cameras("cameras.json").cam2world, rec.cameras.cam2world)
+    assert torch.isfinite(names["pose"]).all()
+    for shown in (names["frames"], rec, rec.medium, scene, out):
+        assert "<" in shown._repr_html_()
 
 
 def test_every_public_name_loads():

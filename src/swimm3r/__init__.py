@@ -1,12 +1,18 @@
 """Swimm3R: underwater video in; camera poses, the water, a restored point cloud and a map that renders out.
 
-    frames = swimm3r.read_frames("dive.mp4", fps=5)
-    rec = swimm3r.reconstruct(frames, swimm3r.ColmapSettings())
-    scene = swimm3r.train(rec, frames, swimm3r.PRESETS["fast"].splat)
-    out = scene.render(rec.cameras[0].pinhole())
+    fast = swimm3r.PRESETS["fast"]  # to start from; dataclasses.replace(fast.splat, iterations=5000) changes it
+
+    frames = swimm3r.read_frames("dive.mp4", fast.frames, fps=5)
+    rec = swimm3r.reconstruct(frames, fast.sfm)
+    scene = swimm3r.train(rec, frames, fast.splat)
+    out = scene.render(rec.cameras[0].pinhole())  # out.rgb with the water, out.clear without
     pose = swimm3r.localize(frames.image(0), scene, rec, frames)
 
-Names load on first use, so that importing the package, and every --help, is instant.
+    scene.save("dive.safetensors")  # and load_map; every record is saved and loaded so
+    rec.cameras.save("cameras.json", rec.names)
+
+Progress is shown in a terminal or a notebook, and notebooks show frames, rec, rec.medium, scene and out. Names load on
+first use, so that importing the package, and every --help, is instant.
 """
 
 from importlib import import_module

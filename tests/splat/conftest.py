@@ -126,8 +126,12 @@ def tiny_dive(tmp_path_factory: pytest.TempPathFactory) -> TinyDive:
         backend="truth",
         metric=True,
         medium=MediumFit(
-            *vars(WATER).values(), AttenuationCurve(WATER.beta_D, flat, flat, flat), Medium(flat, flat, flat),
-            {name: torch.ones(3, dtype=torch.bool) for name in ("Binf", "beta_D", "beta_B")}, (1.0, 4.0), "srgb",
+            **vars(WATER),
+            curve=AttenuationCurve(WATER.beta_D, flat, flat, flat),
+            std=Medium(flat, flat, flat),
+            identifiable={name: torch.ones(3, dtype=torch.bool) for name in ("Binf", "beta_D", "beta_B")},
+            z_range=(1.0, 4.0),
+            encoding="srgb",
         ),
         cloud=DenseCloud(xyz, rgb, rgb),
     )  # fmt: skip

@@ -178,7 +178,15 @@ def water(estimator: Estimator) -> MediumFit:
     medium, known = Medium(0.3 * one, 0.4 * one, 0.2 * one), torch.ones(3, dtype=torch.bool)
     curve = AttenuationCurve(0.4 * one, 0 * one, 0 * one, 0 * one)
     flags = dict.fromkeys(("Binf", "beta_D", "beta_B"), known)
-    return MediumFit(*vars(medium).values(), curve, medium, flags, (0.5, 4.0), "srgb", estimator)
+    return MediumFit(
+        **vars(medium),
+        curve=curve,
+        std=medium,
+        identifiable=flags,
+        z_range=(0.5, 4.0),
+        encoding="srgb",
+        estimator=estimator,
+    )
 
 
 def with_water(run: Path, folder: Path, estimator: Estimator = "Sea-Thru") -> Path:

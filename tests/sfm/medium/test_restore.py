@@ -19,7 +19,8 @@ def exact(medium: Medium) -> MediumFit:
     zero = torch.zeros(3)
     known = {name: torch.ones(3, dtype=torch.bool) for name in ("Binf", "beta_D", "beta_B")}
     curve = AttenuationCurve(medium.beta_D, zero, zero, zero)
-    return MediumFit(*vars(medium).values(), curve, Medium(zero, zero, zero), known, (0.1, 50.0), "srgb")
+    std = Medium(zero, zero, zero)
+    return MediumFit(**vars(medium), curve=curve, std=std, identifiable=known, z_range=(0.1, 50.0), encoding="srgb")
 
 
 def rays_of(camera: Cameras) -> torch.Tensor:
