@@ -74,9 +74,10 @@ def load_medium(path: str | Path, name: Literal["stored", "linear"] | None = Non
     path = Path(path)
     with guard(path, _REMEDY):
         document = decode(path.read_bytes())
-        if isinstance(document, dict) and "Binf" in document and name is None:
+        bare = isinstance(document, dict) and "Binf" in document
+        if bare and name is None:
             return structure(document, MediumRecord).medium()
-        fits = _fits(document)
+        fits = {} if bare else _fits(document)
         if not fits or name not in (None, *fits):
             raise ValueError(f"it holds no medium named {name}" if name else "it holds no medium")
         return fits[name or ("stored" if "stored" in fits else next(iter(fits)))]

@@ -25,8 +25,8 @@ def fit_of(medium: Medium, std: float, known: bool, z_range: tuple[float, float]
     of_beta = torch.full((3,), std / (z_range[0] * z_range[1]) ** 0.5)
     flags = {name: torch.full((3,), known) for name in ("Binf", "beta_D", "beta_B")}
     curve = AttenuationCurve(medium.beta_D, zero, zero, zero)
-    std = Medium(zero, of_beta, zero)
-    return MediumFit(**vars(medium), curve=curve, std=std, identifiable=flags, z_range=z_range, encoding="srgb")
+    spread = Medium(zero, of_beta, zero)
+    return MediumFit(**vars(medium), curve=curve, std=spread, identifiable=flags, z_range=z_range, encoding="srgb")
 
 
 def said(fit: MediumFit, *, gray: bool = False) -> str:
