@@ -84,7 +84,7 @@ class SplatMap:
         )
 
     def _repr_html_(self) -> str:
-        """A view of the map with its water and without, in the middle of its clip; of older files, the text alone."""
+        """A view of the map with its water and without, in the middle of its clip; without a viewpoint, text."""
         if self.viewpoint is None:
             return notebook.table(repr(self), [])
         seen = self.render(self.viewpoint.pinhole(_SHOWN_SIDE), sum(self.span) / 2)
