@@ -30,6 +30,7 @@ if TYPE_CHECKING:
     from swimm3r.pipeline.presets import PRESETS, RunSettings
     from swimm3r.pipeline.run import run_pipeline
     from swimm3r.prepare import load_frames, read_frames
+    from swimm3r.progress import Progress, silent
     from swimm3r.scene.frames import Frames
     from swimm3r.scene.reconstruction import Reconstruction
     from swimm3r.scene.reconstruction_io import load_reconstruction
@@ -73,6 +74,8 @@ _HOME = {
     "RunSettings": "pipeline.presets",
     "Reconstruction": "scene.reconstruction",
     "run_pipeline": "pipeline.run",
+    "Progress": "progress",
+    "silent": "progress",
     "reconstruct": "sfm",
     "ColmapSettings": "sfm.settings",
     "Mast3rSettings": "sfm.settings",
@@ -105,6 +108,7 @@ __all__ = [
     "McmcGsSettings",
     "Medium",
     "MediumFit",
+    "Progress",
     "Reconstruction",
     "RunSettings",
     "SeaSplatSettings",
@@ -125,6 +129,7 @@ __all__ = [
     "remove_water",
     "run_pipeline",
     "seasplat",
+    "silent",
     "threers_gs",
     "train",
     "ubs",

@@ -1,4 +1,4 @@
-"""What interpreters and notebooks show of a record: one line of text, or HTML without scripts and links.
+"""Text and HTML that interpreters and notebooks show for a record, without scripts and links.
 
 Any text may be given: it is escaped.
 """

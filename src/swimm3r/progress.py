@@ -1,4 +1,4 @@
-"""How long work tells its caller how far it is, and what is drawn of it where nobody says otherwise.
+"""Progress of long work: told to the caller, and by default drawn in a terminal or a notebook.
 
 Functions for notebooks and scripts take `progress: Progress | None = None` and work inside `watched(progress)`; those
 that they call take a `Progress`. The command line draws its own (`cli.terminal`).

@@ -53,6 +53,26 @@ def test_a_file_that_is_no_map_is_refused(tmp_path, wall):
         load_map(path)
 
 
+def test_a_map_comes_back_with_the_same_bits(tmp_path, wall, camera):
+    poses = RefinedPoses(("a.png", "b.png"), torch.eye(4, dtype=torch.float64).repeat(2, 1, 1))
+    for scene in (wall(50), replace(wall(50), poses=poses, viewpoint=camera(), span=(1 / 3, 2 / 3), length=0.1)):
+        scene.save(str(tmp_path / "map.safetensors"))
+        again = load_map(str(tmp_path / "map.safetensors"))
+        for name in scene.primitives._fields:
+            assert torch.equal(getattr(again.primitives, name), getattr(scene.primitives, name)), name
+        for name, values in scene.field.state_dict().items():
+            assert torch.equal(again.field.state_dict()[name], values), name
+        rest = ("settings", "metric", "length", "span")
+        assert [getattr(again, name) for name in rest] == [getattr(scene, name) for name in rest]
+        assert (again.poses is None) == (scene.poses is None)
+        assert torch.equal(again.render(camera()).rgb, scene.render(camera()).rgb)
+    assert again.poses.names == poses.names
+    assert torch.equal(again.poses.cam2world, poses.cam2world)
+    for name in ("K", "distortion", "cam2world"):
+        assert torch.equal(getattr(again.viewpoint, name), getattr(camera(), name)), name
+    assert (again.viewpoint.width, again.viewpoint.height) == (camera().width, camera().height)
+
+
 def rewritten(path: Path, tensors: dict[str, Tensor], about: dict[str, Any]) -> None:
     """The same map with some tensors and header entries replaced, or left out where they are None."""
     stored = read_tensors(path, dict[str, Any], remake(path.parent), None)
@@ -98,12 +118,17 @@ def rewritten(path: Path, tensors: dict[str, Tensor], about: dict[str, Any]) -> 
         ({"primitives.query_mean": torch.zeros(10, 5)}, {}, "numbers wide"),
         ({"field.network.0.weight": torch.zeros(1, 1)}, {}, "network.0.weight"),
         ({"field.network.0.weight": None}, {}, "network.0.weight"),
+        ({"viewpoint.K": None}, {}, "viewpoint.K"),
+        ({"viewpoint.K": torch.eye(3)}, {}, "viewpoint has the shapes"),
+        ({"viewpoint.cam2world": torch.zeros(1, 4, 4)}, {}, "rotation"),
+        ({}, {"viewpoint": {"width": 0, "height": 5}}, "whole pixels"),
+        ({}, {"viewpoint": [64, 48]}, "viewpoint: an object is expected"),
     ],
 )
-def test_a_map_that_is_damaged_is_refused(tmp_path, wall, tensors, about, said):
+def test_a_map_that_is_damaged_is_refused(tmp_path, wall, camera, tensors, about, said):
     path = tmp_path / "map.safetensors"
     poses = RefinedPoses(("a.png", "b.png"), torch.eye(4, dtype=torch.float64).repeat(2, 1, 1))
-    replace(wall(10), poses=poses).save(path)
+    replace(wall(10), poses=poses, viewpoint=camera()).save(path)
     load_map(path)
     rewritten(path, tensors, about)
     with pytest.raises(InputError, match=said) as raised:

@@ -30,7 +30,7 @@ def localize(
     The query is first matched with training images: `frames` has them; without, the map's renderings from the same
     poses take their place. `lens` is the image's camera (its pose unused), by default that of the reconstruction;
     `time`, seconds of the clip, is the moment at which a dynamic map is shown. A terminal or a notebook shows how far
-    it is, unless `progress` is given (`swimm3r.progress.silent`: nothing). Many images are placed faster by one
+    it is, unless `progress` is given (`swimm3r.silent`: nothing). Many images are placed faster by one
     `localization.localizer.Localizer`.
     """
     from swimm3r.localization.localizer import Localizer

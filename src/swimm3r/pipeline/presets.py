@@ -174,6 +174,9 @@ PRESETS: dict[Preset, RunSettings] = {
         test=PoseRefinementSettings(long_side=0, halvings=0),
     ),
 }
+"""Settings to start from: `PRESETS["fast"].frames`, `.sfm` and `.splat` are those of `read_frames`, `reconstruct` and
+`train`, the whole is that of `run_pipeline`; `dataclasses.replace` changes single ones.
+"""
 
 MAST3R_PRESETS: dict[Preset, Mast3rSettings] = {  # the same aims with --backend mast3r
     "fast": Mast3rSettings(

@@ -47,12 +47,14 @@ def run_pipeline(
 ) -> dict:
     """Run the stages up to `last_stage` and return the summary (layout: docs/conventions.md).
 
-    Without `settings` the run goes by those that the folder holds, a new one by the defaults. Stages made with other
-    settings are refused, or with `redo` moved to `folder`/old and made again. `reference` is a cameras.json to score
-    against; a synthetic dive brings its own truth. `map_device` is where the map is trained and rendered. Raises the
-    errors of its stages (`swimm3r.errors`), UsageError where settings differ, the folder cannot be written to or
-    another process works in it, and InputError where it belongs to another input. A terminal or a notebook shows how
-    far it is, unless `progress` is given (`swimm3r.progress.silent`: nothing).
+    `settings` are a preset's (`swimm3r.PRESETS["fast"]`), or changed from one. Without them the run goes by those that
+    the folder holds, a new one by the defaults. Stages made with other settings are refused, or with `redo` moved to
+    `folder`/old and made again. `reference` is a cameras.json to score against; a synthetic dive brings its own truth.
+    `map_device` is where the map is trained and rendered. A terminal or a notebook shows how far it is, unless
+    `progress` is given (`swimm3r.silent`: nothing).
+
+    Raises the errors of its stages (`swimm3r.errors`), UsageError where settings differ, the folder cannot be written
+    to or another process works in it, and InputError where it belongs to another input.
     """
     source, folder = Path(source), Path(folder)
     check_source(source)

@@ -24,7 +24,7 @@ def read_frames(
     Without a folder they go into the user's cache and are found there the next time. `changes` replace single settings:
     `read_frames("dive.mp4", fps=2)`. What `folder` held of an earlier preparation is replaced. Raises InputError on
     what cannot be used, and OSError where the disk refuses; then nothing is left behind. A terminal or a notebook shows
-    how far it is, unless `progress` is given (`swimm3r.progress.silent`: nothing).
+    how far it is, unless `progress` is given (`swimm3r.silent`: nothing).
     """
     from swimm3r.prepare import frames_folder
 

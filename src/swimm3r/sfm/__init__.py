@@ -25,7 +25,7 @@ def reconstruct(
 
     `settings` choose the method: `ColmapSettings()` by default, `swimm3r.PRESETS["fast"].sfm` the quickest. Works in
     `folder` (a new temporary one by default) and goes on from what an interrupted call left there. A terminal or a
-    notebook shows how far it is, unless `progress` is given (`swimm3r.progress.silent`: nothing).
+    notebook shows how far it is, unless `progress` is given (`swimm3r.silent`: nothing).
     Raises InputError for fewer than 2 frames and RegistrationError where too few can be placed.
     """
     settings = settings or ColmapSettings()

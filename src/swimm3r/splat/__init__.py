@@ -30,7 +30,7 @@ def train(
 
     Works in `folder` (a new temporary one by default) and goes on exactly from what an interrupted call left there.
     It is trained on `device`, where the map then stays: CUDA where it is here and NVIDIA Warp installed, by default.
-    A terminal or a notebook shows how far it is, unless `progress` is given (`swimm3r.progress.silent`: nothing).
+    A terminal or a notebook shows how far it is, unless `progress` is given (`swimm3r.silent`: nothing).
     Raises InputError where no training frame is registered, DeviceError where `device` is not here.
     """
     from swimm3r import devices
