@@ -35,7 +35,7 @@ from swimm3r.splat.projection.conditioning import Conditioned, condition, querie
 from swimm3r.splat.projection.dispatch import project
 from swimm3r.splat.projection.pinhole import pinhole
 from swimm3r.splat.projection.plain import project_conditioned
-from swimm3r.splat.rendering import SplatMap, in_scene_units
+from swimm3r.splat.rendering import SplatMap, settings_in_scene_units
 from swimm3r.splat.settings import RenderSettings
 
 _CONDON_SHORTLEY = [(-1.0) ** m for degree in (1, 2, 3) for m in range(-degree, degree + 1)]
@@ -81,7 +81,7 @@ def moment_matched(scene: SplatMap, cameras: Cameras, time: float | None = None)
 
     Raises ValueError where a dynamic map is given no time.
     """
-    now, settings = scene.moment(time), in_scene_units(scene.settings, scene.length).render
+    now, settings = scene.normalized_time(time), settings_in_scene_units(scene.settings, scene.length).render
     p = scene.primitives
     assert isinstance(p, BetaPrimitives)
     assert isinstance(settings, RenderSettings)
@@ -149,7 +149,7 @@ def draw_gaussians(g: Gaussians, camera: Cameras, near: float) -> RasterOutput:
 
 def clear_difference(scene: SplatMap, g: Gaussians, cameras: Cameras, time: float | None = None) -> ClearDifference:
     """The Gaussians against the map they were made of, both without water and before black, seen by `cameras`."""
-    settings, now = in_scene_units(scene.settings, scene.length).render, scene.moment(time)
+    settings, now = settings_in_scene_units(scene.settings, scene.length).render, scene.normalized_time(time)
     colors, alphas = [], []
     with torch.no_grad():
         for i in range(len(cameras)):

@@ -23,7 +23,7 @@ from swimm3r.splat.primitives.beta import select
 from swimm3r.splat.primitives.kinds import Primitives
 from swimm3r.splat.projection.dispatch import project
 from swimm3r.splat.projection.pinhole import pinhole
-from swimm3r.splat.rendering import SplatMap, images, in_scene_units, memory_for_views
+from swimm3r.splat.rendering import SplatMap, images, memory_for_views, settings_in_scene_units
 from swimm3r.splat.settings import PoseRefinementSettings
 from swimm3r.splat.training_poses import moved
 
@@ -92,11 +92,11 @@ class _Look:
         long_side: int,
         time: float | None,
     ) -> None:
-        self._scene, self._now = scene, scene.moment(time)
+        self._scene, self._now = scene, scene.normalized_time(time)
         self._canvas = camera.pinhole(long_side)
         target, seen = undistorted(image, mask, camera, self._canvas)
         self._target, self._wanted = target.to(scene.device), edges(target, seen, settings).to(scene.device)
-        self._units = in_scene_units(scene.settings, scene.length)
+        self._units = settings_in_scene_units(scene.settings, scene.length)
         self._primitives = in_sight(scene, self._canvas, self._now)
 
     def pose(self, delta: Float[Tensor, "9"]) -> Float[Tensor, "4 4"]:
@@ -139,7 +139,7 @@ def in_sight(scene: SplatMap, canvas: Cameras, now: Float[Tensor, ""] | None = N
     """The primitives that a camera sees, or would after a small motion."""
     with torch.no_grad():
         view = pinhole(canvas).to(scene.device)
-        seen = project(scene.primitives, view, in_scene_units(scene.settings, scene.length).render, now)
+        seen = project(scene.primitives, view, settings_in_scene_units(scene.settings, scene.length).render, now)
     size = torch.tensor([canvas.width, canvas.height]).to(seen.radius)
     reach = seen.radius[:, None] + _MARGIN * size
     at = seen.primitives.mean2d

@@ -34,7 +34,7 @@ from swimm3r.splat.projection.dispatch import project
 from swimm3r.splat.projection.pinhole import Pinhole, Projection, pinhole
 from swimm3r.splat.settings import SplatSettings, UwbsSettings
 from swimm3r.splat.training_poses import RefinedPoses
-from swimm3r.splat.views import moment
+from swimm3r.splat.views import normalized_time
 
 SCHEMA = 2  # of a map's file; 1: Swimm3R 0.1, whose settings have other names
 _SHOWN_SIDE = 320  # pixels of a view in a notebook
@@ -135,14 +135,14 @@ class SplatMap:
             about["viewpoint"] = {"width": self.viewpoint.width, "height": self.viewpoint.height}
         write_tensors(Path(path), tensors, about)
 
-    def moment(self, time: float | None) -> Float[Tensor, ""] | None:
+    def normalized_time(self, time: float | None) -> Float[Tensor, ""] | None:
         """A time of the clip as the map's own parts take it: None in static maps, 0..1 in dynamic ones."""
         if not self.primitives.dynamic:
             return None
         if time is None:
             start, end = self.span
             raise ValueError(f"a dynamic map is rendered at a time of its clip, {start:g} to {end:g} s; got none")
-        return moment(self.span, time)
+        return normalized_time(self.span, time)
 
 
 @dataclass(frozen=True)
@@ -214,7 +214,7 @@ def _uri(image: Float[Tensor, "h w 3"]) -> str:
 OfMethod = TypeVar("OfMethod", bound=SplatSettings)
 
 
-def in_scene_units(settings: OfMethod, length: float) -> OfMethod:
+def settings_in_scene_units(settings: OfMethod, length: float) -> OfMethod:
     """Settings whose lengths are scene units instead of working units."""
     return replace(settings, render=replace(settings.render, near=settings.render.near * length))
 
@@ -228,8 +228,8 @@ memory_for_views = devices.memory_for(
 @memory_for_views
 def render(scene: SplatMap, camera: Cameras, time: float | None = None) -> RenderOutput:
     """One view of a map at a time of its clip. Raises ValueError as `SplatMap.render` does."""
-    settings = in_scene_units(scene.settings, scene.length)
-    view, now = pinhole(camera).to(scene.device), scene.moment(time)
+    settings = settings_in_scene_units(scene.settings, scene.length)
+    view, now = pinhole(camera).to(scene.device), scene.normalized_time(time)
     match scene.field:
         case MediumField():
             drawing = draw(scene.primitives, scene.field, view, settings, now)
@@ -265,7 +265,7 @@ def mean_water(scene: SplatMap, camera: Cameras, time: float | None = None) -> M
     match scene.field:
         case MediumField():
             view = pinhole(camera).to(scene.device)
-            grid = grid_of(scene.field, view, scene.field.stride, scene.moment(time))
+            grid = grid_of(scene.field, view, scene.field.stride, scene.normalized_time(time))
             mean = grid.values.flatten(1).mean(1).to(camera.cam2world.device)
             return Medium(mean[:3], beta_B=mean[3:6], beta_D=mean[6:])
         case SceneWater():

@@ -19,7 +19,7 @@ from swimm3r.splat.rendering import SplatMap
 from swimm3r.splat.settings import SplatSettings
 from swimm3r.splat.training import loop
 from swimm3r.splat.training.scene import TrainingScene, path_radius
-from swimm3r.splat.training.state import in_scene_units
+from swimm3r.splat.training.state import map_in_scene_units
 from swimm3r.splat.training_poses import RefinedPoses, training_poses_of, write_refined
 from swimm3r.splat.views import TrainingViews, median_z_depth, working_scale
 
@@ -44,7 +44,7 @@ def train(
     training_scene = TrainingScene(rec, scale, radius, views, poses_in_training, device)
     with devices.memory_for("this map", "fewer primitives, a smaller --splat.long-side, or --map-device cpu"):
         final = loop.run(recipe_parts(settings), training_scene, _schedule(settings, rec, views), folder, progress)
-    primitives, field = in_scene_units(final, 1 / scale)
+    primitives, field = map_in_scene_units(final, 1 / scale)
     poses = None
     if poses_in_training is not None and final.poses is not None:
         poses = poses_in_training.refined(final.poses)

@@ -52,7 +52,7 @@ class TrainingViews:
 
     def __init__(self, rec: Reconstruction, frames: Frames, settings: SplatSettings, scale: float) -> None:
         self.rec, self.frames, self.settings, self.scale = rec, frames, settings, scale
-        self._times = {frame.name: moment(frames.span, frame.time) for frame in frames}
+        self._times = {frame.name: normalized_time(frames.span, frame.time) for frame in frames}
         train = {frame.name for frame in frames.train}
         self.names = tuple(name for name in rec.names if name in train)
         if not self.names:
@@ -136,7 +136,7 @@ def _in_working_units(cameras: Cameras, scale: float) -> Cameras:
     return replace(cameras, cam2world=cam2world)
 
 
-def moment(span: tuple[float, float], time: float) -> Float[Tensor, ""]:
+def normalized_time(span: tuple[float, float], time: float) -> Float[Tensor, ""]:
     """A time in seconds of a clip that lasts from span[0] to span[1], as maps take it: 0..1."""
     start, end = span
     return torch.tensor((time - start) / (end - start) if end > start else 0.0)

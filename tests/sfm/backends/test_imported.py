@@ -163,7 +163,7 @@ def test_images_that_match_nowhere_come_with_a_warning(posed_dive, tmp_path: Pat
     for frame in frames:
         images.write_rgb(frame.path, np.full((160, 240, 3), 0.4))
     rec = imported_backend.reconstruct(frames, ColmapModelSettings(path), tmp_path / "sfm")
-    assert "at its poses the images' own matches meet nowhere" in rec.warnings[0].what
+    assert "the images' own matches do not agree with its poses" in rec.warnings[0].what
     assert len(rec.tracks.point) == len(rec.matches.i) == 0
 
 

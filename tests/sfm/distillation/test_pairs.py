@@ -61,8 +61,8 @@ def test_the_augmentation_is_the_clear_image_through_one_water_at_ray_depth(tmp_
     known = item.valid
     torch.testing.assert_close(restored[known], colors(item.clean)[known], atol=2e-4, rtol=0)
     assert not torch.equal(item.raw, item.clean)
-    assert torch.equal(item.drawn, torch.stack([water.Binf, water.beta_D, water.beta_B]).expand(2, 3, 3))
-    assert made(tmp_path).item(0, 0.0, drawn(3)).drawn.isnan().all()  # as taken: nobody knows its water
+    assert torch.equal(item.sampled_medium, torch.stack([water.Binf, water.beta_D, water.beta_B]).expand(2, 3, 3))
+    assert made(tmp_path).item(0, 0.0, drawn(3)).sampled_medium.isnan().all()  # as taken: nobody knows its water
 
 
 def test_half_of_the_items_are_augmented(tmp_path: Path):

@@ -360,7 +360,7 @@ def test_without_physics_there_is_no_head(
 def test_before_its_first_step_the_student_is_the_teacher(network: Mast3r, eight: PairData):
     student = new_student(network, SETTINGS.lora, ObjectiveSettings(), 0)
     item = eight.item(0, 0.0, torch.Generator())
-    batch = {name: getattr(item, name)[None] for name in ("clean", "ray_depth", "valid", "drawn")}
+    batch = {name: getattr(item, name)[None] for name in ("clean", "ray_depth", "valid", "sampled_medium")}
     same = student(raw=item.clean[None], **batch)
     assert same["encoder"] == same["decoder"] == same["descriptors"] == 0
     assert student(raw=item.raw[None], **batch)["encoder"] > 0
@@ -465,7 +465,7 @@ def test_the_heads_water_is_held_against_water_that_is_known(
     student = new_student(network, SETTINGS.lora, ObjectiveSettings(), 0).eval()
     media = []
     for index in range(len(eight)):
-        drawn = eight.item(index, 1.0, torch.Generator().manual_seed(index)).drawn[0]
+        drawn = eight.item(index, 1.0, torch.Generator().manual_seed(index)).sampled_medium[0]
         off = torch.tensor([1.0, 1.2, 0.5])[:, None] * drawn
         media.append(Medium(*(value.expand(2, 48, 64, 3) for value in off)))
     answers = iter(media)

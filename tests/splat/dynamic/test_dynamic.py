@@ -28,7 +28,7 @@ from swimm3r.splat.settings import (
     PoseRefinementSettings,
     UwbsSettings,
 )
-from swimm3r.splat.views import TrainingViews, moment
+from swimm3r.splat.views import TrainingViews, normalized_time
 
 DYNAMIC = UwbsSettings(
     dynamic=True,
@@ -63,7 +63,7 @@ def test_time_is_counted_over_the_whole_clip_test_frames_included(tiny_dive):
 
 
 def test_a_clip_of_one_moment_is_at_its_beginning():
-    assert moment((3.0, 3.0), 3.0) == 0
+    assert normalized_time((3.0, 3.0), 3.0) == 0
 
 
 def test_primitives_begin_around_moments_of_their_own(tiny_dive):

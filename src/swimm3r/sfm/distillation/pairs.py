@@ -38,7 +38,9 @@ class PairItem:
     raw: Float[Tensor, "2 3 h w"]
     ray_depth: Float[Tensor, "2 h w"]  # m, 0 where unknown
     valid: Bool[Tensor, "2 h w"]  # where the water's losses look
-    drawn: Float[Tensor, "2 3 3"]  # Binf, beta_D, beta_B of the augmentation's water; NaN for an image taken in water
+    sampled_medium: Float[
+        Tensor, "2 3 3"
+    ]  # Binf, beta_D, beta_B of the augmentation's water; NaN for an image taken in water
 
 
 @dataclass(frozen=True)
@@ -112,9 +114,9 @@ class PairData:
         if view.z_depth is not None:
             depth = depth_to_network(view.z_depth, frame) * self.z_rays(sequence, frame)
         known = depth > 0
-        drawn = torch.full((3, 3), torch.nan)
+        sampled_medium = torch.full((3, 3), torch.nan)
         if water is not None and bool(known.any()):
-            drawn = torch.stack([water.Binf, water.beta_D, water.beta_B])
+            sampled_medium = torch.stack([water.Binf, water.beta_D, water.beta_B])
             J = ((clean + 1) / 2).permute(1, 2, 0)
             nothing = ~known & (J.amax(-1) < _BLACK)
             wet = torch.where(nothing[..., None], water.Binf, add_water(J, nearest_known(depth), water))
@@ -123,7 +125,7 @@ class PairData:
             raw = to_network(view.raw, frame)
         else:
             raise ValueError(f"{sequence.shots[k].name} has neither a raw image nor any depth")
-        return _ViewItem(clean, raw, depth, known, drawn)
+        return _ViewItem(clean, raw, depth, known, sampled_medium)
 
 
 @dataclass(frozen=True)
@@ -140,7 +142,7 @@ class _ViewItem:
     raw: Float[Tensor, "3 h w"]
     ray_depth: Float[Tensor, "h w"]
     valid: Bool[Tensor, "h w"]
-    drawn: Float[Tensor, "3 3"]
+    sampled_medium: Float[Tensor, "3 3"]
 
 
 def trainable(sequences: Items[Sequence], pairs: Items[Items[Pair]], augmented: bool = True) -> list[tuple[int, Pair]]:

@@ -72,10 +72,10 @@ def water_error(student: Student, data: PairData) -> dict[str, list[float]] | No
         item = data.item(index, 1.0, torch.Generator().manual_seed(index))
         medium = student.water(student.network.encode(item.raw.to(device))).at(item.ray_depth.to(device))
         for view in range(2):
-            known, drawn = item.valid[view], item.drawn[view]
-            if bool(known.any()) and bool(drawn.isfinite().all()):
+            known, sampled_medium = item.valid[view], item.sampled_medium[view]
+            if bool(known.any()) and bool(sampled_medium.isfinite().all()):
                 read = [getattr(medium, name)[view].cpu()[known].median(0).values for name in _COEFFICIENTS]
-                ratios.append(torch.stack(read) / drawn.clamp(min=1e-6) - 1)
+                ratios.append(torch.stack(read) / sampled_medium.clamp(min=1e-6) - 1)
     if not ratios:
         return None
     error = torch.stack(ratios).double().abs().quantile(_ONE_STD, dim=0)

@@ -13,7 +13,7 @@ from swimm3r.sfm.medium.dense_tracks import fuse_depth
 from swimm3r.sfm.medium.from_head import PredictedWater, dive_fit, predicted_images
 from swimm3r.sfm.medium.plausibility import attenuation_is_a_guess, water_warnings
 from swimm3r.sfm.medium.restore import restored_cloud, restored_images, shown_gains
-from swimm3r.sfm.medium.samples import gather_samples
+from swimm3r.sfm.medium.samples import collect_samples
 from swimm3r.sfm.medium.seathru import fit_medium
 from swimm3r.sfm.settings import SfmSettings
 
@@ -32,7 +32,7 @@ def with_water(
     the physics head's water, which then restores images and cloud; only the fit in linear light is Sea-Thru's.
     """
     tracks = fuse_depth(rec, frames, settings.water.tracks, progress)
-    samples = gather_samples(rec, frames, tracks, settings.water, progress)
+    samples = collect_samples(rec, frames, tracks, settings.water, progress)
     try:
         stored = (
             fit_medium(samples, settings.water, "srgb")

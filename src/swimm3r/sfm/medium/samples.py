@@ -34,7 +34,7 @@ class WaterSamples:
     gray: bool = False  # the three channels are one (`Frames.gray`)
 
 
-def gather_samples(
+def collect_samples(
     rec: Reconstruction, frames: Frames, tracks: DenseTracks, settings: SeathruSettings, progress: Progress = silent
 ) -> WaterSamples:
     """Samples of every frame that has a depth map."""

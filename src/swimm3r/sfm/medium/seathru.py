@@ -38,7 +38,7 @@ from swimm3r.sfm.medium.channel_fit import (
     fit_channel,
 )
 from swimm3r.sfm.medium.dense_tracks import fuse_depth
-from swimm3r.sfm.medium.samples import WaterSamples, gather_samples
+from swimm3r.sfm.medium.samples import WaterSamples, collect_samples
 from swimm3r.sfm.settings import SeathruSettings
 
 
@@ -51,7 +51,7 @@ def estimate_medium(
 ) -> MediumFit:
     """The water of a reconstructed dive. Who wants both encodings gathers once and calls `fit_medium` twice."""
     tracks = fuse_depth(rec, frames, settings.tracks, progress)
-    return fit_medium(gather_samples(rec, frames, tracks, settings, progress), settings, encoding)
+    return fit_medium(collect_samples(rec, frames, tracks, settings, progress), settings, encoding)
 
 
 def fit_medium(samples: WaterSamples, settings: SeathruSettings, encoding: Encoding) -> MediumFit:

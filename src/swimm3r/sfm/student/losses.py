@@ -169,12 +169,15 @@ def physics_terms(
 
 
 def known_water_loss(
-    ray_depth: Float[Tensor, "b h w"], valid: Bool[Tensor, "b h w"], medium: Medium, drawn: Float[Tensor, "b 3 3"]
+    ray_depth: Float[Tensor, "b h w"],
+    valid: Bool[Tensor, "b h w"],
+    medium: Medium,
+    sampled_medium: Float[Tensor, "b 3 3"],
 ) -> Float[Tensor, " b"]:
     """L_wat: T_D and B against those of the water that was drawn (its Binf, beta_D, beta_B); 0 where that is NaN."""
     z = torch.where(valid, ray_depth, 0.0)
-    known = drawn.isfinite().flatten(1).all(1)
-    true = Medium(*torch.where(known[:, None, None], drawn, 0.0)[:, None, None].unbind(3))
+    known = sampled_medium.isfinite().flatten(1).all(1)
+    true = Medium(*torch.where(known[:, None, None], sampled_medium, 0.0)[:, None, None].unbind(3))
     of_scene = transmittances(z, medium)[0] - transmittances(z, true)[0]
     of_water = backscatter(z, medium) - backscatter(z, true)
     return torch.where(known, _mean_over((of_scene.abs() + of_water.abs()).sum(-1), valid), 0.0)

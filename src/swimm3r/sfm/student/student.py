@@ -49,13 +49,13 @@ class Student(nn.Module):
         raw: Float[Tensor, "b 2 3 h w"],
         ray_depth: Float[Tensor, "b 2 h w"],
         valid: Bool[Tensor, "b 2 h w"],
-        drawn: Float[Tensor, "b 2 3 3"],
+        sampled_medium: Float[Tensor, "b 2 3 3"],
         teacher: PairFeatures | None = None,
     ) -> dict[str, Float[Tensor, " b"]]:
         """The fields of `LossTerms` of pairs of the network's images (-1..1); ray depth in m, read where valid.
 
-        `drawn` is Binf, beta_D and beta_B of the water the augmentation drew, NaN where it drew none. `teacher` is what
-        it makes of the clear images, where that is known already.
+        `sampled_medium` is Binf, beta_D and beta_B of the water the augmentation drew, NaN where it drew none.
+        `teacher` is its features of the clear images, where they are known already.
         """
         s = self.objective
         if teacher is None:
@@ -73,7 +73,7 @@ class Student(nn.Module):
             z, known = ray_depth.flatten(0, 1), valid.flatten(0, 1)
             medium = self.head(encoded).at(torch.where(known, z, 0.0))
             water = dict(vars(physics_terms(I, J, z, known, medium, s)))
-            water["known_water"] = known_water_loss(z, known, medium, drawn.flatten(0, 1))
+            water["known_water"] = known_water_loss(z, known, medium, sampled_medium.flatten(0, 1))
             terms |= {name: values.unflatten(0, (-1, 2)).mean(1) for name, values in water.items()}
         return terms
 

@@ -88,7 +88,7 @@ def restored(
     return State(p, filled, poses, moments, memory)
 
 
-def in_scene_units(state: State, length: float) -> tuple[Primitives, Water]:
+def map_in_scene_units(state: State, length: float) -> tuple[Primitives, Water]:
     """Primitives and water of a finished state, `length` scene units to a working unit; no gradient.
 
     SceneWater has no length.
