@@ -1,5 +1,6 @@
 """Links between documents: every one leads somewhere, and every file that a text names exists."""
 
+import ast
 import re
 from pathlib import Path
 
@@ -72,3 +73,24 @@ def test_a_broken_link_and_a_missing_file_are_seen(tmp_path: Path):
     assert missing("sfm/elsewhere.py", "", ROOT)
     assert not missing("sfm/settings.py", "", ROOT)
     assert anchor("Are `identifiable` coefficients right?") == "are-identifiable-coefficients-right"
+
+
+def test_every_underscored_name_in_the_sources_backticks_exists():
+    sources = sorted((ROOT / "src").rglob("*.py"))
+    known = {source.stem for source in sources} | {"from_pretrained"}  # Hugging Face's
+    for source in sources:
+        for node in ast.walk(ast.parse(source.read_text(encoding="utf-8"))):
+            match node:
+                case ast.FunctionDef(name=name) | ast.ClassDef(name=name) | ast.arg(arg=name) | ast.Name(id=name):
+                    known.add(name)
+                case ast.Attribute(attr=name) | ast.keyword(arg=str(name)):
+                    known.add(name)
+                case ast.Constant(value=str(text)):
+                    known |= set(re.findall(r"^\w+$", text))
+    wrong = {
+        f"{source.relative_to(ROOT)}: {name}"
+        for source in sources
+        for name in re.findall(r"`(\w+_\w+)`", source.read_text(encoding="utf-8"))
+        if name not in known
+    }
+    assert wrong == set()

@@ -1,6 +1,6 @@
 """One cell of a table: the scores of one method on one scene under one seed.
 
-A cell's folder OUT/SCENE/METHOD/SEED keeps what the method made (a map, images) and two keys (`io.cache_key`):
+A cell's folder OUT/SCENE/METHOD/SEED keeps what the method made (a map, images) and two keys (`io.files.cache_key`):
 
     made_from.json   of everything that decides what the method makes: input, settings, weights, the package's code
     scores.json      of that and of what decides the scores alone: the reference, weights of perceptual scores

@@ -93,7 +93,7 @@ class AlignmentProblem:
     def of(
         frames: Sequence[AnchoredFrame], pairs: Sequence[AnchoredPair], settings: AlignmentSettings, known: Known
     ) -> "AlignmentProblem":
-        """Raises what `alignment.align` says."""
+        """Raises the errors of `optimize.align`."""
         _check(frames, pairs, settings, known)
         center = 0.0 if settings.parity else 0.5
         counts = [len(f.anchor_depth) for f in frames]

@@ -4,7 +4,8 @@
 pairs of observations of one point; where a file has neither observations nor depth, points are triangulated at its
 poses (`swimm3r.sfm.colmap.triangulation`). Depth that comes with the file is used, else it is swept.
 
-Frames that the model places but the split holds back take no part; their poses serve as reference (`model_frames`).
+Frames that the model places but the split holds back take no part; their poses serve as reference
+(`imported.match_frames`).
 """
 
 from dataclasses import replace

@@ -28,7 +28,7 @@ def triangulate(
 ) -> Reconstruction:
     """The reconstruction with the points that its frames' matches agree on, after those it has, and with the matches.
 
-    `folder` keeps features and matches (`feature_database`); the reconstruction may come out without any new point.
+    `folder` keeps features and matches (`features.database`); the reconstruction may come out without any new point.
     """
     import pycolmap
 

@@ -1,7 +1,7 @@
 """Runs the network over a pair graph: every image encoded once while memory lasts, both passes per pair, one pair held.
 
 A pair (i, j) takes two decoder passes, because the network treats its views differently: with i first both pointmaps
-are in camera i, with j first in camera j. `view_ab` is view a in the pass where view b comes first.
+are in camera i, with j first in camera j. `view_ij` is view i in the pass where view j comes first.
 """
 
 from collections import OrderedDict

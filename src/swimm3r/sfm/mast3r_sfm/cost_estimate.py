@@ -67,7 +67,7 @@ def make_plan(network: Mast3r, images: NetworkImages, graph: PairGraph, settings
     seconds = encode_seconds * (n + pairs * pair / encode) + pairs * matching + steps * matched * _POINT_SECONDS
     weights = sum(p.numel() * p.element_size() for p in network.parameters())
     token_bytes = pixels / a.patch**2 * a.encoder_dim * network.enc_norm.weight.element_size()
-    sums = 7 * 8 * pixels  # float64, `canonical.CanonicalSums`
+    sums = 7 * 8 * pixels  # float64, `alignment.canonical.CanonicalSums`
     held = min(settings.memory_mb * 2.0**20, n * (token_bytes + sums))
     maps = 4 * pixels * (a.descriptor_dim + 5) * 4 * 2  # of one pair, and as much again on the way
     return Plan(

@@ -1,9 +1,10 @@
 """Ground that images show and no two of them confirm: a guess at where it is, for a map to start on.
 
 Smooth sand, ground that passes once through a corner, far slopes: plane sweep gives them no depth, so the dense cloud
-has nothing there. Their depth is filled in from the surroundings (`depth_filling`), which is no measurement, so these
-points are kept apart from the cloud. Each piece of ground is taken from the first frame that shows it, unless most of
-that frame's neighbors contradict: they look through the point at a surface behind it, or show another color there.
+has nothing there. Their depth is filled in from the surroundings (`imaging.depth_completion`), which is no measurement,
+so these points are kept apart from the cloud. Each piece of ground is taken from the first frame that shows it, unless
+most of that frame's neighbors contradict: they look through the point at a surface behind it, or show another color
+there.
 """
 
 import torch

@@ -10,7 +10,7 @@ Where T_D is small the quotient is noise, so per channel with s = T_D:
     horizon   in open water, and where no channel sees (max w -> 0), the image's own veil remains
 
 Near the camera all weights are 1 and J is the plain inverse. Nothing is stretched; white balance serves the eye alone,
-and only where the frames say which colors the water took (`water_plausibility`).
+and only where the frames say which colors the water took (`plausibility`).
 """
 
 from collections.abc import Callable, Iterator

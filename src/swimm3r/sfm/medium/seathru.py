@@ -13,8 +13,8 @@ and one bounded least-squares problem finds Binf, beta_B and beta_D(z) = a exp(b
                 only what the tracks leave open
     open water  pixels that look past every surface show Binf; without any, Binf is not far from what is farthest
 
-`water_fit.py` holds the least squares. Depths enter in units of their median, so the fit commutes with any rescaling of
-the scene.
+`channel_fit.py` holds the least squares. Depths enter in units of their median, so the fit commutes with any rescaling
+of the scene.
 """
 
 import numpy as np

@@ -1,6 +1,6 @@
 """Cross-view depth consistency, compiled by Numba: agreement, specks, resampling to another pixel grid.
 
-Maps hold q = 1 / z_depth, 0 where unknown; pixels are indices, and H, e take them between views as in `sweep_kernels`.
+Maps hold q = 1 / z_depth, 0 where unknown; pixels are indices, and H, e take them between views as in `kernels`.
 """
 
 from typing import no_type_check

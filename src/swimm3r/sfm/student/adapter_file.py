@@ -43,7 +43,7 @@ class Base:
 
 @dataclass(frozen=True)
 class _WaterError:
-    """Relative standard errors of the head's water on held-out pairs (`training.scores.water_error`)."""
+    """Relative standard errors of the head's water on held-out pairs (`distillation.validation.water_error`)."""
 
     Binf: tuple[float, float, float]
     beta_D: tuple[float, float, float]

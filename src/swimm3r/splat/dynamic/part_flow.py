@@ -1,7 +1,7 @@
 """Optical flow of a moving part from one frame to another.
 
-Parts that are laid over each other (`tracking`) are near each other up to their turning and bending; optical flow says
-that, and where it leads nowhere the motion of the whole part says enough.
+Parts that are laid over each other (`part_tracks`) are near each other up to their turning and bending; optical flow
+says that, and where it leads nowhere the motion of the whole part says enough.
 """
 
 from dataclasses import dataclass

@@ -1,8 +1,8 @@
 """Primitives for what moves, which the still scene that a dynamic map starts from does not have.
 
-Moving parts are found in every frame (`movement`), followed from frame to frame (`tracking`) and placed in space by the
-course they take (`courses`). In each frame primitives are born on them, for a moment around its time, which travel to
-where the frames before and after show them (`travel`).
+Moving parts are found in every frame (`motion_masks`), tracked from frame to frame (`part_tracks`) and located by
+trajectory triangulation (`trajectory`). In each frame primitives are added on them, for a short time around its own,
+which travel to where the frames before and after show them (`linear_motion`).
 """
 
 from collections.abc import Sequence

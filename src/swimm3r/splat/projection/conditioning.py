@@ -8,7 +8,7 @@ With V = [[V11, V12], [V21, V22]], G = V12 V22^-1, x = q - mu_q, lambda = min(B_
     covariance  S = V11 - G diag(lambda) V21
     opacity     o prod_j (1 - tanh y_j^2)^B_qj
 
-This is the plain form, any D and dtype, by autograd; `projection_kernels` is the fast one and its closed-form gradient.
+This is the plain form, any D and dtype, by autograd; `cpu_conditioning` is the fast one and its closed-form gradient.
 """
 
 import math

@@ -5,7 +5,7 @@ docs/derivations/beta-primitives.md#conditioning never forms V12:
 
     m = mu + L11 W x,   S = L11 (I - W L21) L11^T,   opacity = o exp(sum_j B_j (ln 2 - softplus(2 y_j^2)))
 
-float32, R = I + A. `load`, `condition` and `conditioning_gradients` are inlined into the kernel of `projection_cpu`.
+float32, R = I + A. `load`, `condition` and `conditioning_gradients` are inlined into the kernel of `cpu_project`.
 The gradient is that of docs/derivations/gradients.md#conditioning in factored form; D_ names the loss's gradient by a
 quantity.
 """

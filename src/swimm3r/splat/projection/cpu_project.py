@@ -1,8 +1,8 @@
 """From stored primitives to the image plane and back in one pass on the CPU: `conditioning` and `projection` fused.
 
-One kernel runs blocks of LANES primitives through a small workspace (`lanes`), forward, and, where gradients are asked
-for, back again by the closed forms of docs/derivations/gradients.md; nothing per primitive is kept in between. Only
-primitives with a gradient go back. The pose's is summed block by block, so that no result depends on the number of
+One kernel runs blocks of LANES primitives through a small workspace (`cpu_matrices`), forward, and, where gradients are
+asked for, back again by the closed forms of docs/derivations/gradients.md; nothing per primitive is kept in between.
+Only primitives with a gradient go back. The pose's is summed block by block, so that no result depends on the number of
 threads.
 """
 
@@ -316,7 +316,7 @@ def _run(ids: np.ndarray, back: bool, stored: Any, camera: np.ndarray, time: flo
 def project(
     p: BetaPrimitives, view: Pinhole, settings: RenderSettings, time: Float[Tensor, ""] | None = None
 ) -> Projection:
-    """`projection.project` for float32 on the CPU; no gradient reaches `time`."""
+    """`dispatch.project` for float32 on the CPU; no gradient reaches `time`."""
     moment = 0.0 if time is None else float(time)
     *plane, radius = _Project.apply(
         view, settings, moment, p.xyz, p.query_mean, p.opacity, p.beta, p.scale, p.lower, view.R, view.t, view.center
@@ -332,7 +332,7 @@ def center_gradients(
     on_plane: Float[Tensor, "n k 3"],
     time: Float[Tensor, ""] | None = None,
 ) -> Float[Tensor, "n k 3"]:
-    """`projection.center_gradients` for float32 on the CPU."""
+    """`dispatch.center_gradients` for float32 on the CPU."""
     ids = on_plane.flatten(1).any(-1).nonzero()[:, 0].numpy()
     d_xyz = torch.zeros(*on_plane.shape[:2], 3)
     stored = (p.xyz, p.query_mean, p.opacity, p.beta, p.scale, p.lower)

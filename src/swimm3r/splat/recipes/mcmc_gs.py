@@ -2,11 +2,12 @@
 
     L = 0.8 L1 + 0.2 (1 - SSIM) + 0.01 mean o + 0.01 mean s  [+ 2 L_epi early on]
 
-No water: what it adds becomes part of the colors. 3R-GS is this with `pose_codes` on, at its own rates; 3DGS-MCMC is
-this with poses held. Where we depart from the publications (docs/derivations/compared-methods.md): the points are those
-of every other recipe instead of random ones with 3R-GS's noise; a step draws `TrainingPoseSettings.matches` matches
-where 3R-GS takes every twentieth; SSIM pads with zeros; in short runs rounds are `min_refine_every` steps apart at
-least, rates grow (`short_run_rate_exponent`), and Gaussians start larger (`with_recipe`).
+No water: what it adds becomes part of the colors. 3R-GS is this with `training_poses` refined, at its own rates;
+3DGS-MCMC is this with poses held. Where we depart from the publications (docs/derivations/compared-methods.md): the
+points are those of every other recipe instead of random ones with 3R-GS's noise; a step draws
+`TrainingPoseSettings.matches` matches where 3R-GS takes every twentieth; SSIM pads with zeros; in short runs rounds are
+`min_refine_every` steps apart at least, rates grow (`short_run_rate_exponent`), and Gaussians start larger
+(`with_recipe`).
 """
 
 from dataclasses import dataclass
@@ -34,7 +35,7 @@ from swimm3r.splat.views import TrainingView
 
 @dataclass(frozen=True)
 class McmcGs:
-    """The recipe for one scene (`training.Recipe`)."""
+    """The recipe for one scene (`training.loop.Recipe`)."""
 
     settings: McmcGsSettings
     scene: TrainingScene

@@ -43,7 +43,7 @@ _KEPT = 32  # images, of the Gaussians that stand still while the water learns
 
 @dataclass(frozen=True)
 class SeaSplat:
-    """The recipe for one scene (`training.Recipe`)."""
+    """The recipe for one scene (`training.loop.Recipe`)."""
 
     settings: SeaSplatSettings
     scene: TrainingScene

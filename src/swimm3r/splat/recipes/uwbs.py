@@ -53,7 +53,7 @@ class _Adjoint:
 
 @dataclass(frozen=True)
 class Uwbs:
-    """The recipe for one scene (`training.Recipe`)."""
+    """The recipe for one scene (`training.loop.Recipe`)."""
 
     settings: UwbsSettings
     scene: TrainingScene

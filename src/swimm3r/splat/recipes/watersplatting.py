@@ -41,7 +41,7 @@ from swimm3r.splat.views import TrainingView, smaller
 
 @dataclass(frozen=True)
 class WaterSplatting:
-    """The recipe for one scene (`training.Recipe`)."""
+    """The recipe for one scene (`training.loop.Recipe`)."""
 
     settings: WaterSplattingSettings
     scene: TrainingScene
