@@ -17,8 +17,7 @@ import numpy as np
 import torch
 
 import swimm3r
-from swimm3r.cameras import cameras_of, image_directions, ray_depth_from_z, resized
-from swimm3r.io.cameras_json import read_cameras
+from swimm3r.cameras import image_directions, ray_depth_from_z, resized
 from swimm3r.io.depth import SUFFIXES, read_depth
 from swimm3r.io.images import read_rgb, write_rgb
 
@@ -38,7 +37,7 @@ def main(arguments: Sequence[str] | None = None) -> None:
     given = parser.parse_args(arguments)
 
     water = swimm3r.Medium(*(torch.tensor(values) for values in (given.binf, given.beta_d, given.beta_b)))
-    camera = cameras_of(read_cameras(given.cameras))[0]
+    camera = swimm3r.load_cameras(given.cameras)[0]
     given.out.mkdir(parents=True, exist_ok=True)
     for path in given.images:
         stored = read_rgb(path)
