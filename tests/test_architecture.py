@@ -40,7 +40,8 @@ ROWS = {  # by package: a room or module imports only rooms of rows before its o
     ],
     "swimm3r.splat": [
         {"optimizer", "shared_settings"},
-        {"gaussian_settings", "training_poses"},
+        {"gaussian_settings", "pose_mlp"},
+        {"training_poses"},
         {"settings"},
         {"views", "primitives"},
         {"projection"},

@@ -7,9 +7,9 @@ import torch
 
 from swimm3r.cameras import project
 from swimm3r.geometry import relative_poses, rotation_angle, so3_exp
+from swimm3r.splat.pose_mlp import moved
 from swimm3r.splat.pose_refinement import edges, ends, refine_pose, sizes
 from swimm3r.splat.settings import PoseRefinementSettings
-from swimm3r.splat.training_poses import moved
 
 SEEN = torch.ones(48, 64, dtype=torch.bool)
 

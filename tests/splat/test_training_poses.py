@@ -11,11 +11,12 @@ from swimm3r.geometry import pose_from, so3_exp
 from swimm3r.io.cameras_json import read_cameras
 from swimm3r.pipeline.held_out import FirstPose, in_axes_of
 from swimm3r.scene.reconstruction import Matches
-from swimm3r.splat import train, training_poses
+from swimm3r.splat import train
 from swimm3r.splat.map_file import load_map
+from swimm3r.splat.pose_mlp import PoseMlp, moved, pose_rate
 from swimm3r.splat.rendering import SplatMap
 from swimm3r.splat.settings import DensifySettings, InitialSettings, TrainingPoseSettings, UwbsSettings
-from swimm3r.splat.training_poses import PoseMlp, epipolar_loss, epipolar_matches, pose_rate, training_poses_of
+from swimm3r.splat.training_poses import epipolar_loss, epipolar_matches, training_poses_of
 from swimm3r.splat.views import TrainingViews
 
 
@@ -62,7 +63,7 @@ def test_a_motion_is_made_in_the_cameras_own_axes():
     pose = pose_from(so3_exp(torch.tensor([0.0, 0.0, torch.pi / 2])), torch.tensor([1.0, 2.0, 3.0])).double()
     forward = torch.tensor([0.5, 0.0, 0.0, 0, 0, 0, 0, 0, 0])
     torch.testing.assert_close(
-        training_poses.moved(pose, forward, 2.0)[:3, 3], torch.tensor([1.0, 3.0, 3.0]).double(), atol=1e-6, rtol=0
+        moved(pose, forward, 2.0)[:3, 3], torch.tensor([1.0, 3.0, 3.0]).double(), atol=1e-6, rtol=0
     )
 
 

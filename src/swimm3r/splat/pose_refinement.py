@@ -19,13 +19,13 @@ from torch import Tensor
 from swimm3r.cameras import Cameras
 from swimm3r.imaging.undistortion import undistorted
 from swimm3r.progress import Progress, silent
+from swimm3r.splat.pose_mlp import moved
 from swimm3r.splat.primitives.beta import select
 from swimm3r.splat.primitives.kinds import Primitives
 from swimm3r.splat.projection.dispatch import project
 from swimm3r.splat.projection.pinhole import pinhole
 from swimm3r.splat.rendering import SplatMap, images, memory_for_views, settings_in_scene_units
 from swimm3r.splat.settings import PoseRefinementSettings
-from swimm3r.splat.training_poses import moved
 
 _DARK = 0.01  # sum of R, G, B below which a pixel is not looked at
 _SMALLEST = 60  # pixels of the longer side, below which an image no longer tells a pose

@@ -10,13 +10,12 @@ the cameras from their middle for `spread`. Early on the matches between two fra
 d being the distances of a match's points from each other's epipolar lines in training pixels, c its confidence.
 """
 
-import math
 from dataclasses import dataclass, replace
 from pathlib import Path
 
 import torch
 from jaxtyping import Float, Int
-from torch import Tensor, nn
+from torch import Tensor
 
 from swimm3r.cameras import Cameras
 from swimm3r.errors import InputError
@@ -25,61 +24,21 @@ from swimm3r.geometry import (
     best_similarity,
     fundamental_from_poses,
     pose_from,
-    rotation_from_6d,
     symmetric_epipolar_error,
 )
 from swimm3r.imaging.undistortion import undistorted_matches
 from swimm3r.io.trajectory import write_tum
 from swimm3r.scene.frames import Frames
 from swimm3r.scene.reconstruction import Reconstruction
-from swimm3r.splat.shared_settings import TrainingPoseSettings
+from swimm3r.splat.pose_mlp import PoseMlp, moved
 
-IDENTITY = (1.0, 0.0, 0.0, 0.0, 1.0, 0.0)  # in the 6D form
 _NO_BASELINE = 1e-6  # of the spread: cameras nearer than this have no epipolar lines
-
-
-class PoseMlp(nn.Module):
-    """One code per camera, and the network that reads motions from them."""
-
-    def __init__(self, cameras: int, settings: TrainingPoseSettings, rng: torch.Generator | None = None) -> None:
-        super().__init__()
-        width = settings.width
-        self.codes = nn.Parameter(torch.zeros(cameras, width))
-        self.network = nn.Sequential(
-            nn.Linear(width, width), nn.ReLU(), nn.Linear(width, width), nn.ReLU(), nn.Linear(width, 9)
-        )
-        with torch.no_grad():
-            for layer in (self.network[0], self.network[2]):
-                assert isinstance(layer, nn.Linear)
-                bound = 1 / math.sqrt(width)  # torch's own default, but from our generator
-                layer.weight.uniform_(-bound, bound, generator=rng)
-                layer.bias.uniform_(-bound, bound, generator=rng)
-            last = self.network[4]
-            assert isinstance(last, nn.Linear)
-            last.weight.zero_()
-            last.bias.zero_()
-
-    def forward(self, which: Int[Tensor, " k"]) -> Float[Tensor, "k 9"]:
-        """The motions (v, w) of some cameras."""
-        return self.network(self.codes[which])
-
-
-def moved(cam2world: Float[Tensor, "*k 4 4"], motion: Float[Tensor, "*k 9"], length: float) -> Float[Tensor, "*k 4 4"]:
-    """Poses after motions (v, w) in their own cameras' axes, v in units of `length`."""
-    motion = motion.to(cam2world)
-    rotation = rotation_from_6d(motion[..., 3:] + torch.tensor(IDENTITY).to(motion))
-    return cam2world @ pose_from(rotation, motion[..., :3] * length)
 
 
 def spread_of(cam2world: Float[Tensor, "c 4 4"]) -> float:
     """Root mean square distance of the cameras from their middle."""
     centers = cam2world[:, :3, 3]
     return float((centers - centers.mean(0)).square().sum(-1).mean().sqrt())
-
-
-def pose_rate(settings: TrainingPoseSettings, iterations: int) -> float:
-    """Adam's rate for the poses: `rate` in 20,000 steps, in inverse proportion to others."""
-    return min(settings.largest_rate, settings.rate * 20_000 / iterations)
 
 
 @dataclass(frozen=True)

@@ -15,8 +15,9 @@ from swimm3r.datasets.sequences import Lens, Sequence, Shot
 from swimm3r.geometry import relative_poses
 from swimm3r.io.images import write_rgb
 from swimm3r.medium import remove_water
-from swimm3r.sfm.distillation.pairs import PairData, TwoViews, nearest_known, split_data, trainable
+from swimm3r.sfm.distillation.pairs import PairData, TwoViews, split_data, trainable
 from swimm3r.sfm.distillation.validation import absolute_relative, pose_error
+from swimm3r.sfm.distillation.water_augmentation import nearest_known
 from swimm3r.sfm.mast3r.matching import PixelMatches
 from swimm3r.synthetic import DiveSettings, write_dive
 

@@ -14,7 +14,7 @@ from swimm3r.sfm.medium.from_head import PredictedWater, dive_fit, predicted_ima
 from swimm3r.sfm.medium.restore import restored_cloud
 from swimm3r.sfm.settings import Mast3rSettings, SeathruSettings
 from swimm3r.sfm.student.physics_head import HeadFacts, WaterMaps
-from swimm3r.splat.medium.field import water_prior
+from swimm3r.splat.medium.prior import water_prior
 from swimm3r.splat.settings import MediumFieldSettings
 
 

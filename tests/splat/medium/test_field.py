@@ -8,16 +8,14 @@ import torch
 
 from swimm3r.medium import Medium, backscatter
 from swimm3r.splat.medium.field import (
-    deviation,
     grid_of,
     initial_field,
     medium_at_pixels,
     per_z_depth,
     smoothness,
     spherical_harmonics,
-    water_prior,
-    with_binf_prior,
 )
+from swimm3r.splat.medium.prior import deviation, water_prior, with_binf_prior
 from swimm3r.splat.projection.pinhole import pinhole
 from swimm3r.splat.settings import MediumFieldSettings
 

@@ -13,7 +13,6 @@ from dataclasses import dataclass, replace
 import numpy as np
 import torch
 from jaxtyping import Bool, Float
-from scipy.ndimage import distance_transform_edt
 from torch import Tensor
 
 from swimm3r import water_types
@@ -24,10 +23,9 @@ from swimm3r.errors import InputError
 from swimm3r.geometry import relative_poses
 from swimm3r.io.files.cache_key import cache_key
 from swimm3r.io.images import image_size
-from swimm3r.medium import Medium, add_water
+from swimm3r.medium import Medium
+from swimm3r.sfm.distillation.water_augmentation import with_sampled_water
 from swimm3r.sfm.mast3r.preprocess import Framing, K_to_network, framing, to_network
-
-_BLACK = 5 / 255  # above what resizing leaves of a black area's own values
 
 
 @dataclass(frozen=True)
@@ -117,10 +115,7 @@ class PairData:
         sampled_medium = torch.full((3, 3), torch.nan)
         if water is not None and bool(known.any()):
             sampled_medium = torch.stack([water.Binf, water.beta_D, water.beta_B])
-            J = ((clean + 1) / 2).permute(1, 2, 0)
-            nothing = ~known & (J.amax(-1) < _BLACK)
-            wet = torch.where(nothing[..., None], water.Binf, add_water(J, nearest_known(depth), water))
-            raw = 2 * wet.permute(2, 0, 1) - 1
+            raw = with_sampled_water(clean, depth, water)
         elif view.raw is not None:
             raw = to_network(view.raw, frame)
         else:
@@ -201,13 +196,6 @@ def depth_to_network(z_depth: Float[Tensor, "h w"], frame: Framing) -> Float[Ten
         z_depth[None, None], (frame.resized_height, frame.resized_width), mode="nearest-exact"
     )[0, 0]
     return resized[frame.top : frame.top + frame.network_height, frame.left : frame.left + frame.network_width]
-
-
-def nearest_known(depth: Float[Tensor, "h w"]) -> Float[Tensor, "h w"]:
-    """Depth with its gaps filled from the nearest pixel where it is known."""
-    nearest = distance_transform_edt((depth <= 0).numpy(), return_distances=False, return_indices=True)
-    rows, columns = torch.from_numpy(np.asarray(nearest)).long()
-    return depth[rows, columns]
 
 
 def _evenly(count: int, wanted: int) -> list[int]:

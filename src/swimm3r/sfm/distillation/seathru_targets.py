@@ -25,7 +25,7 @@ from swimm3r.io.files.json_file import read_json
 from swimm3r.io.images import write_rgb
 from swimm3r.medium import MediumFit, linear_from_srgb, remove_water
 from swimm3r.progress import Progress, silent
-from swimm3r.sfm.distillation.pairs import nearest_known
+from swimm3r.sfm.distillation.water_augmentation import nearest_known
 from swimm3r.sfm.medium.samples import WaterSamples
 from swimm3r.sfm.medium.seathru import fit_medium
 from swimm3r.sfm.settings import SeathruSettings

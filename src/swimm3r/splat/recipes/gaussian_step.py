@@ -10,13 +10,13 @@ from torch import Tensor
 from swimm3r.splat.gaussian_settings import GaussianSettings
 from swimm3r.splat.medium.field import NO_WATER, MediumField
 from swimm3r.splat.optimizer import log_linear
+from swimm3r.splat.pose_mlp import pose_rate
 from swimm3r.splat.primitives.gaussian import GaussianPrimitives, initial_gaussians, rescaled, to_degree
 from swimm3r.splat.projection.pinhole import Pinhole
 from swimm3r.splat.rendering import Drawing, draw
 from swimm3r.splat.training import loop
 from swimm3r.splat.training.scene import TrainingScene
 from swimm3r.splat.training.state import POSES, State, parameters_of
-from swimm3r.splat.training_poses import pose_rate
 from swimm3r.splat.views import TrainingView
 
 # purposes of randomness (training.generator): 2 primitives, 3 water, 4 densification, 6 poses, 7 matches, 8 noise

@@ -20,15 +20,10 @@ from swimm3r.splat.densify import mcmc_beta, schedule
 from swimm3r.splat.densify.rows import appended, moments_after
 from swimm3r.splat.dynamic.linear_motion import ways
 from swimm3r.splat.dynamic.spawn import born
-from swimm3r.splat.medium.field import (
-    WaterPrior,
-    deviation,
-    initial_field,
-    smoothness,
-    water_prior,
-    with_binf_prior,
-)
+from swimm3r.splat.medium.field import initial_field, smoothness
+from swimm3r.splat.medium.prior import WaterPrior, deviation, water_prior, with_binf_prior
 from swimm3r.splat.optimizer import adam_step, log_linear
+from swimm3r.splat.pose_mlp import pose_rate
 from swimm3r.splat.primitives.beta import BetaPrimitives, initial_primitives, rescaled, with_time
 from swimm3r.splat.rendering import Drawing, draw
 from swimm3r.splat.settings import UwbsSettings
@@ -36,7 +31,6 @@ from swimm3r.splat.training import loop, losses
 from swimm3r.splat.training.scene import TrainingScene
 from swimm3r.splat.training.sgg import differentiate
 from swimm3r.splat.training.state import FIELD, POSES, State, clip_field, first_state, parameters_of
-from swimm3r.splat.training_poses import pose_rate
 from swimm3r.splat.views import TrainingView
 
 _HORIZON_STD = 0.2  # of the open water's color around the scene's mean color, as structure from motion assumes

@@ -18,12 +18,12 @@ from swimm3r.io.files import metrics_log
 from swimm3r.io.files.damage import guard
 from swimm3r.progress import Progress
 from swimm3r.splat.medium.kinds import Water
+from swimm3r.splat.pose_mlp import PoseMlp
 from swimm3r.splat.primitives.kinds import Primitives
 from swimm3r.splat.settings import SplatSettings
 from swimm3r.splat.training.checkpoint import StateHeader, read_state, state_remedy, write_state
 from swimm3r.splat.training.scene import TrainingScene
 from swimm3r.splat.training.state import State, restored, stored
-from swimm3r.splat.training_poses import PoseMlp
 from swimm3r.splat.views import TrainingView
 
 log = logging.getLogger(__name__)

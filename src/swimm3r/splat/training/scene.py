@@ -9,9 +9,10 @@ from torch import Tensor
 from swimm3r.cameras import Cameras
 from swimm3r.devices import CPU
 from swimm3r.scene.reconstruction import Reconstruction
+from swimm3r.splat.pose_mlp import PoseMlp
 from swimm3r.splat.projection.pinhole import Pinhole, pinhole
 from swimm3r.splat.shared_settings import TrainingPoseSettings
-from swimm3r.splat.training_poses import PoseMlp, TrainingPoses
+from swimm3r.splat.training_poses import TrainingPoses
 from swimm3r.splat.views import TrainingView, TrainingViews
 
 

@@ -12,11 +12,11 @@ from swimm3r.splat.medium.field import MediumField, in_unit
 from swimm3r.splat.medium.kinds import Water
 from swimm3r.splat.medium.seasplat import SceneWater
 from swimm3r.splat.optimizer import Moments, fresh
+from swimm3r.splat.pose_mlp import PoseMlp
 from swimm3r.splat.primitives import beta, gaussian
 from swimm3r.splat.primitives.beta import BetaPrimitives
 from swimm3r.splat.primitives.gaussian import GaussianPrimitives
 from swimm3r.splat.primitives.kinds import Primitives, primitives_from
-from swimm3r.splat.training_poses import PoseMlp
 
 FIELD, POSES = "field.", "poses."
 P = TypeVar("P", BetaPrimitives, GaussianPrimitives)
