@@ -11,7 +11,7 @@ from swimm3r.geometry import pose_from, so3_exp
 from swimm3r.io.cameras_json import read_cameras
 from swimm3r.pipeline.held_out import FirstPose, in_axes_of
 from swimm3r.scene.reconstruction import Matches
-from swimm3r.splat import train
+from swimm3r.splat import train, training_poses
 from swimm3r.splat.map_file import load_map
 from swimm3r.splat.pose_mlp import PoseMlp, moved, pose_rate
 from swimm3r.splat.rendering import SplatMap
