@@ -43,6 +43,7 @@ def asked(monkeypatch: pytest.MonkeyPatch) -> list[RunSettings]:
 def refused(capsys: pytest.CaptureFixture[str], *arguments: str) -> tuple[int, str]:
     with pytest.raises(SystemExit) as stop:
         main(arguments)
+    assert isinstance(stop.value.code, int)
     return stop.value.code, capsys.readouterr().err
 
 

@@ -40,7 +40,7 @@ def demo(
     with drawn_progress() as progress, output_folder(out), output_folder(folder):
         check_vacant(out)
         write_dive(dive, folder, progress)
-        summary = run_pipeline(folder, out, settings, redo=redo, progress=progress)
+        summary = run_pipeline(folder, out, settings, redo=redo, progress=progress, on_stage=progress.begin_stage)
     print_summary(summary)
     print_results(out, RESULTS)
     print_next("other views of the map", "render", out)

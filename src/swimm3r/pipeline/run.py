@@ -7,6 +7,7 @@ short goes on from what it left on disk; one whose settings changed is refused o
 
 import json
 import platform
+from collections.abc import Callable
 from dataclasses import asdict, dataclass, replace
 from importlib.metadata import version
 from pathlib import Path
@@ -16,10 +17,12 @@ from swimm3r.io.files.atomic import write_text
 from swimm3r.io.files.cache_key import stat_digest
 from swimm3r.pipeline import held_out
 from swimm3r.pipeline import summary as sections
+from swimm3r.pipeline.estimate import estimate_run
 from swimm3r.pipeline.inputs import check_inputs, truth_of
 from swimm3r.pipeline.presets import RunSettings, from_yaml, to_yaml
 from swimm3r.pipeline.run_record import RunRecord, open_record, stage_keys
 from swimm3r.pipeline.scoring import MappedRun, Protocol, film_flight, score_map, score_restored_frames, start_poses
+from swimm3r.pipeline.stage_start import StageStart, ignore_stages
 from swimm3r.prepare import check_source, load_frames, read_frames
 from swimm3r.progress import Progress, silent, watched
 from swimm3r.report import write_report
@@ -44,21 +47,24 @@ def run_pipeline(
     last_stage: str = "eval",
     map_device: MapDevice = "auto",
     progress: Progress | None = None,
+    on_stage: Callable[[StageStart], None] = ignore_stages,
 ) -> dict:
     """Run the stages up to `last_stage` and return the summary (layout: docs/conventions.md).
 
     `settings` are a preset's (`swimm3r.PRESETS["fast"]`), or changed from one. Without them the run goes by those that
     the folder holds, a new one by the defaults. Stages made with other settings are refused, or with `redo` moved to
     `folder`/old and made again. `reference` is a cameras.json to score against; a synthetic dive brings its own truth.
-    `map_device` is where the map is trained and rendered. A terminal or a notebook shows how far it is, unless
-    `progress` is given (`swimm3r.silent`: nothing).
+    `map_device` is where the map is trained and rendered. A rough estimate of time and disk is logged first, and
+    `on_stage` is told of every stage that starts. A terminal or a notebook shows how far it is, unless `progress` is
+    given (`swimm3r.silent`: nothing).
 
     Raises the errors of its stages (`swimm3r.errors`), UsageError where settings differ, the folder cannot be written
-    to or another process works in it, and InputError where it belongs to another input.
+    to or another process works in it, InputError where it belongs to another input, and StorageError where the disk is
+    far too small.
     """
     source, folder = Path(source), Path(folder)
     check_source(source)
-    devices.for_maps(map_device)  # before there is a folder, and minutes of structure from motion
+    device = devices.for_maps(map_device)  # before there is a folder, and minutes of structure from motion
     digest = stat_digest(source, leave_out=folder)
     with watched(progress) as told, open_record(folder, source, digest, redo=redo) as record:
         settings, reference = record.settle(settings, reference, last_stage)
@@ -67,6 +73,9 @@ def run_pipeline(
         record.write()
         write_text(folder / "settings.yaml", to_yaml(settings))
         write_text(folder / "versions.json", json.dumps(_versions(), indent=2) + "\n")
+        to_do = record.to_do(stage_keys(record.fingerprint, settings, reference))
+        plan = estimate_run(source, folder, settings, to_do, on_cpu=device.type == "cpu")
+        record.announce(plan, on_stage)
         _make_stages(record, source, settings, reference, last_stage, map_device, told)
         summary = record.write()
         if last_stage == "eval":
@@ -87,7 +96,7 @@ def _make_stages(
     run finds it.
     """
     folder = record.folder
-    keys = stage_keys(record.summary["input"]["fingerprint"], settings, reference)
+    keys = stage_keys(record.fingerprint, settings, reference)
     truth = truth_of(source, reference)
     frames = record.stage(
         "prepare",
@@ -211,7 +220,7 @@ def _own_scores(
         record.summary |= {**scores, "restored": restored}
 
     reference = None if own.reference is None else str(own.reference)
-    key = stage_keys(record.summary["input"]["fingerprint"], run.settings, own.reference)["eval"]
+    key = stage_keys(record.fingerprint, run.settings, own.reference)["eval"]
     record.stage("eval", key, make, record.keep_scores if reuse else None, reference=reference)
 
 

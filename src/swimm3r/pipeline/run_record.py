@@ -20,8 +20,10 @@ from swimm3r.io.files.cache_key import cache_key
 from swimm3r.io.files.folder_lock import folder_lock
 from swimm3r.io.files.outputs import check_file, output_folder
 from swimm3r.memory import available_mb, peak_mb
+from swimm3r.pipeline.estimate import Estimate, check_disk, duration, size
 from swimm3r.pipeline.presets import RunSettings, from_yaml
 from swimm3r.pipeline.run_settings import differences, settings_by_stage, with_stages_of
+from swimm3r.pipeline.stage_start import StageStart, ignore_stages
 from swimm3r.scene.run_folder import MARKERS, SCHEMA, STAGES, RunFolder, StageRecord, check_vacant, is_run, read_run
 
 log = logging.getLogger(__name__)
@@ -42,6 +44,8 @@ _TITLES = {
     "splat": "map",
     "eval": "scores, flight and report",
 }
+_TELLING_S = 20.0  # shorter stages say little about the speed of this computer
+_MOST_OFF = 4.0  # factor; one slow stage is not taken for all
 _SPARE_BYTES = 64 << 20  # below this a stage is not begun: COLMAP's database does not survive a full disk
 _SPARE_MB = 500.0  # of memory; with less, OpenBLAS ends the process, which nothing in it can catch
 
@@ -76,6 +80,9 @@ class RunRecord:
     def __init__(self, folder: Path, source: Path, fingerprint: str, redo: bool = False) -> None:
         self.folder = folder
         self._count = 0  # of the stages to come, where it is known
+        self._plan: Estimate | None = None
+        self._pace = 1.0  # seconds that a second of the estimate took so far
+        self._on_stage: Callable[[StageStart], None] = ignore_stages
         self._redo = redo
         before = self._found(fingerprint)
         sections = {} if before is None else before.sections
@@ -106,12 +113,33 @@ class RunRecord:
             reference = Path(scored.reference)
         return chosen, reference
 
+    @property
+    def fingerprint(self) -> str:
+        """Digest of the input's files."""
+        return self.summary["input"]["fingerprint"]
+
+    def to_do(self, keys: dict[str, str]) -> list[str]:
+        """The stages up to the last one that are not done with these keys."""
+        return [name for name in STAGES[: self._count] if not self._is_done(name, keys[name])]
+
+    def announce(self, plan: Estimate | None, on_stage: Callable[[StageStart], None] = ignore_stages) -> None:
+        """Log the estimate of the work to come and tell `on_stage` of its stages.
+
+        Raises StorageError where the disk is far too small for it.
+        """
+        self._plan, self._on_stage = plan, on_stage
+        if plan is None or not plan.seconds:
+            return
+        log.info("%s (%s free)", plan, size(shutil.disk_usage(self.folder).free))
+        if warning := check_disk(plan, self.folder):
+            log.warning("%s", warning)
+
     def make_room(self, settings: RunSettings, reference: Path | None) -> None:
         """Have no stage in the folder that was made with other settings than these.
 
         Raises UsageError where there is one and the record was not opened with `redo`, which moves it to old/.
         """
-        keys = stage_keys(self.summary["input"]["fingerprint"], settings, reference)
+        keys = stage_keys(self.fingerprint, settings, reference)
         made = {name: record for name in STAGES if (record := self._stage(name)) is not None}
         changed = [name for name, record in made.items() if record.key != keys[name]]
         if not changed:
@@ -158,10 +186,8 @@ class RunRecord:
         self, name: str, key: str, make: Callable[[], Result], reuse: Callable[[], Result] | None = None, **facts: Any
     ) -> Result:
         """Do a stage, or reuse it where it is done with the same key and is still there; `facts` go to its record."""
-        if self._count:
-            log.info("Stage %d of %d: %s", STAGES.index(name) + 1, self._count, _TITLES[name])
-        before = self._stage(name)
-        if reuse and before is not None and (before.key, before.status) == (key, "done") and self._is_there(name):
+        self._begin(name)
+        if reuse and self._is_done(name, key):
             self._log("reused", stage=name)
             return reuse()
         self._check_space()
@@ -176,6 +202,7 @@ class RunRecord:
             self._check_space(error)  # before the log, which a full disk would not take either
             self._log("stopped", stage=name, error=f"{type(error).__name__}: {error}")
             raise
+        self._measure_pace(name, time.perf_counter() - wall)
         peak = peak_mb()
         self.summary["stages"][name] = {
             "seconds": round(time.perf_counter() - wall, 2),
@@ -188,6 +215,27 @@ class RunRecord:
         self.write()
         self._log("done", stage=name, **self.summary["stages"][name])
         return result
+
+    def _begin(self, name: str) -> None:
+        if not self._count:
+            return
+        left = None if self._plan is None else self._plan.seconds_from(name)
+        start = StageStart(
+            STAGES.index(name) + 1, self._count, _TITLES[name], None if left is None else left * self._pace
+        )
+        told = "" if not start.seconds_left else f" (about {duration(start.seconds_left)} left in all)"
+        log.info("Stage %d of %d: %s%s", start.number, start.count, start.title, told)
+        self._on_stage(start)
+
+    def _measure_pace(self, name: str, seconds: float) -> None:
+        """Learn from a stage how far the estimate is off."""
+        expected = None if self._plan is None else self._plan.seconds.get(name)
+        if expected and seconds > _TELLING_S:
+            self._pace = min(max(seconds / expected, 1 / _MOST_OFF), _MOST_OFF)
+
+    def _is_done(self, name: str, key: str) -> bool:
+        before = self._stage(name)
+        return before is not None and (before.key, before.status) == (key, "done") and self._is_there(name)
 
     def write(self) -> dict:
         """Bring summary.json up to date and return it."""

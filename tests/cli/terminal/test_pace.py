@@ -6,7 +6,7 @@ import numba
 import pytest
 
 from swimm3r.cli.terminal.console import drawn_progress, lines
-from swimm3r.cli.terminal.pace import Pace, WorkClock
+from swimm3r.cli.terminal.pace import Countdown, Pace, WorkClock
 
 
 class Clock:
@@ -89,3 +89,17 @@ def test_compilation_is_said_once_and_takes_no_part_in_the_estimate(capsys: pyte
     with drawn_progress():
         kernel(2.0)
     assert "compiling" not in capsys.readouterr().err
+
+
+def test_the_estimate_of_a_run_runs_down_and_is_renewed():
+    clock = Clock()
+    countdown = Countdown(clock)
+    assert countdown.left() is None
+    countdown.set(100)
+    clock.now = 30
+    assert countdown.left() == 70
+    countdown.set(20)
+    clock.now = 60
+    assert countdown.left() == 0
+    countdown.set(None)
+    assert countdown.left() is None

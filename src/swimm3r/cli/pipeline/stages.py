@@ -90,6 +90,7 @@ def run_stages(
             last_stage=last,
             map_device=map_device,
             progress=progress,
+            on_stage=progress.begin_stage,
         )
     print_summary(summary)
     print_results(out, {name: what for name, what in RESULTS.items() if name.startswith(_OF_STAGE[last])})

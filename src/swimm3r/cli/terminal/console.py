@@ -5,6 +5,7 @@ import sys
 import time
 from collections.abc import Callable, Iterator, Mapping
 from contextlib import contextmanager
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
@@ -14,7 +15,8 @@ from rich.progress import Progress as Bars
 from rich.table import Table
 
 from swimm3r.cli.terminal.output_level import is_quiet
-from swimm3r.cli.terminal.pace import Clock, Pace, WorkClock, compilation_watched
+from swimm3r.cli.terminal.pace import Clock, Countdown, Pace, WorkClock, compilation_watched
+from swimm3r.pipeline.stage_start import StageStart, ignore_stages
 from swimm3r.progress import Progress, silent
 
 _LINE_EVERY_S = 10.0  # in logs, where a bar cannot be redrawn
@@ -22,20 +24,31 @@ _COMPILING = "compiling kernels (first run only)"
 _UNWRAPPED = 1000  # columns of what is piped into a file: nobody's window ends there
 
 
-@contextmanager
-def drawn_progress() -> Iterator[Progress]:
-    """A `Progress` that draws one bar per step of work with its estimated time left, or prints lines into a log.
+@dataclass(frozen=True)
+class Drawn:
+    """A `Progress` that is drawn, and the same for the stages of a run."""
 
-    With --quiet it draws nothing.
+    draw: Progress
+    begin_stage: Callable[[StageStart], None] = ignore_stages
+
+    def __call__(self, what: str, done: int, total: int, /) -> None:
+        self.draw(what, done, total)
+
+
+@contextmanager
+def drawn_progress() -> Iterator[Drawn]:
+    """One bar per step of work with its estimated time left, and one for the whole run; or lines in a log.
+
+    With --quiet nothing is drawn.
     """
     if is_quiet():
-        yield silent
+        yield Drawn(silent)
         return
     console = Console(stderr=True)
     clock = WorkClock()
     if not console.is_terminal:
         with _compilation_told(clock, _once_in_a_while(lambda: _print_line(_COMPILING)), lambda: None):
-            yield lines(clock)
+            yield Drawn(lines(clock))  # stages announce themselves by their messages
         return
     columns = (
         TextColumn("{task.description:<28}"),
@@ -75,7 +88,9 @@ def lines(clock: Clock) -> Progress:
     return say
 
 
-def _bars(bars: Bars, clock: Clock) -> Progress:
+def _bars(bars: Bars, clock: WorkClock) -> Drawn:
+    countdown = Countdown(clock)
+    whole = bars.add_task("whole run", total=None, visible=False, left="")
     paces: dict[str, Pace] = {}
     tasks: dict[str, TaskID] = {}
 
@@ -89,8 +104,20 @@ def _bars(bars: Bars, clock: Clock) -> Progress:
         elif pace.round > before:
             bars.reset(tasks[what])
         bars.update(tasks[what], description=_title(what, pace), completed=done, total=total, left=about)
+        show_whole()
 
-    return draw
+    def show_whole() -> None:
+        seconds = countdown.left()
+        if seconds is not None:
+            bars.update(whole, left=f"about {_duration(seconds)} left")
+
+    def begin_stage(start: StageStart) -> None:
+        countdown.set(start.seconds_left)
+        title = f"step {start.number} of {start.count}"
+        bars.update(whole, description=title, completed=start.number - 1, total=start.count, visible=True)
+        show_whole()
+
+    return Drawn(draw, begin_stage)
 
 
 def _title(what: str, pace: Pace) -> str:
@@ -186,7 +213,7 @@ def print_results(folder: Path, files: Mapping[str, str]) -> None:
     there = {name: what for name, what in files.items() if (folder / name).exists()}
     width = max(map(len, there), default=0)
     console = outcome_console()
-    console.print(f"Results in {folder}:")
+    console.print(f"Results in {folder}:", soft_wrap=True)
     for name, what in there.items():
         console.print(f"  {name:<{width}}  {what}")
 
@@ -194,7 +221,8 @@ def print_results(folder: Path, files: Mapping[str, str]) -> None:
 def print_next(what: str, *command: object) -> None:
     """The next command, as it can be copied into a shell; nothing with --quiet."""
     if not is_quiet():
-        outcome_console().print(f"Next, {what}: swimm3r {shlex.join(str(word) for word in command)}")
+        told = f"Next, {what}: swimm3r {shlex.join(str(word) for word in command)}"
+        outcome_console().print(told, soft_wrap=True)
 
 
 def _shown(value: float | None, digits: int) -> str:

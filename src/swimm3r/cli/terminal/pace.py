@@ -74,6 +74,22 @@ class Pace:
         return (self._last - self._began - self._longest) / counted * (total - done)
 
 
+class Countdown:
+    """An estimate of time left that runs down between the moments at which it is renewed."""
+
+    def __init__(self, clock: Clock = time.monotonic) -> None:
+        self._clock = clock
+        self._ends: float | None = None
+
+    def set(self, seconds: float | None) -> None:
+        """So many seconds are left from now on; None where that is not known."""
+        self._ends = None if seconds is None else self._clock() + seconds
+
+    def left(self) -> float | None:
+        """The seconds left, 0 once they are over."""
+        return None if self._ends is None else max(0.0, self._ends - self._clock())
+
+
 @contextmanager
 def compilation_watched(begin: Callable[[], None], end: Callable[[], None]) -> Iterator[None]:
     """Calls `begin` when Numba begins to compile a kernel, and `end` when that kernel and all it calls are compiled.
