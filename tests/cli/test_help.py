@@ -1,17 +1,22 @@
-"""Help in three sizes: the options most users touch, all of them, and those of one group."""
+"""Help in three sizes: the options most users touch, all of them, and those of one group; and its words."""
 
+import importlib
+import re
 from collections.abc import Callable, Iterator
 from pathlib import Path
 
 import pytest
 
+import swimm3r
 from swimm3r.cli.brief import BRIEF
 from swimm3r.cli.main import Family, commands_for, main
-from swimm3r.cli.terminal.help_views import Option, options_of
+from swimm3r.cli.terminal.help_views import Option, groups_of, options_of
 from swimm3r.cli.terminal.output_level import with_output_level
 from swimm3r.cli.terminal.ranges import settings_with_ranges, with_ranges
+from swimm3r.settings import Settings
 from swimm3r.splat.settings import RECIPES
 
+PACKAGE = Path(swimm3r.__file__).parent
 MOST = 15  # options that a short help shows; --quiet and --verbose aside
 
 
@@ -134,3 +139,59 @@ def test_short_forms_name_the_run_folder_as_the_long_one_does(
     for words in (("-o", "x"), ("-o=x",), ("-ox",), ("--out", "x"), ("--out=x",)):
         main(["run", str(tmp_path), *words])
         assert asked[-1][1] == Path("x")
+
+
+DATA_SETS = re.compile("flsea|ruie|dolphin|skerki|gopro|curasao|panama|uieb|squid|sparus|subvo|d5|seathru-nerf", re.I)
+
+
+def settings_options() -> Iterator[Option]:
+    """Every setting of every record, whether a command has it or not."""
+    for path in sorted({*PACKAGE.rglob("*settings.py"), PACKAGE / "sfm" / "features" / "asmk.py"}):
+        importlib.import_module(".".join(("swimm3r", *path.relative_to(PACKAGE).with_suffix("").parts)))
+
+    def below(kind: type[Settings]) -> Iterator[type[Settings]]:
+        for one in kind.__subclasses__():
+            yield one
+            yield from below(one)
+
+    for kind in below(Settings):
+        if kind.__module__.startswith("swimm3r."):
+
+            def command(record: object = None) -> None:
+                pass
+
+            command.__annotations__ = {"record": kind}
+            vars(command).pop("__wrapped__", None)
+            with settings_with_ranges():
+                yield from options_of(command)
+
+
+def test_every_setting_has_a_help_string_that_stands_alone():
+    options = {(one.name, one.help): one for one in settings_options()}
+    assert len(options) > 250
+    for name, text in options:
+        assert text, f"{name} has no help string"
+        assert len(text.split()) >= 3, f"{name}: {text}"
+        assert not DATA_SETS.search(text), f"{name}: {text}"
+
+
+def test_every_help_string_is_a_sentence_of_its_own():
+    texts = {(one.name, one.help) for options in OPTIONS.values() for one in options.values()}
+    texts |= {(one.name, one.help) for one in settings_options()}
+    for name, text in texts:
+        assert text, name
+        assert len(text.split()) >= 3, f"{name}: {text}"
+        assert not re.match(r"(What|Who|Where|How|Whether)\b", text), f"{name}: {text}"
+        assert re.match(r"[A-Z`]", text), f"{name}: {text}"
+        assert text.endswith((".", "...")), f"{name}: {text}"
+
+
+def test_groups_of_options_are_described_in_one_line():
+    for path, command in commands():
+        told = shown_groups(command)
+        assert all(text and not re.match(r"(What|Who|Where|How)\b", text) for text in told.values()), (path, told)
+
+
+def shown_groups(command: Callable) -> dict[str, str]:
+    with settings_with_ranges():
+        return groups_of(with_ranges(with_output_level(command)))

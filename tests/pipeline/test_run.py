@@ -310,7 +310,7 @@ def test_changed_settings_make_their_stage_again_where_that_is_asked_for(dive: P
 
 def test_too_little_disk_is_said_before_anything_is_begun(dive: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
     monkeypatch.setattr("shutil.disk_usage", lambda _: type("Usage", (), {"free": 1 << 20})())
-    with pytest.raises(StorageError, match="1 MB are left"):
+    with pytest.raises(StorageError, match="1 MB are free"):
         run_pipeline(dive, tmp_path / "run")
 
 

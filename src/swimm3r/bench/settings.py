@@ -11,20 +11,20 @@ Seeds = Annotated[int, Range(1, 1000)]  # trainings of one method on one scene
 
 @dataclass(frozen=True)
 class JobSettings(Settings):
-    """Scenes one after the other, in processes side by side, or as jobs of a Slurm cluster."""
+    """Scenes one after the other, in parallel processes, or as jobs of a Slurm cluster."""
 
     jobs: Annotated[int, Range(1, 1024)] = 1
-    """Scenes computed at once, each in a process with its share of the cores."""
+    """Number of scenes computed at once, each in a process with its share of the cores."""
     slurm: bool = False
-    """Each scene as a job through submitit (pip install 'swimm3r[slurm]'); all need the same disk."""
+    """Submit each scene as a Slurm job through submitit (pip install 'swimm3r[slurm]'); all jobs need the same disk."""
     partition: str = ""
-    """Slurm's; its default where empty."""
+    """Slurm partition of the jobs; empty for the cluster's default."""
     minutes: Count = 24 * 60
-    """Most a Slurm job may take."""
+    """Time limit of a Slurm job in minutes."""
     cpus: Count = 8
-    """Of a Slurm job."""
+    """Number of CPU cores of a Slurm job."""
     gpus: CountOrZero = 0
-    """Of a Slurm job."""
+    """Number of GPUs of a Slurm job."""
 
 
 SfmMethod = Literal[
@@ -60,10 +60,12 @@ ABLATION: tuple[SfmMethod, ...] = (
 
 @dataclass(frozen=True)
 class SfmMethods(Settings):
-    """Which ways of structure from motion are compared. One that lacks its files is reported as not run."""
+    """Structure-from-motion methods to compare. A method whose files are missing is reported as not run."""
 
     methods: tuple[SfmMethod, ...] = PEERS
+    """Methods to compare, by the names that the table shows."""
     adapters: Path | None = None
-    """Trainings of swimm3r train-sfm by the names of their recipes: ADAPTERS/dark3r/adapter.safetensors ..."""
+    """Folder with trainings of swimm3r train-sfm by recipe: ADAPTERS/dark3r/adapter.safetensors ..."""
     imports: Path | None = None
-    """What other programs made of the same images: IMPORTS/vggt/SCENE or SCENE.npz, IMPORTS/gluemap/SCENE, ..."""
+    """Folder with other programs' results on the same images: IMPORTS/vggt/SCENE or SCENE.npz, IMPORTS/gluemap/SCENE
+    ..."""

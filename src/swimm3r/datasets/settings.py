@@ -8,20 +8,20 @@ from swimm3r.settings import Count, CountOrZero, NotEmpty, Positive, Settings, S
 
 @dataclass(frozen=True)
 class PairSettings(Settings):
-    """Which two shots of a sequence are shown together."""
+    """Selection of the two shots of a training pair."""
 
     min_overlap: Share = 0.3
-    """Share of the depth of each shot that the other must see, where metric poses and depth tell."""
+    """Smallest share of each shot's depth that the other shot must see, if poses and depth are metric."""
     max_overlap: Share = 0.95
-    """More alike than this a pair teaches nothing about motion."""
+    """Largest share of each shot's depth that the other shot may see."""
     reach: Count = 40
-    """Shots farther apart in the sequence than this are not tried."""
+    """Largest distance in the sequence between two shots of a pair."""
     gaps_s: Annotated[tuple[Positive, ...], NotEmpty()] = (0.5, 1.0, 2.0)
-    """Seconds between the two where only time tells; a diver still sees half of the scene."""
+    """Seconds between the two shots, if only times are known."""
     steps: Annotated[tuple[Count, ...], NotEmpty()] = (1, 2, 4)
-    """Shots between the two where not even time tells."""
+    """Shots between the two, if neither poses nor times are known."""
     per_shot: Count = 4
-    """Most partners of a shot among the later ones."""
+    """Largest number of later partners of a shot."""
     retrieved: CountOrZero = 0
-    """Where poses do not tell: partners per shot beyond `reach` that look alike to the network; it encodes every shot
-    once for it, before training."""
+    """Number of partners per shot beyond `reach` that the network finds similar, if poses are unknown; every shot is
+    encoded once before training."""

@@ -11,33 +11,34 @@ from swimm3r.sfm.settings import FeatureSettings, Mast3rSettings, SfmSettings
 
 @dataclass(frozen=True)
 class LocalizationSettings(Settings):
-    """A query image placed in a map, as the paper does it after GS-CPR."""
+    """Localization of a query image in a map, as the paper does it after GS-CPR."""
 
     matcher: Literal["auto", "mast3r", "sift"] = "auto"
-    """What finds matches; auto takes MASt3R where its weights are on this computer."""
+    """Feature matcher; auto uses MASt3R if its weights are present, otherwise SIFT."""
     weights: Path | None = None
-    """MASt3R's checkpoint; else the one that found the run's poses, or that `swimm3r weights path mast3r` prints."""
+    """MASt3R checkpoint; by default the one that found the run's poses, or that `swimm3r weights path mast3r` prints.
+    """
     device: Literal["auto", "cpu", "cuda", "mps"] = "auto"
-    """Where MASt3R runs."""
+    """Device that MASt3R runs on; auto uses a GPU if one is present."""
     precision: Literal["float32", "bfloat16", "float16"] = "float32"
-    """Of MASt3R's trunk; its heads are always float32."""
+    """Number format of MASt3R's trunk; its heads always use float32."""
     candidates: Count = 5
-    """Reference images that the query is matched with for its coarse pose."""
+    """Number of reference images that the query is matched with for its coarse pose."""
     rounds: Annotated[int, Range(0, 100)] = 1
-    """Times that the map is rendered and matched; GS-CPR does it once."""
+    """Number of times that the map is rendered and matched (1 in GS-CPR)."""
     max_error: Positive = 5.0
-    """Reprojection error of an inlier, pixels of the query."""
+    """Largest reprojection error of an inlier, in pixels of the query."""
     min_inliers: Annotated[int, Range(4)] = 12
-    """Matches that agree on a pose before it is believed."""
+    """Smallest number of matches that agree on a pose."""
     accept: Literal["more_certain", "inliers"] = "more_certain"
-    """When the refined pose replaces the coarse one: inliers, as in GS-CPR, from min_inliers on; more_certain also
-    requires a smaller standard error, by the residuals and the geometry of each pose's own inliers."""
+    """Rule that replaces the coarse pose by the refined one: enough inliers, as in GS-CPR (inliers), or also a smaller
+    standard error (more_certain)."""
     border: CountOrZero = 3
-    """Matches this near to the border of the rendering do not count, pixels."""
+    """Distance in pixels from the edge of the rendering within which matches are dropped."""
     min_alpha: Share = 0.5
-    """Coverage of the rendering below which a pixel has no depth to trust."""
+    """Smallest coverage of a rendered pixel whose depth is used."""
     long_side: LongSideOrOwn = 0
-    """Longer side of the rendering, pixels; 0 is the size that the map was trained at."""
+    """Longer side of the rendering in pixels; 0 is the size that the map was trained at."""
     features: FeatureSettings = field(default_factory=FeatureSettings)
     matching: MatchingSettings = field(default_factory=MatchingSettings)
 

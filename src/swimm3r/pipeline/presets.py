@@ -61,9 +61,13 @@ class RunSettings(Settings):
     """Everything that decides what a run computes."""
 
     frames: FrameSettings = field(default_factory=FrameSettings)
+    """Frames taken from the input, and their size."""
     sfm: SfmSettings = field(default_factory=ColmapSettings)
+    """Structure from motion, depth, medium and restoration; the class is the back end."""
     splat: SplatSettings = field(default=LAPTOP)
+    """Training of the map; the class is the renderer."""
     test: PoseRefinementSettings = field(default_factory=PoseRefinementSettings)
+    """Refinement of the test frames' poses before they are scored."""
 
 
 def to_yaml(settings: RunSettings) -> str:

@@ -10,24 +10,25 @@ from swimm3r.settings import ClipSecond, CountOrZero, LongSideOrOwn, Range, Sett
 
 @dataclass(frozen=True)
 class FrameSettings(Settings):
-    """Sampling of a video, and checks of a folder of images, by `swimm3r.read_frames`."""
+    """Sampling of a video, and checks of a folder of images (`prepare.read_frames`)."""
 
     fps: Annotated[float, Range(0, 1000)] = 5.0
-    """Frames per second taken from a video; 0 takes every frame. Of stills every one is taken."""
+    """Frames per second taken from a video; 0 takes every frame. Folders of images are used completely."""
     pick: Literal["sharpest", "uniform"] = "sharpest"
-    """The frame taken of each 1/fps: the sharpest, or the first (at 30 fps the paper's every 6th)."""
+    """Frame taken from each interval of 1/fps seconds: the sharpest, or the first."""
     start: ClipSecond = 0.0
-    """Second of the video to begin at: leaves out the descent."""
+    """Second of the video to start at, for example after the descent."""
     end: ClipSecond | None = None
-    """Second of the video to stop at; its end where none is given."""
+    """Second of the video to stop at; by default its end."""
     max_frames: CountOrZero = 0
-    """Most frames, spread evenly over the dive; 0 is no limit."""
+    """Largest number of frames, spread evenly over the dive; 0 sets no limit."""
     long_side: LongSideOrOwn = 1600
-    """Larger images are scaled down to this many pixels along their longer side; 0 keeps them as they are."""
+    """Longer side in pixels to which larger images are reduced; 0 keeps the original size."""
     masks: Path | None = None
-    """Folder of masks NAME.png, NAME.jpg.png or NAME_mask.png (0 = leave out); else masks/ in the input, if any."""
+    """Folder of masks NAME.png, NAME.jpg.png or NAME_mask.png whose black pixels are ignored; by default masks/ in the
+    input, if it exists."""
     odd_sizes: Literal["refuse", "skip"] = "refuse"
-    """What is done about stills of another size than most."""
+    """Handling of images whose size differs from most others: refuse the input, or skip them."""
 
     def __post_init__(self) -> None:
         super().__post_init__()

@@ -29,35 +29,38 @@ class PlaneSweepSettings(Settings):
     """Dense depth of posed frames (`sfm/plane_sweep/estimate.py`)."""
 
     long_side: LongSide = 640
-    """Pixels of the longer side at which depth is computed; larger frames get it upsampled along their edges."""
+    """Longer side in pixels at which depth is computed; for larger frames it is upsampled along image edges."""
     sources: Annotated[int, Range(1, 16)] = 5
-    """Frames each frame is compared with."""
+    """Number of neighboring frames that each frame is compared with."""
     angle_deg: Annotated[float, Range(above=0, most=90)] = 8.0
-    """Triangulation angle at which a source counts most: less is imprecise, more hides surfaces and changes them."""
+    """Preferred triangulation angle in degrees: smaller angles are imprecise, larger ones hide surfaces."""
     planes: Annotated[int, Range(32, 1024)] = 128
-    """Most planes of the coarse sweep, even in inverse depth; fewer where views are close: one per pixel of motion."""
+    """Largest number of planes of the coarse sweep, uniform in inverse depth; close views use fewer, one per pixel of
+    motion."""
     window: Annotated[int, Range(1, 16)] = 3
     """Half width of the coarse sweep's NCC window, in pixels of the half-size image."""
     noise: PositiveShare = 0.8 / 255
-    """Standard deviation of gray below which a window says nothing."""
+    """Standard deviation of gray values below which a window is too uniform to be matched."""
     smooth: NotNegative = 0.15
-    """Price of one plane of disagreement between neighbors in the semi-global step; a jump costs eight times that."""
+    """Penalty for one plane of disagreement between neighboring pixels in the semi-global step; a jump costs eight
+    times as much."""
     rounds: Annotated[int, Range(0, 32)] = 3
-    """Rounds of slanted-plane refinement at full working size."""
+    """Number of slanted-plane refinement rounds at full working size."""
     smooth_fine: NotNegative = 0.05
-    """Price there of one source pixel of disagreement with the neighbors."""
+    """Penalty in the refinement for one source pixel of disagreement with neighboring pixels."""
     min_ncc: Annotated[float, Range(0, below=1)] = 0.4
-    """Correlation with the sources below which a depth is dropped."""
+    """Smallest correlation with the sources at which a depth is kept."""
     min_peak: NotNegative = 0.12
-    """Share by which 1 - NCC must rise 2.5 pixels beside a match; below, the depth is dropped as undetermined."""
+    """Smallest share by which 1 - NCC must rise 2.5 pixels beside a match; flatter peaks are dropped as undetermined.
+    """
     tolerance: Share = 0.015
-    """Relative difference in depth up to which two frames agree; or what the reprojection error allows, if more."""
+    """Largest relative difference in depth at which two frames agree; the reprojection error may allow more."""
     agreeing: Annotated[int, Range(0, 16)] = 2
-    """Other frames that must agree with a depth."""
+    """Number of other frames that must agree with a depth."""
     speck: CountOrZero = 48
-    """Connected patches smaller than this are dropped, pixels at working size."""
+    """Size in working pixels below which connected patches of depth are dropped."""
     threads: Threads = 0
-    """Frames computed at once; 0 takes every core, at most 8."""
+    """Number of frames computed at once; 0 uses all cores, at most 8."""
 
 
 @dataclass(frozen=True)
@@ -65,13 +68,15 @@ class TrackSettings(Settings):
     """Pixels of several depth maps grouped into surface points (`sfm/medium/dense_tracks.py`)."""
 
     tolerance: Share = 0.02
-    """Relative difference in z depth up to which two frames show the same point."""
+    """Largest relative difference in z depth at which two frames show the same point."""
     max_color_change: Share = 0.3
-    """Largest change of a channel between two observations; water alone changes less between neighboring distances."""
+    """Largest change of a color channel between two observations of a point."""
     max_views: Count = 12
-    """Other frames in which the points of one frame are looked up."""
+    """Number of other frames in which the points of one frame are looked up."""
     min_overlap: Share = 0.1
+    """Overlap above which another frame is searched for the points of a frame."""
     max_tracks: Count = 1_000_000
+    """Approximate largest number of surface points; more are thinned on a regular grid."""
 
 
 @dataclass(frozen=True)
@@ -79,20 +84,21 @@ class RestoreSettings(Settings):
     """Images and points with the water removed (`sfm/medium/restore.py`). Values are 0..1."""
 
     noise: PositiveShare = 0.01
-    """Standard deviation of a pixel: sensor and compression."""
+    """Standard deviation of a pixel value caused by the sensor and compression."""
     texture: PositiveShare = 0.1
-    """Standard deviation of J within a small window."""
+    """Standard deviation of clear colors within a small window."""
     veil_error: PositiveShare = 0.006
-    """What B(z) may be wrong by; where T_D is not well above it, J is taken from the channels that still see."""
+    """Assumed error of the backscatter B(z); where T_D is not clearly larger, color is taken from the other channels.
+    """
     color_error: PositiveShare = 0.12
-    """Error of J that would be accepted."""
+    """Largest error of a clear color that is accepted."""
     window: Annotated[float, Range(0.001, 0.25)] = 0.02
-    """Standard deviation of the local windows, as a share of the long side."""
+    """Standard deviation of the local windows, as a share of the longer side."""
     max_points: Annotated[int, Range(100)] = 500_000
-    """Of the restored cloud, thinned by voxels."""
+    """Largest number of points of the restored cloud, thinned by voxels."""
     white_balance: bool = True
-    """Gray-world gains, one triple per dive, on the images made for looking at (restored/, clear renders); points, the
-    images in restored_physical/ and all scores stay physical."""
+    """Apply gray-world gains, one triple per dive, to displayed images (restored/, clear renders); points, images in
+    restored_physical/ and scores stay physical."""
 
 
 @dataclass(frozen=True)
@@ -101,58 +107,72 @@ class SeathruSettings(Settings):
 
     tracks: TrackSettings = field(default_factory=TrackSettings)
     max_pixels: Count = 300_000
-    """Single pixels drawn from all frames together."""
+    """Number of single pixels drawn from all frames together."""
     open_water_pixels: Count = 2_000
-    """Most pixels of open water taken from one frame."""
+    """Largest number of open-water pixels taken from one frame."""
     patch_pixels: Positive = 12.0
-    """Edge of a patch of surface, in pixels of its farthest observation; at most 1/32 of the image's long side."""
+    """Edge length of a surface patch in pixels of its farthest observation; at most 1/32 of the longer side."""
     patch_observations: Count = 6
-    """Fewest pixels of a patch in a frame."""
+    """Smallest number of pixels of a patch in a frame."""
     patch_offset: NotNegative = 0.15
-    """Largest distance between the centroids of a patch and of what a frame shows of it, in edges."""
+    """Largest distance, in edge lengths, between the centroid of a patch and that of its visible part."""
     range_bins: Annotated[int, Range(1, 1000)] = 10
+    """Number of range bins that the darkest pixels are taken from."""
     dark_fraction: PositiveShare = 0.01  # Sea-Thru: the darkest 1 % of each range bin
+    """Share of darkest pixels in each range bin that stand for backscatter (1 % in Sea-Thru)."""
     min_bin_pixels: Count = 50
+    """Smallest number of pixels of a range bin that is used."""
     dark_std: PositiveShare = 0.015
-    """How far the dark envelope of one range bin may stray."""
+    """Standard deviation of the dark envelope of one range bin."""
     dark_reflectance: Share = 0.02
-    """J of the darkest 1 %: black things are rarely quite black."""
+    """Expected clear color of the darkest pixels, as black surfaces are rarely fully black."""
     dark_reflectance_std: PositiveShare = 0.03
+    """Standard deviation of the clear color of the darkest pixels."""
     lsac_f: Positive = 2.0
-    """Sea-Thru's f: the illuminant is f times the local average color, so surfaces reflect 1 / f on average."""
+    """Sea-Thru's f: the illuminant is f times the local average color, so that surfaces reflect 1/f on average."""
     mean_reflectance_std: Positive = 0.5
-    """Of ln(1 / f) for a whole dive: what the gray-world guess is worth."""
+    """Standard deviation of ln(1/f) over a whole dive, which weights the gray-world assumption."""
     average_std: Positive = 0.3
-    """Of the ln of one range bin's average color."""
+    """Standard deviation of the logarithm of one range bin's average color."""
     slope_std: Positive = 0.1
-    """Of b times the median depth in beta_D(z) = a exp(b z)."""
+    """Standard deviation of b times the median depth in beta_D(z) = a exp(b z)."""
     open_water_std: PositiveShare = 0.01
+    """Standard deviation of Binf from open-water pixels, beyond their spread."""
     far_color_std: PositiveShare = 0.2
-    """How far Binf may be from the mean color of the farthest tenth, where no open water is in view."""
+    """Standard deviation of Binf about the mean color of the farthest tenth, if no open water is visible."""
     min_open_water: Count = 200
+    """Smallest number of open-water pixels that determine Binf."""
     min_samples: Count = 500
+    """Smallest number of pixels with a depth that a fit needs."""
     min_tracks: Count = 100
+    """Smallest number of surface points seen in several frames that a fit needs."""
     min_depth_ratio: Annotated[float, Range(1)] = 1.05
-    """Farthest over nearest observation of a point that enters the fit."""
+    """Smallest ratio of the farthest to the nearest observation of a point in the fit."""
     black: Share = 0.002
+    """Pixel value at or below which a pixel counts as underexposed."""
     saturated: Share = 0.98
+    """Pixel value from which a pixel counts as overexposed."""
     max_observations: Count = 200_000
+    """Largest number of observations in the fit; points with the largest ratio of depths are kept."""
     start_observations: Count = 5_000
+    """Number of observations in the search for the fit's initial values."""
     min_redundancy: Positive = 3.0
-    """At least so many observations share one error."""
+    """Smallest number of observations that share one error term."""
     loss_scale: PositiveShare = 0.02
-    """Residuals beyond it count as outliers."""
+    """Residual, in pixel values, beyond which observations count as outliers."""
     reweightings: Annotated[int, Range(1, 100)] = 6
+    """Number of robust reweighting rounds of the fit."""
     depth_error: Share = 0.01
-    """Relative error of one observation's ray depth, beyond what all observations of a point share."""
+    """Relative error of one observation's ray depth, beyond the error that all observations of a point share."""
     gain_std: Share = 0.1
-    """First guess of how much exposure and white balance vary between frames; then estimated."""
+    """Initial standard deviation of exposure and white balance between frames, which is then estimated."""
     gain_evidence: Share = 0.85
-    """Gains are used where they shrink the residuals below this share."""
+    """Share of the residuals below which gains per frame must bring them to be used."""
     std_inflation: Positive = 2.0
-    """Of the standard deviations beyond what residuals show (benchmarks/seathru_calibration.py)."""
+    """Factor on the standard deviations beyond that of the residuals (benchmarks/seathru_calibration.py)."""
     identifiable_std: NotNegative = 0.065
-    """A coefficient is identifiable below this relative standard deviation (benchmarks/seathru_calibration.py)."""
+    """Relative standard deviation below which a coefficient counts as identifiable (benchmarks/seathru_calibration.py).
+    """
 
 
 @dataclass(frozen=True)
@@ -160,17 +180,17 @@ class FeatureSettings(Settings):
     """SIFT and its matching (`sfm/features/sift.py`)."""
 
     count: Annotated[int, Range(1, 1_000_000)] = 2048
-    """Most keypoints of a frame; one with two orientations counts once."""
+    """Largest number of keypoints per frame; one with two orientations counts once."""
     peak_threshold: PositiveShare = 0.003
-    """Contrast a keypoint needs, of 1; COLMAP's 0.0067 starves in haze."""
+    """Smallest contrast of a keypoint, of 1; hazy images need less than COLMAP's 0.0067."""
     faint_threshold: PositiveShare = 0.001
-    """The same for frames that yield fewer than `count`: it places 14 of ruie_murky's 14 frames, not 12."""
+    """Smallest contrast of a keypoint in frames that yield fewer than `count` with `peak_threshold`."""
     equalize: Annotated[float, Range(0, 1000)] = 0.0
-    """Clip limit of the local contrast equalization (CLAHE) before detection; 0 leaves images as they are."""
+    """Clip limit of the local contrast equalization (CLAHE) before detection; 0 leaves images unchanged."""
     long_side: LongSide = 1000
-    """Larger frames are reduced to this many pixels for detection."""
+    """Longer side in pixels to which larger frames are reduced for detection."""
     max_ratio: PositiveShare = 0.8
-    """Nearest over second nearest descriptor, angles."""
+    """Largest ratio of the nearest to the second nearest descriptor distance (angles) of a match."""
 
 
 @dataclass(frozen=True)
@@ -178,25 +198,30 @@ class MappingSettings(Settings):
     """From verified matches to cameras and points (`sfm/colmap/mapping.py`)."""
 
     method: Literal["auto", "incremental", "global"] = "auto"
-    """Auto places clips below `global_from` frames both ways and keeps what explains more; above, globally (GLOMAP)."""
+    """Mapper to use; auto tries both below `global_from` frames and keeps the better one, above it maps globally
+    (GLOMAP)."""
     global_from: CountOrZero = 100
+    """Number of frames from which `auto` maps globally only."""
     focal_ladder: Annotated[tuple[Annotated[float, Range(0.1, 20)], ...], NotEmpty()] = (0.75, 1.1, 0.6, 1.5)
-    """Focal lengths per image width that are tried in turn while frames are left over; no lens is known better."""
+    """Focal lengths, as multiples of the image width, tried in turn if the lens is unknown and frames are not
+    registered."""
     k1: Annotated[float, Range(-1, 1)] = 0.03
-    """Radial distortion the ladder starts from: what a flat port leaves of a corrected lens."""
+    """Radial distortion that the trials of focal lengths start from."""
     enough: Share = 1.0
-    """Share of the frames at which the ladder is left early."""
+    """Share of registered frames at which no further focal lengths are tried."""
     retry_ratio: PositiveShare = 0.9
-    """Ratio test of the second matching of frames that were left over."""
+    """Ratio test of the second matching of frames that were not registered."""
     min_frames: Annotated[int, Range(2)] = 3
+    """Smallest number of registered frames of a result."""
     min_share: Share = 0.2
-    """Share of the frames below which the result is refused."""
+    """Smallest share of registered frames of a result."""
     thin_points: CountOrZero = 150
-    """Points seen by the mean frame below which a model may well be a passing animal (dolphin_dynamic 93,
-    ruie_murky 219); it is refused unless it holds `thin_share` of the frames."""
+    """Mean number of points per frame below which a model may be a passing animal; it is refused unless it holds
+    `thin_share` of the frames."""
     thin_share: Share = 0.6
+    """Share of the frames from which a model with few points is accepted."""
     opencv_gain: Share = 0.03
-    """Relative drop of the reprojection error that buys OPENCV's further parameters where the model is "auto"."""
+    """Relative decrease of the reprojection error from which camera `auto` uses OPENCV's additional parameters."""
 
 
 @dataclass(frozen=True)
@@ -204,15 +229,20 @@ class LensSettings(Settings):
     """The one lens of a clip, as far as it is known (`sfm/lens.py`)."""
 
     focal: Positive | None = None
-    """Focal length, pixels of the prepared frames, measured in water, or in air where `housing` is flat: a start value,
-    which `intrinsics` or `alignment.intrinsics` can hold. The MASt3R back end always holds a lens with distortion."""
+    """Focal length in pixels of the prepared frames, measured in water, or in air if `housing` is flat: a start value,
+    which `intrinsics` or `alignment.intrinsics` can fix. MASt3R always fixes a lens with distortion."""
     k1: LensParameter | None = None
+    """First radial distortion coefficient of the lens, in COLMAP's convention."""
     k2: LensParameter | None = None
+    """Second radial distortion coefficient of the lens."""
     k3: LensParameter | None = None
-    """OPENCV_FISHEYE only, as k4."""
+    """Third radial distortion coefficient, for OPENCV_FISHEYE only."""
     k4: LensParameter | None = None
+    """Fourth radial distortion coefficient, for OPENCV_FISHEYE only."""
     p1: LensParameter | None = None
+    """First tangential distortion coefficient, for OPENCV only."""
     p2: LensParameter | None = None
+    """Second tangential distortion coefficient, for OPENCV only."""
 
 
 @dataclass(frozen=True)
@@ -220,20 +250,23 @@ class ColmapSettings(LensSettings):
     """Structure from motion without weights: pycolmap, plane sweep, Sea-Thru."""
 
     camera: Literal["auto", "SIMPLE_RADIAL", "OPENCV", "OPENCV_FISHEYE"] = "auto"
-    """One lens for the whole clip. Auto: SIMPLE_RADIAL, or OPENCV where it explains the matches clearly better."""
+    """Lens model of the whole clip; auto uses SIMPLE_RADIAL, or OPENCV where it explains the matches clearly better."""
     intrinsics: Literal["prior", "fixed"] = "prior"
-    """Whether the numbers above are a start for refinement or the truth."""
+    """Use of the given focal length and distortion: as a start to refine, or fixed."""
     housing: Literal["none", "flat", "dome"] = "none"
-    """A flat port lengthens the focal length by water's 1.333; given and assumed ones are multiplied by it."""
+    """Port of the camera housing; for a flat one, focal lengths are multiplied by water's refractive index of 1.333."""
     pairs: Literal["auto", "exhaustive", "sequential"] = "auto"
-    """Auto: every pair up to `exhaustive_to` frames; above, neighbors in time (video) and frames that look alike."""
+    """Frames to match: every pair, or neighbors in time and similar frames; auto matches every pair up to
+    `exhaustive_to` frames."""
     exhaustive_to: CountOrZero = 60
+    """Number of frames up to which `auto` matches every pair."""
     overlap: CountOrZero = 10
-    """Neighbors in time each frame is matched with, and some at doubling distances."""
+    """Number of neighbors in time that each frame is matched with, followed by some at doubling distances."""
     loops: CountOrZero = 6
-    """Frames elsewhere in the clip that look most alike (VLAD), matched with each frame; 5 times that for stills."""
+    """Number of most similar frames elsewhere in the clip (VLAD) that each frame is matched with; five times as many
+    for folders of images."""
     threads: Threads = 0
-    """0: every core."""
+    """Number of threads for features and matching; 0 uses all cores."""
     features: FeatureSettings = field(default_factory=FeatureSettings)
     mapping: MappingSettings = field(default_factory=MappingSettings)
     depth: PlaneSweepSettings = field(default_factory=PlaneSweepSettings)
@@ -251,44 +284,46 @@ class Mast3rSettings(LensSettings):
     """Structure from motion by the MASt3R network: pointmaps and matches of pairs of frames, aligned; Sea-Thru."""
 
     weights: Path | None = None
-    """The checkpoint (.pth or .safetensors); else the one that `swimm3r weights path mast3r` prints."""
+    """MASt3R checkpoint (.pth or .safetensors); by default the one that `swimm3r weights path mast3r` prints."""
     adapter: Path | None = None
-    """An adapter.safetensors of train-sfm: matches and depth are then the student's, and the water its head's."""
+    """File adapter.safetensors of train-sfm; matches and depth then come from the student, the medium from its head."""
     graph: str = "video"
-    """Pairs to look at: video[-WINDOW-CLOSURES], complete, swin-K, logwin-K, oneref-FRAME, retrieval-KEYS-K."""
+    """Pairs of frames to process: video[-WINDOW-CLOSURES], complete, swin-K, logwin-K, oneref-FRAME or
+    retrieval-KEYS-K."""
     similarity: Literal["cosine", "asmk"] = "cosine"
-    """How frames that look alike are found, from the encoder's tokens; asmk needs mast3r-retrieval and its codebook."""
+    """Similarity of frames from the encoder's tokens; asmk needs the weights mast3r-retrieval and its codebook."""
     size: NetworkSide = 512
-    """Long side of the images the network sees; it was trained at 512."""
+    """Longer side of the network's images in pixels; it was trained at 512."""
     square_ok: bool = False
-    """Square images stay square; else they lose a quarter of their height, as in training."""
+    """Keep square images square; otherwise they are cropped to 4:3, as in training."""
     device: Literal["auto", "cpu", "cuda", "mps"] = "auto"
+    """Device that the network runs on; auto uses a GPU if one is present."""
     precision: Literal["float32", "bfloat16", "float16"] = "float32"
-    """Of the network's trunk; its heads are always float32."""
+    """Number format of the network's trunk; its heads always use float32."""
     camera: Literal["PINHOLE", "SIMPLE_RADIAL", "OPENCV", "OPENCV_FISHEYE"] = "PINHOLE"
-    """One lens for the whole clip; its distortion is removed before the network sees an image."""
+    """Lens model of the whole clip; distortion is removed before the network sees an image."""
     known: Path | None = None
-    """Cameras that are known: a cameras.json, a COLMAP model or another program's file. Frames it names keep its poses
-    (and its unit), the others find theirs; its lens takes the place of the numbers above."""
+    """Known cameras: a cameras.json, a COLMAP model or another program's file. Frames in it keep their poses and unit;
+    its lens replaces the options above."""
     min_matches: Count = 16
-    """Pairs with fewer matches than this are taken for strangers: a few pixels agree by chance."""
+    """Smallest number of matches of a pair; pairs with fewer are treated as non-overlapping."""
     min_share: Share = 0.9
-    """Share of the frames that must hang together through matches; the few others are left out, under a warning."""
+    """Smallest share of the frames that must be connected by matches; the others are left out with a warning."""
     max_matches: Count = 2_000_000
-    """Of all pairs together in the alignment, drawn evenly from each: what bounds its memory, not its accuracy."""
+    """Largest number of matches of all pairs together in the alignment, which bounds its memory."""
     max_error: Positive = 3.0
-    """Pixels of the network's image that a match may miss its point by; others are no tracks and not exported."""
+    """Largest reprojection error, in pixels of the network's image, of a match in a track."""
     max_points: Annotated[int, Range(100)] = 200_000
-    """Sparse points that are kept, those seen in most frames first."""
+    """Largest number of sparse points; those seen in most frames are kept."""
     min_confidence: NotNegative = 1.5
-    """Of the pointmaps (1 and up) below which a pixel's depth is unknown; the reference's viewer has it, too."""
+    """Smallest confidence (1 and up) at which the depth of a pixel is used."""
     bundle_adjustment: bool = False
-    """Poses and points once more by COLMAP's bundle adjustment of the tracks."""
+    """Refine poses and points by COLMAP's bundle adjustment of the tracks at the end."""
     memory_mb: Count = 2048
-    """For encodings and running sums of frames that are held at once; what does not fit waits on disk."""
+    """Memory in MB for encodings and running sums; frames beyond it wait on disk."""
     cache: Path | None = None
-    """Folder of encodings and pair results, keyed by content, that several runs may share; else the run's own, removed
-    at its end."""
+    """Folder for encodings and pair results that several runs may share; by default the run's own, removed at its end.
+    """
     matching: MatchingSettings = field(default_factory=MatchingSettings)
     alignment: AlignmentSettings = field(default_factory=lambda: AlignmentSettings(intrinsics="shared"))
     features: FeatureSettings = field(default_factory=FeatureSettings)
@@ -307,7 +342,7 @@ class ColmapModelSettings(Settings):
     """Poses and points of a COLMAP model that exists; depth, water and cloud are found as without one."""
 
     model: Path
-    """The folder with cameras, images and points3D (.bin or .txt), or one above its sparse/0; or another program's file
+    """Folder with cameras, images and points3D (.bin or .txt), or one above its sparse/0; or another program's file
     (`swimm3r.io.imports.read.read_foreign`)."""
     features: FeatureSettings = field(default_factory=FeatureSettings)
     depth: PlaneSweepSettings = field(default_factory=PlaneSweepSettings)

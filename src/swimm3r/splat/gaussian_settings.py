@@ -31,69 +31,80 @@ class GaussianInitialSettings(Settings):
     """The Gaussians that training starts from."""
 
     primitives: MapSize = 400_000
-    """Points of the cloud and its backdrop that become primitives, one per voxel."""
+    """Number of points of the cloud and its backdrop that become Gaussians, one per voxel."""
     backdrop: Share = 0.2
-    """Largest share of them that lies on ground whose depth is a guess."""
+    """Largest share of the initial Gaussians on ground of guessed depth; 0 starts from measured points alone."""
     colors: Literal["restored", "raw"] = "raw"
-    """As filmed, or without the water for maps that have one."""
+    """Colors of the initial Gaussians: raw, or restored for maps with a medium."""
     harmonics: Annotated[int, Range(0, 3)] = 3
     """Degree of the colors' spherical harmonics."""
     scale: Annotated[float, Range(1e-3, 1e3)] = 1.0
-    """In root mean square distances to the 3 nearest neighbors."""
+    """Spatial scale of a Gaussian, in root mean square distances to its 3 nearest neighbors."""
     opacity: Opacity = 0.1
+    """Opacity of the initial Gaussians, between 0 and 1."""
 
 
 @dataclass(frozen=True)
 class GaussianRenderSettings(Settings):
-    """How a Gaussian meets a camera."""
+    """Projection and compositing of Gaussians."""
 
     depth: Literal["ray", "z"] = "z"
-    """The depth that attenuates: along the ray, or along the optical axis as the peers have it."""
+    """Depth that light is attenuated over: along the ray, or along the optical axis as published."""
     alpha_min: Annotated[float, Range(0, 0.5)] = 1 / 255
-    """Pairs fainter than this are skipped."""
+    """Smallest opacity of a Gaussian at a pixel that is drawn."""
     near: Annotated[float, Range(above=0, most=1e6)] = 0.01
-    """Primitives nearer than this z depth are not drawn."""
+    """Smallest z depth of a Gaussian that is drawn."""
     medium_depth_grad: Literal["full", "detach"] = "full"
-    """Whether what the water takes and adds may move a primitive in depth."""
+    """Gradient of the medium's terms to the Gaussians' depths: full, or detached."""
 
 
 @dataclass(frozen=True)
 class GaussianRates(Settings):
-    """Of Adam (eps 1e-15); positions decay log-linearly over the run."""
+    """Adam's learning rates (eps 1e-15); positions decay log-linearly over the run."""
 
     xyz: DecayingRate = 1.6e-4
-    """Times the scene's radius, as is its end."""
+    """Initial learning rate of the positions, times the scene's radius."""
     xyz_end: DecayingRate = 1.6e-6
+    """Final learning rate of the positions, times the scene's radius."""
     quaternion: Rate = 1e-3
+    """Learning rate of the rotations."""
     scale: Rate = 5e-3
+    """Learning rate of the scales."""
     opacity: Rate = 5e-2
+    """Learning rate of the opacities."""
     color: Rate = 2.5e-3
+    """Learning rate of the colors' constant part."""
     harmonics: Rate = 1.25e-4
+    """Learning rate of the colors' higher harmonics."""
     short_run_rate_exponent: Annotated[float, Range(0, 4)] = 0.5
-    """In runs shorter than the published one the rates of positions, rotations and colors grow with its length over
-    theirs to this power, at most fourfold; 0 keeps them. UWBS's `fast` preset has rates raised by as much, and 400
-    steps of Gaussian MCMC on ruie_green_rock gain 1.2 dB by it on frames held back."""
+    """Exponent of the factor, published length over length of the run, on the rates of positions, rotations and colors
+    in shorter runs; at most fourfold, 0 keeps the rates."""
 
 
 @dataclass(frozen=True)
 class GaussianSettings(Settings):
-    """What all peers have."""
+    """Settings that all renderers with Gaussians share."""
 
     iterations: Count = 30_000
+    """Number of training steps, one image each."""
     long_side: LongSideOrOwn = 1600
-    """Longer side of the training images, pixels; they are never enlarged."""
+    """Longer side of the training images in pixels; images are never enlarged."""
     working_depth: Annotated[float, Range(1e-3, 1e6)] = 3.0
-    """Median depth, working units, that a scene without metric scale is given while it is trained."""
+    """Median depth, in working units, that a scene without metric scale is scaled to for training."""
     cap_max: MapSize = 800_000
+    """Largest number of Gaussians in the map."""
     initial: GaussianInitialSettings = field(default_factory=GaussianInitialSettings)
     render: GaussianRenderSettings = field(default_factory=GaussianRenderSettings)
     rates: GaussianRates = field(default_factory=GaussianRates)
     degree_every: Cadence = 1 / 30
-    """Share of the run between two degrees of the colors' harmonics."""
+    """Share of the run between two degrees of the colors' spherical harmonics."""
     poses: TrainingPoseSettings = field(default_factory=TrainingPoseSettings)
     seed: Seed = 0
+    """Seed of the random number generator."""
     log_every: Cadence = 0.005
+    """Share of the run between two rows of metrics.jsonl."""
     checkpoint_every: Cadence = 0.1
+    """Share of the run between two checkpoints that an interrupted training resumes from."""
 
     @property
     def depth_confidence(self) -> float | None:
@@ -106,24 +117,32 @@ class McmcSettings(Settings):
     """Relocation, growth and noise (3DGS-MCMC), with its regularizers."""
 
     refine_start: Share = 1 / 60  # 500 of 30,000
+    """Share of the run before the first densification round."""
     refine_stop: Share = 5 / 6  # 25,000 of 30,000
+    """Share of the run after which densification ends."""
     refine_every: Cadence = 1 / 300  # 100 of 30,000
+    """Share of the run between two densification rounds."""
     min_refine_every: Count = 20
-    """Fewest steps between two rounds, whatever `refine_every` says; growth is made up for."""
+    """Fewest steps between two densification rounds, whatever `refine_every` says; growth is scaled to make up for it.
+    """
     growth: Annotated[float, Range(1, 2)] = 1.05
-    """Per round at `refine_every`."""
+    """Factor by which the number of Gaussians grows in each densification round."""
     min_opacity: Opacity = 0.005
+    """Opacity below which a Gaussian is relocated."""
     noise: NotNegative = 5e5
-    """Times the positions' learning rate, with every step."""
+    """Scale of the noise on positions in every step, times their learning rate."""
 
 
 @dataclass(frozen=True)
 class McmcWeights(Settings):
-    """Of the losses, all the run."""
+    """Loss weights, constant over the run."""
 
     ssim: Share = 0.2
+    """Weight of D-SSIM against L1 in the image loss."""
     opacity: NotNegative = 0.01
+    """Weight of the Gaussians' opacities."""
     scale: NotNegative = 0.01
+    """Weight of the Gaussians' scales."""
 
 
 @dataclass(frozen=True)
@@ -148,33 +167,38 @@ class AbsGradSettings(Settings):
     """Multiplication by absolute gradients, culls, and cuts of the opacities (WaterSplatting)."""
 
     refine_start: Share = 1 / 30  # 500 of 15,000
+    """Share of the run before the first densification round."""
     refine_stop: Share = 2 / 3  # 10,000 of 15,000
+    """Share of the run after which densification ends."""
     refine_every: Cadence = 1 / 150  # 100 of 15,000
+    """Share of the run between two densification rounds."""
     min_refine_every: Count = 40
-    """Fewest steps between two rounds, whatever `refine_every` says: a round needs its views."""
+    """Fewest steps between two densification rounds, whatever `refine_every` says, so that gradients average over
+    enough views."""
     grow_grad2d: NotNegative = 8e-4
-    """Least mean gradient of a projected center, in half images."""
+    """Mean absolute gradient of a projected center, in half images, from which a Gaussian is split or duplicated."""
     grow_scale3d: NotNegative = 1e-3
-    """Scale from which on a Gaussian is split instead of doubled, in radii of the cameras' path."""
+    """Scale from which a Gaussian is split instead of duplicated, in radii of the cameras' path."""
     prune_opacity: Share = 0.5
-    """Fainter Gaussians are culled by a round,"""
+    """Opacity below which Gaussians are culled in a densification round."""
     prune_opacity_late: Share = 0.1
-    """and these after the last."""
+    """Opacity below which Gaussians are culled after the last densification round."""
     prune_scale3d: Positive = 10.0
-    """Scale above which they are culled, in radii of the cameras' path."""
+    """Scale above which Gaussians are culled, in radii of the cameras' path."""
     reset_every: Share = 1 / 30  # 500 of 15,000
-    """Share of the run between two cuts of the opacities; 0 for none."""
+    """Share of the run between two resets of the opacities; 0 for none."""
     reset_opacity: Opacity = 0.5
-    """What they are cut to."""
+    """Largest opacity after a reset."""
 
 
 @dataclass(frozen=True)
 class RelativeWeights(Settings):
-    """Of reg-L1 and reg-SSIM."""
+    """Weights of the losses that are relative to the rendered value (reg-L1 and reg-SSIM)."""
 
     ssim: Share = 0.2
+    """Weight of reg-SSIM against reg-L1 in the image loss."""
     floor: PositiveShare = 1e-3
-    """Added to the rendered value that errors are divided by."""
+    """Constant added to the rendered value that errors are divided by."""
 
 
 @dataclass(frozen=True)
@@ -182,20 +206,24 @@ class WaterSplattingSettings(GaussianSettings):
     """Gaussians in water that a network knows for every direction."""
 
     iterations: Count = 15_000
+    """Number of training steps, one image each."""
     initial: GaussianInitialSettings = field(default_factory=lambda: GaussianInitialSettings(colors="restored"))
     medium: MediumFieldSettings = field(
         default_factory=lambda: MediumFieldSettings(layers=1, activation="sigmoid", biases=False, begin=0.0)
     )
     medium_rate: DecayingRate = 1e-3
+    """Initial learning rate of the medium field."""
     medium_rate_end: DecayingRate = 1.5e-4
+    """Final learning rate of the medium field."""
     rates: GaussianRates = field(default_factory=lambda: GaussianRates(xyz_end=5e-5))
     weights: RelativeWeights = field(default_factory=RelativeWeights)
     densify: AbsGradSettings = field(default_factory=AbsGradSettings)
     degree_every: Cadence = 1 / 15
+    """Share of the run between two degrees of the colors' spherical harmonics."""
     first_divisor: Annotated[int, Range(1, 64)] = 4
-    """By how much the training images are smaller at first,"""
+    """Factor by which the training images are reduced at first."""
     double_every: Cadence = 0.2  # 3,000 of 15,000
-    """and the share of the run after which they double."""
+    """Share of the run after which the size of the training images doubles."""
 
     @property
     def recipe(self) -> RecipeName:
@@ -208,64 +236,72 @@ class GradientSettings(Settings):
     """Multiplication by gradients, culls, and cuts of the opacities (3DGS)."""
 
     refine_start: Share = 1 / 60  # 500 of 30,000
+    """Share of the run before the first densification round."""
     refine_stop: Share = 0.5  # 15,000 of 30,000
+    """Share of the run after which densification ends."""
     refine_every: Cadence = 1 / 300  # 100 of 30,000
+    """Share of the run between two densification rounds."""
     min_refine_every: Count = 40
-    """Fewest steps between two rounds, whatever `refine_every` says: a round needs its views."""
+    """Fewest steps between two densification rounds, whatever `refine_every` says, so that gradients average over
+    enough views."""
     grow_grad2d: NotNegative = 2e-4
-    """Least mean gradient of a projected center, in half images."""
+    """Mean gradient of a projected center, in half images, from which a Gaussian is split or duplicated."""
     grow_scale3d: NotNegative = 0.01
-    """Scale from which on a Gaussian is split instead of doubled, in radii of the cameras' path."""
+    """Scale from which a Gaussian is split instead of duplicated, in radii of the cameras' path."""
     prune_opacity: Share = 0.005
-    """Fainter Gaussians are culled,"""
+    """Opacity below which Gaussians are culled."""
     prune_scale3d: Positive = 0.1
-    """and, after the first cut, those of larger scales, in radii of the cameras' path,"""
+    """Scale above which Gaussians are culled after the first reset, in radii of the cameras' path."""
     largest_radius: Positive = 20.0
-    """or of larger radius in a training image, pixels."""
+    """Radius in a training image, in pixels, above which Gaussians are culled after the first reset."""
     reset_every: Share = 0.1  # 3,000 of 30,000
-    """Share of the run between two cuts of the opacities; 0 for none."""
+    """Share of the run between two resets of the opacities; 0 for none."""
     reset_opacity: Opacity = 0.01
-    """What they are cut to."""
+    """Largest opacity after a reset."""
 
 
 @dataclass(frozen=True)
 class SeaSplatWeights(Settings):
-    """Of the losses; those on J, and the dark channel's, begin with the water."""
+    """Loss weights; the terms on clear colors and the dark channel start with the medium."""
 
     ssim: Share = 0.2
+    """Weight of D-SSIM against L1 in the image loss."""
     far: NotNegative = 1.0
-    """Of the error in proportion to depth."""
+    """Weight of the image error in proportion to depth."""
     background: NotNegative = 0.01
-    """Of what covers pixels that have the color of the open water."""
+    """Weight of Gaussians that cover pixels of the open water's color."""
     background_distance: Positive = 0.2 * 3**0.5
-    """Largest distance in RGB of a color that counts as such."""
+    """Largest RGB distance of a pixel to the color of the open water."""
     smooth_depth: NotNegative = 2.0
+    """Weight of the edge-aware smoothness of depth."""
     gray: NotNegative = 0.1
+    """Weight of the deviation of the clear image's channel means from 0.5."""
     saturation: NotNegative = 2.0
+    """Weight of clear colors below 0 or above `saturated`."""
     saturated: NotNegative = 0.7
-    """Clear colors are to be darker than this."""
+    """Value above which clear colors are penalized."""
     dark: NotNegative = 1.0
-    """Of the light left when the backscatter is taken away,"""
+    """Weight of the light that is left after the backscatter is subtracted."""
     negative: NotNegative = 1000.0
-    """and of backscatter beyond the image, in units of the former."""
+    """Weight of backscatter brighter than the image, in units of `dark`."""
 
 
 @dataclass(frozen=True)
 class SceneWaterSettings(Settings):
-    """When the water comes, and how often it learns."""
+    """Start of the medium's training, and its alternation with the Gaussians."""
 
     begin: Share = 1 / 3  # 10,000 of 30,000
-    """Share of the run before which there is a background instead."""
+    """Share of the run before which a background color stands for the medium."""
     rate: Rate = 1e-2
-    """Of Adam, for water and background."""
+    """Learning rate of Adam for medium and background."""
     first_burst: Annotated[float, Range(0, 10)] = 1 / 30
-    """Steps of the water alone when it comes, 1,000, as a share of the run, which does not count them;"""
+    """Steps of the medium alone when it starts, as a share of the run, which does not count them."""
     color_burst: Annotated[float, Range(0, 10)] = 1 / 15
-    """then of the colors alone, 2,000."""
+    """Steps of the colors alone after that, as a share of the run, which does not count them."""
     every: Cadence = 1 / 300
-    """Share of the run between two more bursts of the water, 100 steps,"""
+    """Share of the run between two bursts of steps of the medium alone."""
     burst: Annotated[float, Range(0, 10)] = 0.5
-    """and how long they are, 50 steps, as a share of that."""
+    """Length of a burst, as a share of the steps between two of them."""
 
 
 @dataclass(frozen=True)

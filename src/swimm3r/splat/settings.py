@@ -30,20 +30,22 @@ from swimm3r.splat.shared_settings import MediumFieldSettings, RecipeName, Train
 
 @dataclass(frozen=True)
 class RenderSettings(Settings):
-    """How a primitive meets a camera."""
+    """Projection and compositing of Beta primitives."""
 
     depth: Literal["ray", "z"] = "ray"
-    """The depth that attenuates: along the ray (exact), or along the optical axis as WaterSplatting and UBS have it."""
+    """Depth that light is attenuated over: along the ray (exact), or along the optical axis as in WaterSplatting and
+    UBS."""
     alpha_min: Annotated[float, Range(0, 0.5)] = 1 / 255
-    """Pairs fainter than this are skipped; 0 for parity with the papers, which skip nothing."""
+    """Smallest opacity of a primitive at a pixel that is drawn; 0 draws all, as the papers do."""
     near: Annotated[float, Range(above=0, most=1e6)] = 0.01
-    """Primitives nearer than this z depth are not drawn."""
+    """Smallest z depth of a primitive that is drawn."""
     covariance: Literal["symmetric", "upper"] = "symmetric"
-    """The conditional covariance is not symmetric: its mean with its transpose, or its upper triangle as UBS has it."""
+    """Reduction of the conditional covariance, which is not symmetric: its mean with its transpose, or its upper
+    triangle as in UBS."""
     rotation: Literal["first_order", "exponential"] = "first_order"
-    """I + A as UBS has it, or the rotation exp(A)."""
+    """Rotation of a primitive from its parameters A: I + A as in UBS, or exp(A)."""
     medium_depth_grad: Literal["full", "detach"] = "full"
-    """Whether what the water takes and adds may move a primitive in depth; detach as WaterSplatting has it."""
+    """Gradient of the medium's terms to the primitives' depths: full, or detached as in WaterSplatting."""
 
 
 @dataclass(frozen=True)
@@ -51,87 +53,101 @@ class InitialSettings(Settings):
     """The primitives and the water that training starts from."""
 
     primitives: MapSize = 400_000
-    """Points of the restored cloud and its backdrop that become primitives, one per voxel."""
+    """Number of points of the restored cloud and its backdrop that become primitives, one per voxel."""
     backdrop: Share = 0.2
-    """Largest share of them that lies on ground whose depth is a guess; 0 starts on measured points alone."""
+    """Largest share of the initial primitives on ground of guessed depth; 0 starts from measured points alone."""
     directions: Literal["mean", "uniform"] = "mean"
-    """Mean of the conditioned direction: that of the frames which see the point, or drawn from a cube as UBS does,
-    which hides 9 of 10 primitives in any one view."""
+    """Mean of the conditioned direction: that of the frames that see the point, or uniform over a cube as in UBS."""
     view_exponent: Annotated[float, Range(-20, 10)] = 0.0
-    """Stored exponent of the conditioned directions: how fast a primitive fades seen from elsewhere, as 4 exp of it."""
+    """Stored exponent of the conditioned directions; a primitive fades toward other views as 4 exp of it."""
     time_exponent: Annotated[float, Range(-20, 10)] = 0.0
-    """The same of time, in dynamic maps."""
+    """Stored exponent of the conditioned time, in dynamic maps; a primitive fades over time as 4 exp of it."""
     time_scale: Annotated[float, Range(1e-3, 1e3)] = 4.0
-    """Scale of a primitive in time, in lengths of the clip; its mean time is drawn from all of the clip (UBS). UBS's 1
-    lets still ground fade away from that moment: 4 is worth 0.2 dB on the synthetic dive with the fish."""
+    """Scale of a primitive in time, in lengths of the clip, in dynamic maps (1 in UBS)."""
     scale: Annotated[float, Range(1e-3, 1e3)] = 1.0
-    """Spatial scale, in root mean square distances to the 3 nearest neighbors."""
+    """Spatial scale of a primitive, in root mean square distances to its 3 nearest neighbors."""
     opacity: Opacity = 0.5
+    """Opacity of the initial primitives, between 0 and 1."""
     colors: Literal["restored", "raw"] = "restored"
-    """Without the water, or as filmed for maps that have none."""
+    """Colors of the initial primitives: restored, or raw for maps without a medium."""
     max_views: Count = 64
-    """Frames asked whether they see a point."""
+    """Number of frames that are tested for visibility of a point."""
 
 
 @dataclass(frozen=True)
 class LearningRates(Settings):
-    """Of Adam (eps 1e-15), UBS's values; positions and the medium decay log-linearly over the run."""
+    """Adam's learning rates (eps 1e-15), UBS's values; positions and medium decay log-linearly over the run."""
 
     xyz: DecayingRate = 1.6e-4
-    """Times the scene's radius, as is its end."""
+    """Initial learning rate of the positions, times the scene's radius."""
     xyz_end: DecayingRate = 1.6e-6
+    """Final learning rate of the positions, times the scene's radius."""
     query_mean: Rate = 1e-3
+    """Learning rate of the means of the conditioned direction and time."""
     rgb: Rate = 1e-3
+    """Learning rate of the colors."""
     opacity: Rate = 5e-2
+    """Learning rate of the opacities."""
     beta: Rate = 1e-3
+    """Learning rate of the Beta kernels' exponents."""
     scale: Rate = 5e-3
+    """Learning rate of the scales."""
     lower: Rate = 1e-3
+    """Learning rate of the covariances' off-diagonal entries."""
     medium: DecayingRate = 1e-3
+    """Initial learning rate of the medium field."""
     medium_end: DecayingRate = 1.5e-4
+    """Final learning rate of the medium field."""
     final_rate_factor: PositiveShare = 1.0
-    """Share that the other rates have fallen to at the end of the run, log-linearly from `rate_decay_start` on; UBS
-    holds them, and at rates high enough for a short run the primitives then never come to rest."""
+    """Factor that the other rates fall to at the end of the run, log-linearly from `rate_decay_start` on; 1 keeps them,
+    as in UBS."""
     rate_decay_start: Annotated[float, Range(0, below=1)] = 0.5
+    """Share of the run after which the other rates decay by `final_rate_factor`."""
 
 
 @dataclass(frozen=True)
 class LossWeights(Settings):
-    """Of the objective, Eq. 18, and of four terms beyond it."""
+    """Weights of the objective (Eq. 18) and of four terms beyond it."""
 
     ssim: Share = 0.2
+    """Weight of D-SSIM against L1 in the image loss (Eq. 14)."""
     opacity: NotNegative = 0.01
+    """Weight of the primitives' opacities (Eq. 15)."""
     scale: NotNegative = 0.01
+    """Weight of the primitives' scales (Eq. 15)."""
     mcmc_begin: Share = 0.025
-    """Share of the run before which opacity and scale are not regularized: UBS's window, MCMC-GS has 0 to 1."""
+    """Share of the run before which opacities and scales are not regularized."""
     mcmc_end: Share = 0.5
+    """Share of the run after which opacities and scales are not regularized."""
     ubs_scale_reg_bug: bool = False
-    """Regularize all scales of the first three primitives, as UBS's code does, instead of the spatial ones of all."""
+    """Regularize all scales of the first three primitives, as UBS's code does, instead of the spatial scales of all."""
     depth: NotNegative = 0.1
+    """Weight of the depth regularizer (Eq. 13)."""
     depth_edges: NotNegative = 10.0
-    """Gradient scale k of the depth term's weights, the mean of e^(-k |dI/dx|) and e^(-k |dI/dy|) in pixel values per
-    pixel, normalized to a sum of 1. 0 counts all pixels alike; the paper names no scale."""
+    """Gradient scale k of the depth term's weights, the mean of e^(-k |dI/dx|) and e^(-k |dI/dy|), normalized to a sum
+    of 1; 0 weights all pixels alike. The paper gives no scale."""
     medium_smoothness: NotNegative = 1.0
+    """Weight of the medium's smoothness (Eq. 16)."""
     medium_prior: NotNegative = 0.01
-    """Of the deviation from the reconstruction's water in its standard deviations; 0 is the paper's objective.
-    Colors and water can trade places in a map, and without it they do."""
+    """Weight of the deviation from the reconstruction's medium, in its standard deviations; 0 is the paper's objective.
+    """
     radius: NotNegative = 0.1
+    """Weight of the radius regularizer (Eq. 17)."""
     max_radius: Positive = 256.0
-    """Projected radius, pixels of an image `max_radius_width` wide, beyond which a primitive counts as veil."""
+    """Projected radius beyond which a primitive is penalized, in pixels of an image `max_radius_width` wide."""
     max_radius_width: CountOrZero = 1280
-    """Width in pixels that `max_radius` refers to; 0 is that of the training images."""
+    """Image width in pixels that `max_radius` refers to; 0 is that of the training images."""
     coverage: NotNegative = 0.05
-    """Of the light that passes a surface whose depth is known; 0 is the paper's objective. A map may leave a surface
-    half transparent and let the veil behind it fill in; its clear colors are then dark."""
+    """Weight of the light that passes a surface of known depth, which keeps surfaces opaque; 0 is the paper's
+    objective."""
     open_water: NotNegative = 0.025
-    """Of what is drawn over pixels that look past every surface; 0 is the paper's objective. Painted on primitives,
-    open water is part of the scene: in clear images it glares."""
+    """Weight of primitives drawn over open water, which would glare in clear images; 0 is the paper's objective."""
     gamut: NotNegative = 1.0
-    """Of the squared excess of clear colors over 0..1; 0 is the paper's objective. Where the water leaves little of a
-    channel nearly any value of it explains the images, and Adam, whose steps know no scale, lets it stray."""
+    """Weight of the squared excess of clear colors over 0..1; 0 is the paper's objective."""
     depth_confidence: NotNegative = 0.3
-    """Least confidence of a depth that regularizes."""
+    """Smallest confidence of a depth that the regularizer uses."""
     depth_alpha: Share = 0.5
-    """Least alpha of a pixel whose depth is regularized."""
+    """Smallest rendered alpha of a pixel whose depth is regularized."""
 
 
 @dataclass(frozen=True)
@@ -139,59 +155,69 @@ class DensifySettings(Settings):
     """Relocation, growth and noise of the primitives (MCMC-GS, for Beta kernels as UBS has it)."""
 
     cap_max: MapSize = 800_000
+    """Largest number of primitives in the map."""
     refine_start: Share = 0.025  # 500 of 20,000
+    """Share of the run before the first densification round."""
     refine_stop: Share = 0.5  # 10,000 of 20,000
+    """Share of the run after which densification ends."""
     refine_every: Cadence = 0.005  # 100 of 20,000
+    """Share of the run between two densification rounds."""
     min_refine_every: Count = 20
-    """Fewest steps between two rounds, whatever `refine_every` says; growth is made up for."""
+    """Fewest steps between two densification rounds, whatever `refine_every` says; growth is scaled to make up for it.
+    """
     growth: Annotated[float, Range(1, 2)] = 1.02
-    """Per round at `refine_every`."""
+    """Factor by which the number of primitives grows in each densification round."""
     min_opacity: Opacity = 0.005
+    """Opacity below which a primitive is relocated."""
     noise: NotNegative = 1e6
-    """Rate times the positions' learning rate in static maps; UBS's."""
+    """Scale of the noise on positions, times their learning rate, in static maps (UBS's value)."""
     noise_dynamic: NotNegative = 1e6
-    """In dynamic ones; UBS has 1, with which still ground is 0.6 dB worse on the synthetic dive."""
+    """Scale of the noise on positions, times their learning rate, in dynamic maps (1 in UBS)."""
     noise_gate: Literal["sigmoid", "power"] = "sigmoid"
-    """How noise fades with opacity o: as 1 / (1 + exp(100 (o - dead_opacity))) (MCMC-GS), or as (1 - o)^100 (UBS)."""
+    """Decrease of the noise with opacity o: 1 / (1 + exp(100 (o - min_opacity))) as in MCMC-GS (sigmoid), or (1 -
+    o)^100 as in UBS (power)."""
     noise_cadence: Literal["round", "step"] = "round"
-    """Noise with every round (UBS), or with every step from the first to the last (MCMC-GS, whose rate is 5e5)."""
+    """Steps that add noise: each densification round (UBS), or every step of the run (MCMC-GS, with a scale of 5e5)."""
 
 
 @dataclass(frozen=True)
 class MoverSettings(Settings):
-    """Primitives born where a frame shows what a still scene cannot, in dynamic maps (beyond the paper)."""
+    """Primitives created for moving objects in dynamic maps (beyond the paper)."""
 
     at: Share = 0.2
-    """Share of the run after which the frames are searched for what moves; 0 leaves it to the densification."""
+    """Share of the run after which frames are searched for moving objects; 0 turns the search off."""
     contrast: NotNegative = 3.0
-    """How much more a pixel must be off in one frame, from map and other frames, than its ground is in those."""
+    """Smallest ratio of a pixel's error in one frame to its usual error in other frames that see the same ground."""
     least: Share = 0.04
-    """And by how much at least, pixel values, with the texture of both averaged out."""
+    """Smallest error of a pixel of a moving object, in pixel values averaged over texture."""
     nearness: PositiveShare = 0.85
-    """Distance from the camera assumed where the course does not tell, as a share of the ground's behind it."""
+    """Assumed distance of an object from the camera, as a share of that of the ground behind it, if its trajectory does
+    not tell."""
     duration: Positive = 3.0
-    """Scale in time, in intervals between training frames."""
+    """Scale in time of the created primitives, in intervals between training frames."""
     share: Share = 0.15
-    """Of the largest number of primitives, born at most."""
+    """Largest share of the map's primitives that are created for moving objects."""
 
 
 @dataclass(frozen=True)
 class SggSettings(Settings):
-    """Scattering-aware geometric gradients (Alg. 1); names the readings of what the paper leaves open."""
+    """Scattering-aware geometric gradients (Alg. 1), with the options that the paper leaves open."""
 
     enabled: bool = True
+    """Use scattering-aware geometric gradients in the first part of the run."""
     end: Share = 0.5  # tau_c, 10,000 of 20,000
+    """Share of the run after which exact gradients are used (tau_c)."""
     residual: Share = 0.15
-    """eta: share of the exact gradient that an uncertain center keeps."""
+    """Share of the exact gradient that an uncertain center keeps (eta)."""
     split: Literal["clear", "direct"] = "clear"
-    """What counts as geometry: the light without water, or the light that arrives, attenuated ("direct")."""
+    """Light that counts as geometry: that without water (clear), or the attenuated light that arrives (direct)."""
     depth: Literal["geometry", "apart"] = "geometry"
-    """Whether the depth loss's gradient is filtered with the geometry's, or added to it as it is."""
+    """Treatment of the depth loss's gradient: filtered with the geometry's, or added unfiltered (apart)."""
     isolated: Literal["branch", "exact"] = "branch"
-    """The depth loss's own gradient: from the adjoint's depth branch, which takes alpha as given, or by a second
-    backward pass."""
+    """Computation of the depth loss's own gradient: by the adjoint's depth branch with fixed alpha, or by a second
+    backward pass (exact)."""
     largest_step: Annotated[float, Range(1)] = 2.0
-    """c_max: bound of the multiplier of Adam's step."""
+    """Largest factor on Adam's step (c_max)."""
 
 
 @dataclass(frozen=True)
@@ -199,12 +225,13 @@ class UwbsSettings(Settings):
     """Underwater Beta Splatting; static, or with primitives and water that depend on the time, too."""
 
     dynamic: bool = False
-    """Condition primitives on time besides direction (D = 7), and let the water change with it."""
+    """Condition primitives on time besides direction (D = 7), and let the medium change with time."""
     iterations: Count = 20_000
+    """Number of training steps, one image each."""
     long_side: LongSideOrOwn = 1600
-    """Longer side of the training images, pixels; they are never enlarged."""
+    """Longer side of the training images in pixels; images are never enlarged."""
     working_depth: Annotated[float, Range(1e-3, 1e6)] = 3.0
-    """Median depth, working units, that a scene without metric scale is given while it is trained."""
+    """Median depth, in working units, that a scene without metric scale is scaled to for training."""
     initial: InitialSettings = field(default_factory=InitialSettings)
     render: RenderSettings = field(default_factory=RenderSettings)
     medium: MediumFieldSettings = field(default_factory=MediumFieldSettings)
@@ -215,8 +242,11 @@ class UwbsSettings(Settings):
     sgg: SggSettings = field(default_factory=SggSettings)
     poses: TrainingPoseSettings = field(default_factory=TrainingPoseSettings)
     seed: Seed = 0
+    """Seed of the random number generator."""
     log_every: Cadence = 0.005
+    """Share of the run between two rows of metrics.jsonl."""
     checkpoint_every: Cadence = 0.1
+    """Share of the run between two checkpoints that an interrupted training resumes from."""
 
     @property
     def recipe(self) -> RecipeName:
@@ -236,17 +266,19 @@ class PoseRefinementSettings(Settings):
     """A camera refined against a frozen map (3R-GS's protocol for test frames, with the paper's 300 steps)."""
 
     steps: CountOrZero = 300
+    """Number of refinement steps for the pose of each test frame; 0 keeps the first pose."""
     rate: Rate = 8e-4
-    """Of Adam, for a rotation in the 6D form and a translation in working units; decays to 1 %."""
+    """Learning rate of Adam for a rotation in 6D form and a translation in working units; decays to 1 %."""
     long_side: LongSideOrOwn = 240
-    """Longer side of the image the pose is refined on, pixels; at most, and for 0, that of the training images."""
+    """Longer side in pixels of the image that the pose is refined on; at most, and for 0, that of the training images.
+    """
     halvings: Annotated[int, Range(0, 16)] = 2
-    """How often that image is halved at first; the smaller ones share half of the steps. A pose that starts 9 px off
-    (of 400) is found from a quarter of the size, and not from the whole: on ruie_green_rock 24.0 instead of 20.2 dB."""
+    """Number of times that the image is halved at first; the smaller sizes share half of the steps and find poses that
+    start several pixels off."""
     edge: NotNegative = 4.0
-    """Pixels count whose gradient exceeds this many medians."""
+    """Image gradient, in medians, above which pixels count."""
     min_edges: Share = 0.01
-    """Share of the image below which every pixel counts instead."""
+    """Share of the image below which all pixels count instead of those at edges."""
 
 
 SplatSettings = UwbsSettings | WaterSplattingSettings | SeaSplatSettings | McmcGsSettings

@@ -13,41 +13,47 @@ class MediumFieldSettings(Settings):
     """The ambient field A_phi of Eq. 10."""
 
     model: Literal["network", "none"] = "network"
-    """none is clear water before black: Beta splatting without the underwater part (UBS)."""
+    """Model of the medium: a network of the viewing direction (Eq. 10), or none, for Beta splatting without water
+    (UBS)."""
     layers: Annotated[int, Range(0, 16)] = 2
-    """Hidden ones."""
+    """Number of hidden layers of the medium field."""
     hidden: Annotated[int, Range(1, 4096)] = 128  # WaterSplatting's width
+    """Width of the hidden layers of the medium field."""
     activation: Literal["relu", "sigmoid"] = "relu"
-    """Of hidden layers; sigmoid as WaterSplatting has it."""
+    """Activation of the hidden layers (sigmoid in WaterSplatting)."""
     biases: bool = True
+    """Use biases in the layers of the medium field."""
     frequencies: Annotated[int, Range(1, 16)] = 8
-    """Octaves of the clip's time that gamma(t) begins with, in dynamic maps."""
+    """Number of octaves of the clip's time at the input of gamma(t), in dynamic maps."""
     time_features: Annotated[int, Range(1, 1024)] = 16
-    """Width of gamma(t)."""
+    """Number of outputs of the time embedding gamma(t)."""
     stride: Annotated[int, Range(1, 1024)] = 8
-    """Pixels between the directions at which the field is evaluated; between them its maps are interpolated."""
+    """Pixels between the directions at which the field is evaluated; values between them are interpolated."""
     prior: Annotated[float, Range(0, 100)] = 0.3
-    """Beta per working unit where the reconstruction has no medium."""
+    """Initial beta per working unit, if the reconstruction has no medium."""
     begin: Share = 0.1
-    """Share of the run before which the water stays the reconstruction's: it learns so much faster than the primitives
-    that it would explain their first transparency."""
+    """Share of the run before which the medium stays that of the reconstruction."""
     least_std: Annotated[float, Range(1e-6, 100)] = 0.05
-    """The reconstruction's water is not held tighter than this: betas relative, Binf in pixel values."""
+    """Smallest standard deviation of the prior from the reconstruction's medium: relative for betas, in pixel values
+    for Binf."""
 
 
 @dataclass(frozen=True)
 class TrainingPoseSettings(Settings):
-    """The training frames' poses, refined with the map (3R-GS's module and values)."""
+    """Refinement of the training poses along with the map (3R-GS's module and values)."""
 
     enabled: bool = True
+    """Refine the training poses along with the map."""
     width: Annotated[int, Range(1, 4096)] = 64
-    """Of a camera's code and of the network's hidden layers."""
+    """Width of a camera's code and of the network's hidden layers."""
     rate: Rate = 1.5e-4
-    """Of Adam, for codes and network, in 20,000 steps; shorter runs step as much farther, up to `largest_rate`."""
+    """Learning rate of Adam for codes and network over 20,000 steps; shorter runs use a larger one, up to
+    `largest_rate`."""
     largest_rate: Rate = 2e-3
+    """Largest learning rate that short runs use for codes and network."""
     epipolar: NotNegative = 2.0
-    """Weight of the matches' epipolar error, pixels."""
+    """Weight of the matches' epipolar error in pixels."""
     epipolar_end: Share = 0.15
-    """Share of the run after which the matches are left out."""
+    """Share of the run after which the epipolar error is left out."""
     matches: Count = 4096
-    """Matches per step, drawn anew each time; 3R-GS takes every twentieth of all."""
+    """Number of matches per step, drawn anew in each."""

@@ -54,6 +54,11 @@ def options_of(command: Callable) -> list[Option]:
     return _listed(command).options
 
 
+def groups_of(command: Callable) -> dict[str, str]:
+    """The description of each record of a command."""
+    return _listed(command).about
+
+
 def brief_help(command: Callable, usage: str, shown: Groups) -> View:
     """The options of the groups that this command has, and where the others are explained."""
     listed = _listed(command)

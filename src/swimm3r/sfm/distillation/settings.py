@@ -16,37 +16,39 @@ class TrainSettings(Settings):
     objective: ObjectiveSettings = field(default_factory=ObjectiveSettings)
     pairs: PairSettings = field(default_factory=PairSettings)
     water_probability: Share = 0.5
-    """p of the paper's parametric water-type augmentation. 0 turns it off and leaves out images taken in air, which
-    have no raw image of their own."""
+    """Probability of the paper's parametric water augmentation; 0 turns it off and leaves out images taken in air."""
     learning_rate: DecayingRate = 5e-4
+    """Learning rate of AdamW for adapters and physics head."""
     cool_down: Share = 0.0
-    """Share of the steps, at the end, in which the learning rate falls to 0 along a line; the paper names no
-    schedule. Short trainings gain from it."""
+    """Share of the steps, at the end, over which the learning rate falls linearly to 0."""
     weight_decay: NotNegative = 1e-4
+    """Weight decay of AdamW for all trained parameters."""
     epochs: Count = 20
+    """Number of passes over the training pairs."""
     batch: Count = 4
     """Pairs per step, over all processes together."""
     micro_batch: CountOrZero = 0
-    """Pairs per forward pass, their gradients added up to the batch; 0 is the whole batch. Less memory, same result."""
+    """Pairs per forward pass, whose gradients are added up to the batch; 0 uses the whole batch. Smaller values save
+    memory."""
     size: NetworkSide = 512
-    """Long side of the network's images, pixels."""
+    """Longer side of the network's images in pixels."""
     precision: Literal["auto", "float32", "bfloat16"] = "auto"
-    """Of the frozen trunk; adapters, heads and losses stay float32. auto: bfloat16 on a GPU."""
+    """Number format of the frozen trunk; auto uses bfloat16 on a GPU. Adapters, heads and losses use float32."""
     seed: Seed = 0
-    """Decides adapters, head, order of the pairs and water."""
+    """Seed of adapters, head, order of the pairs and water."""
     validation: CountOrZero = 16
-    """Pairs drawn from the training sequences, never trained on, scored after each epoch; 0 for none."""
+    """Number of pairs held back from the training sequences and scored after each epoch; 0 for none."""
     max_pairs: CountOrZero = 0
-    """Most pairs trained on, drawn evenly; 0 is no limit."""
+    """Largest number of training pairs, drawn evenly; 0 sets no limit."""
     log_every: Count = 10
-    """Steps between rows of metrics.jsonl, each the mean of its steps."""
+    """Steps between two rows of metrics.jsonl, each the mean of its steps."""
     tensorboard: bool = False
-    """Write the rows of metrics.jsonl for TensorBoard, too (pip install tensorboard)."""
+    """Write the rows of metrics.jsonl for TensorBoard too (pip install tensorboard)."""
     teacher_cache_mb: CountOrZero = 0
-    """Disk for the teacher's features, so that it looks at each pair once: 20 MB per pair at 512 x 320. 0 computes them
-    anew in each epoch."""
+    """Disk in MB for the teacher's features, about 20 MB per pair at 512 x 320, so that each pair is encoded once; 0
+    encodes it in each epoch."""
     checkpoint_every: Count = 200
-    """Steps between states that an interrupted training goes on from; the end of an epoch is always one."""
+    """Steps between two states that an interrupted training resumes from; the end of an epoch is always one."""
 
 
 def _without(*terms: Literal["forward", "inverse", "saturation"]) -> TrainSettings:

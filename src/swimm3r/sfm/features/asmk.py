@@ -46,11 +46,13 @@ class AsmkSettings(Settings):
     """Aggregated selective match kernel."""
 
     features: Count = 300
-    """The strongest features of a frame that are kept."""
+    """Number of strongest features of a frame that are kept."""
     words_when_found: Count = 1
+    """Number of visual words per feature of a stored frame."""
     words_when_asking: Count = 5
+    """Number of visual words per feature of a query frame."""
     power: Positive = 3.0
-    """Exponent of a signature's similarity: a few good words beat many mediocre ones."""
+    """Exponent of a signature's similarity; larger values favor few good words over many mediocre ones."""
 
 
 @dataclass(frozen=True)
