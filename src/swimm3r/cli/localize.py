@@ -9,6 +9,7 @@ from tyro.conf import Positional, arg
 from swimm3r.cli.terminal.console import drawn_progress, outcome_console
 from swimm3r.cli.terminal.options import FLAT, OutOrDefault, Run
 from swimm3r.localization.settings import LocalizationSettings
+from swimm3r.splat.settings import MapDevice
 
 
 def localize(
@@ -17,6 +18,7 @@ def localize(
     /,
     lens: Path | None = None,
     out: OutOrDefault = None,
+    map_device: MapDevice = "auto",
     settings: Annotated[LocalizationSettings, FLAT] = LocalizationSettings(),  # noqa: B008
 ) -> None:
     """Find the camera poses of images in a run's map; without images, those of its test frames.
@@ -26,6 +28,7 @@ def localize(
         images: Images of the same place.
         lens: File cameras.json whose first camera took the images; by default they share the run's lens.
         out: Folder for poses.json, poses.tum and the match images; RUN/localization by default.
+        map_device: Device that renders the map; auto uses CUDA if a GPU and NVIDIA Warp are present.
         settings: The localization protocol.
     """
     from swimm3r.io.files.outputs import output_folder
@@ -37,7 +40,7 @@ def localize(
     open_run(run, "splat")
     settings = with_checkpoint_of(settings, from_yaml(run / "settings.yaml").sfm)
     with output_folder(out or run / "localization"), drawn_progress() as progress:
-        answers, folder = localize_run(run, images, lens, out, settings, progress)
+        answers, folder = localize_run(run, images, lens, out, settings, progress, map_device=map_device)
     table = Table("image", "pose", "inliers", "median error, px", "seconds")
     for a in answers:
         if a.found is None:

@@ -29,6 +29,7 @@ from swimm3r.progress import Progress, silent
 from swimm3r.scene.reconstruction_io import load_reconstruction
 from swimm3r.scene.run_folder import open_run
 from swimm3r.splat.map_file import load_map
+from swimm3r.splat.settings import MapDevice
 
 _LINES = 60  # inliers drawn, spread over all of them
 
@@ -61,6 +62,8 @@ def localize_run(
     out: Path | None = None,
     settings: LocalizationSettings | None = None,
     progress: Progress = silent,
+    *,
+    map_device: MapDevice = "auto",
 ) -> tuple[list[Answer], Path]:
     """Places images, by default the run's test frames, in the run's map; the record goes to `out`.
 
@@ -72,7 +75,7 @@ def localize_run(
     for path in image_files:
         read_header(path)  # before minutes of matching
     open_run(folder, "splat")
-    scene = load_map(folder / "splat" / "map.safetensors").to(devices.for_maps())
+    scene = load_map(folder / "splat" / "map.safetensors").to(devices.for_maps(map_device))
     frames = load_frames(folder / "prepare")
     rec = load_reconstruction(folder / "sfm", frames)
     localizer = Localizer(scene, rec, frames, settings, progress=progress)

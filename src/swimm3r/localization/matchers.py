@@ -162,7 +162,7 @@ def matcher_for(settings: LocalizationSettings) -> Matcher:
     """The matcher that the settings name. Raises WeightsError where MASt3R is asked for and its weights are missing."""
     match chosen_matcher(settings):
         case "mast3r":
-            network = Mast3rSettings(settings.weights, device=settings.device, precision=settings.precision)
+            network = Mast3rSettings(weights=settings.weights, device=settings.device, precision=settings.precision)
             return Mast3rMatcher(load_network(network), settings)
         case "sift":
             return SiftMatcher(settings)

@@ -25,6 +25,7 @@ from swimm3r.io.cameras_json import CameraTable
 from swimm3r.io.files.atomic import atomic_path
 from swimm3r.io.view_names import view_stems
 from swimm3r.medium import transmittances
+from swimm3r.pipeline.presets import from_yaml
 from swimm3r.prepare import load_frames
 from swimm3r.progress import Progress, silent
 from swimm3r.report.charts import depth_image
@@ -37,6 +38,7 @@ from swimm3r.sfm.medium.restore import keep_open_water, shown_gains
 from swimm3r.sfm.settings import RestoreSettings
 from swimm3r.splat.map_file import load_map
 from swimm3r.splat.rendering import RenderOutput, SplatMap
+from swimm3r.splat.settings import MapDevice
 from swimm3r.splat.training_poses import axes_of_map
 
 KINDS = ("rgb", "clear", "clear_physical", "backscatter", "z_depth")
@@ -156,20 +158,23 @@ def render_run(
     time: float | None = None,
     restore: RestoreSettings | None = None,
     progress: Progress = silent,
+    *,
+    map_device: MapDevice = "auto",
 ) -> Path:
     """Images of a finished run's map from the cameras of a cameras.json, by default those of training; into `out`.
 
     `cameras` are in the axes of RUN/sfm, or the map's own, RUN/splat/cameras.json.
 
-    Clear images look like the frames that `restore` made. A dynamic map shows `time` (seconds of the clip), by
-    default the cameras' own times, else when the frames of their names were taken. Raises InputError where the run has
-    no map or no moment is known.
+    Clear images look like the frames that `restore` made, by default the run's own settings. A dynamic map shows `time`
+    (seconds of the clip), by default the cameras' own times, else when the frames of their names were taken. Raises
+    InputError where the run has no map or no moment is known.
     """
     accepted("long_side", long_side, LongSideOrOwn)
     accepted("flight", flight, CountOrZero)
     accepted("time", time, ClipSecond | None)
     open_run(folder, "splat")
-    scene = load_map(folder / "splat" / "map.safetensors").to(devices.for_maps())
+    restore = restore or from_yaml(folder / "settings.yaml").sfm.restore
+    scene = load_map(folder / "splat" / "map.safetensors").to(devices.for_maps(map_device))
     frames = load_frames(folder / "prepare")
     rec = load_reconstruction(folder / "sfm", frames)
     refined = folder / "splat" / "cameras.json"

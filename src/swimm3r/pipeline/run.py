@@ -173,6 +173,7 @@ def evaluate_run(
     *,
     steps: int | None = None,
     reference: Path | None = None,
+    map_device: MapDevice = "auto",
     progress: Progress | None = None,
 ) -> dict:
     """Score a finished run again, its test frames' poses found anew, and return the summary.
@@ -189,7 +190,7 @@ def evaluate_run(
     )
     with watched(progress) as told, open_record(folder, source, before.input.fingerprint) as record:
         record.summary |= before.sections
-        scene = load_map(folder / "splat" / "map.safetensors").to(devices.for_maps())
+        scene = load_map(folder / "splat" / "map.safetensors").to(devices.for_maps(map_device))
         frames = load_frames(folder / "prepare")
         run = MappedRun(folder, frames, load_reconstruction(folder / "sfm", frames), scene, settings)
         truth = truth_of(source, asked.reference)
