@@ -52,7 +52,7 @@ def run(tmp_path_factory: pytest.TempPathFactory) -> Path:
     )  # fmt: skip
     rec.save(out / "sfm", frames)
     about = {
-        "schema": 1,
+        "schema": SCHEMA,
         "input": {"path": str(folder / "dive"), "fingerprint": "f"},
         "stages": {"prepare": {"status": "done", "key": "p"}, "sfm": {"status": "done", "key": "k"}},
     }

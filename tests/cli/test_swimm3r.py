@@ -71,7 +71,7 @@ def test_the_students_water_restores_the_dive(place: Path, tmp_path: Path, capsy
     [
         ((), 2, "needs --adapter"),
         (("--adapter", "nowhere.safetensors"), 4, "nowhere.safetensors"),
-        (("--adapter", "tiny.safetensors"), 4, "no adapter file"),
+        (("--adapter", "tiny.safetensors"), 4, "cannot be used as an adapter"),
     ],
 )
 def test_a_missing_or_foreign_adapter_is_told_before_anything_runs(

@@ -20,7 +20,7 @@ from swimm3r.prepare.image_folder import images_of
 from swimm3r.scene.run_folder import STAGES
 from swimm3r.scene.settings import FrameSettings
 from swimm3r.sfm.settings import ColmapModelSettings, ColmapSettings, Mast3rSettings, PlaneSweepSettings
-from swimm3r.splat.settings import RecipeName, SplatSettings, UwbsSettings, recipe_of
+from swimm3r.splat.settings import SplatSettings, UwbsSettings
 
 _TEST_SHARE = 1 / 8  # of the frames (prepare.frames_folder.TEST_EVERY)
 
@@ -216,9 +216,8 @@ def _frame_seconds(frame: int, long_side: int, depth: PlaneSweepSettings) -> flo
 
 def _step_seconds(settings: SplatSettings, width: int, height: int) -> float:
     pixels = width * height * _scale(settings.long_side, max(width, height)) ** 2
-    recipe: RecipeName = recipe_of(settings)
     plain = _most_primitives(settings) * _STEP_PRIMITIVE_S + pixels * _STEP_PIXEL_S
-    return plain * _RECIPE_STEP.get(recipe, 1.0)
+    return plain * _RECIPE_STEP.get(settings.recipe, 1.0)
 
 
 def _most_primitives(settings: SplatSettings) -> int:
