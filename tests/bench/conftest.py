@@ -11,6 +11,7 @@ from swimm3r.pipeline.presets import PRESETS, to_yaml
 from swimm3r.prepare import read_frames
 from swimm3r.scene.ground_truth import FOLDER, read_ground_truth
 from swimm3r.scene.reconstruction import DepthMap, DepthMaps, Matches, Points, Reconstruction, Tracks
+from swimm3r.scene.run_folder import SCHEMA
 from swimm3r.scene.settings import FrameSettings
 from swimm3r.splat.settings import (
     DensifySettings,

@@ -42,7 +42,7 @@ class Query:
     time: float  # seconds; the number of the image where it has none
     image: Float[Tensor, "h w 3"]
     mask: Bool[Tensor, "h w"] | None = None
-    time: float | None = None  # seconds of the map's clip, where the image is part of it
+    clip_time: float | None = None  # seconds of the map's clip, where the image is part of it
 
 
 @dataclass(frozen=True)
@@ -114,7 +114,7 @@ def localize_run(
 def answer(localizer: Localizer, query: Query, lens: Cameras | None = None) -> Answer:
     """The query's place, or the reason why none was found."""
     try:
-        found = localizer.locate(query.image, query.mask, lens, query.time)
+        found = localizer.locate(query.image, query.mask, lens, query.clip_time)
         return Answer(query.name, query.time, found)
     except RegistrationError as failure:
         return Answer(query.name, query.time, None, failure.what)
