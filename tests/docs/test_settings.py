@@ -1,0 +1,69 @@
+"""Options and settings that documents name exist under that name."""
+
+import contextlib
+import io
+import re
+from pathlib import Path
+from typing import Any, get_args
+
+import pytest
+from tests.docs.documents import DOCUMENTS, ROOT
+
+from swimm3r.cli.main import main
+from swimm3r.pipeline.presets import RunSettings
+from swimm3r.settings import Settings, declarations
+from swimm3r.sfm.distillation.settings import TrainSettings
+from swimm3r.splat.settings import RECIPES
+
+COMMANDS = (
+    *("run", "prepare", "sfm", "splat", "render", "export", "eval", "localize", "report", "demo", "doctor", "datasets"),
+    *("train-sfm", "weights get", "bench render", "bench sfm", "bench flsea", "bench restoration"),
+    *("bench localization", "bench ablation-uwbs", "bench ablation-sfm", "run --backend mast3r"),
+    *(f"run --recipe {recipe}" for recipe in RECIPES),
+)
+OTHER_PROGRAMS = {"--extra-index-url", "--rm", "--junitxml", "--timeout", "--nproc-per-node"}
+"""Of pip, docker, pytest and torchrun."""
+OPTION = re.compile(r"(?<![\w-])--[a-z][\w.-]*\w")
+
+
+@pytest.fixture(scope="module")
+def options() -> set[str]:
+    """Every option of the command line, and of the repository's scripts."""
+    shown = io.StringIO()
+    for command in ("--help", *(f"{command} --help-all" for command in COMMANDS)):
+        with contextlib.redirect_stdout(shown), contextlib.suppress(SystemExit):
+            main(command.split())
+    scripts = [*ROOT.glob("benchmarks/**/*.py"), *ROOT.glob("examples/*.py"), ROOT / "tests" / "processors.py"]
+    declared = [name for script in scripts for name in re.findall(r'"(--[a-z][\w-]*)"', script.read_text("utf-8"))]
+    declared.append("--waters")  # of veil_anchor, whose options are the parameters of a function
+    return {*OPTION.findall(shown.getvalue()), *declared}
+
+
+@pytest.mark.parametrize("document", DOCUMENTS, ids=lambda path: str(path.relative_to(ROOT)))
+def test_every_option_that_a_document_names_exists(document: Path, options: set[str]):
+    assert len(options) > 300
+    text = document.read_text(encoding="utf-8")
+    renamed = r"^- Options mean the same.*\n(?:  .*\n)*"  # in the changelog, old names beside the new ones
+    text = re.sub(renamed, "", text, flags=re.MULTILINE)
+    assert set(OPTION.findall(text)) - options - OTHER_PROGRAMS == set()
+
+
+def groups(kind: Any, found: dict[str, set[str]]) -> dict[str, set[str]]:
+    """The settings below a record, by the name of the group that they are in."""
+    for name, hint in declarations(kind).items():
+        for part in get_args(hint) or (hint,):
+            if isinstance(part, type) and issubclass(part, Settings):
+                found.setdefault(name, set()).update(declarations(part))
+                groups(part, found)
+    return found
+
+
+@pytest.mark.parametrize("document", DOCUMENTS, ids=lambda path: str(path.relative_to(ROOT)))
+def test_every_setting_that_a_document_names_exists(document: Path):
+    known = groups(TrainSettings, groups(RunSettings, {}))
+    for room_or_file in ("frames", "medium", "poses", "sfm", "splat"):  # names of other things, too
+        del known[room_or_file]
+    assert {"weights", "densify", "sgg", "alignment", "restore", "objective"} < known.keys()
+    named = re.findall(r"`(?:splat\.)?([a-z_]+)\.([a-z_]+)`", document.read_text(encoding="utf-8"))
+    wrong = {f"{group}.{name}" for group, name in named if group in known and name not in known[group]}
+    assert wrong == set()
