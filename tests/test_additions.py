@@ -1,4 +1,4 @@
-"""What CONTRIBUTING.md calls complete: each test fails until an addition of its kind is wired everywhere.
+"""The recipes of CONTRIBUTING.md: each test fails until an addition of its kind is wired everywhere.
 
 A structure-from-motion back end, a renderer recipe, a camera model, an export format, a score, a data set.
 """

@@ -30,7 +30,7 @@ def broken_work() -> None:
 
 @pytest.fixture
 def displayed(monkeypatch: pytest.MonkeyPatch) -> list[str]:
-    """What a notebook shows, page after page, in the one place that is updated."""
+    """The pages that a notebook shows, one after another, in the one place that is updated."""
     pages: list[str] = []
 
     def display(page: str, display_id: bool) -> SimpleNamespace:

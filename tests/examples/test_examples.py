@@ -46,7 +46,7 @@ def example() -> Callable[[str], ModuleType]:
 
 @pytest.fixture(scope="module")
 def work(dive: Path, example: Callable[[str], ModuleType]) -> Path:
-    """What reconstruct_and_train leaves."""
+    """The folder that reconstruct_and_train leaves."""
     folder = dive.parent / "work"
     example("reconstruct_and_train").main([str(dive / "images"), "--out", str(folder), *SIZE])
     return folder

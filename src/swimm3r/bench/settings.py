@@ -1,4 +1,4 @@
-"""What the protocols are told besides the settings of their parts; torch-free, so that --help is instant."""
+"""Options of the protocols besides the settings of their parts; torch-free, so that --help is instant."""
 
 from dataclasses import dataclass
 from pathlib import Path

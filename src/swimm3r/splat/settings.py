@@ -285,7 +285,7 @@ SplatSettings = UwbsSettings | WaterSplattingSettings | SeaSplatSettings | McmcG
 uwbs = UwbsSettings  # as the Python API calls it: swimm3r.train(rec, frames, swimm3r.uwbs(iterations=20_000))
 
 MapDevice = Literal["auto", "cpu", "cuda"]
-"""Where maps are trained and rendered; no part of the settings, for a map can go from one to the other."""
+"""The device that trains and renders maps; no part of the settings, for a map can go from one to the other."""
 
 RECIPES: tuple[RecipeName, ...] = get_args(RecipeName)
 
