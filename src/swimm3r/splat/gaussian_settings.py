@@ -11,7 +11,6 @@ from swimm3r.settings import (
     Cadence,
     Count,
     DecayingRate,
-    LongSideOrOwn,
     MapSize,
     NotNegative,
     Opacity,
@@ -19,11 +18,16 @@ from swimm3r.settings import (
     PositiveShare,
     Range,
     Rate,
-    Seed,
     Settings,
     Share,
 )
-from swimm3r.splat.shared_settings import MediumFieldSettings, RecipeName, TrainingPoseSettings
+from swimm3r.splat.shared_settings import (
+    MapSettings,
+    MediumFieldSettings,
+    RecipeName,
+    RefineSettings,
+    TrainingPoseSettings,
+)
 
 
 @dataclass(frozen=True)
@@ -82,15 +86,10 @@ class GaussianRates(Settings):
 
 
 @dataclass(frozen=True)
-class GaussianSettings(Settings):
+class GaussianSettings(MapSettings):
     """Settings that all renderers with Gaussians share."""
 
     iterations: Count = 30_000
-    """Number of training steps, one image each."""
-    long_side: LongSideOrOwn = 1600
-    """Longer side of the training images in pixels; images are never enlarged."""
-    working_depth: Annotated[float, Range(1e-3, 1e6)] = 3.0
-    """Median depth, in working units, that a scene without metric scale is scaled to for training."""
     cap_max: MapSize = 800_000
     """Largest number of Gaussians in the map."""
     initial: GaussianInitialSettings = field(default_factory=GaussianInitialSettings)
@@ -98,13 +97,6 @@ class GaussianSettings(Settings):
     rates: GaussianRates = field(default_factory=GaussianRates)
     degree_every: Cadence = 1 / 30
     """Share of the run between two degrees of the colors' spherical harmonics."""
-    poses: TrainingPoseSettings = field(default_factory=TrainingPoseSettings)
-    seed: Seed = 0
-    """Seed of the random number generator."""
-    log_every: Cadence = 0.005
-    """Share of the run between two rows of metrics.jsonl."""
-    checkpoint_every: Cadence = 0.1
-    """Share of the run between two checkpoints that an interrupted training resumes from."""
 
     @property
     def depth_confidence(self) -> float | None:
@@ -113,18 +105,12 @@ class GaussianSettings(Settings):
 
 
 @dataclass(frozen=True)
-class McmcSettings(Settings):
+class McmcSettings(RefineSettings):
     """Relocation, growth and noise (3DGS-MCMC), with its regularizers."""
 
     refine_start: Share = 1 / 60  # 500 of 30,000
-    """Share of the run before the first densification round."""
     refine_stop: Share = 5 / 6  # 25,000 of 30,000
-    """Share of the run after which densification ends."""
     refine_every: Cadence = 1 / 300  # 100 of 30,000
-    """Share of the run between two densification rounds."""
-    min_refine_every: Count = 20
-    """Fewest steps between two densification rounds, whatever `refine_every` says; growth is scaled to make up for it.
-    """
     growth: Annotated[float, Range(1, 2)] = 1.05
     """Factor by which the number of Gaussians grows in each densification round."""
     min_opacity: Opacity = 0.005
@@ -163,15 +149,12 @@ class McmcGsSettings(GaussianSettings):
 
 
 @dataclass(frozen=True)
-class AbsGradSettings(Settings):
+class AbsGradSettings(RefineSettings):
     """Multiplication by absolute gradients, culls, and cuts of the opacities (WaterSplatting)."""
 
     refine_start: Share = 1 / 30  # 500 of 15,000
-    """Share of the run before the first densification round."""
     refine_stop: Share = 2 / 3  # 10,000 of 15,000
-    """Share of the run after which densification ends."""
     refine_every: Cadence = 1 / 150  # 100 of 15,000
-    """Share of the run between two densification rounds."""
     min_refine_every: Count = 40
     """Fewest steps between two densification rounds, whatever `refine_every` says, so that gradients average over
     enough views."""
@@ -232,15 +215,12 @@ class WaterSplattingSettings(GaussianSettings):
 
 
 @dataclass(frozen=True)
-class GradientSettings(Settings):
+class GradientSettings(RefineSettings):
     """Multiplication by gradients, culls, and cuts of the opacities (3DGS)."""
 
     refine_start: Share = 1 / 60  # 500 of 30,000
-    """Share of the run before the first densification round."""
     refine_stop: Share = 0.5  # 15,000 of 30,000
-    """Share of the run after which densification ends."""
     refine_every: Cadence = 1 / 300  # 100 of 30,000
-    """Share of the run between two densification rounds."""
     min_refine_every: Count = 40
     """Fewest steps between two densification rounds, whatever `refine_every` says, so that gradients average over
     enough views."""

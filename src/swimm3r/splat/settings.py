@@ -4,11 +4,10 @@ Windows and cadences are fractions of `iterations`, exact at the paper's 20,000.
 or, where the reconstruction has no scale, a third of its median depth (`working_depth`).
 """
 
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, field, fields, replace
 from typing import Annotated, Any, Literal, TypeVar, get_args
 
 from swimm3r.settings import (
-    Cadence,
     Count,
     CountOrZero,
     DecayingRate,
@@ -20,12 +19,17 @@ from swimm3r.settings import (
     PositiveShare,
     Range,
     Rate,
-    Seed,
     Settings,
     Share,
 )
 from swimm3r.splat.gaussian_settings import GaussianSettings, McmcGsSettings, SeaSplatSettings, WaterSplattingSettings
-from swimm3r.splat.shared_settings import MediumFieldSettings, RecipeName, TrainingPoseSettings
+from swimm3r.splat.shared_settings import (
+    MapSettings,
+    MediumFieldSettings,
+    RecipeName,
+    RefineSettings,
+    TrainingPoseSettings,
+)
 
 
 @dataclass(frozen=True)
@@ -151,20 +155,11 @@ class LossWeights(Settings):
 
 
 @dataclass(frozen=True)
-class DensifySettings(Settings):
+class DensifySettings(RefineSettings):
     """Relocation, growth and noise of the primitives (MCMC-GS, for Beta kernels as UBS has it)."""
 
     cap_max: MapSize = 800_000
     """Largest number of primitives in the map."""
-    refine_start: Share = 0.025  # 500 of 20,000
-    """Share of the run before the first densification round."""
-    refine_stop: Share = 0.5  # 10,000 of 20,000
-    """Share of the run after which densification ends."""
-    refine_every: Cadence = 0.005  # 100 of 20,000
-    """Share of the run between two densification rounds."""
-    min_refine_every: Count = 20
-    """Fewest steps between two densification rounds, whatever `refine_every` says; growth is scaled to make up for it.
-    """
     growth: Annotated[float, Range(1, 2)] = 1.02
     """Factor by which the number of primitives grows in each densification round."""
     min_opacity: Opacity = 0.005
@@ -221,17 +216,11 @@ class SggSettings(Settings):
 
 
 @dataclass(frozen=True)
-class UwbsSettings(Settings):
+class UwbsSettings(MapSettings):
     """Underwater Beta Splatting; static, or with primitives and water that depend on the time, too."""
 
     dynamic: bool = False
     """Condition primitives on time besides direction (D = 7), and let the medium change with time."""
-    iterations: Count = 20_000
-    """Number of training steps, one image each."""
-    long_side: LongSideOrOwn = 1600
-    """Longer side of the training images in pixels; images are never enlarged."""
-    working_depth: Annotated[float, Range(1e-3, 1e6)] = 3.0
-    """Median depth, in working units, that a scene without metric scale is scaled to for training."""
     initial: InitialSettings = field(default_factory=InitialSettings)
     render: RenderSettings = field(default_factory=RenderSettings)
     medium: MediumFieldSettings = field(default_factory=MediumFieldSettings)
@@ -240,13 +229,6 @@ class UwbsSettings(Settings):
     densify: DensifySettings = field(default_factory=DensifySettings)
     movers: MoverSettings = field(default_factory=MoverSettings)
     sgg: SggSettings = field(default_factory=SggSettings)
-    poses: TrainingPoseSettings = field(default_factory=TrainingPoseSettings)
-    seed: Seed = 0
-    """Seed of the random number generator."""
-    log_every: Cadence = 0.005
-    """Share of the run between two rows of metrics.jsonl."""
-    checkpoint_every: Cadence = 0.1
-    """Share of the run between two checkpoints that an interrupted training resumes from."""
 
     @property
     def recipe(self) -> RecipeName:
@@ -345,8 +327,7 @@ Peer = TypeVar("Peer", bound=GaussianSettings)
 def _of_the_same_size(settings: UwbsSettings, peer: Peer) -> Peer:
     """A peer's settings with the length, the sizes and the cloud of ours."""
     start = replace(peer.initial, primitives=settings.initial.primitives, backdrop=settings.initial.backdrop)
-    alike = ("iterations", "long_side", "working_depth", "seed", "log_every", "checkpoint_every")
-    same = {name: getattr(settings, name) for name in alike}
+    same = {shared.name: getattr(settings, shared.name) for shared in fields(MapSettings) if shared.name != "poses"}
     return replace(peer, initial=start, cap_max=settings.densify.cap_max, **same)
 
 

@@ -1,9 +1,9 @@
 """The settings of what several recipes share: a field of water, and poses refined with the map; torch-free."""
 
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from typing import Annotated, Literal
 
-from swimm3r.settings import Count, NotNegative, Range, Rate, Settings, Share
+from swimm3r.settings import Cadence, Count, LongSideOrOwn, NotNegative, Range, Rate, Seed, Settings, Share
 
 RecipeName = Literal["uwbs-static", "uwbs-dynamic", "ubs", "watersplatting", "seasplat", "threers_gs", "mcmc_gs"]
 
@@ -57,3 +57,37 @@ class TrainingPoseSettings(Settings):
     """Share of the run after which the epipolar error is left out."""
     matches: Count = 4096
     """Number of matches per step, drawn anew in each."""
+
+
+@dataclass(frozen=True)
+class MapSettings(Settings):
+    """Settings that all recipes share: length and image size of a training, and its record."""
+
+    iterations: Count = 20_000
+    """Number of training steps, one image each."""
+    long_side: LongSideOrOwn = 1600
+    """Longer side of the training images in pixels; images are never enlarged."""
+    working_depth: Annotated[float, Range(1e-3, 1e6)] = 3.0
+    """Median depth, in working units, that a scene without metric scale is scaled to for training."""
+    poses: TrainingPoseSettings = field(default_factory=TrainingPoseSettings)
+    seed: Seed = 0
+    """Seed of the random number generator."""
+    log_every: Cadence = 0.005
+    """Share of the run between two rows of metrics.jsonl."""
+    checkpoint_every: Cadence = 0.1
+    """Share of the run between two checkpoints that an interrupted training resumes from."""
+
+
+@dataclass(frozen=True)
+class RefineSettings(Settings):
+    """Rounds of densification (`splat/densify/schedule.py`)."""
+
+    refine_start: Share = 0.025  # 500 of 20,000
+    """Share of the run before the first densification round."""
+    refine_stop: Share = 0.5  # 10,000 of 20,000
+    """Share of the run after which densification ends."""
+    refine_every: Cadence = 0.005  # 100 of 20,000
+    """Share of the run between two densification rounds."""
+    min_refine_every: Count = 20
+    """Fewest steps between two densification rounds, whatever `refine_every` says; growth is scaled to make up for it.
+    """
