@@ -17,7 +17,7 @@ from scipy.ndimage import gaussian_filter1d
 from torch import Tensor
 
 from swimm3r import devices
-from swimm3r.cameras import Cameras, cameras_of, image_directions, project, ray_depth_from_z
+from swimm3r.cameras import Cameras, cameras_of, image_directions, ray_depth_from_z
 from swimm3r.errors import InputError
 from swimm3r.geometry import pose_from, quaternion_from_rotation, rotation_from_quaternion
 from swimm3r.io import cameras_json, images
@@ -95,13 +95,7 @@ def write_view(folder: Path, stem: str, out: RenderOutput, camera: Cameras, styl
 
 def depth_span(rec: Reconstruction) -> tuple[float, float]:
     """The z depths between which all but the nearest and farthest fiftieth of the frames' points lie, scene units."""
-    depths = []
-    for i in range(len(rec.names)):
-        mine = rec.tracks.point[rec.tracks.frame == i]
-        points = rec.points.xyz[mine] if len(rec.tracks.point) else rec.points.xyz
-        depths.append(project(rec.cameras[i], points[None])[1][0])
-    z = torch.cat(depths)
-    near, far = np.quantile(z[z > 0].numpy(), [0.02, 0.98]).tolist()
+    near, far = np.quantile(rec.point_depths().numpy(), [0.02, 0.98]).tolist()
     return near, max(far, near * 1.01)
 
 

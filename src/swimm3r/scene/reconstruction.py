@@ -17,7 +17,7 @@ from jaxtyping import Float, Int
 from torch import Tensor
 
 from swimm3r import notebook
-from swimm3r.cameras import Cameras
+from swimm3r.cameras import Cameras, project
 from swimm3r.io import ply
 from swimm3r.io.colmap import model as colmap
 from swimm3r.io.files.array_file import Layout, read_arrays
@@ -190,6 +190,19 @@ class Reconstruction:
     def index(self, name: str) -> int:
         """The position of a registered frame by its name."""
         return self.names.index(name)
+
+    def point_depths(self) -> Float[Tensor, " n"]:
+        """z depths of the sparse points in the frames that track them; without tracks, of all points in all frames.
+
+        Those behind a camera are left out.
+        """
+        depths = []
+        for i in range(len(self.names)):
+            mine = self.tracks.point[self.tracks.frame == i]
+            points = self.points.xyz[mine] if len(self.tracks.point) else self.points.xyz
+            depths.append(project(self.cameras[i], points[None])[1][0])
+        z = torch.cat(depths)
+        return z[z > 0]
 
     def colmap_model(self) -> colmap.ColmapModel:
         """Cameras, points and tracks as io/colmap writes them."""

@@ -13,7 +13,7 @@ from jaxtyping import Bool, Float
 from torch import Tensor
 from torch.nn.functional import interpolate
 
-from swimm3r.cameras import Cameras, project, resized
+from swimm3r.cameras import Cameras, resized
 from swimm3r.errors import InputError
 from swimm3r.imaging.open_water import sea_share
 from swimm3r.imaging.undistortion import nearest_pixels, undistorted
@@ -149,13 +149,7 @@ def working_scale(rec: Reconstruction, settings: SplatSettings) -> float:
 
 def median_z_depth(rec: Reconstruction) -> float:
     """Median z depth of the sparse points in the frames that track them; of all points in all frames without tracks."""
-    depths = []
-    for i in range(len(rec.names)):
-        mine = rec.tracks.point[rec.tracks.frame == i]
-        points = rec.points.xyz[mine] if len(rec.tracks.point) else rec.points.xyz
-        depths.append(project(rec.cameras[i], points[None])[1][0])
-    z = torch.cat(depths)
-    z = z[z > 0]
+    z = rec.point_depths()
     if not len(z):
         raise InputError(
             "The reconstruction has no point in front of a camera.",
