@@ -14,6 +14,7 @@ import torch
 from jaxtyping import Bool, Float, Int
 from torch import Tensor
 
+from swimm3r.imaging.filters import LUMA
 from swimm3r.sfm.settings import FeatureSettings
 
 if TYPE_CHECKING:
@@ -37,7 +38,7 @@ def extract_features(image: Float[Tensor, "h w 3"], usable: Bool[Tensor, "h w"],
     import pycolmap
 
     # Rec. 601 luma, as every SIFT is fed
-    gray = (image.numpy() @ np.array([0.299, 0.587, 0.114], np.float32) * 255).round().astype(np.uint8)
+    gray = (image.numpy() @ LUMA.numpy() * 255).round().astype(np.uint8)
     height, width = gray.shape
     scale = min(1.0, settings.long_side / max(height, width))
     if scale < 1:
