@@ -125,11 +125,14 @@ def test_two_models_at_once_are_exit_2(capsys: pytest.CaptureFixture[str], tmp_p
     assert outcome(capsys, "splat", *models, "--out", str(tmp_path / "run"))[0] == 2
 
 
-def test_without_a_command_the_help_is_shown_and_it_is_exit_2(capsys: pytest.CaptureFixture[str]):
+@pytest.mark.parametrize(("words", "shows"), [([], "localize"), (["bench"], "ablation-uwbs"), (["weights"], "verify")])
+def test_without_a_command_the_help_is_shown_and_it_is_exit_2(
+    words: list[str], shows: str, capsys: pytest.CaptureFixture[str]
+):
     with pytest.raises(SystemExit) as stop:
-        main([])
+        main(words)
     assert stop.value.code == 2
-    assert "localize" in capsys.readouterr().out
+    assert shows in capsys.readouterr().out
 
 
 def test_what_may_not_be_read_is_exit_3_and_what_may_not_be_written_7(

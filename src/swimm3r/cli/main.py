@@ -73,10 +73,6 @@ def main(arguments: Sequence[str] | None = None) -> None:
     begin_messages()
     try:
         _run_command(arguments)
-    except SystemExit:
-        if not arguments:
-            raise SystemExit(UsageError.exit_code) from None
-        raise
     except Swimm3rError as error:
         _fail(error)
     except KeyboardInterrupt:
@@ -152,7 +148,14 @@ def _parse_and_run(commands: Commands, arguments: list[str]) -> None:
     view = _help_view(commands, path, arguments)
     if view is None:
         given = ["--help" if word == "--help-all" else word for word in arguments]
-        tyro.cli(_parser(commands), prog="swimm3r", description=_DESCRIPTION, args=given or ["--help"])
+        is_missing = not given or (len(given) == 1 and isinstance(commands.get(given[0]), Family))
+        try:
+            given += ["--help"] if is_missing else []
+            tyro.cli(_parser(commands), prog="swimm3r", description=_DESCRIPTION, args=given)
+        except SystemExit:
+            if is_missing:
+                raise SystemExit(UsageError.exit_code) from None
+            raise
         return
     try:
         tyro.cli(_parser(commands, path, view), prog="swimm3r", args=[*path, "--help"])
