@@ -13,7 +13,7 @@ from swimm3r.cli.main import Family, commands_for, main
 from swimm3r.cli.terminal.help_views import Option, groups_of, options_of
 from swimm3r.cli.terminal.output_level import with_output_level
 from swimm3r.cli.terminal.ranges import settings_with_ranges, with_ranges
-from swimm3r.settings import Settings
+from swimm3r.settings import Settings, description
 from swimm3r.splat.settings import RECIPES
 
 PACKAGE = Path(swimm3r.__file__).parent
@@ -121,7 +121,7 @@ def test_options_of_one_name_take_the_same_values():
     kinds: dict[str, set[str]] = {}
     for options in OPTIONS.values():
         for name, one in options.items():
-            kinds.setdefault(name, set()).add(repr(one.hint).split(", PrimitiveConstructorSpec")[0])
+            kinds.setdefault(name, set()).add(description(one.hint))
     differing = {name: found for name, found in kinds.items() if len(found) > 1 and name.startswith("--")}
     assert differing.keys() <= apart, differing
 

@@ -14,7 +14,7 @@ from swimm3r.splat.settings import MapDevice
 
 def localize(
     run: Run,
-    images: Positional[Annotated[tuple[Path, ...], arg(metavar="[IMAGE ...]")]] = (),
+    images: Positional[Annotated[tuple[Path, ...], arg(metavar="[IMAGE ...]", help_behavior_hint="(optional)")]] = (),
     /,
     lens: Path | None = None,
     out: OutOrDefault = None,

@@ -130,7 +130,7 @@ class RunRecord:
         self._plan, self._on_stage = plan, on_stage
         if plan is None or not plan.seconds:
             return
-        log.info("%s (%s free)", plan, size(shutil.disk_usage(self.folder).free))
+        log.info("%s (%s free). A busy computer takes longer.", plan, size(shutil.disk_usage(self.folder).free))
         if warning := check_disk(plan, self.folder):
             log.warning("%s", warning)
 

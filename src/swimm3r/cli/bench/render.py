@@ -36,7 +36,9 @@ def render_command(defaults: Defaults) -> Callable:
     """The command, with the settings of a preset as defaults."""
 
     def render(
-        inputs: Positional[Annotated[tuple[Path, ...], arg(metavar="INPUT [INPUT ...]")]],
+        inputs: Positional[
+            Annotated[tuple[Path, ...], arg(metavar="INPUT [INPUT ...]", help_behavior_hint="(one or more)")]
+        ],
         /,
         out: Out,
         seeds: Seeds = 1,

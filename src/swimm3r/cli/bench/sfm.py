@@ -17,7 +17,9 @@ def sfm_command(defaults: Defaults) -> Callable:
     """The command, with the settings of a preset as defaults."""
 
     def sfm(
-        clips: Positional[Annotated[tuple[Path, ...], arg(metavar="CLIP [CLIP ...]")]],
+        clips: Positional[
+            Annotated[tuple[Path, ...], arg(metavar="CLIP [CLIP ...]", help_behavior_hint="(one or more)")]
+        ],
         /,
         out: Out,
         given: Methods = ALL_METHODS,

@@ -65,7 +65,10 @@ def brief_help(command: Callable, usage: str, shown: Groups) -> View:
     by_name = {one.name: one for one in listed.options}
     groups = {title: [by_name[name] for name in names if name in by_name] for title, names in shown.items()}
     hidden = sum(not one.positional for one in listed.options) - sum(map(len, groups.values()))
-    records = dict.fromkeys(one.group.split(".")[0] for one in listed.options if one.group)
+    records: dict[str, None] = {}  # those of the command, and those that are typed before an option
+    for one in listed.options:
+        if one.group:
+            records |= dict.fromkeys([one.group.split(".")[0], *one.name.removeprefix("--").split(".")[:-1][:1]])
     footer = (
         f"{hidden} more options: {usage} --help-all\n"
         f"Options of one group: {usage} --help GROUP, with GROUP one of {', '.join(records)}"
@@ -93,7 +96,7 @@ def _listed(command: Callable) -> _Listed:
     for name, parameter in inspect.signature(command).parameters.items():
         default = MISSING_NONPROP if parameter.default is parameter.empty else parameter.default
         if parameter.kind is parameter.POSITIONAL_ONLY:
-            listed.options.append(Option(name, "", hints[name], default, told.get(name, "")))
+            listed.options.append(Option(name, "", hints[name], default, _help(hints[name], told.get(name, ""))))
         else:
             _list(listed, name, hints[name], default, told.get(name, ""))
     return listed
@@ -104,8 +107,7 @@ def _list(listed: _Listed, name: str, hint: Any, default: Any, told: str, group:
     kind, *extras = get_args(hint) if get_origin(hint) is Annotated else (hint,)
     typed = f"{prefix}{name.replace('_', '-')}"
     if not (isinstance(kind, type) and is_dataclass(kind)):
-        given = next((extra.help for extra in extras if getattr(extra, "help", None)), told)
-        listed.options.append(Option(f"--{typed}", group, hint, default, given))
+        listed.options.append(Option(f"--{typed}", group, hint, default, _help(hint, told)))
         return
     inside = f"{group}.{name}".lstrip(".")
     listed.about[inside] = told or (inspect.getdoc(kind) or "").splitlines()[0]
@@ -114,6 +116,11 @@ def _list(listed: _Listed, name: str, hint: Any, default: Any, told: str, group:
     for one in record.fields:
         said = one.helptext() if callable(one.helptext) else one.helptext
         _list(listed, one.name, one.type, one.default, said or "", inside, prefix if FLAT in extras else f"{typed}.")
+
+
+def _help(hint: Any, told: str) -> str:
+    """The help string beside a type hint, else the one that a docstring has."""
+    return next((extra.help for extra in get_args(hint)[1:] if getattr(extra, "help", None)), told)
 
 
 def _command(command: Callable, listed: _Listed, groups: Mapping[str, Sequence[Option]]) -> Callable:

@@ -6,13 +6,14 @@ Tyro leaves foreign metadata of `Annotated` aside. Here every hint that declares
 so that a refusal names the option as it was written: --splat.rates.xyz.
 """
 
+import inspect
 from collections.abc import Callable
 from dataclasses import is_dataclass, replace
 from functools import partial, wraps
-from inspect import signature
 from types import NoneType
 from typing import Annotated, Any, get_args, get_origin, get_type_hints
 
+import docstring_parser
 from tyro.conf import arg
 from tyro.constructors import (
     ConstructorRegistry,
@@ -52,14 +53,20 @@ def settings_with_ranges() -> ConstructorRegistry:
 
 
 def with_ranges(command: Callable) -> Callable:
-    """A command whose arguments are checked against the ranges that its signature declares."""
+    """A command whose arguments are checked against the ranges that its signature declares.
+
+    Their help strings, too, have no line breaks of their source.
+    """
     hints = {name: parsed(hint) for name, hint in get_type_hints(command, include_extras=True).items()}
+    for one in docstring_parser.parse(inspect.getdoc(command) or "").params:
+        if one.description:
+            hints[one.arg_name] = Annotated[hints[one.arg_name], arg(help=_unbroken(one.description))]
 
     @wraps(command)
     def call(*arguments: Any, **options: Any) -> None:
         command(*arguments, **options)
 
-    given = signature(command)
+    given = inspect.signature(command)
     found = [one.replace(annotation=hints.get(name, one.annotation)) for name, one in given.parameters.items()]
     setattr(call, "__signature__", given.replace(parameters=found))  # noqa: B010 - functions have it, type stubs not
     call.__annotations__ = hints
