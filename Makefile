@@ -31,7 +31,7 @@ test-processors: setup  ## The numerically delicate tests as other processors an
 	$(BIN)/python tests/processors.py $(PROFILES)
 
 site: setup  ## The documents as a web site: site/index.html (the test suite builds it, too)
-	$(BIN)/mkdocs build --strict
+	DISABLE_MKDOCS_2_WARNING=true NO_MKDOCS_2_WARNING=1 $(BIN)/mkdocs build --strict
 
 clean:
 	rm -rf runs site .pytest_cache .ruff_cache
