@@ -3,7 +3,7 @@
     python examples/localize_image.py RUN IMAGE... [--time SECONDS]
 
 RUN is a run folder, or the WORK folder of reconstruct_and_train.py; the images were taken by the same camera. `swimm3r
-localize RUN IMAGE...` does the same, and writes poses and pictures of the matches.
+localize RUN IMAGE...` does the same, and writes poses and images of the matches.
 """
 
 import argparse

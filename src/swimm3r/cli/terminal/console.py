@@ -168,7 +168,7 @@ def outcome_console() -> Console:
 
 
 def print_summary(summary: dict) -> None:
-    """The outcome of a run: registered frames, the water, scores, and cautions."""
+    """The outcome of a run: registered frames, the water, scores, and warnings."""
     console = outcome_console()
     taken = summary.get("input", {})
     if "frames" in taken:
