@@ -6,6 +6,7 @@ Everything else is our own mistake and keeps its traceback.
 """
 
 from functools import partial
+from typing import Any
 
 
 class Swimm3rError(Exception):
@@ -19,7 +20,7 @@ class Swimm3rError(Exception):
         self.cause = cause
         self.hint = hint
 
-    def __reduce__(self) -> tuple:
+    def __reduce__(self) -> tuple[Any, ...]:
         return partial(type(self), cause=self.cause, hint=self.hint), (self.what,)  # between processes
 
     def __str__(self) -> str:

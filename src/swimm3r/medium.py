@@ -134,11 +134,12 @@ def _coefficients(water: Medium | MediumFit) -> str:
 
 def _rows(water: Medium | MediumFit, unit: str) -> list[tuple[str, ...]]:
     """The rows of a table: a coefficient and its values, with what a fit knows about them."""
-    rows = []
+    rows: list[tuple[str, ...]] = []
     for name, label in _LABELS.items():
         cells = [f"{value:.3f}" for value in getattr(water, name).tolist()]
         if isinstance(water, MediumFit):
-            std, known = getattr(water.std, name).tolist(), water.identifiable[name].tolist()
+            std: list[float] = getattr(water.std, name).tolist()
+            known: list[bool] = [bool(flag) for flag in water.identifiable[name]]
             cells = [f"{cell} \u00b1 {each:.3f}" for cell, each in zip(cells, std, strict=True)]
             cells = [cell if sure else f"({cell})" for cell, sure in zip(cells, known, strict=True)]
         rows.append((label if name == "Binf" else f"{label}, {unit}", *cells))
@@ -147,12 +148,12 @@ def _rows(water: Medium | MediumFit, unit: str) -> list[tuple[str, ...]]:
 
 def save_fits(path: Path, fits: Mapping[str, MediumFit]) -> None:
     """Write a medium.json of named fits ("stored", "linear"); lists are R, G, B."""
-    document = {
+    document: dict[str, dict[str, object]] = {
         name: {
             "medium": _plain(fit.constant()),
             "curve": _plain(fit.curve),
             "std": _plain(fit.std),
-            "identifiable": {key: flags.tolist() for key, flags in fit.identifiable.items()},
+            "identifiable": {key: [bool(flag) for flag in flags] for key, flags in fit.identifiable.items()},
             "z_range": list(fit.z_range),
             "encoding": fit.encoding,
             "estimator": fit.estimator,
