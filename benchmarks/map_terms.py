@@ -16,14 +16,16 @@ from pathlib import Path
 import torch
 
 from swimm3r.bench import tables
-from swimm3r.bench.cells import Place, Result, Scores, kept_cell
+from swimm3r.bench.cells import Result, ResultKey, Scores, kept_cell
 from swimm3r.bench.map_scores import map_scores, trained
-from swimm3r.bench.protocols.ablation_uwbs import COLUMNS
+from swimm3r.bench.protocols.ablation_uwbs import COLUMNS as OF_ABLATION
+from swimm3r.bench.scores import columns
 from swimm3r.pipeline.held_out import FirstPose
 from swimm3r.pipeline.presets import PRESETS
 from swimm3r.pipeline.run import FinishedSfm, open_finished_sfm
 from swimm3r.splat.settings import PoseRefinementSettings, SggSettings, UwbsSettings
 
+COLUMNS = (*OF_ABLATION, *columns("clear_psnr", "T_D_abs", "B_abs"))  # the last three of synthetic dives
 TERMS = ("medium_prior", "coverage", "open_water", "gamut")
 _SEEDS_APART = 1_000
 
@@ -93,7 +95,7 @@ def main() -> None:
                     continue
                 make = partial(scores, sfm=sfm, settings=settings, test=test, poses=poses)
                 depends_on = [sfm.key, asdict(settings), asdict(test), [c.score for c in COLUMNS]]
-                cells.append(kept_cell(a.out, Place(run.resolve().name, name, seed), depends_on, make))
+                cells.append(kept_cell(a.out, ResultKey(run.resolve().name, name, seed), depends_on, make))
                 print(cells[-1].scene, name, seed, cells[-1].scores, flush=True)
     print(tables.write(a.out, tables.Table("map-terms", "Terms of the objective", cells, COLUMNS)))
 

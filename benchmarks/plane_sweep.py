@@ -19,11 +19,11 @@ import cv2
 import numpy as np
 import torch
 
-from swimm3r.cameras import project, unproject
+from swimm3r.cameras import cameras_of, project, unproject
 from swimm3r.io import cameras_json, images
 from swimm3r.io.colmap import model as colmap
 from swimm3r.scene.frames import Frame, Frames
-from swimm3r.scene.reconstruction import DepthMaps, Matches, Points, Reconstruction, Tracks, cameras_of
+from swimm3r.scene.reconstruction import DepthMaps, Matches, Points, Reconstruction, Tracks
 from swimm3r.sfm.plane_sweep.estimate import estimate_depth
 from swimm3r.sfm.settings import PlaneSweepSettings
 
@@ -51,7 +51,9 @@ def sampled_reconstruction(clip: Path, table: cameras_json.CameraTable, per_fram
     """True poses with sparse points taken from the true depth, seen by every frame whose depth agrees with them."""
     cameras = cameras_of(table)
     rng = np.random.default_rng(0)
-    depths = [true_depth(clip, name) for name in table.names]
+    depths = [known for name in table.names if (known := true_depth(clip, name)) is not None]
+    if len(depths) != len(table.names):
+        raise ValueError(f"{clip} has frames without true depth")
     points, track_point, track_frame, track_xy = [], [], [], []
     for i, depth in enumerate(depths):
         rows, columns = np.nonzero(depth)
@@ -75,10 +77,16 @@ def sampled_reconstruction(clip: Path, table: cameras_json.CameraTable, per_fram
         cameras,
         Points(torch.from_numpy(xyz), torch.zeros(len(xyz), 3), torch.zeros(len(xyz))),
         Tracks(*(torch.from_numpy(np.concatenate(a)) for a in (track_point, track_frame, track_xy))),
-        Matches(*(torch.zeros(0, dtype=torch.long),) * 2, *(torch.zeros(0, 2),) * 2, torch.zeros(0)),
+        no_matches(),
         DepthMaps(Path()),
         "truth",
     )
+
+
+def no_matches() -> Matches:
+    """Matches of a reconstruction that has none."""
+    frame, pixel = torch.zeros(0, dtype=torch.long), torch.zeros(0, 2)
+    return Matches(frame, frame, pixel, pixel, torch.zeros(0))
 
 
 def colmap_reconstruction(folder: Path) -> Reconstruction:
@@ -91,7 +99,7 @@ def colmap_reconstruction(folder: Path) -> Reconstruction:
             torch.from_numpy(sparse.xyz), torch.from_numpy(sparse.rgb / 255).float(), torch.from_numpy(sparse.error)
         ),
         Tracks(*(torch.from_numpy(a) for a in (sparse.track_point, sparse.track_frame, sparse.track_xy))),
-        Matches(*(torch.zeros(0, dtype=torch.long),) * 2, *(torch.zeros(0, 2),) * 2, torch.zeros(0)),
+        no_matches(),
         DepthMaps(Path()),
         "colmap",
     )

@@ -16,6 +16,7 @@ from pathlib import Path
 
 import torch
 
+from swimm3r.evaluate import NotComputed
 from swimm3r.evaluate.poses import absolute_pose_errors
 from swimm3r.geometry import pose_from, so3_exp
 from swimm3r.pipeline import held_out
@@ -43,6 +44,7 @@ def errors(names: tuple[str, ...], cam2world: torch.Tensor, truth: GroundTruth) 
     """Mean rotation error, degrees, and ATE over the spread."""
     true = truth.cameras.cam2world[[truth.names.index(name) for name in names]]
     found = absolute_pose_errors(cam2world, true)
+    assert not isinstance(found.ate, NotComputed)
     return f"{found.rotation_deg:.3f} | {100 * float(found.ate) / spread_of(true):.2f} %"
 
 
@@ -58,6 +60,7 @@ def main() -> None:
     parser.add_argument("--rates", nargs="+", type=float, default=[TrainingPoseSettings().rate])
     a = parser.parse_args()
     base = PRESETS["fast"].splat
+    assert isinstance(base, UwbsSettings)
     base = replace(
         base, iterations=a.iterations, long_side=a.long_side,
         initial=replace(base.initial, primitives=a.primitives),

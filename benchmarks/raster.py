@@ -18,7 +18,7 @@ import numba
 import numpy as np
 import torch
 
-from swimm3r.raster import Bins, MediumMaps, Primitives2D, SggBuffers, bin_primitives, rasterize
+from swimm3r.raster import Backend, Bins, MediumMaps, Primitives2D, SggBuffers, bin_primitives, rasterize
 
 
 class Size(NamedTuple):
@@ -95,7 +95,7 @@ def now(backend: str) -> float:
     return time.perf_counter()
 
 
-def measure(size: Size, backend: str, repeats: int) -> tuple[Row, Bins]:
+def measure(size: Size, backend: Backend, repeats: int) -> tuple[Row, Bins]:
     """Each stage alone, medians over interleaved repeats."""
     device = "cuda" if backend == "warp" else "cpu"
     p, medium = workload(size)

@@ -32,7 +32,7 @@ from swimm3r.splat.rendering import Drawing
 from swimm3r.splat.settings import UwbsSettings
 from swimm3r.splat.training.scene import TrainingScene
 from swimm3r.splat.training.state import first_state, parameters_of
-from swimm3r.splat.views import View
+from swimm3r.splat.views import TrainingView
 
 
 def camera(size: Size) -> Cameras:
@@ -114,12 +114,12 @@ def measure(size: Size, repeats: int, device: torch.device) -> dict[str, float]:
     settings = UwbsSettings(iterations=20_000)
     rng = torch.Generator().manual_seed(1)
     height, width = size.height, size.width
-    # reconstruction and views are read at the start only
-    recipe = uwbs.Uwbs(settings, TrainingScene(None, 1.0, 1.0, None, device=device))
+    unread: Any = None  # reconstruction and views are read at the start only
+    recipe = uwbs.Uwbs(settings, TrainingScene(unread, 1.0, 1.0, unread, device=device))
     state = first_state(lifted(size), initial_field(None, settings.medium, rng), None).to(device)
     p, field = state.primitives, state.field
     prior = 1 + 9 * torch.rand(height, width, generator=rng)
-    view = View(
+    view = TrainingView(
         "benchmark", camera(size), torch.rand(3, height, width, generator=rng),
         torch.ones(height, width, dtype=torch.bool), prior, torch.full((height, width), 1.8),
         prior < 0,

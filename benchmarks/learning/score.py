@@ -28,7 +28,7 @@ import torch
 from torch import Tensor
 from views import Shots, read_shots, true_partners
 
-from swimm3r.cameras import Cameras, pixel_grid
+from swimm3r.cameras import Cameras, cameras_of, pixel_grid
 from swimm3r.datasets import PairSettings
 from swimm3r.evaluate.underwater import water_scores_from_views
 from swimm3r.geometry import relative_poses, rotation_angle
@@ -37,7 +37,7 @@ from swimm3r.io.colmap.model import read_model
 from swimm3r.io.depth import read_depth
 from swimm3r.medium import Medium, MediumFit
 from swimm3r.scene.frames import Frame, Frames
-from swimm3r.scene.reconstruction import DepthMap, DepthMaps, Matches, Points, Reconstruction, Tracks, cameras_of
+from swimm3r.scene.reconstruction import DepthMap, DepthMaps, Matches, Points, Reconstruction, Tracks
 from swimm3r.sfm.colmap.poses import absolute_pose
 from swimm3r.sfm.distillation.pairs import depth_to_network
 from swimm3r.sfm.distillation.validation import absolute_relative

@@ -111,8 +111,8 @@ def losses(
         Encoded(both.tokens[k], both.positions[k], both.height, both.width) for k in (slice(half), slice(half, None))
     )
     views = network.decode(one, two)
-    maps = tuple(network.pointmap(v, k) for k, v in enumerate(views, 1))
-    described = tuple(network.descriptors(v, k) for k, v in enumerate(views, 1))
+    maps = network.pointmap(views[0], 1), network.pointmap(views[1], 2)
+    described = network.descriptors(views[0], 1), network.descriptors(views[1], 2)
     metric = torch.ones(half, dtype=torch.bool)
     return pointmap_loss(maps, truth, metric), matching_loss(described, matches, least_share)
 
