@@ -25,7 +25,7 @@ from swimm3r.pipeline.presets import PRESETS
 from swimm3r.pipeline.run import FinishedSfm, open_finished_sfm
 from swimm3r.splat.settings import PoseRefinementSettings, SggSettings, UwbsSettings
 
-COLUMNS = (*OF_ABLATION, *columns("clear_psnr", "T_D_abs", "B_abs"))  # the last three of synthetic dives
+COLUMNS = (*OF_ABLATION, *columns("T_D_abs", "B_abs"))  # the last two of synthetic dives
 TERMS = ("medium_prior", "coverage", "open_water", "gamut")
 _SEEDS_APART = 1_000
 

@@ -171,6 +171,13 @@ class Exported:
     primitives: int
     difference: ClearDifference
 
+    def __str__(self) -> str:
+        return (
+            f"{self.path}: {self.gaussians:,} Gaussians of {self.primitives:,} primitives.\n"
+            f"Beside the map's own clear images: {self.difference.psnr:.1f} dB,"
+            f" mean alpha {self.difference.alpha:+.3f}."
+        )
+
 
 def export_run(folder: Path, path: Path, time: float | None = None) -> Exported:
     """The Gaussians of a finished run's map, and how far they are from it in views along the dive.

@@ -12,6 +12,11 @@ class GaussiansSettings(Settings):
     time: ClipSecond | None = None
     """Second of the clip at which a dynamic map is exported; half way by default."""
 
+    @property
+    def file_name(self) -> str:
+        """Name of the file in RUN/splat where none is given."""
+        return "gaussians.ply"
+
 
 ExportSettings = GaussiansSettings
 """The union of all formats; `export.export_run` matches on it."""

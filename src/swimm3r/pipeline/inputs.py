@@ -2,13 +2,11 @@
 
 from pathlib import Path
 
-from swimm3r import weights
-from swimm3r.io.imports.read import read_foreign
 from swimm3r.pipeline.presets import RunSettings
 from swimm3r.prepare import check_source
 from swimm3r.prepare.masks import check_masks
 from swimm3r.scene.ground_truth import FOLDER, GroundTruth, read_ground_truth
-from swimm3r.sfm.settings import ColmapModelSettings, ColmapSettings, Mast3rSettings
+from swimm3r.sfm import check_files
 
 
 def check_inputs(source: Path, settings: RunSettings, reference: Path | None = None) -> None:
@@ -19,19 +17,7 @@ def check_inputs(source: Path, settings: RunSettings, reference: Path | None = N
     check_source(source)
     check_masks(settings.frames)
     truth_of(source, reference)
-    match settings.sfm:
-        case ColmapModelSettings(model=model):
-            read_foreign(model)
-        case Mast3rSettings(graph=graph, weights=given, adapter=adapter):
-            from swimm3r.sfm.features.pair_graph import parse_graph
-            from swimm3r.sfm.student import adapter_file
-
-            parse_graph(graph)
-            weights.require("mast3r", given)
-            if adapter is not None:
-                adapter_file.describe(adapter)
-        case ColmapSettings():
-            pass
+    check_files(settings.sfm)
 
 
 def truth_of(source: Path, reference: Path | None) -> GroundTruth | None:

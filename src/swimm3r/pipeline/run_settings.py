@@ -5,7 +5,7 @@ from pathlib import Path
 from typing import Any
 
 from swimm3r.pipeline.presets import MAST3R_PRESETS, PRESETS, Preset, RunSettings
-from swimm3r.sfm.settings import ColmapModelSettings, SfmSettings
+from swimm3r.sfm.settings import BACKENDS, BackendName, ColmapModelSettings, SfmSettings
 from swimm3r.splat.settings import RecipeName, UwbsSettings, with_recipe
 
 _PARTS = {"prepare": "frames", "sfm": "sfm", "splat": "splat", "eval": "test"}  # of RunSettings, by the stage they make
@@ -42,7 +42,7 @@ def differences(old: RunSettings, new: RunSettings, stages: list[str]) -> list[s
 
 
 def starting_settings(
-    preset: Preset | None, backend: str | None, recipe: RecipeName | None, held: RunSettings | None
+    preset: Preset | None, backend: BackendName | None, recipe: RecipeName | None, held: RunSettings | None
 ) -> RunSettings:
     """The defaults of a command's options: those of a named preset, else those that the run folder holds.
 
@@ -52,8 +52,10 @@ def starting_settings(
     named = PRESETS[preset or "default"]
     base = named if preset is not None or held is None else held
     sfm, splat = base.sfm, base.splat
-    if backend is not None and (backend == "colmap") != (sfm.backend == "colmap"):
-        sfm = named.sfm if backend == "colmap" else MAST3R_PRESETS[preset or "default"]
+    if backend is not None and BACKENDS[backend] is not BACKENDS[sfm.backend]:
+        kind = BACKENDS[backend]
+        tuned = (named.sfm, MAST3R_PRESETS[preset or "default"])
+        sfm = next((settings for settings in tuned if isinstance(settings, kind)), kind())
     if recipe is not None and splat.recipe != recipe:
         assert isinstance(named.splat, UwbsSettings)
         splat = with_recipe(named.splat, recipe)

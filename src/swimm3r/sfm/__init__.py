@@ -2,6 +2,7 @@
 
 from pathlib import Path
 from tempfile import mkdtemp
+from types import ModuleType
 from typing import TYPE_CHECKING
 
 from swimm3r.errors import InputError
@@ -37,22 +38,27 @@ def reconstruct(
             hint="a longer clip or a higher --fps",
         )
     with watched(progress) as told:
-        return _reconstruct(frames, settings, Path(folder or mkdtemp(prefix="swimm3r-sfm-")), told)
+        work = Path(folder or mkdtemp(prefix="swimm3r-sfm-"))
+        return _backend(settings).reconstruct(frames, settings, work, told)
 
 
-def _reconstruct(
-    frames: "swimm3r.scene.frames.Frames", settings: SfmSettings, folder: Path, progress: Progress
-) -> "swimm3r.scene.reconstruction.Reconstruction":
+def check_files(settings: SfmSettings) -> None:
+    """Raise the error of the first file named by the settings that cannot be used: InputError or WeightsError."""
+    _backend(settings).check_files(settings)
+
+
+def _backend(settings: SfmSettings) -> ModuleType:
+    """The module of a back end: `reconstruct` and `check_files`."""
     match settings:
         case ColmapSettings():
             from swimm3r.sfm.backends import colmap as colmap_backend
 
-            return colmap_backend.reconstruct(frames, settings, folder, progress)
+            return colmap_backend
         case Mast3rSettings():
             from swimm3r.sfm.backends import mast3r as mast3r_backend
 
-            return mast3r_backend.reconstruct(frames, settings, folder, progress)
+            return mast3r_backend
         case ColmapModelSettings():
             from swimm3r.sfm.backends import imported as imported_backend
 
-            return imported_backend.reconstruct(frames, settings, folder, progress)
+            return imported_backend

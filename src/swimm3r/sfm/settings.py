@@ -356,3 +356,10 @@ class ColmapModelSettings(Settings):
 
 
 SfmSettings = ColmapSettings | Mast3rSettings | ColmapModelSettings
+
+BACKENDS: dict[BackendName, type[ColmapSettings] | type[Mast3rSettings]] = {
+    "colmap": ColmapSettings,
+    "mast3r": Mast3rSettings,
+    "swimm3r": Mast3rSettings,
+}
+"""Settings of the back ends that the command line offers by name."""

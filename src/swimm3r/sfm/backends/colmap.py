@@ -12,6 +12,10 @@ from swimm3r.sfm.plane_sweep.estimate import estimate_depth
 from swimm3r.sfm.settings import ColmapSettings
 
 
+def check_files(settings: ColmapSettings) -> None:
+    """COLMAP's settings name no file."""
+
+
 def reconstruct(frames: Frames, settings: ColmapSettings, folder: Path, progress: Progress = silent) -> Reconstruction:
     """Poses first, and saved at once: what comes after reads them from there when an interrupted run goes on."""
     if not (folder / "reconstruction.json").is_file():

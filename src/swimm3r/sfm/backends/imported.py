@@ -31,6 +31,11 @@ from swimm3r.sfm.settings import ColmapModelSettings
 from swimm3r.sfm.tracks import MatchTracks, as_points
 
 
+def check_files(settings: ColmapModelSettings) -> None:
+    """Raise InputError for a model that cannot be read; it is read whole."""
+    read_foreign(settings.model)
+
+
 def reconstruct(
     frames: Frames, settings: ColmapModelSettings, folder: Path, progress: Progress = silent
 ) -> Reconstruction:

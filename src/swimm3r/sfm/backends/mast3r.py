@@ -13,6 +13,7 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
+from swimm3r import weights
 from swimm3r.cameras import Cameras, project_visible
 from swimm3r.errors import RegistrationError
 from swimm3r.imaging.filters import LUMA
@@ -42,6 +43,14 @@ from swimm3r.sfm.tracks import FrameMatches, MatchTracks
 
 _WATER = "water"  # of what the physics head read, in the working folder
 _FOLDER = "mast3r"  # of what is kept until the run is done, in the working folder
+
+
+def check_files(settings: Mast3rSettings) -> None:
+    """Raise UsageError for a pair graph that is none, WeightsError for weights or an adapter that cannot be used."""
+    parse_graph(settings.graph)
+    weights.require("mast3r", settings.weights)
+    if settings.adapter is not None:
+        adapter_file.describe(settings.adapter)
 
 
 def reconstruct(frames: Frames, settings: Mast3rSettings, folder: Path, progress: Progress = silent) -> Reconstruction:
