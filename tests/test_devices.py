@@ -1,4 +1,4 @@
-"""Which device is taken, and what is said where it is not here."""
+"""The chosen device, and the message where it is missing."""
 
 import importlib.util
 import logging

@@ -11,7 +11,7 @@ import swimm3r
 
 PACKAGE = Path(swimm3r.__file__).parent
 ROOTS = (PACKAGE, *(PACKAGE.parents[1] / name for name in ("tests", "benchmarks", "examples")))
-AS_SUBJECT = re.compile(r"(What|Who|Whom|Whose|Where|How)\b(?!\?)")
+AS_SUBJECT = re.compile(r"(What|Who|Whom|Whose|Where|Whether|Which|When|Why|How)\b(?!\?)")
 METAPHORS = re.compile(
     r"false friend|lottery|witness|strangers?\b|so-manieth|swims? by|what the other defaults aim at", re.I
 )

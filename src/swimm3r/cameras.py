@@ -292,7 +292,7 @@ def project(cameras: Cameras, points: Float[Tensor, "c p 3"]) -> tuple[Float[Ten
 
 
 def inside_image(pixels: Float[Tensor, "*points 2"], width: int, height: int) -> Bool[Tensor, "*points"]:
-    """Which pixels lie in an image of this size, so that rounded down they are a column and a row of it."""
+    """Mask of the pixels inside an image of this size: rounded down they are a column and a row of it."""
     return ((pixels >= 0) & (pixels < torch.tensor([width, height]).to(pixels))).all(-1)
 
 

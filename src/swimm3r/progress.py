@@ -68,7 +68,7 @@ def _bar(what: str, done: int, total: int) -> str:
 
 
 def _in_notebook() -> bool:
-    """Whether the code runs in a Jupyter kernel; IPython in a terminal is a terminal."""
+    """Return whether the code runs in a Jupyter kernel; IPython in a terminal is a terminal."""
     ipython = sys.modules.get("IPython")
     shell = None if ipython is None else ipython.get_ipython()
     return getattr(shell, "kernel", None) is not None

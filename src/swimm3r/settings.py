@@ -52,7 +52,7 @@ class Range:
     or_zero: bool = False
 
     def allows(self, value: float) -> bool:
-        """Whether a number lies in the range."""
+        """Return whether a number lies in the range."""
         if self.or_zero and value == 0:
             return True
         return (
@@ -95,7 +95,7 @@ class NotEmpty:
     """At least one element."""
 
     def allows(self, value: tuple) -> bool:
-        """Whether there is one."""
+        """Return whether there is one."""
         return len(value) > 0
 
     def __str__(self) -> str:

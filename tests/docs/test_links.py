@@ -27,7 +27,7 @@ def citations(text: str) -> list[tuple[str, str]]:
 
 
 def missing(path: str, fragment: str, home: Path) -> bool:
-    """Whether no file of the repository has this path, seen from a text's folder or one that paths begin at."""
+    """Return whether no file of the repository has this path, seen from a text's folder or one that paths begin at."""
     found = [base / path for base in (home, *HOMES) if (base / path).is_file()]
     return not found or (bool(fragment) and broken(f"{found[0]}#{fragment}", found[0]) is not None)
 

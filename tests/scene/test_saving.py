@@ -25,7 +25,7 @@ def random(*shape: int, dtype: torch.dtype = torch.float64) -> torch.Tensor:
 
 
 def same(a: Any, b: Any) -> bool:
-    """Whether two records are equal to the last bit, types included."""
+    """Return whether two records are equal to the last bit, types included."""
     if isinstance(a, torch.Tensor):
         return a.dtype == b.dtype and torch.equal(a, b)
     if isinstance(a, dict):

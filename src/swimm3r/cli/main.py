@@ -233,7 +233,7 @@ def _file_failure(error: Exception) -> Swimm3rError | None:
 
 
 def _readable(path: Path) -> bool:
-    """Whether a path, or the nearest folder above it that is known to exist, may be read."""
+    """Return whether a path, or the nearest folder above it that is known to exist, may be read."""
     there = next((one for one in (path, *path.absolute().parents) if os.path.lexists(one)), path)
     effective = os.access in os.supports_effective_ids
     return os.access(there, os.R_OK | (os.X_OK if there.is_dir() else 0), effective_ids=effective)

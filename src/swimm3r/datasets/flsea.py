@@ -49,7 +49,7 @@ _LENSES = {
 
 
 def is_sequence(folder: Folder) -> bool:
-    """Whether a folder has the layout of a sequence, or uw_depth's."""
+    """Return whether a folder has the layout of a sequence, or uw_depth's."""
     return "imgs" in folder.children or {"rgb", "depth"} <= folder.children.keys()
 
 

@@ -19,12 +19,12 @@ _RAW, _CLEAN, _DEPTH = ("raw", "input"), ("clean", "reference", "clear"), ("dept
 
 
 def is_dive(folder: Folder) -> bool:
-    """Whether a folder is a synthetic dive."""
+    """Return whether a folder is a synthetic dive."""
     return {"images", FOLDER} <= folder.children.keys()
 
 
 def is_triples(folder: Folder) -> bool:
-    """Whether a folder has clean images beside raw ones or beside depth maps."""
+    """Return whether a folder has clean images beside raw ones or beside depth maps."""
     names = folder.children.keys()
     return bool(names & set(_CLEAN)) and bool(names & {*_RAW, *_DEPTH})
 

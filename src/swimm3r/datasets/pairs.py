@@ -1,4 +1,4 @@
-"""Which two shots of a sequence see much the same: by poses and depth where there are, else by time.
+"""Pairs of images of a sequence that overlap: by poses and depth where known, else by time.
 
     overlap(i, j) = share of i's pixels of known depth that land in j at the depth j measures there
 

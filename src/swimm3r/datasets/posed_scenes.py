@@ -17,7 +17,7 @@ _TEST_EVERY = 8
 
 
 def is_scene(folder: Folder) -> bool:
-    """Whether a folder has images and a COLMAP model."""
+    """Return whether a folder has images and a COLMAP model."""
     names = folder.children.keys()
     return bool({"images_wb", "images"} & names) and bool({"sparse", "colmap"} & names)
 

@@ -20,7 +20,7 @@ _NEAREST = {"D5": 1.0}  # a loader's rule: what D5 has below is noise
 
 
 def is_scene(folder: Folder) -> bool:
-    """Whether a folder has the layout of a scene."""
+    """Return whether a folder has the layout of a scene."""
     names = folder.children.keys()
     return "linearpng" in names or "depthmaps" in names
 

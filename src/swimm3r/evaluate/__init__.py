@@ -10,7 +10,7 @@ from dataclasses import dataclass
 
 @dataclass(frozen=True)
 class NotComputed:
-    """Why a score is missing."""
+    """The reason for a missing score."""
 
     reason: str
 

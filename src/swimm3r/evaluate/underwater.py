@@ -23,7 +23,7 @@ from swimm3r.evaluate.images import as_8_bit, psnr_from_errors
 from swimm3r.medium import Encoding, Medium, MediumFit, backscatter, linear_from_srgb, transmittances
 
 URANKER = NotComputed("URanker's network is not published in enough detail to be rebuilt")
-"""Why there is no UnderwaterRanker score (Guo et al. 2023).
+"""The reason for the missing UnderwaterRanker score (Guo et al. 2023).
 
 Known are a CoaT-like transformer (patches 4, 2, 2, 2; widths 152, 320, 320, 320; serial depths 2, 2, 2, 2; 6 parallel
 blocks; 8 heads; position windows 3, 5, 7 for 2, 3, 3 heads), a 64-bin histogram of each channel as a further token, and

@@ -119,7 +119,7 @@ def _through_lens(camera: Cameras, rays: Float[Tensor, "*m 2"]) -> Float[Tensor,
 
 
 def _same_image(camera: Cameras, pinhole: Cameras) -> bool:
-    """Whether a pinhole camera's image is the frame's own: a fisheye without parameters is no pinhole camera."""
+    """Return whether a pinhole camera's image is the frame's own: a fisheye without parameters is no pinhole camera."""
     straight = camera.model != "OPENCV_FISHEYE" and not bool(camera.distortion.any())
     same_size = (camera.width, camera.height) == (pinhole.width, pinhole.height)
     return straight and same_size and torch.allclose(camera.K.double(), pinhole.K.double(), rtol=0, atol=1e-6)

@@ -84,7 +84,8 @@ def natural_key(path: Path, folder: Path) -> list[tuple[int, int, str]]:
 
 
 def numbered(images: Sequence[Path]) -> bool:
-    """Whether they lie in one folder and differ only in a running number: as a camera or a video export names them."""
+    """Return whether they lie in one folder and differ only in a running number: as a camera or a video export names
+    them."""
     patterns = {re.sub(r"\d+", "#", path.stem) for path in images}
     return len({path.parent for path in images}) == 1 and len(patterns) == 1 and "#" in patterns.pop()
 

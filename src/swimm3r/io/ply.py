@@ -48,7 +48,7 @@ def write_vertices(path: Path, vertices: np.ndarray) -> None:
 
 
 def is_ply(path: Path) -> bool:
-    """Whether a file begins as PLY files do."""
+    """Return whether a file begins as PLY files do."""
     with path.open("rb") as file:
         return file.read(4) in (b"ply\n", b"ply\r")
 

@@ -187,7 +187,7 @@ class Localizer:
         return best
 
     def _stands(self, refined: _Solved, before: _Solved) -> bool:
-        """Whether a refined pose takes the place of the pose before it."""
+        """Return whether a refined pose takes the place of the pose before it."""
         if refined.cam2world is None or self.settings.accept == "inliers":
             return refined.cam2world is not None
         seen = torch.cat([before.points[before.inlier], refined.points[refined.inlier]])

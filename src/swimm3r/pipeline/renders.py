@@ -193,7 +193,7 @@ def render_run(
 
 
 def moments_of(scene: SplatMap, table: CameraTable, frames: Frames, time: float | None) -> Sequence[float]:
-    """When each view shows the scene, seconds of the clip: `time`, the camera's, or that of the frame of its name.
+    """Times of the views, seconds of the clip: `time`, the camera's, or that of the frame of its name.
 
     Raises InputError where a dynamic map is to be shown at a moment that is not known.
     """

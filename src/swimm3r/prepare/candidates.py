@@ -60,7 +60,8 @@ def small_gray(image: Rgb) -> UInt8[np.ndarray, "h w"]:
 
 
 def is_gray(image: Rgb) -> bool:
-    """Whether the three channels are equal, but for the rounding of JPEG and video in one pixel of a thousand."""
+    """Return whether the three channels are equal, but for the rounding of JPEG and video in one pixel of a
+    thousand."""
     small = scaled_down(image, GRAY_SIDE).astype(np.int32)
     spread = small.max(axis=2) - small.min(axis=2)
     rounding = 2 if image.dtype == np.uint8 else 2 * 257

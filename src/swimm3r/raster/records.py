@@ -81,7 +81,7 @@ class CpuBins:
 
 @dataclass(frozen=True)
 class Bins:
-    """Which primitives meet which tile, front to back; without gradient, for one camera and one image size."""
+    """Primitives of each tile, front to back; without gradient, for one camera and one image size."""
 
     height: int
     width: int

@@ -103,7 +103,7 @@ class Frames:
 
     @property
     def span(self) -> tuple[float, float]:
-        """When the first and the last frame were taken."""
+        """Times of the first and the last frame."""
         times = [frame.time for frame in self.frames]
         return min(times), max(times)
 
@@ -112,7 +112,7 @@ class Frames:
         return self.names.index(name)
 
     def times_of(self, names: Sequence[str]) -> tuple[float, ...]:
-        """When the frames of these names were taken, seconds since the start of the clip."""
+        """Times of the frames of these names, seconds since the start of the clip."""
         times = {frame.name: frame.time for frame in self.frames}
         return tuple(times[name] for name in names)
 

@@ -48,7 +48,7 @@ class Points:
 
 @dataclass(frozen=True)
 class Tracks:
-    """Which point was seen where: one row per observation."""
+    """Observations of points in frames, one row each."""
 
     point: Int[Tensor, " o"]  # index into Points
     frame: Int[Tensor, " o"]  # index into Reconstruction.names

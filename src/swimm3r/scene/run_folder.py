@@ -55,7 +55,7 @@ class RunFolder:
     sections: dict[str, Any]
 
     def is_finished(self, stage: str) -> bool:
-        """Whether a stage is done and still there."""
+        """Return whether a stage is done and still there."""
         record = self.stages.get(stage)
         return record is not None and record.status == "done" and (self.folder / MARKERS[stage]).exists()
 
@@ -76,7 +76,7 @@ class _Summary:
 
 
 def is_run(folder: Path) -> bool:
-    """Whether a folder is one of `swimm3r run`, finished or not."""
+    """Return whether a folder is one of `swimm3r run`, finished or not."""
     return os.path.isfile(folder / "summary.json")  # unlike Path.is_file, false where no path is that long
 
 

@@ -1,4 +1,4 @@
-"""Which frames of a dive are used, and at what size; torch-free, so that --help is instant."""
+"""Selection and size of a dive's frames; torch-free, so that --help is instant."""
 
 from dataclasses import dataclass
 from pathlib import Path

@@ -65,7 +65,7 @@ def reprojection_errors(
 
 
 def consistent(matches: FrameMatches, cameras: Cameras, max_error: float) -> Bool[Tensor, " m"]:
-    """Which matches lie within `max_error` of their point in both frames; cameras are of the matches' pixel grid."""
+    """Mask of matches within `max_error` of their point in both frames; cameras are of the matches' pixel grid."""
     ends = ((matches.i, matches.xy_i), (matches.j, matches.xy_j))
     errors = [reprojection_errors(cameras, frame, xy + 0.5, matches.xyz) for frame, xy in ends]
     return torch.maximum(*errors) <= max_error

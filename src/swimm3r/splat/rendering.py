@@ -98,7 +98,7 @@ class SplatMap:
 
     @property
     def has_water(self) -> bool:
-        """Whether it tells water and scene apart."""
+        """Return whether it tells water and scene apart."""
         return isinstance(self.field, SceneWater) or not self.field.is_clear
 
     def to(self, device: torch.device) -> "SplatMap":

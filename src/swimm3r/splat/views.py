@@ -65,7 +65,7 @@ class TrainingViews:
 
     @property
     def times(self) -> list[float]:
-        """When the views were taken, 0..1 of the clip."""
+        """Times of the views, 0..1 of the clip."""
         return [float(self._times[name]) for name in self.names]
 
     def __len__(self) -> int:

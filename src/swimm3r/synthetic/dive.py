@@ -137,7 +137,7 @@ def write_dive(settings: DiveSettings, folder: Path, progress: Progress = silent
 
 
 def _is_whole(folder: Path, record: Path, described: dict[str, Any]) -> bool:
-    """Whether the dive lies in the folder already; false of a part of it, and of an empty folder."""
+    """Return whether the dive lies in the folder already; false of a part of it, and of an empty folder."""
     if not record.is_file():
         if folder.is_dir() and any(folder.iterdir()):
             raise _holds_others(folder)

@@ -134,7 +134,7 @@ def _receive(url: str, part: Path, weights: Weights, progress: Progress, seconds
 
 
 def _origin(part: Path) -> Path:
-    """Which version of the file a part belongs to."""
+    """Version of the file that a part belongs to."""
     return part.with_name(part.name + ".origin")
 
 

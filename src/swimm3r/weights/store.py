@@ -70,7 +70,7 @@ def find(name: str, explicit: Path | None = None, manifest: tuple[Weights, ...] 
 
 
 def _is_there(path: Path) -> bool:
-    """Whether a file is there. Raises WeightsError where the folder does not let anybody look."""
+    """Return whether a file is there. Raises WeightsError where the folder does not let anybody look."""
     try:
         return path.is_file()
     except OSError as error:

@@ -122,7 +122,7 @@ def test_the_true_water_leaves_only_the_anchor():
 
 
 def test_in_haze_the_anchor_pulls_the_true_veil_down_and_nothing_else_moves_it():
-    """Why `anchor` is a setting: Q_0.05 is below Binf where the dimmest pixels are near."""
+    """Reason for the setting `anchor`: Q_0.05 is below Binf where the dimmest pixels are near."""
     J, z, medium = scene()
     J = 0.02 + 0.96 * J  # strictly inside, so that no term sits on its kink
     I = add_water(J, z, medium)

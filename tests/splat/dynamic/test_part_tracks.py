@@ -44,7 +44,7 @@ CASES = [((33.0, 25.0), 1.0, 0.0), ((55.0, 30.0), 1.12, 0.05), ((70.0, 20.0), 1.
 
 @pytest.mark.parametrize(("middle", "size", "turn"), CASES)
 def test_stripes_are_laid_on_the_same_stripes(middle, size, turn):
-    """Which are five pixels apart; the last two parts are cut by the border."""
+    """The parts are five pixels apart; the last two are cut by the border."""
     fit = laid_over(part(striped(HERE), 0), part(striped(middle, size, turn), 1))
     assert fit is not None
     assert (carried(fit.whole, torch.tensor([HERE]))[0] - torch.tensor(middle)).norm() < 2

@@ -31,7 +31,7 @@ class Option:
 
     @property
     def positional(self) -> bool:
-        """Whether it is given by its place among the arguments."""
+        """Return whether it is given by its place among the arguments."""
         return not self.name.startswith("-")
 
 

@@ -50,7 +50,7 @@ def set_level(*, quiet: bool, verbose: bool) -> None:
 
 
 def is_quiet() -> bool:
-    """Whether nothing but errors and final results is asked for."""
+    """Return whether nothing but errors and final results is asked for."""
     return not logging.getLogger("swimm3r").isEnabledFor(logging.WARNING)
 
 

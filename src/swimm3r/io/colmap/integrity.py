@@ -1,4 +1,4 @@
-"""Whether the binary files of a COLMAP model are whole, before its own reader believes the counts that they begin with.
+"""Integrity of the binary files of a COLMAP model, checked before a reader relies on the counts in their headers.
 
     every file: uint64 count, then that many records; little-endian, without padding
     camera: id, model, width, height, parameters      image: id, quaternion, translation, camera, name\\0, points2D

@@ -1,4 +1,4 @@
-"""Which reader takes which file of another program."""
+"""Readers for the files of other programs, chosen by name and content."""
 
 from pathlib import Path
 

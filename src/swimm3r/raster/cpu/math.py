@@ -95,7 +95,7 @@ def full_width_vectors(typingctx: Any) -> Any:
 @no_type_check
 @intrinsic
 def any_positive(typingctx: Any, array: Any, first: Any) -> Any:
-    """Whether any of the 16 values of a float32 array from `first` on is above 0."""
+    """Return whether any of the 16 values of a float32 array from `first` on is above 0."""
 
     def generate(context: Any, builder: Any, signature: Any, args: Any) -> Any:
         data = context.make_array(signature.args[0])(context, builder, args[0]).data

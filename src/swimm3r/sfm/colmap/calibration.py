@@ -139,7 +139,8 @@ def refine(
 
 
 def is_lens(camera: "pycolmap.Camera") -> bool:
-    """Whether the intrinsics can belong to a lens: field of view, pixel shape, distortion that grows to the corners."""
+    """Return whether the intrinsics can belong to a lens: field of view, pixel shape, distortion that grows to the
+    corners."""
     name, width, height = camera.model.name, camera.width, camera.height
     fx, fy = camera.focal_length_x, camera.focal_length_y
     if not (0.3 < fx / width < 4 and 0.5 < fx / fy < 2):

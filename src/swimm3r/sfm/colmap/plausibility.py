@@ -1,4 +1,4 @@
-"""Whether a reconstruction can be true: a clip of tiles registers every frame, and is wrong.
+"""Plausibility of a reconstruction: repetitive ground registers every frame with wrong poses.
 
 Each check says in plain words what it saw. The limits stand between the good and the bad real clips they were measured
 on; the figures are beside them.

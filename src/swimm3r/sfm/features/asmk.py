@@ -1,4 +1,4 @@
-"""Which frames look alike, before any of them is matched.
+"""Image retrieval by ASMK: similarity of frames before any of them is matched.
 
 From local features x of a frame (MASt3R's encoder tokens, or anything else):
 

@@ -102,7 +102,7 @@ def start_database(
 
 
 def _is_whole(path: Path, frames: int) -> bool:
-    """Whether a file is a database that SQLite finds no fault with, of so many frames."""
+    """Return whether a file is a database that SQLite finds no fault with, of so many frames."""
     try:
         with closing(sqlite3.connect(path)) as database:
             (verdict,) = database.execute("PRAGMA quick_check(1)").fetchone()

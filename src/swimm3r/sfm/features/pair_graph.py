@@ -1,4 +1,4 @@
-"""Which frames are compared with which: a pair graph over n frames.
+"""Pair graphs: the pairs of n frames that are compared.
 
 A pair (i, j) is unordered here and written with i < j, once; the network's two passes per pair are the caller's matter.
 The reference's lists differ in habits that change nothing (a frame paired with itself where a cyclic window wraps,

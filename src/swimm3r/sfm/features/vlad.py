@@ -1,4 +1,4 @@
-"""Which frames look alike: VLAD descriptors over a vocabulary learned from the clip itself, nothing downloaded.
+"""Image retrieval by VLAD descriptors over a vocabulary learned from the clip itself; nothing is downloaded.
 
 VLAD sums, per visual word, what separates a frame's descriptors from the word (Jegou et al. 2010); each word's sum is
 normalized, so that one repeated texture cannot drown the rest (Arandjelovic and Zisserman 2013).

@@ -1,4 +1,4 @@
-"""Which frames a model made elsewhere places, and through which cameras they were taken, at the size of the frames."""
+"""The frames that an imported model registers, and their cameras at the size of the frames."""
 
 from pathlib import PurePosixPath
 

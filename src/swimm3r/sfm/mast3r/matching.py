@@ -1,4 +1,4 @@
-"""Which pixels of two views show the same point: reciprocal nearest neighbors of dense descriptors (MASt3R, sec. 3.3).
+"""Matches of two views: reciprocal nearest neighbors of dense descriptors (MASt3R, sec. 3.3).
 
 From a grid of seeds in view 1, walk to the nearest descriptor in view 2 and back until the walk stands still; it then
 stands on a reciprocal pair. Costs a hundredth of comparing every pixel with every pixel and finds the pairs with the

@@ -41,7 +41,7 @@ class Architecture:
 
     @property
     def dpt_levels(self) -> tuple[int, int, int, int]:
-        """Which token sequences of `Decoded` the DPT reads."""
+        """Indices of the token sequences of `Decoded` that the DPT reads."""
         return 0, self.decoder_depth // 2, 3 * self.decoder_depth // 4, self.decoder_depth
 
 

@@ -179,5 +179,5 @@ class ObjectiveSettings(Settings):
 
     @property
     def physics(self) -> bool:
-        """Whether the water is trained at all."""
+        """Return whether the water is trained at all."""
         return max(self.forward, self.inverse, self.saturation, self.known_water) > 0

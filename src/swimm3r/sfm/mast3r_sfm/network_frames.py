@@ -59,7 +59,7 @@ class NetworkImages:
         return to_network(self._undistorted(i)[0], self.framing)
 
     def mask(self, i: int) -> Bool[Tensor, "H W"] | None:
-        """Which pixels of frame i may be used; None: all."""
+        """Mask of the usable pixels of frame i; None: all."""
         if self.frames.frames[i].mask is None and self.lens.model == "PINHOLE":
             return None
         return mask_to_network(self._undistorted(i)[1], self.framing)

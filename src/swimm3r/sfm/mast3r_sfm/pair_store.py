@@ -72,7 +72,7 @@ class PairStore:
         return self.folder / f"{cache_key(name_i, name_j, self.settings_key)}.safetensors"
 
     def has(self, name_i: str, name_j: str) -> bool:
-        """Whether a pair is done."""
+        """Return whether a pair is done."""
         return self.path(name_i, name_j).is_file()
 
     def write(self, name_i: str, name_j: str, record: PairRecord) -> None:
@@ -122,7 +122,7 @@ class FrameStore:
         self._saved_at = time.monotonic()
 
     def has(self, i: int, partner: int) -> bool:
-        """Whether the pass of frame i with a partner has been added."""
+        """Return whether the pass of frame i with a partner has been added."""
         if i in self._finished or self._view_path(i).is_file():
             self._finished.add(i)
             return True

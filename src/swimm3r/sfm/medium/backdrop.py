@@ -104,7 +104,7 @@ def _lattice(camera: Cameras, step: float) -> tuple[Tensor, Tensor]:
 
 
 def _shown_cells(camera: Cameras, xyz: Tensor, edge: float) -> Bool[Tensor, "rows columns"]:
-    """Which square cells of an image some point falls into."""
+    """Mask of the square cells of an image that hold a point."""
     pixels, _, visible = project_visible(camera, xyz[None])
     column, row = (pixels[visible] / edge).long().unbind(-1)
     cells = torch.zeros(int(camera.height / edge) + 1, int(camera.width / edge) + 1, dtype=torch.bool)

@@ -191,7 +191,7 @@ def ray_depth_map(z_depth: Float[Tensor, "h w"], rays: Float[Tensor, "h w 3"]) -
 
 
 def cubes(xyz: Float[Tensor, "n 3"], size: Float[Tensor, "#n"]) -> tuple[Int[Tensor, " n"], Int[Tensor, " k"]]:
-    """Which cube of the world's grid (edge `size`, may differ per point) holds each point; number of points per cube.
+    """Cube of the world's grid (edge `size`, may differ per point) of each point; number of points per cube.
 
     Cubes are told apart by a 64-bit mix of their indices: two of a million collide with a chance of 3e-8.
     """

@@ -22,12 +22,13 @@ def optical_depth(fit: MediumFit) -> tuple[Float[Tensor, "3"], Float[Tensor, "3"
 
 
 def attenuation_is_a_guess(fit: MediumFit) -> bool:
-    """Whether no channel's T_D is known: dividing by it would invent colors."""
+    """Return whether no channel's T_D is known: dividing by it would invent colors."""
     return bool((optical_depth(fit)[1] > _GUESS).all())
 
 
 def any_determined(fit: MediumFit) -> bool:
-    """Whether the frames determine a single coefficient; where not, no restored color is a surface's true one."""
+    """Return whether the frames determine a single coefficient; where not, no restored color is a surface's true
+    one."""
     return any(bool(flags.any()) for flags in fit.identifiable.values())
 
 

@@ -148,7 +148,8 @@ def _propose(surface, y, x, reach, move, tries, beside):
 @kernel
 @no_type_check
 def _is_tried(tries, n, q, margin, speed, reach):
-    """Whether a candidate lies ahead and differs from the own plane; only that and its moves are judged at reach 0."""
+    """Return whether a candidate lies ahead and differs from the own plane; only that and its moves are judged at reach
+    0."""
     if n == OWN:
         return tries[n, 0] > 0
     apart = abs(tries[n, 0] - q) + margin * (abs(tries[n, 1] - tries[OWN, 1]) + abs(tries[n, 2] - tries[OWN, 2]))

@@ -105,7 +105,7 @@ class Adapters(nn.Module):
 
     @property
     def on(self) -> bool:
-        """Whether the network is the student now."""
+        """Return whether the network is the student now."""
         return self._on
 
     @contextmanager

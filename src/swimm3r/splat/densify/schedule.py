@@ -14,22 +14,22 @@ def steps_between(settings: RefineSettings, iterations: int) -> int:
 
 
 def is_due(settings: RefineSettings, step: int, iterations: int) -> bool:
-    """Whether a step, counted from 1, is one of the cadence's."""
+    """Return whether a step, counted from 1, is one of the cadence's."""
     return step % steps_between(settings, iterations) == 0
 
 
 def has_begun(settings: RefineSettings, step: int, iterations: int) -> bool:
-    """Whether a step lies behind the start of the window."""
+    """Return whether a step lies behind the start of the window."""
     return step / iterations > settings.refine_start
 
 
 def is_open(settings: RefineSettings, step: int, iterations: int) -> bool:
-    """Whether a step lies in the window."""
+    """Return whether a step lies in the window."""
     return has_begun(settings, step, iterations) and step / iterations <= settings.refine_stop
 
 
 def has_round(settings: RefineSettings, step: int, iterations: int) -> bool:
-    """Whether a step, counted from 1, densifies."""
+    """Return whether a step, counted from 1, densifies."""
     return is_open(settings, step, iterations) and is_due(settings, step, iterations)
 
 

@@ -61,7 +61,7 @@ def traveling(
 
 @dataclass(frozen=True)
 class Ways:
-    """When and along which ways primitives travel that last for a part of the clip only."""
+    """Times and paths of primitives that exist for a part of the clip only."""
 
     rows: Int[Tensor, " m"]
     values: dict[str, Float[Tensor, "m c"]]  # by the parameters' names

@@ -47,7 +47,7 @@ class MediumField(nn.Module):
 
     @property
     def is_clear(self) -> bool:
-        """Whether there is no water, wherever one looks."""
+        """Return whether there is no water, wherever one looks."""
         return not len(self.network)
 
     def forward(

@@ -38,7 +38,7 @@ class BetaPrimitives(NamedTuple):
 
     @property
     def dynamic(self) -> bool:
-        """Whether they change with time."""
+        """Return whether they change with time."""
         return self.query_mean.shape[1] > 3
 
     def to(self, device: torch.device) -> "BetaPrimitives":

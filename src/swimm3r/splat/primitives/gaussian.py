@@ -33,7 +33,7 @@ class GaussianPrimitives(NamedTuple):
 
     @property
     def dynamic(self) -> bool:
-        """Whether they change with time."""
+        """Return whether they change with time."""
         return False
 
     def to(self, device: torch.device) -> "GaussianPrimitives":
