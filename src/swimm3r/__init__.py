@@ -40,18 +40,7 @@ if TYPE_CHECKING:
     from swimm3r.splat import train
     from swimm3r.splat.map_file import load_map
     from swimm3r.splat.rendering import SplatMap
-    from swimm3r.splat.settings import (
-        McmcGsSettings,
-        SeaSplatSettings,
-        UwbsSettings,
-        WaterSplattingSettings,
-        mcmc_gs,
-        seasplat,
-        threers_gs,
-        ubs,
-        uwbs,
-        watersplatting,
-    )
+    from swimm3r.splat.settings import UwbsSettings, uwbs, with_recipe
     from swimm3r.synthetic import DiveSettings, write_dive
 
 _HOME = {
@@ -80,18 +69,11 @@ _HOME = {
     "ColmapSettings": "sfm.settings",
     "Mast3rSettings": "sfm.settings",
     "SplatMap": "splat.rendering",
-    "McmcGsSettings": "splat.settings",
-    "SeaSplatSettings": "splat.settings",
-    "seasplat": "splat.settings",
     "UwbsSettings": "splat.settings",
-    "WaterSplattingSettings": "splat.settings",
-    "watersplatting": "splat.settings",
-    "mcmc_gs": "splat.settings",
-    "threers_gs": "splat.settings",
     "load_map": "splat.map_file",
     "train": "splat",
-    "ubs": "splat.settings",
     "uwbs": "splat.settings",
+    "with_recipe": "splat.settings",
     "DiveSettings": "synthetic",
     "write_dive": "synthetic",
 }
@@ -105,17 +87,14 @@ __all__ = [
     "Frames",
     "LocalizationSettings",
     "Mast3rSettings",
-    "McmcGsSettings",
     "Medium",
     "MediumFit",
     "Progress",
     "Reconstruction",
     "RunSettings",
-    "SeaSplatSettings",
     "SplatMap",
     "Swimm3rError",
     "UwbsSettings",
-    "WaterSplattingSettings",
     "add_water",
     "load_cameras",
     "load_frames",
@@ -123,18 +102,14 @@ __all__ = [
     "load_medium",
     "load_reconstruction",
     "localize",
-    "mcmc_gs",
     "read_frames",
     "reconstruct",
     "remove_water",
     "run_pipeline",
-    "seasplat",
     "silent",
-    "threers_gs",
     "train",
-    "ubs",
     "uwbs",
-    "watersplatting",
+    "with_recipe",
     "write_dive",
 ]
 

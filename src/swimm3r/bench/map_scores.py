@@ -4,6 +4,7 @@ from pathlib import Path
 
 from swimm3r import devices
 from swimm3r.bench.cells import Scores
+from swimm3r.bench.scores import columns
 from swimm3r.evaluate import NotComputed
 from swimm3r.imaging.undistortion import undistorted
 from swimm3r.io import images
@@ -17,6 +18,11 @@ from swimm3r.splat import train
 from swimm3r.splat.map_file import load_map
 from swimm3r.splat.rendering import SplatMap
 from swimm3r.splat.settings import PoseRefinementSettings, SplatSettings
+
+COLUMNS = columns(
+    "psnr", "ssim_3dgs", "lpips_vgg", "sharpness", "blur4_psnr", "clear_psnr", "T_D_abs", "B_abs",
+    "from_reference_pct", "train_cpu_seconds",
+)  # fmt: skip
 
 
 def trained(sfm: FinishedSfm, settings: SplatSettings, folder: Path, progress: Progress = silent) -> SplatMap:

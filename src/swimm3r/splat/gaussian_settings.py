@@ -24,7 +24,6 @@ from swimm3r.settings import (
 from swimm3r.splat.shared_settings import (
     MapSettings,
     MediumFieldSettings,
-    RecipeName,
     RefineSettings,
     TrainingPoseSettings,
 )
@@ -143,7 +142,7 @@ class McmcGsSettings(GaussianSettings):
     )
 
     @property
-    def recipe(self) -> RecipeName:
+    def recipe(self) -> str:
         """The name of the method."""
         return "threers_gs" if self.poses.enabled else "mcmc_gs"
 
@@ -209,7 +208,7 @@ class WaterSplattingSettings(GaussianSettings):
     """Share of the run after which the size of the training images doubles."""
 
     @property
-    def recipe(self) -> RecipeName:
+    def recipe(self) -> str:
         """The name of the method."""
         return "watersplatting"
 
@@ -294,6 +293,6 @@ class SeaSplatSettings(GaussianSettings):
     water: SceneWaterSettings = field(default_factory=SceneWaterSettings)
 
     @property
-    def recipe(self) -> RecipeName:
+    def recipe(self) -> str:
         """The name of the method."""
         return "seasplat"

@@ -26,7 +26,6 @@ from swimm3r.splat.gaussian_settings import GaussianSettings, McmcGsSettings, Se
 from swimm3r.splat.shared_settings import (
     MapSettings,
     MediumFieldSettings,
-    RecipeName,
     RefineSettings,
     TrainingPoseSettings,
 )
@@ -231,7 +230,7 @@ class UwbsSettings(MapSettings):
     sgg: SggSettings = field(default_factory=SggSettings)
 
     @property
-    def recipe(self) -> RecipeName:
+    def recipe(self) -> str:
         """The name of the method."""
         if self.medium.model == "none":
             return "ubs"
@@ -269,6 +268,7 @@ uwbs = UwbsSettings  # as the Python API calls it: swimm3r.train(rec, frames, sw
 MapDevice = Literal["auto", "cpu", "cuda"]
 """The device that trains and renders maps; no part of the settings, for a map can go from one to the other."""
 
+RecipeName = Literal["uwbs-static", "uwbs-dynamic", "ubs", "watersplatting", "seasplat", "threers_gs", "mcmc_gs"]
 RECIPES: tuple[RecipeName, ...] = get_args(RecipeName)
 
 

@@ -5,8 +5,6 @@ from typing import Annotated, Literal
 
 from swimm3r.settings import Cadence, Count, LongSideOrOwn, NotNegative, Range, Rate, Seed, Settings, Share
 
-RecipeName = Literal["uwbs-static", "uwbs-dynamic", "ubs", "watersplatting", "seasplat", "threers_gs", "mcmc_gs"]
-
 
 @dataclass(frozen=True)
 class MediumFieldSettings(Settings):

@@ -15,9 +15,8 @@ from swimm3r.bench import reference
 from swimm3r.bench.cells import Result, ResultKey, Scores, check_choice, kept_cell, over_scenes, scene_folder
 from swimm3r.bench.images import Panel, stored, write_grid
 from swimm3r.bench.inputs import lpips_weights, reconstruction_of
-from swimm3r.bench.map_scores import map_scores, trained
+from swimm3r.bench.map_scores import COLUMNS, map_scores, trained
 from swimm3r.bench.runs import POSES_REFINED, Clip, clips_of, made_runs
-from swimm3r.bench.scores import columns
 from swimm3r.bench.settings import JobSettings, Seeds
 from swimm3r.bench.tables import Table
 from swimm3r.evaluate import NotComputed
@@ -37,10 +36,6 @@ from swimm3r.splat.settings import (
     with_recipe,
 )
 
-COLUMNS = columns(
-    "psnr", "ssim_3dgs", "lpips_vgg", "sharpness", "blur4_psnr", "clear_psnr", "T_D_abs", "B_abs",
-    "from_reference_pct", "train_cpu_seconds",
-)  # fmt: skip
 _SEEDS_APART = 1_000
 
 
