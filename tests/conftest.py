@@ -1,9 +1,10 @@
 """The suite runs with every shape annotation of the package checked (jaxtyping + beartype); users never pay for it."""
 
 import os
-from collections.abc import Callable, Iterable, Sequence
+from collections.abc import Callable, Iterable, Iterator, Sequence
 from fractions import Fraction
 from pathlib import Path
+from typing import Any
 
 os.environ.setdefault("OMP_WAIT_POLICY", "PASSIVE")  # as the command line does
 os.environ.setdefault("NUMBA_CACHE_DIR", str(Path(__file__).parents[1] / ".venv" / "numba-cache"))
@@ -17,6 +18,7 @@ import av
 import numpy as np
 import pytest
 import torch
+from tests.browser import WatchedPage, headless_chromium, reason_to_skip, watched_page
 
 from swimm3r.sfm.mast3r.network import Architecture, Mast3r
 
@@ -37,6 +39,35 @@ def shared() -> Path:
     if not (SHARED / "data").is_dir():
         pytest.skip(f"{SHARED} is not here: nothing was checked against real footage or reference numbers")
     return SHARED
+
+
+@pytest.fixture(scope="session")
+def chromium() -> Iterator[object]:
+    """The system's browser, started once; None where there is none."""
+    if reason_to_skip():
+        yield None
+        return
+    with headless_chromium() as browser:
+        yield browser
+
+
+@pytest.fixture
+def open_page(chromium: object, request: pytest.FixtureRequest) -> Iterator[Callable[..., WatchedPage]]:
+    """Opens a file or an address in the system's Chromium, see `tests.browser.watched_page`; pages end with the test.
+
+    Skips where there is no browser, and says what was not checked.
+    """
+    if reason := reason_to_skip():
+        pytest.skip(f"{reason}: not checked in a browser: {request.node.name.removeprefix('test_').replace('_', ' ')}")
+    opened: list[WatchedPage] = []
+
+    def open_one(target: str | Path | None = None, **options: Any) -> WatchedPage:
+        opened.append(watched_page(chromium, target, **options))
+        return opened[-1]
+
+    yield open_one
+    for watched in opened:
+        watched.page.context.close()
 
 
 @pytest.fixture
