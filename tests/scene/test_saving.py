@@ -11,10 +11,12 @@ import torch
 import swimm3r
 from swimm3r.errors import InputError, StorageError
 from swimm3r.geometry import so3_exp
+from swimm3r.io import ply
 from swimm3r.io.images import write_mask, write_rgb
 from swimm3r.medium import AttenuationCurve
 from swimm3r.scene.frames import Frame
 from swimm3r.scene.reconstruction import DenseCloud, DepthMap, DepthMaps, Matches, Points, QualityWarning, Tracks
+from swimm3r.scene.white_balance import WhiteBalance
 
 NAMES = ("a/0.png", "a/1.png", "b/2.png")
 RNG = np.random.default_rng(0)
@@ -88,6 +90,7 @@ def rec(tmp_path: Path, cameras: swimm3r.Cameras, fit: swimm3r.MediumFit) -> swi
         medium_linear=replace(fit, encoding="linear"),
         cloud=DenseCloud(xyz, bytes_.float() / 255, bytes_.flip(0).float() / 255),
         warnings=(QualityWarning("little & far", "go <nearer>"),),
+        white_balance=WhiteBalance((1.25, 1.0, 0.7)),
         points_found=17,
     )
 
@@ -152,6 +155,39 @@ def test_saved_twice_a_reconstruction_has_the_same_bits(rec: swimm3r.Reconstruct
     for path in sorted((tmp_path / "one").rglob("*.*")):
         if path.is_file() and path.suffix != ".npz":  # which carry times
             assert path.read_bytes() == (tmp_path / "two" / path.relative_to(tmp_path / "one")).read_bytes(), path
+
+
+def test_a_cloud_is_saved_as_shown_as_restored_and_as_filmed(rec: swimm3r.Reconstruction, tmp_path: Path):
+    assert rec.cloud is not None
+    cloud = rec.cloud
+    for source in ("restored", "filmed"):
+        folder = tmp_path / source
+        replace(rec, white_balance=WhiteBalance((1.25, 1.0, 0.7), source)).save(folder)
+        balanced = (cloud.restored * torch.tensor([1.25, 1.0, 0.7])).clamp(0, 1)
+        expected = {"points": balanced if source == "restored" else cloud.raw, "points_physical": cloud.restored}
+        for stem, rgb in {**expected, "points_raw": cloud.raw}.items():
+            assert np.abs(ply.read_points(folder / f"{stem}.ply")[1] - rgb.numpy()).max() <= 0.5 / 255 + 1e-6
+
+
+@pytest.mark.parametrize("gains", ["[1, 1]", "[1, 0, 1]", "[1, -1, 1]", "[1, NaN, 1]", "[1, 1e9, 1]", '"gray"'])
+def test_a_white_balance_that_is_none_is_refused_by_name(gains: str, rec: swimm3r.Reconstruction, tmp_path: Path):
+    rec.save(tmp_path / "one")
+    (tmp_path / "one" / "white_balance.json").write_text(f'{{"gains": {gains}}}')
+    with pytest.raises(InputError, match=r"white_balance\.json is damaged \("):
+        swimm3r.load_reconstruction(tmp_path / "one")
+
+
+def test_a_lost_white_balance_is_missed_and_an_early_run_without_any_is_read(
+    rec: swimm3r.Reconstruction, tmp_path: Path
+):
+    rec.save(tmp_path / "one")
+    (tmp_path / "one" / "white_balance.json").unlink()
+    with pytest.raises(InputError, match=r"white_balance\.json is missing"):
+        swimm3r.load_reconstruction(tmp_path / "one")
+    (tmp_path / "one" / "points_physical.ply").replace(tmp_path / "one" / "points.ply")
+    early = swimm3r.load_reconstruction(tmp_path / "one")
+    assert early.white_balance == WhiteBalance()
+    assert same(early.cloud, rec.cloud)
 
 
 def test_a_folder_in_use_is_not_written_to(rec: swimm3r.Reconstruction, frames: swimm3r.Frames, tmp_path: Path):

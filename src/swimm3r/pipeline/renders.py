@@ -34,7 +34,7 @@ from swimm3r.scene.reconstruction import Reconstruction
 from swimm3r.scene.reconstruction_io import load_reconstruction
 from swimm3r.scene.run_folder import open_run
 from swimm3r.settings import ClipSecond, CountOrZero, LongSideOrOwn, accepted
-from swimm3r.sfm.medium.restore import keep_open_water, shown_gains
+from swimm3r.sfm.medium.restore import keep_open_water
 from swimm3r.sfm.settings import RestoreSettings
 from swimm3r.splat.map_file import load_map
 from swimm3r.splat.rendering import RenderOutput, SplatMap
@@ -54,16 +54,15 @@ _SMOOTH = 1.5  # frames of the dive over which the flight's hand steadies
 class DisplayStyle:
     """Display of a dive's restored frames, and of the clear views and depths of its map."""
 
-    gains: Float[Tensor, "3"]  # white balance of clear images
+    gains: Float[Tensor, "3"]  # white balance of clear images (`scene.white_balance`)
     near_far: tuple[float, float]  # z depths that are red and blue, scene units
     restore: RestoreSettings
 
 
 def display_style(scene: SplatMap, rec: Reconstruction, restore: RestoreSettings | None = None) -> DisplayStyle:
     """The look that the restored frames of a reconstruction have, for views of its map."""
-    restore = restore or RestoreSettings()
-    gains = shown_gains(rec, restore) if scene.has_water else torch.ones(3)
-    return DisplayStyle(gains, depth_span(rec), restore)
+    gains = rec.white_balance.factors if scene.has_water else torch.ones(3)
+    return DisplayStyle(gains, depth_span(rec), restore or RestoreSettings())
 
 
 def shown_clear(out: RenderOutput, camera: Cameras, style: DisplayStyle) -> Float[Tensor, "h w 3"]:

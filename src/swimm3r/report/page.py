@@ -165,7 +165,10 @@ def _plan(rec: Reconstruction) -> dict[str, str]:
     """The map from above, before and after, with the camera path."""
     assert rec.cloud is not None
     view = charts.plan_view(
-        rec.cloud.xyz.numpy(), rec.cloud.raw.numpy(), rec.cloud.restored.numpy(), rec.cameras.cam2world.numpy()
+        rec.cloud.xyz.numpy(),
+        rec.cloud.raw.numpy(),
+        rec.cloud.shown(rec.white_balance).numpy(),
+        rec.cameras.cam2world.numpy(),
     )
     return {
         "raw": images.jpeg_uri(view.raw, 760, 90),

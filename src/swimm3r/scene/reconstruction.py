@@ -1,9 +1,10 @@
 """The result of structure from motion: the one record that every back end fills and every later stage reads.
 
 On disk (`Reconstruction.save`, `reconstruction_io.load_reconstruction`) it is a folder: sparse/ (COLMAP model),
-cameras.json, trajectory.tum, z_depth/NAME.npz, matches.npz, medium.json, points.ply (restored colors), points_raw.ply,
-backdrop.ply (guessed ground, restored colors), backdrop_raw.ply, reconstruction.json (back end, metric flag, warnings,
-points found).
+cameras.json, trajectory.tum, z_depth/NAME.npz, matches.npz, medium.json, white_balance.json, reconstruction.json (back
+end, metric flag, warnings, points found), and the dense cloud in three colors, points.ply (as shown: restored and
+white-balanced), points_physical.ply (restored) and points_raw.ply (as filmed); backdrop.ply and its two are ground at a
+guessed depth.
 """
 
 import json
@@ -28,6 +29,7 @@ from swimm3r.io.files.outputs import check_empty
 from swimm3r.io.trajectory import write_tum
 from swimm3r.medium import MediumFit, save_fits
 from swimm3r.scene.frames import Frames
+from swimm3r.scene.white_balance import UNBALANCED, WHITE_BALANCE, WhiteBalance
 
 _CACHE = ArrayCache(max_bytes=1 << 30)
 _SHOWN_WARNINGS = 10  # in a notebook
@@ -126,7 +128,11 @@ class DenseCloud:
 
     xyz: Float[Tensor, "n 3"]
     raw: Float[Tensor, "n 3"]  # 0..1
-    restored: Float[Tensor, "n 3"]  # 0..1
+    restored: Float[Tensor, "n 3"]  # physical, 0..1
+
+    def shown(self, balance: WhiteBalance) -> Float[Tensor, "n 3"]:
+        """The colors for people to look at, like the restored frames."""
+        return balance.shown(self.restored, self.raw)
 
     def __repr__(self) -> str:
         return notebook.shapes(self)
@@ -157,6 +163,7 @@ class Reconstruction:
     cloud: DenseCloud | None = None  # fused from the depth maps; colors averaged over each point's track
     backdrop: DenseCloud | None = None  # ground filmed but not measured, at a guessed depth, for maps to start on
     warnings: tuple[QualityWarning, ...] = ()
+    white_balance: WhiteBalance = UNBALANCED  # of everything that is shown
     points_found: int | None = None  # sparse ones, before the settings' cap; None: nothing was left out
 
     def __repr__(self) -> str:
@@ -241,8 +248,10 @@ class Reconstruction:
         save_fits(folder / "medium.json", {name: fit for name, fit in fits.items() if fit is not None})
         for stem, cloud in (("points", self.cloud), ("backdrop", self.backdrop)):
             if cloud is not None:
-                ply.write_points(folder / f"{stem}.ply", cloud.xyz.numpy(), cloud.restored.numpy())
-                ply.write_points(folder / f"{stem}_raw.ply", cloud.xyz.numpy(), cloud.raw.numpy())
+                colors = {"": cloud.shown(self.white_balance), "_physical": cloud.restored, "_raw": cloud.raw}
+                for kind, rgb in colors.items():
+                    ply.write_points(folder / f"{stem}{kind}.ply", cloud.xyz.numpy(), rgb.numpy())
+        self.white_balance.save(folder / WHITE_BALANCE)
         about = {"backend": self.backend, "metric": self.metric, "warnings": [vars(each) for each in self.warnings]}
         about["points_found"] = self.points_found
         write_text(folder / "reconstruction.json", json.dumps(about, indent=2) + "\n")

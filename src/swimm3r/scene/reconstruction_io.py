@@ -18,6 +18,7 @@ from swimm3r.io.files.damage import guard, remake
 from swimm3r.io.files.json_file import read_json
 from swimm3r.scene.frames import Frames
 from swimm3r.scene.reconstruction import DenseCloud, DepthMaps, Matches, Points, QualityWarning, Reconstruction, Tracks
+from swimm3r.scene.white_balance import UNBALANCED, WHITE_BALANCE, read_white_balance
 
 _UNFILTERED = "matches_unfiltered.npz"
 _MATCHES = {
@@ -52,6 +53,8 @@ def load_reconstruction(folder: str | Path, frames: Frames | None = None) -> Rec
             _check_frames(sparse, frames)
     about = read_json(folder / "reconstruction.json", _About, remedy)
     fits = medium_json.read_fits(folder / "medium.json", remedy)
+    balanced = _is_balanced(folder)
+    clear = "_physical" if balanced else ""
     return Reconstruction(
         names=sparse.names,
         cameras=_read_cameras(folder / "cameras.json", sparse.names),
@@ -67,9 +70,10 @@ def load_reconstruction(folder: str | Path, frames: Frames | None = None) -> Rec
         metric=about.metric,
         medium=fits.get("stored"),
         medium_linear=fits.get("linear"),
-        cloud=_load_cloud(folder, "points"),
-        backdrop=_load_cloud(folder, "backdrop"),
+        cloud=_load_cloud(folder, "points", clear),
+        backdrop=_load_cloud(folder, "backdrop", clear),
         warnings=about.warnings,
+        white_balance=read_white_balance(folder / WHITE_BALANCE, remedy) if balanced else UNBALANCED,
         points_found=about.points_found,
     )
 
@@ -115,13 +119,18 @@ def _read_matches(path: Path, frames: int) -> Matches:
     return Matches(**{name: torch.from_numpy(values) for name, values in stored.items()})
 
 
-def _load_cloud(folder: Path, stem: str) -> DenseCloud | None:
+def _is_balanced(folder: Path) -> bool:
+    """Return whether points.ply is as shown; early runs of schema 2 have physical colors there and no balance."""
+    return any((folder / name).exists() for name in (WHITE_BALANCE, "points_physical.ply"))
+
+
+def _load_cloud(folder: Path, stem: str, clear: str) -> DenseCloud | None:
     if not (folder / f"{stem}.ply").is_file():
         return None
     remedy = remake(folder)
-    xyz, restored = ply.read_points(folder / f"{stem}.ply", remedy)
+    xyz, restored = ply.read_points(folder / f"{stem}{clear}.ply", remedy)
     _, raw = ply.read_points(folder / f"{stem}_raw.ply", remedy)
     with guard(folder / f"{stem}_raw.ply", remedy):
         if len(raw) != len(xyz):
-            raise ValueError(f"it has {len(raw)} points, {stem}.ply {len(xyz)}")
+            raise ValueError(f"it has {len(raw)} points, {stem}{clear}.ply {len(xyz)}")
     return DenseCloud(torch.from_numpy(xyz), torch.from_numpy(raw), torch.from_numpy(restored))

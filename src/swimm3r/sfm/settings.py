@@ -97,8 +97,8 @@ class RestoreSettings(Settings):
     max_points: Annotated[int, Range(100)] = 500_000
     """Largest number of points of the restored cloud, thinned by voxels."""
     white_balance: bool = True
-    """Apply gray-world gains, one triple per dive, to displayed images (restored/, clear renders); points, images in
-    restored_physical/ and scores stay physical."""
+    """Apply gray-world gains, one triple per dive, to all that is shown: restored/, points.ply, clear views, exports.
+    The colors in restored_physical/ and points_physical.ply, and all scores, stay physical."""
 
 
 @dataclass(frozen=True)

@@ -8,6 +8,7 @@ import torch
 
 from swimm3r.errors import InputError
 from swimm3r.medium import AttenuationCurve, Medium, remove_water
+from swimm3r.scene.white_balance import WhiteBalance
 from swimm3r.sfm.mast3r_sfm.network_frames import NetworkImages, network_images
 from swimm3r.sfm.medium.dense_tracks import fuse_depth
 from swimm3r.sfm.medium.from_head import PredictedWater, dive_fit, predicted_images, read, write
@@ -108,13 +109,13 @@ def test_restored_images_are_clear(dive, water: PredictedWater):
 
 
 def test_shown_images_are_white_balanced_and_the_clear_ones_stay_physical(dive, water: PredictedWater):
-    gains = torch.tensor([1.5, 1.0, 0.7])
+    balance = WhiteBalance((1.5, 1.0, 0.7))
     plain = dict(predicted_images(dive.rec, dive.frames, water))
-    for i, restored in predicted_images(dive.rec, dive.frames, water, gains=gains):
+    for i, restored in predicted_images(replace(dive.rec, white_balance=balance), dive.frames, water):
         torch.testing.assert_close(restored.clear, plain[i].clear)
         surface = (restored.sea == 0) & (restored.clear > 0).all(-1) & (restored.clear < 0.6).all(-1)
         assert surface.float().mean() > 0.1
-        torch.testing.assert_close(restored.shown[surface], restored.clear[surface] * gains)
+        torch.testing.assert_close(restored.shown[surface], restored.clear[surface] * balance.factors)
 
 
 def test_restoration_divides_by_no_less_than_the_head_was_trained_with(dive, water: PredictedWater):

@@ -12,11 +12,14 @@ from swimm3r.io import images
 from swimm3r.medium import AttenuationCurve, Medium, MediumFit
 from swimm3r.scene.frames import Frames
 from swimm3r.scene.reconstruction import DenseCloud
-from swimm3r.sfm.medium import apply
+from swimm3r.scene.white_balance import WhiteBalance
+from swimm3r.sfm.medium import apply, restore
 from swimm3r.sfm.medium.dense_tracks import fuse_depth
 from swimm3r.sfm.medium.plausibility import attenuation_is_a_guess, optical_depth, water_warnings
-from swimm3r.sfm.medium.restore import display_gains, restored_cloud, shown_gains
+from swimm3r.sfm.medium.restore import RestoredImage, display_gains, restore_image, restored_cloud, white_balance
 from swimm3r.sfm.settings import ColmapSettings, RestoreSettings, TrackSettings
+
+TINT = torch.tensor([0.6, 1.0, 0.9])
 
 
 def fit_of(medium: Medium, std: float, known: bool, z_range: tuple[float, float] = (1.0, 4.0)) -> MediumFit:
@@ -92,13 +95,35 @@ def written(dive, fit: MediumFit, folder: Path, monkeypatch: pytest.MonkeyPatch)
 
 def tinted(cloud: DenseCloud) -> DenseCloud:
     """As under the light that reaches a few metres of depth."""
-    return replace(cloud, restored=cloud.restored * torch.tensor([0.6, 1.0, 0.9]))
+    return replace(cloud, restored=cloud.restored * TINT)
 
 
 def test_where_attenuation_is_a_guess_frames_are_shown_as_filmed(dive, tmp_path: Path, monkeypatch):
     found = written(dive, fit_of(dive.medium, 0.9, known=False), tmp_path, monkeypatch)
     assert abs(found["shown"] - found["filmed"]).max() < 1 / 255
     assert abs(found["physical"] - found["filmed"]).mean() > 0.02  # what a map starts on: the inverse of its water
+
+
+def test_the_cloud_as_shown_has_the_mean_color_of_the_restored_frames(dive, tmp_path: Path, monkeypatch):
+    """And of the frames as filmed where those are shown."""
+    monkeypatch.setattr(apply, "restored_cloud", lambda *given: tinted(restored_cloud(*given)))
+    monkeypatch.setattr(restore, "restore_image", lambda *given: tinted_image(restore_image(*given), given[5]))
+    for std in (0.1, 0.9):
+        monkeypatch.setattr(apply, "fit_medium", lambda *_, std=std: fit_of(dive.medium, std, known=std < 0.5))
+        rec = apply.with_water(dive.rec, dive.frames, ColmapSettings(), tmp_path)
+        assert rec.cloud is not None
+        known = [(dive.rec.depth[name].z_depth > 0).numpy() for name in rec.names]
+        shown = [images.read_rgb(tmp_path / "restored" / f"{name}.png") / 255 for name in rec.names]
+        of_frames = np.concatenate([image[k] for image, k in zip(shown, known, strict=True)]).mean(0)
+        of_cloud = rec.cloud.shown(rec.white_balance).numpy().mean(0)
+        assert abs(of_cloud / of_frames - 1).max() < 0.05
+        other = rec.cloud.restored if std < 0.5 else rec.cloud.shown(replace(rec.white_balance, source="restored"))
+        assert abs(other.numpy().mean(0) / of_frames - 1).max() > 0.1
+
+
+def tinted_image(image: RestoredImage, gains: torch.Tensor) -> RestoredImage:
+    clear = image.clear * TINT
+    return replace(image, clear=clear, shown=(clear * gains).clamp(0, 1))
 
 
 def test_where_nothing_of_the_water_is_determined_frames_are_not_balanced_to_neutral_grays(
@@ -115,10 +140,12 @@ def test_gains_need_water_that_is_determined_and_somebody_who_wants_them(dive):
     fit = fit_of(dive.medium, 0.1, known=True)
     cloud = restored_cloud(dive.rec, dive.frames, fuse_depth(dive.rec, dive.frames, TrackSettings()), fit)
     rec = replace(dive.rec, medium=fit, cloud=cloud)
-    torch.testing.assert_close(shown_gains(rec, RestoreSettings()), display_gains(cloud.restored))
-    assert torch.equal(shown_gains(rec, RestoreSettings(white_balance=False)), torch.ones(3))
+    torch.testing.assert_close(white_balance(rec, RestoreSettings()).factors, display_gains(cloud.restored))
+    assert white_balance(rec, RestoreSettings(white_balance=False)) == WhiteBalance()
     unsure = replace(rec, medium=fit_of(dive.medium, 0.1, known=False))
-    assert torch.equal(shown_gains(unsure, RestoreSettings()), torch.ones(3))
+    assert white_balance(unsure, RestoreSettings()) == WhiteBalance()
+    guessed = replace(rec, medium=fit_of(dive.medium, 0.9, known=False))
+    assert white_balance(guessed, RestoreSettings()) == WhiteBalance(source="filmed")
 
 
 def test_a_gray_clip_is_called_gray_and_stays_gray(dive, tmp_path: Path):

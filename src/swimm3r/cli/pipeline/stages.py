@@ -21,7 +21,7 @@ RESULTS = {  # of the stages, as far as the folder holds them
     "report.html": "all results on one page",
     "summary.json": "every number of the run, for scripts",
     "prepare": "frames as they are used",
-    "sfm/points.ply": "restored point cloud",
+    "sfm/points.ply": "restored point cloud, white-balanced; as filmed and physical beside it",
     "sfm/cameras.json": "camera poses; also as a COLMAP model in sfm/sparse",
     "sfm/medium.json": "parameters of the water",
     "sfm/restored": "frames with the water removed",

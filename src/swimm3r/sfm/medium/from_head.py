@@ -172,11 +172,10 @@ def predicted_images(
     frames: Frames,
     water: PredictedWater,
     progress: Progress = silent,
-    gains: Float[Tensor, "3"] | None = None,
 ) -> Iterator[tuple[int, RestoredImage]]:
     """Every frame with depth, by its place in `rec`: Eq. 4, clamped, by the frame's own water.
 
-    Unknown depth is filled in along the edges; open water keeps the color it has. `gains` balance the images as shown.
+    Unknown depth is filled in along the edges; open water keeps the color it has.
     """
     rays = shared_rays(rec.cameras)
     for i, name in enumerate(rec.names):
@@ -191,7 +190,7 @@ def predicted_images(
         z = ray_depth.flatten()
         J = remove_water(image.reshape(-1, 3), z, own.at(z, water.place), water.head.min_transmittance)
         J = J.clamp(0, 1).reshape(image.shape)
-        balanced = J if gains is None else (J * gains).clamp(0, 1)
+        balanced = (J * rec.white_balance.factors).clamp(0, 1)
         clear, shown = (surface + sea[..., None] * (image - surface) for surface in (J, balanced))
         yield i, RestoredImage(clear, shown, ray_depth, sea)
     progress("restoring images", len(rec.names), len(rec.names))

@@ -36,8 +36,9 @@ from swimm3r.medium import (
 from swimm3r.progress import Progress, silent
 from swimm3r.scene.frames import Frames
 from swimm3r.scene.reconstruction import DenseCloud, DepthMap, Reconstruction
+from swimm3r.scene.white_balance import WhiteBalance
 from swimm3r.sfm.medium.dense_tracks import DenseTracks, cubes, ray_depth_map, shared_rays
-from swimm3r.sfm.medium.plausibility import any_determined
+from swimm3r.sfm.medium.plausibility import any_determined, attenuation_is_a_guess
 from swimm3r.sfm.settings import RestoreSettings
 
 MediumOfPixels = Callable[[str, Int[Tensor, " n"], Float[Tensor, " n"]], Medium]  # frame, pixels, ray depth
@@ -59,9 +60,9 @@ class RestoredImage:
 def restored_images(
     rec: Reconstruction, frames: Frames, settings: RestoreSettings, progress: Progress = silent
 ) -> Iterator[tuple[int, RestoredImage]]:
-    """Every registered frame with some known depth, by its place in `rec`; needs the medium and the cloud."""
+    """Every registered frame with some known depth, by its place in `rec`; needs the medium and the balance."""
     assert rec.medium is not None
-    gains = shown_gains(rec, settings)
+    gains = rec.white_balance.factors
     rays = shared_rays(rec.cameras)
     for i, name in enumerate(rec.names):
         progress("restoring images", i, len(rec.names))
@@ -146,15 +147,19 @@ def restored_cloud(
     return _thinned(cloud, settings.max_points)
 
 
-def shown_gains(rec: Reconstruction, settings: RestoreSettings) -> Float[Tensor, "3"]:
-    """White balance of a dive's clear images (`display_gains`).
+def white_balance(rec: Reconstruction, settings: RestoreSettings) -> WhiteBalance:
+    """The one balance of a dive with a restored cloud (`display_gains`).
 
-    Ones where nobody asked for it, and where the frames determine nothing of the water: neutral grays would pass for
-    the true colors of surfaces.
+    Gains are ones where nobody asked for any, and where the frames determine nothing of the water: neutral grays would
+    pass for the true colors of surfaces. Where the light lost on the way is a guess, colors are shown as filmed.
     """
-    if rec.cloud is None or rec.medium is None or not settings.white_balance or not any_determined(rec.medium):
-        return torch.ones(3)
-    return display_gains(rec.cloud.restored)
+    assert rec.cloud is not None
+    assert rec.medium is not None
+    source = "filmed" if attenuation_is_a_guess(rec.medium) else "restored"
+    if source == "filmed" or not settings.white_balance or not any_determined(rec.medium):
+        return WhiteBalance(source=source)
+    red, green, blue = display_gains(rec.cloud.restored).tolist()
+    return WhiteBalance((red, green, blue))
 
 
 def display_gains(restored: Float[Tensor, "n 3"]) -> Float[Tensor, "3"]:
