@@ -172,13 +172,21 @@ def test_the_cameras_clock_orders_and_times_images(tmp_path, prepared):
     np.testing.assert_allclose([frame.time for frame in frames], [0, 0.25, 4.5])
     assert frames.ordered
     assert any("clock" in warning for warning in frames.warnings)
+    assert frames.recorded == load_frames(prepared).recorded == "2024-05-01T12:00:01"
 
 
 def test_without_a_clock_on_every_image_time_is_the_index(dive, prepared):
     exif = Image.Exif()
     exif.get_ifd(0x8769)[36867] = "2024:05:01 12:00:00"
-    write(dive / "img5.png", image(5), exif=exif)
-    assert [frame.time for frame in read_frames(dive, folder=prepared)] == list(range(12))
+    (dive / "img5.png").unlink()
+    write(dive / "img5.jpg", image(5), exif=exif)
+    frames = read_frames(dive, folder=prepared)
+    assert [frame.time for frame in frames] == list(range(12))
+    assert frames.recorded == "2024-05-01T12:00:00"
+
+
+def test_without_any_clock_no_date_is_made_up(dive, prepared):
+    assert read_frames(dive, folder=prepared).recorded is None
 
 
 def test_sharper_images_score_higher(tmp_path, prepared):

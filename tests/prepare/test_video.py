@@ -2,6 +2,7 @@
 
 from pathlib import Path
 
+import av
 import cv2
 import numpy as np
 import pytest
@@ -36,6 +37,27 @@ def test_uniform_takes_every_sixth_frame_of_thirty_a_second(tmp_path, write_vide
     assert frames.ordered
     assert frames.names[3] == "frame_000003.png"
     assert frames.warnings == ()
+
+
+def dated(source: Path, stated: str) -> Path:
+    """A copy of a video whose container states a date."""
+    path = source.with_name(f"dated_{source.name}")
+    with av.open(str(source)) as before, av.open(str(path), "w") as after:
+        after.metadata["creation_time"] = stated
+        stream = after.add_stream_from_template(before.streams.video[0])
+        for packet in before.demux(before.streams.video[0]):
+            if packet.dts is not None:
+                packet.stream = stream
+                after.mux(packet)
+    return path
+
+
+@pytest.mark.parametrize(
+    ("stated", "kept"), [("2023-08-19T09:30:05.000000Z", "2023-08-19T09:30:05"), ("1970-01-01T00:00:00Z", None)]
+)
+def test_the_date_of_the_container_is_kept_unless_its_clock_was_never_set(tmp_path, write_video, stated, kept):
+    path = dated(write_video(tmp_path / "dive.mp4", [numbered(i) for i in range(30)]), stated)
+    assert read_frames(path, folder=tmp_path / "prepare").recorded == kept
 
 
 def test_the_sharpest_frame_of_each_bin_is_taken(tmp_path, write_video):

@@ -7,6 +7,7 @@ decode are passed over and counted.
 import math
 from collections.abc import Iterator
 from dataclasses import dataclass
+from datetime import datetime
 from fractions import Fraction
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -28,6 +29,7 @@ _NOT_VIDEO = ("tty", "image2", "_pipe")  # FFmpeg's readers of text and of singl
 _INDEXED = ("mov,mp4,m4a,3gp,3g2,mj2", "matroska,webm")  # the containers whose seeking can be relied on
 _FARTHEST = 2**62  # ticks; FFmpeg counts them in 64 bits
 _UNSPECIFIED = 2  # AVCOL_SPC_UNSPECIFIED
+_FIRST_YEAR = 1990  # QuickTime counts from 1904 and Unix from 1970: what a clock that was never set shows
 _HD_LINES = 720  # from here on untagged video is BT.709, as players take it; below BT.601
 
 
@@ -60,6 +62,7 @@ class Video:
     height: int
     seconds: float | None  # length as the file states it
     rate: float  # frames per second on average
+    recorded: str | None  # begin of the recording by the container, ISO 8601; None where it does not tell
     damaged: int  # packets that did not decode so far
     interlaced: bool  # true once an interlaced frame was seen
 
@@ -113,6 +116,8 @@ class Video:
         self._stream = stream.index
         self._origin, self._tick = stream.start_time or 0, stream.time_base or Fraction(1)
         self._aspect = float(stream.sample_aspect_ratio or 1)
+        stated = file.metadata.get("creation_time") or stream.metadata.get("creation_time")
+        self.recorded = _plausible_date(stated)
         self.rate = float(stream.average_rate or stream.guessed_rate or 25)
         if stream.duration is not None:
             self.seconds = float(stream.duration * self._tick)
@@ -160,6 +165,15 @@ class Video:
             frame, width, height, pixels, src_colorspace=matrix, interpolation=Interpolation.AREA
         )
         return scaled.to_ndarray()
+
+
+def _plausible_date(stated: str | None) -> str | None:
+    """A container's date of recording; None where it is absent, or of a clock that was never set."""
+    try:
+        date = datetime.fromisoformat(stated or "")
+    except ValueError:
+        return None
+    return date.strftime("%Y-%m-%dT%H:%M:%S") if date.year >= _FIRST_YEAR else None
 
 
 def _unreadable(path: Path, why: object) -> InputError:

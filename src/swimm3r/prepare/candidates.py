@@ -40,6 +40,7 @@ class SelectedImages:
     mask_folders: list[Path]
     originals: list[Path]  # what a mask may belong to, frames left out included
     files: frozenset[Path] = frozenset()  # the originals of stills where they lie: no masks, whatever their names
+    recorded: str | None = None  # begin of the recording, ISO 8601
 
 
 def sharpness(gray: UInt8[np.ndarray, "h w"]) -> float:

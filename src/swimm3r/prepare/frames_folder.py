@@ -1,7 +1,8 @@
 """From a source to a complete folder of frames, and back from the folder.
 
 The folder appears when it is complete, and not before. frames.json holds name, time, split, sharpness and mask of each
-frame, and width, height, ordered, gray, masks (how many are used and unused), source and warnings of them all.
+frame, and width, height, ordered, gray, masks (how many are used and unused), source, date of the recording and
+warnings of them all.
 """
 
 import logging
@@ -10,6 +11,7 @@ import shutil
 from collections.abc import Iterator
 from contextlib import contextmanager, suppress
 from dataclasses import dataclass, replace
+from datetime import datetime
 from pathlib import Path
 from typing import Any, Literal
 
@@ -88,12 +90,15 @@ class _Document:
     warnings: tuple[str, ...] = ()
     gray: bool = False
     masks: _Masks = _Masks()
+    recorded: str | None = None
 
     def __post_init__(self) -> None:
         if min(self.width, self.height) < 1:
             raise ValueError(f"frames have a size in whole pixels, got {self.width}x{self.height}")
         if not self.frames:
             raise ValueError("it names no frames")
+        if self.recorded is not None:
+            datetime.fromisoformat(self.recorded)
         check_names(entry.name for entry in self.frames)
 
 
@@ -121,6 +126,7 @@ def load_frames(folder: Path) -> Frames:
         document.warnings,
         gray=document.gray,
         unused_masks=document.masks.unused,
+        recorded=document.recorded,
     )
 
 
@@ -197,7 +203,15 @@ def _write_frames(dive: SelectedImages, draft: Path, source: Path, settings: Fra
         for i, image in enumerate(kept)
     )
     _remove_all_but(draft, {path for frame in listed for path in (frame.path, frame.mask)})
-    frames = Frames(listed, *size, dive.ordered, tuple(warnings), gray=gray, unused_masks=masks.unused)
+    frames = Frames(
+        listed,
+        *size,
+        dive.ordered,
+        tuple(warnings),
+        gray=gray,
+        unused_masks=masks.unused,
+        recorded=dive.recorded,
+    )
     write_index(draft, frames, str(source.resolve()))
 
 

@@ -6,6 +6,7 @@ from collections import Counter
 from collections.abc import Callable, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
+from datetime import UTC, datetime
 from functools import partial
 from pathlib import Path
 from typing import TypeVar
@@ -72,7 +73,7 @@ def prepare_stills(
             refused[path] = error
     sizes = {path: header.size for path, header in headers.items()}
     paths, warnings = _one_size(list(headers), sizes, root, settings)
-    paths, times, ordered = _in_time_order(paths, warnings)
+    paths, times, ordered, recorded = _in_time_order(paths, warnings)
     chosen = thinned(list(zip(paths, times, strict=True)), settings.max_frames)
     work = _named(chosen, root, settings.long_side, headers)
     most = max((headers[path].decoding_bytes for path in paths), default=0)
@@ -96,7 +97,7 @@ def prepare_stills(
             dict.fromkeys([root, root / MASKS, source / MASKS, *([root.parent / MASKS] * (root.name == "images"))])
         )
     files = frozenset(root.resolve() / original for original in originals)
-    return SelectedImages(images, ordered, warnings, mask_folders, originals, files)
+    return SelectedImages(images, ordered, warnings, mask_folders, originals, files, recorded)
 
 
 def images_of(source: Path, leave_out: Sequence[Path] = ()) -> ImageFolder:
@@ -180,16 +181,20 @@ def _one_size(
     return [p for p in paths if sizes[p] == usual], [f"{len(odd)} images of another size were left out: {which}."]
 
 
-def _in_time_order(paths: list[Path], warnings: list[str]) -> tuple[list[Path], list[float], bool]:
-    """Sorted images, their times, whether neighbors were taken in turn; by the camera's clock where all carry it."""
+def _in_time_order(paths: list[Path], warnings: list[str]) -> tuple[list[Path], list[float], bool, str | None]:
+    """Sorted images, their times, whether neighbors were taken in turn; by the camera's clock where all carry it.
+
+    Last, the date of the earliest image that has one.
+    """
     taken = [capture_time(path) for path in paths]
     known = [time for time in taken if time is not None]
+    recorded = datetime.fromtimestamp(min(known), UTC).strftime("%Y-%m-%dT%H:%M:%S") if known else None
     if len(known) < len(paths) or len(set(known)) < 2:
-        return paths, [float(i) for i in range(len(paths))], image_folder.numbered(paths)
+        return paths, [float(i) for i in range(len(paths))], image_folder.numbered(paths), recorded
     order = sorted(range(len(paths)), key=known.__getitem__)  # stable: equal seconds keep the order of names
     if order != list(range(len(paths))):
         warnings.append("The images are ordered by the camera's clock, which is not the order of their names.")
-    return [paths[i] for i in order], [known[i] - min(known) for i in order], True
+    return [paths[i] for i in order], [known[i] - min(known) for i in order], True, recorded
 
 
 def _named(

@@ -71,7 +71,8 @@ def prepare_clip(source: Path, draft: Path, settings: FrameSettings, progress: P
     warnings += _warnings(video, last, reached)
     mask_folders = [settings.masks] if settings.masks is not None else []
     kept = thinned(found, settings.max_frames)
-    return SelectedImages(kept, True, warnings, mask_folders, [image.original for image in found])
+    originals = [image.original for image in found]
+    return SelectedImages(kept, True, warnings, mask_folders, originals, recorded=video.recorded)
 
 
 def _warnings(video: Video, last: float, reached: float) -> list[str]:

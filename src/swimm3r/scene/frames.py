@@ -52,6 +52,7 @@ class Frames:
     warnings: tuple[str, ...] = ()  # what was left out or looks odd, in plain words
     gray: bool = False  # the three channels of every image are equal
     unused_masks: int = 0  # masks given that belong to no frame
+    recorded: str | None = None  # begin of the recording, ISO 8601, as the files state it: EXIF or the container
 
     def __len__(self) -> int:
         return len(self.frames)
@@ -178,6 +179,7 @@ def write_index(folder: Path, frames: Frames, source: str = "") -> None:
         "gray": frames.gray,
         "masks": {"used": sum(frame.mask is not None for frame in frames), "unused": frames.unused_masks},
         "warnings": list(frames.warnings),
+        "recorded": frames.recorded,
         "frames": [
             {
                 "name": frame.name,
