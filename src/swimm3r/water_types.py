@@ -1,9 +1,13 @@
-"""The four families of water of the paper, for augmentation and for synthetic dives.
+"""The four families of water of the paper, for augmentation and for synthetic dives; Jerlov's types, to look at.
 
     Binf ~ U(family), beta_D,R ~ U(0.3, 2.0) (cyan: U(0.7, 1.6)), beta_D,G, beta_D,B ~ U(0.04, 0.85),
     beta_B = r beta_D with r ~ U(0, 1) per channel            (paper, "Parametric water-type augmentation")
 
 Coefficients are 1/m and act on pixel values as stored (sRGB), as the paper applies them.
+
+Jerlov's optical water types (Jerlov 1976, Marine Optics) are classes by the daylight left after a metre of water. They
+act on linear light. Attenuation and backscatter share its logarithm, and the veiling light has the color of the
+daylight that is left at `_JERLOV_DEPTH`.
 """
 
 from dataclasses import dataclass
@@ -35,6 +39,37 @@ FAMILIES: dict[Family, WaterType] = {
     "green": WaterType(((0.10, 0.25), (0.30, 0.50), (0.10, 0.30)), ((0.3, 2.0), _CLEAR_CHANNEL, _CLEAR_CHANNEL)),
     "warm": WaterType(((0.20, 0.40), (0.15, 0.30), (0.10, 0.25)), ((0.3, 2.0), _CLEAR_CHANNEL, _CLEAR_CHANNEL)),
 }
+
+JerlovType = Literal["I", "IA", "IB", "II", "III", "1C", "3C", "5C", "7C", "9C"]
+JERLOV: dict[JerlovType, tuple[float, float, float]] = {  # daylight left after 1 m at 600, 525 and 475 nm
+    "I": (0.805, 0.961, 0.982),
+    "IA": (0.804, 0.955, 0.975),
+    "IB": (0.83, 0.95, 0.968),
+    "II": (0.80, 0.925, 0.94),
+    "III": (0.75, 0.885, 0.89),
+    "1C": (0.75, 0.885, 0.875),
+    "3C": (0.71, 0.82, 0.80),
+    "5C": (0.67, 0.73, 0.67),
+    "7C": (0.62, 0.61, 0.50),
+    "9C": (0.55, 0.46, 0.29),
+}
+"""Oceanic types I (clearest) to III, coastal types 1C to 9C (most turbid)."""
+_JERLOV_DEPTH = 5.0  # metres of water above the camera
+_JERLOV_VEIL = 0.4  # largest channel of the veiling light, linear
+
+
+def jerlov(kind: JerlovType) -> Medium:
+    """The medium of a Jerlov type, 1/m, on linear light."""
+    beta = -torch.tensor(JERLOV[kind]).log()
+    daylight = torch.exp(-beta * _JERLOV_DEPTH)
+    return Medium(_JERLOV_VEIL * daylight / daylight.max(), beta, beta)
+
+
+def typical(family: Family) -> Medium:
+    """The middle of a family's ranges, 1/m, on pixel values as stored; beta_B is half of beta_D."""
+    water = FAMILIES[family]
+    Binf, beta_D = (torch.tensor(ranges).mean(-1) for ranges in (water.Binf, water.beta_D))
+    return Medium(Binf, beta_D, beta_D / 2)
 
 
 def sample(family: Family, generator: torch.Generator) -> Medium:

@@ -57,6 +57,12 @@ BRIEF: dict[tuple[str, ...], Groups] = {
         "map": ("--recipe",),
         "": _MESSAGES,
     },
+    ("view",): {
+        "address": ("--host", "--port"),
+        "pictures": ("--moving-side", "--full-side", "--pictures-per-second", "--jpeg-quality", "--map-device"),
+        "water": ("--water",),
+        "": _MESSAGES,
+    },
     ("bench", "flsea"): {
         "input": ("--sequences", "--stride"),
         "methods": ("--methods", "--adapters", "--imports"),

@@ -36,6 +36,7 @@ from swimm3r.cli.terminal.help_views import View, brief_help, group_help
 from swimm3r.cli.terminal.output_level import FLAGS, begin_messages, with_output_level
 from swimm3r.cli.terminal.ranges import settings_with_ranges, with_ranges
 from swimm3r.cli.train_sfm import train_sfm_command
+from swimm3r.cli.view import view
 from swimm3r.cli.weights import WEIGHTS
 from swimm3r.errors import InputError, StorageError, Swimm3rError, UsageError
 from swimm3r.memory import out_of_memory
@@ -126,6 +127,7 @@ def commands_for(arguments: Sequence[str]) -> dict[str, Callable | Family]:
         "bench": Family(
             "The paper's tables on your own dives. Results stay in --out; re-run the same command to resume.", protocols
         ),
+        "view": view,
         "demo": demo,
         "doctor": doctor,
         "eval": evaluate,

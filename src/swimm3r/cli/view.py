@@ -1,0 +1,32 @@
+"""`swimm3r view`: a finished run in the browser."""
+
+from pathlib import Path
+from typing import Annotated
+
+from swimm3r.cli.terminal.options import FLAT, Run
+from swimm3r.splat.settings import MapDevice
+from swimm3r.viewer.settings import ViewerSettings
+
+
+def view(
+    run: Run,
+    /,
+    settings: Annotated[ViewerSettings, FLAT] = ViewerSettings(),  # noqa: B008 - records are frozen
+    water: tuple[Path, ...] = (),
+    map_device: MapDevice = "auto",
+) -> None:
+    """Look at a run in the browser: fly through the map, change its water, measure, keep views and camera paths.
+
+    Args:
+        run: Run folder with finished structure from motion; a map, where there is one, is drawn as the camera moves.
+        settings: The address, and size and pace of the pictures.
+        water: Other run folders whose water the scene can be put into.
+        map_device: Device that renders the map; auto uses CUDA if a GPU and NVIDIA Warp are present.
+    """
+    from swimm3r.viewer.server import serve
+
+    serve(run, settings, water, map_device, ready=_say)
+
+
+def _say(line: str) -> None:
+    print(line, flush=True)

@@ -1,0 +1,133 @@
+"""Objects of the browser's 3D scene: the frames as frusta with thumbnails, the camera's path, the cloud, the crop box.
+
+The picture lies behind them; once the camera rests, its depth hides those that lie behind a surface.
+"""
+
+import math
+from collections.abc import Callable
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+import torch
+
+from swimm3r.cameras import Cameras
+from swimm3r.geometry import pose_from, quaternion_from_rotation, rotation_from_quaternion
+from swimm3r.viewer.layers import CropBox, ViewCamera
+from swimm3r.viewer.viewed_run import ViewedRun
+
+if TYPE_CHECKING:
+    from viser import ClientHandle
+
+FRAME_COLOR, CHOSEN_COLOR, PATH_COLOR = (255, 209, 102), (255, 120, 60), (255, 209, 102)
+_MOST_FRUSTA = 150
+_MOST_POINTS = 250_000
+_FRUSTUM = 0.22  # of the working depth unit
+
+
+class SceneNodes:
+    """The objects in one browser's scene; each kind is sent when it is first shown."""
+
+    def __init__(self, client: "ClientHandle", run: ViewedRun, fly_to: Callable[[str], None]) -> None:
+        self._client, self._run, self._fly_to = client, run, fly_to
+        self._frusta: dict[str, Any] = {}
+        self._path: Any = None
+        self._cloud: Any = None
+        self._cloud_key: tuple | None = None
+        self._chosen: str | None = None
+
+    def show_frusta(self, shown: bool) -> None:
+        """Show or hide the frames."""
+        if shown and not self._frusta:
+            self._add_frusta()
+        for frustum in self._frusta.values():
+            frustum.visible = shown
+
+    def show_path(self, shown: bool) -> None:
+        """Show or hide the line through the cameras, in the order of time."""
+        if shown and self._path is None and len(self._run.rec.names) > 1:
+            centers = (self._run.cameras.centers * self._run.scale).numpy().astype(np.float32)
+            order = np.argsort([self._run.time_of(name) for name in self._run.rec.names], kind="stable")
+            segments = np.stack([centers[order][:-1], centers[order][1:]], 1)
+            self._path = self._client.scene.add_line_segments(
+                "/path", segments, PATH_COLOR, thickness=2.0, thickness_units="screen"
+            )
+        if self._path is not None:
+            self._path.visible = shown
+
+    def show_cloud(self, shown: bool, restored: bool, size: float, crop: CropBox | None) -> None:
+        """Show or hide the points, with the water or without, of this size in working units."""
+        key = (restored, crop)
+        if shown and (self._cloud is None or self._cloud_key != key):
+            xyz, colors = self._run.cloud(restored)
+            if crop is not None:
+                inside = crop.holds(torch.from_numpy(xyz)).numpy()
+                xyz, colors = xyz[inside], colors[inside]
+            step = max(1, math.ceil(len(xyz) / _MOST_POINTS))
+            self._cloud = self._client.scene.add_point_cloud(
+                "/points", xyz[::step].astype(np.float32), colors[::step], point_size=size, point_shape="circle",
+                precision="float32", point_shading="flat",
+            )  # fmt: skip
+            self._cloud_key = key
+        if self._cloud is not None:
+            self._cloud.visible, self._cloud.point_size = shown, size
+
+    def mark(self, name: str) -> None:
+        """Mark the frame that was chosen last."""
+        for each, color in ((self._chosen, FRAME_COLOR), (name, CHOSEN_COLOR)):
+            if each in self._frusta:
+                self._frusta[each].color = color
+        self._chosen = name
+
+    def outline(self, crop: CropBox | None) -> None:
+        """Draw the edges of a crop box, or none."""
+        self._client.scene.remove_by_name("/crop")
+        if crop is not None:
+            self._client.scene.add_line_segments(
+                "/crop", _edges(crop), (120, 220, 255), thickness=1.5, thickness_units="screen"
+            )
+
+    def _add_frusta(self) -> None:
+        run = self._run
+        step = max(1, math.ceil(len(run.rec.names) / _MOST_FRUSTA))
+        for i in range(0, len(run.rec.names), step):
+            name, camera = run.rec.names[i], run.cameras[i]
+            frustum = self._client.scene.add_camera_frustum(
+                f"/frames/{i}",
+                fov=vertical_fov(camera),
+                aspect=camera.width / camera.height,
+                scale=_FRUSTUM,
+                thickness=1.5,
+                thickness_units="screen",
+                color=FRAME_COLOR,
+                image=run.thumbnail(name),
+                format="jpeg",
+                wxyz=quaternion_from_rotation(camera.cam2world[0, :3, :3]).numpy(),
+                position=(camera.centers[0] * run.scale).numpy(),
+                cast_shadow=False,
+                receive_shadow=False,
+            )
+            frustum.on_click(lambda _, name=name: self._fly_to(name))
+            self._frusta[name] = frustum
+
+
+def view_of(client: "ClientHandle", run: ViewedRun) -> ViewCamera:
+    """The camera of a browser as the renderer takes it."""
+    camera = client.camera
+    R = rotation_from_quaternion(torch.from_numpy(np.asarray(camera.wxyz, np.float64)))
+    t = torch.from_numpy(np.asarray(camera.position, np.float64)) / run.scale
+    width, height = camera.image_width, max(1, camera.image_height)
+    return ViewCamera(pose_from(R, t), float(camera.fov), width / height, max(width, height, 64))
+
+
+def vertical_fov(camera: Cameras, aspect: float | None = None) -> float:
+    """The vertical field of view of a camera, radians; with `aspect`, that of a window that shows all of its image."""
+    down = camera.height / (2 * float(camera.K[0, 1, 1]))
+    if aspect is not None:
+        down = max(down, camera.width / (2 * float(camera.K[0, 0, 0])) / aspect)
+    return 2 * math.atan(down)
+
+
+def _edges(crop: CropBox) -> np.ndarray:
+    corners = np.array([[(crop.low, crop.high)[k >> axis & 1][axis] for axis in range(3)] for k in range(8)])
+    pairs = [(a, a | 1 << axis) for a in range(8) for axis in range(3) if not a >> axis & 1]
+    return corners[np.array(pairs)].astype(np.float32)
