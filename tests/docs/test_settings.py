@@ -16,8 +16,8 @@ from swimm3r.sfm.distillation.settings import TrainSettings
 from swimm3r.splat.settings import RECIPES
 
 COMMANDS = (
-    *("run", "prepare", "sfm", "splat", "render", "export", "eval", "localize", "report", "demo", "doctor", "datasets"),
-    *("train-sfm", "weights get", "bench render", "bench sfm", "bench flsea", "bench restoration"),
+    *("run", "prepare", "sfm", "splat", "render", "export", "eval", "localize", "report", "view", "demo", "doctor"),
+    *("datasets", "train-sfm", "weights get", "bench render", "bench sfm", "bench flsea", "bench restoration"),
     *("bench localization", "bench ablation-uwbs", "bench ablation-sfm", "run --backend mast3r"),
     *(f"run --recipe {recipe}" for recipe in RECIPES),
 )

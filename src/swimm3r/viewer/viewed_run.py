@@ -121,7 +121,7 @@ class ViewedRun:
         if cloud is None:
             xyz, colors = self.rec.points.xyz, self.rec.points.rgb
         else:
-            xyz, colors = cloud.xyz, cloud.restored if restored else cloud.raw
+            xyz, colors = cloud.xyz, cloud.shown(self.rec.white_balance) if restored else cloud.raw
         xyz = xyz.double() if self.to_map is None else self.to_map.points(xyz.double())
         return (xyz * self.scale).numpy(), (colors.clamp(0, 1) * 255).round().to(torch.uint8).numpy()
 
