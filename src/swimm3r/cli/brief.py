@@ -10,6 +10,7 @@ _INPUT = ("--fps", "--start", "--end", "--max-frames", "--masks")
 _OUTPUT = ("--out", "--redo")
 _SETTINGS = ("--preset", "--config")
 _CAMERA = ("--housing", "--focal", "--adapter", "--weights")
+_PAGE = ("--view",)
 _MESSAGES = ("--quiet", "--verbose")
 
 BRIEF: dict[tuple[str, ...], Groups] = {
@@ -18,6 +19,7 @@ BRIEF: dict[tuple[str, ...], Groups] = {
         "output": _OUTPUT,
         "speed and quality": (*_SETTINGS, "--recipe", "--map-device"),
         "camera and poses": ("--backend", *_CAMERA),
+        "browser": _PAGE,
         "": _MESSAGES,
     },
     ("prepare",): {
@@ -37,6 +39,7 @@ BRIEF: dict[tuple[str, ...], Groups] = {
         "poses of another program": ("--colmap", "--transforms", "--images"),
         "output": _OUTPUT,
         "speed and quality": (*_SETTINGS, "--recipe", "--splat.iterations", "--splat.long-side", "--map-device"),
+        "browser": _PAGE,
         "": _MESSAGES,
     },
     ("train-sfm",): {

@@ -47,4 +47,4 @@ def demo(
         )
     print_summary(summary)
     print_results(out, RESULTS)
-    print_next("other views of the map", "render", out)
+    print_next("fly through the map", "view", out)

@@ -35,6 +35,7 @@ from swimm3r.sfm import reconstruct
 from swimm3r.splat import train
 from swimm3r.splat.map_file import load_map
 from swimm3r.splat.settings import MapDevice
+from swimm3r.splat.training.observer import Observer
 
 
 def run_pipeline(
@@ -48,6 +49,7 @@ def run_pipeline(
     map_device: MapDevice = "auto",
     progress: Progress | None = None,
     on_stage: Callable[[StageStart], None] = ignore_stages,
+    observer: Observer | None = None,
 ) -> dict:
     """Run the stages up to `last_stage` and return the summary (layout: docs/conventions.md).
 
@@ -55,8 +57,8 @@ def run_pipeline(
     the folder holds, a new one by the defaults. Stages made with other settings are refused, or with `redo` moved to
     `folder`/old and made again. `reference` is a cameras.json to score against; a synthetic dive brings its own truth.
     `map_device` is where the map is trained and rendered. A rough estimate of time and disk is logged first, and
-    `on_stage` is told of every stage that starts. A terminal or a notebook shows how far it is, unless `progress` is
-    given (`swimm3r.silent`: nothing).
+    `on_stage` is told of every stage that starts, `observer` of every step of the map's training. A terminal or a
+    notebook shows how far it is, unless `progress` is given (`swimm3r.silent`: nothing).
 
     Raises the errors of its stages (`swimm3r.errors`), UsageError where settings differ, the folder cannot be written
     to or another process works in it, InputError where it belongs to another input, and StorageError where the disk is
@@ -76,7 +78,7 @@ def run_pipeline(
         to_do = record.to_do(stage_keys(record.fingerprint, settings, reference))
         plan = estimate_run(source, folder, settings, to_do, on_cpu=device.type == "cpu")
         record.announce(plan, on_stage)
-        _make_stages(record, source, settings, reference, last_stage, map_device, told)
+        _make_stages(record, source, settings, reference, last_stage, map_device, told, observer)
         summary = record.write()
         if last_stage == "eval":
             write_report(folder)
@@ -91,6 +93,7 @@ def _make_stages(
     last_stage: str,
     map_device: MapDevice,
     progress: Progress,
+    observer: Observer | None,
 ) -> None:
     """Make or reuse the stages one after another. What a stage hands on is read from disk, to the last bit as a resumed
     run finds it.
@@ -128,7 +131,7 @@ def _make_stages(
     record.stage(
         "splat",
         keys["splat"],
-        make=lambda: train(rec, frames, settings.splat, folder / "splat", progress, map_device),
+        make=lambda: train(rec, frames, settings.splat, folder / "splat", progress, map_device, observer),
         reuse=lambda: None,
     )
     scene = load_map(folder / "splat" / "map.safetensors").to(devices.for_maps(map_device))

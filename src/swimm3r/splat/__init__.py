@@ -11,6 +11,7 @@ if TYPE_CHECKING:
     import swimm3r.scene.frames
     import swimm3r.scene.reconstruction
     import swimm3r.splat.rendering
+    import swimm3r.splat.training.observer
 
 __all__ = ["SplatSettings", "UwbsSettings", "train"]
 
@@ -22,6 +23,7 @@ def train(
     folder: str | Path | None = None,
     progress: Progress | None = None,
     device: MapDevice = "auto",
+    observer: "swimm3r.splat.training.observer.Observer | None" = None,
 ) -> "swimm3r.splat.rendering.SplatMap":
     """A map of the reconstruction, trained on the registered of `frames.train`.
 
@@ -30,7 +32,8 @@ def train(
 
     Works in `folder` (a new temporary one by default) and goes on exactly from what an interrupted call left there.
     It is trained on `device`, where the map then stays: CUDA where it is here and NVIDIA Warp installed, by default.
-    A terminal or a notebook shows how far it is, unless `progress` is given (`swimm3r.silent`: nothing).
+    A terminal or a notebook shows how far it is, unless `progress` is given (`swimm3r.silent`: nothing); `observer` is
+    called after every step and changes nothing of the map.
     Raises InputError where no training frame is registered, DeviceError where `device` is not here.
     """
     from swimm3r import devices
@@ -39,4 +42,4 @@ def train(
     place = devices.for_maps(device)
     folder = Path(folder or mkdtemp(prefix="swimm3r-splat-"))
     with watched(progress) as told:
-        return train_map.train(reconstruction, frames, settings or UwbsSettings(), folder, told, place)
+        return train_map.train(reconstruction, frames, settings or UwbsSettings(), folder, told, place, observer)

@@ -18,6 +18,7 @@ from swimm3r.splat.recipes import recipe_parts
 from swimm3r.splat.rendering import SplatMap
 from swimm3r.splat.settings import SplatSettings
 from swimm3r.splat.training import loop
+from swimm3r.splat.training.observer import Observer
 from swimm3r.splat.training.scene import TrainingScene, path_radius
 from swimm3r.splat.training.state import map_in_scene_units
 from swimm3r.splat.training_poses import RefinedPoses, training_poses_of, write_refined
@@ -31,6 +32,7 @@ def train(
     folder: Path,
     progress: Progress = silent,
     device: torch.device = CPU,
+    observer: Observer | None = None,
 ) -> SplatMap:
     """Train a map in `folder`: checkpoint/, metrics.jsonl, and at the end map.safetensors and the refined poses.
 
@@ -43,7 +45,8 @@ def train(
     radius = path_radius(rec, scale, settings.working_depth)
     training_scene = TrainingScene(rec, scale, radius, views, poses_in_training, device)
     with devices.memory_for("this map", "fewer primitives, a smaller --splat.long-side, or --map-device cpu"):
-        final = loop.run(recipe_parts(settings), training_scene, _schedule(settings, rec, views), folder, progress)
+        schedule = _schedule(settings, rec, views)
+        final = loop.run(recipe_parts(settings), training_scene, schedule, folder, progress, observer)
     primitives, field = map_in_scene_units(final, 1 / scale)
     poses = None
     if poses_in_training is not None and final.poses is not None:

@@ -32,15 +32,17 @@ Request = tuple[ViewCamera, LayerChoice]
 
 
 class Viewer:
-    """A server and the loop that draws for its browsers. The loop is run by the caller, in any one thread."""
+    """The loop that draws for the browsers of a server. The loop is run by the caller, in any one thread."""
 
-    def __init__(self, run: ViewedRun, settings: ViewerSettings, waters: Sequence[OtherWater] = ()) -> None:
+    def __init__(
+        self, run: ViewedRun, settings: ViewerSettings, waters: Sequence[OtherWater], server: "ViserServer"
+    ) -> None:
         self.painter, self.settings = Painter(run), settings
         self.work = threading.Lock()  # of the renderer: one picture, measurement or video at a time
         self._waters = waters
         self.loop: RenderLoop[Request, Picture] = RenderLoop(self._draw, settings)
         self._panels: dict[int, Panel] = {}
-        self.server = started_server(settings, f"Swimm3R: {run.folder.resolve().name}")
+        self.server = server
         self._place_camera(run)
         self.server.on_client_connect(self._connected)
         self.server.on_client_disconnect(self._left)
@@ -112,7 +114,8 @@ def serve(
     settings = settings or ViewerSettings()
     require_viser()
     run = open_viewed_run(folder, map_device)
-    viewer = Viewer(run, settings, known_waters(waters))
+    others = known_waters(waters)
+    viewer = Viewer(run, settings, others, started_server(settings, f"Swimm3R: {folder.resolve().name}"))
     drawing = threading.Thread(target=viewer.loop.run, name="pictures")
     try:
         with _ended_by_signals() as ended:

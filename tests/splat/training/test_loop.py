@@ -24,6 +24,7 @@ from swimm3r.splat.settings import (
     UwbsSettings,
 )
 from swimm3r.splat.training.loop import view_of_step
+from swimm3r.splat.training.observer import TrainingStep
 from swimm3r.splat.training.scene import TrainingScene
 from swimm3r.splat.views import TrainingViews
 
@@ -181,3 +182,22 @@ def test_a_near_plane_behind_the_scene_is_refused_before_training(tiny_dive, tmp
     with pytest.raises(UsageError, match="near plane"):
         train(tiny_dive.rec, tiny_dive.frames, settings, tmp_path)
     assert not any(tmp_path.iterdir())
+
+
+def test_an_observer_sees_the_map_grow_and_changes_none_of_its_bits(tiny_dive, tmp_path):
+    seen: list[tuple[int, int, SplatMap]] = []
+
+    def watch(done: TrainingStep) -> None:
+        if done.step % 10:
+            return
+        scene = done.map()
+        scene.render(done.camera())
+        torch.rand(3)  # an observer's own randomness is none of the training's
+        seen.append((done.step, done.iterations, scene))
+
+    unwatched = train(tiny_dive.rec, tiny_dive.frames, SETTINGS, tmp_path / "unwatched")
+    watched = train(tiny_dive.rec, tiny_dive.frames, SETTINGS, tmp_path / "watched", observer=watch)
+    assert equal(unwatched, watched)
+    assert [(step, of) for step, of, _ in seen] == [(10, 40), (20, 40), (30, 40), (40, 40)]
+    assert equal(seen[-1][2], watched)
+    assert not equal(seen[0][2], seen[1][2])  # each stays as it was

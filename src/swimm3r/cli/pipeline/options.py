@@ -7,6 +7,7 @@ from swimm3r.cli.terminal.options import OutOrDefault
 from swimm3r.pipeline.presets import Preset
 from swimm3r.sfm.settings import BackendName
 from swimm3r.splat.settings import MapDevice, RecipeName
+from swimm3r.viewer.settings import Port, ViewerSettings
 
 
 @dataclass(frozen=True)
@@ -33,6 +34,18 @@ class PoseOptions:
     its options."""
     reference: Path | None = None
     """File cameras.json with known poses to score the result against."""
+
+
+@dataclass(frozen=True)
+class ViewOptions:
+    """The page that shows a run while it is made."""
+
+    view: bool = False
+    """Show the run in the browser while it is made: the map growing, the losses, a test frame beside its render."""
+    host: str = ViewerSettings().host
+    """Network address of --view: 127.0.0.1 for this computer alone, 0.0.0.0 for everyone who can reach it."""
+    port: Port = ViewerSettings().port
+    """Port of --view; the next free one where it is taken."""
 
 
 @dataclass(frozen=True)

@@ -7,7 +7,7 @@ from typing import Annotated
 
 from tyro.conf import Positional, arg
 
-from swimm3r.cli.pipeline.options import FolderOptions, MapOptions
+from swimm3r.cli.pipeline.options import FolderOptions, MapOptions, ViewOptions
 from swimm3r.cli.pipeline.stages import run_stages
 from swimm3r.cli.terminal.options import FLAT
 from swimm3r.errors import UsageError
@@ -40,6 +40,7 @@ def splat_command(defaults: RunSettings) -> Callable:
         folder: Annotated[FolderOptions, FLAT] = FolderOptions(),  # noqa: B008 - records are frozen
         model: Annotated[ModelOptions, FLAT] = ModelOptions(),
         map: Annotated[MapOptions, FLAT] = MapOptions(defaults.splat.recipe),  # noqa: B008
+        page: Annotated[ViewOptions, FLAT] = ViewOptions(),  # noqa: B008
         frames: Annotated[FrameSettings, FLAT] = defaults.frames,
         sfm: Annotated[type(defaults.sfm), FLAT] = defaults.sfm,
         splat: type(defaults.splat) = defaults.splat,
@@ -53,7 +54,7 @@ def splat_command(defaults: RunSettings) -> Callable:
         given, poses = _input(source, model)
         found = sfm if poses is None else with_poses_of(poses, sfm)
         settings = RunSettings(frames, found, splat, test)
-        run_stages(given, folder, settings, "eval", model.reference, map.map_device)
+        run_stages(given, folder, settings, "eval", model.reference, map.map_device, page)
 
     return splat
 

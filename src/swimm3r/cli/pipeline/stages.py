@@ -4,18 +4,22 @@ The defaults of the options are those of a preset or a settings file that is nam
 folder holds: a command without settings resumes with them, and one with a few changes those alone.
 """
 
-from collections.abc import Sequence
+from collections.abc import Callable, Iterator, Sequence
+from contextlib import contextmanager
 from pathlib import Path
+from typing import Any
 
-from swimm3r.cli.pipeline.options import FolderOptions
+from swimm3r.cli.pipeline.options import FolderOptions, ViewOptions
 from swimm3r.cli.terminal.arguments import named, values_of
-from swimm3r.cli.terminal.console import drawn_progress, print_next, print_results, print_summary
+from swimm3r.cli.terminal.console import Drawn, drawn_progress, print_line, print_next, print_results, print_summary
 from swimm3r.errors import UsageError
 from swimm3r.pipeline.presets import PRESETS, RunSettings, from_yaml, read_config
 from swimm3r.pipeline.run_settings import starting_settings
+from swimm3r.progress import Progress
 from swimm3r.scene.run_folder import input_and_folder, is_run
 from swimm3r.sfm.settings import BackendName, Mast3rSettings, SfmSettings
 from swimm3r.splat.settings import RECIPES, MapDevice
+from swimm3r.viewer.settings import ViewerSettings
 
 RESULTS = {  # of the stages, as far as the folder holds them
     "report.html": "all results on one page",
@@ -75,12 +79,13 @@ def run_stages(
     last: str,
     reference: Path | None = None,
     map_device: MapDevice = "cpu",  # stages before the map ask for no GPU
+    page: ViewOptions | None = None,
 ) -> None:
     """Run the stages up to the last one, then print the outcome, the files that hold it and the next command."""
     source, out = input_and_folder(source, given.out)
     from swimm3r.pipeline.run import run_pipeline
 
-    with drawn_progress() as progress:
+    with drawn_progress() as progress, _watched(out, page, progress) as (told, observer):
         summary = run_pipeline(
             source,
             out,
@@ -89,8 +94,9 @@ def run_stages(
             reference=reference,
             last_stage=last,
             map_device=map_device,
-            progress=progress,
+            progress=told,
             on_stage=progress.begin_stage,
+            observer=observer,
         )
     print_summary(summary)
     print_results(out, {name: what for name, what in RESULTS.items() if name.startswith(_OF_STAGE[last])})
@@ -100,4 +106,18 @@ def run_stages(
         case "sfm":
             print_next("the map, scores and report", "run", source, "--out", out)
         case _:
-            print_next("other views of the map", "render", out)
+            print_next("fly through the map", "view", out)
+
+
+@contextmanager
+def _watched(
+    out: Path, page: ViewOptions | None, progress: Drawn
+) -> Iterator[tuple[Progress, Callable[[Any], None] | None]]:
+    """The progress of a run and the observer of its training; with --view, those of a page in the browser."""
+    if page is None or not page.view:
+        yield progress, None
+        return
+    from swimm3r.viewer.live import live_view
+
+    with live_view(out, ViewerSettings(host=page.host, port=page.port), progress, print_line) as live:
+        yield live.progress, live.observe

@@ -47,7 +47,7 @@ def drawn_progress() -> Iterator[Drawn]:
     console = Console(stderr=True)
     clock = WorkClock()
     if not console.is_terminal:
-        with _compilation_told(clock, _once_in_a_while(lambda: _print_line(_COMPILING)), lambda: None):
+        with _compilation_told(clock, _once_in_a_while(lambda: print_line(_COMPILING)), lambda: None):
             yield Drawn(lines(clock))  # stages announce themselves by their messages
         return
     columns = (
@@ -83,7 +83,7 @@ def lines(clock: Clock) -> Progress:
             return
         said[what] = now
         about = "" if left is None else f", about {left:.0f} s left"
-        _print_line(f"{_title(what, pace)} {done}/{total} ({pace.seconds:.0f} s{about})")
+        print_line(f"{_title(what, pace)} {done}/{total} ({pace.seconds:.0f} s{about})")
 
     return say
 
@@ -130,7 +130,8 @@ def _duration(seconds: float) -> str:
     return f"{hours}:{minutes:02d}:{seconds:02d}"
 
 
-def _print_line(line: str) -> None:
+def print_line(line: str) -> None:
+    """Print a line beside the progress, on stderr."""
     print(line, file=sys.stderr, flush=True)
 
 

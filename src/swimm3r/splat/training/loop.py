@@ -22,6 +22,7 @@ from swimm3r.splat.pose_mlp import PoseMlp
 from swimm3r.splat.primitives.kinds import Primitives
 from swimm3r.splat.settings import SplatSettings
 from swimm3r.splat.training.checkpoint import StateHeader, read_state, state_remedy, write_state
+from swimm3r.splat.training.observer import Observer, TrainingStep
 from swimm3r.splat.training.scene import TrainingScene
 from swimm3r.splat.training.state import State, restored, stored
 from swimm3r.splat.views import TrainingView
@@ -87,7 +88,14 @@ def view_of_step(step: int, views: int, seed: int) -> int:
     return int(torch.randperm(views, generator=generator(seed, epoch, 1))[place])
 
 
-def run(parts: RecipeParts, scene: TrainingScene, schedule: Schedule, folder: Path, progress: Progress) -> State:
+def run(
+    parts: RecipeParts,
+    scene: TrainingScene,
+    schedule: Schedule,
+    folder: Path,
+    progress: Progress,
+    observer: Observer | None = None,
+) -> State:
     """Train from the checkpoint in `folder`, if there is one of this training, else from the start."""
     recipe = parts.build(scene)
     path, metrics = folder / "checkpoint" / "state.safetensors", folder / "metrics.jsonl"
@@ -112,6 +120,8 @@ def run(parts: RecipeParts, scene: TrainingScene, schedule: Schedule, folder: Pa
             sums = {}
         if step % schedule.checkpoint_every == 0 or last:
             write_state(path, stored(state), StateHeader(step, schedule.fingerprint))
+        if observer is not None:
+            observer(TrainingStep(step, schedule.iterations, numbers, view, recipe.scene, state))
     progress("training the map", schedule.iterations, schedule.iterations)
     return state
 
