@@ -20,6 +20,7 @@ from swimm3r import devices
 from swimm3r.cameras import Cameras, cameras_of, image_directions, ray_depth_from_z
 from swimm3r.errors import InputError
 from swimm3r.geometry import pose_from, quaternion_from_rotation, rotation_from_quaternion
+from swimm3r.imaging.depth_colors import depth_image, depth_span
 from swimm3r.io import cameras_json, images
 from swimm3r.io.cameras_json import CameraTable
 from swimm3r.io.files.atomic import atomic_path
@@ -28,7 +29,6 @@ from swimm3r.medium import transmittances
 from swimm3r.pipeline.presets import from_yaml
 from swimm3r.prepare import load_frames
 from swimm3r.progress import Progress, silent
-from swimm3r.report.charts import depth_image
 from swimm3r.scene.frames import Frames
 from swimm3r.scene.reconstruction import Reconstruction
 from swimm3r.scene.reconstruction_io import load_reconstruction
@@ -62,7 +62,7 @@ class DisplayStyle:
 def display_style(scene: SplatMap, rec: Reconstruction, restore: RestoreSettings | None = None) -> DisplayStyle:
     """The look that the restored frames of a reconstruction have, for views of its map."""
     gains = rec.white_balance.factors if scene.has_water else torch.ones(3)
-    return DisplayStyle(gains, depth_span(rec), restore or RestoreSettings())
+    return DisplayStyle(gains, depth_span(rec.point_depths()), restore or RestoreSettings())
 
 
 def shown_clear(out: RenderOutput, camera: Cameras, style: DisplayStyle) -> Float[Tensor, "h w 3"]:
@@ -90,12 +90,6 @@ def write_view(folder: Path, stem: str, out: RenderOutput, camera: Cameras, styl
     images.write_rgb(folder / f"{stem}_z_depth.png", depth_image(out.z_depth.numpy(), *style.near_far))
     with atomic_path(folder / f"{stem}_z_depth.npz") as draft:
         np.savez_compressed(draft, z_depth=out.z_depth.numpy(), alpha=out.alpha.numpy())
-
-
-def depth_span(rec: Reconstruction) -> tuple[float, float]:
-    """The z depths between which all but the nearest and farthest fiftieth of the frames' points lie, scene units."""
-    near, far = np.quantile(rec.point_depths().numpy(), [0.02, 0.98]).tolist()
-    return near, max(far, near * 1.01)
 
 
 def smooth_path(cam2world: Float[Tensor, "c 4 4"], count: int) -> Float[Tensor, "f 4 4"]:

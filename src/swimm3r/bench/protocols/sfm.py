@@ -27,7 +27,7 @@ from swimm3r.pipeline.presets import RunSettings
 from swimm3r.pipeline.run import run_pipeline
 from swimm3r.prepare import check_source, load_frames
 from swimm3r.progress import Progress, silent
-from swimm3r.report.charts import plan_view
+from swimm3r.report.plan_view import plan_view
 from swimm3r.scene.ground_truth import GroundTruth
 from swimm3r.scene.reconstruction import Reconstruction
 from swimm3r.scene.reconstruction_io import load_reconstruction
