@@ -72,11 +72,16 @@ def watched_page(
     height: int = 800,
     scheme: Literal["light", "dark"] = "light",
     touch: bool = False,
+    phone: bool = False,
     scripts: bool = True,
 ) -> WatchedPage:
     """A new page in a context of its own, with a file or an address opened in it if one is given."""
     context = browser.new_context(
-        viewport={"width": width, "height": height}, color_scheme=scheme, has_touch=touch, java_script_enabled=scripts
+        viewport={"width": width, "height": height},
+        color_scheme=scheme,
+        has_touch=touch,
+        is_mobile=phone,
+        java_script_enabled=scripts,
     )
     watched = WatchedPage(context.new_page())
     page = watched.page

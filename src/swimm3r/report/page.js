@@ -4,7 +4,7 @@ document.documentElement.classList.add("js");
 for (const compare of document.querySelectorAll(".compare")) {
   const under = compare.querySelector(".under"), over = compare.querySelector(".over"), stage = compare.querySelector(".stage");
   const range = compare.querySelector("input[type=range]"), name = compare.querySelector(".name");
-  const tag = compare.querySelector(".tag.right"), bar = compare.querySelector(".depth-scale");
+  const tag = compare.querySelector(".tag.right"), bar = compare.parentElement.querySelector(".depth-scale");
   const frames = [...compare.parentElement.querySelectorAll(".frame")];
   let chosen = frames[0];
 

@@ -11,7 +11,7 @@ from dataclasses import dataclass
 import numpy as np
 import torch
 from jaxtyping import Float
-from scipy.spatial import cKDTree
+from scipy.spatial import KDTree
 
 from swimm3r.cameras import image_directions
 from swimm3r.report.plan_view import least_extended
@@ -27,7 +27,7 @@ _STEPS = 65535
 
 @dataclass(frozen=True)
 class Scene3d:
-    """What the page draws: `header` is JSON, `data` the packed points in base64."""
+    """The drawing of the page: `header` is JSON, `data` the packed points in base64."""
 
     header: str
     data: str
@@ -102,7 +102,7 @@ def _spacing(xyz: Float[np.ndarray, "n 3"]) -> float:
     if len(xyz) < 2:
         return 0.0
     asked = xyz[:: max(1, len(xyz) // 2000)]
-    return float(np.median(cKDTree(xyz).query(asked, k=2)[0][:, 1]))
+    return float(np.median(KDTree(xyz).query(asked, k=2)[0][:, 1]))
 
 
 def _down(xyz: Float[np.ndarray, "n 3"], poses: Float[np.ndarray, "c 4 4"]) -> np.ndarray:

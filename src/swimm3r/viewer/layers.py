@@ -13,9 +13,9 @@ from jaxtyping import Bool, Float, UInt8
 from torch import Tensor
 
 from swimm3r.cameras import Cameras, image_directions, pixel_grid, project_visible, ray_depth_from_z, unproject
+from swimm3r.imaging.depth_colors import depth_image
 from swimm3r.medium import Medium, linear_from_srgb, srgb_from_linear
 from swimm3r.pipeline.renders import shown_clear
-from swimm3r.report.charts import depth_image
 from swimm3r.splat.primitives.beta import select
 from swimm3r.splat.projection.pinhole import pinhole
 from swimm3r.splat.rendering import (

@@ -12,7 +12,7 @@ import torch
 
 from swimm3r.errors import Swimm3rError
 from swimm3r.geometry import quaternion_from_rotation
-from swimm3r.report.charts import depth_image
+from swimm3r.imaging.depth_colors import depth_image
 from swimm3r.viewer import camera_path, measuring
 from swimm3r.viewer.camera_path import KeyFrame
 from swimm3r.viewer.layers import CropBox, Layer, LayerChoice, Painter, Picture, ViewCamera

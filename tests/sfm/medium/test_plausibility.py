@@ -69,6 +69,15 @@ def test_curves_without_a_determined_coefficient_are_said_to_give_no_true_colors
     assert said(fit) == ""
 
 
+def test_attenuation_that_linear_light_leaves_open_in_every_channel_is_said(teal):
+    fit, linear = fit_of(teal, 0.05, known=True), fit_of(teal, 0.05, known=True)
+    assert water_warnings(fit, gray=False, linear=linear) == ()
+    linear.identifiable["beta_D"][:] = False
+    (warning,) = water_warnings(fit, gray=False, linear=linear)
+    assert "attenuation is not determined in any color channel" in warning.what
+    assert "near and from far" in warning.advice
+
+
 @pytest.mark.parametrize("known", [True, False])
 def test_red_attenuated_least_is_implausible_in_every_natural_water(teal, known: bool):
     odd = Medium(teal.Binf, torch.tensor([0.03, 0.04, 0.05]), teal.beta_B)

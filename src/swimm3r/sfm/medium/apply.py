@@ -48,7 +48,7 @@ def with_water(
     else:
         eps_inv = predicted.head.min_transmittance
         cloud = restored_cloud(rec, frames, tracks, stored, settings.restore, progress, predicted.at, eps_inv)
-    doubts = water_warnings(stored, gray=frames.gray, predicted=predicted is not None)
+    doubts = water_warnings(stored, gray=frames.gray, predicted=predicted is not None, linear=linear)
     rec = replace(rec, medium=stored, medium_linear=linear, cloud=cloud, warnings=(*rec.warnings, *doubts))
     rec = replace(rec, white_balance=white_balance(rec, settings.restore))
     restored = (

@@ -32,12 +32,15 @@ def any_determined(fit: MediumFit) -> bool:
     return any(bool(flags.any()) for flags in fit.identifiable.values())
 
 
-def water_warnings(fit: MediumFit, *, gray: bool, predicted: bool = False) -> tuple[QualityWarning, ...]:
+def water_warnings(
+    fit: MediumFit, *, gray: bool, predicted: bool = False, linear: MediumFit | None = None
+) -> tuple[QualityWarning, ...]:
     """Everything that speaks against the water that restores a dive's images, or limits what it means.
 
-    `predicted` by a physics head instead of fitted to the frames.
+    `predicted` by a physics head instead of fitted to the frames. `linear` is the fit that tables and the report's
+    verdict are taken from.
     """
-    found = (_gray(gray), _undetermined(fit, predicted), _red_lost_least(fit, gray))
+    found = (_gray(gray), _undetermined(fit, predicted, linear), _red_lost_least(fit, gray))
     return tuple(warning for warning in found if warning is not None)
 
 
@@ -51,7 +54,7 @@ def _gray(gray: bool) -> QualityWarning | None:
     )
 
 
-def _undetermined(fit: MediumFit, predicted: bool) -> QualityWarning | None:
+def _undetermined(fit: MediumFit, predicted: bool, linear: MediumFit | None) -> QualityWarning | None:
     advice = (
         "Train the adapter with held-out pairs, so that its head's error is known, or restore without one."
         if predicted
@@ -66,7 +69,13 @@ def _undetermined(fit: MediumFit, predicted: bool) -> QualityWarning | None:
             advice,
         )
     if any_determined(fit):
-        return None
+        if linear is None or bool(linear.identifiable["beta_D"].any()):
+            return None
+        return QualityWarning(
+            "The attenuation is not determined in any color channel: these frames do not tell over which distance the"
+            " water takes half of the light.",
+            advice,
+        )
     return QualityWarning(
         f"None of the water's coefficients is determined: restored colors (some {factor - 1:.0%} uncertain at the"
         " middle distance) are not the true ones, and the restored frames are not white-balanced.",
