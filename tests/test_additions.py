@@ -19,9 +19,9 @@ import swimm3r
 from swimm3r import export, sfm
 from swimm3r.bench import protocols, scores
 from swimm3r.cameras import DISTORTION_PARAMETERS, CameraModel, Cameras, distort, undistort
-from swimm3r.cli import export as export_command
+from swimm3r.cli.export import export_command
 from swimm3r.datasets import tree
-from swimm3r.export.settings import ExportSettings
+from swimm3r.export.settings import FOLDERS, FORMATS, ExportSettings, FormatName
 from swimm3r.io.colmap.cameras import from_pycolmap_camera, to_pycolmap_camera
 from swimm3r.pipeline.run_settings import starting_settings, with_poses_of
 from swimm3r.settings import declarations
@@ -162,14 +162,20 @@ def _options(settings: type) -> set[str]:
 
 
 def test_every_export_format_is_chosen_by_its_settings_offered_and_described():
-    kinds = {kind.__name__ for kind in get_args(ExportSettings) or (ExportSettings,)}
-    formats = {name: module for name, module in modules(export).items() if name != "settings"}
-    assert len(formats) == len(kinds)
-    assert kinds == cases(export)
-    assert inspect.signature(export_command.export).parameters["settings"].annotation.__origin__ == ExportSettings
-    for name, module in formats.items():
-        assert list(inspect.signature(module.export_run).parameters)[:2] == ["folder", "path"], name
-        assert any(f"`{module.__name__}`" in row for row in rows(page("guides/export.md"))), name
+    kinds = {kind.__name__ for kind in get_args(ExportSettings)}
+    formats = modules(import_module("swimm3r.export.formats"))
+    assert kinds == cases(export) == {type(settings).__name__ for settings in FORMATS.values()}
+    assert tuple(FORMATS) == get_args(FormatName)
+    takes = {name: inspect.signature(module.export_run).parameters for name, module in formats.items()}
+    assert {tuple(parameters) for parameters in takes.values()} == {("folder", "path", "settings")}
+    assert sorted(one["settings"].annotation.__name__ for one in takes.values()) == sorted(kinds)
+    for name, settings in FORMATS.items():
+        offered = inspect.signature(export_command(name)).parameters
+        assert offered["settings"].default == settings
+        assert isinstance(settings, FOLDERS) == (not Path(settings.file_name).suffix)
+        assert any(f"`{name}`" in row for row in rows(page("guides/export.md"))), name
+    for module in formats.values():
+        assert any(f"`{module.__name__}`" in row for row in rows(page("guides/export.md"))), module.__name__
 
 
 # a score

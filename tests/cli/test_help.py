@@ -13,6 +13,7 @@ from swimm3r.cli.main import Family, commands_for, main
 from swimm3r.cli.terminal.help_views import Option, groups_of, options_of
 from swimm3r.cli.terminal.output_level import with_output_level
 from swimm3r.cli.terminal.ranges import settings_with_ranges, with_ranges
+from swimm3r.export.settings import FORMATS
 from swimm3r.settings import Settings, description
 from swimm3r.splat.settings import RECIPES
 
@@ -33,9 +34,14 @@ def all_options() -> dict[tuple[str, ...], dict[str, Option]]:
     """The options of every command, whatever the back end and the recipe."""
     found: dict[tuple[str, ...], dict[str, Option]] = {}
     with settings_with_ranges():
-        for options in ((), ("--backend", "mast3r"), *(("--recipe", name) for name in RECIPES)):
+        for options in (
+            (),
+            ("--backend", "mast3r"),
+            *(("--recipe", name) for name in RECIPES),
+            *(("--format", name) for name in FORMATS),
+        ):
             for path, command in commands(*options):
-                if path[0] not in ("run", "sfm", "splat") and options:
+                if path[0] not in ("run", "sfm", "splat", "export") and options:
                     continue
                 listed = options_of(with_ranges(with_output_level(command)))
                 found.setdefault(path, {}).update((one.name, one) for one in listed)

@@ -10,6 +10,7 @@ import pytest
 from tests.docs.documents import DOCUMENTS, ROOT
 
 from swimm3r.cli.main import main
+from swimm3r.export.settings import FORMATS
 from swimm3r.pipeline.presets import RunSettings
 from swimm3r.settings import Settings, declarations
 from swimm3r.sfm.distillation.settings import TrainSettings
@@ -20,9 +21,10 @@ COMMANDS = (
     *("datasets", "train-sfm", "weights get", "bench render", "bench sfm", "bench flsea", "bench restoration"),
     *("bench localization", "bench ablation-uwbs", "bench ablation-sfm", "run --backend mast3r"),
     *(f"run --recipe {recipe}" for recipe in RECIPES),
+    *(f"export --format {name}" for name in FORMATS),
 )
-OTHER_PROGRAMS = {"--extra-index-url", "--rm", "--junitxml", "--timeout", "--nproc-per-node"}
-"""Of pip, docker, pytest and torchrun."""
+OTHER_PROGRAMS = {"--extra-index-url", "--rm", "--junitxml", "--timeout", "--nproc-per-node", "--prefix"}
+"""Of pip, docker, pytest, torchrun and npm."""
 OPTION = re.compile(r"(?<![\w-])--[a-z][\w.-]*\w")
 
 

@@ -8,16 +8,16 @@ import pytest
 import torch
 
 from swimm3r.cameras import Cameras
-from swimm3r.errors import UsageError
-from swimm3r.export import GaussiansSettings, export_run
+from swimm3r.export.formats.splat_ply import write_ply
 from swimm3r.export.gaussians import (
     Gaussians,
     clear_difference,
     clear_gaussians,
     draw_gaussians,
     moment_matched,
-    write_ply,
 )
+from swimm3r.export.settings import SplatPlySettings
+from swimm3r.export.splats import arrays_of
 from swimm3r.raster import Primitives2D, rasterize
 from swimm3r.splat.medium.field import initial_field
 from swimm3r.splat.primitives.beta import BetaPrimitives, inverse_softplus
@@ -82,7 +82,7 @@ def test_on_the_image_plane_mass_and_second_moments_are_those_of_the_beta_kernel
 
 def test_the_file_holds_what_3dgs_viewers_expect(tmp_path):
     g = gaussians()
-    write_ply(tmp_path / "g.ply", g)
+    write_ply(tmp_path / "g.ply", arrays_of(g))
     head, _, body = (tmp_path / "g.ply").read_bytes().partition(b"end_header\n")
     lines = head.decode().split("\n")
     assert lines[:3] == ["ply", "format binary_little_endian 1.0", "element vertex 5"]
@@ -156,7 +156,7 @@ def test_viewers_see_the_harmonics_with_their_own_signs(tmp_path):
     p = scene.primitives._replace(harmonics=scene.primitives.harmonics.clone())
     p.harmonics[:, 3:] = 0
     g = clear_gaussians(replace(scene, primitives=p), camera())
-    write_ply(tmp_path / "g.ply", g)
+    write_ply(tmp_path / "g.ply", arrays_of(g))
     head, _, body = (tmp_path / "g.ply").read_bytes().partition(b"end_header\n")
     names = [line.split()[-1] for line in head.decode().split("\n") if line.startswith("property")]
     assert [name for name in names if name.startswith("f_rest")] == [f"f_rest_{k}" for k in range(45)]
@@ -171,14 +171,7 @@ def test_viewers_see_the_harmonics_with_their_own_signs(tmp_path):
         np.testing.assert_allclose(seen, expected[:, c], atol=1e-5)
 
 
-def test_a_file_of_another_kind_is_not_replaced(tmp_path):
-    (tmp_path / "notes.txt").write_text("mine")
-    with pytest.raises(UsageError, match="no PLY file"):
-        export_run(tmp_path / "run", tmp_path / "notes.txt")
-    assert (tmp_path / "notes.txt").read_text() == "mine"
-
-
 @pytest.mark.parametrize("time", [-1.0, math.nan, 1e9])
 def test_a_time_outside_of_any_clip_is_refused(time: float):
     with pytest.raises(ValueError, match="time"):
-        GaussiansSettings(time)
+        SplatPlySettings(time)

@@ -54,6 +54,14 @@ BRIEF: dict[tuple[str, ...], Groups] = {
         "matching": ("--matcher", "--weights", "--device", "--candidates", "--rounds", "--min-inliers"),
         "": _MESSAGES,
     },
+    ("export",): {
+        "output": ("--format", "--out"),
+        "splats and clouds": ("--colors", "--time", "--point-limit"),
+        "data sets": ("--with-images", "--text"),
+        "trajectories and cameras": ("--refined",),
+        "depth": ("--type",),
+        "": _MESSAGES,
+    },
     ("demo",): {
         "output": _OUTPUT,
         "dive": ("--frames", "--width", "--height", "--family", "--moving-object", "--seed"),

@@ -1,28 +1,38 @@
-"""`swimm3r export`: a finished map in a format that other programs show."""
+"""`swimm3r export`: a run in the formats of other programs."""
 
+from collections.abc import Callable
 from typing import Annotated
 
 from swimm3r.cli.terminal.options import FLAT, OutOrDefault, Run
-from swimm3r.export.settings import ExportSettings, GaussiansSettings
+from swimm3r.export.settings import FOLDERS, FORMATS, FormatName
 
 
-def export(
-    run: Run,
-    /,
-    out: OutOrDefault = None,
-    settings: Annotated[ExportSettings, FLAT] = GaussiansSettings(),  # noqa: B008
-) -> None:
-    """Write a run's map, without its water, as Gaussians for 3DGS viewers, and say how much is lost on the way.
+def export_command(name: FormatName) -> Callable:
+    """The command, with the options of a format."""
+    default = FORMATS[name]
 
-    Args:
-        run: Run folder with a finished map.
-        out: PLY file to write; RUN/splat/gaussians.ply by default.
-        settings: The format.
-    """
-    from swimm3r.export import export_run
-    from swimm3r.io.files.outputs import output_file
-    from swimm3r.scene.run_folder import open_run
+    def export(
+        run: Run,
+        /,
+        out: OutOrDefault = None,
+        format: FormatName = name,
+        settings: Annotated[type(default), FLAT] = default,
+    ) -> None:
+        """Write a run for other programs, and print what is lost on the way: splats, clouds, data sets, trajectories.
 
-    open_run(run, "splat")
-    with output_file(out or run / "splat" / settings.file_name, "--out") as path:
-        print(export_run(run, path, settings))
+        Splats need a finished map; the other formats need structure from motion alone.
+
+        Args:
+            run: Run folder to export.
+            out: File to write, or a new folder for colmap, nerfstudio and depth; by default a place in RUN.
+            format: Format to write. `--format NAME --help` lists its options.
+            settings: Options of the format.
+        """
+        from swimm3r.export import export_run
+        from swimm3r.io.files.outputs import output_file, output_folder
+
+        path = out or run / settings.file_name
+        with (output_folder if isinstance(settings, FOLDERS) else output_file)(path, "--out"):
+            print(export_run(run, path, settings))
+
+    return export

@@ -22,7 +22,7 @@ from swimm3r.cli.datasets import datasets
 from swimm3r.cli.demo import demo
 from swimm3r.cli.doctor import doctor
 from swimm3r.cli.evaluate import evaluate
-from swimm3r.cli.export import export
+from swimm3r.cli.export import export_command
 from swimm3r.cli.localize import localize
 from swimm3r.cli.pipeline.prepare import prepare_command
 from swimm3r.cli.pipeline.run import run_command
@@ -39,6 +39,7 @@ from swimm3r.cli.train_sfm import train_sfm_command
 from swimm3r.cli.view import view
 from swimm3r.cli.weights import WEIGHTS
 from swimm3r.errors import InputError, StorageError, Swimm3rError, UsageError
+from swimm3r.export.settings import FORMATS
 from swimm3r.memory import out_of_memory
 from swimm3r.pipeline.presets import PRESETS
 from swimm3r.sfm.distillation.settings import RECIPES
@@ -131,7 +132,7 @@ def commands_for(arguments: Sequence[str]) -> dict[str, Callable | Family]:
         "demo": demo,
         "doctor": doctor,
         "eval": evaluate,
-        "export": export,
+        "export": export_command(named("--format", arguments, FORMATS) or "ply"),
         "render": render,
         "localize": localize,
         "report": report,

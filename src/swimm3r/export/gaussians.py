@@ -1,6 +1,6 @@
 """A map as Gaussians that 3DGS viewers show, without its water.
 
-Gaussians leave as they are, their harmonics with the Condon-Shortley sign that viewers expect. A Beta splat of exponent
+Gaussians leave as they are. A Beta splat of exponent
 B on the ellipse of covariance S has on the image plane the mass and the second moments of a Gaussian with
 (docs/derivations/beta-primitives.md#a-gaussian-of-equal-moments)
 
@@ -11,7 +11,6 @@ cameras that have the primitive in their image, and o their mean. How much is lo
 """
 
 from dataclasses import dataclass
-from pathlib import Path
 
 import numpy as np
 import torch
@@ -19,15 +18,9 @@ from jaxtyping import Float
 from torch import Tensor
 from torch.nn.functional import normalize
 
-from swimm3r.cameras import Cameras, cameras_of
-from swimm3r.errors import UsageError
+from swimm3r.cameras import Cameras
 from swimm3r.evaluate.images import psnr_from_errors
-from swimm3r.geometry import quaternion_from_rotation
-from swimm3r.io import cameras_json
-from swimm3r.io.ply import is_ply, write_vertices
 from swimm3r.raster import ALPHA_MAX, ALPHA_MIN, RasterOutput, rasterize
-from swimm3r.scene.run_folder import open_run
-from swimm3r.splat.map_file import load_map
 from swimm3r.splat.primitives.beta import BetaPrimitives, select
 from swimm3r.splat.primitives.gaussian import colored, covariance
 from swimm3r.splat.primitives.spherical_harmonics import Y_00
@@ -37,11 +30,6 @@ from swimm3r.splat.projection.pinhole import pinhole
 from swimm3r.splat.projection.plain import project_conditioned
 from swimm3r.splat.rendering import SplatMap, settings_in_scene_units
 from swimm3r.splat.settings import RenderSettings
-
-_CONDON_SHORTLEY = [(-1.0) ** m for degree in (1, 2, 3) for m in range(-degree, degree + 1)]
-_ASKED = 64  # cameras, spread over the dive, that say which way a primitive is looked at
-_COMPARED = 8  # of them
-_FLATTEST = 1e-6  # a scale of this share of the largest, at least: viewers divide by it
 
 
 @dataclass(frozen=True)
@@ -110,34 +98,6 @@ def moment_matched(scene: SplatMap, cameras: Cameras, time: float | None = None)
     return Gaussians(state.mean[visible], p.rgb[visible], peak[visible], shape[visible], none)
 
 
-def write_ply(path: Path, g: Gaussians) -> None:
-    """The Gaussians as 3DGS stores them: logits, log scales, quaternions wxyz, harmonics channel by channel.
-
-    There are always the 45 harmonics of degree 1 to 3 that its loader insists on; those the map has not are 0.
-    """
-    variance, axes = torch.linalg.eigh(g.covariance.double())
-    scale = variance.clamp(min=0).sqrt()
-    scale = scale.clamp(min=_FLATTEST * scale.amax(-1, keepdim=True)).clamp(min=1e-12)
-    axes = axes * torch.linalg.det(axes).sign()[:, None, None]  # a rotation, not a reflection
-    quaternion = quaternion_from_rotation(axes)
-    known = g.harmonics.shape[1]
-    signed = torch.zeros(len(g.xyz), len(_CONDON_SHORTLEY), 3)
-    signed[:, :known] = g.harmonics * torch.tensor(_CONDON_SHORTLEY[:known])[:, None]
-    columns = {
-        **{name: g.xyz[:, k] for k, name in enumerate("xyz")},
-        **{f"n{name}": torch.zeros(len(g.xyz)) for name in "xyz"},
-        **{f"f_dc_{k}": (g.rgb[:, k] - 0.5) / Y_00 for k in range(3)},
-        **{f"f_rest_{k}": values for k, values in enumerate(signed.permute(2, 1, 0).flatten(0, 1))},
-        "opacity": g.opacity.double().logit(),
-        **{f"scale_{k}": scale[:, k].log() for k in range(3)},
-        **{f"rot_{k}": quaternion[:, k] for k in range(4)},
-    }
-    vertices = np.empty(len(g.xyz), [(name, "<f4") for name in columns])
-    for name, values in columns.items():
-        vertices[name] = values.numpy()
-    write_vertices(path, vertices)
-
-
 def draw_gaussians(g: Gaussians, camera: Cameras, near: float) -> RasterOutput:
     """The image of a 3DGS viewer: exp(-r2 / 2) under the image plane's covariance with its 0.3 px^2 of blur."""
     view = pinhole(camera)
@@ -147,8 +107,18 @@ def draw_gaussians(g: Gaussians, camera: Cameras, near: float) -> RasterOutput:
     return rasterize(p, None, view.height, view.width, kernel="gaussian")
 
 
-def clear_difference(scene: SplatMap, g: Gaussians, cameras: Cameras, time: float | None = None) -> ClearDifference:
-    """The Gaussians against the map they were made of, both without water and before black, seen by `cameras`."""
+def clear_difference(
+    scene: SplatMap,
+    g: Gaussians,
+    cameras: Cameras,
+    time: float | None = None,
+    gains: Float[Tensor, "3"] | None = None,
+) -> ClearDifference:
+    """The Gaussians against the map they were made of, both without water and before black, seen by `cameras`.
+
+    `gains` are the white balance that the Gaussians have and the map has not.
+    """
+    balance = torch.ones(3) if gains is None else gains
     settings, now = settings_in_scene_units(scene.settings, scene.length).render, scene.normalized_time(time)
     colors, alphas = [], []
     with torch.no_grad():
@@ -157,50 +127,6 @@ def clear_difference(scene: SplatMap, g: Gaussians, cameras: Cameras, time: floa
             seen = project(scene.primitives, view, settings, now)
             own = rasterize(seen.primitives, None, view.height, view.width, kernel=seen.kernel)
             theirs = draw_gaussians(g, cameras[i], settings.near)
-            colors.append(theirs.clear - own.clear)
+            colors.append(theirs.clear - balance[:, None, None] * own.clear)
             alphas.append(float((theirs.alpha - own.alpha).mean()))
     return ClearDifference(psnr_from_errors(torch.stack(colors)), float(np.mean(alphas)))
-
-
-@dataclass(frozen=True)
-class Exported:
-    """The result of an export."""
-
-    path: Path
-    gaussians: int
-    primitives: int
-    difference: ClearDifference
-
-    def __str__(self) -> str:
-        return (
-            f"{self.path}: {self.gaussians:,} Gaussians of {self.primitives:,} primitives.\n"
-            f"Beside the map's own clear images: {self.difference.psnr:.1f} dB,"
-            f" mean alpha {self.difference.alpha:+.3f}."
-        )
-
-
-def export_run(folder: Path, path: Path, time: float | None = None) -> Exported:
-    """The Gaussians of a finished run's map, and how far they are from it in views along the dive.
-
-    A dynamic map is exported at `time`, seconds of the clip; half way by default. Raises InputError without a map,
-    UsageError where `path` is a file that is no PLY file: it would be replaced.
-    """
-    if path.is_file() and not is_ply(path):
-        raise UsageError(
-            f"{path} exists and is no PLY file: it is not replaced",
-            cause="a slip in the name of the file to write",
-            hint="another name, or remove the file first",
-        )
-    open_run(folder, "splat")
-    scene = load_map(folder / "splat" / "map.safetensors")
-    refined = folder / "splat" / "cameras.json"
-    table = refined if refined.is_file() else folder / "sfm" / "cameras.json"
-    cameras = cameras_of(cameras_json.read_cameras(table))
-    time = sum(scene.span) / 2 if time is None else time
-    asked = torch.linspace(0, len(cameras) - 1, min(_ASKED, len(cameras))).round().long()
-    canvas = cameras[asked].pinhole(scene.settings.long_side)
-    g = clear_gaussians(scene, canvas, time)
-    write_ply(path, g)
-    looked_at = canvas[torch.linspace(0, len(canvas) - 1, min(_COMPARED, len(canvas))).round().long()]
-    difference = clear_difference(scene, g, looked_at, time)
-    return Exported(path, len(g.xyz), len(scene.primitives.xyz), difference)

@@ -74,6 +74,11 @@ def write_mask(path: Path, usable: Bool[np.ndarray, "h w"]) -> None:
     _write_png(path, usable.astype(np.uint8) * 255)
 
 
+def write_levels(path: Path, levels: UInt16[np.ndarray, "h w"]) -> None:
+    """Write one number of 16 bits per pixel as a gray PNG, whole or not at all."""
+    _write_png(path, levels)
+
+
 def jpeg_uri(image: UInt8[np.ndarray, "h w 3"], long_side: int = 640, quality: int = 88) -> str:
     """A data URI for a page: a JPEG of the image, scaled down to at most `long_side` pixels."""
     import cv2

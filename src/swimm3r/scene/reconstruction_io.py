@@ -18,7 +18,7 @@ from swimm3r.io.files.damage import guard, remake
 from swimm3r.io.files.json_file import read_json
 from swimm3r.scene.frames import Frames
 from swimm3r.scene.reconstruction import DenseCloud, DepthMaps, Matches, Points, QualityWarning, Reconstruction, Tracks
-from swimm3r.scene.white_balance import UNBALANCED, WHITE_BALANCE, read_white_balance
+from swimm3r.scene.white_balance import UNBALANCED, WHITE_BALANCE, WhiteBalance, read_white_balance
 
 _UNFILTERED = "matches_unfiltered.npz"
 _MATCHES = {
@@ -53,8 +53,7 @@ def load_reconstruction(folder: str | Path, frames: Frames | None = None) -> Rec
             _check_frames(sparse, frames)
     about = read_json(folder / "reconstruction.json", _About, remedy)
     fits = medium_json.read_fits(folder / "medium.json", remedy)
-    balanced = _is_balanced(folder)
-    clear = "_physical" if balanced else ""
+    clear = "_physical" if _is_balanced(folder) else ""
     return Reconstruction(
         names=sparse.names,
         cameras=_read_cameras(folder / "cameras.json", sparse.names),
@@ -73,7 +72,7 @@ def load_reconstruction(folder: str | Path, frames: Frames | None = None) -> Rec
         cloud=_load_cloud(folder, "points", clear),
         backdrop=_load_cloud(folder, "backdrop", clear),
         warnings=about.warnings,
-        white_balance=read_white_balance(folder / WHITE_BALANCE, remedy) if balanced else UNBALANCED,
+        white_balance=read_run_balance(folder),
         points_found=about.points_found,
     )
 
@@ -117,6 +116,11 @@ def _read_matches(path: Path, frames: int) -> Matches:
             if len(index) and not 0 <= int(index.min()) <= int(index.max()) < frames:
                 raise ValueError(f"its matches point beyond the {frames} registered frames")
     return Matches(**{name: torch.from_numpy(values) for name, values in stored.items()})
+
+
+def read_run_balance(folder: Path) -> WhiteBalance:
+    """The white balance in RUN/sfm. Raises InputError where it is damaged, or lost beside a balanced cloud."""
+    return read_white_balance(folder / WHITE_BALANCE, remake(folder)) if _is_balanced(folder) else UNBALANCED
 
 
 def _is_balanced(folder: Path) -> bool:

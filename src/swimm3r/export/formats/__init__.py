@@ -1,0 +1,1 @@
+"""One module per format, each with its `export_run(folder, path, settings)`."""

@@ -1,0 +1,41 @@
+"""The cameras of a run that trajectories and camera files are written from."""
+
+from dataclasses import dataclass
+from pathlib import Path
+
+from swimm3r.cameras import Cameras, cameras_of
+from swimm3r.errors import InputError
+from swimm3r.io import cameras_json
+from swimm3r.io.files.damage import remake
+from swimm3r.prepare import load_frames
+from swimm3r.scene.run_folder import open_run
+
+
+@dataclass(frozen=True)
+class TimedCameras:
+    """Cameras with the names and times of their frames."""
+
+    names: tuple[str, ...]
+    times: tuple[float, ...]  # seconds of the clip
+    cameras: Cameras
+    units: str
+
+
+def wanted_poses(folder: Path, *, refined: bool) -> TimedCameras:
+    """The poses by structure from motion, or those refined with the map. Raises InputError where there are none."""
+    open_run(folder, "splat" if refined else "sfm")
+    room = folder / ("splat" if refined else "sfm")
+    if not (room / "cameras.json").is_file():
+        raise InputError(
+            f"the map in {folder} has no poses of its own",
+            cause="its training held the poses that structure from motion found",
+            hint="leave out --refined: they are the same",
+        )
+    table = cameras_json.read_own_cameras(room / "cameras.json", remake(room))
+    times = table.times or load_frames(folder / "prepare").times_of(table.names)
+    return TimedCameras(table.names, times, cameras_of(table), table.units)
+
+
+def unit_of(table: TimedCameras) -> str:
+    """Their unit of length in words."""
+    return "in metres" if table.units == "metres" else "in scene units"
