@@ -27,6 +27,8 @@ from swimm3r.pipeline.presets import MAST3R_PRESETS, PRESETS, RunSettings, from_
 from swimm3r.pipeline.renders import KINDS, render_run
 from swimm3r.pipeline.run import evaluate_run, run_pipeline
 from swimm3r.prepare import load_frames
+from swimm3r.report.outputs import OUTPUTS, outputs_of
+from swimm3r.report.scores import TRUTH_LABELS, truth_rows
 from swimm3r.scene.ground_truth import read_ground_truth
 from swimm3r.scene.reconstruction_io import load_reconstruction
 from swimm3r.sfm.settings import ColmapModelSettings
@@ -255,6 +257,20 @@ def test_the_report_needs_no_network(finished: tuple[Path, dict]):
     assert 'src="data:video/mp4' in page
     assert "http://" not in page.replace("http://www.w3.org", "")
     assert "https://" not in page
+
+
+def test_the_report_lists_every_result_and_names_every_score(finished: tuple[Path, dict]):
+    folder, summary = finished
+    listed = {output.path.rstrip("/") for output in outputs_of(folder)}
+    assert set(OUTPUTS) - listed <= {"splat/cameras.json"}  # of a map that refined the poses
+    truth = summary["truth"]
+    scores = {k for section in (truth, truth["sfm"], truth["splat"]) for k, v in section.items() if _is_score(v)}
+    assert scores <= set(TRUTH_LABELS)
+    assert len(truth_rows(truth)) >= len(scores)
+
+
+def _is_score(value: object) -> bool:
+    return isinstance(value, (int, float, list))
 
 
 def test_finished_stages_are_reused_bit_for_bit(dive: Path, finished: tuple[Path, dict]):

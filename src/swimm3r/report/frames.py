@@ -14,8 +14,8 @@ from swimm3r.scene.reconstruction import Reconstruction
 
 _SHOWN_FRAMES = 8
 _SHOWN_TESTS = 4
-_LONG_SIDE = 800  # pixels
-_QUALITY = 84
+_LONG_SIDE = 720  # pixels
+_QUALITY = 82
 _STEPS = 17  # colors of the bar
 _NUMBERS = (0.0, 0.25, 0.5, 0.75, 1.0)  # places on the bar that carry one
 

@@ -11,7 +11,7 @@ from swimm3r.report import charts
 from swimm3r.report.head import Figure
 
 _MISSING = "\u2013"
-_TRUTH = {  # key of summary.json -> label, unit, factor, decimals
+TRUTH_LABELS = {  # key of summary.json -> name, unit, factor, decimals
     "rotation_deg": ("Rotation between frames, mean error", "\u00b0", 1, 3),
     "rotation_median_deg": ("Rotation of a frame, median error", "\u00b0", 1, 3),
     "translation_deg": ("Direction of translation, mean error", "\u00b0", 1, 3),
@@ -86,14 +86,18 @@ def truth_rows(truth: dict[str, Any] | None) -> list[TruthRow]:
     if not truth:
         return []
     of_sfm, of_map = truth.get("sfm", {}), truth.get("splat", {})
-    rows = [TruthRow(_TRUTH[key][0], _truth_text(key, truth.get(key)), "") for key in _TRUTH if key in truth]
-    for key in _TRUTH:
+    rows = [
+        TruthRow(TRUTH_LABELS[key][0], _truth_text(key, truth.get(key)), "") for key in TRUTH_LABELS if key in truth
+    ]
+    for key in TRUTH_LABELS:
         if key in of_sfm or key in of_map:
-            rows.append(TruthRow(_TRUTH[key][0], _truth_text(key, of_sfm.get(key)), _truth_text(key, of_map.get(key))))
+            rows.append(
+                TruthRow(TRUTH_LABELS[key][0], _truth_text(key, of_sfm.get(key)), _truth_text(key, of_map.get(key)))
+            )
     refined = truth.get("refined_poses", {})
     rows += [
-        TruthRow(f"{_TRUTH[key][0]}, poses refined with the map", "", _truth_text(key, refined[key]))
-        for key in _TRUTH
+        TruthRow(f"{TRUTH_LABELS[key][0]}, poses refined with the map", "", _truth_text(key, refined[key]))
+        for key in TRUTH_LABELS
         if key in refined
     ]
     return rows
@@ -119,7 +123,7 @@ def training_charts(metrics: Path) -> list[str]:
 
 
 def _truth_text(key: str, value: object) -> str:
-    _, unit, factor, decimals = _TRUTH[key]
+    _, unit, factor, decimals = TRUTH_LABELS[key]
     match value:
         case float() | int():
             return f"{value * factor:.{decimals}f}{unit}"
