@@ -10,7 +10,7 @@ The gradient is that of docs/derivations/gradients.md#conditioning in factored f
 quantity.
 """
 
-from typing import no_type_check
+from typing import Any, NamedTuple, no_type_check
 
 import numpy as np
 
@@ -44,26 +44,38 @@ NEAREST = np.float32(1e-24)  # squared distance
 MATRICES = 46
 
 
+class Stored(NamedTuple):
+    """Arrays of the primitives as a map stores them (`primitives.beta`), or of the loss's gradients by them."""
+
+    xyz: Any  # [n, 3]
+    query_mean: Any  # [n, c]
+    opacity: Any  # [n]
+    beta: Any  # [n, 1 + c]
+    scale: Any  # [n, 3 + c]
+    lower: Any  # [n, (3 + c) (2 + c) / 2]
+
+
 @no_type_check
 @inlined
-def load(g, ids, first, count, xyz, query_mean, opacity, beta, scale, lower, camera, time):
+def load(g, ids, first, count, stored, camera, time):
     """Gather `count` primitives (the last one again in spare lanes), activate them, and take their queries."""
-    three, c = xyz.shape[1], query_mean.shape[1]
+    three, c = stored.xyz.shape[1], stored.query_mean.shape[1]
     for q in range(g.shape[3]):
         i = ids[first + min(q, count - 1)]
         for k in range(three):
-            g[XYZ, k, 0, q] = xyz[i, k]
-            g[S, 0, k, q] = scale[i, k]
-        g[B, 0, 0, q] = beta[i, 0]
-        g[O, 0, 0, q] = opacity[i]
-        g[R, 0, 1, q], g[R, 0, 2, q], g[R, 1, 2, q] = lower[i, 0], lower[i, 1], lower[i, 2]
+            g[XYZ, k, 0, q] = stored.xyz[i, k]
+            g[S, 0, k, q] = stored.scale[i, k]
+        g[B, 0, 0, q] = stored.beta[i, 0]
+        g[O, 0, 0, q] = stored.opacity[i]
+        g[R, 0, 1, q], g[R, 0, 2, q], g[R, 1, 2, q] = stored.lower[i, 0], stored.lower[i, 1], stored.lower[i, 2]
         entry = 3
         for r in range(c):
-            g[S, 1, r, q], g[B, 1, r, q], g[X, r, 0, q] = scale[i, 3 + r], beta[i, 1 + r], query_mean[i, r]
+            g[S, 1, r, q], g[B, 1, r, q] = stored.scale[i, 3 + r], stored.beta[i, 1 + r]
+            g[X, r, 0, q] = stored.query_mean[i, r]
             for k in range(three):
-                g[L21, r, k, q] = lower[i, entry + k]
+                g[L21, r, k, q] = stored.lower[i, entry + k]
             for k in range(r):
-                g[L22, r, k, q] = lower[i, entry + 3 + k]
+                g[L22, r, k, q] = stored.lower[i, entry + 3 + k]
             entry += 3 + r
     for row in range(2):
         for k in range(three if row == 0 else c):

@@ -1,0 +1,212 @@
+"""From the conditioned primitives of a block to the image plane, and their gradients: parts of `cpu_project`.
+
+The gradients are those of docs/derivations/gradients.md#projection; D_ names the loss's gradient by a quantity.
+"""
+
+from typing import Any, NamedTuple, no_type_check
+
+import numpy as np
+
+from swimm3r.raster.cpu.math import inlined
+from swimm3r.splat.projection.cpu_conditioning import (  # fmt: skip
+    COV,
+    D_B,
+    D_COV,
+    D_L11,
+    D_L21,
+    D_L22,
+    D_MEAN,
+    D_S,
+    D_X,
+    DIRECTION,
+    DISTANCE,
+    MATRICES,
+    MEAN,
+    OC,
+    SLOPE,
+    B,
+    O,
+)
+from swimm3r.splat.projection.cpu_matrices import (
+    HALF,
+    ONE,
+    SET,
+    TWO,
+    ZERO,
+    product,
+    product_at,
+    product_bt,
+    zero,
+)
+from swimm3r.splat.projection.pinhole import BLUR
+
+LEAST_SPREAD = np.float32(0.01)
+PX2 = np.float32(BLUR)
+POSE = 15  # gradient of R (9), t (3), center (3)
+(FX, FY, CX, CY, X_LOW, X_HIGH, Y_LOW, Y_HIGH, NEAR, UPPER) = range(15, 25)  # of the camera array, after R, t, center
+# matrices after those of conditioning
+AT, J, RV, COV_SEEN, M, M_COV, PLANE, D_AT, D_M, D_J, D_PLANE, OUTER = range(MATRICES, MATRICES + 12)
+
+
+class OnPlane(NamedTuple):
+    """Arrays of the primitives on the image plane, or of the loss's gradients by them."""
+
+    mean2d: Any  # [n, 2]
+    conic: Any  # [n, 3]
+    opacity: Any  # [n]
+    exponent: Any  # [n]
+    depth: Any  # [n]
+    radius: Any  # [n]; empty among gradients
+
+
+@no_type_check
+@inlined
+def onto_plane(g, camera, three, two):
+    """AT in camera axes and PLANE, the covariance on the image plane with its blur."""
+    for i in range(three):
+        at, x, y, z = g[AT, i, 0], g[MEAN, 0, 0], g[MEAN, 1, 0], g[MEAN, 2, 0]
+        r0, r1, r2, t = camera[3 * i], camera[3 * i + 1], camera[3 * i + 2], camera[9 + i]
+        for q in range(g.shape[3]):
+            at[q] = r0 * x[q] + r1 * y[q] + r2 * z[q] + t
+        for j in range(three):
+            upper, lower, seen, rotation = (
+                g[COV, min(i, j), max(i, j)],
+                g[COV, max(i, j), min(i, j)],
+                g[COV_SEEN, i, j],
+                g[RV, i, j],
+            )
+            mix, r = ONE if camera[UPPER] > ZERO else HALF, camera[3 * i + j]
+            for q in range(g.shape[3]):
+                seen[q] = mix * upper[q] + (ONE - mix) * lower[q]
+                rotation[q] = r
+    for axis in range(two):
+        f, low, high = camera[FX + axis], camera[X_LOW + 2 * axis], camera[X_HIGH + 2 * axis]
+        at, z, straight, slant = g[AT, axis, 0], g[AT, 2, 0], g[J, axis, axis], g[J, axis, 2]
+        for q in range(g.shape[3]):
+            inverse = ONE / max(z[q], camera[NEAR])
+            straight[q] = f * inverse
+            slant[q] = -f * inverse * min(max(at[q] * inverse, low), high)
+    product(g, M, J, RV, two, three, three, ONE, SET)
+    product(g, M_COV, M, COV_SEEN, two, three, three, ONE, SET)
+    product_bt(g, PLANE, M_COV, M, two, three, two, ONE, SET)
+    for axis in range(two):
+        variance = g[PLANE, axis, axis]
+        for q in range(g.shape[3]):
+            variance[q] += PX2
+
+
+@no_type_check
+@inlined
+def plane_gradients(g, ids, start, count, camera, three, two, d):
+    """D_AT, D_M, D_COV and D_MEAN of centers, conics and depths (docs/derivations/gradients.md#projection)."""
+    zero(g, D_AT, three, 1)
+    zero(g, D_PLANE, two, two)
+    fx, fy = camera[FX], camera[FY]
+    for q in range(count):
+        i = ids[start + q]
+        x, y, z = g[AT, 0, 0, q], g[AT, 1, 0, q], g[AT, 2, 0, q]
+        a, b, c = g[PLANE, 0, 0, q], g[PLANE, 0, 1, q], g[PLANE, 1, 1, q]
+        det = a * c - b * b
+        if z <= camera[NEAR] or det <= ZERO:
+            continue
+        u, v = d.mean2d[i, 0], d.mean2d[i, 1]
+        g[D_AT, 0, 0, q], g[D_AT, 1, 0, q] = fx / z * u, fy / z * v
+        g[D_AT, 2, 0, q] = d.depth[i] - (fx * x * u + fy * y * v) / (z * z)
+        xx, xy, yy = c / det, -b / det, a / det
+        g00, g01, g11 = d.conic[i, 0], HALF * d.conic[i, 1], d.conic[i, 2]
+        r00, r01, r10, r11 = g00 * xx + g01 * xy, g00 * xy + g01 * yy, g01 * xx + g11 * xy, g01 * xy + g11 * yy
+        g[D_PLANE, 0, 0, q], g[D_PLANE, 0, 1, q] = -(xx * r00 + xy * r10), -(xx * r01 + xy * r11)
+        g[D_PLANE, 1, 0, q], g[D_PLANE, 1, 1, q] = g[D_PLANE, 0, 1, q], -(xy * r01 + yy * r11)
+    product(g, D_M, D_PLANE, M_COV, two, two, three, TWO, SET)
+    product_bt(g, D_J, D_M, RV, two, three, three, ONE, SET)
+    for axis in range(two):
+        f, low, high = camera[FX + axis], camera[X_LOW + 2 * axis], camera[X_HIGH + 2 * axis]
+        at, z, d_at, d_z = g[AT, axis, 0], g[AT, 2, 0], g[D_AT, axis, 0], g[D_AT, 2, 0]
+        straight, slant = g[D_J, axis, axis], g[D_J, axis, 2]
+        for q in range(g.shape[3]):
+            inverse = ONE / max(z[q], camera[NEAR])
+            s, v = at[q] * inverse, f * slant[q]
+            inside = low <= s <= high  # beyond, J follows z alone
+            d_at[q] -= v * inverse * inverse if inside else ZERO
+            d_z[q] -= (f * straight[q] - v * (TWO * s if inside else min(max(s, low), high))) * inverse * inverse
+    product_at(g, OUTER, M, D_PLANE, three, two, two, ONE, SET)
+    product(g, D_COV, OUTER, M, three, two, three, ONE, SET)
+    if camera[UPPER] > ZERO:
+        for i in range(three):
+            for j in range(i):
+                for q in range(g.shape[3]):
+                    g[D_COV, j, i, q] += g[D_COV, i, j, q]
+                    g[D_COV, i, j, q] = ZERO
+    product_at(g, D_MEAN, RV, D_AT, three, three, 1, ONE, SET)
+
+
+@no_type_check
+@inlined
+def along_view(g, q, three):
+    """The part of D_X along lane q's view direction, which a unit vector does not follow."""
+    along = ZERO
+    for k in range(three):
+        along += g[D_X, k, 0, q] * g[DIRECTION, k, 0, q]
+    return along
+
+
+@no_type_check
+@inlined
+def store_on_plane(g, ids, start, count, camera, out):
+    """A block on the image plane; depth and radius are 0 of what does not show."""
+    for q in range(count):
+        i = ids[start + q]
+        x, y, z = g[AT, 0, 0, q], g[AT, 1, 0, q], g[AT, 2, 0, q]
+        xx, xy, yy = g[PLANE, 0, 0, q], g[PLANE, 0, 1, q], g[PLANE, 1, 1, q]
+        det = xx * yy - xy * xy
+        out.opacity[i], out.exponent[i] = g[OC, 0, 0, q], g[B, 0, 0, q]
+        if z <= camera[NEAR] or det <= ZERO:
+            out.mean2d[i, 0], out.mean2d[i, 1], out.depth[i], out.radius[i] = ZERO, ZERO, ZERO, ZERO
+            out.conic[i, 0], out.conic[i, 1], out.conic[i, 2] = ONE, ZERO, ONE
+            continue
+        out.mean2d[i, 0], out.mean2d[i, 1] = camera[FX] * x / z + camera[CX], camera[FY] * y / z + camera[CY]
+        out.conic[i, 0], out.conic[i, 1], out.conic[i, 2] = yy / det, -xy / det, xx / det
+        middle = HALF * (xx + yy)
+        out.depth[i] = z
+        out.radius[i] = np.sqrt(middle + np.sqrt(max(middle * middle - det, LEAST_SPREAD)))
+
+
+@no_type_check
+@inlined
+def add_pose_gradients(g, count, three, pose):
+    """Add a block's gradients by R and t to `pose`; those by the center come with the directions."""
+    for i in range(three):
+        for j in range(three):
+            for q in range(count):
+                pose[3 * i + j] += g[D_AT, i, 0, q] * g[MEAN, j, 0, q]
+                pose[3 * i + j] += g[J, 0, i, q] * g[D_M, 0, j, q] + g[J, 1, i, q] * g[D_M, 1, j, q]
+        for q in range(count):
+            pose[9 + i] += g[D_AT, i, 0, q]
+
+
+@no_type_check
+@inlined
+def store_gradients(g, ids, start, count, three, c, d_opacity, out, pose):
+    """Gradients by the stored parameters of a block, through their activations; adds those by the center to `pose`."""
+    for q in range(count):
+        i, along = ids[start + q], along_view(g, q, three)
+        for k in range(three):
+            across = (g[D_X, k, 0, q] - along * g[DIRECTION, k, 0, q]) / g[DISTANCE, 0, 0, q]
+            out.xyz[i, k] = g[D_MEAN, k, 0, q] + across
+            pose[12 + k] -= across
+            out.scale[i, k] = g[D_S, 0, k, q] * g[SLOPE, 0, k, q]
+        out.opacity[i] = d_opacity[i] * g[OC, 0, 0, q] * (ONE - g[O, 0, 0, q])
+        out.beta[i, 0] = g[D_B, 0, 0, q] * g[B, 0, 0, q]
+        out.lower[i, 0] = g[D_L11, 0, 1, q] - g[D_L11, 1, 0, q]
+        out.lower[i, 1] = g[D_L11, 0, 2, q] - g[D_L11, 2, 0, q]
+        out.lower[i, 2] = g[D_L11, 1, 2, q] - g[D_L11, 2, 1, q]
+        entry = 3
+        for r in range(c):
+            out.query_mean[i, r] = -g[D_X, r, 0, q]
+            out.beta[i, 1 + r] = g[D_B, 1, r, q] * g[B, 1, r, q]
+            out.scale[i, 3 + r] = g[D_L22, r, r, q] * g[SLOPE, 1, r, q]
+            for k in range(three):
+                out.lower[i, entry + k] = g[D_L21, r, k, q]
+            for k in range(r):
+                out.lower[i, entry + 3 + k] = g[D_L22, r, k, q]
+            entry += 3 + r
