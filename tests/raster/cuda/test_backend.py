@@ -13,6 +13,7 @@ from swimm3r.raster import Kernel, MediumMaps, Primitives2D, SggBuffers, bin_pri
 
 wp = pytest.importorskip("warp", reason="warp-lang is not installed: the GPU source was not compiled")
 from swimm3r.raster.cuda import backend as cuda_backend  # noqa: E402
+from swimm3r.raster.cuda import kernels as cuda_kernels  # noqa: E402
 
 Scene = Callable[..., tuple[Primitives2D, MediumMaps]]
 gpu = pytest.mark.gpu
@@ -21,7 +22,7 @@ needs_gpu = pytest.mark.skipif(not torch.cuda.is_available(), reason="no CUDA de
 
 @pytest.mark.parametrize("arch", [80, 86, 90])
 def test_the_kernels_compile_ahead_of_time_without_a_gpu(arch: int, tmp_path: Path):
-    made = wp.compile_aot_module(cuda_backend, arch=arch, module_dir=tmp_path, use_ptx=True)
+    made = wp.compile_aot_module(cuda_kernels, arch=arch, module_dir=tmp_path, use_ptx=True)
     ptx = Path(made[0]).read_text()
     assert f".target sm_{arch}" in ptx
     functions = ptx.split(".visible .entry")[1:]
