@@ -98,14 +98,8 @@ def _receive(url: str, part: Path, weights: Weights, progress: Progress, seconds
     """One connection's worth of the file appended to `part`; True when it is whole."""
     origin = _origin(part)
     have = _size(part) if origin.exists() else 0
-    validator = json.loads(origin.read_text()).get("validator") if have else None
-    headers = {"User-Agent": "swimm3r", "Accept-Encoding": "identity"}
-    if have:
-        headers["Range"] = f"bytes={have}-"
-        if validator:
-            headers["If-Range"] = validator
     try:
-        response = _answer(urllib.request.Request(url, headers=headers), seconds)
+        response = _answer(_request(url, origin, have), seconds)
     except urllib.error.HTTPError as error:
         if error.code != 416 or have == 0:
             raise
@@ -115,22 +109,38 @@ def _receive(url: str, part: Path, weights: Weights, progress: Progress, seconds
         return _receive(url, part, weights, progress, seconds)
     with response:
         resumed = response.status == 206 and response.headers.get("Content-Range", "").startswith(f"bytes {have}-")
-        if not resumed:
-            have = 0
-        length = response.headers.get("Content-Length")
-        total = have + int(length) if length is not None else weights.size
-        if weights.size is not None and total != weights.size:
-            raise WeightsError(
-                f"{url} has {total:,} bytes, the published {weights.filename} has {weights.size:,}",
-                cause="the server sends another version or an error page",
-                hint=f"bring the file by hand and put it into {directory()}",
-            )
+        have = have if resumed else 0
+        total = _total(url, response, have, weights)
         _check_room(part.parent, (total or int((weights.about_mb or 0) * 1e6)) - have)
         tag = response.headers.get("ETag") or response.headers.get("Last-Modified")
         origin.write_text(json.dumps({"url": url, "validator": None if (tag or "").startswith("W/") else tag}))
         with part.open("ab" if resumed else "wb") as file:
             have = _copy(response, file, have, lambda done: progress(weights.filename, done, total or done))
     return total is None or have == total
+
+
+def _request(url: str, origin: Path, have: int) -> urllib.request.Request:
+    """A request for what is missing of a file of which `have` bytes are there, of the version that `origin` names."""
+    headers = {"User-Agent": "swimm3r", "Accept-Encoding": "identity"}
+    if have:
+        headers["Range"] = f"bytes={have}-"
+        validator = json.loads(origin.read_text()).get("validator")
+        if validator:
+            headers["If-Range"] = validator
+    return urllib.request.Request(url, headers=headers)
+
+
+def _total(url: str, response: HTTPResponse, have: int, weights: Weights) -> int | None:
+    """Length of the whole file; None where nobody says. Raises WeightsError for another than the published one."""
+    length = response.headers.get("Content-Length")
+    total = have + int(length) if length is not None else weights.size
+    if weights.size is not None and total != weights.size:
+        raise WeightsError(
+            f"{url} has {total:,} bytes, the published {weights.filename} has {weights.size:,}",
+            cause="the server sends another version or an error page",
+            hint=f"bring the file by hand and put it into {directory()}",
+        )
+    return total
 
 
 def _origin(part: Path) -> Path:

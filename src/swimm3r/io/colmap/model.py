@@ -9,6 +9,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 import numpy as np
+from jaxtyping import Float
 
 from swimm3r.cameras import cameras_of, check_cameras
 from swimm3r.errors import InputError
@@ -120,8 +121,31 @@ def from_pycolmap(model: "pycolmap.Reconstruction") -> ColmapModel:
             cause="its reconstruction did not start, or its images file is empty",
             hint="use another sub-model (sparse/0, sparse/1, ...)",
         )
-    names = tuple(image.name for image in images)
     cameras = [model.cameras[image.camera_id] for image in images]
+    width, height = _one_size(cameras)
+    lens = common_model({camera.model.name for camera in cameras})
+    intrinsics = [from_pycolmap_camera(camera, lens) for camera in cameras]
+    points = [model.points3D[i] for i in sorted(model.point3D_ids())]
+    observations = _observations(points, images)
+    return ColmapModel(
+        names=tuple(image.name for image in images),
+        model=lens,
+        width=width,
+        height=height,
+        K=np.stack([K for K, _ in intrinsics]),
+        distortion=np.stack([distortion for _, distortion in intrinsics]),
+        cam2world=np.stack([_pose(image) for image in images]),
+        xyz=np.array([point.xyz for point in points], np.float64).reshape(-1, 3),
+        rgb=np.array([point.color for point in points], np.uint8).reshape(-1, 3),
+        error=np.array([point.error for point in points], np.float64),
+        track_point=np.array([point for point, _, _ in observations], np.int64),
+        track_frame=np.array([frame for _, frame, _ in observations], np.int64),
+        track_xy=np.array([xy for _, _, xy in observations], np.float64).reshape(-1, 2),
+    )
+
+
+def _one_size(cameras: "list[pycolmap.Camera]") -> tuple[int, int]:
+    """The width and height of all cameras."""
     sizes = sorted({(camera.width, camera.height) for camera in cameras})
     if len(sizes) > 1:
         raise InputError(
@@ -129,39 +153,29 @@ def from_pycolmap(model: "pycolmap.Reconstruction") -> ColmapModel:
             cause="images of several cameras or crops were reconstructed together",
             hint="reconstruct the images of one size, or resize them first",
         )
-    lens = common_model({camera.model.name for camera in cameras})
-    intrinsics = [from_pycolmap_camera(camera, lens) for camera in cameras]
-    cam2world = np.tile(np.eye(4), (len(images), 1, 1))
-    for pose, image in zip(cam2world, images, strict=True):
-        world2cam = image.cam_from_world()
-        if not np.linalg.norm(world2cam.rotation.quat) > 0.5:  # zero would be taken for no rotation
-            raise ValueError(f"the rotation of {image.name} is a quaternion of zeros")
-        pose[:3] = world2cam.inverse().matrix()
+    return sizes[0]
 
-    points = [model.points3D[i] for i in sorted(model.point3D_ids())]
+
+def _pose(image: "pycolmap.Image") -> Float[np.ndarray, "4 4"]:
+    """cam2world of an image."""
+    world2cam = image.cam_from_world()
+    if not np.linalg.norm(world2cam.rotation.quat) > 0.5:  # zero would be taken for no rotation
+        raise ValueError(f"the rotation of {image.name} is a quaternion of zeros")
+    return np.vstack([world2cam.inverse().matrix(), [0.0, 0.0, 0.0, 1.0]])
+
+
+def _observations(
+    points: "list[pycolmap.Point3D]", images: "list[pycolmap.Image]"
+) -> list[tuple[int, int, Float[np.ndarray, "2"]]]:
+    """Point, frame and pixel of every observation in the images."""
     frame_of = {image.image_id: frame for frame, image in enumerate(images)}
     seen = {image.image_id: np.array([p.xy for p in image.points2D]).reshape(-1, 2) for image in images}
-    observations = [
-        (row, frame_of[element.image_id], element.image_id, element.point2D_idx)
+    return [
+        (row, frame_of[element.image_id], seen[element.image_id][element.point2D_idx])
         for row, point in enumerate(points)
         for element in point.track.elements
         if element.image_id in frame_of
     ]
-    return ColmapModel(
-        names=names,
-        model=lens,
-        width=sizes[0][0],
-        height=sizes[0][1],
-        K=np.stack([K for K, _ in intrinsics]),
-        distortion=np.stack([distortion for _, distortion in intrinsics]),
-        cam2world=cam2world,
-        xyz=np.array([point.xyz for point in points], np.float64).reshape(-1, 3),
-        rgb=np.array([point.color for point in points], np.uint8).reshape(-1, 3),
-        error=np.array([point.error for point in points], np.float64),
-        track_point=np.array([row for row, _, _, _ in observations], np.int64),
-        track_frame=np.array([frame for _, frame, _, _ in observations], np.int64),
-        track_xy=np.array([seen[image][k] for _, _, image, k in observations], np.float64).reshape(-1, 2),
-    )
 
 
 def to_pycolmap(model: ColmapModel) -> "pycolmap.Reconstruction":

@@ -10,6 +10,7 @@ from typing import Any
 
 import numpy as np
 
+from swimm3r.io.colmap.model import ColmapModel
 from swimm3r.io.files.json_file import structure
 from swimm3r.io.imports.opencv_fit import nearest_opencv, radial
 from swimm3r.io.imports.record import ForeignModel, one_size, without_points
@@ -134,19 +135,26 @@ def read(document: dict[str, Any]) -> ForeignModel:
     kinds = {kind for kind, *_ in used}
     if len(kinds) > 1:
         raise ValueError(f"it mixes lenses: {', '.join(sorted(kinds))}")
-    cam2world = np.tile(np.eye(4), (len(placed), 1, 1))
-    for pose, view in zip(cam2world, placed, strict=True):
-        known = poses[view.id_pose]
-        pose[:3, :3] = np.array(known.rotation).T
-        pose[:3, 3] = known.center
     model = without_points(
         tuple(str(PurePosixPath(view.local_path.strip("/")) / view.filename) for view in placed),
         kinds.pop(),
         one_size({size for _, size, _, _ in used}),
         np.stack([K for _, _, K, _ in used]),
         np.stack([distortion for *_, distortion in used]),
-        cam2world,
+        np.stack([_cam2world(poses[view.id_pose]) for view in placed]),
     )
+    return ForeignModel("OpenMVG", _with_points(model, file, placed), colored=False)
+
+
+def _cam2world(pose: _Pose) -> np.ndarray:
+    known = np.eye(4)
+    known[:3, :3] = np.array(pose.rotation).T
+    known[:3, 3] = pose.center
+    return known
+
+
+def _with_points(model: ColmapModel, file: _Document, placed: list[_View]) -> ColmapModel:
+    """The model with the file's structure, as the placed views observe it."""
     row = {view.id_view: i for i, view in enumerate(placed)}
     points = [entry.value for entry in file.structure]
     observations = [
@@ -155,7 +163,7 @@ def read(document: dict[str, Any]) -> ForeignModel:
         for seen in point.observations
         if seen.key in row
     ]
-    model = replace(
+    return replace(
         model,
         xyz=np.array([point.X for point in points], np.float64).reshape(-1, 3),
         rgb=np.zeros((len(points), 3), np.uint8),
@@ -164,7 +172,6 @@ def read(document: dict[str, Any]) -> ForeignModel:
         track_frame=np.array([frame for _, frame, _ in observations], np.int64),
         track_xy=np.array([xy for _, _, xy in observations], np.float64).reshape(-1, 2),
     )
-    return ForeignModel("OpenMVG", model, colored=False)
 
 
 def _lenses(entries: tuple[_LensEntry, ...]) -> dict[int, tuple[str, tuple[int, int], np.ndarray, np.ndarray]]:

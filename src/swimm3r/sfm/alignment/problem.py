@@ -103,19 +103,7 @@ class AlignmentProblem:
         frame = torch.cat([torch.full((len(xy),), f) for f, xy, _, _ in sides])
         passes = [bool((p.confidence > settings.confidence_threshold).any()) for p in pairs]
         median = torch.stack([f.anchor_depth.median() for f in frames])
-        matches = np.zeros((len(frames), len(frames)))
-        for p in pairs:
-            matches[p.i, p.j] = matches[p.j, p.i] = len(p.confidence)
-        focal = torch.tensor([f.focal for f in frames])
-        K = None
-        if known.K is not None:
-            K = known.K.float().clone()
-            K[:, :2, 2] += center - 0.5
-            focal = K[:, 0, 0].clone()
-        start = focal
-        if settings.intrinsics == "shared":
-            weight = torch.tensor([f.confidence for f in frames])
-            start = ((focal * weight).sum() / weight.sum()).expand(len(frames)).clone()
+        K, focal, start = _focal_lengths(frames, settings, known, center)
         anchor_frame = torch.repeat_interleave(torch.arange(len(frames)), torch.tensor(counts))
         pose = None if known.cam2world is None else known.cam2world.float()
         posed = known.posed if known.posed is not None else torch.full((len(frames),), pose is not None)
@@ -133,7 +121,7 @@ class AlignmentProblem:
             point_relative=torch.cat([relative for _, _, _, relative in sides]).float(),
             match_confidence=torch.cat([p.confidence * ok for p, ok in zip(pairs, passes, strict=True)]).float(),
             **_failed(pairs, passes, frame, torch.cat([anchor for _, _, anchor, _ in sides])),
-            tree=kinematic_tree(matches, counts, settings.tree),
+            tree=kinematic_tree(_match_counts(pairs, len(frames)), counts, settings.tree),
             pixel_center=center,
             known_K=K,
             known_pose=pose,
@@ -146,6 +134,30 @@ class AlignmentProblem:
         if self.known_K is None:
             return torch.ones(len(self.focal))
         return self.known_K[:, 1, 1] / self.known_K[:, 0, 0]
+
+
+def _focal_lengths(
+    frames: Sequence[AnchoredFrame], settings: AlignmentSettings, known: Known, center: float
+) -> tuple[Tensor | None, Tensor, Tensor]:
+    """Known intrinsics, with the principal point of pixel centers at `center`; focal lengths; and those to start at."""
+    focal = torch.tensor([f.focal for f in frames])
+    K = None
+    if known.K is not None:
+        K = known.K.float().clone()
+        K[:, :2, 2] += center - 0.5
+        focal = K[:, 0, 0].clone()
+    if settings.intrinsics != "shared":
+        return K, focal, focal
+    weight = torch.tensor([f.confidence for f in frames])
+    return K, focal, ((focal * weight).sum() / weight.sum()).expand(len(frames)).clone()
+
+
+def _match_counts(pairs: Sequence[AnchoredPair], frames: int) -> np.ndarray:
+    """Number of matches of every two frames, symmetric."""
+    matches = np.zeros((frames, frames))
+    for p in pairs:
+        matches[p.i, p.j] = matches[p.j, p.i] = len(p.confidence)
+    return matches
 
 
 def _failed(

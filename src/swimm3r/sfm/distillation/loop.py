@@ -17,6 +17,7 @@ from collections.abc import Callable, Iterator
 from concurrent.futures import Future, ThreadPoolExecutor
 from contextlib import contextmanager, nullcontext
 from dataclasses import asdict, dataclass, replace
+from functools import cached_property
 from pathlib import Path
 from typing import Any
 
@@ -92,70 +93,115 @@ def train(
     with _workers(network) as workers:
         student = new_student(network, settings.lora, settings.objective, settings.seed).train()
         try:
-            return _run(student, base, data, validation, settings, folder, validate, announce, progress, workers)
+            return _Training(student, base, data, validation, settings, folder, validate, workers).run(
+                announce, progress
+            )
         finally:
             student.adapters.detach()
 
 
-def _run(
-    student: Student,
-    base: Base,
-    data: PairData,
-    validation: PairData,
-    settings: TrainSettings,
-    folder: Path,
-    validate: Validate,
-    announce: Callable[[Estimate], None],
-    progress: Progress,
-    workers: Workers,
-) -> Path:
-    size = batch_size(settings, len(data), workers)
-    per_epoch = len(data) // size
-    total = settings.epochs * per_epoch
-    optimizer = torch.optim.AdamW(
-        trained_parameters(student).values(), lr=settings.learning_rate, weight_decay=settings.weight_decay
-    )
-    mark = _fingerprint(settings, base, data)
-    state, metrics, adapter = (folder / n for n in ("state.safetensors", "metrics.jsonl", "adapter.safetensors"))
-    done = resume(student, optimizer, state, mark)
-    if workers.first:
-        folder.mkdir(parents=True, exist_ok=True)
-        drop_rows_after(metrics, done)
-        if done < total:
-            announce(_estimate(student, data, settings, total, size, workers))
-    model = _shared(student) if workers.count > 1 else student
-    cache = None
-    if settings.teacher_cache_mb:
-        cache = TeacherCache(folder / "teacher" / mark[:16] / str(workers.rank), settings.teacher_cache_mb << 20)
-    rows = MetricsSums(metrics, folder / "tensorboard" if settings.tensorboard and workers.first else None)
-    with ThreadPoolExecutor(_LOADERS) as pool:
-        coming = _load(pool, data, settings, size, done + 1, workers) if done < total else []
-        for step in range(done + 1, total + 1):
-            if workers.first:
-                progress("training the student", step - 1, total)
+@dataclass(frozen=True)
+class _Training:
+    """One training, its data and its files, as one of the processes sees it."""
+
+    student: Student
+    base: Base
+    data: PairData
+    validation: PairData
+    settings: TrainSettings
+    folder: Path
+    validate: Validate
+    workers: Workers
+
+    @property
+    def adapter(self) -> Path:
+        """The file that is handed on."""
+        return self.folder / "adapter.safetensors"
+
+    @property
+    def state(self) -> Path:
+        """The file that a training resumes from."""
+        return self.folder / "state.safetensors"
+
+    @cached_property
+    def size(self) -> int:
+        """Pairs per step."""
+        return batch_size(self.settings, len(self.data), self.workers)
+
+    @property
+    def per_epoch(self) -> int:
+        """Steps per epoch."""
+        return len(self.data) // self.size
+
+    @cached_property
+    def mark(self) -> str:
+        """Settings, base and data: a state of another training is not continued."""
+        return _fingerprint(self.settings, self.base, self.data)
+
+    def run(self, announce: Callable[[Estimate], None], progress: Progress) -> Path:
+        """Train to the end from the state on disk, if there is one; the path of the adapter."""
+        settings, student, workers = self.settings, self.student, self.workers
+        total = settings.epochs * self.per_epoch
+        optimizer = torch.optim.AdamW(
+            trained_parameters(student).values(), lr=settings.learning_rate, weight_decay=settings.weight_decay
+        )
+        metrics = self.folder / "metrics.jsonl"
+        done = resume(student, optimizer, self.state, self.mark)
+        if workers.first:
+            self.folder.mkdir(parents=True, exist_ok=True)
+            drop_rows_after(metrics, done)
+            if done < total:
+                announce(_estimate(student, self.data, settings, total, self.size, workers))
+        model = _shared(student) if workers.count > 1 else student
+        cache = None
+        if settings.teacher_cache_mb:
+            kept = self.folder / "teacher" / self.mark[:16] / str(workers.rank)
+            cache = TeacherCache(kept, settings.teacher_cache_mb << 20)
+        board = self.folder / "tensorboard" if settings.tensorboard and workers.first else None
+        rows = MetricsSums(metrics, board)
+        with ThreadPoolExecutor(_LOADERS) as pool:
+            for step, items in self._batches(pool, done + 1, total):
+                if workers.first:
+                    progress("training the student", step - 1, total)
+                for group in optimizer.param_groups:
+                    group["lr"] = learning_rate(settings, step, total)
+                terms = _step(model, student, optimizer, items, settings, self.size // workers.count, cache)
+                rows.add(_mean_over_workers(terms, workers), step / self.per_epoch)
+                if workers.first:
+                    self._keep(step, rows, optimizer)
+        if workers.first:
+            progress("training the student", total, total)
+        return self.adapter
+
+    def _batches(self, pool: ThreadPoolExecutor, first: int, total: int) -> Iterator[tuple[int, list[PairItem]]]:
+        """Every step from `first` on and its pairs; those of the next are read meanwhile."""
+        data, settings, size, workers = self.data, self.settings, self.size, self.workers
+        coming = _load(pool, data, settings, size, first, workers) if first <= total else []
+        for step in range(first, total + 1):
             items = [future.result() for future in coming]
             coming = _load(pool, data, settings, size, step + 1, workers) if step < total else []
-            for group in optimizer.param_groups:
-                group["lr"] = learning_rate(settings, step, total)
-            terms = _step(model, student, optimizer, items, settings, size // workers.count, cache)
-            rows.add(_mean_over_workers(terms, workers), step / per_epoch)
-            ends_epoch = step % per_epoch == 0
-            if workers.first and (step % settings.log_every == 0 or ends_epoch):
-                rows.write(step)
-            if workers.first and ends_epoch:
-                about: dict[str, Any] = {"step": step, "epoch": step // per_epoch, "settings": asdict(settings)}
-                if len(validation):
-                    student.eval()
-                    with torch.no_grad():
-                        about["validation"] = validate(student, validation)
-                    student.train()
-                    rows.append({"step": step, "validation": about["validation"]})
-                adapter_file.save(student, base, adapter, about)
-            if workers.first and (step % settings.checkpoint_every == 0 or ends_epoch):
-                write_state(student, optimizer, state, {"step": step, "fingerprint": mark})
-    if workers.first:
-        progress("training the student", total, total)
-    return adapter
+            yield step, items
+
+    def _keep(self, step: int, rows: MetricsSums, optimizer: torch.optim.Optimizer) -> None:
+        """Write what is due after a step: a row of metrics, the adapter, the state to resume from."""
+        ends_epoch = step % self.per_epoch == 0
+        if step % self.settings.log_every == 0 or ends_epoch:
+            rows.write(step)
+        if ends_epoch:
+            about: dict[str, Any] = {"step": step, "epoch": step // self.per_epoch, "settings": asdict(self.settings)}
+            if len(self.validation):
+                about["validation"] = self._validated()
+                rows.append({"step": step, "validation": about["validation"]})
+            adapter_file.save(self.student, self.base, self.adapter, about)
+        if step % self.settings.checkpoint_every == 0 or ends_epoch:
+            write_state(self.student, optimizer, self.state, {"step": step, "fingerprint": self.mark})
+
+    def _validated(self) -> dict[str, Any]:
+        self.student.eval()
+        with torch.no_grad():
+            found = self.validate(self.student, self.validation)
+        self.student.train()
+        return found
 
 
 def _shared(student: Student) -> DistributedDataParallel:

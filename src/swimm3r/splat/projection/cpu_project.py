@@ -161,7 +161,7 @@ def _run(
     d_pose: Tensor,
 ) -> None:
     """The kernel over all blocks of `ids`, on as many threads as torch uses."""
-    primitives, seen, by_primitive = (_arrays(tensors) for tensors in (stored, plane, gradients))
+    primitives, seen, by_primitive = _arrays(stored), _arrays(plane), _arrays(gradients)
     pose, moment = d_pose.numpy(), np.float32(time)
 
     def work(first: int, beyond: int) -> None:
