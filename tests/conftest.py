@@ -86,7 +86,7 @@ def write_video() -> Callable[..., Path]:
             options = {"preset": "ultrafast", "crf": "8"} if codec == "libx264" else {}
             if codec == "libx265":
                 options = {"preset": "ultrafast", "x265-params": "log-level=none"}
-            stream = file.add_stream(codec, rate=30, options=options)
+            stream: Any = file.add_stream(codec, rate=30, options=options)
             stream.pix_fmt, stream.codec_context.time_base = "yuv420p", tick
             for name, value in stream_options.items():
                 setattr(stream.codec_context, name, value)

@@ -95,7 +95,7 @@ def _numpy(keeps: str | None) -> dict[str, str]:
 
 def main() -> int:
     """Run the tests under each profile and say which failed; the exit status is 1 where any did."""
-    parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
+    parser = argparse.ArgumentParser(description=(__doc__ or "").splitlines()[0])
     parser.add_argument("profiles", nargs="*", help=f"of {', '.join(PROFILES)}; all where none is given")
     parser.add_argument("--tests", nargs="+", default=DELICATE, help="files or options of pytest")
     given = parser.parse_args()

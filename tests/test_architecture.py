@@ -118,8 +118,10 @@ def violations(module: str, source: str, is_package: bool = False) -> list[str]:
             if not (module.startswith(f"{package}.") and other.startswith(f"{package}.")):
                 continue
             own, seen = (child_of(package, name) for name in (module, other))
-            rows = row_of(package, own), row_of(package, seen)
-            if own != seen and None not in rows and rows[1] >= rows[0] and "*" not in ROWS[package][rows[0]]:
+            first, second = row_of(package, own), row_of(package, seen)
+            if own == seen or first is None or second is None:
+                continue
+            if second >= first and "*" not in ROWS[package][first]:
                 found.append(f"{module} imports {other}")
     return found
 

@@ -45,7 +45,7 @@ def test_one_seed_is_one_water():
 
 def family_of(water: Medium) -> Family | None:
     """The only family whose red and blue veil both fit; the intervals of the four do not all overlap."""
-    fits = [
+    fits: list[Family] = [
         name
         for name, kind in FAMILIES.items()
         if all(low <= float(value) <= high for value, (low, high) in zip(water.Binf, kind.Binf, strict=True))

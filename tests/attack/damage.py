@@ -41,7 +41,10 @@ ANY = {f.__name__: f for f in (truncated, empty, garbage, missing, folder)}
 
 
 def _text(value: str) -> Damage:
-    return lambda path: path.write_text(value) and None
+    def write(path: Path) -> None:
+        path.write_text(value)
+
+    return write
 
 
 JSON_KINDS: dict[str, Damage] = {

@@ -33,7 +33,7 @@ class Case:
     name: str
     arguments: tuple[str, ...]
     codes: tuple[int, ...]
-    prepare: Callable[[Path], None] = lambda folder: None
+    prepare: Callable[[Path], object] = lambda folder: None
     as_nobody: bool = False  # without root's right to read everything
     memory: int | None = None  # bytes of address space beyond those the process starts with
     seconds: int = 240

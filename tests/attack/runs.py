@@ -116,7 +116,10 @@ def _copied_halfway(run: Path, change: Callable[[Path], None], folder: Path) -> 
 
 def _half_made() -> dict[str, Callable[[Path], None]]:
     def left(name: str, content: bytes) -> Callable[[Path], None]:
-        return lambda sfm: (sfm / name).write_bytes(content) and None
+        def write(sfm: Path) -> None:
+            (sfm / name).write_bytes(content)
+
+        return write
 
     made = {}
     for name in ("database.db", "database.json", "made_from.json"):

@@ -34,7 +34,7 @@ def _good(fixture: Fixture, folder: Path, suffix: str = ".png") -> Path:
 
 def _sources(fixture: Fixture) -> Iterator[Case]:
     def case(name: str, source: str, codes: tuple[int, ...], make: Callable[[Path], object], **options) -> Case:
-        return Case(name, ("prepare", source, "--out", "out"), codes, lambda folder: make(folder) and None, **options)
+        return Case(name, ("prepare", source, "--out", "out"), codes, make, **options)
 
     def fifo(folder: Path) -> None:
         os.mkfifo(folder / "p.mp4")

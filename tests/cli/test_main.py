@@ -19,6 +19,7 @@ from swimm3r.splat.settings import RECIPES
 def outcome(capsys: pytest.CaptureFixture[str], *arguments: str) -> tuple[int, str]:
     with pytest.raises(SystemExit) as stop:
         main(arguments)
+    assert isinstance(stop.value.code, int)
     return stop.value.code, capsys.readouterr().err
 
 

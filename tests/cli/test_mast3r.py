@@ -4,6 +4,7 @@ import argparse
 import json
 from collections.abc import Callable
 from pathlib import Path
+from typing import Any
 
 import pytest
 import torch
@@ -46,7 +47,7 @@ def outcome(capsys: pytest.CaptureFixture[str], *arguments: object) -> tuple[int
     try:
         main([str(argument) for argument in arguments])
     except SystemExit as stop:
-        code = stop.code or 0
+        code = int(stop.code or 0)
     return code, capsys.readouterr().err
 
 
@@ -118,7 +119,8 @@ def of_wrong_sizes(folder: Path, good: Path) -> Path:
 
 def not_a_number(folder: Path, good: Path) -> Path:
     model = checkpoint.load(good)
-    model.downstream_head1.dpt.head[4].bias.fill_(torch.nan)
+    last: Any = model.downstream_head1.dpt.head[4]
+    last.bias.fill_(torch.nan)
     path = folder / "nan.safetensors"
     checkpoint.save(model, path)
     return path

@@ -49,7 +49,7 @@ def outcome(capsys: pytest.CaptureFixture[str], *arguments: str) -> tuple[int, s
     try:
         main(["weights", *arguments])
     except SystemExit as stop:
-        code = stop.code or 0
+        code = int(stop.code or 0)
     shown = capsys.readouterr()
     return code, shown.out, shown.err
 

@@ -1,6 +1,7 @@
 """The trunks against torch.nn modules in torchvision's order; no weights, no score; wrong weights, an error."""
 
 import hashlib
+from typing import Any
 
 import pytest
 import torch
@@ -10,7 +11,7 @@ from swimm3r.errors import WeightsError
 from swimm3r.evaluate import NotComputed
 from swimm3r.evaluate import lpips as module
 from swimm3r.evaluate.images import view_scores
-from swimm3r.evaluate.lpips import load_lpips, lpips
+from swimm3r.evaluate.lpips import Lpips, load_lpips, lpips
 
 TAPS = {"vgg": (3, 8, 15, 22, 29), "alex": (1, 4, 7, 9, 11)}
 
@@ -43,7 +44,8 @@ def weights(request, tmp_path_factory):
     folder = tmp_path_factory.mktemp(backbone)
     features = published_layout(backbone)
     torch.save({f"features.{k}": v for k, v in features.state_dict().items()}, folder / "trunk.pth")
-    channels = [features[t - 1].out_channels for t in TAPS[backbone]]
+    layers: Any = features
+    channels = [layers[t - 1].out_channels for t in TAPS[backbone]]
     heads = {f"lin{k}.model.1.weight": torch.rand(1, c, 1, 1) for k, c in enumerate(channels)}
     torch.save(heads, folder / "heads.pth")
     return backbone, features, list(heads.values()), folder
@@ -111,5 +113,6 @@ def test_weights_that_are_not_the_published_ones_are_refused(weights):
 def test_a_image_too_small_for_the_trunk_is_refused(weights):
     backbone, _, _, folder = weights
     model = load_lpips(folder / "trunk.pth", folder / "heads.pth", backbone)
+    assert isinstance(model, Lpips)
     with pytest.raises(ValueError, match="32 pixels"):
         lpips(torch.zeros(31, 64, 3), torch.zeros(31, 64, 3), model)

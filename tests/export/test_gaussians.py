@@ -153,6 +153,7 @@ def test_gaussians_leave_as_they_are():
 def test_viewers_see_the_harmonics_with_their_own_signs(tmp_path):
     """3DGS's degree 1 is C1 (-y, z, -x), its coefficients stand channel by channel."""
     scene = gaussian_wall()
+    assert isinstance(scene.primitives, GaussianPrimitives)
     p = scene.primitives._replace(harmonics=scene.primitives.harmonics.clone())
     p.harmonics[:, 3:] = 0
     g = clear_gaussians(replace(scene, primitives=p), camera())

@@ -2,6 +2,7 @@
 
 import base64
 from pathlib import Path
+from typing import Any
 
 import cv2
 import numpy as np
@@ -99,7 +100,8 @@ def test_every_orientation_stands_upright(tmp_path, orientation, suffix):
     elif suffix == "lzw.tif":
         sensor.save(path, compression="tiff_lzw", tiffinfo={274: orientation})
     else:
-        sensor.save(path, exif=exif, **({"quality": 100, "subsampling": 0} if suffix == ".jpg" else {}))
+        options: dict[str, Any] = {"quality": 100, "subsampling": 0} if suffix == ".jpg" else {}
+        sensor.save(path, exif=exif, **options)
     read = read_rgb(path)
     assert image_size(path) == (48, 32) == read.shape[1::-1]
     assert np.abs(read.astype(int) - upright).max() < 10

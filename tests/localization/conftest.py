@@ -51,7 +51,7 @@ def place(tmp_path_factory: pytest.TempPathFactory) -> Place:
     rec = Reconstruction(
         names=frames.train.names,
         cameras=cameras[[0, 1, 3, 5]],
-        points=Points(xyz.double(), scene.primitives.rgb, torch.zeros(len(xyz))),
+        points=Points(xyz.double(), _beta(scene).rgb, torch.zeros(len(xyz))),
         tracks=Tracks(none, none, torch.zeros(0, 2)),
         matches=Matches(none, none, torch.zeros(0, 2), torch.zeros(0, 2), torch.zeros(0)),
         depth=depth,
@@ -61,11 +61,16 @@ def place(tmp_path_factory: pytest.TempPathFactory) -> Place:
     return Place(scene, rec, frames, cameras)
 
 
+def _beta(scene: SplatMap) -> BetaPrimitives:
+    assert isinstance(scene.primitives, BetaPrimitives)
+    return scene.primitives
+
+
 def _blotchy_wall() -> SplatMap:
     rng = torch.Generator().manual_seed(0)
     y, x = torch.meshgrid(torch.linspace(-1.4, 1.4, 110), torch.linspace(-1.8, 1.8, 140), indexing="ij")
     xyz = torch.stack([x, y, 2 + 0.1 * torch.sin(2 * x) * torch.cos(3 * y)], -1).reshape(-1, 3)
-    blotches = sum(
+    blotches = torch.zeros(3, 110, 140) + sum(
         torch.nn.functional.interpolate(torch.rand(1, 3, n, n, generator=rng), (110, 140), mode="bicubic")[0] / n**0.3
         for n in (12, 40, 90)
     )

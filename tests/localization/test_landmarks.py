@@ -23,7 +23,7 @@ def plane(tmp_path_factory: pytest.TempPathFactory) -> tuple[Reconstruction, Fra
     """Four images of a blotchy plane at z = 2 from a camera that slides and turns; the third is not registered."""
     folder = tmp_path_factory.mktemp("plane")
     rng = torch.Generator().manual_seed(0)
-    blotches = sum(
+    blotches = torch.zeros(3, 640, 640) + sum(
         torch.nn.functional.interpolate(torch.rand(1, 3, n, n, generator=rng), (640, 640), mode="bicubic")[0] / n**0.3
         for n in (12, 40, 120)
     )

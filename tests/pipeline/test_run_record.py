@@ -227,7 +227,7 @@ def outcome(capsys: pytest.CaptureFixture[str], *arguments: object) -> tuple[int
     try:
         main([str(argument) for argument in arguments])
     except SystemExit as stop:
-        code = stop.code or 0
+        code = int(stop.code or 0)
     return code, capsys.readouterr().err
 
 

@@ -1,6 +1,7 @@
 """Folders of stills: names, sizes, order, masks, and what cannot be used."""
 
 import os
+from typing import Any
 
 import cv2
 import numpy as np
@@ -192,7 +193,7 @@ def test_without_any_clock_no_date_is_made_up(dive, prepared):
 def test_sharper_images_score_higher(tmp_path, prepared):
     sharp = cv2.resize(image(0), (640, 480), interpolation=cv2.INTER_CUBIC)
     for i, sigma in enumerate((0.01, 2, 4)):
-        write(tmp_path / "dive" / f"{i}.png", cv2.GaussianBlur(sharp, None, sigma))
+        write(tmp_path / "dive" / f"{i}.png", cv2.GaussianBlur(sharp, (0, 0), sigma))
     first, second, third = (frame.sharpness for frame in read_frames(tmp_path / "dive", folder=prepared))
     assert first > second > third > 0
 
@@ -308,7 +309,9 @@ def test_without_a_folder_the_cache_is_used_and_found_again(dive, tmp_path, monk
 
 
 def test_settings_that_make_no_sense_are_refused(dive, prepared):
-    for changes in ({"fps": -1.0}, {"fps": float("nan")}, {"start": 5.0, "end": 5.0}, {"long_side": -1}):
+    cases: list[dict[str, Any]]
+    cases = [{"fps": -1.0}, {"fps": float("nan")}, {"start": 5.0, "end": 5.0}, {"long_side": -1}]
+    for changes in cases:
         with pytest.raises(UsageError):
             read_frames(dive, folder=prepared, **changes)
 

@@ -2,6 +2,7 @@
 
 import json
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
@@ -59,6 +60,7 @@ def test_masks_may_have_the_very_names_of_the_images(tmp_path, suffix, layout):
         image = np.random.default_rng(i).integers(0, 255, (48, 64, 3), dtype=np.uint8)
         Image.fromarray(image).save(root / f"{i}{suffix}")
         mask = USABLE.astype(np.uint8) * 255
+        tight: dict[str, Any]
         tight = {"quality": 100} if suffix in (".jpg", ".JPG") else {"lossless": True} if suffix == ".webp" else {}
         Image.fromarray(mask).save(folders[layout] / f"{i}{suffix}", **tight)
     masks = folders[layout] if layout.startswith("given") else None

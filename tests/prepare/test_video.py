@@ -15,7 +15,7 @@ TEXTURE = np.random.default_rng(0).integers(0, 255, (24, 32, 3), dtype=np.uint8)
 
 def numbered(i, blur=0.0):
     """A texture that carries its number as eight black or white bars."""
-    image = cv2.GaussianBlur(TEXTURE, None, blur) if blur else TEXTURE.copy()
+    image = cv2.GaussianBlur(TEXTURE, (0, 0), blur) if blur else TEXTURE.copy()
     for bit in range(8):
         image[:48, bit * 32 : bit * 32 + 32] = 255 * (i >> bit & 1)
     return image

@@ -249,7 +249,9 @@ def test_clear_water_shows_the_clear_image(backend: Backend, scene: Scene):
 def test_clear_water_has_the_gradients_of_water_without_coefficients(backend: Backend, kernel: Kernel, scene: Scene):
     p, _ = scene(60, 29, 37)
     results = []
-    for way, medium in ((backend, None), ("reference", MediumMaps(*torch.zeros(3, 3, 29, 37, dtype=torch.float64)))):
+    water = MediumMaps(*torch.zeros(3, 3, 29, 37, dtype=torch.float64))
+    ways: list[tuple[Backend, MediumMaps | None]] = [(backend, None), ("reference", water)]
+    for way, medium in ways:
         leaves = [t.to(torch.float32 if medium is None else torch.float64).requires_grad_() for t in p]
         sgg = SggBuffers(*(b.to(leaves[0]) for b in SggBuffers.zeros(60)))
         out = rasterize(Primitives2D(*leaves), medium, 29, 37, kernel=kernel, sgg=sgg, backend=way)

@@ -55,7 +55,7 @@ def finite(fit: MediumFit) -> bool:
 @pytest.fixture(scope="module")
 def known_water(teal: Medium) -> MediumFit:
     zero, yes = torch.zeros(3), torch.ones(3, dtype=torch.bool)
-    known = dict.fromkeys(("Binf", "beta_D", "beta_B"), yes)
+    known: dict[str, torch.Tensor] = {name: yes for name in ("Binf", "beta_D", "beta_B")}
     return MediumFit(
         **vars(teal),
         curve=AttenuationCurve(teal.beta_D, zero, zero, zero),

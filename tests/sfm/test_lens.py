@@ -1,6 +1,7 @@
 """Every back end makes the same lens of the same numbers, and refuses the same slips."""
 
 from dataclasses import replace
+from typing import Any
 
 import pytest
 import torch
@@ -9,7 +10,7 @@ from swimm3r.errors import UsageError
 from swimm3r.sfm.lens import check_lens_settings, lens_of
 from swimm3r.sfm.settings import ColmapSettings, LensSettings, Mast3rSettings
 
-GIVEN = {"focal": 900.0, "k1": -0.1, "p2": 0.002}
+GIVEN: dict[str, Any] = {"focal": 900.0, "k1": -0.1, "p2": 0.002}
 
 
 @pytest.mark.parametrize("settings", [ColmapSettings(**GIVEN), Mast3rSettings(**GIVEN)])

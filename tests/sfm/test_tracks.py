@@ -11,7 +11,8 @@ WIDTH, HEIGHT = 40, 30
 def matches(*rows: tuple[int, tuple[int, int], int, tuple[int, int], float]) -> FrameMatches:
     i, xy_i, j, xy_j, confidence = zip(*rows, strict=True)
     xyz = torch.arange(3.0 * len(rows)).reshape(-1, 3)
-    return FrameMatches(*(torch.tensor(column) for column in (i, j, xy_i, xy_j, confidence)), xyz)
+    a, b, at_a, at_b, sure = (torch.tensor(column) for column in (i, j, xy_i, xy_j, confidence))
+    return FrameMatches(a, b, at_a, at_b, sure, xyz)
 
 
 def observations(tracks) -> set[frozenset[tuple[int, int, int]]]:

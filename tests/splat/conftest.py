@@ -114,6 +114,7 @@ def tiny_dive(tmp_path_factory: pytest.TempPathFactory) -> TinyDive:
         listed.append(Frame(path.name, path, float(i), 1.0, "test" if i % 8 == 0 else "train"))
     frames = Frames(tuple(listed), width, height, True)
     flat = torch.zeros(3)
+    assert isinstance(truth.primitives, BetaPrimitives)
     xyz, rgb = truth.primitives.xyz, truth.primitives.rgb
     none = torch.zeros(0, dtype=torch.int64)
     rec = Reconstruction(

@@ -7,7 +7,7 @@ import pytest
 import torch
 
 from swimm3r.cameras import Cameras
-from swimm3r.raster import MediumMaps, RasterOutput, rasterize
+from swimm3r.raster import Backend, MediumMaps, RasterOutput, rasterize
 from swimm3r.splat.primitives.beta import BetaPrimitives
 from swimm3r.splat.projection.dispatch import project
 from swimm3r.splat.projection.pinhole import Pinhole, pinhole
@@ -36,7 +36,7 @@ def loss(out: RasterOutput) -> torch.Tensor:
     return sum(((w * image).sum() for w, image in zip(weights, out, strict=True)), torch.zeros(()))
 
 
-def image(p: BetaPrimitives, view: Pinhole, backend: str) -> RasterOutput:
+def image(p: BetaPrimitives, view: Pinhole, backend: Backend) -> RasterOutput:
     dtype = p.xyz.dtype
     time = TIME.to(dtype) if p.query_mean.shape[1] == 4 else None
     drawn = project(p, view, RenderSettings(), time).primitives
@@ -85,7 +85,8 @@ def test_gradients_of_the_image_agree_with_finite_differences(c: int, primitives
 def test_the_fast_path_gives_the_oracles_image_and_gradients(c: int, primitives: Make, camera):
     p, view, pose = scene(primitives, camera, c)
     results = []
-    for dtype, backend in ((torch.float64, "reference"), (torch.float32, "numba")):
+    kinds: list[tuple[torch.dtype, Backend]] = [(torch.float64, "reference"), (torch.float32, "numba")]
+    for dtype, backend in kinds:
         leaves = [t.to(dtype).requires_grad_() for t in (*p, pose)]
         out = image(BetaPrimitives(*leaves[:-1]), turned(view, leaves[-1]), backend)
         results.append((out, torch.autograd.grad(loss(out), leaves)))

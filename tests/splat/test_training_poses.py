@@ -1,6 +1,7 @@
 """The training frames' poses, refined with the map."""
 
 from dataclasses import replace
+from typing import Any
 
 import pytest
 import torch
@@ -55,7 +56,8 @@ def test_zero_codes_leave_every_pose_where_it_is(tiny_dive):
     codes = PoseMlp(len(s), TrainingPoseSettings())
     torch.testing.assert_close(s.moved(codes), s.cameras.cam2world)
     total = s.moved(codes)[:, :3, 3].sum()
-    learns = torch.autograd.grad(total, codes.network[4].weight)[0]
+    last: Any = codes.network[4]
+    learns = torch.autograd.grad(total, last.weight)[0]
     assert (learns != 0).any()  # the last layer is zero, what it reads is not
 
 

@@ -142,7 +142,7 @@ class McmcGsSettings(GaussianSettings):
     )
 
     @property
-    def recipe(self) -> str:
+    def recipe(self) -> Literal["threers_gs", "mcmc_gs"]:
         """The name of the method."""
         return "threers_gs" if self.poses.enabled else "mcmc_gs"
 
@@ -208,7 +208,7 @@ class WaterSplattingSettings(GaussianSettings):
     """Share of the run after which the size of the training images doubles."""
 
     @property
-    def recipe(self) -> str:
+    def recipe(self) -> Literal["watersplatting"]:
         """The name of the method."""
         return "watersplatting"
 
@@ -293,6 +293,6 @@ class SeaSplatSettings(GaussianSettings):
     water: SceneWaterSettings = field(default_factory=SceneWaterSettings)
 
     @property
-    def recipe(self) -> str:
+    def recipe(self) -> Literal["seasplat"]:
         """The name of the method."""
         return "seasplat"

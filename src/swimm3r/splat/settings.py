@@ -230,7 +230,7 @@ class UwbsSettings(MapSettings):
     sgg: SggSettings = field(default_factory=SggSettings)
 
     @property
-    def recipe(self) -> str:
+    def recipe(self) -> Literal["uwbs-static", "uwbs-dynamic", "ubs"]:
         """The name of the method."""
         if self.medium.model == "none":
             return "ubs"

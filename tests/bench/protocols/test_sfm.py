@@ -3,6 +3,7 @@
 import shutil
 from dataclasses import replace
 from pathlib import Path
+from typing import Any
 
 import pytest
 import torch
@@ -12,7 +13,7 @@ from swimm3r.bench.protocols import sfm as bench_sfm
 from swimm3r.bench.protocols.restoration import score_restoration
 from swimm3r.bench.protocols.sfm import compare_sfm
 from swimm3r.bench.runs import original_pixels, sfm_label
-from swimm3r.bench.settings import PEERS, SfmMethods
+from swimm3r.bench.settings import PEERS, SfmMethod, SfmMethods
 from swimm3r.bench.sfm_methods import Uncapped, model_scores, reference_scores, settings_for
 from swimm3r.cameras import project
 from swimm3r.errors import InputError, RegistrationError
@@ -104,7 +105,7 @@ def test_frames_that_are_not_placed_fail_their_pairs(run: Path):
 
 @pytest.mark.usefixtures("weightless")
 def test_each_method_has_its_settings_or_says_what_is_missing(tmp_path: Path):
-    def chosen(method, given=SfmMethods(), mast3r=Mast3rSettings()):  # noqa: B008
+    def chosen(method: SfmMethod, given=SfmMethods(), mast3r=Mast3rSettings()) -> Any:  # noqa: B008
         return settings_for(method, "reef", given, ColmapSettings(), mast3r)
 
     assert chosen("colmap-global").mapping.method == "global"
@@ -177,7 +178,7 @@ def water(estimator: Estimator) -> MediumFit:
     one = torch.ones(3)
     medium, known = Medium(0.3 * one, 0.4 * one, 0.2 * one), torch.ones(3, dtype=torch.bool)
     curve = AttenuationCurve(0.4 * one, 0 * one, 0 * one, 0 * one)
-    flags = dict.fromkeys(("Binf", "beta_D", "beta_B"), known)
+    flags: dict[str, torch.Tensor] = {name: known for name in ("Binf", "beta_D", "beta_B")}
     return MediumFit(
         **vars(medium),
         curve=curve,
@@ -226,7 +227,7 @@ def test_restored_frames_are_scored_in_physical_colors_beside_the_shown_ones_and
         assert cell.scores["uiqm_funie"] == pytest.approx(sum(uiqm(image).uiqm for image in images) / 2, rel=1e-3)
         assert cell.scores["uciqe_cielab"] == pytest.approx(sum(uciqe(image) for image in images) / 2, rel=1e-3)
         assert cell.scores["uranker"] == URANKER
-    assert len({round(cell.scores["uciqe_cielab"], 2) for cell in table.cells}) == 3
+    assert len({f"{cell.scores['uciqe_cielab']:.2f}" for cell in table.cells}) == 3
     assert list((tmp_path / "out" / "images" / "dive").glob("*.png"))
     nothing = score_restoration([with_water(run, tmp_path / "unrestored")], tmp_path / "none").cells[1]
     assert isinstance(nothing.scores["uiqm_funie"], NotComputed)

@@ -61,8 +61,8 @@ def same_cameras(found: ForeignModel, scene: Scene, scale: float = 1.0) -> None:
 
 def same_pixels(found: ForeignModel, scene: Scene, pixels: np.ndarray, scale: float = 1.0) -> None:
     model = found.model
-    cameras = Cameras(*(torch.from_numpy(a) for a in (model.K, model.distortion, model.cam2world)),
-                      model.width, model.height, model.model)  # fmt: skip
+    K, distortion, cam2world = (torch.from_numpy(a) for a in (model.K, model.distortion, model.cam2world))
+    cameras = Cameras(K, distortion, cam2world, model.width, model.height, model.model)
     uv = project(cameras, torch.from_numpy(scene.xyz * scale).expand(N, -1, -1))[0].numpy()
     np.testing.assert_allclose(uv, pixels, atol=1e-6)
 
@@ -266,8 +266,9 @@ def test_openmvg_keeps_points_and_observations(scene: Scene, tmp_path: Path):
     assert not found.colored
     np.testing.assert_allclose(found.model.xyz, scene.xyz)
     assert len(found.model.track_point) == 20 * N
-    cameras = Cameras(*(torch.from_numpy(a) for a in (found.model.K, found.model.distortion, found.model.cam2world)),
-                      WIDTH, HEIGHT, found.model.model)  # fmt: skip
+    m = found.model
+    K, distortion, cam2world = (torch.from_numpy(a) for a in (m.K, m.distortion, m.cam2world))
+    cameras = Cameras(K, distortion, cam2world, WIDTH, HEIGHT, m.model)
     uv = project(cameras, torch.from_numpy(scene.xyz).expand(N, -1, -1))[0].numpy()
     seen = uv[found.model.track_frame, found.model.track_point]
     np.testing.assert_allclose(seen, found.model.track_xy, atol=1e-6)

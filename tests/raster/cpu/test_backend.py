@@ -11,7 +11,7 @@ import pytest
 import torch
 from torch.nn.functional import interpolate
 
-from swimm3r.raster import ALPHA_MIN, Kernel, MediumMaps, Primitives2D, SggBuffers, bin_primitives, rasterize
+from swimm3r.raster import ALPHA_MIN, Backend, Kernel, MediumMaps, Primitives2D, SggBuffers, bin_primitives, rasterize
 from swimm3r.raster.cpu import adjoint, forward, math, tiles
 
 Scene = Callable[..., tuple[Primitives2D, MediumMaps]]
@@ -155,7 +155,8 @@ def test_smooth_water_and_water_that_changes_within_a_tile_agree_with_the_oracle
     smooth = MediumMaps(*(interpolate(c, (48, 64), mode="bilinear", align_corners=True)[0] for c in corners))
     for medium in (smooth, rough, MediumMaps(*(maps.mean((1, 2), keepdim=True).expand_as(maps) for maps in rough))):
         results = []
-        for dtype, backend in ((torch.float32, "numba"), (torch.float64, "reference")):
+        kinds: list[tuple[torch.dtype, Backend]] = [(torch.float32, "numba"), (torch.float64, "reference")]
+        for dtype, backend in kinds:
             leaves = [t.to(dtype).requires_grad_() for t in (*p, *medium)]
             out = rasterize(Primitives2D(*leaves[:6]), MediumMaps(*leaves[6:]), 48, 64, backend=backend)
             results.append([*out, *torch.autograd.grad(out.rgb.square().sum(), leaves)])

@@ -72,7 +72,7 @@ def make_scene(n: int = 4, noise: float = 0.0, scales: torch.Tensor | None = Non
             points = rays_of(cameras[f]) * z[f, ..., None] * scales[f]
             points = points * (1 + noise * torch.randn(*points.shape, generator=generator))
             sums[f] = canonical.add_pass(sums[f], points, torch.full((HEIGHT, WIDTH), 5.0))
-    views = [canonical.canonical_view(s) for s in sums]
+    views = [canonical.canonical_view(s) for s in sums if s is not None]
     frames = [canonical.anchored_frame(v, pixel_center=center) for v in views]
     pairs = [match(cameras, z, views, i, j) for i, j in graph]
     return Scene(cameras, z, frames, pairs, views)
@@ -312,6 +312,7 @@ def test_streamed_canonical_view_is_the_average_over_all_passes():
     sums = None
     for X, C in zip(passes, confidence, strict=True):
         sums = canonical.add_pass(sums, X, C)
+    assert sums is not None
     view = canonical.canonical_view(sums)
     w = confidence - 0.999
     mean = (w[..., None] * passes).sum(0) / w.sum(0)[..., None]

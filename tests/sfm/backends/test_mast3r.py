@@ -4,6 +4,7 @@ import os
 from collections.abc import Callable
 from dataclasses import dataclass, replace
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
@@ -61,7 +62,7 @@ class ExactNetwork(Mast3r):
     def decode(self, view1: Encoded, view2: Encoded) -> tuple[Decoded, Decoded]:
         self.passes.append((int(view1.tokens[0, 0, 0]), int(view2.tokens[0, 0, 0])))
         both = (view1.tokens, view2.tokens)
-        return tuple(Decoded(both, view.height, view.width) for view in (view1, view2))
+        return Decoded(both, view1.height, view1.width), Decoded(both, view2.height, view2.width)
 
     def pointmap(self, view: Decoded, which: int) -> Pointmap:
         first, own = self._frames(view, which)
@@ -111,7 +112,8 @@ class Dive:
         assert (frame.left, frame.top) == (0, 0)
         step = self.frames.width // frame.network_width
         cameras = resized(self.cameras, frame.network_width, frame.network_height)
-        seen = [exact_depth(self.truth.z_depth(name), step) for name in train.names]
+        depths = [self.truth.z_depth(name) for name in train.names]
+        seen = [exact_depth(z_depth, step) for z_depth in depths if z_depth is not None]
         return kind([images.image(i) for i in range(len(train))], cameras, torch.stack(seen), noise)
 
 
@@ -138,7 +140,7 @@ def take(monkeypatch: pytest.MonkeyPatch) -> Callable[[ExactNetwork], None]:
     return place
 
 
-def make_dive(folder: Path, **settings: int) -> tuple[Frames, GroundTruth]:
+def make_dive(folder: Path, **settings: Any) -> tuple[Frames, GroundTruth]:
     write_dive(DiveSettings(**settings), folder)
     return swimm3r.read_frames(folder, folder=folder / "prepared"), read_ground_truth(folder / "truth")
 
@@ -305,7 +307,9 @@ def test_known_cameras_of_a_file_are_kept_and_the_others_found_in_its_unit(
     torch.testing.assert_close(rec.cameras.cam2world[named], moved[named], atol=1e-5, rtol=0)
     torch.testing.assert_close(rec.cameras.K, small.cameras.K, rtol=1e-6, atol=0)
     assert (rec.cameras.centers[[2, 4]] - moved[[2, 4], :3, 3]).norm(dim=1).max() < 0.1
-    found, true = rec.depth[rec.names[2]].z_depth, 2 * small.truth.z_depth(rec.names[2])
+    found, true = rec.depth[rec.names[2]].z_depth, small.truth.z_depth(rec.names[2])
+    assert true is not None
+    true = 2 * true
     known = (found > 0) & (true > 0)
     assert (found[known] / true[known] - 1).abs().median() < 0.03
 

@@ -28,7 +28,7 @@ def _texture(seed: int, size: int = 1024) -> np.ndarray:
     total = np.zeros((size, size), np.float32)
     for cells in (8, 16, 32, 64, 128, 256):
         total += cv2.resize(rng.random((cells, cells), np.float32), (size, size), interpolation=cv2.INTER_CUBIC)
-    return np.uint8(255 * (total - total.min()) / np.ptp(total))
+    return (255 * (total - total.min()) / np.ptp(total)).astype(np.uint8)
 
 
 def _cameras() -> Cameras:
@@ -299,7 +299,9 @@ def test_pnp_finds_the_pose_among_outliers() -> None:
     pixels, _ = project(truth, points[None])
     pixels = pixels[0].clone()
     pixels[:30] += 50 * torch.rand(30, 2, generator=generator, dtype=torch.float64) + 20
-    pose, inliers = colmap.absolute_pose(pixels, points, truth)
+    found = colmap.absolute_pose(pixels, points, truth)
+    assert found is not None
+    pose, inliers = found
     torch.testing.assert_close(pose, truth.cam2world[0], atol=1e-4, rtol=0)
     assert inliers.tolist() == [False] * 30 + [True] * 70
 

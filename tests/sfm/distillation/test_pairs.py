@@ -158,7 +158,8 @@ def two_views() -> tuple[PixelMatches, TwoViews]:
     z = 2 + torch.rand(xy1.shape[1], generator=drawn(0)).double()[None]
     xy2, _ = project(cameras[1], unproject(cameras[0], xy1, z))
     inside = ((xy2[0] > 0) & (xy2[0] < torch.tensor([384, 256]))).all(-1)
-    matches = PixelMatches(*(p[0][inside].floor().long() for p in (xy1, xy2)), torch.ones(int(inside.sum())))
+    ends = [p[0][inside].floor().long() for p in (xy1, xy2)]
+    matches = PixelMatches(ends[0], ends[1], torch.ones(int(inside.sum())))
     return matches, TwoViews(cameras[0], relative_poses(pose[1], pose[0]))
 
 

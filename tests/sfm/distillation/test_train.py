@@ -10,6 +10,7 @@ from collections.abc import Callable
 from dataclasses import astuple, replace
 from pathlib import Path
 from types import ModuleType, SimpleNamespace
+from typing import Any
 
 import numpy as np
 import pytest
@@ -434,7 +435,7 @@ def test_tensorboard_gets_every_number_of_a_row_and_is_asked_for_where_it_is_mis
         def flush(self) -> None:
             pass
 
-    module = ModuleType("torch.utils.tensorboard.writer")
+    module: Any = ModuleType("torch.utils.tensorboard.writer")
     module.SummaryWriter = Writer
     monkeypatch.setitem(sys.modules, "torch.utils.tensorboard", ModuleType("torch.utils.tensorboard"))
     monkeypatch.setitem(sys.modules, "torch.utils.tensorboard.writer", module)

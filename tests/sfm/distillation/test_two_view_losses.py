@@ -39,7 +39,8 @@ METRES, ANY_UNIT = torch.tensor([True]), torch.tensor([False])
 def test_points_are_compared_in_units_of_their_mean_distance(views: tuple[TruePoints, TruePoints]):
     known = torch.cat([v.points[v.valid] for v in views])
     s = known.norm(dim=-1).mean()
-    moved = tuple(v.points + torch.tensor([0.3, 0.0, 0.4]) for v in views)
+    shift = torch.tensor([0.3, 0.0, 0.4])
+    moved = views[0].points + shift, views[1].points + shift
     for error, view in zip(regression_errors(moved, views, METRES), views, strict=True):
         torch.testing.assert_close(error[view.valid], torch.full((5,), 0.5) / s)
 
@@ -98,7 +99,8 @@ def test_a_match_rarer_than_the_least_share_costs_no_more_and_teaches_nothing():
 def test_only_true_matches_are_rows_but_all_are_wrong_answers():
     generator = torch.Generator().manual_seed(0)
     maps = [torch.nn.functional.normalize(torch.randn(1, 2, 3, 4, generator=generator), dim=-1) for _ in range(2)]
-    views = tuple(Descriptors(d, torch.full((1, 2, 3), 2.0)) for d in maps)
+    two = torch.full((1, 2, 3), 2.0)
+    views = Descriptors(maps[0], two), Descriptors(maps[1], two)
     index = torch.arange(6)[None]
     valid = torch.tensor([[True, True, False, False, False, False]])
     errors = matching_errors(maps[0].flatten(1, 2), maps[1].flatten(1, 2))[0, :2]
@@ -111,7 +113,8 @@ def test_only_true_matches_are_rows_but_all_are_wrong_answers():
 def test_the_whole_loss_weighs_matching_by_0_075(views: tuple[TruePoints, TruePoints]):
     generator = torch.Generator().manual_seed(0)
     maps = [torch.nn.functional.normalize(torch.randn(1, 2, 3, 4, generator=generator), dim=-1) for _ in range(2)]
-    described = tuple(Descriptors(d, torch.full((1, 2, 3), 2.0)) for d in maps)
+    two = torch.full((1, 2, 3), 2.0)
+    described = Descriptors(maps[0], two), Descriptors(maps[1], two)
     index = torch.arange(6)[None]
     matches = TrueMatches(index, index, torch.ones(1, 6, dtype=torch.bool))
     points = predicted((views[1].points, views[0].points), 1.5)

@@ -87,8 +87,8 @@ def test_merged_pairs_reproduce_the_reference(vectors: dict[str, torch.Tensor]):
 @pytest.mark.shared
 @pytest.mark.parametrize("subsample", [8, 4])
 def test_matches_of_both_passes_reproduce_the_reference(vectors: dict[str, torch.Tensor], subsample: int):
-    views = [view(vectors, name) for name in ("11", "21", "12", "22")]
-    found = matching.match_views(*views, MatchingSettings(subsample, border=0))
+    v11, v21, v12, v22 = (view(vectors, name) for name in ("11", "21", "12", "22"))
+    found = matching.match_views(v11, v21, v12, v22, MatchingSettings(subsample, border=0))
     assert torch.equal(found.xy1, vectors[f"sym.S{subsample}.xy1"])
     assert torch.equal(found.xy2, vectors[f"sym.S{subsample}.xy2"])
     torch.testing.assert_close(found.confidence, vectors[f"sym.S{subsample}.conf"], atol=1e-6, rtol=0)
@@ -138,8 +138,8 @@ def test_masked_pixels_never_match():
     mask1[:, :16] = False
     mask2 = torch.ones(24, 32, dtype=torch.bool)
     mask2[12:] = False
-    masked = [replace(one, mask=mask1), replace(two, mask=mask2)]
-    found = matching.match_views(*masked, *masked, replace(ALL, subsample=2))
+    first, second = replace(one, mask=mask1), replace(two, mask=mask2)
+    found = matching.match_views(first, second, first, second, replace(ALL, subsample=2))
     assert len(found.xy1) > 20
     assert (found.xy1[:, 0] >= 16).all()
     assert (found.xy2[:, 1] < 12).all()

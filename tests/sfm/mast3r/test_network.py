@@ -4,6 +4,7 @@ import importlib.util
 import json
 from pathlib import Path
 from types import ModuleType
+from typing import Any
 
 import pytest
 import torch
@@ -12,7 +13,7 @@ from safetensors.torch import load_file
 from swimm3r.sfm.mast3r.checkpoint import infer_architecture
 from swimm3r.sfm.mast3r.network import Architecture, Mast3r, rope2d, rotary_table, rotate
 
-PARITY = {"atol": 5e-5, "rtol": 0.0}
+PARITY: dict[str, Any] = {"atol": 5e-5, "rtol": 0.0}
 
 
 @pytest.fixture(scope="module")
@@ -92,11 +93,12 @@ def test_encoder_reproduces_the_reference_at_every_step(tiny: Mast3r, expected: 
     def keep(name: str):
         return lambda module, inputs, output: seen.__setitem__(name, output[0] if isinstance(output, tuple) else output)
 
+    first: Any = tiny.enc_blocks[0]
     hooks = [
         tiny.patch_embed.register_forward_hook(keep("patch_embed")),
-        tiny.enc_blocks[0].norm1.register_forward_hook(keep("enc0.norm1")),
-        tiny.enc_blocks[0].attn.qkv.register_forward_hook(keep("qkv")),
-        tiny.enc_blocks[0].attn.register_forward_hook(keep("enc0.attn")),
+        first.norm1.register_forward_hook(keep("enc0.norm1")),
+        first.attn.qkv.register_forward_hook(keep("qkv")),
+        first.attn.register_forward_hook(keep("enc0.attn")),
         *(block.register_forward_hook(keep(f"enc_block{i}")) for i, block in enumerate(tiny.enc_blocks)),
     ]
     encoded = tiny.encode(expected["img1"])

@@ -1,6 +1,7 @@
 """Relocation, growth and noise."""
 
 from pathlib import Path
+from typing import Literal
 
 import numpy as np
 import torch
@@ -91,6 +92,7 @@ def test_the_gates_are_those_of_the_two_papers(primitives):
     opacity = torch.tensor([0.001, 0.005, 0.02, 0.05])
     p = with_opacity(primitives(4), opacity)
     p = p._replace(scale=p.scale[:1].expand(4, -1), lower=p.lower[:1].expand(4, -1))
+    gates: dict[Literal["sigmoid", "power"], torch.Tensor]
     gates = {"sigmoid": 1 / (1 + torch.exp(100 * (opacity - 0.005))), "power": (1 - opacity) ** 100}
     L = rotation_block(p.lower[:1, :3])[0] * torch.nn.functional.softplus(p.scale[0, :3])
     eps = torch.randn(4, 3, 1, generator=rng())[..., 0]

@@ -2,6 +2,7 @@
 
 from dataclasses import replace
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
@@ -118,11 +119,13 @@ def test_the_water_of_a_dynamic_map_begins_the_same_at_all_times_and_learns_to_c
     first = [grid_of(field, view, 8, t).values for t in times]
     assert all(torch.equal(first[0], values) for values in first)
     with torch.no_grad():
-        field.network[-1].weight.normal_(0, 0.3, generator=rng())
+        last: Any = field.network[-1]
+        last.weight.normal_(0, 0.3, generator=rng())
     changed = [grid_of(field, view, 8, t).values for t in times]
     assert (changed[0] - changed[1]).abs().max() > 1e-3
     changed[1].sum().backward()
-    assert field.gamma.weight.grad.abs().max() > 0
+    gamma: Any = field.gamma
+    assert gamma.weight.grad.abs().max() > 0
 
 
 def test_held_out_frames_are_shown_at_their_own_times(tiny_dive, trained, tmp_path):
@@ -148,7 +151,7 @@ def test_what_moves_is_scored_apart_where_the_truth_knows_it(tiny_dive, trained,
     truth = GroundTruth(frames.names, cameras, True, tiny_dive.rec.medium.constant(), tmp_path / "truth")
     poses = {name: FirstPose(cameras.cam2world[frames.index(name)], "reference") for name in frames.test.names}
     views = score_views(scene, tiny_dive.rec, frames, poses, tmp_path, PoseRefinementSettings(steps=0))
-    section = truth_section(tiny_dive.rec, frames, truth, scene, views)["splat"]
+    section: Any = truth_section(tiny_dive.rec, frames, truth, scene, views)["splat"]
     expected = []
     for name in frames.test.names:
         f = frames.index(name)

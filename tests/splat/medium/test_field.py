@@ -1,6 +1,7 @@
 """The water as a field over directions."""
 
 from dataclasses import replace
+from typing import Any
 
 import numpy as np
 import pytest
@@ -26,7 +27,8 @@ def rough_field():
     """A field as training leaves it: different in every direction."""
     field = initial_field(WATER, MediumFieldSettings(), torch.Generator().manual_seed(0))
     with torch.no_grad():
-        field.network[-1].weight.normal_(0, 0.3, generator=torch.Generator().manual_seed(1))
+        last: Any = field.network[-1]
+        last.weight.normal_(0, 0.3, generator=torch.Generator().manual_seed(1))
     return field
 
 

@@ -2,6 +2,7 @@
 
 from collections.abc import Callable
 from dataclasses import replace
+from typing import Literal
 
 import pytest
 import torch
@@ -79,7 +80,7 @@ def test_what_is_behind_the_camera_is_not_drawn(primitives: Make, camera: Callab
 @pytest.mark.parametrize("c", [3, 4])
 @pytest.mark.parametrize("covariance", ["symmetric", "upper"])
 def test_the_fast_form_agrees_with_the_plain_one(
-    c: int, covariance: str, primitives: Make, camera: Callable[..., Cameras]
+    c: int, covariance: Literal["symmetric", "upper"], primitives: Make, camera: Callable[..., Cameras]
 ):
     settings = RenderSettings(covariance=covariance)
     time = torch.tensor(0.4) if c == 4 else None

@@ -13,13 +13,19 @@ from swimm3r.pipeline.presets import MAST3R_PRESETS, PRESETS
 from swimm3r.splat.projection.pinhole import pinhole
 from swimm3r.splat.recipes import uwbs
 from swimm3r.splat.rendering import draw
-from swimm3r.splat.settings import UwbsSettings, with_recipe
+from swimm3r.splat.settings import SplatSettings, UwbsSettings, WaterSplattingSettings, with_recipe
 from swimm3r.splat.training.scene import TrainingScene
 from swimm3r.splat.views import TrainingViews
 
 PAPER = PRESETS["paper"]
-MAP = PAPER.splat
-assert isinstance(MAP, UwbsSettings)
+
+
+def uwbs_of(settings: SplatSettings) -> UwbsSettings:
+    assert isinstance(settings, UwbsSettings)
+    return settings
+
+
+MAP = uwbs_of(PAPER.splat)
 
 
 def varied_field(dive, settings: UwbsSettings):
@@ -78,7 +84,7 @@ def test_the_water_learns_from_the_first_step(tiny_dive):
     """`default` waits a tenth of the run."""
     before_and_after = {}
     for name in ("paper", "default"):
-        whole = PRESETS[name].splat
+        whole = uwbs_of(PRESETS[name].splat)
         settings = replace(whole, initial=replace(whole.initial, primitives=300), iterations=1000)
         views = TrainingViews(tiny_dive.rec, tiny_dive.frames, settings, 1.0)
         scene = TrainingScene(tiny_dive.rec, 1.0, 1.0, views)
@@ -119,5 +125,6 @@ def test_every_command_with_presets_knows_it(command: str, capsys: pytest.Captur
 
 def test_it_trains_no_peer_otherwise_than_at_its_size():
     peer = with_recipe(MAP, "watersplatting")
+    assert isinstance(peer, WaterSplattingSettings)
     assert (peer.iterations, peer.initial.primitives, peer.cap_max) == (20_000, 400_000, 800_000)
     assert asdict(peer.weights) == asdict(with_recipe(UwbsSettings(), "watersplatting").weights)

@@ -13,7 +13,7 @@ from swimm3r.splat.gaussian_settings import SeaSplatWeights
 from swimm3r.splat.medium.seasplat import SceneWater, layer, relative_depth, seen_through
 from swimm3r.splat.recipes.seasplat import SeaSplat, covered_background, dark_channel, depth_steps, objective
 from swimm3r.splat.rendering import SplatMap, mean_water
-from swimm3r.splat.settings import UwbsSettings, seasplat, with_recipe
+from swimm3r.splat.settings import SeaSplatSettings, UwbsSettings, seasplat, with_recipe
 from swimm3r.splat.training.scene import TrainingScene
 from swimm3r.splat.views import TrainingView, TrainingViews
 
@@ -241,4 +241,5 @@ def test_opacities_are_cut_in_long_runs_alone(recipe):
     cut = of._round(bright, 3000)
     assert float(torch.sigmoid(cut.primitives.opacity).max()) == pytest.approx(0.01, rel=1e-4)
     short = with_recipe(UwbsSettings(iterations=2000), "seasplat")
+    assert isinstance(short, SeaSplatSettings)
     assert short.densify.reset_every == 0

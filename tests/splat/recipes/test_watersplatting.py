@@ -11,7 +11,7 @@ from swimm3r.splat.primitives.gaussian import GaussianPrimitives
 from swimm3r.splat.projection.pinhole import pinhole
 from swimm3r.splat.recipes.watersplatting import WaterSplatting, relative_photometric
 from swimm3r.splat.rendering import draw
-from swimm3r.splat.settings import UwbsSettings, watersplatting, with_recipe
+from swimm3r.splat.settings import UwbsSettings, WaterSplattingSettings, watersplatting, with_recipe
 from swimm3r.splat.training.losses import mean_ssim
 from swimm3r.splat.training.scene import TrainingScene
 from swimm3r.splat.views import TrainingViews, smaller
@@ -134,6 +134,7 @@ def test_clips_of_any_length_are_densified(tiny_dive):
 
 def test_short_runs_are_culled_gently_and_long_ones_as_published():
     short, long = (with_recipe(UwbsSettings(iterations=n), "watersplatting") for n in (2000, 15_000))
+    assert isinstance(short, WaterSplattingSettings)
     assert (short.densify.reset_every, short.densify.prune_opacity) == (0, 0.1)
     assert long.densify == watersplatting().densify
 

@@ -2,6 +2,7 @@
 
 from collections.abc import Callable
 from dataclasses import replace
+from typing import Any
 
 import pytest
 import torch
@@ -119,7 +120,7 @@ def test_no_water_no_cancellation_no_change(tiny_dive):
     """In clear water u = 0; where a primitive's pixels all pull one way, the step is then plain Adam's."""
     clear = initial_field(None, UwbsSettings().medium, torch.Generator())
     with torch.no_grad():
-        last = clear.network[-1]
+        last: Any = clear.network[-1]
         last.bias.copy_(torch.tensor([-30.0] * 9))  # black, and neither attenuating nor scattering
     p, view = scene(tiny_dive)
     seen_from = pinhole(view.camera)
@@ -164,7 +165,9 @@ def oracle(drawing, p: BetaPrimitives, view: TrainingView, settings: UwbsSetting
     if settings.sgg.depth == "apart":
         on_images = [a - b for a, b in zip(on_images, alone, strict=True)]
 
-    def pull(maps: MediumMaps, cotangents: list[torch.Tensor], *, of=("mean2d",)) -> tuple[torch.Tensor, SggBuffers]:
+    def pull(
+        maps: MediumMaps, cotangents: list[torch.Tensor], *, of=("mean2d",)
+    ) -> tuple[tuple[torch.Tensor, ...], SggBuffers]:
         flat = Primitives2D(*(t.detach() for t in seen))
         leaves = {name: getattr(flat, name).clone().requires_grad_() for name in of}
         buffers = SggBuffers(*(b.double() for b in SggBuffers.zeros(len(flat.mean2d))))
@@ -184,7 +187,7 @@ def oracle(drawing, p: BetaPrimitives, view: TrainingView, settings: UwbsSetting
     u = gradients.medium_uncertainty(b)
     delta = gradients.filtered_gradient(b, settings.sgg.residual) - g0
     names = ("mean2d", "conic", "opacity", "depth")
-    by_depth = dict(zip(names, pull(maps, alone, of=names)[0], strict=True))
+    by_depth: dict[str, torch.Tensor] = dict(zip(names, pull(maps, alone, of=names)[0], strict=True))
     if settings.sgg.depth == "apart":
         delta = delta + settings.sgg.residual * u[:, None] * by_depth["mean2d"]
     if settings.sgg.isolated == "exact" or settings.sgg.depth == "apart":
