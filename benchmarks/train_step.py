@@ -19,9 +19,9 @@ from typing import Any
 
 import torch
 
-from raster import SIZES, Size, workload
 from swimm3r.cameras import Cameras
 from swimm3r.raster import MediumMaps, rasterize
+from swimm3r.selftest.speed import SIZES, Size, workload
 from swimm3r.splat.medium.field import grid_of, initial_field, medium_at_pixels, per_z_depth
 from swimm3r.splat.optimizer import adam_step
 from swimm3r.splat.primitives.beta import BetaPrimitives, inverse_softplus

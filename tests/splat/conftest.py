@@ -12,6 +12,7 @@ from swimm3r.io.images import write_rgb
 from swimm3r.medium import AttenuationCurve, Medium, MediumFit
 from swimm3r.scene.frames import Frame, Frames
 from swimm3r.scene.reconstruction import DenseCloud, DepthMap, DepthMaps, Matches, Points, Reconstruction, Tracks
+from swimm3r.selftest.scenes import beta_primitives, turned_camera
 from swimm3r.splat.medium.field import initial_field
 from swimm3r.splat.primitives.beta import BetaPrimitives, inverse_softplus
 from swimm3r.splat.rendering import SplatMap
@@ -22,39 +23,14 @@ from swimm3r.splat.settings import MediumFieldSettings, UwbsSettings
 def primitives() -> Callable[..., BetaPrimitives]:
     """Random primitives two to five units in front of the origin: `primitives(n, c=3, seed=0)`, float64."""
 
-    def make(n: int, c: int = 3, seed: int = 0) -> BetaPrimitives:
-        rng = torch.Generator().manual_seed(seed)
-
-        def normal(*shape: int) -> torch.Tensor:
-            return torch.randn(*shape, generator=rng, dtype=torch.float64)
-
-        xyz = normal(n, 3) * torch.tensor([0.8, 0.6, 0.6]) + torch.tensor([0.0, 0.0, 3.5])
-        direction = torch.nn.functional.normalize(xyz, dim=-1) + 0.3 * normal(n, 3)
-        time = torch.rand(n, c - 3, generator=rng, dtype=torch.float64)
-        scale = torch.cat([-1.8 + 0.5 * normal(n, 3), 0.5 + 0.3 * normal(n, c)], -1)
-        beta = torch.cat([0.4 * normal(n, 1), -0.5 + 0.8 * normal(n, c)], -1)
-        lower = 0.4 * normal(n, (3 + c) * (2 + c) // 2)
-        rgb = torch.rand(n, 3, generator=rng, dtype=torch.float64)
-        return BetaPrimitives(xyz, torch.cat([direction, time], -1), rgb, 1 + normal(n), beta, scale, lower)
-
-    return make
+    return beta_primitives
 
 
 @pytest.fixture
 def camera() -> Callable[..., Cameras]:
     """A slightly turned pinhole camera near the origin, principal point off center: `camera(width=80, height=56)`."""
 
-    def make(width: int = 80, height: int = 56) -> Cameras:
-        K = torch.tensor([[70.0, 0, 0.46 * width], [0, 66.0, 0.55 * height], [0, 0, 1]], dtype=torch.float64)
-        K[:2, :2] *= width / 80
-        pose = torch.eye(4, dtype=torch.float64)
-        pose[:3, :3] = torch.linalg.matrix_exp(
-            torch.tensor([[0, -0.05, 0.1], [0.05, 0, -0.08], [-0.1, 0.08, 0]], dtype=torch.float64)
-        )
-        pose[:3, 3] = torch.tensor([0.1, -0.05, 0.2])
-        return Cameras(K[None], torch.zeros(1, 0, dtype=torch.float64), pose[None], width, height)
-
-    return make
+    return turned_camera
 
 
 WATER = Medium(torch.tensor([0.1, 0.4, 0.5]), torch.tensor([0.4, 0.15, 0.1]), torch.tensor([0.3, 0.2, 0.2]))

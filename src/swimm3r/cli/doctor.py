@@ -10,12 +10,18 @@ from pathlib import Path
 from swimm3r import memory
 from swimm3r import weights as store
 from swimm3r.cli.weights import whereabouts
+from swimm3r.errors import DeviceError
 
 _PACKAGES = ("swimm3r", "torch", "numpy", "scipy", "numba", "pycolmap", "opencv-python-headless", "av", "warp-lang")
 
 
-def doctor() -> None:
-    """Print versions, processors, free memory and disk, the GPU with its driver, and which weights are here."""
+def doctor(*, selftest: bool = False) -> None:
+    """Print versions, processors, free memory and disk, the GPU with its driver, and which weights are here.
+
+    Args:
+        selftest: Compare every kernel of this machine with its reference and time the rasterizer; about a minute, and
+            some more where kernels are compiled first.
+    """
     rows = {
         "python": platform.python_version(),
         "system": platform.platform(),
@@ -30,6 +36,30 @@ def doctor() -> None:
         **{f"weights {entry.name}": whereabouts(entry.name) for entry in store.MANIFEST},
     }
     print("\n".join(f"{name:<24} {value}" for name, value in rows.items()))
+    if selftest:
+        _selftest()
+
+
+def _selftest() -> None:
+    """Print the table of checks and that of times. Raises DeviceError where a kernel is wrong."""
+    from swimm3r.selftest import check_kernels, measure_speed
+
+    print(f"\n{'kernel':<44} {'device':<8} {'error':<10} {'allowed':<10}")
+    failed = []
+    for check in check_kernels():
+        verdict = "" if check.passed else "WRONG"
+        print(f"{check.kernel:<44} {check.device:<8} {check.error:<10.1e} {check.allowed:<10.0e} {verdict}", flush=True)
+        failed += [] if check.passed else [f"{check.kernel} ({check.device})"]
+    print("\nrasterizer, one pass with gradients")
+    for speed in measure_speed():
+        print(f"{speed.device:<8} {speed}", flush=True)
+    if failed:
+        raise DeviceError(
+            f"{len(failed)} kernels of this computer do not agree with their references: {', '.join(failed)}",
+            cause="a defective driver or compiler, an unstable processor or GPU, or kernels compiled for another",
+            hint="an issue with this output; until then --map-device cpu where only CUDA is wrong",
+        )
+    print("\nEvery kernel agrees with its reference.")
 
 
 def _version(package: str) -> str:
