@@ -52,7 +52,7 @@ def chromium() -> Iterator[object]:
 
 
 @pytest.fixture
-def open_page(chromium: object, request: pytest.FixtureRequest) -> Iterator[Callable[..., WatchedPage]]:
+def open_page(chromium: Any, request: pytest.FixtureRequest) -> Iterator[Callable[..., WatchedPage]]:
     """Opens a file or an address in the system's Chromium, see `tests.browser.watched_page`; pages end with the test.
 
     Skips where there is no browser, and says what was not checked.

@@ -105,7 +105,7 @@ def _cameras() -> Cameras:
 
 def _floor(x: torch.Tensor, y: torch.Tensor) -> torch.Tensor:
     bumps = ((-1.5, 0.2), (0.4, -0.4), (1.7, 0.5))
-    return FLOOR - sum(0.8 * torch.exp(-3 * ((x - a) ** 2 + (y - b) ** 2)) for a, b in bumps)
+    return FLOOR - torch.stack([0.8 * torch.exp(-3 * ((x - a) ** 2 + (y - b) ** 2)) for a, b in bumps]).sum(0)
 
 
 def _image(cameras: Cameras, i: int) -> tuple[torch.Tensor, torch.Tensor]:
@@ -137,14 +137,14 @@ def _write_sfm(
     x, y = 8 * torch.rand(4000, generator=rng) - 4, 4 * torch.rand(4000, generator=rng) - 2
     xyz = torch.stack([x, y, _floor(x, y)], 1)
     color = torch.stack([0.5 + 0.4 * torch.sin(9 * x), 0.5 + 0.4 * torch.sin(8 * y), 0.5 + 0 * x], 1)
-    few, index = xyz[:50], torch.arange(50)
+    few, index, none = xyz[:50], torch.arange(50), torch.zeros(0, dtype=torch.long)
     depth = DepthMaps(folder / "z_depth")
     rec = Reconstruction(
         tuple(NAMES[i] for i in train),
         cameras[train],
         Points(few.double(), color[:50], torch.full((50,), 0.4).double()),
         Tracks(index, index % len(train), torch.full((50, 2), 20.0).double()),
-        Matches(*(torch.zeros(0, dtype=torch.long),) * 2, *(torch.zeros(0, 2),) * 2, torch.zeros(0)),
+        Matches(none, none, torch.zeros(0, 2), torch.zeros(0, 2), torch.zeros(0)),
         depth,
         "colmap",
         metric=asked.metric,

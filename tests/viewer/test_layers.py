@@ -14,7 +14,7 @@ from swimm3r.viewer.layers import BACKGROUND, CropBox, LayerChoice, Painter, Vie
 from swimm3r.viewer.scene_nodes import vertical_fov
 from swimm3r.viewer.viewed_run import ViewedRun, open_viewed_run
 from swimm3r.viewer.water import OtherWater, in_water, known_waters, light_of_water, water_of_run, with_amount
-from swimm3r.water_types import JERLOV, jerlov
+from swimm3r.water_types import JERLOV, JerlovType, jerlov
 
 
 def frame_view(run: ViewedRun, i: int = 3) -> ViewCamera:
@@ -60,7 +60,8 @@ def test_a_jerlov_type_follows_the_image_formation_model_on_linear_light(wall: V
 
 
 def test_jerlov_types_take_red_first_in_the_ocean_and_blue_first_at_the_coast():
-    for kind, first in (("I", 0), ("III", 0), ("7C", 2), ("9C", 2)):
+    strongest: dict[JerlovType, int] = {"I": 0, "III": 0, "7C": 2, "9C": 2}
+    for kind, first in strongest.items():
         assert int(jerlov(kind).beta_D.argmax()) == first
     left = [float(torch.exp(-jerlov(kind).beta_D[2])) for kind in JERLOV]
     assert left == sorted(left, reverse=True)
@@ -100,6 +101,7 @@ def test_the_picture_of_the_cheap_path_is_the_maps_render(wall: ViewedRun):
     picture = painter.draw(view, 64, LayerChoice())
     whole = wall.scene.render(view.at(64))
     assert np.abs(picture.rgb / 255 - whole.rgb.clamp(0, 1).numpy()).max() <= 0.5 / 255 + 1e-6
+    assert picture.z_depth is not None
     assert np.array_equal(picture.z_depth, whole.z_depth.numpy())
 
 
