@@ -20,6 +20,19 @@ def test_the_plan_view_puts_the_path_over_the_points_below_it():
     assert "<circle" in path_overlay(view, "m")
 
 
+def test_cameras_that_move_along_their_view_or_not_at_all_have_a_view_from_above():
+    rng = np.random.default_rng(0)
+    xyz = np.column_stack([np.full(500, 3.0), rng.uniform(-1, 1, (500, 2))])
+    gray = np.full((500, 3), 0.5)
+    poses = np.eye(4)[None].repeat(5, 0)
+    poses[:, :3, :3] = [[0, 0, 1], [-1, 0, 0], [0, -1, 0]]  # looks along x
+    still = plan_view(xyz, gray, gray, poses)
+    poses[:, 0, 3] = np.linspace(0, 1, 5)
+    for view in (still, plan_view(xyz, gray, gray, poses)):
+        assert np.isfinite(view.path).all()
+        assert (view.raw != 255).any()
+
+
 def test_the_normal_of_a_tilted_ground_is_found_and_a_ball_has_none():
     rng = np.random.default_rng(0)
     flat = np.column_stack([rng.uniform(-4, 4, 5000), rng.uniform(-3, 3, 5000), 0.05 * rng.normal(size=5000)])

@@ -30,7 +30,14 @@ OUTPUTS = {  # path in the run folder -> contents
     "versions.json": "Versions of the programs used",
     "log.jsonl": "Times of all stages",
 }
-_FURTHER = {"export": "Exported files", "exports": "Exported files", "localization": "Localized images"}
+FURTHER = {  # pattern of what later commands add -> contents
+    "sfm/points*.glb": "Point cloud as glTF",
+    "splat/gaussians*": "Map without its water as Gaussians",
+    "export/*": "Exported for other programs",
+    "renders/views": "Views from other cameras",
+    "renders/protocols": "Test frames by other protocols",
+    "localization": "Poses of localized images",
+}
 
 
 @dataclass(frozen=True)
@@ -44,10 +51,13 @@ class Output:
 
 
 def outputs_of(folder: Path) -> list[Output]:
-    """The known outputs of a run that exist, in the order of the pipeline."""
+    """The known outputs of a run that exist, in the order of the pipeline, then what later commands added."""
+    listed = [(folder / name, contents) for name, contents in OUTPUTS.items()]
+    for pattern, contents in FURTHER.items():
+        listed += [(path, contents) for path in sorted(folder.glob(pattern)) if not path.name.startswith(".")]
     found = []
-    for name, contents in {**OUTPUTS, **_FURTHER}.items():
-        path = folder / name
+    for path, contents in listed:
+        name = path.relative_to(folder).as_posix()
         if path.is_file():
             found.append(Output(name, contents, human_size(path.stat().st_size), 0))
         elif path.is_dir():

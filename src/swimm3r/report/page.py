@@ -42,13 +42,13 @@ def write(folder: Path) -> Path:
     sfm = folder / "sfm"
     rec = load_reconstruction(sfm, frames) if (sfm / "reconstruction.json").is_file() else None
     fields = _made_with(folder, remedy) | _of_dive(frames, rec, folder)
+    if "test" in summary:
+        fields["tests"] = shown_frames.test_frames(frames, folder)
     template = jinja2.Environment(
         autoescape=True, undefined=jinja2.StrictUndefined, trim_blocks=True, lstrip_blocks=True
     )
     try:
         fields |= _of_summary(summary, folder)
-        if "test" in summary:
-            fields["tests"] = shown_frames.test_frames(frames, folder)
         page = template.from_string(_part("page.html.j2")).render(fields)
     except (jinja2.UndefinedError, TypeError, ValueError, KeyError, AttributeError) as error:
         raise damaged(folder / "summary.json", first_line(error), remedy) from error

@@ -34,7 +34,7 @@ def plan_view(
     down = cam2world[:, :3, 2].mean(0)
     down /= np.linalg.norm(down)
     forward = np.linalg.svd((cam2world[:, :3, 3] - cam2world[:, :3, 3].mean(0)) @ (np.eye(3) - np.outer(down, down)))[2]
-    along = forward[0] - down * (forward[0] @ down)
+    along = max((axis - down * (axis @ down) for axis in forward[:2]), key=lambda axis: np.linalg.norm(axis) > 1e-3)
     along /= np.linalg.norm(along)
     axes = np.stack([along, np.cross(down, along)])
     flat, centers = xyz @ axes.T, cam2world[:, :3, 3] @ axes.T

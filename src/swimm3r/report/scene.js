@@ -136,7 +136,7 @@
       hovered = k;
       label.hidden = k < 0;
       if (k < 0) return;
-      label.textContent = `${scene.cameras[k].name}, ${scene.cameras[k].time} s`;
+      label.textContent = scene.cameras[k].name;
       label.style.transform = `translate(${Math.min(x + 12, canvas.clientWidth - label.offsetWidth - 4)}px, ${Math.max(y - 30, 4)}px)`;
     }
     function goTo(k) {  // look from where a camera was

@@ -14,6 +14,7 @@ from jaxtyping import Float
 from scipy.spatial import KDTree
 
 from swimm3r.cameras import image_directions
+from swimm3r.report.head import caption
 from swimm3r.report.plan_view import least_extended
 from swimm3r.scene.frames import Frames
 from swimm3r.scene.reconstruction import Reconstruction
@@ -118,17 +119,16 @@ def _down(xyz: Float[np.ndarray, "n 3"], poses: Float[np.ndarray, "c 4 4"]) -> n
 
 
 def _cameras(rec: Reconstruction, frames: Frames, length: float) -> list[dict[str, object]]:
-    """Center, the four corners of the image at `length`, and the name of evenly spread cameras."""
+    """Center, the four corners of the image at `length`, and the caption of evenly spread cameras."""
     count = len(rec.names)
     chosen = sorted({round(i) for i in np.linspace(0, count - 1, min(count, _MOST_CAMERAS))})
-    times = dict(zip(rec.names, frames.times_of(rec.names), strict=True))
     found = []
     for i in chosen:
         camera = rec.cameras[i]
         rays = image_directions(camera)[[0, 0, -1, -1], [0, -1, -1, 0]].double()
         corners = rays * length @ camera.cam2world[0, :3, :3].T + camera.cam2world[0, :3, 3]
         view = torch.cat([camera.cam2world[0, :3, 3][None], corners]).numpy()
-        found.append({"name": rec.names[i], "time": round(times[rec.names[i]], 2), "xyz": _rounded(view).tolist()})
+        found.append({"name": caption(frames, rec.names[i]), "xyz": _rounded(view).tolist()})
     return found
 
 

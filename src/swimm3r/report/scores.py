@@ -1,5 +1,6 @@
 """Scores in plain words: the map on held-out frames, restored colors, known truth, and the training of the map."""
 
+import math
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -105,12 +106,10 @@ def truth_rows(truth: dict[str, Any] | None) -> list[TruthRow]:
 
 def training_charts(metrics: Path) -> list[str]:
     """SVGs of the loss and of the number of primitives over the training; none without its record."""
-    rows = [row for row in read_rows(metrics) if {"loss", "primitives"} <= row.keys()]
+    rows = [row for row in read_rows(metrics) if all(_is_number(row.get(key)) for key in ("loss", "primitives"))]
     if len(rows) < 3:
         return []
     steps, loss, count = (np.array([float(row[key]) for row in rows]) for key in ("step", "loss", "primitives"))
-    if not np.isfinite([loss, count]).all():
-        return []
     width = min(len(rows), max(1, round(_SMOOTHED * len(rows))) * 2 + 1)
     smooth = np.convolve(np.pad(loss, width // 2, mode="edge"), np.ones(width) / width, "valid")[: len(rows)]
     accent = "var(--accent)"
@@ -120,6 +119,10 @@ def training_charts(metrics: Path) -> list[str]:
             [charts.Curve(steps, count / 1000, accent, "primitives")], "training step", "primitives, thousands"
         ),
     ]
+
+
+def _is_number(value: object) -> bool:
+    return isinstance(value, int | float) and math.isfinite(value)
 
 
 def _truth_text(key: str, value: object) -> str:
