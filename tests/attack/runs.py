@@ -38,7 +38,9 @@ READERS = {  # file -> commands that read it
     "sfm/sparse/cameras.bin": ("report", "render"),
     "sfm/sparse/points3D.bin": ("report", "render"),
     "splat/map.safetensors": ("render", "export", "eval", "localize", "resume"),
-    "splat/metrics.jsonl": ("resume",),
+    "splat/metrics.jsonl": ("resume", "report"),
+    "log.jsonl": ("report",),
+    "renders/flythrough.mp4": ("report",),
 }
 
 

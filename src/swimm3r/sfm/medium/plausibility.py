@@ -59,7 +59,7 @@ def _undetermined(fit: MediumFit, predicted: bool, linear: MediumFit | None) -> 
         "Train the adapter with held-out pairs, so that its head's error is known, or restore without one."
         if predicted
         else "Film the same ground from near and from far in one dive (1 to 4 m), with open water in view; coefficients"
-        " in gray or in brackets are not for a table."
+        " in brackets are not for a table."
     )
     factor = optical_depth(fit)[1].max().exp().item()
     if attenuation_is_a_guess(fit):
