@@ -5,6 +5,7 @@ little; their spread is the standard deviation that a length carries. It says ho
 well the scale of a metric run is known.
 """
 
+import math
 from collections.abc import Sequence
 from dataclasses import dataclass
 from itertools import pairwise
@@ -99,9 +100,11 @@ def area(points: Sequence[SurfacePoint]) -> Measured:
 
 
 def told(measured: Measured, unit: str) -> str:
-    """A number as people write it: 1.24 m ± 0.02 m."""
-    std = "" if measured.std is None else f" ± {measured.std:.2g} {unit}"
-    return f"{measured.value:.3g} {unit}{std}"
+    """A number as people write it, with the digits that its spread leaves: 1.243 ± 0.018 m."""
+    if not measured.std:
+        return f"{measured.value:.3g} {unit}"
+    digits = max(0, 1 - math.floor(math.log10(measured.std)))
+    return f"{measured.value:.{digits}f} ± {measured.std:.{digits}f} {unit}"
 
 
 def _vector_area(xyz: Float[np.ndarray, "n 3"]) -> Float[np.ndarray, "3"]:

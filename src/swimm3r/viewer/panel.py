@@ -61,7 +61,7 @@ class Panel:
             self._add_keeping()
         with tabs.add_tab("About"):
             client.gui.add_markdown(about(painter))
-        client.camera.on_update(lambda _: self.changed())
+        client.camera.on_update(lambda _: self._moved())
         self.changed()
         self.show_objects()
 
@@ -94,7 +94,7 @@ class Panel:
     def show(self, picture: Picture, in_full: bool, quality: int) -> None:
         """Put a picture behind the scene; with its depth once the camera rests."""
         depth = None
-        if in_full and picture.z_depth is not None and self._has_objects():
+        if in_full and picture.z_depth is not None and self._is_depth_needed():
             depth = np.where(picture.z_depth > 0, picture.z_depth * self.run.scale, 160.0)
         self._client.scene.set_background_image(
             picture.rgb, format="jpeg", jpeg_quality=min(100, quality + 10 * in_full), depth=depth
@@ -135,7 +135,7 @@ class Panel:
 
     def _add_view(self) -> None:
         gui, run, painter = self._client.gui, self.run, self._painter
-        first = painter.layers[0]
+        first = painter.layers[0] if run.scene is not None else "Points alone"
         self._layer = gui.add_dropdown("Picture", painter.layers, initial_value=first)
         self._legend = gui.add_html(self._legend_of(first))
         self._exposure = gui.add_slider("Exposure (stops)", -3.0, 3.0, 0.1, 0.0)
@@ -201,7 +201,7 @@ class Panel:
         fly.on_click(lambda _: self.fly_to(chosen()))
         steps.on_click(neighbor)
         nearest.on_click(free)
-        self._wipe.on_update(lambda _: self.changed())
+        self._wipe.on_update(lambda _: self.show_objects())
 
     def _add_measuring(self) -> None:
         gui = self._client.gui
@@ -231,17 +231,23 @@ class Panel:
 
     # ---------------------------------------------------------------- reactions
 
+    def _moved(self) -> None:
+        self._nodes.clear_view()
+        self.changed()
+
     def show_objects(self) -> None:
-        """Show the objects that are switched on."""
-        self._nodes.show_frusta(self._frusta.value)
-        self._nodes.show_path(self._path.value)
+        """Show the objects that are switched on; the wipe has the view to itself."""
+        alone = self._wipe.value > 0
+        self._nodes.show_frusta(self._frusta.value and not alone)
+        self._nodes.show_path(self._path.value and not alone)
         size = self._point_size.value / 1000
         self._nodes.show_cloud(self._points.value, self._restored.value, size, self._crop_box())
         self.changed()
 
-    def _has_objects(self) -> bool:
+    def _is_depth_needed(self) -> bool:
+        """Return whether surfaces are to hide what lies behind them; measured lines stay visible through them."""
         shown = self._frusta.value or self._path.value or self._points.value or self._crop.value
-        return shown or bool(self._measuring.points)
+        return shown and not self._measuring.points
 
     def _layer_changed(self) -> None:
         self._legend.content = self._legend_of(cast(Layer, self._layer.value))

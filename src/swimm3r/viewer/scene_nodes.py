@@ -21,7 +21,8 @@ if TYPE_CHECKING:
 FRAME_COLOR, CHOSEN_COLOR, PATH_COLOR = (255, 209, 102), (255, 120, 60), (255, 209, 102)
 _MOST_FRUSTA = 150
 _MOST_POINTS = 250_000
-_FRUSTUM = 0.22  # of the working depth unit
+_FRUSTUM = (0.06, 0.16)  # smallest and largest size, working units
+_NEAR = 2.0  # sizes of a frustum: nearer than that it would fill the view, and is hidden
 
 
 class SceneNodes:
@@ -34,13 +35,26 @@ class SceneNodes:
         self._cloud: Any = None
         self._cloud_key: tuple | None = None
         self._chosen: str | None = None
+        self._frusta_shown = self._path_shown = False
+        self._size = _frustum_size(run)
 
     def show_frusta(self, shown: bool) -> None:
         """Show or hide the frames."""
         if shown and not self._frusta:
             self._add_frusta()
-        for frustum in self._frusta.values():
-            frustum.visible = shown
+        self._frusta_shown = shown
+        self.clear_view()
+
+    def clear_view(self) -> None:
+        """Hide the frames in whose midst the camera is, and the path where the camera is on it."""
+        if not self._frusta and self._path is None:
+            return
+        at = np.asarray(self._client.camera.position, np.float64)
+        away = np.linalg.norm(self._run.cameras.centers.numpy() * self._run.scale - at, axis=1)
+        for name, frustum in list(self._frusta.items()):
+            _set_visible(frustum, self._frusta_shown and away[self._run.rec.index(name)] > _NEAR * self._size)
+        if self._path is not None:
+            _set_visible(self._path, self._path_shown and float(away.min()) > self._size / 2)
 
     def show_path(self, shown: bool) -> None:
         """Show or hide the line through the cameras, in the order of time."""
@@ -51,8 +65,8 @@ class SceneNodes:
             self._path = self._client.scene.add_line_segments(
                 "/path", segments, PATH_COLOR, thickness=2.0, thickness_units="screen"
             )
-        if self._path is not None:
-            self._path.visible = shown
+        self._path_shown = shown
+        self.clear_view()
 
     def show_cloud(self, shown: bool, restored: bool, size: float, crop: CropBox | None) -> None:
         """Show or hide the points, with the water or without, of this size in working units."""
@@ -95,7 +109,7 @@ class SceneNodes:
                 f"/frames/{i}",
                 fov=vertical_fov(camera),
                 aspect=camera.width / camera.height,
-                scale=_FRUSTUM,
+                scale=self._size,
                 thickness=1.5,
                 thickness_units="screen",
                 color=FRAME_COLOR,
@@ -108,6 +122,20 @@ class SceneNodes:
             )
             frustum.on_click(lambda _, name=name: self._fly_to(name))
             self._frusta[name] = frustum
+
+
+def _set_visible(node: Any, visible: bool) -> None:
+    if node.visible != visible:
+        node.visible = visible
+
+
+def _frustum_size(run: ViewedRun) -> float:
+    """A size that leaves frames apart: about the distance of neighbors."""
+    centers = (run.cameras.centers * run.scale).numpy()
+    if len(centers) < 2:
+        return _FRUSTUM[1]
+    steps = np.linalg.norm(np.diff(centers, axis=0), axis=1)
+    return float(np.clip(np.median(steps), *_FRUSTUM))
 
 
 def view_of(client: "ClientHandle", run: ViewedRun) -> ViewCamera:
