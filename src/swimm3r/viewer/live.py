@@ -31,7 +31,8 @@ from swimm3r.viewer.viewed_run import ViewedRun, of_reconstruction
 from swimm3r.viewer.water import known_waters
 
 _SHARE = 0.12  # of the training's time that pictures may take
-_MAP_S, _CHART_S, _IMAGE_S, _TEXT_S = 3.0, 2.0, 5.0, 0.5  # between two updates of each
+_EVERY_S = {"map": 3.0, "chart": 2.0, "image": 5.0}  # between two updates of each
+_TEXT_S = 0.5
 _KEPT = 400  # points of the chart
 _PREVIEW = 320  # pixels of the image in training
 _CURVES = (("loss", "#4cc3e0"), ("l1", "#ffd166"))
@@ -73,7 +74,9 @@ class LiveView:
         self._image: Any = None
         self._shown_view: _ShownView | None = None
         self._losses: list[tuple[float | Tensor, ...]] = []
-        self._due: dict[str, float] = {}
+        self._due = dict.fromkeys(_EVERY_S, 0.0)
+        self._text_due = 0.0
+        self._is_picture_next = True
         self._begun, self._spent = clock(), 0.0
 
     @property
@@ -86,7 +89,8 @@ class LiveView:
         self._told(what, done, total)
         if threading.current_thread() is not self._thread:
             return
-        if self._is_due("text", _TEXT_S) or done == total:
+        if self._clock() >= self._text_due or done == total:
+            self._text_due = self._clock() + _TEXT_S
             self._status.content = f"**{what}**: {done} of {total}"
             self._bar.value = 100.0 * done / max(1, total)
         if self._viewer is not None and what != "training the map":
@@ -111,17 +115,23 @@ class LiveView:
                 self.server.stop()
 
     def _show(self, step: TrainingStep, last: bool) -> None:
-        """One update: a new state of the map, the chart, the image in training, or a picture for a browser."""
+        """One update: a picture for a browser, by turns with a new state of the map, the chart and the test frame."""
         assert self._viewer is not None
-        if last or self._is_due("map", _MAP_S):
-            self._viewer.painter.run = self._with_map(step)
-            self._viewer.loop.ask_again()
-        elif self._is_due("chart", _CHART_S):
-            self._draw_chart()
-        elif self._is_due("image", _IMAGE_S):
-            self._draw_image()
-        else:
-            self._viewer.loop.turn()
+        if not last and self._is_picture_next:
+            self._is_picture_next = False
+            if self._viewer.loop.turn():
+                return
+        self._is_picture_next = True
+        match "map" if last else self._most_overdue():
+            case "map":
+                self._viewer.painter.run = self._with_map(step)
+                self._viewer.loop.ask_again()
+            case "chart":
+                self._draw_chart()
+            case "image":
+                self._draw_image()
+            case _:
+                self._viewer.loop.turn()
 
     def _begin(self, step: TrainingStep) -> None:
         rec, frames = step.scene.rec, step.scene.views.frames
@@ -138,7 +148,8 @@ class LiveView:
     def _note_losses(self, step: TrainingStep) -> None:
         """Keep the step's losses; tensors stay where they are until the chart is drawn."""
         if step.step % max(1, step.iterations // (4 * _KEPT)) == 0:
-            self._losses.append((step.step, *(step.numbers.get(name, 0.0) for name, _ in _CURVES)))
+            values = (step.numbers.get(name, 0.0) for name, _ in _CURVES)
+            self._losses.append((step.step, *(v.detach() if isinstance(v, Tensor) else v for v in values)))
 
     def _draw_chart(self) -> None:
         rows = self._losses[:: max(1, len(self._losses) // _KEPT)]
@@ -199,12 +210,14 @@ class LiveView:
         work()
         self._spent += self._clock() - started
 
-    def _is_due(self, what: str, every: float) -> bool:
+    def _most_overdue(self) -> str | None:
+        """The part of the page whose update has waited longest, and is due; its next one is then set."""
         now = self._clock()
-        if now < self._due.get(what, 0.0):
-            return False
-        self._due[what] = now + every
-        return True
+        name = min(_EVERY_S, key=lambda name: self._due[name])
+        if self._due[name] > now:
+            return None
+        self._due[name] = now + _EVERY_S[name]
+        return name
 
 
 @contextlib.contextmanager
