@@ -24,8 +24,8 @@ ROWS = {  # by package: a room or module imports only rooms of rows before its o
         {"cli"},
     ],
     "swimm3r.io": [
-        {"files", "depth", "view_names"},
-        {"cameras_json", "medium_json", "colmap", "image_header", "ply", "trajectory", "video"},
+        {"files", "view_names"},
+        {"cameras_json", "depth", "medium_json", "colmap", "image_header", "ply", "trajectory", "video"},
         {"images"},
         {"image_folder", "imports"},
     ],

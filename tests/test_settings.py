@@ -22,6 +22,7 @@ from swimm3r.cli.main import main
 from swimm3r.errors import InputError, UsageError
 from swimm3r.pipeline.presets import PRESETS, RunSettings, from_yaml, to_yaml
 from swimm3r.pipeline.renders import render_run
+from swimm3r.pipeline.view_settings import ViewSettings
 from swimm3r.scene.settings import FrameSettings
 from swimm3r.settings import NotEmpty, Positive, Range, SettingError, Settings, declarations, ranges_of
 from swimm3r.settings_document import from_document, to_document
@@ -279,7 +280,7 @@ def refused(capsys: pytest.CaptureFixture[str], *arguments: str) -> str:
             "demo --coefficients.Binf 0 0 2",
             "--coefficients.Binf: must be 3 values (a number at least 0 and at most 1",
         ),
-        ("render x --flight -1", "--flight: must be a whole number"),
+        ("render x --count -1", "--count: must be a whole number"),
         ("render x --long-side 5", "--long-side: must be a whole number at least 32 and at most 65536, or 0, got 5"),
         ("render x --time nan", "--time: must be"),
         ("export x --time inf", "--time: must be"),
@@ -328,12 +329,12 @@ def test_a_range_says_what_it_is():
         _Sample(2.0)
 
 
-@pytest.mark.parametrize(("long_side", "flight", "time"), [(5, 0, None), (0, -1, None), (0, 0, math.nan)])
+@pytest.mark.parametrize(("long_side", "count", "time"), [(5, 0, None), (0, -1, None), (0, 0, math.nan)])
 def test_functions_of_the_python_api_check_their_numbers_before_anything_else(
-    long_side: int, flight: int, time: float | None, tmp_path: Path
+    long_side: int, count: int, time: float | None, tmp_path: Path
 ):
     with pytest.raises(SettingError):
-        render_run(tmp_path / "nowhere", long_side=long_side, flight=flight, time=time)
+        render_run(tmp_path / "nowhere", ViewSettings(count=count, long_side=long_side, time=time))
 
 
 def test_no_seed_and_no_stride_are_refused_before_anything_is_measured(tmp_path: Path):

@@ -38,7 +38,7 @@ def cases(fixture: Fixture) -> Iterator[Case]:
     frame = next(p for p in sorted((fixture.run / "prepare").rglob("*")) if p.suffix in (".png", ".jpg"))
     for arguments in (
         ("render", "copy", "--long-side", "{}"),
-        ("render", "copy", "--flight", "{}"),
+        ("render", "copy", "--count", "{}"),
         ("render", "copy", "--time", "{}"),
         ("export", "copy", "--time", "{}"),
         ("eval", "copy", "--steps", "{}"),

@@ -14,7 +14,8 @@ from swimm3r.errors import InputError
 from swimm3r.io import images
 from swimm3r.io.depth import read_depth
 from swimm3r.medium import Medium
-from swimm3r.pipeline.renders import DisplayStyle, shown_clear, smooth_path, write_view
+from swimm3r.pipeline.camera_paths import smooth_path
+from swimm3r.pipeline.renders import DisplayStyle, shown_clear, write_view
 from swimm3r.sfm.settings import RestoreSettings
 from swimm3r.splat.rendering import RenderOutput
 
@@ -73,7 +74,7 @@ def test_numbers_lie_beside_the_images(tmp_path: Path):
     physical = images.read_rgb(tmp_path / "dive" / "a_clear_physical.png")
     assert physical.dtype == np.uint16
     assert np.abs(physical / 65535 - 0.4).max() < 2e-3  # some of the open water is mixed in
-    torch.testing.assert_close(torch.from_numpy(read_depth(tmp_path / "dive" / "a_z_depth.npz")), out.z_depth)
+    torch.testing.assert_close(torch.from_numpy(read_depth(tmp_path / "dive" / "a_z_depth.tif")), out.z_depth)
 
 
 ENCODE = """

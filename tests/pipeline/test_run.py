@@ -26,6 +26,7 @@ from swimm3r.localization.settings import LocalizationSettings
 from swimm3r.pipeline.presets import MAST3R_PRESETS, PRESETS, RunSettings, from_yaml, to_yaml
 from swimm3r.pipeline.renders import KINDS, render_run
 from swimm3r.pipeline.run import evaluate_run, run_pipeline
+from swimm3r.pipeline.view_settings import ViewSettings
 from swimm3r.prepare import load_frames
 from swimm3r.report.outputs import OUTPUTS, outputs_of
 from swimm3r.report.scores import TRUTH_LABELS, truth_rows
@@ -111,7 +112,7 @@ def test_the_run_folder_holds_what_the_conventions_promise(finished: tuple[Path,
         stem = folder / "renders" / "test" / Path(name).stem
         for kind in KINDS:
             assert Path(f"{stem}_{kind}.png").is_file()
-        assert read_depth(Path(f"{stem}_z_depth.npz")).any()
+        assert read_depth(Path(f"{stem}_z_depth.tif")).any()
 
 
 def test_the_map_shows_frames_it_never_saw(finished: tuple[Path, dict]):
@@ -145,7 +146,7 @@ def test_a_finished_run_is_scored_and_rendered_again(finished: tuple[Path, dict]
     again = evaluate_run(copy)
     assert again["test"] == summary["test"]
     assert again["truth"]["splat"]["clear_psnr"] == pytest.approx(summary["truth"]["splat"]["clear_psnr"], abs=1e-3)
-    images = render_run(copy, long_side=80)
+    images = render_run(copy, ViewSettings(long_side=80))
     assert len(list(images.rglob("*_rgb.png"))) == summary["sfm"]["registered"]
 
 

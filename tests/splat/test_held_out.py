@@ -8,8 +8,8 @@ import torch
 from swimm3r.cameras import Cameras
 from swimm3r.evaluate import NotComputed
 from swimm3r.geometry import Similarity, align_similarity, best_similarity, pose_from, rotation_angle, so3_exp
+from swimm3r.pipeline.camera_paths import smooth_path
 from swimm3r.pipeline.held_out import covered_by_training, covered_scores, cut, first_poses, visible_window
-from swimm3r.pipeline.renders import smooth_path
 from swimm3r.scene.ground_truth import GroundTruth
 from swimm3r.scene.reconstruction import DenseCloud
 from swimm3r.sfm.settings import FeatureSettings

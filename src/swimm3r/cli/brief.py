@@ -54,6 +54,12 @@ BRIEF: dict[tuple[str, ...], Groups] = {
         "matching": ("--matcher", "--weights", "--device", "--candidates", "--rounds", "--min-inliers"),
         "": _MESSAGES,
     },
+    ("render",): {
+        "cameras": ("--path", "--count", "--time"),
+        "output": ("--out", "--long-side", "--video"),
+        "speed": ("--map-device",),
+        "": _MESSAGES,
+    },
     ("export",): {
         "output": ("--format", "--out"),
         "splats and clouds": ("--colors", "--time", "--point-limit"),

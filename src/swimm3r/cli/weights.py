@@ -32,14 +32,14 @@ def get(name: Positional[Name], /, accept_license: bool = False) -> None:
     print(path)
 
 
-def verify(name: Positional[Name], /, path: Path | None = None) -> None:
+def verify(name: Positional[Name], /, file: Path | None = None) -> None:
     """Read a whole file and compare its checksum with the published one, else with that of its first use.
 
     Args:
         name: Name of the weights, as `swimm3r weights list` prints it.
-        path: File to check, if it lies elsewhere.
+        file: File to check, if it lies elsewhere.
     """
-    checked = store.verify(name, path)
+    checked = store.verify(name, file)
     outcome = {
         "published": "is the published file",
         "first use": "is unchanged since its first use here (no checksum is published)",

@@ -9,9 +9,11 @@ import zlib
 from pathlib import Path
 
 import numpy as np
+import tifffile
 from jaxtyping import Float32
 
 from swimm3r.errors import InputError
+from swimm3r.io.files.atomic import atomic_path
 
 SUFFIXES = (".tif", ".tiff", ".png", ".npz", ".npy")
 
@@ -34,6 +36,12 @@ def read_depth(path: Path, per_metre: float = 1000.0) -> Float32[np.ndarray, "h 
         raise _unreadable(path, f"its values are {stored.dtype}")
     depth = stored.astype(np.float32)
     return np.where(np.isfinite(depth) & (depth > 0), depth, np.float32(0))
+
+
+def write_depth(path: Path, depth: Float32[np.ndarray, "h w"]) -> None:
+    """Write depth as a TIFF of 32-bit floats, whole or not at all; 0 where nothing is known."""
+    with atomic_path(path) as draft:
+        tifffile.imwrite(draft, depth, compression="zlib")
 
 
 def _decode(path: Path) -> np.ndarray:

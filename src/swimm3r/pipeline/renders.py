@@ -2,7 +2,8 @@
 
 NAME_rgb.png             with the water                NAME_clear.png            without it, white-balanced for display
 NAME_backscatter.png     the light of the water alone  NAME_clear_physical.png   before the white balance, 16 bits
-NAME_z_depth.png         depth in colors               NAME_z_depth.npz          z_depth, scene units, and alpha
+NAME_z_depth.png         depth in colors               NAME_z_depth.tif          z_depth, scene units, 32-bit floats
+NAME_alpha.png           opacity, 16 bits
 """
 
 from collections.abc import Iterable, Sequence
@@ -13,27 +14,27 @@ from pathlib import Path
 import numpy as np
 import torch
 from jaxtyping import Float, UInt8
-from scipy.ndimage import gaussian_filter1d
 from torch import Tensor
 
 from swimm3r import devices
 from swimm3r.cameras import Cameras, cameras_of, image_directions, ray_depth_from_z
 from swimm3r.errors import InputError
-from swimm3r.geometry import pose_from, quaternion_from_rotation, rotation_from_quaternion
 from swimm3r.imaging.depth_colors import depth_image, depth_span
 from swimm3r.io import cameras_json, images
 from swimm3r.io.cameras_json import CameraTable
+from swimm3r.io.depth import write_depth
 from swimm3r.io.files.atomic import atomic_path
 from swimm3r.io.view_names import view_stems
 from swimm3r.medium import transmittances
+from swimm3r.pipeline.camera_paths import CameraPath, Dive, camera_path, smooth_path, times_along
 from swimm3r.pipeline.presets import from_yaml
+from swimm3r.pipeline.view_settings import ViewSettings
 from swimm3r.prepare import load_frames
 from swimm3r.progress import Progress, silent
 from swimm3r.scene.frames import Frames
 from swimm3r.scene.reconstruction import Reconstruction
 from swimm3r.scene.reconstruction_io import load_reconstruction
 from swimm3r.scene.run_folder import open_run
-from swimm3r.settings import ClipSecond, CountOrZero, LongSideOrOwn, accepted
 from swimm3r.sfm.medium.restore import keep_open_water
 from swimm3r.sfm.settings import RestoreSettings
 from swimm3r.splat.map_file import load_map
@@ -47,7 +48,6 @@ _RATE = 15  # images per second of the flight
 _X264 = {"crf": "23", "preset": "medium", "x264-params": "mbtree=0"}
 """Options of the video encoder, which gives the same bits for the same images: the vector code of its macroblock tree
 reads beyond its rows where half a width is no multiple of a vector, and what it finds there moves its decisions."""
-_SMOOTH = 1.5  # frames of the dive over which the flight's hand steadies
 
 
 @dataclass(frozen=True)
@@ -88,23 +88,8 @@ def write_view(folder: Path, stem: str, out: RenderOutput, camera: Cameras, styl
         images.write_rgb(folder / f"{stem}_{kind}.png", image.numpy())
     images.write_rgb_16(folder / f"{stem}_clear_physical.png", physical_clear(out, camera, style).numpy())
     images.write_rgb(folder / f"{stem}_z_depth.png", depth_image(out.z_depth.numpy(), *style.near_far))
-    with atomic_path(folder / f"{stem}_z_depth.npz") as draft:
-        np.savez_compressed(draft, z_depth=out.z_depth.numpy(), alpha=out.alpha.numpy())
-
-
-def smooth_path(cam2world: Float[Tensor, "c 4 4"], count: int) -> Float[Tensor, "f 4 4"]:
-    """`count` poses along a path of cameras, without the shaking of the hand that held them."""
-    q = quaternion_from_rotation(cam2world[:, :3, :3].double()).numpy().copy()
-    for i in range(1, len(q)):  # q and -q are one rotation, but not on the way in between
-        if q[i] @ q[i - 1] < 0:
-            q[i] *= -1
-    stations = np.concatenate([cam2world[:, :3, 3].double().numpy(), q], 1)
-    at = np.linspace(0, len(stations) - 1, count)
-    dense = np.stack([np.interp(at, np.arange(len(stations)), column) for column in stations.T], 1)
-    per_frame = (count - 1) / max(1, len(stations) - 1)
-    width = _SMOOTH * per_frame
-    steady = torch.from_numpy(gaussian_filter1d(dense, width, axis=0, mode="nearest") if width else dense)
-    return pose_from(rotation_from_quaternion(steady[:, 3:]), steady[:, :3])
+    write_depth(folder / f"{stem}_z_depth.tif", out.z_depth.numpy())
+    images.write_levels(folder / f"{stem}_alpha.png", (out.alpha.numpy().clip(0, 1) * 65535 + 0.5).astype(np.uint16))
 
 
 def write_flythrough(
@@ -117,20 +102,33 @@ def write_flythrough(
     style: DisplayStyle,
     progress: Progress = silent,
 ) -> None:
-    """An H.264 video of `count` views along the cameras' path: with the water, and beside it without.
+    """An H.264 video of `count` views along the cameras' smoothed path: with the water, and beside it without.
 
     `times` are the cameras' own, seconds of the clip; the flight takes as many of its own on the way.
     """
-    clock = np.interp(np.linspace(0, len(times) - 1, count), np.arange(len(times)), times)
+    flight = replace(canvas, K=canvas.K[:1], cam2world=smooth_path(cam2world, count))
+    write_video(path, scene, flight, times_along(times, count), style, progress)
+
+
+def write_video(
+    path: Path,
+    scene: SplatMap,
+    flight: Cameras,
+    times: Sequence[float],
+    style: DisplayStyle,
+    progress: Progress = silent,
+) -> None:
+    """An H.264 video of these pinhole views, all through the first one's lens: with the water, and without beside."""
+    canvas = flight[0]
 
     def views() -> Iterable[UInt8[np.ndarray, "h w 3"]]:
-        for i, pose in enumerate(smooth_path(cam2world, count)):
-            progress("filming the flight", i, count)
+        for i, pose in enumerate(flight.cam2world):
+            progress("filming the flight", i, len(times))
             camera = replace(canvas, cam2world=pose[None])
-            out = scene.render(camera, float(clock[i]))
+            out = scene.render(camera, times[i])
             both = torch.cat([out.rgb, shown_clear(out, camera, style)], 1)
             yield (both.clamp(0, 1) * 255).round().to(torch.uint8).numpy()
-        progress("filming the flight", count, count)
+        progress("filming the flight", len(times), len(times))
 
     with atomic_path(path) as draft:
         _encode(draft, views())
@@ -138,63 +136,73 @@ def write_flythrough(
 
 def render_run(
     folder: Path,
-    cameras: Path | None = None,
+    settings: ViewSettings | None = None,
     out: Path | None = None,
-    long_side: int = 0,
-    flight: int = 0,
-    time: float | None = None,
     restore: RestoreSettings | None = None,
     progress: Progress = silent,
     *,
     map_device: MapDevice = "auto",
 ) -> Path:
-    """Images of a finished run's map from the cameras of a cameras.json, by default those of training; into `out`.
+    """Images of a finished run's map, or a video, along a path of cameras (`camera_paths`); into `out`.
 
-    `cameras` are in the axes of RUN/sfm, or the map's own, RUN/splat/cameras.json.
-
-    Clear images look like the frames that `restore` made, by default the run's own settings. A dynamic map shows `time`
-    (seconds of the clip), by default the cameras' own times, else when the frames of their names were taken. Raises
-    InputError where the run has no map or no moment is known.
+    Clear images look like the frames that `restore` made, by default the run's own settings. A dynamic map shows the
+    settings' time (seconds of the clip), by default the cameras' own times, else when the frames of their names were
+    taken. The cameras are written beside the images, in the axes of RUN/sfm. Raises InputError where the run has no map
+    or no moment is known.
     """
-    accepted("long_side", long_side, LongSideOrOwn)
-    accepted("flight", flight, CountOrZero)
-    accepted("time", time, ClipSecond | None)
+    settings = settings or ViewSettings()
     open_run(folder, "splat")
     restore = restore or from_yaml(folder / "settings.yaml").sfm.restore
     scene = load_map(folder / "splat" / "map.safetensors").to(devices.for_maps(map_device))
     frames = load_frames(folder / "prepare")
     rec = load_reconstruction(folder / "sfm", frames)
-    refined = folder / "splat" / "cameras.json"
-    own = refined if refined.is_file() else folder / "sfm" / "cameras.json"
-    table = cameras_json.read_cameras(cameras or own)
-    stations, out = cameras_of(table), out or folder / "renders" / "views"
-    to_map = axes_of_map(rec, scene.poses)
-    if to_map is not None and cameras is not None and cameras.resolve() != own.resolve():
-        stations = replace(stations, cam2world=to_map.poses(stations.cam2world.double()))
-    times = moments_of(scene, table, frames, time)
+    dive, out = _dive(folder, scene, rec), out or folder / "renders" / "views"
+    path = camera_path(dive, settings)
+    times = moments_of(scene, path, frames, settings.time)
     style = display_style(scene, rec, restore)
-    stems = view_stems(table.names)
-    for i, name in enumerate(table.names):
-        progress("rendering", i, len(table.names))
-        camera = stations[i].pinhole(long_side)
-        write_view(out, stems[name], scene.render(camera, times[i]), camera, style)
-    progress("rendering", len(table.names), len(table.names))
-    if flight:
-        canvas = stations[0].pinhole(long_side)
-        write_flythrough(out / "flythrough.mp4", scene, canvas, stations.cam2world, times, flight, style, progress)
+    _write_cameras(out / "rendered_cameras.json", path, times, dive, rec)
+    stems = view_stems(path.names)
+    if settings.video != "only":
+        for i, name in enumerate(path.names):
+            progress("rendering", i, len(path.names))
+            camera = path.cameras[i].pinhole(settings.long_side)
+            write_view(out, stems[name], scene.render(camera, times[i]), camera, style)
+        progress("rendering", len(path.names), len(path.names))
+    if settings.video != "no":
+        canvas = path.cameras[0].pinhole(settings.long_side)
+        flight = replace(canvas, cam2world=path.cameras.cam2world)
+        write_video(out / "flythrough.mp4", scene, flight, times, style, progress)
     return out
 
 
-def moments_of(scene: SplatMap, table: CameraTable, frames: Frames, time: float | None) -> Sequence[float]:
+def _dive(folder: Path, scene: SplatMap, rec: Reconstruction) -> Dive:
+    refined = folder / "splat" / "cameras.json"
+    own = refined if refined.is_file() else folder / "sfm" / "cameras.json"
+    table, to_map = cameras_json.read_cameras(own), axes_of_map(rec, scene.poses)
+    ground = rec.points.xyz if to_map is None else to_map.points(rec.points.xyz.double())
+    return Dive(CameraPath(table.names, cameras_of(table), table.times), ground, scene.span, own, to_map)
+
+
+def _write_cameras(path: Path, shown: CameraPath, times: Sequence[float], dive: Dive, rec: Reconstruction) -> None:
+    """The cameras in the axes of RUN/sfm, from where `--path` reads them."""
+    poses = shown.cameras.cam2world.double()
+    poses = poses if dive.to_map is None else dive.to_map.inverse().poses(poses)
+    units = "metres" if rec.metric else "scene units"
+    replace(shown.cameras, cam2world=poses).save(path, shown.names, times, units)
+
+
+def moments_of(scene: SplatMap, path: CameraPath | CameraTable, frames: Frames, time: float | None) -> Sequence[float]:
     """Times of the views, seconds of the clip: `time`, the camera's, or that of the frame of its name.
 
     Raises InputError where a dynamic map is to be shown at a moment that is not known.
     """
-    if time is not None or not scene.primitives.dynamic:
-        return [time or 0.0] * len(table.names)
-    if table.times is not None:
-        return table.times
-    unknown = [name for name in table.names if name not in set(frames.names)]
+    if time is not None:
+        return [time] * len(path.names)
+    if path.times is not None:
+        return path.times
+    unknown = [name for name in path.names if name not in set(frames.names)]
+    if not scene.primitives.dynamic:
+        return [0.0] * len(path.names)
     if unknown:
         start, end = scene.span
         raise InputError(
@@ -202,7 +210,7 @@ def moments_of(scene: SplatMap, table: CameraTable, frames: Frames, time: float 
             cause="the map changes with time, and the cameras are not those of its frames",
             hint=f"--time SECONDS, {start:g} to {end:g}, or a time for every frame of the file",
         )
-    return frames.times_of(table.names)
+    return frames.times_of(path.names)
 
 
 def _encode(path: Path, images: Iterable[UInt8[np.ndarray, "h w 3"]]) -> None:

@@ -1,6 +1,6 @@
 """Views and camera paths that the user keeps: cameras.json with times, pictures, and the video along a path.
 
-They go to RUN/renders/views/NAME, which `swimm3r render --cameras` reads; nothing that lies there is overwritten.
+They go to RUN/renders/views/NAME, which `swimm3r render --path` reads; nothing that lies there is overwritten.
 """
 
 from collections.abc import Sequence

@@ -126,7 +126,7 @@ class ViewedRun:
         return (xyz * self.scale).numpy(), (colors.clamp(0, 1) * 255).round().to(torch.uint8).numpy()
 
     def in_axes_of_sfm(self, cam2world: Float[Tensor, "c 4 4"]) -> Float[Tensor, "c 4 4"]:
-        """Poses of the map's axes in those of RUN/sfm, as `swimm3r render --cameras` reads them."""
+        """Poses of the map's axes in those of RUN/sfm, as `swimm3r render --path` reads them."""
         return cam2world if self.to_map is None else self.to_map.inverse().poses(cam2world)
 
     def up(self) -> Float[np.ndarray, "3"]:

@@ -7,13 +7,13 @@ import json
 from pathlib import Path
 
 import numpy as np
-import tifffile
 from jaxtyping import Float32
 
 from swimm3r.errors import InputError
 from swimm3r.export.result import Exported
 from swimm3r.export.settings import DepthSettings
 from swimm3r.io import images
+from swimm3r.io.depth import write_depth
 from swimm3r.io.files.atomic import atomic_folder, write_text
 from swimm3r.io.files.outputs import check_empty
 from swimm3r.io.view_names import view_stems
@@ -43,11 +43,10 @@ def export_run(folder: Path, path: Path, settings: DepthSettings) -> Exported:
         for name in names:
             z = rec.depth[name].z_depth.numpy()
             place = draft / f"{stems[name]}.{'png' if settings.type == 'png' else 'tif'}"
-            place.parent.mkdir(parents=True, exist_ok=True)
             if settings.type == "png":
                 images.write_levels(place, as_levels(z, level))
             else:
-                tifffile.imwrite(place, z, compression="zlib")
+                write_depth(place, z)
         write_text(
             draft / "depth.json",
             json.dumps(
