@@ -90,7 +90,7 @@ def test_verify_trusts_the_first_use_and_finds_a_later_change(capsys: pytest.Cap
 
 def test_verify_takes_a_file_that_lies_elsewhere(capsys: pytest.CaptureFixture[str], small: Path, tmp_path: Path):
     other = small.rename(tmp_path / small.name)
-    assert str(other) in outcome(capsys, "verify", "mast3r-retrieval", "--path", str(other))[1]
+    assert str(other) in outcome(capsys, "verify", "mast3r-retrieval", "--file", str(other))[1]
 
 
 def test_the_license_is_accepted_by_nobody_else(capsys: pytest.CaptureFixture[str]):
