@@ -123,6 +123,8 @@ def test_options_of_one_name_take_the_same_values():
         "--recipe",  # of maps, and of trainings
         "--device", "--precision",  # training has no MPS and no float16
         "--frames", "--seed",
+        "--fps",  # 0 takes every frame of a video; a synthetic dive has no such rate
+        "--path",  # of a synthetic dive, and of the views of a map
     }  # fmt: skip
     kinds: dict[str, set[str]] = {}
     for options in OPTIONS.values():

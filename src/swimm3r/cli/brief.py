@@ -70,7 +70,7 @@ BRIEF: dict[tuple[str, ...], Groups] = {
     },
     ("demo",): {
         "output": _OUTPUT,
-        "dive": ("--frames", "--width", "--height", "--family", "--moving-object", "--seed"),
+        "dive": ("--path", "--length", "--frames", "--width", "--height", "--family", "--moving-object", "--seed"),
         "map": ("--recipe",),
         "": _MESSAGES,
     },

@@ -29,12 +29,11 @@ from swimm3r.medium import Medium, add_water, srgb_from_linear
 from swimm3r.progress import Progress, silent
 from swimm3r.scene.ground_truth import FOLDER
 from swimm3r.synthetic import disturbances
-from swimm3r.synthetic.path import camera_path
+from swimm3r.synthetic.path import loop, survey
+from swimm3r.synthetic.plain import Plain
 from swimm3r.synthetic.render_frame import SAMPLES, render
 from swimm3r.synthetic.seafloor import Seafloor, make_seafloor
 from swimm3r.synthetic.settings import DiveSettings
-
-_FRAMES_PER_SECOND = 5.0  # the speed of caustics; the pace of the path depends on the number of frames
 
 
 @dataclass(frozen=True)
@@ -56,7 +55,7 @@ class Dive:
     names: tuple[str, ...]  # of the images, with extension
     cameras: Cameras  # metres
     medium: Medium  # [3], 1/m
-    floor: Seafloor
+    floor: Seafloor | Plain
 
     def __len__(self) -> int:
         return len(self.names)
@@ -64,13 +63,14 @@ class Dive:
     def frame(self, i: int) -> DiveFrame:
         """Render frame i; the same every time."""
         settings, camera = self.settings, self.cameras[i]
+        floor = self.floor.around(*camera.centers[0, :2].tolist())
         rays, sample_rays = _rays(camera), _rays(resized(camera, SAMPLES * camera.width, SAMPLES * camera.height))
         radiance, z = render(
-            self.floor,
+            floor,
             camera.cam2world[0].numpy(),
             rays.numpy(),
             sample_rays.numpy(),
-            i / _FRAMES_PER_SECOND,
+            i / settings.fps,
             settings.caustics,
         )
         clear = srgb_from_linear(torch.from_numpy(radiance)).clamp(0, 1).float()
@@ -80,7 +80,7 @@ class Dive:
         usable = torch.ones_like(z_depth, dtype=torch.bool)
         rng = np.random.default_rng([settings.seed, 2, i])
         if settings.moving_object:
-            there = disturbances.swimming(self.floor, i / max(len(self) - 1, 1), settings.seed)
+            there = disturbances.swimming(floor, i / max(len(self) - 1, 1), settings.seed)
             seen = disturbances.fish(sample_rays, z_depth, there.seen_from(camera.cam2world[0]))
             raw, usable = disturbances.with_fish(raw, seen, self.medium), disturbances.untouched(seen)
         if settings.marine_snow:
@@ -93,14 +93,21 @@ class Dive:
 
 
 def make_dive(settings: DiveSettings) -> Dive:
-    """The seafloor, path and water of a dive; images are rendered by `Dive.frame`."""
-    floor = make_seafloor(settings.seed)
+    """The seafloor, path and water of a dive; images are rendered by `Dive.frame`.
+
+    Raises UsageError where a survey's camera would see too far.
+    """
+    if settings.path == "loop":
+        floor = make_seafloor(settings.seed)
+        poses = loop(floor, settings.frames, settings.seed)
+    else:
+        floor, poses = Plain(settings.seed), survey(settings)
     focal = settings.width / 2 / np.tan(np.radians(settings.fov) / 2)
     K = torch.tensor([[focal, 0, settings.width / 2], [0, focal, settings.height / 2], [0, 0, 1]], dtype=torch.float64)
     cameras = Cameras(
-        K=K.repeat(settings.frames, 1, 1),
-        distortion=torch.zeros(settings.frames, 0, dtype=torch.float64),
-        cam2world=torch.from_numpy(camera_path(floor, settings.frames, settings.seed)),
+        K=K.repeat(len(poses), 1, 1),
+        distortion=torch.zeros(len(poses), 0, dtype=torch.float64),
+        cam2world=torch.from_numpy(poses),
         width=settings.width,
         height=settings.height,
     )
@@ -167,7 +174,7 @@ def water(settings: DiveSettings) -> Medium:
 
 
 def _names(settings: DiveSettings) -> tuple[str, ...]:
-    return tuple(f"{i:04d}.png" for i in range(settings.frames))
+    return tuple(f"{i:04d}.png" for i in range(settings.frame_count))
 
 
 def _rays(camera: Cameras) -> Float[Tensor, "h w 3"]:

@@ -16,6 +16,7 @@ from swimm3r.synthetic.raycast import Heightfield, heightfield
 
 CELLS = 2048
 EXTENT = 14.0  # m, side of the grid
+CELL = EXTENT / CELLS
 CENTER = (0.0, 2.6)  # of the terrace
 RIM = 5.2  # m, its mean radius
 SUN = np.array([-0.45, 0.35, 0.82])  # toward the sun; unit length to 1 %
@@ -37,21 +38,38 @@ class Seafloor:
     owner: np.ndarray  # [n, n] int16: the animal whose outline may reach this cell, -1 for none
     seed: int
 
+    def around(self, x: float, y: float) -> "Seafloor":
+        """The floor that a camera at a place sees: all of it."""
+        return self
+
 
 def make_seafloor(seed: int) -> Seafloor:
-    """The seafloor of a seed."""
+    """The terrace of a seed."""
     rng = np.random.default_rng(seed)
-    cell = EXTENT / CELLS
     x0, y0 = CENTER[0] - EXTENT / 2, CENTER[1] - EXTENT / 2
-    sand, height = _terrain(CELLS + 1, x0, y0, cell, int(seed) * 7919 + 1)
+    sand, height = terrain(CELLS + 1, x0, y0, CELL, int(seed) * 7919 + 1, RIM + 1.2)
     for boulder in _boulders(rng):
-        _add_boulder(height, x0, y0, cell, boulder, int(rng.integers(1 << 30)))
+        add_boulder(height, height, x0, y0, CELL, boulder, int(rng.integers(1 << 30)))
     rock = np.clip((height - sand) / 0.03, 0, 1)
-    animals = _animals(rng, height, rock, x0, y0, cell)
+    animals = _animals(rng, height, rock, x0, y0, CELL)
+    owner = with_animals(height, animals, x0, y0)
+    _add_rim(height, x0, y0, CELL, int(seed) * 7919 + 5)
+    return lit_floor(height, rock, animals, owner, x0, y0, seed)
+
+
+def with_animals(height: np.ndarray, animals: np.ndarray, x0: float, y0: float) -> np.ndarray:
+    """The owner of every cell; the animals are added to `height`."""
     owner = np.full((CELLS, CELLS), -1, np.int16)
     for number, animal in enumerate(animals):
-        _add_animal(height, owner, x0, y0, cell, animal, number)
-    _add_rim(height, x0, y0, cell, int(seed) * 7919 + 5)
+        _add_animal(height, owner, x0, y0, CELL, animal, number)
+    return owner
+
+
+def lit_floor(
+    height: np.ndarray, rock: np.ndarray, animals: np.ndarray, owner: np.ndarray, x0: float, y0: float, seed: int
+) -> Seafloor:
+    """A floor of this shape with its slopes and its light."""
+    cell = CELL
     smooth = ndimage.gaussian_filter(height, 0.7)
     slope_y, slope_x = np.gradient(smooth, cell)
     sun = _sun_share(height, cell, SUN)
@@ -84,15 +102,15 @@ def _blurred(grid: np.ndarray, sigma: float) -> np.ndarray:
 
 @numba.njit(cache=True)
 @no_type_check
-def _terrain(nodes: int, x0: float, y0: float, cell: float, seed: int) -> tuple[np.ndarray, np.ndarray]:
-    """Sand (dunes and ripples) and sand with outcrops, before boulders and the rim."""
+def terrain(nodes: int, x0: float, y0: float, cell: float, seed: int, radius: float) -> tuple[np.ndarray, np.ndarray]:
+    """Sand (dunes and ripples) and sand with outcrops, before boulders and the rim; flat beyond `radius` of CENTER."""
     sand = np.empty((nodes, nodes))
     height = np.empty((nodes, nodes))
     for row in range(nodes):
         y = y0 + row * cell
         for column in range(nodes):
             x = x0 + column * cell
-            if np.hypot(x - CENTER[0], y - CENTER[1]) > RIM + 1.2:  # past the rim, out of sight
+            if np.hypot(x - CENTER[0], y - CENTER[1]) > radius:  # out of sight
                 sand[row, column] = height[row, column] = 0.0
                 continue
             dune = 0.16 * fractal(x, y, 0.0, 2.6, 3, 0.45, 0.0, seed)
@@ -131,22 +149,28 @@ def _boulders(rng: np.random.Generator) -> list[np.ndarray]:
             if np.hypot(x, y - 0.6) < nearest + 0.6 * (nearest > 1):  # large ones leave room for the camera
                 continue
             r = rng.uniform(*radius)
-            boulders.append(
-                np.array([x, y, r, r * rng.uniform(0.6, 1.0), r * rng.uniform(0.65, 1.25), rng.uniform(0, np.pi)])
-            )
+            boulders.append(some_boulder(rng, x, y, r))
             placed += 1
     return boulders
 
 
+def some_boulder(rng: np.random.Generator, x: float, y: float, r: float) -> np.ndarray:
+    """x, y, two radii, height and angle of a boulder of radius `r`."""
+    return np.array([x, y, r, r * rng.uniform(0.6, 1.0), r * rng.uniform(0.65, 1.25), rng.uniform(0, np.pi)])
+
+
 @numba.njit(cache=True)
 @no_type_check
-def _add_boulder(height: np.ndarray, x0: float, y0: float, cell: float, boulder: np.ndarray, seed: int) -> None:
+def add_boulder(
+    height: np.ndarray, ground: np.ndarray, x0: float, y0: float, cell: float, boulder: np.ndarray, seed: int
+) -> None:
+    """Add a boulder that stands on `ground` to `height`."""
     x, y, a, b, top, angle = boulder
     reach = int(1.4 * max(a, b) / cell) + 1
     column0, row0 = int((x - x0) / cell), int((y - y0) / cell)
     if not (0 <= row0 < height.shape[0] and 0 <= column0 < height.shape[1]):
         return
-    base = height[row0, column0] - 0.18 * top
+    base = ground[row0, column0] - 0.18 * top
     cos, sin = np.cos(angle), np.sin(angle)
     for row in range(max(row0 - reach, 0), min(row0 + reach + 1, height.shape[0])):
         for column in range(max(column0 - reach, 0), min(column0 + reach + 1, height.shape[1])):
@@ -175,20 +199,39 @@ def _animals(
         distance, angle = RIM * 0.98 * np.sqrt(rng.random()), rng.uniform(0, 2 * np.pi)
         x, y = CENTER[0] + distance * np.cos(angle), CENTER[1] + distance * np.sin(angle)
         row, column = int((y - y0) / cell), int((x - x0) / cell)
-        patch = height[row - 6 : row + 7, column - 6 : column + 7]
-        if np.ptp(patch) > 0.09 or (kind == SPONGE and rock[row, column] < 0.9):
+        if not has_room(kind, x, y, height, rock, row, column, rows):
             continue
-        if any(np.hypot(x - other[1], y - other[2]) < 0.14 for other in rows):
-            continue
-        if kind == STAR:
-            r, top, color = rng.uniform(0.06, 0.12), 0.012, _STAR_COLORS[rng.integers(4)]
-        elif kind == URCHIN:
-            r, top, color = rng.uniform(0.045, 0.08), 0.035, (0.002, 0.0016, 0.002)
-        else:
-            r, top, color = rng.uniform(0.03, 0.075), rng.uniform(0.03, 0.08), _SPONGE_COLORS[rng.integers(4)]
-        rows.append([kind, x, y, r, top, rng.uniform(0, 2 * np.pi), *(np.array(color) * rng.uniform(0.75, 1.1))])
+        rows.append(some_animal(rng, kind, x, y))
         wanted[kind] -= 1
     return np.array(rows)
+
+
+def has_room(
+    kind: int,
+    x: float,
+    y: float,
+    height: np.ndarray,
+    rock: np.ndarray,
+    row: int,
+    column: int,
+    others: list[list[float]],
+) -> bool:
+    """Return whether an animal fits at a place: the ground is even, of its kind, and no other animal is near."""
+    patch = height[row - 6 : row + 7, column - 6 : column + 7]
+    if np.ptp(patch) > 0.09 or (kind == SPONGE and rock[row, column] < 0.9):
+        return False
+    return not any(np.hypot(x - other[1], y - other[2]) < 0.14 for other in others)
+
+
+def some_animal(rng: np.random.Generator, kind: int, x: float, y: float) -> list[float]:
+    """The fields of an animal, see ANIMAL_FIELDS."""
+    if kind == STAR:
+        r, top, color = rng.uniform(0.06, 0.12), 0.012, _STAR_COLORS[rng.integers(4)]
+    elif kind == URCHIN:
+        r, top, color = rng.uniform(0.045, 0.08), 0.035, (0.002, 0.0016, 0.002)
+    else:
+        r, top, color = rng.uniform(0.03, 0.075), rng.uniform(0.03, 0.08), _SPONGE_COLORS[rng.integers(4)]
+    return [kind, x, y, r, top, rng.uniform(0, 2 * np.pi), *(np.array(color) * rng.uniform(0.75, 1.1))]
 
 
 @numba.njit(cache=True, inline="always")

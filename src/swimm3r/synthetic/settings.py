@@ -3,6 +3,7 @@
 from dataclasses import dataclass
 from typing import Annotated, Literal
 
+from swimm3r.errors import UsageError
 from swimm3r.settings import Range, Seed, Settings, Share
 
 _Beta = Annotated[float, Range(0, 100)]
@@ -23,10 +24,21 @@ class Coefficients(Settings):
 
 @dataclass(frozen=True)
 class DiveSettings(Settings):
-    """A synthetic dive over a procedural seafloor."""
+    """A synthetic dive over a procedural seafloor: a diver's loop over a terrace, or a survey of a plain."""
 
+    path: Literal["loop", "transect", "lawnmower"] = "loop"
+    """Path of the camera: a loop of a few meters over a terrace; or, over a plain of any size, a straight transect or
+    parallel lines with a last line across them (lawnmower)."""
     frames: Annotated[int, Range(1, 10_000)] = 32
-    """Number of frames of the dive."""
+    """Number of frames of a loop; a survey has as many as its length, speed and frame rate make."""
+    length: Annotated[float, Range(1, 10_000)] = 50.0
+    """Length of a survey's path in meters."""
+    speed: Annotated[float, Range(0.05, 3)] = 0.3
+    """Speed of a survey in m/s."""
+    fps: Annotated[float, Range(0.1, 60)] = 5.0
+    """Frames per second."""
+    altitude: Annotated[float, Range(1, 1.8)] = 1.5
+    """Mean height of a survey's camera above the sand in meters."""
     width: _Pixels = 480
     """Width of the frames in pixels."""
     height: _Pixels = 320
@@ -50,3 +62,17 @@ class DiveSettings(Settings):
     """Let a fish swim across the view once during the dive."""
     give_masks: bool = False
     """Write the masks of the moving object beside images/, where the pipeline uses them, not only under truth/."""
+
+    def __post_init__(self) -> None:
+        super().__post_init__()
+        if self.path != "loop" and self.moving_object:
+            raise UsageError(
+                "the moving object swims in loops only",
+                cause=f"moving_object was asked for together with path={self.path!r}",
+                hint="path='loop', or no moving object",
+            )
+
+    @property
+    def frame_count(self) -> int:
+        """Number of frames of the dive."""
+        return self.frames if self.path == "loop" else int(self.length / self.speed * self.fps) + 1
