@@ -18,7 +18,7 @@ from tests.report.conftest import COUNT, NAMES
 from swimm3r.errors import InputError
 from swimm3r.export.settings import ExportSettings
 from swimm3r.prepare import load_frames
-from swimm3r.report import write_report
+from swimm3r.report import water, write_report
 from swimm3r.report.head import clock
 from swimm3r.report.outputs import FURTHER, OUTPUTS, human_size, outputs_of
 from swimm3r.report.scene import pack_scene
@@ -194,6 +194,13 @@ def test_water_that_is_not_determined_is_said_in_every_place(make_run: Callable[
 def test_coefficients_that_are_not_determined_stand_in_brackets(page: str):
     text = text_of(page)
     assert re.search(r"0\.500 \u00b1 0\.020 \(0\.160 \u00b1 0\.020\) \(0\.100 \u00b1 0\.020\)", text)
+
+
+@pytest.mark.parametrize(
+    ("std", "text"), [(0.29, "0.12 \u00b1 0.29"), (0.0028, "0.1234 \u00b1 0.0028"), (1e-9, "0.12341 \u00b1 0.00000")]
+)
+def test_coefficients_have_two_digits_of_their_deviation(std: float, text: str):
+    assert water._with_std(0.12341, std) == text
 
 
 def test_a_metric_run_has_metres_and_a_run_without_scale_has_none(make_run: Callable[..., Path], page: str):

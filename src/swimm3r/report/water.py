@@ -1,5 +1,6 @@
 """The section on the water: the two curves over ray depth, the tables of coefficients, and how images are shown."""
 
+import math
 from collections.abc import Callable
 from dataclasses import dataclass
 
@@ -77,12 +78,18 @@ def _table(fit: MediumFit, metric: bool) -> Table:
     for name, label in _LABELS.items():
         values, errors = getattr(fit, name).tolist(), getattr(fit.std, name).tolist()
         known = fit.identifiable[name].tolist()
-        cells = tuple(Cell(f"{v:.3f} \u00b1 {e:.3f}", k) for v, e, k in zip(values, errors, known, strict=True))
+        cells = tuple(Cell(_with_std(v, e), k) for v, e, k in zip(values, errors, known, strict=True))
         rows.append((label, "0 to 1" if name == "Binf" else rate, cells))
     title = (
         "In linear light, for tables" if fit.encoding == "linear" else "On stored pixel values, as images are restored"
     )
     return Table(title, tuple(rows))
+
+
+def _with_std(value: float, std: float) -> str:
+    """A number with two digits of its standard deviation, which may lie orders of magnitude apart between scenes."""
+    places = min(max(1 - math.floor(math.log10(std)), 2), 5) if std > 0 else 3
+    return f"{value:.{places}f} \u00b1 {std:.{places}f}"
 
 
 def _chart(fit: MediumFit, label: str, unit: str, law: Callable[[Tensor], Tensor]) -> str:
