@@ -3,6 +3,7 @@
 from pathlib import Path
 from typing import Annotated
 
+from swimm3r.cli.terminal.console import drawn_progress
 from swimm3r.cli.terminal.options import FLAT, Run
 from swimm3r.splat.settings import MapDevice
 from swimm3r.viewer.settings import ViewerSettings
@@ -23,9 +24,11 @@ def view(
         water: Other run folders whose water the scene can be put into.
         map_device: Device that renders the map; auto uses CUDA if a GPU and NVIDIA Warp are present.
     """
-    from swimm3r.viewer.server import serve
+    from swimm3r.viewer.server import opened_viewer, serve
 
-    serve(run, settings, water, map_device, ready=_say)
+    with drawn_progress() as progress:
+        viewer = opened_viewer(run, settings, water, map_device, progress)
+    serve(viewer, ready=_say)
 
 
 def _say(line: str) -> None:

@@ -12,6 +12,7 @@ from types import FrameType
 from typing import TYPE_CHECKING
 
 from swimm3r.errors import UsageError
+from swimm3r.progress import Progress, silent
 from swimm3r.splat.settings import MapDevice
 from swimm3r.viewer.layers import LayerChoice, Painter, Picture, ViewCamera
 from swimm3r.viewer.panel import Panel
@@ -26,6 +27,7 @@ if TYPE_CHECKING:
 
 _TRIED_PORTS = 50
 _BRAND = (18, 122, 148)
+_WARM_UP_SIDE = 64  # pixels
 _END_S = 5.0  # for the picture that is being drawn at the end
 
 Request = tuple[ViewCamera, LayerChoice]
@@ -86,8 +88,8 @@ class Viewer:
 
     def _place_camera(self, run: ViewedRun) -> None:
         """Browsers begin where the middle frame was taken; with points alone, a little behind it."""
-        middle = run.cameras[len(run.cameras) // 2]
-        pose = middle.cam2world[0].numpy()
+        view = starting_view(run)
+        pose = view.cam2world.numpy()
         center, ahead = pose[:3, 3], pose[:3, 2] * run.median_depth
         back = 0.0 if run.scene is not None else 0.6
         self.server.scene.set_up_direction(run.up())
@@ -95,32 +97,44 @@ class Viewer:
         start.position = (center - back * ahead) * run.scale
         start.look_at = (center + ahead) * run.scale
         start.up = -pose[:3, 1]
-        start.fov = vertical_fov(middle)
+        start.fov = view.fov
         start.near = 0.02
 
 
-def serve(
+def opened_viewer(
     folder: Path,
     settings: ViewerSettings | None = None,
     waters: Sequence[Path] = (),
     map_device: MapDevice = "auto",
-    ready: Callable[[str], None] = print,
-) -> None:
-    """Serve a run until Ctrl-C or SIGTERM; `ready` receives the lines that say where.
+    progress: Progress = silent,
+) -> Viewer:
+    """The viewer of a run, ready to draw; `waters` are other runs whose water it offers.
 
-    Raises InputError where the run is not finished far enough, UsageError where the address cannot be served or viser
-    is not installed.
+    Raises InputError where the run is not finished far enough or another run has no water, UsageError where the address
+    cannot be served or viser is not installed.
     """
     settings = settings or ViewerSettings()
     require_viser()
+    progress("preparing the view", 0, 3)
     run = open_viewed_run(folder, map_device)
     others = known_waters(waters)
+    progress("preparing the view", 1, 3)
+    if run.scene is not None:  # compiled and in memory before the first browser waits for it
+        Painter(run).draw(starting_view(run), _WARM_UP_SIDE, LayerChoice("Without the water"))
+        Painter(run).draw(starting_view(run), _WARM_UP_SIDE, LayerChoice())
+    progress("preparing the view", 2, 3)
     viewer = Viewer(run, settings, others, started_server(settings, f"Swimm3R: {folder.resolve().name}"))
+    progress("preparing the view", 3, 3)
+    return viewer
+
+
+def serve(viewer: Viewer, ready: Callable[[str], None] = print) -> None:
+    """Draw for browsers until Ctrl-C or SIGTERM; `ready` receives the lines that say where they find it."""
     drawing = threading.Thread(target=viewer.loop.run, name="pictures")
     try:
         with _ended_by_signals() as ended:
             drawing.start()
-            for line in address_lines(settings, viewer.port):
+            for line in address_lines(viewer.settings, viewer.port):
                 ready(line)
             ready("Ctrl-C ends it.")
             while not ended.wait(0.2) and not viewer.loop.stopped:
@@ -131,6 +145,12 @@ def serve(
             drawing.join(_END_S)
     if viewer.loop.failure is not None:
         raise viewer.loop.failure
+
+
+def starting_view(run: ViewedRun) -> ViewCamera:
+    """The view where the middle frame was taken."""
+    middle = run.cameras[len(run.cameras) // 2]
+    return ViewCamera(middle.cam2world[0].double(), vertical_fov(middle), middle.width / middle.height)
 
 
 def require_viser() -> None:
