@@ -30,7 +30,9 @@ def export_command(name: FormatName) -> Callable:
         """
         from swimm3r.export import export_run
         from swimm3r.io.files.outputs import output_file, output_folder
+        from swimm3r.scene.run_folder import read_run
 
+        read_run(run)
         path = out or run / settings.file_name
         with (output_folder if isinstance(settings, FOLDERS) else output_file)(path, "--out"):
             print(export_run(run, path, settings))

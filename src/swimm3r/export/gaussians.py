@@ -10,7 +10,7 @@ A viewer's Gaussian knows neither conditioned direction nor time, so S is that s
 cameras that have the primitive in their image, and o their mean. How much is lost is measured: `clear_difference`.
 """
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 import torch
@@ -30,6 +30,8 @@ from swimm3r.splat.projection.pinhole import pinhole
 from swimm3r.splat.projection.plain import project_conditioned
 from swimm3r.splat.rendering import SplatMap, settings_in_scene_units
 from swimm3r.splat.settings import RenderSettings
+
+_MOST_OFF = 1.5  # factor between a mean color and the map's; beyond, something else is wrong
 
 
 @dataclass(frozen=True)
@@ -107,6 +109,16 @@ def draw_gaussians(g: Gaussians, camera: Cameras, near: float) -> RasterOutput:
     return rasterize(p, None, view.height, view.width, kernel="gaussian")
 
 
+def with_mean_color(scene: SplatMap, g: Gaussians, cameras: Cameras, time: float | None = None) -> Gaussians:
+    """The Gaussians of a Beta map, their channels scaled so that the mean color seen by `cameras` is that of the map.
+
+    Colors below 0, which a viewer takes for 0, and shapes that change with the view would brighten them as a whole.
+    """
+    seen = [_both(scene, g, cameras[i], time) for i in range(len(cameras))]
+    theirs, own = (torch.stack([pair[k].clear.mean((1, 2)) for pair in seen]).mean(0) for k in (0, 1))
+    return replace(g, rgb=g.rgb * (own / theirs.clamp(min=1e-6)).clamp(1 / _MOST_OFF, _MOST_OFF))
+
+
 def clear_difference(
     scene: SplatMap,
     g: Gaussians,
@@ -119,14 +131,19 @@ def clear_difference(
     `gains` are the white balance that the Gaussians have and the map has not.
     """
     balance = torch.ones(3) if gains is None else gains
-    settings, now = settings_in_scene_units(scene.settings, scene.length).render, scene.normalized_time(time)
     colors, alphas = [], []
-    with torch.no_grad():
-        for i in range(len(cameras)):
-            view = pinhole(cameras[i])
-            seen = project(scene.primitives, view, settings, now)
-            own = rasterize(seen.primitives, None, view.height, view.width, kernel=seen.kernel)
-            theirs = draw_gaussians(g, cameras[i], settings.near)
-            colors.append(theirs.clear - balance[:, None, None] * own.clear)
-            alphas.append(float((theirs.alpha - own.alpha).mean()))
+    for i in range(len(cameras)):
+        theirs, own = _both(scene, g, cameras[i], time)
+        colors.append(theirs.clear - balance[:, None, None] * own.clear)
+        alphas.append(float((theirs.alpha - own.alpha).mean()))
     return ClearDifference(psnr_from_errors(torch.stack(colors)), float(np.mean(alphas)))
+
+
+def _both(scene: SplatMap, g: Gaussians, camera: Cameras, time: float | None) -> tuple[RasterOutput, RasterOutput]:
+    """One view of the Gaussians as a 3DGS viewer draws them, and of the map without its water."""
+    settings, now = settings_in_scene_units(scene.settings, scene.length).render, scene.normalized_time(time)
+    with torch.no_grad():
+        view = pinhole(camera)
+        seen = project(scene.primitives, view, settings, now)
+        own = rasterize(seen.primitives, None, view.height, view.width, kernel=seen.kernel)
+        return draw_gaussians(g, camera, settings.near), own

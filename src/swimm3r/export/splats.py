@@ -14,7 +14,7 @@ from jaxtyping import Float, Float32
 
 from swimm3r.cameras import Cameras, cameras_of
 from swimm3r.errors import DeviceError
-from swimm3r.export.gaussians import Gaussians, clear_difference, clear_gaussians
+from swimm3r.export.gaussians import Gaussians, clear_difference, clear_gaussians, with_mean_color
 from swimm3r.export.result import Exported
 from swimm3r.export.settings import CompressedPlySettings, SplatFileSettings, SplatPlySettings, SpzSettings
 from swimm3r.geometry import quaternion_from_rotation, rotation_from_quaternion
@@ -23,6 +23,7 @@ from swimm3r.scene.reconstruction_io import read_run_balance
 from swimm3r.scene.run_folder import open_run
 from swimm3r.scene.white_balance import UNBALANCED, WhiteBalance
 from swimm3r.splat.map_file import load_map
+from swimm3r.splat.primitives.beta import BetaPrimitives
 from swimm3r.splat.primitives.spherical_harmonics import Y_00
 from swimm3r.splat.rendering import SplatMap
 
@@ -84,8 +85,10 @@ def open_map(folder: Path, settings: SplatSettings) -> ExportedMap:
     canvas = cameras[_spread(len(cameras), _ASKED)].pinhole(scene.settings.long_side)
     own = settings.colors == "physical" or not scene.has_water
     balance = UNBALANCED if own else read_run_balance(folder / "sfm")
-    g = balanced(clear_gaussians(scene, canvas, time), balance)
-    return ExportedMap(scene, canvas[_spread(len(canvas), _COMPARED)], time, balance, g)
+    g, views = clear_gaussians(scene, canvas, time), canvas[_spread(len(canvas), _COMPARED)]
+    if isinstance(scene.primitives, BetaPrimitives):
+        g = with_mean_color(scene, g, views, time)
+    return ExportedMap(scene, views, time, balance, balanced(g, balance))
 
 
 def balanced(g: Gaussians, balance: WhiteBalance) -> Gaussians:

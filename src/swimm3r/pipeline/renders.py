@@ -106,23 +106,22 @@ def write_flythrough(
 
     `times` are the cameras' own, seconds of the clip; the flight takes as many of its own on the way.
     """
-    flight = replace(canvas, K=canvas.K[:1], cam2world=smooth_path(cam2world, count))
-    write_video(path, scene, flight, times_along(times, count), style, progress)
+    write_video(path, scene, canvas, smooth_path(cam2world, count), times_along(times, count), style, progress)
 
 
 def write_video(
     path: Path,
     scene: SplatMap,
-    flight: Cameras,
+    canvas: Cameras,
+    cam2world: Float[Tensor, "f 4 4"],
     times: Sequence[float],
     style: DisplayStyle,
     progress: Progress = silent,
 ) -> None:
-    """An H.264 video of these pinhole views, all through the first one's lens: with the water, and without beside."""
-    canvas = flight[0]
+    """An H.264 video of one pinhole camera at these poses and times: with the water, and beside it without."""
 
     def views() -> Iterable[UInt8[np.ndarray, "h w 3"]]:
-        for i, pose in enumerate(flight.cam2world):
+        for i, pose in enumerate(cam2world):
             progress("filming the flight", i, len(times))
             camera = replace(canvas, cam2world=pose[None])
             out = scene.render(camera, times[i])
@@ -170,8 +169,8 @@ def render_run(
         progress("rendering", len(path.names), len(path.names))
     if settings.video != "no":
         canvas = path.cameras[0].pinhole(settings.long_side)
-        flight = replace(canvas, cam2world=path.cameras.cam2world)
-        write_video(out / "flythrough.mp4", scene, flight, times, style, progress)
+        poses = path.cameras.cam2world
+        write_video(out / "flythrough.mp4", scene, canvas, poses, times, style, progress)
     return out
 
 
