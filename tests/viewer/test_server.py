@@ -37,7 +37,7 @@ def test_a_port_that_is_taken_is_left_to_the_other_program(taken: int):
 
 def test_the_ssh_line_forwards_the_port():
     lines = address_lines(ViewerSettings(), 8080)
-    assert f"ssh -L 8080:localhost:8080 {socket.gethostname()}" in lines[-1]
+    assert f"ssh -L 8080:localhost:8080 user@{socket.gethostname()}" in lines[-1]
 
 
 def test_an_open_server_says_that_it_is_open():

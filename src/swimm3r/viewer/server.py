@@ -210,7 +210,7 @@ def address_lines(settings: ViewerSettings, port: int) -> list[str]:
     lines.append(f"Viewer: http://{shown}:{port}")
     name = socket.gethostname()
     if local:
-        lines.append(f"From another computer: ssh -L {port}:localhost:{port} {name}, then the same address there.")
+        lines.append(f"From another computer: ssh -L {port}:localhost:{port} user@{name}, then the same address there.")
     else:
         lines.append(f"From another computer: http://{name}:{port} (everyone who can reach it can look).")
     return lines
