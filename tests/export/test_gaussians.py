@@ -15,6 +15,7 @@ from swimm3r.export.gaussians import (
     clear_gaussians,
     draw_gaussians,
     moment_matched,
+    with_mean_color,
 )
 from swimm3r.export.settings import SplatPlySettings
 from swimm3r.export.splats import arrays_of
@@ -22,6 +23,8 @@ from swimm3r.raster import Primitives2D, rasterize
 from swimm3r.splat.medium.field import initial_field
 from swimm3r.splat.primitives.beta import BetaPrimitives, inverse_softplus
 from swimm3r.splat.primitives.gaussian import GaussianPrimitives, seen_color
+from swimm3r.splat.projection.dispatch import project
+from swimm3r.splat.projection.pinhole import pinhole
 from swimm3r.splat.rendering import SplatMap
 from swimm3r.splat.settings import MediumFieldSettings, UwbsSettings, mcmc_gs
 
@@ -127,6 +130,20 @@ def test_the_wall_looks_like_itself_as_gaussians():
     faint = clear_difference(scene, replace(g, opacity=0.3 * g.opacity), camera())
     assert faint.psnr < lost.psnr
     assert faint.alpha < -0.02
+
+
+def test_negative_colors_do_not_brighten_the_gaussians_as_a_whole():
+    """A viewer takes them for 0; the map blends them as they are."""
+    scene = wall()
+    dark = replace(scene, primitives=scene.primitives._replace(rgb=scene.primitives.rgb - 0.25))
+    p, view = dark.primitives, camera()
+    assert (p.rgb < 0).float().mean() > 0.15
+    plain = moment_matched(dark, view)
+    own = rasterize(project(p, pinhole(view), dark.settings.render).primitives, None, 56, 80).clear.mean((1, 2))
+    brighter = draw_gaussians(plain, view, 0.01).clear.mean((1, 2)) / own
+    assert brighter.min() > 1.05
+    kept = draw_gaussians(with_mean_color(dark, plain, view), view, 0.01).clear.mean((1, 2))
+    torch.testing.assert_close(kept, own, rtol=0.01, atol=0)
 
 
 def gaussian_wall() -> SplatMap:

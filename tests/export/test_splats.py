@@ -15,6 +15,7 @@ from tests.export.conftest import BALANCE
 from swimm3r.errors import DeviceError, InputError, UsageError
 from swimm3r.export import export_run
 from swimm3r.export.formats import splat_file, spz
+from swimm3r.export.gaussians import draw_gaussians
 from swimm3r.export.settings import (
     FORMATS,
     CompressedPlySettings,
@@ -25,6 +26,8 @@ from swimm3r.export.settings import (
     SpzSettings,
 )
 from swimm3r.export.splats import SplatArrays, SplatSettings, arrays_of, gaussians_of, open_map
+from swimm3r.pipeline.renders import display_style
+from swimm3r.scene.reconstruction_io import load_reconstruction
 
 SPLATS: tuple[FormatName, ...] = ("ply", "compressed-ply", "splat", "spz")
 # median share of the size of a Gaussian's covariance that its rounding may change, and largest error of position in
@@ -216,6 +219,28 @@ def test_shown_colors_are_the_physical_ones_times_the_gains_of_the_dive(run: str
     np.testing.assert_allclose(shown.harmonics, gains * physical.harmonics, atol=1e-5)
     assert (shown.xyz == physical.xyz).all()
     assert SplatPlySettings(colors="physical").file_name == "splat/gaussians_physical.ply"
+
+
+@pytest.mark.parametrize("run", ["wall_run", "harmonic_run"])
+def test_a_splat_drawn_by_a_3dgs_viewer_has_the_mean_color_of_the_maps_clear_views(run: str, request, tmp_path: Path):
+    """The gray-world check: balanced as the restored frames are, within 5 %."""
+    folder: Path = request.getfixturevalue(run)
+    export_run(folder, tmp_path / "g.ply")
+    found = open_map(folder, SplatPlySettings())
+    drawn_from = gaussians_of(read_by_plyfile(tmp_path / "g.ply"))
+    rec = load_reconstruction(folder / "sfm")
+    style = display_style(found.scene, rec)
+    assert style.gains.tolist() == pytest.approx(BALANCE.gains)
+    theirs, own = [], []
+    for i in range(len(rec.cameras)):
+        view = rec.cameras[i].pinhole()
+        drawn, shown = draw_gaussians(drawn_from, view, 0.01), found.scene.render(view)
+        covered = (drawn.alpha > 0.95) & (shown.alpha > 0.95)
+        theirs.append(drawn.clear.permute(1, 2, 0)[covered])
+        own.append((shown.clear * style.gains)[covered])
+    a, b = (torch.cat(values).mean(0) for values in (theirs, own))
+    assert (a / b - 1).abs().max() < 0.05
+    assert (a / b * torch.tensor(BALANCE.gains) - 1).abs().max() > 0.15  # without the balance it would not be
 
 
 @pytest.mark.parametrize("format", SPLATS)
