@@ -13,7 +13,7 @@ from swimm3r.errors import UsageError
 from swimm3r.geometry import Similarity, so3_exp
 from swimm3r.io import images
 from swimm3r.pipeline.renders import render_run
-from swimm3r.progress import silent
+from swimm3r.pipeline.view_settings import ViewSettings
 from swimm3r.viewer.camera_path import KeyFrame, film, load_path, new_folder, save_path, save_view
 from swimm3r.viewer.layers import LayerChoice, Painter
 from swimm3r.viewer.viewed_run import ViewedRun
@@ -49,7 +49,7 @@ def test_a_saved_view_is_rendered_again_by_render(copied: Callable[[], ViewedRun
     run = copied()
     folder = save_view(Painter(run), frame_view(run), LayerChoice())
     shown = images.read_rgb(folder / "view.png")
-    out = render_run(run.folder, folder / "cameras.json", run.folder / "again", progress=silent, map_device="cpu")
+    out = render_run(run.folder, ViewSettings(folder / "cameras.json"), run.folder / "again", map_device="cpu")
     (rendered,) = out.glob("*_rgb.png")
     assert np.abs(images.read_rgb(rendered).astype(int) - shown).max() <= 1
 
