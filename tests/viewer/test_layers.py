@@ -10,6 +10,8 @@ from tests.viewer.conftest import DISTANCE
 
 from swimm3r.cameras import image_directions, ray_depth_from_z
 from swimm3r.medium import Medium, add_water, linear_from_srgb, srgb_from_linear
+from swimm3r.splat.primitives.beta import with_time
+from swimm3r.splat.settings import InitialSettings
 from swimm3r.viewer.layers import BACKGROUND, CropBox, LayerChoice, Painter, ViewCamera, exposed, normal_colors, wiped
 from swimm3r.viewer.scene_nodes import vertical_fov
 from swimm3r.viewer.viewed_run import ViewedRun, open_viewed_run
@@ -174,3 +176,14 @@ def test_a_run_with_structure_from_motion_alone_has_frames_and_points(sfm_run: P
     assert (filmed.rgb != BACKGROUND).any(-1).mean() > 0.85
     assert (painter.draw(view, 64, LayerChoice("Points alone")).rgb == BACKGROUND).all()
     assert np.abs(painter.draw(view, 64, LayerChoice("Frame restored")).rgb[20:30, 20:40].astype(int) - 128).max() <= 1
+
+
+def test_a_map_that_changes_with_time_is_drawn_at_the_second_that_is_asked_for(wall: ViewedRun):
+    rng = torch.Generator().manual_seed(0)
+    still = wall.scene.primitives
+    moving = with_time(still, InitialSettings(time_scale=0.05), rng)
+    moving = moving._replace(query_mean=torch.cat([still.query_mean, torch.zeros(len(still.xyz), 1)], -1))
+    run = replace(wall, scene=replace(wall.scene, primitives=moving))  # there at the start, gone at the end
+    start, end = (Painter(run).draw(frame_view(run), 64, LayerChoice(time=second)) for second in (0.0, 8.0))
+    assert (start.z_depth > 0).mean() > 0.9
+    assert (end.z_depth > 0).mean() < 0.1
