@@ -332,12 +332,12 @@ def test_the_report_says_what_is_missing(run: Path, name: str, capsys: pytest.Ca
 
 def test_the_report_says_that_a_number_is_missing(run: Path, capsys: pytest.CaptureFixture[str]):
     document = json.loads((run / "summary.json").read_text())
-    del document["input"]["width"]
+    del document["input"]["path"]
     (run / "summary.json").write_text(json.dumps(document))
     code, said = outcome(capsys, "report", run)
     assert code == 3
     assert "summary.json" in said
-    assert "width" in said
+    assert "input: there is no" in said
 
 
 def test_a_stage_that_is_done_is_open(run: Path):
