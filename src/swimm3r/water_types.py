@@ -5,9 +5,8 @@
 
 Coefficients are 1/m and act on pixel values as stored (sRGB), as the paper applies them.
 
-Jerlov's optical water types (Jerlov 1976, Marine Optics) are classes by the daylight left after a metre of water. They
-act on linear light. Attenuation and backscatter share its logarithm, and the veiling light has the color of the
-daylight that is left at `_JERLOV_DEPTH`.
+Jerlov's optical water types are classes by the attenuation of downward daylight, and act on linear light. Here both
+coefficients are that attenuation, and the veiling light has the color of the daylight that is left at `_JERLOV_DEPTH`.
 """
 
 from dataclasses import dataclass
@@ -41,26 +40,27 @@ FAMILIES: dict[Family, WaterType] = {
 }
 
 JerlovType = Literal["I", "IA", "IB", "II", "III", "1C", "3C", "5C", "7C", "9C"]
-JERLOV: dict[JerlovType, tuple[float, float, float]] = {  # daylight left after 1 m at 600, 525 and 475 nm
-    "I": (0.805, 0.961, 0.982),
-    "IA": (0.804, 0.955, 0.975),
-    "IB": (0.83, 0.95, 0.968),
-    "II": (0.80, 0.925, 0.94),
-    "III": (0.75, 0.885, 0.89),
-    "1C": (0.75, 0.885, 0.875),
-    "3C": (0.71, 0.82, 0.80),
-    "5C": (0.67, 0.73, 0.67),
-    "7C": (0.62, 0.61, 0.50),
-    "9C": (0.55, 0.46, 0.29),
+JERLOV: dict[JerlovType, tuple[float, float, float]] = {  # 1/m at 600, 525 and 475 nm
+    "I": (0.235, 0.043, 0.018),
+    "IA": (0.24, 0.048, 0.025),
+    "IB": (0.245, 0.054, 0.033),
+    "II": (0.26, 0.076, 0.062),
+    "III": (0.295, 0.116, 0.116),
+    "1C": (0.30, 0.13, 0.17),
+    "3C": (0.33, 0.20, 0.29),
+    "5C": (0.40, 0.31, 0.43),
+    "7C": (0.48, 0.49, 0.71),
+    "9C": (0.60, 0.78, 1.23),
 }
-"""Oceanic types I (clearest) to III, coastal types 1C to 9C (most turbid)."""
+"""Attenuation of downward daylight (Jerlov 1976, Marine Optics, Table XXVII): oceanic types I (clearest) to III,
+coastal types 1C to 9C (most turbid)."""
 _JERLOV_DEPTH = 5.0  # metres of water above the camera
 _JERLOV_VEIL = 0.4  # largest channel of the veiling light, linear
 
 
 def jerlov(kind: JerlovType) -> Medium:
     """The medium of a Jerlov type, 1/m, on linear light."""
-    beta = -torch.tensor(JERLOV[kind]).log()
+    beta = torch.tensor(JERLOV[kind])
     daylight = torch.exp(-beta * _JERLOV_DEPTH)
     return Medium(_JERLOV_VEIL * daylight / daylight.max(), beta, beta)
 

@@ -134,9 +134,10 @@ def test_the_wall_looks_like_itself_as_gaussians():
 
 def test_negative_colors_do_not_brighten_the_gaussians_as_a_whole():
     """A viewer takes them for 0; the map blends them as they are."""
-    scene = wall()
-    dark = replace(scene, primitives=scene.primitives._replace(rgb=scene.primitives.rgb - 0.25))
-    p, view = dark.primitives, camera()
+    scene, view = wall(), camera()
+    assert isinstance(scene.primitives, BetaPrimitives)
+    p = scene.primitives._replace(rgb=scene.primitives.rgb - 0.25)
+    dark = replace(scene, primitives=p)
     assert (p.rgb < 0).float().mean() > 0.15
     plain = moment_matched(dark, view)
     own = rasterize(project(p, pinhole(view), dark.settings.render).primitives, None, 56, 80).clear.mean((1, 2))

@@ -139,7 +139,7 @@ def test_the_pretence_sees_tensors_in_two_places():
     with Pretended():
         there = torch.ones(3).to(DEVICE)
         with pytest.raises(AssertionError, match="on the device and on the processor"):
-            there + torch.ones(3)
+            _ = there + torch.ones(3)
         with pytest.raises(RuntimeError):
             there.numpy()
 

@@ -10,7 +10,7 @@ from tests.viewer.conftest import DISTANCE
 
 from swimm3r.cameras import image_directions, ray_depth_from_z
 from swimm3r.medium import Medium, add_water, linear_from_srgb, srgb_from_linear
-from swimm3r.splat.primitives.beta import with_time
+from swimm3r.splat.primitives.beta import BetaPrimitives, with_time
 from swimm3r.splat.settings import InitialSettings
 from swimm3r.viewer.layers import BACKGROUND, CropBox, LayerChoice, Painter, ViewCamera, exposed, normal_colors, wiped
 from swimm3r.viewer.scene_nodes import vertical_fov
@@ -180,10 +180,14 @@ def test_a_run_with_structure_from_motion_alone_has_frames_and_points(sfm_run: P
 
 def test_a_map_that_changes_with_time_is_drawn_at_the_second_that_is_asked_for(wall: ViewedRun):
     rng = torch.Generator().manual_seed(0)
+    assert wall.scene is not None
     still = wall.scene.primitives
+    assert isinstance(still, BetaPrimitives)
     moving = with_time(still, InitialSettings(time_scale=0.05), rng)
     moving = moving._replace(query_mean=torch.cat([still.query_mean, torch.zeros(len(still.xyz), 1)], -1))
     run = replace(wall, scene=replace(wall.scene, primitives=moving))  # there at the start, gone at the end
     start, end = (Painter(run).draw(frame_view(run), 64, LayerChoice(time=second)) for second in (0.0, 8.0))
+    assert start.z_depth is not None
+    assert end.z_depth is not None
     assert (start.z_depth > 0).mean() > 0.9
     assert (end.z_depth > 0).mean() < 0.1

@@ -18,7 +18,7 @@ def clicked(wall: ViewedRun) -> list[SurfacePoint]:
     painter, view = Painter(wall), frame_view(wall)
     found = [surface_point(painter, view, at, LayerChoice()) for at in CORNERS]
     assert None not in found
-    return found
+    return [point for point in found if point is not None]
 
 
 def sides(wall: ViewedRun) -> tuple[float, float]:

@@ -6,6 +6,7 @@ import socket
 import subprocess
 import sys
 import urllib.request
+from collections.abc import Iterator
 from pathlib import Path
 
 import pytest
@@ -19,7 +20,7 @@ HERE = "127.0.0.1"
 
 
 @pytest.fixture
-def taken() -> int:
+def taken() -> Iterator[int]:
     """A port that another program serves."""
     with socket.socket() as other:
         other.bind((HERE, 0))
@@ -55,6 +56,7 @@ def test_the_address_of_another_computer_is_refused(host: str):
 def code_of(*arguments: str) -> int:
     with pytest.raises(SystemExit) as stop:
         main(arguments)
+    assert isinstance(stop.value.code, int)
     return stop.value.code
 
 

@@ -84,12 +84,12 @@ def _undetermined(fit: MediumFit, predicted: bool, linear: MediumFit | None) -> 
 
 
 def _red_lost_least(fit: MediumFit, gray: bool) -> QualityWarning | None:
-    """In every natural water, by Jerlov's types, red is attenuated as much as green at least, mostly far more."""
+    """Of Jerlov's types only the most turbid of the coast, 7C and 9C, attenuate red the least."""
     depth = optical_depth(fit)[0]
     if gray or not bool(depth[0] < depth[1:].min()):
         return None
     return QualityWarning(
-        "The water found attenuates red least, which no natural water does: its colors are implausible.",
+        "The water found attenuates red least, as only the most turbid coastal waters do: its colors are implausible.",
         "The footage may be color-corrected, lit by lamps, or too hazy to tell; give the uncorrected original, and do"
         " not read colors or coefficients off this result.",
     )
