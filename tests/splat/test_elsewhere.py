@@ -131,7 +131,7 @@ def test_a_step_waits_for_the_device_only_to_bin(tiny_dive):
         state, view = recipe.start().to(DEVICE), scene.view(2)
         waits.clear()
         recipe.step(state, view, 26)
-    assert set(waits) == {"backend.py:bin_primitives"}
+    assert set(waits) == {"bins.py:bin_primitives"}
     assert len(waits) == 2  # how many tiles the primitives may touch, and how many they do
 
 
