@@ -63,3 +63,18 @@ def memory_for(what: str, hint: str) -> Iterator[None]:
         raise DeviceError(
             f"the accelerator's memory is too small for {what}", cause=str(error).splitlines()[0], hint=hint
         ) from error
+
+
+@contextmanager
+def torch_threads(count: int | None = None) -> Iterator[None]:
+    """Torch with that many threads inside, and with as many as before afterwards.
+
+    None changes nothing at first: around code whose own kernels set OpenMP's number of threads, which torch shares.
+    """
+    before = torch.get_num_threads()
+    if count is not None:
+        torch.set_num_threads(count)
+    try:
+        yield
+    finally:
+        torch.set_num_threads(before)

@@ -1,6 +1,7 @@
 """A small finished run: a wall in water filmed by six turning cameras of one bent lens, and its map."""
 
 import json
+from collections.abc import Iterator
 from pathlib import Path
 
 import numpy as np
@@ -9,6 +10,7 @@ import torch
 from tests.splat.conftest import WATER, make_wall
 
 from swimm3r.cameras import Cameras, project
+from swimm3r.devices import torch_threads
 from swimm3r.geometry import so3_exp
 from swimm3r.io.images import write_rgb
 from swimm3r.medium import AttenuationCurve, Medium, MediumFit
@@ -25,6 +27,13 @@ from swimm3r.splat.settings import UwbsSettings, with_recipe
 COUNT, WIDTH, HEIGHT = 6, 64, 48
 BALANCE = WhiteBalance((1.25, 1.0, 0.8))
 TIMES = tuple(0.25 * i for i in range(COUNT))
+
+
+@pytest.fixture(autouse=True)
+def threads_of_torch() -> Iterator[None]:
+    """gsply, called directly by a test, would leave torch with as many threads as there are cores."""
+    with torch_threads():
+        yield
 
 
 def cameras() -> Cameras:

@@ -12,6 +12,7 @@ import torch
 from plyfile import PlyData
 from tests.export.conftest import BALANCE
 
+from swimm3r.devices import torch_threads
 from swimm3r.errors import DeviceError, InputError, UsageError
 from swimm3r.export import export_run
 from swimm3r.export.formats import splat_file, spz
@@ -288,3 +289,11 @@ def test_opacities_at_both_ends_survive_the_splat_file():
     assert np.isfinite(back.logit).all()
     assert back.logit[0] > 5
     assert back.logit[1] < -5
+
+
+@pytest.mark.parametrize("settings", [CompressedPlySettings(), SpzSettings()])
+def test_an_export_leaves_torch_its_threads(wall_run: Path, tmp_path: Path, settings: ExportSettings):
+    """gsply's parallel kernels set OpenMP's number, which is torch's, too; other threads mean other roundings."""
+    with torch_threads(3):
+        export_run(wall_run, tmp_path / "map", settings)
+        assert torch.get_num_threads() == 3

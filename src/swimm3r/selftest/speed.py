@@ -8,7 +8,6 @@ import importlib.util
 import statistics
 import time
 from collections.abc import Callable, Iterator
-from contextlib import contextmanager
 from dataclasses import dataclass
 from typing import NamedTuple
 
@@ -16,6 +15,7 @@ import numba
 import numpy as np
 import torch
 
+from swimm3r.devices import torch_threads
 from swimm3r.raster import Backend, Bins, MediumMaps, Primitives2D, SggBuffers, bin_primitives, rasterize
 
 
@@ -73,7 +73,7 @@ class Speed:
 
 def measure_speed(repeats: int = 3) -> Iterator[Speed]:
     """The sizes S and M on the processor and, where there is one, on the GPU."""
-    with one_thread():
+    with torch_threads(1):
         unit = calibration_ms()
         for name in ("S", "M"):
             times, _ = measure(SIZES[name], "numba", repeats)
@@ -82,17 +82,6 @@ def measure_speed(repeats: int = 3) -> Iterator[Speed]:
         for name in ("S", "M", "L"):
             times, _ = measure(SIZES[name], "warp", repeats)
             yield Speed("cuda", SIZES[name], times, None, None)
-
-
-@contextmanager
-def one_thread() -> Iterator[None]:
-    """One thread of torch and of the kernels, and as many as before afterwards."""
-    before = torch.get_num_threads()
-    torch.set_num_threads(1)
-    try:
-        yield
-    finally:
-        torch.set_num_threads(before)
 
 
 def workload(size: Size, seed: int = 0) -> tuple[Primitives2D, MediumMaps]:

@@ -5,6 +5,7 @@ Written by gsply. The Gaussians are put along a Morton curve first, which keeps 
 
 from pathlib import Path
 
+from swimm3r.devices import torch_threads
 from swimm3r.export.result import Exported, check_replaceable
 from swimm3r.export.settings import CompressedPlySettings
 from swimm3r.export.splats import along_curve, for_gsply, from_gsply, gsply_or_refuse, open_map
@@ -18,7 +19,9 @@ def export_run(folder: Path, path: Path, settings: CompressedPlySettings) -> Exp
     gsply = gsply_or_refuse()
     found = open_map(folder, settings)
     arrays = found.arrays()
-    packed = gsply.compress_to_bytes(for_gsply(gsply, arrays[along_curve(arrays.xyz)]))
+    with torch_threads():
+        packed = gsply.compress_to_bytes(for_gsply(gsply, arrays[along_curve(arrays.xyz)]))
+        written = from_gsply(gsply.decompress_from_bytes(packed))
     with atomic_path(path) as draft:
         draft.write_bytes(packed)
-    return found.result(path, from_gsply(gsply.decompress_from_bytes(packed)))
+    return found.result(path, written)

@@ -11,6 +11,7 @@ from pathlib import Path
 
 import numpy as np
 
+from swimm3r.devices import torch_threads
 from swimm3r.export.result import Exported, check_replaceable
 from swimm3r.export.settings import SpzSettings
 from swimm3r.export.splats import SplatArrays, along_curve, for_gsply, from_gsply, gsply_or_refuse, open_map
@@ -28,9 +29,12 @@ def export_run(folder: Path, path: Path, settings: SpzSettings) -> Exported:
     gsply = gsply_or_refuse()
     found = open_map(folder, settings)
     arrays = turned(found.arrays())
-    with atomic_path(path) as draft:
-        gsply.write_spz(draft, for_gsply(gsply, arrays[along_curve(arrays.xyz)]), fractional_bits=_fraction(arrays.xyz))
-    return found.result(path, turned(from_gsply(gsply.read_spz(path))))
+    with torch_threads():
+        with atomic_path(path) as draft:
+            ordered = for_gsply(gsply, arrays[along_curve(arrays.xyz)])
+            gsply.write_spz(draft, ordered, fractional_bits=_fraction(arrays.xyz))
+        written = turned(from_gsply(gsply.read_spz(path)))
+    return found.result(path, written)
 
 
 def turned(arrays: SplatArrays) -> SplatArrays:
