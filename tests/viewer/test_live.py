@@ -81,6 +81,30 @@ def test_a_watched_training_ends_with_the_bits_of_one_that_is_not(
     assert page._image.label.startswith("Test frame 8.png" if len(tiny_dive.frames.test) == 1 else "T")
 
 
+def test_a_page_that_fails_ends_with_a_warning_and_the_training_goes_on(
+    tiny_dive: TinyDive,
+    tmp_path: Path,
+    page: LiveView,
+    clock: Clock,
+    monkeypatch: pytest.MonkeyPatch,
+    caplog: pytest.LogCaptureFixture,
+):
+    asked: list[int] = []
+
+    def failing(step: TrainingStep, last: bool) -> None:
+        asked.append(step.step)
+        raise RuntimeError("no memory for pictures")
+
+    monkeypatch.setattr(page, "_show", failing)
+    monkeypatch.setattr(page.server, "get_clients", lambda: {7: object()})
+    unwatched = train(tiny_dive.rec, tiny_dive.frames, TRAINING, tmp_path / "a", silent)
+    watched = train(tiny_dive.rec, tiny_dive.frames, TRAINING, tmp_path / "b", silent, observer=page.observe)
+    assert len(asked) == 1
+    assert "the page of the run ends, the run goes on: RuntimeError: no memory for pictures" in caplog.text
+    assert torch.equal(unwatched.primitives.xyz, watched.primitives.xyz)
+    page.progress("scoring", 1, 2)  # and after it
+
+
 def test_without_a_browser_nothing_is_drawn(tiny_dive: TinyDive, tmp_path: Path, page: LiveView, clock: Clock):
     step = last_step(tiny_dive, tmp_path)
     for number in range(1, 50):

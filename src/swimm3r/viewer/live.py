@@ -1,10 +1,12 @@
 """A run watched in the browser while it is made: the map growing, the losses, a test frame beside its render.
 
 Everything is drawn between two steps, in the thread that trains, and only while somebody watches; it gets at most
-`_SHARE` of the time. A page that is opened, closed or reloaded changes nothing of the run.
+`_SHARE` of the time. A page that is opened, closed or reloaded changes nothing of the run, and one that fails ends with
+a warning: the run goes on.
 """
 
 import contextlib
+import logging
 import threading
 import time
 from collections.abc import Callable, Iterator
@@ -29,6 +31,8 @@ from swimm3r.viewer.server import Viewer, address_lines, started_server
 from swimm3r.viewer.settings import ViewerSettings
 from swimm3r.viewer.viewed_run import ViewedRun, of_reconstruction
 from swimm3r.viewer.water import known_waters
+
+log = logging.getLogger(__name__)
 
 _SHARE = 0.12  # of the training's time that pictures may take
 _EVERY_S = {"map": 3.0, "chart": 2.0, "image": 5.0}  # between two updates of each
@@ -78,6 +82,7 @@ class LiveView:
         self._text_due = 0.0
         self._is_picture_next = True
         self._begun, self._spent = clock(), 0.0
+        self._failed = self._closed = False
 
     @property
     def share_spent(self) -> float:
@@ -87,32 +92,48 @@ class LiveView:
     def progress(self, what: str, done: int, total: int, /) -> None:
         """A `Progress` that the page shows, too; after the training it keeps drawing the finished map."""
         self._told(what, done, total)
-        if threading.current_thread() is not self._thread:
+        if self._failed or threading.current_thread() is not self._thread:
             return
-        if self._clock() >= self._text_due or done == total:
-            self._text_due = self._clock() + _TEXT_S
-            self._status.content = f"**{what}**: {done} of {total}"
-            self._bar.value = 100.0 * done / max(1, total)
-        if self._viewer is not None and what != "training the map":
-            self._spend(self._viewer.loop.turn)
+        with self._page_alone():
+            if self._clock() >= self._text_due or done == total:
+                self._text_due = self._clock() + _TEXT_S
+                self._status.content = f"**{what}**: {done} of {total}"
+                self._bar.value = 100.0 * done / max(1, total)
+            if self._viewer is not None and what != "training the map":
+                self._spend(self._viewer.loop.turn)
 
     def observe(self, step: TrainingStep) -> None:
         """Show a step of the training, as far as time and watchers allow; the last one in any case."""
-        last = step.step == step.iterations
-        if self._viewer is None:
-            self._begin(step)
-        self._note_losses(step)
-        if not last and (not self.server.get_clients() or self.share_spent > self._share):
+        if self._failed:
             return
-        self._spend(lambda: self._show(step, last))
+        last = step.step == step.iterations
+        with self._page_alone():
+            if self._viewer is None:
+                self._begin(step)
+            self._note_losses(step)
+            if last or (self.server.get_clients() and self.share_spent <= self._share):
+                self._spend(lambda: self._show(step, last))
 
     def close(self) -> None:
-        """End the server; the run goes on without a page."""
+        """End the server, once; the run goes on without a page."""
+        if self._closed:
+            return
+        self._closed = True
         if self._viewer is not None:
             self._viewer.close()
         else:
             with contextlib.suppress(RuntimeError):
                 self.server.stop()
+
+    @contextlib.contextmanager
+    def _page_alone(self) -> Iterator[None]:
+        """Work of the page: an error in it ends the page, not hours of training."""
+        try:
+            yield
+        except Exception as error:  # noqa: BLE001 - said, and the page ends
+            self._failed = True
+            log.warning("the page of the run ends, the run goes on: %s: %s", type(error).__name__, error)
+            self.close()
 
     def _show(self, step: TrainingStep, last: bool) -> None:
         """One update: a picture for a browser, by turns with a new state of the map, the chart and the test frame."""
