@@ -1,11 +1,9 @@
 """`swimm3r COMMAND ...`: parses, runs one command and turns what users can mend into messages and exit codes."""
 
-import errno
 import os
 import sys
 from collections.abc import Callable, Mapping, Sequence
 from io import TextIOWrapper
-from pathlib import Path
 from typing import Annotated, Any, Union
 
 import tyro
@@ -38,15 +36,15 @@ from swimm3r.cli.terminal.ranges import settings_with_ranges, with_ranges
 from swimm3r.cli.train_sfm import train_sfm_command
 from swimm3r.cli.view import view
 from swimm3r.cli.weights import WEIGHTS
-from swimm3r.errors import InputError, StorageError, Swimm3rError, UsageError
+from swimm3r.errors import Swimm3rError, UsageError
 from swimm3r.export.settings import FORMATS
+from swimm3r.io.files.refusals import refusal
 from swimm3r.memory import out_of_memory
 from swimm3r.pipeline.presets import PRESETS
 from swimm3r.sfm.distillation.settings import RECIPES
 from swimm3r.weights.store import cache_folder
 
 _INTERRUPTED, _UNREAD = 130, 141  # 128 + SIGINT, SIGPIPE
-_STORAGE_ERRORS = {errno.ENOSPC, errno.EDQUOT, errno.EROFS, errno.EACCES, errno.EPERM, errno.EFBIG}
 _DESCRIPTION = (
     "Underwater video in; camera poses, water, a restored cloud and a map that renders out. "
     "Options of a command: swimm3r COMMAND --help. Version: swimm3r --version."
@@ -84,7 +82,7 @@ def main(arguments: Sequence[str] | None = None) -> None:
         os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
         raise SystemExit(_UNREAD) from None
     except Exception as error:
-        told = out_of_memory(error) or _file_failure(error)
+        told = out_of_memory(error) or refusal(error)
         if told is None:
             raise
         _fail(told)
@@ -216,30 +214,6 @@ def _family(about: str, members: Any) -> Callable:
 
 def _ready(command: Callable) -> Callable:
     return with_ranges(with_output_level(command))
-
-
-def _file_failure(error: Exception) -> Swimm3rError | None:
-    """The failure in the user's words where the system refused a file; None where that is not what happened."""
-    if not isinstance(error, OSError) or error.errno not in _STORAGE_ERRORS:
-        return None
-    if error.errno in (errno.EACCES, errno.EPERM) and error.filename and not _readable(Path(error.filename)):
-        return InputError(
-            f"cannot read {error.filename}: {error.strerror}",
-            cause="it belongs to another user, or lies in a folder that may not be entered",
-            hint="change the permissions (chmod -R u+rX FOLDER), or copy it to a folder of your own",
-        )
-    return StorageError(
-        f"cannot write {error.filename or 'to the run folder'}: {error.strerror}",
-        cause="the disk is full, over quota or read-only",
-        hint="free some space or choose another --out; the same command then resumes from here",
-    )
-
-
-def _readable(path: Path) -> bool:
-    """Return whether a path, or the nearest folder above it that is known to exist, may be read."""
-    there = next((one for one in (path, *path.absolute().parents) if os.path.lexists(one)), path)
-    effective = os.access in os.supports_effective_ids
-    return os.access(there, os.R_OK | (os.X_OK if there.is_dir() else 0), effective_ids=effective)
 
 
 def _fail(error: Swimm3rError) -> None:
