@@ -30,7 +30,7 @@ from swimm3r.progress import Progress, silent
 from swimm3r.scene.frames import Frames
 from swimm3r.scene.reconstruction import DepthMap, DepthMaps, Reconstruction
 from swimm3r.sfm.plane_sweep import consistency, kernels
-from swimm3r.sfm.plane_sweep.refinement import refine
+from swimm3r.sfm.plane_sweep.refinement import refine, window
 from swimm3r.sfm.plane_sweep.views import (
     SweepView,
     choose_sources,
@@ -130,29 +130,28 @@ def sweep(
     if not 1 <= len(sources) <= _MOST_SOURCES:
         raise ValueError(f"a sweep takes 1 to {_MOST_SOURCES} sources, got {len(sources)}")
     keep = (len(sources) + 1) // 2
-    noise, edge = settings.noise**2, likely_edge(reference.gray)
+    noise, edge = (kernels.SCALE * settings.noise) ** 2, likely_edge(reference.gray)
     half, halves = halved(reference), [halved(source) for source in sources]
     H, e = _transfers(half, halves)
     planes = _planes(half.gray.shape, H, e, z_range, settings.planes)
-    volume = kernels.sweep_costs(
-        half.detail.numpy(), *_stacked(halves, settings.window), H, e, planes, settings.window, noise, keep
-    )
+    detail, seen = _stacked(halves, settings.window)
+    volume = kernels.sweep_costs(_scaled(half), detail, seen, _lenses(H, e), planes, settings.window, noise, keep)
     total = kernels.semi_global(volume, half.gray.numpy(), settings.smooth, 8 * settings.smooth, edge)
     surface = kernels.doubled(kernels.best_plane(total, planes))
 
-    H, e = _transfers(reference, sources)
-    detail, seen = _stacked(sources, 1)
+    lenses, own = _lenses(*_transfers(reference, sources)), _scaled(reference)
+    detail, seen = _stacked(sources, int(_REACH.max()))
     every = np.stack(np.meshgrid(_REACH, _REACH), -1).reshape(-1, 2).astype(np.float32)
-    chequered = every[np.abs(every).sum(1) % 2 == 0]  # half of the window judges as well as all of it
-    odd = every[(np.abs(every) % 2 == 1).all(1)]  # and a third finds as well
+    chequered = window(every[np.abs(every).sum(1) % 2 == 0])  # half of the window judges as well as all of it
+    odd = window(every[(np.abs(every) % 2 == 1).all(1)])  # and a third finds as well
     cost = peak = np.zeros(reference.gray.shape, np.float32)
     for n in range(settings.rounds + 1):
         offsets, step, reach = (odd, 0.5 if n else 1.0, (3, 1)[n % 2])
         if n == settings.rounds:  # no more moves: how good is it, and does leaving it make it worse
             offsets, step, reach = chequered, _ASIDE, 0
         surface, cost, peak = refine(
-            reference.detail.numpy(), reference.gray.numpy(), reference.seen.numpy(), detail, seen, H, e, surface,
-            offsets, noise, edge, keep, settings.smooth_fine, step, reach,
+            own, reference.gray.numpy(), reference.seen.numpy(), detail, seen, lenses, surface, offsets,
+            noise, edge, keep, settings.smooth_fine, step, reach,
         )  # fmt: skip
     q = np.ascontiguousarray(surface[..., 0])
     cost, peak = _with_neighbors(cost), _with_neighbors(peak)
@@ -213,12 +212,22 @@ def _transfers(reference: SweepView, sources: Sequence[SweepView]) -> tuple[np.n
     return np.stack([H for H, _ in pairs]), np.stack([e for _, e in pairs])
 
 
+def _lenses(H: np.ndarray, e: np.ndarray) -> np.ndarray:
+    """H row by row and e of every source: [s, 12]."""
+    return np.concatenate([H.reshape(-1, 9), e], 1).astype(np.float32)
+
+
+def _scaled(view: SweepView) -> np.ndarray:
+    """The view's detail in the integers' unit."""
+    return view.detail.numpy() * np.float32(kernels.SCALE)
+
+
 def _stacked(sources: Sequence[SweepView], margin: int) -> tuple[np.ndarray, np.ndarray]:
-    """Images of the sources, and where a window of half width `margin` lies wholly in what they see."""
+    """Packed images of the sources, and where a window of half width `margin` lies wholly in what they see."""
     detail = torch.stack([s.detail for s in sources])
     unseen = torch.stack([(~s.seen).float() for s in sources])[:, None]
     near = torch.nn.functional.max_pool2d(unseen, 2 * margin + 1, stride=1, padding=margin)[:, 0]
-    return detail.numpy(), (near == 0).numpy()
+    return kernels.packed(detail.numpy()), (near == 0).numpy()
 
 
 def _planes(shape: torch.Size, H: np.ndarray, e: np.ndarray, z_range: tuple[float, float], most: int) -> np.ndarray:

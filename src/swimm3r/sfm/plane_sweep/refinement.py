@@ -2,130 +2,149 @@
 
 A pixel's plane is (q, dq/dx, dq/dy). Each round a pixel compares eight candidates: its own plane, those of four
 neighbors extended to it, its own moved nearer and farther, and its own with the mean slopes of its surroundings.
+
+Nearly all of the time goes into `_patch_cost`. What keeps its loop one of vectors: 16 samples at a time and a count
+that is known; float32 throughout; two pixels in one int32 (`kernels.packed`), so that a sample reads two values and not
+four; positions clamped to the image instead of tested; no store inside.
 """
 
 from typing import no_type_check
 
 import numpy as np
 
-from swimm3r.sfm.plane_sweep.kernels import kernel
+from swimm3r.sfm.plane_sweep.kernels import (
+    SOURCES,
+    clamped,
+    inlined,
+    kernel,
+    pixel,
+    place,
+    unpacked_left,
+    unpacked_right,
+)
 
 OWN, FIRST_NEIGHBOR, NEARER, FARTHER, SLOPES, CANDIDATES = 0, 1, 5, 6, 7, 8
-_SAME = 0.05  # source pixels: a candidate that differs less from the own plane is not tried
-_ROUGHEST = 2.0  # source pixels: most that one neighbor's disagreement counts
+LANES = 16  # samples of a window at a time
 _MIN_SOURCES = 2  # further sources count only where they see the pixel
+_UNSEEN = np.float32(1)  # the cost where a source does not see the pixel
+_NEVER = np.float32(1e9)
+
+_inside, _row_times, _ahead, _bilinear = pixel.inside, pixel.row_times, pixel.ahead, pixel.bilinear
+_ncc_cost, _likeness, _pixels_per_q = pixel.ncc_cost, pixel.likeness, pixel.pixels_per_q
+_extended, _differs, _disagreement = pixel.extended, pixel.differs, pixel.disagreement
+_minimum_between, _mean_slope = pixel.minimum_between, pixel.mean_slope
 
 
-@kernel
 @no_type_check
-def _patch_cost(sources, n, x, y, q, gx, gy, window):
+def window(offsets: np.ndarray) -> np.ndarray:
+    """Offsets [n, 2] as rows x, y, used (1 or 0), filled up to whole vectors with copies of the center: [3, m]."""
+    n = len(offsets)
+    rows = np.zeros((3, -(-n // LANES) * LANES), np.float32)
+    rows[:2, :n], rows[2, :n] = offsets.T, 1
+    return rows
+
+
+@inlined
+@no_type_check
+def _at_infinity(lenses, y, x, bases):
+    """Fill the homogeneous points of every source on which the pixel lands at q = 0."""
+    for s in range(bases.shape[0]):
+        for k in range(3):
+            a, b, c = lenses[s, 3 * k], lenses[s, 3 * k + 1], lenses[s, 3 * k + 2]
+            bases[s, k] = _row_times(a, b, c, np.float32(x), np.float32(y))
+
+
+@inlined
+@no_type_check
+def _patch_cost(sources, n, bases, q, gx, gy, view):
     """1 - weighted NCC of one window between the reference and source n, on a plane through the pixel."""
-    flat, seen, shape, H, e = sources
-    offsets, patch, weights, mean, variance, noise = window
-    h, w = shape
-    X0 = np.float32(H[n, 0, 0] * x + H[n, 0, 1] * y + H[n, 0, 2] + q * e[n, 0])
-    Y0 = np.float32(H[n, 1, 0] * x + H[n, 1, 1] * y + H[n, 1, 2] + q * e[n, 1])
-    Z0 = np.float32(H[n, 2, 0] * x + H[n, 2, 1] * y + H[n, 2, 2] + q * e[n, 2])
-    Xx, Xy = np.float32(H[n, 0, 0] + gx * e[n, 0]), np.float32(H[n, 0, 1] + gy * e[n, 0])
-    Yx, Yy = np.float32(H[n, 1, 0] + gx * e[n, 1]), np.float32(H[n, 1, 1] + gy * e[n, 1])
-    Zx, Zy = np.float32(H[n, 2, 0] + gx * e[n, 2]), np.float32(H[n, 2, 1] + gy * e[n, 2])
-    one, right, low = np.float32(1), np.float32(w - 1), np.float32(h - 1)
-    far = offsets[offsets.shape[0] - 1, 0]
-    for k in range(4):  # the window is convex: its corners tell
-        dx, dy = far if k % 2 else -far, far if k // 2 else -far
-        Z = Z0 + dx * Zx + dy * Zy
-        X, Y = X0 + dx * Xx + dy * Xy, Y0 + dx * Yx + dy * Yy
-        if not (Z > 0 and 0 <= X < right * Z and 0 <= Y < low * Z):
-            return np.float32(1)
-    base = np.int32(n * h * w)
-    row = np.int32(w)
-    if not seen[np.uint32(base + np.int32(Y0 / Z0) * row + np.int32(X0 / Z0))]:
-        return np.float32(1)
-    s_sum = ss_sum = rs_sum = np.float32(0)
-    for k in range(offsets.shape[0]):
-        dx, dy = offsets[k, 0], offsets[k, 1]
-        inverse = one / (Z0 + dx * Zx + dy * Zy)
-        u, v = (X0 + dx * Xx + dy * Xy) * inverse, (Y0 + dx * Yx + dy * Yy) * inverse
-        i, j = np.int32(u), np.int32(v)
-        a, b = u - np.float32(i), v - np.float32(j)
-        at = base + j * row + i
-        top, right_top = flat[np.uint32(at)], flat[np.uint32(at + 1)]
-        bottom, right_bottom = flat[np.uint32(at + row)], flat[np.uint32(at + row + 1)]
-        upper = top + a * (right_top - top)
-        lower = bottom + a * (right_bottom - bottom)
-        s = upper + b * (lower - upper)
-        weighted = weights[k] * s
-        s_sum += weighted
-        ss_sum += weighted * s
-        rs_sum += weighted * patch[k]
-    covariance = rs_sum - s_sum * mean
-    spread = max(ss_sum - s_sum * s_sum, np.float32(0)) + noise
-    return min(one, one - covariance / np.sqrt((variance + noise) * spread))
+    flat, seen, lenses, h, w = sources
+    offsets, patch, weights, mean, variance, noise = view
+    most_u, most_v = np.float32(w) - np.float32(1.01), np.float32(h) - np.float32(1.01)  # the next pixel is read, too
+    start, row = np.int32(n * h * w), np.int32(w)
+    ex, ey, ez = lenses[n, 9], lenses[n, 10], lenses[n, 11]
+    X0, Y0, Z0 = bases[n, 0] + q * ex, bases[n, 1] + q * ey, bases[n, 2] + q * ez
+    if not _inside(X0, Y0, Z0, most_u, most_v):
+        return _UNSEEN
+    if not seen[place(np.int32(start + np.int32(np.int32(Y0 / Z0) * row) + np.int32(X0 / Z0)))]:
+        return _UNSEEN
+    Xx, Yx, Zx = lenses[n, 0] + gx * ex, lenses[n, 3] + gx * ey, lenses[n, 6] + gx * ez
+    Xy, Yy, Zy = lenses[n, 1] + gy * ex, lenses[n, 4] + gy * ey, lenses[n, 7] + gy * ez
+    s = ss = rs = np.float32(0)
+    for block in range(offsets.shape[1] // LANES):
+        for lane in range(LANES):
+            k = np.uint32(block * LANES + lane)
+            dx, dy = offsets[0, k], offsets[1, k]
+            inverse = np.float32(1) / _ahead(_row_times(Zx, Zy, Z0, dx, dy))
+            u = clamped(_row_times(Xx, Xy, X0, dx, dy) * inverse, most_u)
+            v = clamped(_row_times(Yx, Yy, Y0, dx, dy) * inverse, most_v)
+            i, j = np.int32(u), np.int32(v)
+            at = np.int32(start + np.int32(np.int32(j * row) + i))
+            upper, lower = flat[place(at)], flat[place(np.int32(at + row))]
+            value = _bilinear(
+                unpacked_left(upper), unpacked_right(upper), unpacked_left(lower), unpacked_right(lower),
+                u - np.float32(i), v - np.float32(j),
+            )  # fmt: skip
+            weighted = weights[k] * value
+            s += weighted
+            ss += weighted * value
+            rs += weighted * patch[k]
+    return _ncc_cost(s, ss, rs, mean, variance, noise)
 
 
-@kernel
+@inlined
 @no_type_check
 def _bilateral_window(reference, guide, offsets, noise, edge, y, x, patch, weights):
     """Fill the window's values and weights; its mean, its variance, and whether its center's likes have texture."""
-    total = mean = square = 0.0
-    for k in range(offsets.shape[0]):
-        i, j = x + int(offsets[k, 0]), y + int(offsets[k, 1])
-        likeness = (guide[j, i] - guide[y, x]) / edge
-        weights[k] = np.exp(-0.5 * likeness * likeness)
-        patch[k] = reference[j, i]
-        total += weights[k]
-        mean += weights[k] * patch[k]
-        square += weights[k] * patch[k] * patch[k]
-    weights /= total
-    mean /= total
-    variance = max(square / total - mean * mean, 0.0)
-    total = inner = square = 0.0  # pixels like the center must have texture of their own, not only a border
-    for k in range(offsets.shape[0]):
+    zero = np.float32(0)
+    total, mean, square, center = zero, zero, zero, guide[y, x]
+    for k in range(offsets.shape[1]):
+        j, i = np.uint32(y + np.int32(offsets[1, k])), np.uint32(x + np.int32(offsets[0, k]))
+        weight = _likeness(guide[j, i] - center, edge) * offsets[2, k]
+        value = reference[j, i]
+        weights[k] = weight
+        patch[k] = value
+        total += weight
+        mean += weight * value
+        square += weight * value * value
+    share = np.float32(1) / total
+    all_alike = inner = inner_square = zero  # pixels like the center must have texture of their own, not only a border
+    for k in range(offsets.shape[1]):
         likeness = weights[k] * weights[k]
-        total += likeness
+        all_alike += likeness
         inner += likeness * patch[k]
-        square += likeness * patch[k] * patch[k]
-    return mean, variance, square * total - inner * inner >= noise * total * total
+        inner_square += likeness * patch[k] * patch[k]
+        weights[k] *= share
+    mean *= share
+    variance = max(square * share - mean * mean, zero)
+    return mean, variance, inner_square * all_alike - inner * inner >= noise * all_alike * all_alike
 
 
-@kernel
+@inlined
 @no_type_check
-def _best_sources(sources, x, y, q, gx, gy, window, first, left, chosen):
-    """Fill `first`, every source's cost on the own plane, and `chosen`, the sources that count.
+def _choose(cost, left, chosen):
+    """Fill `chosen` with the sources of the least costs, those beyond the second only where they see the pixel.
 
-    Returns how many are chosen, and the most source pixels that a unit of q moves the pixel by.
+    Returns how many and their mean cost.
     """
-    _, _, _, H, e = sources
-    count = first.shape[0]
+    count, kept, total = cost.shape[0], 0, np.float32(0)
     for s in range(count):
-        first[s] = _patch_cost(sources, s, x, y, q, gx, gy, window)
-        left[s] = first[s]
-    speed, kept = 0.0, 0
+        left[s] = cost[s]
     for n in range(chosen.shape[0]):
         best = 0
         for s in range(1, count):
             if left[s] < left[best]:
                 best = s
-        if n >= _MIN_SOURCES and left[best] >= 1:
+        if n >= _MIN_SOURCES and left[best] >= _UNSEEN:
             break
-        left[best] = 1e9
+        total += left[best]
+        left[best] = _NEVER
         chosen[n] = best
         kept = n + 1
-        X = H[best, 0, 0] * x + H[best, 0, 1] * y + H[best, 0, 2] + q * e[best, 0]
-        Y = H[best, 1, 0] * x + H[best, 1, 1] * y + H[best, 1, 2] + q * e[best, 1]
-        Z = H[best, 2, 0] * x + H[best, 2, 1] * y + H[best, 2, 2] + q * e[best, 2]
-        speed = max(speed, np.hypot(e[best, 0] * Z - X * e[best, 2], e[best, 1] * Z - Y * e[best, 2]) / (Z * Z))
-    return kept, speed
+    return kept, total / np.float32(kept)
 
 
-@kernel
-@no_type_check
-def _extended(surface, y, x, dy, dx):
-    """q at pixel (y, x) of the plane of pixel (y + dy, x + dx)."""
-    return surface[y + dy, x + dx, 0] - surface[y + dy, x + dx, 1] * dx - surface[y + dy, x + dx, 2] * dy
-
-
-@kernel
+@inlined
 @no_type_check
 def _propose(surface, y, x, reach, move, tries, beside):
     """Fill the candidate planes, and q of the four nearest pixels' planes at this one."""
@@ -134,104 +153,105 @@ def _propose(surface, y, x, reach, move, tries, beside):
             tries[n, k] = surface[y, x, k]
     for n in range(4):
         dy, dx = (n // 2) * (2 * n - 5), (1 - n // 2) * (2 * n - 1)  # (0, -1), (0, 1), (-1, 0), (1, 0)
-        beside[n] = _extended(surface, y, x, dy, dx)
+        j, i = y + dy, x + dx
+        beside[n] = _extended(surface[j, i, 0], surface[j, i, 1], surface[j, i, 2], np.float32(-dx), np.float32(-dy))
         dy, dx = dy * reach, dx * reach
-        tries[FIRST_NEIGHBOR + n, 0] = _extended(surface, y, x, dy, dx)
+        j, i = y + dy, x + dx
+        q = _extended(surface[j, i, 0], surface[j, i, 1], surface[j, i, 2], np.float32(-dx), np.float32(-dy))
+        tries[FIRST_NEIGHBOR + n, 0] = q
         for k in range(1, 3):
-            tries[FIRST_NEIGHBOR + n, k] = surface[y + dy, x + dx, k]
+            tries[FIRST_NEIGHBOR + n, k] = surface[j, i, k]
     tries[NEARER, 0] += move
     tries[FARTHER, 0] -= move
-    tries[SLOPES, 1] = 0.25 * (surface[y, x + 2, 0] - surface[y, x - 2, 0])
-    tries[SLOPES, 2] = 0.25 * (surface[y + 2, x, 0] - surface[y - 2, x, 0])
+    tries[SLOPES, 1] = _mean_slope(surface[y, x - 2, 0], surface[y, x + 2, 0])
+    tries[SLOPES, 2] = _mean_slope(surface[y - 2, x, 0], surface[y + 2, x, 0])
 
 
-@kernel
+@inlined
 @no_type_check
-def _is_tried(tries, n, q, margin, speed, reach):
-    """Return whether a candidate lies ahead and differs from the own plane; only that and its moves are judged at reach
-    0."""
-    if n == OWN:
-        return tries[n, 0] > 0
-    apart = abs(tries[n, 0] - q) + margin * (abs(tries[n, 1] - tries[OWN, 1]) + abs(tries[n, 2] - tries[OWN, 2]))
-    return tries[n, 0] > 0 and apart * speed >= _SAME and (reach > 0 or n in (NEARER, FARTHER))
+def _every_source(sources, bases, q, gx, gy, view, first):
+    """Fill every source's cost on the own plane."""
+    for s in range(first.shape[0]):
+        first[s] = _patch_cost(sources, s, bases, q, gx, gy, view)
 
 
-@kernel
+@inlined
+@no_type_check
+def _fastest(lenses, bases, q, chosen, kept):
+    """The most source pixels that a unit of q moves the pixel by."""
+    speed = np.float32(1e-12)
+    for m in range(kept):
+        s = chosen[m]
+        ex, ey, ez = lenses[s, 9], lenses[s, 10], lenses[s, 11]
+        X, Y, Z = bases[s, 0] + q * ex, bases[s, 1] + q * ey, bases[s, 2] + q * ez
+        speed = max(speed, _pixels_per_q(X, Y, Z, ex, ey, ez))
+    return speed
+
+
+@inlined
 @no_type_check
 def _roughness(beside, q, speed):
     """Disagreement with the four nearest pixels' planes, source pixels."""
-    total = 0.0
+    total = np.float32(0)
     for k in range(4):
-        total += min(abs(beside[k] - q) * speed, _ROUGHEST)
+        total += _disagreement(beside[k], q, speed)
     return total
 
 
-@kernel
+@inlined
 @no_type_check
-def _photometric_cost(sources, x, y, q, gx, gy, window, chosen, kept, limit):
-    """Mean cost over the chosen sources; broken off beyond `limit`."""
-    total = 0.0
-    for m in range(kept):
-        total += _patch_cost(sources, chosen[m], x, y, q, gx, gy, window) / kept
-        if total >= limit:
-            break
-    return total
+def _is_tried(tries, n, across, speed, reach):
+    """Return whether a candidate is worth a look; only the own plane's moves are judged at reach 0."""
+    apart = _differs(tries[n, 0], tries[n, 1], tries[n, 2], tries[OWN, 0], tries[OWN, 1], tries[OWN, 2], across, speed)
+    return apart and (reach > 0 or n in (NEARER, FARTHER))
 
 
-@kernel
+@inlined
 @no_type_check
-def _best_candidate(sources, x, y, window, first, chosen, kept, speed, tries, beside, margin, smooth, reach, move):
+def _best_candidate(sources, bases, view, chosen, kept, speed, tries, beside, center, across, price, reach, move):
     """The cheapest candidate, its photometric cost, and how much leaving the own plane's depth raises that.
 
-    Where the own plane is a minimum along depth, it is moved to the parabola's before it can be returned.
+    Where the own plane is a minimum along depth, it is moved to the parabola's before it is returned.
     """
-    lowest, pick, middle, peak = 1e9, OWN, 1.0, 0.0
-    center, side, q = 1.0, 1.0, tries[OWN, 0]
-    for n in range(CANDIDATES):
-        if not _is_tried(tries, n, q, margin, speed, reach):
+    share = np.float32(1) / np.float32(kept)
+    pick, lowest, middle, peak, side, moved = OWN, _NEVER, _UNSEEN, np.float32(0), _UNSEEN, tries[OWN, 0]
+    if moved > 0:
+        lowest, middle = center + price * _roughness(beside, moved, speed), center
+    for n in range(FIRST_NEIGHBOR, CANDIDATES):
+        if not _is_tried(tries, n, across, speed, reach):
             continue
-        penalty = 0.25 * smooth * _roughness(beside, tries[n, 0], speed)
-        if n == OWN:
-            cost = 0.0
-            for m in range(kept):
-                cost += first[chosen[m]] / kept
-        else:
-            limit = 1e9 if n in (NEARER, FARTHER) else lowest - penalty
-            cost = _photometric_cost(sources, x, y, tries[n, 0], tries[n, 1], tries[n, 2], window, chosen, kept, limit)
-        if cost + penalty < lowest and (n == OWN or reach > 0):
+        penalty = price * _roughness(beside, tries[n, 0], speed)
+        limit = _NEVER if n in (NEARER, FARTHER) else lowest - penalty
+        cost = np.float32(0)
+        for m in range(kept):
+            cost += share * _patch_cost(sources, chosen[m], bases, tries[n, 0], tries[n, 1], tries[n, 2], view)
+            if cost >= limit:
+                break
+        if cost + penalty < lowest and reach > 0:
             lowest, pick, middle = cost + penalty, n, cost
-        if n == OWN:
-            center = cost
-        elif n == NEARER:
+        if n == NEARER:
             side = cost
         elif n == FARTHER:
             peak = min(side, cost) - center
             if peak > 0 and reach > 0:
-                tries[OWN, 0] += 0.5 * move * (cost - side) / (side + cost - 2 * center)
+                moved = tries[OWN, 0] + move * _minimum_between(cost, center, side)
+    tries[OWN, 0] = moved
     return pick, middle, peak
 
 
-@kernel
+@inlined
 @no_type_check
-def refine(reference, guide, usable, sources, seen, H, e, surface, offsets, noise, edge, keep, smooth, step, reach):
-    """One round of slanted-plane refinement: every pixel tries its neighbors' planes and small moves of its own.
-
-    `surface` [h, w, 3] holds q and its slopes along x and y. Windows weigh pixels by likeness to their center
-    (bilateral), which keeps depth edges on image edges. `step` is the trial move in source pixels, `reach` the
-    distance of the neighbors asked (0: nothing moves, the surface is only judged), `smooth` the price of one source
-    pixel of disagreement with the four nearest. All pixels read the state of the round before, so order does not
-    matter. Returns the new surface, its cost (1 - NCC), and `peak`: how much the cost of the old one rises by `step`.
-    """
+def _refine_all(
+    reference, guide, usable, flat, seen, lenses, surface, offsets, noise, edge, price, step, reach, patch, weights,
+    first, left, chosen, bases, tries, beside, new, cost, peak,
+):  # fmt: skip
+    """`refine` into given arrays: nothing is allocated here."""
     h, w = reference.shape
-    new = surface.copy()
-    cost = np.ones((h, w), np.float32)
-    peak = np.zeros((h, w), np.float32)
-    noise = np.float32(noise)
-    views = (sources.ravel(), seen.ravel(), (h, w), H, e)
-    patch, weights = np.empty(offsets.shape[0], np.float32), np.empty(offsets.shape[0], np.float32)
-    first, left, chosen = np.empty(sources.shape[0]), np.empty(sources.shape[0]), np.empty(keep, np.int64)
-    tries, beside = np.empty((CANDIDATES, 3)), np.empty(4)
-    margin = int(np.abs(offsets).max())
+    sources = (flat, seen, lenses, h, w)
+    margin = 0
+    for k in range(offsets.shape[1]):
+        margin = max(margin, int(offsets[0, k]))
+    margin_f = np.float32(margin)
     for y in range(margin, h - margin):
         for x in range(margin, w - margin):
             if not usable[y, x]:
@@ -239,14 +259,46 @@ def refine(reference, guide, usable, sources, seen, H, e, surface, offsets, nois
             mean, variance, textured = _bilateral_window(reference, guide, offsets, noise, edge, y, x, patch, weights)
             if not textured:
                 continue
-            window = (offsets, patch, weights, mean, variance, noise)
-            q, gx, gy = surface[y, x, 0], surface[y, x, 1], surface[y, x, 2]
-            kept, speed = _best_sources(views, x, y, q, gx, gy, window, first, left, chosen)
-            move = step / max(speed, 1e-12)
+            view = (offsets, patch, weights, mean, variance, noise)
+            _at_infinity(lenses, y, x, bases)
+            q = surface[y, x, 0]
+            _every_source(sources, bases, q, surface[y, x, 1], surface[y, x, 2], view, first)
+            kept, center = _choose(first, left, chosen)
+            speed = _fastest(lenses, bases, q, chosen, kept)
+            move = step / speed
             _propose(surface, y, x, reach, move, tries, beside)
             pick, cost[y, x], peak[y, x] = _best_candidate(
-                views, x, y, window, first, chosen, kept, speed, tries, beside, margin, smooth, reach, move
+                sources, bases, view, chosen, kept, speed, tries, beside, center, margin_f, price, reach, move
             )
             for k in range(3):
                 new[y, x, k] = tries[pick, k]
+
+
+@kernel
+@no_type_check
+def refine(
+    reference, guide, usable, flat, seen, lenses, surface, offsets, noise, edge, keep, smooth, step, reach,
+    stamp=SOURCES,
+):  # fmt: skip
+    """One round of slanted-plane refinement: every pixel tries its neighbors' planes and small moves of its own.
+
+    `surface` [h, w, 3] holds q and its slopes along x and y; `flat` [s, h, w] the sources' packed images, `lenses`
+    [s, 12] their H and e. Windows (`window`) weigh pixels by likeness to their center (bilateral), which keeps depth
+    edges on image edges. `step` is the trial move in source pixels, `reach` the distance of the neighbors asked (0:
+    nothing moves, the surface is only judged), `smooth` the price of one source pixel of disagreement with the four
+    nearest. All pixels read the state of the round before, so order does not matter. Returns the new surface, its cost
+    (1 - NCC), and `peak`: how much the cost of the old one rises by `step`.
+    """
+    h, w = reference.shape
+    count = flat.shape[0]
+    new = surface.copy()
+    cost, peak = np.ones((h, w), np.float32), np.zeros((h, w), np.float32)
+    window_values = np.empty((2, offsets.shape[1]), np.float32)
+    per_source, chosen = np.empty((5, count), np.float32), np.empty(keep, np.int64)
+    planes = np.empty((CANDIDATES, 3), np.float32), np.empty(4, np.float32)
+    _refine_all(
+        reference, guide, usable, flat.ravel(), seen.ravel(), lenses, surface, offsets, np.float32(noise),
+        np.float32(edge), np.float32(0.25 * smooth), np.float32(step), reach, window_values[0], window_values[1],
+        per_source[0], per_source[1], chosen, per_source[2:].T, planes[0], planes[1], new, cost, peak,
+    )  # fmt: skip
     return new, cost, peak
