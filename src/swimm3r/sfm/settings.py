@@ -198,10 +198,11 @@ class MappingSettings(Settings):
     """From verified matches to cameras and points (`sfm/colmap/mapping.py`)."""
 
     method: Literal["auto", "incremental", "global"] = "auto"
-    """Mapper to use; auto tries both below `global_from` frames and keeps the better one, above it maps globally
-    (GLOMAP)."""
-    global_from: CountOrZero = 100
-    """Number of frames from which `auto` maps globally only."""
+    """Mapper of a clip or a chunk: incremental, global (GLOMAP), or both and the better result (auto)."""
+    chunk_frames: Annotated[int, Range(8)] = 48
+    """Largest number of frames of a chunk; `auto` maps clips with more than twice as many in chunks that are joined."""
+    chunk_overlap: Annotated[int, Range(2)] = 8
+    """Number of frames that neighboring chunks share."""
     focal_ladder: Annotated[tuple[Annotated[float, Range(0.1, 20)], ...], NotEmpty()] = (0.75, 1.1, 0.6, 1.5)
     """Focal lengths, as multiples of the image width, tried in turn if the lens is unknown and frames are not
     registered."""

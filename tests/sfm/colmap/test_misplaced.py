@@ -105,7 +105,7 @@ def test_of_two_ways_to_place_a_small_clip_the_one_that_explains_more_is_kept(
     wrong.update_point_3d_errors()
     for way in ("_try_focal_lengths", "_map_globally"):
         monkeypatch.setattr(mapping, way, lambda *_, found=wrong if way == wrong_one else model: [found])
-    monkeypatch.setattr(mapping, "replace_misplaced", lambda store, model, *_: model)
+    monkeypatch.setattr(mapping, "_replaced", lambda store, model, *_: (model, False))
     for thin_points, kept in ((1, model), (100_000, wrong if wrong_one == "_try_focal_lengths" else model)):
         settings = replace(SETTINGS, mapping=replace(SETTINGS.mapping, thin_points=thin_points))
         assert mapping.map_frames(store, settings, silent) == [kept]

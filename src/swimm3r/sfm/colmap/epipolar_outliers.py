@@ -6,6 +6,8 @@ meet their epipolar lines. Frames are taken away, the one with the fewest pairs 
 each that is left do.
 """
 
+from collections import defaultdict
+from collections.abc import Collection, Mapping
 from typing import TYPE_CHECKING
 
 import numpy as np
@@ -25,24 +27,27 @@ def contradicting_frames(store: FeatureDatabase, model: "pycolmap.Reconstruction
     """Image ids of registered frames that stand against their own pairs; none where too few would be left."""
     distances = pair_distances(store, model)
     limit = max(1.0, _AGREES * model.compute_mean_reprojection_error())
-    ids = sorted(model.reg_image_ids())
-    place = {image_id: k for k, image_id in enumerate(ids)}
-    asked, agrees = np.zeros((2, len(ids), len(ids)), bool)
-    for (a, b), distance in distances.items():
-        i, j = place[a], place[b]
-        asked[i, j] = asked[j, i] = True
-        agrees[i, j] = agrees[j, i] = distance < limit
-    left = np.ones(len(ids), bool)
+    partners: defaultdict[int, dict[int, bool]] = defaultdict(dict)
+    for (i, j), distance in distances.items():
+        partners[i][j] = partners[j][i] = distance < limit
+    left = set(model.reg_image_ids())
+    share = {i: _share(partners[i], left) for i in left}
     while True:
-        pairs = asked[:, left].sum(1)
-        share = np.where(left & (pairs > 0), agrees[:, left].sum(1) / np.maximum(pairs, 1), np.inf)
-        worst = int(share.argmin())
+        worst = min(left, key=lambda i: (share[i], i))
         if share[worst] >= _MOST:
             break
-        left[worst] = False
-    if left.sum() < max(3, _KEPT * len(ids)):
+        left.remove(worst)
+        share |= {i: _share(partners[i], left) for i in partners[worst] if i in left}
+    placed = model.reg_image_ids()
+    if len(left) < max(3, _KEPT * len(placed)):
         return []
-    return [image_id for image_id, stays in zip(ids, left, strict=True) if not stays]
+    return sorted(set(placed) - left)
+
+
+def _share(partners: Mapping[int, bool], left: Collection[int]) -> float:
+    """Share of a frame's pairs with frames that are left which agree; 1 without any."""
+    asked = [agrees for partner, agrees in partners.items() if partner in left]
+    return sum(asked) / len(asked) if asked else 1.0
 
 
 def pair_distances(store: FeatureDatabase, model: "pycolmap.Reconstruction") -> dict[tuple[int, int], float]:

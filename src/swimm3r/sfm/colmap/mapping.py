@@ -3,13 +3,14 @@
 A short ladder of focal lengths is mapped until all frames are placed; then frames left over are tried again with looser
 limits, and frames that stand against their matches are placed anew. Flat or small hazy scenes allow more than one
 motion, and a mapper that begins with the wrong one ends with every frame in place, many of them tens of degrees off. So
-small clips are placed twice, frame by frame and all at once, and what explains more observations is kept. Long ones are
-placed all at once, under the lens that their pairs agree on.
+clips that leave a doubt are placed twice, frame by frame and all at once, and what explains more observations is kept.
+Long clips are placed in chunks (`chunks.long_clip`).
 """
 
 import tempfile
 import threading
 from collections.abc import Callable
+from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING
 
@@ -17,14 +18,14 @@ from swimm3r.progress import Progress
 from swimm3r.sfm.colmap import calibration
 from swimm3r.sfm.colmap.epipolar_outliers import contradicting_frames
 from swimm3r.sfm.colmap.resection_outliers import misplaced_frames
-from swimm3r.sfm.features.database import MIN_INLIERS, FeatureDatabase
+from swimm3r.sfm.features.database import MIN_INLIERS, FeatureDatabase, flat_share
 from swimm3r.sfm.settings import ColmapSettings
 
 if TYPE_CHECKING:
     import pycolmap
 
 _CLEARLY = 1.1
-_GLOBAL_ENOUGH = 0.9  # share of the frames below which the incremental method has its turn, too
+_FLAT = 0.25  # share of pairs that see a plane, from which the lens and the motion of a pair are ambiguous
 _MAX_ERROR = 4.0  # pixels, where COLMAP drops observations
 _ROUNDS = 3
 _LOOSE_INLIERS, _LOOSE_SHARE = 15, 0.15  # to place a frame that COLMAP's 30 and 0.25 left over
@@ -33,42 +34,59 @@ _LOOSE_INLIERS, _LOOSE_SHARE = 15, 0.15  # to place a frame that COLMAP's 30 and
 def map_frames(store: FeatureDatabase, settings: ColmapSettings, progress: Progress) -> list["pycolmap.Reconstruction"]:
     """The models found, the best one first, its frames where they explain most; empty where no two could be joined."""
     method = settings.mapping.method
-    if method == "global" or (method == "auto" and store.frames >= settings.mapping.global_from):
-        return _replace_outliers(store, _place_many(store, settings, progress), settings, progress)
-    one_by_one = _replace_outliers(
-        store, _try_focal_lengths(store, calibration.lenses(store, settings), settings, progress), settings, progress
-    )
-    if method == "incremental" or not one_by_one:
-        return one_by_one
-    at_once = _replace_outliers(store, _map_globally(store, settings, progress), settings, progress)
-    if not at_once or at_once[0].compute_mean_observations_per_reg_image() < settings.mapping.thin_points:
-        return one_by_one  # it gives every frame a pose, be there ever so little to see (dolphin_dynamic: 61 points)
-    return max(one_by_one, at_once, key=_explained)
+    if method == "global":
+        return _checked(store, _place_at_once(store, settings, progress), settings, progress).models
+    lenses = calibration.lenses(store, settings)
+    one_by_one = _checked(store, _try_focal_lengths(store, lenses, settings, progress), settings, progress)
+    if method == "incremental" or not one_by_one.models or not _leaves_doubt(store, one_by_one, settings):
+        return one_by_one.models
+    at_once = _checked(store, _map_globally(store, settings, progress), settings, progress).models
+    if _is_thin(at_once, settings):
+        return one_by_one.models  # GLOMAP gives every frame a pose, however little it sees (dolphin_dynamic: 61 points)
+    return max(one_by_one.models, at_once, key=_explained)
 
 
-def _place_many(
+def _place_at_once(
     store: FeatureDatabase, settings: ColmapSettings, progress: Progress
-) -> list["pycolmap.Reconstruction"]:
-    """Models of all frames at once, under the lens that their pairs agree on, adjusted once the frames are in place.
+) -> "list[pycolmap.Reconstruction]":
+    """Models of all frames at once under the lens that their pairs agree on, adjusted once the frames are in place.
 
-    Under a lens that is far off, frames bend the scene, stand against their own pairs and are taken out for it. A part
-    of the clip is no place to look for the lens: the frames that share most stand side by side, and leave it open.
+    Under a lens that is far off, frames bend the scene, stand against their own pairs and would be taken out for it.
     """
-    lenses = calibration.lenses_of_pairs(store, settings)
-    calibration.set_camera(store, lenses[0])
+    calibration.set_camera(store, calibration.lenses_of_pairs(store, settings)[0])
     models = _map_globally(store, settings, progress)
-    if not models or models[0].num_reg_images() < _GLOBAL_ENOUGH * store.frames:
-        models = max(models, _try_focal_lengths(store, lenses, settings, progress), key=_quality)
     return [calibration.adjust_lens(store, model, settings, progress) for model in models[:1]] + models[1:]
 
 
-def _replace_outliers(
-    store: FeatureDatabase,
-    models: list["pycolmap.Reconstruction"],
-    settings: ColmapSettings,
-    progress: Progress,
-) -> list["pycolmap.Reconstruction"]:
-    return [replace_misplaced(store, model, settings, progress) for model in models[:1]] + models[1:]
+@dataclass(frozen=True)
+class _Checked:
+    """Models whose largest one was checked for misplaced frames."""
+
+    models: "list[pycolmap.Reconstruction]"
+    clean: bool  # no frame of the largest one stands against the others
+
+
+def _checked(
+    store: FeatureDatabase, models: "list[pycolmap.Reconstruction]", settings: ColmapSettings, progress: Progress
+) -> _Checked:
+    """Models with the misplaced frames of the largest one placed again."""
+    if not models:
+        return _Checked([], clean=False)
+    model, clean = _replaced(store, models[0], settings, progress)
+    return _Checked([model, *models[1:]], clean)
+
+
+def _leaves_doubt(store: FeatureDatabase, checked: _Checked, settings: ColmapSettings) -> bool:
+    """Return whether another mapper may do better: frames left over or misplaced, few points, or ground so flat that
+    two frames allow two motions while the lens is open, too.
+    """
+    if not checked.clean or checked.models[0].num_reg_images() < store.frames or _is_thin(checked.models, settings):
+        return True
+    return settings.intrinsics != "fixed" and flat_share(store) > _FLAT
+
+
+def _is_thin(models: "list[pycolmap.Reconstruction]", settings: ColmapSettings) -> bool:
+    return not models or models[0].compute_mean_observations_per_reg_image() < settings.mapping.thin_points
 
 
 def _try_focal_lengths(
@@ -111,11 +129,19 @@ def replace_misplaced(
 
     First those that contradict their pairs, which may be a whole part of the clip; then single ones, by resection.
     """
+    return _replaced(store, model, settings, progress)[0]
+
+
+def _replaced(
+    store: FeatureDatabase, model: "pycolmap.Reconstruction", settings: ColmapSettings, progress: Progress
+) -> "tuple[pycolmap.Reconstruction, bool]":
+    """`replace_misplaced`, and whether no frame is left that stands against the others."""
     import pycolmap
 
+    clean = True
     for ask in (contradicting_frames, misplaced_frames):
+        misplaced = ask(store, model)
         for _ in range(_ROUNDS):
-            misplaced = ask(store, model)
             if not misplaced:
                 break
             rest = pycolmap.Reconstruction(model)
@@ -125,7 +151,9 @@ def replace_misplaced(
             if _quality([again]) <= _quality([model]):
                 break
             model = again
-    return model
+            misplaced = ask(store, model)
+        clean = clean and not misplaced
+    return model, clean
 
 
 def _quality(models: "list[pycolmap.Reconstruction]") -> tuple[int, float]:
@@ -197,7 +225,7 @@ def _map_globally(
     import pycolmap
 
     options = pycolmap.GlobalPipelineOptions()
-    options.num_threads = calibration.THREADS if store.frames < settings.mapping.global_from else settings.threads or -1
+    options.num_threads = calibration.THREADS
     options.random_seed = calibration.SEED
     options.min_num_matches = MIN_INLIERS
     options.mapper.bundle_adjustment.refine_focal_length = False

@@ -34,6 +34,7 @@ from swimm3r.scene.reconstruction import (
     Tracks,
 )
 from swimm3r.sfm.colmap import calibration, mapping
+from swimm3r.sfm.colmap.chunks.long_clip import is_long, map_long_clip
 from swimm3r.sfm.colmap.plausibility import implausible
 from swimm3r.sfm.features import vlad
 from swimm3r.sfm.features.database import FeatureDatabase, fill_features, match_pairs, start_database
@@ -106,13 +107,14 @@ def choose_pairs(store: FeatureDatabase, frames: Frames, settings: ColmapSetting
     if settings.pairs == "exhaustive" or (settings.pairs == "auto" and n <= settings.exhaustive_to):
         return list(itertools.combinations(range(n), 2))
     with store.open() as database:
-        described = [unit_descriptors(database.read_descriptors(i + 1).data) for i in range(n)]
-    alike = vlad.similarity(described, torch.Generator().manual_seed(0))
+        described = vlad.describe_frames(
+            n, lambda i: unit_descriptors(database.read_descriptors(i + 1).data), torch.Generator().manual_seed(0)
+        )
     if not frames.ordered and settings.pairs == "auto":
-        return vlad.alike_pairs(alike, 5 * settings.loops)
+        return vlad.alike_pairs(described, 5 * settings.loops)
     steps = {*range(1, settings.overlap + 1), *(2**k for k in range(settings.overlap.bit_length(), 8))}
     near = {(i, i + step) for i in range(n) for step in steps if i + step < n}
-    return sorted(near | set(vlad.alike_pairs(alike, settings.loops, apart=settings.overlap)))
+    return sorted(near | set(vlad.alike_pairs(described, settings.loops, apart=settings.overlap)))
 
 
 def absolute_pose(
@@ -181,7 +183,11 @@ def _map(
     progress: Progress,
 ) -> "tuple[pycolmap.Reconstruction, list[int], list[Warning]]":
     n, threads = len(frames), settings.threads or os.cpu_count() or 1
-    models = mapping.map_frames(store, settings, progress)
+    long = is_long(n, settings.mapping)
+    if long:
+        models = map_long_clip(store, settings, ordered=frames.ordered, progress=progress)
+    else:
+        models = mapping.map_frames(store, settings, progress)
     if not models:
         raise _too_few(0, n, settings)
     model = models[0]
@@ -190,7 +196,8 @@ def _map(
         again = [(i, j) for i, j in pairs if i not in placed or j not in placed]
         looser = replace(settings.features, max_ratio=settings.mapping.retry_ratio)
         match_pairs(store, again, looser, threads, progress, again=True)
-        model = calibration.refine(store, model, settings, progress).model  # a better lens places more
+        if not long:
+            model = calibration.refine(store, model, settings, progress).model  # a better lens places more
         model = mapping.place_leftovers(store, model, settings, progress)
         model = mapping.replace_misplaced(store, model, settings, progress)
     sizes = [model.num_reg_images(), *(m.num_reg_images() for m in models[1:])]
@@ -198,7 +205,10 @@ def _map(
     share = settings.mapping.thin_share if thin else settings.mapping.min_share
     if sizes[0] < max(min(settings.mapping.min_frames, n), share * n):
         raise _too_few(sizes[0], n, settings)
-    mapped = calibration.refine(store, model, settings, progress)
+    if long:
+        mapped = calibration.Calibrated(model, refined=True)
+    else:
+        mapped = calibration.refine(store, model, settings, progress)
     warnings = []
     if not mapped.refined and settings.intrinsics != "fixed":
         camera = mapped.model.cameras[1]
@@ -240,12 +250,16 @@ def _colors(table: ColmapModel, frames: Frames, index: list[int]) -> Float[Tenso
 
 def verified_matches(store: FeatureDatabase, index: list[int]) -> Matches:
     """The verified matches among the database's frames of these numbers; `index[k]` is frame k of the result."""
+    import pycolmap
+
     row_of = {i: row for row, i in enumerate(index)}
     i, j, xy_i, xy_j = [], [], [], []
     with store.open() as database:
         xy = {k: database.read_keypoints(k + 1)[:, :2].astype(np.float64) for k in index}
-        for a, b in itertools.combinations(sorted(index), 2):
-            if not database.exists_two_view_geometry(a + 1, b + 1):
+        pairs, counts = database.read_two_view_geometry_num_inliers()
+        for pair in sorted(pair for pair, count in zip(pairs, counts, strict=True) if count):
+            a, b = (k - 1 for k in pycolmap.pair_id_to_image_pair(pair))
+            if a not in row_of or b not in row_of:
                 continue
             rows = np.asarray(database.read_two_view_geometry(a + 1, b + 1).inlier_matches, np.int64).reshape(-1, 2)
             i.append(np.full(len(rows), row_of[a]))

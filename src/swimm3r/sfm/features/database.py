@@ -7,6 +7,7 @@ Nothing is written in COLMAP's transactions: one that meets a full disk aborts t
 frame (keypoints) and of a pair (two-view geometry) says that it is complete.
 """
 
+import itertools
 import json
 import logging
 import sqlite3
@@ -62,8 +63,6 @@ def start_database(
     folder: Path, frames: Frames, camera: "pycolmap.Camera", settings: FeatureSettings
 ) -> FeatureDatabase:
     """The database in `folder`, new unless the one there was made of the same frames with the same settings."""
-    import pycolmap
-
     path, about = folder / "database.db", folder / "database.json"
     content = {
         "frames": [[frame.name, round(frame.sharpness, 3), str(frame.mask)] for frame in frames],
@@ -86,19 +85,54 @@ def start_database(
         leftover.unlink()
     with out.open() as database:
         camera_id = database.write_camera(camera, use_camera_id=True)
-        sensor = pycolmap.sensor_t(pycolmap.SensorType.CAMERA, camera_id)
-        rig = pycolmap.Rig()
-        rig.add_ref_sensor(sensor)
-        rig_id = database.write_rig(rig)
-        for i in range(len(frames)):
-            image = pycolmap.Image(name=f"{i:06d}", camera_id=camera_id, image_id=i + 1)
-            database.write_image(image, use_image_id=True)
-            frame = pycolmap.Frame()
-            frame.rig_id = rig_id
-            frame.add_data_id(pycolmap.data_t(sensor, i + 1))
-            database.write_frame(frame)
+        _write_frames(database, camera_id, range(len(frames)))
     write_text(about, described)
     return out
+
+
+def flat_share(store: FeatureDatabase) -> float:
+    """Share of the verified pairs whose matches fit a homography: flat ground, or a camera that only turns."""
+    import pycolmap
+
+    kinds = pycolmap.TwoViewGeometryConfiguration
+    with store.open() as database:
+        found = [geometry.config for geometry in database.read_two_view_geometries()[1]]
+    flat = sum(kind in (kinds.PLANAR, kinds.PANORAMIC, kinds.PLANAR_OR_PANORAMIC) for kind in found)
+    return flat / max(1, sum(kind not in (kinds.UNDEFINED, kinds.DEGENERATE) for kind in found))
+
+
+def write_excerpt(store: FeatureDatabase, path: Path, images: Sequence[int]) -> FeatureDatabase:
+    """A new database of some frames alone: keypoints and verified matches, as mapping needs them.
+
+    Frames keep their names; the k-th of `images` (ids) has id k + 1.
+    """
+    with store.open() as database, FeatureDatabase(path, len(images)).open() as excerpt:
+        camera_id = excerpt.write_camera(database.read_camera(1), use_camera_id=True)
+        _write_frames(excerpt, camera_id, [image - 1 for image in images])
+        new_id = {image: k + 1 for k, image in enumerate(images)}
+        for image in images:
+            excerpt.write_keypoints(new_id[image], database.read_keypoints(image))
+        for i, j in itertools.combinations(images, 2):
+            if database.exists_two_view_geometry(i, j):
+                excerpt.write_two_view_geometry(new_id[i], new_id[j], database.read_two_view_geometry(i, j))
+    return FeatureDatabase(path, len(images))
+
+
+def _write_frames(database: "pycolmap.Database", camera_id: int, numbers: Sequence[int]) -> None:
+    """Write images of one camera, each a frame of its own, named by their numbers in the clip."""
+    import pycolmap
+
+    sensor = pycolmap.sensor_t(pycolmap.SensorType.CAMERA, camera_id)
+    rig = pycolmap.Rig()
+    rig.add_ref_sensor(sensor)
+    rig_id = database.write_rig(rig)
+    for k, number in enumerate(numbers):
+        image = pycolmap.Image(name=f"{number:06d}", camera_id=camera_id, image_id=k + 1)
+        database.write_image(image, use_image_id=True)
+        frame = pycolmap.Frame()
+        frame.rig_id = rig_id
+        frame.add_data_id(pycolmap.data_t(sensor, k + 1))
+        database.write_frame(frame)
 
 
 def _is_whole(path: Path, frames: int) -> bool:

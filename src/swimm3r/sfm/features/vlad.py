@@ -4,7 +4,7 @@ VLAD sums, per visual word, what separates a frame's descriptors from the word (
 normalized, so that one repeated texture cannot drown the rest (Arandjelovic and Zisserman 2013).
 """
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 
 import torch
 from jaxtyping import Float
@@ -14,23 +14,34 @@ from torch.nn.functional import normalize
 _WORDS = 64
 _SAMPLES = 20_000  # descriptors the vocabulary is learned from
 _ROUNDS = 10  # of k-means
+_ROWS = 256  # frames that are compared with all others at a time
 
 
-def similarity(descriptors: Sequence[Float[Tensor, "_ 128"]], generator: torch.Generator) -> Float[Tensor, "c c"]:
-    """Cosine similarity of all frames, -1..1, given each frame's descriptors."""
-    words = vocabulary(descriptors, generator)
-    v = torch.stack([summed(d, words) for d in descriptors])
-    return v @ v.mT
+def describe_frames(
+    count: int, descriptors_of: Callable[[int], Float[Tensor, "_ 128"]], generator: torch.Generator
+) -> Float[Tensor, "c d"]:
+    """VLAD descriptors of frames 0..count-1, of unit length or zero, given each frame's descriptors when asked for."""
+    share = max(1, _SAMPLES // max(1, count))
+    sampled = []
+    for i in range(count):
+        own = descriptors_of(i)
+        sampled.append(own[torch.randperm(len(own), generator=generator)[:share]])
+    words = vocabulary(sampled, generator)
+    return torch.stack([summed(descriptors_of(i), words) for i in range(count)])
 
 
-def alike_pairs(similarity: Float[Tensor, "c c"], count: int, apart: int = 0) -> list[tuple[int, int]]:
+def alike_pairs(described: Float[Tensor, "c d"], count: int, apart: int = 0) -> list[tuple[int, int]]:
     """Each frame with the `count` most similar ones that are more than `apart` frames away, as (i < j), sorted."""
-    n = len(similarity)
+    n = len(described)
     index = torch.arange(n)
-    far = (index[:, None] - index).abs() > apart
-    ranked = similarity.masked_fill(~far, -torch.inf)
-    best = ranked.topk(min(count, n)).indices
-    return sorted({(min(i, j), max(i, j)) for i in range(n) for j in best[i].tolist() if far[i, j]})
+    pairs: set[tuple[int, int]] = set()
+    for start in range(0, n, _ROWS):
+        rows = index[start : start + _ROWS]
+        far = (rows[:, None] - index).abs() > apart
+        best = (described[rows] @ described.mT).masked_fill(~far, -torch.inf).topk(min(count, n)).indices
+        for row, i in enumerate(rows.tolist()):
+            pairs |= {(min(i, j), max(i, j)) for j in best[row].tolist() if far[row, j]}
+    return sorted(pairs)
 
 
 def vocabulary(descriptors: Sequence[Float[Tensor, "_ 128"]], generator: torch.Generator) -> Float[Tensor, "k 128"]:

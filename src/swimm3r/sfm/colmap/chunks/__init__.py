@@ -1,0 +1,1 @@
+"""Mapping of long clips: chunks placed as small clips are, joined by shared points, and adjusted together."""

@@ -1,0 +1,102 @@
+"""Mapping of a long clip: pilot chunk -> lens -> every chunk under it -> joined -> one adjustment.
+
+A chunk is placed by the method for small clips, so that its errors are found by the checks for small clips. Chunks that
+fail, and frames that a chunk leaves over, are those of no part; models that nothing joins are handed back beside the
+largest.
+"""
+
+import os
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+import numpy as np
+
+from swimm3r.io.files.cache_key import cache_key
+from swimm3r.progress import Progress
+from swimm3r.sfm.colmap import calibration
+from swimm3r.sfm.colmap.chunks.assemble import assemble
+from swimm3r.sfm.colmap.chunks.join import join_parts
+from swimm3r.sfm.colmap.chunks.links import link
+from swimm3r.sfm.colmap.chunks.parts import Part, part_of, shared_points
+from swimm3r.sfm.colmap.chunks.pilot import PILOT, pilot_lens
+from swimm3r.sfm.colmap.chunks.place import ChunkTask, place_chunks, placed_models, remove_stale
+from swimm3r.sfm.colmap.chunks.plan import order_by_matches, plan_chunks
+from swimm3r.sfm.features.database import MIN_INLIERS, FeatureDatabase
+from swimm3r.sfm.settings import ColmapSettings, MappingSettings
+
+if TYPE_CHECKING:
+    import pycolmap
+
+_FOLDER = "chunks"  # in the working folder
+_PLACING, _LINKING = "placing chunks", "linking chunks"
+
+
+def is_long(frames: int, settings: MappingSettings) -> bool:
+    """Return whether a clip of so many frames is mapped in chunks."""
+    return settings.method == "auto" and frames > 2 * settings.chunk_frames
+
+
+def map_long_clip(
+    store: FeatureDatabase, settings: ColmapSettings, *, ordered: bool, progress: Progress
+) -> "list[pycolmap.Reconstruction]":
+    """Models of a clip of any length, the largest first; adjusted under one lens, which is left in the database."""
+    matches = match_counts(store)
+    order = list(range(store.frames)) if ordered else order_by_matches(store.frames, matches).tolist()
+    windows = plan_chunks(order, settings.mapping.chunk_frames, settings.mapping.chunk_overlap)
+    chunks = [tuple(i + 1 for i in window) for window in windows]
+    folder = store.path.parent / _FOLDER
+    lens = pilot_lens(store, chunks, matches, settings, folder / PILOT, progress)
+    if lens is None:
+        return []
+    tasks = [_task(store, chunk, lens, matches, settings, folder) for chunk in chunks]
+    remove_stale(folder, {task.folder.name for task in tasks} | {PILOT})
+    place_chunks(tasks, settings.threads or os.cpu_count() or 1, _PLACING, progress)
+    parts = [part_of(model) for task in tasks for model in placed_models(task.folder)]
+    return _join(store, parts, lens, settings, progress)
+
+
+def match_counts(store: FeatureDatabase) -> dict[tuple[int, int], int]:
+    """Number of verified matches of every pair of frames (i < j, counted from 0) that has enough of them."""
+    import pycolmap
+
+    with store.open() as database:
+        pairs, counts = database.read_two_view_geometry_num_inliers()
+    named = ((pycolmap.pair_id_to_image_pair(pair), count) for pair, count in zip(pairs, counts, strict=True))
+    return {(min(i, j) - 1, max(i, j) - 1): int(count) for (i, j), count in named if count >= MIN_INLIERS}
+
+
+def _task(
+    store: FeatureDatabase,
+    chunk: tuple[int, ...],
+    lens: "pycolmap.Camera",
+    matches: dict[tuple[int, int], int],
+    settings: ColmapSettings,
+    folder: Path,
+) -> ChunkTask:
+    inside = sorted((i, j, count) for (i, j), count in matches.items() if {i + 1, j + 1} <= set(chunk))
+    key = cache_key(chunk, inside, lens.model.name, lens.params.tolist(), settings.mapping)
+    params = tuple(lens.params.tolist())
+    return ChunkTask(key, store.path, store.frames, chunk, (lens.model.name, params), settings, folder / key)
+
+
+def _join(
+    store: FeatureDatabase, parts: list[Part], lens: "pycolmap.Camera", settings: ColmapSettings, progress: Progress
+) -> "list[pycolmap.Reconstruction]":
+    """The parts that hang together, each group one model, adjusted; the largest first."""
+    with store.open() as database:
+        used = sorted({image for part in parts for image in part.images})
+        pixels = {image: database.read_keypoints(image)[:, :2].astype(np.float64) for image in used}
+    shared = shared_points(store, parts)
+    links = []
+    for done, ((a, b), points) in enumerate(sorted(shared.items())):
+        progress(_LINKING, done, len(shared))
+        found = link(a, b, parts, points, pixels, lens)
+        if found is not None:
+            links.append(found)
+    progress(_LINKING, len(shared), len(shared))
+    groups = join_parts(len(parts), links, lens.mean_focal_length())
+    models = []
+    for group in groups:
+        model = assemble(store, parts, group, lens, progress)
+        models.append(calibration.adjust_lens(store, model, settings, progress))
+    return sorted(models, key=lambda model: model.num_reg_images(), reverse=True)

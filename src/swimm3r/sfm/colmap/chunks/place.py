@@ -1,0 +1,104 @@
+"""One chunk of a long clip, placed by itself as a small clip is; its models are kept as files.
+
+The chunk's folder, models named 0, 1, ..., appears when they are whole: a killed run repeats the chunks it was at.
+"""
+
+import shutil
+import tempfile
+from collections.abc import Sequence
+from concurrent.futures import ALL_COMPLETED, ThreadPoolExecutor, wait
+from dataclasses import dataclass, replace
+from pathlib import Path
+from threading import Event
+from typing import TYPE_CHECKING
+
+from swimm3r.io.files.atomic import atomic_folder
+from swimm3r.progress import Progress, silent
+from swimm3r.sfm.colmap import calibration
+from swimm3r.sfm.colmap.mapping import map_frames
+from swimm3r.sfm.features.database import FeatureDatabase, write_excerpt
+from swimm3r.sfm.settings import ColmapSettings
+
+if TYPE_CHECKING:
+    import pycolmap
+
+_LEAST_FRAMES = 3  # of a model that is kept
+
+
+@dataclass(frozen=True)
+class ChunkTask:
+    """A chunk to be placed under a lens that is held; plain values, so that another process can place it."""
+
+    name: str
+    database: Path
+    frames: int  # of the whole clip
+    images: tuple[int, ...]  # image ids of the whole clip's database
+    lens: tuple[str, tuple[float, ...]]  # COLMAP's model name and parameters
+    settings: ColmapSettings
+    folder: Path  # that receives the models
+
+
+def place_chunk(task: ChunkTask, progress: Progress = silent) -> None:
+    """Place the frames of a chunk, unless its folder is there already."""
+    if task.folder.is_dir():
+        return
+    task.folder.parent.mkdir(parents=True, exist_ok=True)
+    with tempfile.TemporaryDirectory(dir=task.folder.parent, prefix=".mapping.") as scratch:
+        store = write_excerpt(FeatureDatabase(task.database, task.frames), Path(scratch) / "database.db", task.images)
+        name, parameters = task.lens
+        with store.open() as database:
+            camera = database.read_camera(1)
+        calibration.set_camera(store, lens_with(camera, name, parameters))
+        models = map_frames(store, replace(task.settings, intrinsics="fixed"), progress)
+    with atomic_folder(task.folder) as draft:
+        for k, model in enumerate(m for m in models if m.num_reg_images() >= _LEAST_FRAMES):
+            (draft / str(k)).mkdir()
+            model.write_binary(str(draft / str(k)))
+
+
+def place_chunks(tasks: Sequence[ChunkTask], threads: int, label: str, progress: Progress) -> None:
+    """Place several chunks at a time (COLMAP releases the interpreter); `progress` may stop it."""
+    stopped = Event()
+
+    def watch(what: str, done: int, total: int, /) -> None:
+        if stopped.is_set():
+            raise KeyboardInterrupt
+
+    progress(label, 0, len(tasks))
+    with ThreadPoolExecutor(threads) as pool:
+        pending = [pool.submit(place_chunk, task, watch) for task in tasks]
+        try:
+            done = 0
+            while done < len(tasks):  # told twice a second, so that ^C is heard between two chunks, too
+                done = len(wait(pending, timeout=0.5, return_when=ALL_COMPLETED).done)
+                progress(label, done, len(tasks))
+            for future in pending:
+                future.result()
+        except BaseException:
+            stopped.set()
+            pool.shutdown(wait=True, cancel_futures=True)
+            raise
+
+
+def placed_models(folder: Path) -> "list[pycolmap.Reconstruction]":
+    """The models of a chunk that was placed; images are named by their number in the clip."""
+    import pycolmap
+
+    return [pycolmap.Reconstruction(str(path)) for path in sorted(folder.iterdir(), key=lambda path: int(path.name))]
+
+
+def lens_with(camera: "pycolmap.Camera", name: str, parameters: tuple[float, ...]) -> "pycolmap.Camera":
+    """A camera of the same size under another lens."""
+    import pycolmap
+
+    return pycolmap.Camera(
+        model=name, width=camera.width, height=camera.height, params=list(parameters), camera_id=camera.camera_id
+    )
+
+
+def remove_stale(folder: Path, current: set[str]) -> None:
+    """Remove chunks that were placed under other settings, another lens or other matches."""
+    if folder.is_dir():
+        for path in folder.iterdir():
+            if path.name not in current:
+                shutil.rmtree(path)
