@@ -36,11 +36,20 @@ def for_maps(name: str = "auto") -> torch.device:
 
     Raises DeviceError where "cuda" was asked for and a part of it is missing; "auto" says so in the log.
     """
-    device = chosen(name, ("cuda",), "--map-device")
+    return _with_warp(name, "maps", "--map-device")
+
+
+def for_depth(name: str = "auto") -> torch.device:
+    """The device of the plane sweep: CUDA with NVIDIA Warp, else the CPU; errors as of `for_maps`."""
+    return _with_warp(name, "dense depth", "--depth.device")
+
+
+def _with_warp(name: str, what: str, option: str) -> torch.device:
+    device = chosen(name, ("cuda",), option)
     if device.type == "cuda" and importlib.util.find_spec("warp") is None:
         if name == "cuda":
-            raise without_warp("--map-device cpu")
-        log.warning("there is a GPU, but maps need NVIDIA Warp to use it: pip install 'swimm3r[cuda]'")
+            raise without_warp(f"{option} cpu")
+        log.warning("there is a GPU, but Warp is missing, which %s needs: pip install 'swimm3r[cuda]'", what)
         return CPU
     return device
 
@@ -48,7 +57,7 @@ def for_maps(name: str = "auto") -> torch.device:
 def without_warp(instead: str) -> DeviceError:
     """The error for a requested GPU whose kernels cannot run; `instead` names the alternative."""
     return DeviceError(
-        "the GPU rasterizer needs NVIDIA Warp, which is not installed",
+        "the kernels for the GPU need NVIDIA Warp, which is not installed",
         cause="Swimm3R was installed without its cuda extra",
         hint=f"pip install 'swimm3r[cuda]', or {instead}",
     )

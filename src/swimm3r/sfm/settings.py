@@ -61,6 +61,8 @@ class PlaneSweepSettings(Settings):
     """Size in working pixels below which connected patches of depth are dropped."""
     threads: Threads = 0
     """Number of frames computed at once; 0 uses all cores, at most 8."""
+    device: Literal["auto", "cpu", "cuda"] = "auto"
+    """Processor of the sweep; "auto" uses a CUDA device where there is one."""
 
 
 @dataclass(frozen=True)

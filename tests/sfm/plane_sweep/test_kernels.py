@@ -54,7 +54,7 @@ def test_the_cost_volume_is_the_mean_of_the_best_correlations():
         reference * np.float32(SCALE), kernels.packed(sources), seen, lenses, planes, 2, SCALE**2 * NOISE, 2
     )
     true = oracles.sweep_costs(reference, sources, seen, lenses, planes, 2, NOISE, 2)
-    assert (np.abs(ours - true) < 1e-3).mean() > 0.99  # the rest sees a pixel on the border of what a source shows
+    assert np.abs(ours - true).max() < 1e-3
     assert (ours.argmin(-1)[5:-5, 8:-8] == 2).mean() > 0.9  # planes[2] = 0.6 is the nearest to 0.5 beside planes[1]
 
 

@@ -20,6 +20,7 @@ from jaxtyping import Float
 from torch import Tensor
 
 from swimm3r.cameras import Cameras
+from swimm3r.devices import CPU, for_depth
 from swimm3r.imaging.undistortion import covering_pinholes
 from swimm3r.io.files.array_file import Layout, read_arrays
 from swimm3r.io.files.atomic import atomic_path, write_text
@@ -30,6 +31,7 @@ from swimm3r.progress import Progress, silent
 from swimm3r.scene.frames import Frames
 from swimm3r.scene.reconstruction import DepthMap, DepthMaps, Reconstruction
 from swimm3r.sfm.plane_sweep import consistency, kernels
+from swimm3r.sfm.plane_sweep.level import Level, Round, SweepNumbers
 from swimm3r.sfm.plane_sweep.refinement import refine, window
 from swimm3r.sfm.plane_sweep.views import (
     SweepView,
@@ -67,6 +69,7 @@ def estimate_depth(
     Maps of an interrupted call with the same cameras, points and settings are kept, others are made anew. A frame that
     sees fewer than 8 points, or has no source views, gets a map without depth.
     """
+    device = for_depth(settings.device)
     folder = rec.depth.folder
     _claim(folder, _stamp(rec, frames, settings))
     canvas = covering_pinholes(rec.cameras, settings.long_side)
@@ -98,7 +101,7 @@ def estimate_depth(
         span, compared = depth_range(rec, i), sources[i][: settings.sources]
         raw = RawDepth(torch.zeros(canvas.height, canvas.width), torch.zeros(canvas.height, canvas.width))
         if span is not None and compared:
-            raw = sweep(view(i), [view(j) for j in compared], span, settings)
+            raw = sweep(view(i), [view(j) for j in compared], span, settings, device)
         with atomic_path(raw_path(i)) as draft:
             np.savez(draft, inverse_depth=raw.inverse_depth.numpy(), correlation=raw.correlation.numpy())
 
@@ -124,39 +127,69 @@ def estimate_depth(
 
 
 def sweep(
-    reference: SweepView, sources: Sequence[SweepView], z_range: tuple[float, float], settings: PlaneSweepSettings
+    reference: SweepView,
+    sources: Sequence[SweepView],
+    z_range: tuple[float, float],
+    settings: PlaneSweepSettings,
+    device: torch.device = CPU,
 ) -> RawDepth:
     """Depth of one view from the others, between two z depths; 0 where the images do not determine it."""
     if not 1 <= len(sources) <= _MOST_SOURCES:
         raise ValueError(f"a sweep takes 1 to {_MOST_SOURCES} sources, got {len(sources)}")
-    keep = (len(sources) + 1) // 2
-    noise, edge = (kernels.SCALE * settings.noise) ** 2, likely_edge(reference.gray)
     half, halves = halved(reference), [halved(source) for source in sources]
-    H, e = _transfers(half, halves)
-    planes = _planes(half.gray.shape, H, e, z_range, settings.planes)
-    detail, seen = _stacked(halves, settings.window)
-    volume = kernels.sweep_costs(_scaled(half), detail, seen, _lenses(H, e), planes, settings.window, noise, keep)
-    total = kernels.semi_global(volume, half.gray.numpy(), settings.smooth, 8 * settings.smooth, edge)
-    surface = kernels.doubled(kernels.best_plane(total, planes))
-
-    lenses, own = _lenses(*_transfers(reference, sources)), _scaled(reference)
-    detail, seen = _stacked(sources, int(_REACH.max()))
-    every = np.stack(np.meshgrid(_REACH, _REACH), -1).reshape(-1, 2).astype(np.float32)
-    chequered = window(every[np.abs(every).sum(1) % 2 == 0])  # half of the window judges as well as all of it
-    odd = window(every[(np.abs(every) % 2 == 1).all(1)])  # and a third finds as well
-    cost = peak = np.zeros(reference.gray.shape, np.float32)
-    for n in range(settings.rounds + 1):
-        offsets, step, reach = (odd, 0.5 if n else 1.0, (3, 1)[n % 2])
-        if n == settings.rounds:  # no more moves: how good is it, and does leaving it make it worse
-            offsets, step, reach = chequered, _ASIDE, 0
-        surface, cost, peak = refine(
-            own, reference.gray.numpy(), reference.seen.numpy(), detail, seen, lenses, surface, offsets,
-            noise, edge, keep, settings.smooth_fine, step, reach,
-        )  # fmt: skip
+    coarse = _level(half, halves, settings.window)
+    fine = _level(reference, sources, int(_REACH.max()))
+    numbers = SweepNumbers(
+        planes=_planes(half.gray.shape, coarse.lenses, z_range, settings.planes),
+        radius=settings.window,
+        noise=(kernels.SCALE * settings.noise) ** 2,
+        edge=likely_edge(reference.gray),
+        keep=(len(sources) + 1) // 2,
+        smooth=settings.smooth,
+        smooth_fine=settings.smooth_fine,
+    )
+    surface, cost, peak = _backend(device)(coarse, fine, numbers, _rounds(settings.rounds))
     q = np.ascontiguousarray(surface[..., 0])
     cost, peak = _with_neighbors(cost), _with_neighbors(peak)
     sure = (1 - cost >= settings.min_ncc) & (peak >= settings.min_peak * (cost + 0.03)) & (q > 0)
     return RawDepth(torch.from_numpy(np.where(sure, q, 0)), torch.from_numpy(np.where(sure, 1 - cost, 0)))
+
+
+def numba_sweep(
+    coarse: Level, fine: Level, numbers: SweepNumbers, rounds: Sequence[Round]
+) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """The slanted surface of a view, its cost and its peak, on the CPU."""
+    n = numbers
+    volume = kernels.sweep_costs(
+        coarse.reference, coarse.flat, coarse.seen, coarse.lenses, n.planes, n.radius, n.noise, n.keep
+    )
+    total = kernels.semi_global(volume, coarse.guide, n.smooth, 8 * n.smooth, n.edge)
+    surface = kernels.doubled(kernels.best_plane(total, n.planes))
+    cost = peak = np.zeros(fine.reference.shape, np.float32)
+    for turn in rounds:
+        surface, cost, peak = refine(
+            fine.reference, fine.guide, fine.usable, fine.flat, fine.seen, fine.lenses, surface, turn.offsets, n.noise,
+            n.edge, n.keep, n.smooth_fine, turn.step, turn.reach,
+        )  # fmt: skip
+    return surface, cost, peak
+
+
+def _backend(device: torch.device) -> Callable[..., tuple[np.ndarray, np.ndarray, np.ndarray]]:
+    """The sweep of a processor."""
+    if device.type == "cpu":
+        return numba_sweep
+    from swimm3r.sfm.plane_sweep.cuda import backend as cuda_backend
+
+    return cuda_backend.sweep
+
+
+def _rounds(count: int) -> list[Round]:
+    """The rounds that look for better planes, and a last one that judges: is it good, is it worse beside it."""
+    every = np.stack(np.meshgrid(_REACH, _REACH), -1).reshape(-1, 2).astype(np.float32)
+    chequered = window(every[np.abs(every).sum(1) % 2 == 0])  # half of the window judges as well as all of it
+    odd = window(every[(np.abs(every) % 2 == 1).all(1)])  # and a third finds as well
+    moves = [Round(odd, 0.5 if n else 1.0, (3, 1)[n % 2]) for n in range(count)]
+    return [*moves, Round(chequered, _ASIDE, 0)]
 
 
 def consistent(
@@ -212,28 +245,26 @@ def _transfers(reference: SweepView, sources: Sequence[SweepView]) -> tuple[np.n
     return np.stack([H for H, _ in pairs]), np.stack([e for _, e in pairs])
 
 
-def _lenses(H: np.ndarray, e: np.ndarray) -> np.ndarray:
-    """H row by row and e of every source: [s, 12]."""
-    return np.concatenate([H.reshape(-1, 9), e], 1).astype(np.float32)
-
-
-def _scaled(view: SweepView) -> np.ndarray:
-    """The view's detail in the integers' unit."""
-    return view.detail.numpy() * np.float32(kernels.SCALE)
-
-
-def _stacked(sources: Sequence[SweepView], margin: int) -> tuple[np.ndarray, np.ndarray]:
-    """Packed images of the sources, and where a window of half width `margin` lies wholly in what they see."""
-    detail = torch.stack([s.detail for s in sources])
+def _level(view: SweepView, sources: Sequence[SweepView], margin: int) -> Level:
+    """The arrays of the kernels; a source sees where a window of half width `margin` lies wholly in what it shows."""
+    H, e = _transfers(view, sources)
     unseen = torch.stack([(~s.seen).float() for s in sources])[:, None]
     near = torch.nn.functional.max_pool2d(unseen, 2 * margin + 1, stride=1, padding=margin)[:, 0]
-    return kernels.packed(detail.numpy()), (near == 0).numpy()
+    return Level(
+        reference=view.detail.numpy() * np.float32(kernels.SCALE),
+        guide=view.gray.numpy(),
+        usable=view.seen.numpy(),
+        flat=kernels.packed(torch.stack([s.detail for s in sources]).numpy()),
+        seen=(near == 0).numpy(),
+        lenses=np.concatenate([H.reshape(-1, 9), e], 1).astype(np.float32),
+    )
 
 
-def _planes(shape: torch.Size, H: np.ndarray, e: np.ndarray, z_range: tuple[float, float], most: int) -> np.ndarray:
+def _planes(shape: torch.Size, lenses: np.ndarray, z_range: tuple[float, float], most: int) -> np.ndarray:
     """Inverse depths from far to near, evenly spaced: one per pixel of the largest motion, 32 to `most` of them."""
     near, far = z_range
     h, w = shape
+    H, e = lenses[:, :9].reshape(-1, 3, 3).astype(np.float64), lenses[:, 9:].astype(np.float64)
     x = np.array([[0.5 * w, 0.5 * h, 1], [0, 0, 1], [w, 0, 1], [0, h, 1], [w, h, 1]])
     ends = [x @ H.transpose(0, 2, 1) + q * e[:, None] for q in (1 / far, 1 / near)]
     a, b = (p[..., :2] / np.maximum(p[..., 2:], 1e-3) for p in ends)

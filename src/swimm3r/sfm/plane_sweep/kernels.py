@@ -109,7 +109,10 @@ def unpacked_right(pair):
 @kernel
 @no_type_check
 def _positions(w, most_u, most_v, lens, y, q, at, across, down):
-    """Fill the source's pixels, and the fractions beside them, that show a row of the reference at inverse depth q."""
+    """Fill the source's pixels, and the fractions beside them, that show a row of the reference at inverse depth q.
+
+    A fraction across of -1 is outside of the source's image.
+    """
     X0, Y0, Z0 = lens[1] * y + lens[2], lens[4] * y + lens[5], lens[7] * y + lens[8]
     X0, Y0, Z0 = X0 + q * lens[9], Y0 + q * lens[10], Z0 + q * lens[11]
     Xx, Yx, Zx = lens[0], lens[3], lens[6]
@@ -118,10 +121,10 @@ def _positions(w, most_u, most_v, lens, y, q, at, across, down):
         x = np.float32(n)
         X, Y, Z = X0 + Xx * x, Y0 + Yx * x, Z0 + Zx * x
         inverse = one / _ahead(Z)
-        u, v = X * inverse, Y * inverse
-        i, j = np.int32(clamped(u, most_u)), np.int32(clamped(v, most_v))
-        at[n] = j * np.int32(w) + i
-        across[n] = u - np.float32(i)
+        u, v = clamped(X * inverse, most_u), clamped(Y * inverse, most_v)
+        i, j = np.int32(u), np.int32(v)
+        at[n] = np.int32(np.int32(j * np.int32(w)) + i)
+        across[n] = select(_inside(X, Y, Z, most_u, most_v), u - np.float32(i), -one)
         down[n] = v - np.float32(j)
 
 
@@ -129,14 +132,14 @@ def _positions(w, most_u, most_v, lens, y, q, at, across, down):
 @no_type_check
 def _warp_row(flat, seen, w, at, across, down, warped, visible):
     """One row of the reference as a source shows it at these positions, 0 where it does not."""
-    zero, one = np.float32(0), np.float32(1)
+    zero, row = np.float32(0), np.int32(w)
     for n in range(at.shape[0]):
-        place, a, b = np.uint32(at[n]), across[n], down[n]
-        upper, lower = flat[place], flat[np.uint32(at[n] + w)]
+        a, b = across[n], down[n]
+        upper, lower = flat[place(at[n])], flat[place(np.int32(at[n] + row))]
         value = _bilinear(
             unpacked_left(upper), unpacked_right(upper), unpacked_left(lower), unpacked_right(lower), a, b
         )
-        ok = (a >= zero) & (b >= zero) & (a <= one) & (b <= one) & seen[place]
+        ok = (a >= zero) & seen[place(at[n])]
         warped[n] = select(ok, value, zero)
         visible[n] = ok
 

@@ -108,14 +108,14 @@ def make(jit: Any, minimum: Any, maximum: Any, select: Any, sqrt: Any, K: Any) -
         return select(bend > flat, minimum(maximum(shift, -one), one), zero)
 
     @jit
-    def jump_price(change, small, large, edge):
+    def jump_price(change, one_plane, any_jump, edge):
         """The price of a jump between planes: less where the guide changes by more than `edge`."""
-        return maximum(small, large / (one + abs(change) / edge))
+        return maximum(one_plane, any_jump / (one + abs(change) / edge))
 
     @jit
-    def path_cost(cost, same_plane, below, above, least, jump, small):
+    def path_cost(cost, same_plane, below, above, least, jump, one_plane):
         """One plane's cost along a path (Hirschmueller 2008): `least` is the least of the pixel before."""
-        cheapest = minimum(minimum(same_plane, least + jump), minimum(below, above) + small)
+        cheapest = minimum(minimum(same_plane, least + jump), minimum(below, above) + one_plane)
         return cost + cheapest - least
 
     @jit

@@ -1,0 +1,111 @@
+"""The plane sweep's Warp kernels: on Warp's CPU device they agree with Numba's, and they compile for every card."""
+
+from pathlib import Path
+
+import numpy as np
+import pytest
+import torch
+
+from swimm3r.devices import for_depth
+from swimm3r.errors import DeviceError
+
+wp = pytest.importorskip("warp", reason="warp-lang is not installed: the GPU source was not compiled")
+from swimm3r.sfm.plane_sweep.cuda import backend  # noqa: E402
+from swimm3r.sfm.plane_sweep.cuda import kernels as cuda_kernels  # noqa: E402
+from swimm3r.sfm.plane_sweep.estimate import numba_sweep  # noqa: E402
+from swimm3r.sfm.plane_sweep.kernels import SCALE, best_plane, packed, semi_global, sweep_costs  # noqa: E402
+from swimm3r.sfm.plane_sweep.level import Level, Round, SweepNumbers  # noqa: E402
+from swimm3r.sfm.plane_sweep.refinement import refine, window  # noqa: E402
+from swimm3r.sfm.settings import PlaneSweepSettings  # noqa: E402
+
+HEIGHT, WIDTH = 24, 36
+NUMBERS = SweepNumbers(
+    planes=np.linspace(0.2, 0.8, 12),
+    radius=2,
+    noise=(0.8 / 255 * SCALE) ** 2,
+    edge=0.05,
+    keep=2,
+    smooth=0.15,
+    smooth_fine=0.05,
+)
+OFFSETS = window(np.array([(x, y) for y in range(-3, 4) for x in range(-3, 4) if (x + y) % 2 == 0]))
+
+
+def level(height: int = HEIGHT, width: int = WIDTH) -> Level:
+    """A textured plane at q = 0.5 and three sources that see it from aside."""
+    rng = np.random.default_rng(0)
+    waves = rng.uniform(0.3, 1.2, (12, 2)), rng.uniform(0, 6, 12)
+
+    def texture(x: np.ndarray, y: np.ndarray) -> np.ndarray:
+        return 0.02 * np.sum([np.sin(a * x + b * y + c) for (a, b), c in zip(*waves, strict=True)], 0)
+
+    x, y = np.meshgrid(np.arange(width, dtype=float), np.arange(height, dtype=float))
+    shifts = ((6.0, 0.4), (-8.0, 0.6), (0.5, 10.0))
+    sources = np.stack([texture(x - 0.5 * a, y - 0.5 * b) for a, b in shifts]).astype(np.float32)
+    H = np.tile(np.eye(3), (3, 1, 1))
+    H[:, 2, 0] = 1e-4
+    seen = np.ones(sources.shape, bool)
+    seen[1, :, :5] = False
+    lenses = np.concatenate([H.reshape(3, 9), [(a, b, 0.01) for a, b in shifts]], 1).astype(np.float32)
+    gray = texture(x, y).astype(np.float32)
+    return Level(gray * np.float32(SCALE), gray + 0.5, np.ones(gray.shape, bool), packed(sources), seen, lenses)
+
+
+def shares_apart(a: np.ndarray, b: np.ndarray, tolerance: float) -> float:
+    return float((np.abs(a - b) > tolerance).mean())
+
+
+def test_cost_volume_and_paths_agree_with_numba_to_1e_4():
+    half, n = level(), NUMBERS
+    volume = sweep_costs(half.reference, half.flat, half.seen, half.lenses, n.planes, n.radius, n.noise, n.keep)
+    total = semi_global(volume, half.guide, n.smooth, 8 * n.smooth, n.edge)
+    ours = backend.coarse_depth(half, n, "cpu")
+    assert shares_apart(ours, best_plane(total, n.planes), 1e-4) < 0.01  # pixels on the border of what a source shows
+    assert np.median(np.abs(ours - 0.5)) < 0.02
+
+
+@pytest.mark.parametrize(("step", "reach"), [(1.0, 3), (0.5, 1), (2.5, 0)])
+def test_a_round_of_refinement_agrees_with_numba_to_1e_3(step: float, reach: int):
+    fine, n = level(), NUMBERS
+    rng = np.random.default_rng(1)
+    surface = (0.003 * rng.standard_normal((HEIGHT, WIDTH, 3))).astype(np.float32)
+    surface[..., 0] = 0.5 + 0.05 * rng.standard_normal((HEIGHT, WIDTH))
+    theirs = refine(
+        fine.reference, fine.guide, fine.usable, fine.flat, fine.seen, fine.lenses, surface, OFFSETS, n.noise, n.edge,
+        n.keep, n.smooth_fine, step, reach,
+    )  # fmt: skip
+    ours = backend.refined(fine, n, surface, [Round(OFFSETS, step, reach)], "cpu")
+    for a, b in zip(ours, theirs, strict=True):
+        assert shares_apart(a, b, 1e-3) < 0.01  # ties of two candidates
+
+
+def test_a_whole_sweep_on_warp_finds_the_plane_that_numba_finds():
+    coarse, fine = level(), level(2 * HEIGHT, 2 * WIDTH)
+    rounds = [Round(OFFSETS, 1.0, 3), Round(OFFSETS, 2.5, 0)]
+    ours = backend.sweep(coarse, fine, NUMBERS, rounds, "cpu")[0]
+    theirs = numba_sweep(coarse, fine, NUMBERS, rounds)[0]
+    assert shares_apart(ours[..., 0], theirs[..., 0], 2e-3) < 0.02
+
+
+@pytest.mark.parametrize("arch", [75, 80, 86, 89, 90])
+def test_the_kernels_compile_ahead_of_time_without_a_gpu(arch: int, tmp_path: Path):
+    made = wp.compile_aot_module(cuda_kernels, arch=arch, module_dir=tmp_path, use_ptx=True)
+    ptx = Path(made[0]).read_text()
+    assert f".target sm_{arch}" in ptx
+    assert len(ptx.split(".visible .entry")) - 1 == 4
+
+
+@pytest.mark.gpu
+@pytest.mark.skipif(not torch.cuda.is_available(), reason="no CUDA device: nothing ran on a GPU")
+def test_on_the_gpu_a_sweep_agrees_with_numba():
+    coarse, fine = level(), level(2 * HEIGHT, 2 * WIDTH)
+    rounds = [Round(OFFSETS, 1.0, 3), Round(OFFSETS, 2.5, 0)]
+    ours, theirs = backend.sweep(coarse, fine, NUMBERS, rounds)[0], numba_sweep(coarse, fine, NUMBERS, rounds)[0]
+    assert shares_apart(ours[..., 0], theirs[..., 0], 2e-3) < 0.02
+
+
+@pytest.mark.skipif(torch.cuda.is_available(), reason="there is a CUDA device")
+def test_a_gpu_that_is_not_there_is_refused():
+    with pytest.raises(DeviceError, match="no cuda device"):
+        for_depth("cuda")
+    assert for_depth(PlaneSweepSettings().device).type == "cpu"
