@@ -20,7 +20,7 @@ ROWS = {  # by package: a room or module imports only rooms of rows before its o
         {"sfm", "splat"},
         {"localization", "export", "report", "selftest"},
         {"pipeline"},
-        {"bench", "viewer"},
+        {"batch", "bench", "viewer"},
         {"cli"},
     ],
     "swimm3r.io": [
@@ -210,7 +210,7 @@ def test_importing_the_package_loads_nothing_heavy():
 
 def test_help_loads_no_torch():
     commands = ["run", "demo", "sfm", "splat", "render", "export", "eval", "prepare", "doctor", "datasets"]
-    commands += ["view", "train-sfm", "bench", "bench render"]
+    commands += ["view", "train-sfm", "batch", "bench", "bench render"]
     for command in ("", "weights get", *commands):
         snippet = (
             "from swimm3r.cli.main import main\n"

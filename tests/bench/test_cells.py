@@ -1,19 +1,16 @@
 """Cells are kept, found again by what they depend on, and say why they are empty; scenes run side by side."""
 
-import sys
-from contextlib import nullcontext
 from functools import partial
 from pathlib import Path
-from types import SimpleNamespace
 
 import pytest
 
 from swimm3r.bench import cells
 from swimm3r.bench.cells import Result, ResultKey, Scores, kept_cell, over_scenes
-from swimm3r.bench.settings import JobSettings
 from swimm3r.errors import InputError, UsageError, WeightsError
 from swimm3r.evaluate import NotComputed
 from swimm3r.progress import Progress
+from swimm3r.tasks import EngineSettings
 
 PLACE = ResultKey("reef", "colmap / + SGG", 2)
 
@@ -102,55 +99,24 @@ def names_lead_out(scene: str, /, *, out: Path, progress: Progress) -> list[Resu
     (out / scene).touch()
     if scene == "b":
         raise InputError("b is damaged", cause="why", hint="try")
-    return [Result(scene, "m", 0, {"x": float(ord(scene))})]
+    return [Result(scene, "m", 0, {"x": float(ord(scene)), "y": NotComputed("no weights")})]
 
 
 @pytest.mark.parametrize("jobs", [1, 2])
 def test_scenes_keep_their_order_and_one_error_waits_for_the_others(tmp_path: Path, jobs: int):
     work = partial(names_lead_out, out=tmp_path)
-    found = over_scenes(["c", "a"], work, tmp_path, JobSettings(jobs))
+    found = over_scenes(["c", "a"], work, tmp_path, EngineSettings(jobs=jobs))
     assert [c.scene for c in found] == ["c", "a"]
+    assert found[0].scores == {"x": 99.0, "y": NotComputed("no weights")}
     with pytest.raises(InputError, match="b is damaged") as raised:
-        over_scenes(["b", "d"], work, tmp_path, JobSettings(jobs))
+        over_scenes(["b", "d"], work, tmp_path, EngineSettings(jobs=jobs))
     assert (raised.value.cause, raised.value.hint) == ("why", "try")
     assert (tmp_path / "d").exists()
 
 
-def test_no_scenes_and_no_submitit_are_said_plainly(tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
+def test_no_scenes_are_said_plainly(tmp_path: Path):
     with pytest.raises(UsageError, match="nothing to measure"):
-        over_scenes([], names_lead_out, tmp_path, JobSettings())
-    monkeypatch.setitem(sys.modules, "submitit", None)
-    with pytest.raises(UsageError, match="submitit"):
-        over_scenes(["a"], partial(names_lead_out, out=tmp_path), tmp_path, JobSettings(slurm=True))
-
-
-def test_a_cluster_gets_a_job_per_scene(tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
-    told = {}
-
-    class AutoExecutor:  # what of submitit is used
-        def __init__(self, folder):
-            told["folder"] = folder
-
-        def update_parameters(self, **options):
-            told.update(options)
-
-        def batch(self):
-            return nullcontext()
-
-        def submit(self, work, scene, **options):
-            return SimpleNamespace(result=partial(work, scene, **options))
-
-    monkeypatch.setitem(sys.modules, "submitit", SimpleNamespace(AutoExecutor=AutoExecutor))
-    how = JobSettings(slurm=True, partition="sea", minutes=5, cpus=3)
-    found = over_scenes(["a", "c"], partial(names_lead_out, out=tmp_path), tmp_path, how)
-    assert [c.scene for c in found] == ["a", "c"]
-    assert told == {
-        "folder": tmp_path / "slurm",
-        "timeout_min": 5,
-        "cpus_per_task": 3,
-        "gpus_per_node": 0,
-        "slurm_partition": "sea",
-    }
+        over_scenes([], names_lead_out, tmp_path, EngineSettings())
 
 
 def test_names_of_scenes_stay_below_the_folder(tmp_path: Path):

@@ -7,26 +7,22 @@ A cell's folder OUT/SCENE/METHOD/SEED keeps what the method made (a map, images)
 
 A cell whose scores have the key is not computed again. One that was cut short, or is only scored differently, goes on
 from what its folder holds; what was made from something else is set aside in SEED/old and never taken for it.
-Torch-free: worker processes learn their share of the cores before torch starts its threads.
 """
 
 import json
-import os
 import re
 from collections.abc import Callable, Mapping, Sequence
-from concurrent.futures import ProcessPoolExecutor
 from dataclasses import dataclass, field
 from functools import partial
-from multiprocessing import get_context
 from pathlib import Path
 from typing import Any
 
-from swimm3r.bench.settings import JobSettings
-from swimm3r.errors import DeviceError, Swimm3rError, UsageError, WeightsError
+from swimm3r.errors import DeviceError, UsageError, WeightsError
 from swimm3r.evaluate import NotComputed, summary_entries
 from swimm3r.io.files.atomic import write_text
 from swimm3r.io.files.cache_key import cache_key, code_version
 from swimm3r.progress import Progress, silent
+from swimm3r.tasks import EngineSettings, run_tasks
 
 Scores = Mapping[str, float | NotComputed]
 
@@ -131,56 +127,41 @@ def check_choice(what: str, chosen: Sequence[str], against: str | None = None) -
 
 
 def over_scenes(
-    scenes: Sequence[object], work: SceneWork, out: Path, how: JobSettings, progress: Progress = silent
+    scenes: Sequence[object], work: SceneWork, out: Path, how: EngineSettings, progress: Progress = silent
 ) -> list[Result]:
     """The cells of all scenes in the scenes' order. One scene's error is raised when the others are done."""
     if not scenes:
         raise UsageError(
             "there is nothing to measure on", cause="no run folder or clip was named", hint="name at least one"
         )
-    if how.slurm:
-        return _joined([job.result for job in _submitted(scenes, work, out, how)], progress)
-    if how.jobs == 1 or len(scenes) < 2:
-        return _joined([partial(work, scene, progress=progress) for scene in scenes], progress)
-    threads = max(1, (os.cpu_count() or 1) // how.jobs)
-    with ProcessPoolExecutor(how.jobs, get_context("spawn"), _share_cores, (threads,)) as pool:
-        return _joined([pool.submit(work, scene, progress=silent).result for scene in scenes], progress)
+    if how.engine == "local" and how.at_once(1) == 1:
+        work = partial(work, progress=progress)
+    else:
+        work = partial(work, progress=silent)
+    folder = out / "jobs"
+    items = [_Scene(f"{number}", scene) for number, scene in enumerate(scenes)]
+    failures = run_tasks(partial(_keep_cells, work=work, folder=folder), items, how, progress, "scenes", logs=folder)
+    if failures:
+        raise failures[0].error
+    return [cell for item in items for cell in _kept_cells(folder / f"{item.name}.json")]
 
 
-def _submitted(scenes: Sequence[object], work: SceneWork, out: Path, how: JobSettings) -> list:
-    try:
-        import submitit  # pyright: ignore[reportMissingImports]
-    except ImportError as error:
-        raise UsageError(
-            "scenes are sent to Slurm by submitit, which is not installed",
-            cause="it is not among Swimm3R's own requirements",
-            hint="pip install 'swimm3r[slurm]', or --jobs N for processes on this computer",
-        ) from error
-    executor = submitit.AutoExecutor(folder=out / "slurm")
-    options = {"timeout_min": how.minutes, "cpus_per_task": how.cpus, "gpus_per_node": how.gpus}
-    executor.update_parameters(**options, **({"slurm_partition": how.partition} if how.partition else {}))
-    with executor.batch():
-        return [executor.submit(work, scene, progress=silent) for scene in scenes]
+@dataclass(frozen=True)
+class _Scene:
+    """A scene with the number that its results lie under until they are joined."""
+
+    name: str
+    scene: object
 
 
-def _joined(results: Sequence[Callable[[], list[Result]]], progress: Progress) -> list[Result]:
-    cells: list[Result] = []
-    failed: list[Swimm3rError] = []
-    for done, result in enumerate(results):
-        progress("scenes", done, len(results))
-        try:
-            cells += result()
-        except Swimm3rError as error:
-            failed.append(error)
-    progress("scenes", len(results), len(results))
-    if failed:
-        raise failed[0]
-    return cells
+def _keep_cells(item: _Scene, *, work: SceneWork, folder: Path) -> None:
+    cells = [{**vars(cell), "scores": summary_entries(cell.scores)} for cell in work(item.scene)]
+    write_text(folder / f"{item.name}.json", json.dumps(cells, indent=2) + "\n")
 
 
-def _share_cores(threads: int) -> None:
-    for name in ("OMP_NUM_THREADS", "NUMBA_NUM_THREADS", "MKL_NUM_THREADS"):
-        os.environ[name] = str(threads)
+def _kept_cells(path: Path) -> list[Result]:
+    cells = json.loads(path.read_text(encoding="utf-8"))
+    return [Result(**{**cell, "scores": _scores(cell["scores"])}) for cell in cells]
 
 
 def _scores(entries: Mapping[str, Any]) -> dict[str, float | NotComputed]:

@@ -4,27 +4,9 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Annotated, Literal
 
-from swimm3r.settings import Count, CountOrZero, Range, Settings
+from swimm3r.settings import Range, Settings
 
 Seeds = Annotated[int, Range(1, 1000)]  # trainings of one method on one scene
-
-
-@dataclass(frozen=True)
-class JobSettings(Settings):
-    """Scenes one after the other, in parallel processes, or as jobs of a Slurm cluster."""
-
-    jobs: Annotated[int, Range(1, 1024)] = 1
-    """Number of scenes computed at once, each in a process with its share of the cores."""
-    slurm: bool = False
-    """Submit each scene as a Slurm job through submitit (pip install 'swimm3r[slurm]'); all jobs need the same disk."""
-    partition: str = ""
-    """Slurm partition of the jobs; empty for the cluster's default."""
-    minutes: Count = 24 * 60
-    """Time limit of a Slurm job in minutes."""
-    cpus: Count = 8
-    """Number of CPU cores of a Slurm job."""
-    gpus: CountOrZero = 0
-    """Number of GPUs of a Slurm job."""
 
 
 SfmMethod = Literal[

@@ -9,6 +9,7 @@ from typing import Annotated, Any, Union
 import tyro
 from tyro.conf import arg, subcommand
 
+from swimm3r.cli.batch import batch_command
 from swimm3r.cli.bench.ablation_uwbs import ablation_uwbs_command
 from swimm3r.cli.bench.flsea import ablation_sfm_command, flsea_command
 from swimm3r.cli.bench.on_runs import localization, restoration
@@ -106,7 +107,7 @@ def _run_command(arguments: list[str]) -> None:
 
 def commands_for(arguments: Sequence[str]) -> dict[str, Callable | Family]:
     """Every command, with the defaults that its command line decides."""
-    is_pipeline = arguments[:1] and arguments[0] in ("run", "prepare", "sfm", "splat")
+    is_pipeline = arguments[:1] and arguments[0] in ("run", "prepare", "sfm", "splat", "batch")
     start = starting_point(arguments if is_pipeline else ())
     tables = defaults_of(named("--preset", arguments, PRESETS) or "fast")
     protocols = {
@@ -123,6 +124,7 @@ def commands_for(arguments: Sequence[str]) -> dict[str, Callable | Family]:
         "prepare": prepare_command(start),
         "sfm": sfm_command(start),
         "splat": splat_command(start),
+        "batch": batch_command(start),
         "bench": Family(
             "The paper's tables on your own dives. Results stay in --out; re-run the same command to resume.", protocols
         ),

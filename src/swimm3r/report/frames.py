@@ -70,7 +70,7 @@ def dive_frames(
     """A few registered frames, evenly spread over the dive."""
     found = []
     for name in _spread(rec.names, _SHOWN_FRAMES):
-        views = [View("raw", _uri(_filmed(frames, name)), f"{name} as filmed")]
+        views = [View("raw", _uri(filmed(frames, name)), f"{name} as filmed")]
         restored = folder / "sfm" / "restored" / f"{name}.png"
         if restored.is_file():
             views.append(View("restored", _uri(images.read_rgb(restored)), f"{name} {restored_as}"))
@@ -85,7 +85,7 @@ def frames_only(frames: Frames) -> list[ShownFrame]:
     """A few frames as filmed, for a run without structure from motion."""
     chosen = _spread(frames.names, _SHOWN_FRAMES)
     return [
-        ShownFrame(caption(frames, name), (View("raw", _uri(_filmed(frames, name)), f"{name} as filmed"),))
+        ShownFrame(caption(frames, name), (View("raw", _uri(filmed(frames, name)), f"{name} as filmed"),))
         for name in chosen
     ]
 
@@ -95,7 +95,7 @@ def test_frames(frames: Frames, folder: Path) -> list[ShownFrame]:
     found, stems = [], view_stems(frames.names)
     alts = {"rgb": "as the map renders it", "clear": "as the map renders it without the water", "z_depth": "depth"}
     for name in _spread(frames.test.names, _SHOWN_TESTS):
-        views = [View("raw", _uri(_filmed(frames, name)), f"{name} as filmed")]
+        views = [View("raw", _uri(filmed(frames, name)), f"{name} as filmed")]
         for kind, alt in alts.items():
             image = images.read_rgb(folder / "renders" / "test" / f"{stems[name]}_{kind}.png")
             views.append(View("depth" if kind == "z_depth" else kind, _uri(image), f"{name} {alt}"))
@@ -107,7 +107,8 @@ def _spread(names: tuple[str, ...], most: int) -> list[str]:
     return [names[k] for k in sorted({round(i) for i in np.linspace(0, len(names) - 1, most)})] if names else []
 
 
-def _filmed(frames: Frames, name: str) -> np.ndarray:
+def filmed(frames: Frames, name: str) -> np.ndarray:
+    """A frame as filmed, 8-bit RGB."""
     return (frames.image(frames.index(name)).numpy() * 255).round().astype(np.uint8)
 
 

@@ -18,6 +18,7 @@ from swimm3r.report import frames as shown_frames
 from swimm3r.report import head, outputs, scores, verdict, water
 from swimm3r.report.plan_view import path_overlay, plan_view
 from swimm3r.report.scene import pack_scene, shown_points
+from swimm3r.report.style import style_sheet
 from swimm3r.scene.frames import Frames
 from swimm3r.scene.reconstruction import Reconstruction
 from swimm3r.scene.reconstruction_io import load_reconstruction
@@ -123,7 +124,7 @@ def _made_with(folder: Path, remedy: Remedy) -> dict[str, object]:
     return {
         "settings": settings,
         "versions": versions,
-        "style": Markup(_part("page.css")),
+        "style": Markup(style_sheet()),
         "script": Markup(_part("page.js")),
         "scene_script": Markup(_part("scene.js")),
     }

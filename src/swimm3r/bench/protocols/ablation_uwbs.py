@@ -14,7 +14,7 @@ from swimm3r.bench.cells import Result, ResultKey, Scores, kept_cell, over_scene
 from swimm3r.bench.inputs import lpips_weights, reconstruction_of
 from swimm3r.bench.map_scores import map_scores, trained
 from swimm3r.bench.scores import columns
-from swimm3r.bench.settings import JobSettings, Seeds
+from swimm3r.bench.settings import Seeds
 from swimm3r.bench.tables import Table
 from swimm3r.errors import InputError
 from swimm3r.pipeline import held_out
@@ -22,6 +22,7 @@ from swimm3r.pipeline.run import FinishedSfm, open_finished_sfm
 from swimm3r.progress import Progress, silent
 from swimm3r.settings import accepted
 from swimm3r.splat.settings import PoseRefinementSettings, UwbsSettings
+from swimm3r.tasks.settings import EngineSettings
 
 COLUMNS = columns("psnr", "ssim_3dgs", "lpips_vgg", "sharpness", "clear_psnr", "train_cpu_seconds")
 _SEEDS_APART = 1_000  # a preset's own seed and these do not meet
@@ -56,7 +57,7 @@ def ablate(
     full: UwbsSettings,
     seeds: int,
     test: PoseRefinementSettings | None = None,
-    how: JobSettings | None = None,
+    how: EngineSettings | None = None,
     progress: Progress = silent,
 ) -> Table:
     """The scores of every run, variant and seed; `full` is what the paper calls UWBS (full).
@@ -75,7 +76,7 @@ def ablate(
     for run in runs:
         open_finished_sfm(run)
     work = partial(_cells_of_run, out=out, full=full, seeds=seeds, test=test or PoseRefinementSettings())
-    cells = over_scenes(runs, work, out, how or JobSettings(), progress)
+    cells = over_scenes(runs, work, out, how or EngineSettings(), progress)
     return Table("ablation", "Underwater Beta Splatting without its parts", cells, COLUMNS)
 
 

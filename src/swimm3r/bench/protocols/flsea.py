@@ -20,7 +20,7 @@ from swimm3r.bench import reference
 from swimm3r.bench.cells import Result, ResultKey, Scores, check_choice, kept_cell, over_scenes, scene_folder
 from swimm3r.bench.inputs import files_of
 from swimm3r.bench.scores import columns
-from swimm3r.bench.settings import JobSettings, SfmMethods
+from swimm3r.bench.settings import SfmMethods
 from swimm3r.bench.sfm_methods import reference_scores, settings_for
 from swimm3r.bench.tables import Table
 from swimm3r.cameras import Cameras
@@ -39,6 +39,7 @@ from swimm3r.scene.settings import FrameSettings
 from swimm3r.settings import Count, accepted
 from swimm3r.sfm import reconstruct
 from swimm3r.sfm.settings import ColmapSettings, Mast3rSettings, SfmSettings
+from swimm3r.tasks.settings import EngineSettings
 
 COLUMNS = columns(
     "absrel_median", "delta125_median", "rmselog_median", "depth_coverage_pct", "rra15", "rta15", "maa30",
@@ -56,7 +57,7 @@ def compare_on_flsea(
     mast3r: Mast3rSettings,
     stride: int = 1,
     sequences: Many[str] = (),
-    how: JobSettings | None = None,
+    how: EngineSettings | None = None,
     progress: Progress = silent,
     name: str = "flsea",
 ) -> Table:
@@ -68,7 +69,7 @@ def compare_on_flsea(
     accepted("stride", stride, Count)
     found = chosen_sequences(root, sequences)
     options = {"root": root, "out": out, "given": given, "colmap": colmap, "mast3r": mast3r, "stride": stride}
-    cells = over_scenes(found, partial(_cells_of_sequence, **options), out, how or JobSettings(), progress)
+    cells = over_scenes(found, partial(_cells_of_sequence, **options), out, how or EngineSettings(), progress)
     return Table(name, "Depth and poses on FLSea's test sequences", cells, COLUMNS)
 
 

@@ -24,7 +24,6 @@ from swimm3r.bench.inputs import reconstruction_of, weights_digest
 from swimm3r.bench.memory import in_own_process, with_peak_mb
 from swimm3r.bench.runs import POSES_REFINED, Clip, SfmRun, clips_of
 from swimm3r.bench.scores import columns
-from swimm3r.bench.settings import JobSettings
 from swimm3r.bench.tables import Table
 from swimm3r.errors import InputError, WeightsError
 from swimm3r.evaluate import NotComputed
@@ -41,6 +40,7 @@ from swimm3r.progress import Progress, silent
 from swimm3r.scene.ground_truth import GroundTruth
 from swimm3r.scene.reconstruction import Reconstruction
 from swimm3r.splat.map_file import load_map
+from swimm3r.tasks.settings import EngineSettings
 
 _PAIRS = [f"{score}_{pairs}" for pairs in ("map", "queries") for score in ("rra2", "rta5", "rra15", "rta15")]
 _PAIRS += ["rra2_training", "rta5_training"]
@@ -65,7 +65,7 @@ def localize(
     settings: LocalizationSettings | None = None,
     maps: Path | None = None,
     references: Path | None = None,
-    how: JobSettings | None = None,
+    how: EngineSettings | None = None,
     progress: Progress = silent,
 ) -> Table:
     """Every test frame of every run in each of its maps; `maps` is a folder that `bench render` filled.
@@ -79,7 +79,7 @@ def localize(
         for run in clip.runs:
             maps_of(run, maps)
     work = partial(_cells_of_clip, out=out, settings=settings or GS_CPR, maps=maps, references=references)
-    cells = over_scenes(clips, work, out, how or JobSettings(), progress)
+    cells = over_scenes(clips, work, out, how or EngineSettings(), progress)
     return Table("localization", "Test frames placed in maps", cells, COLUMNS)
 
 

@@ -17,7 +17,7 @@ from swimm3r.bench.images import Panel, stored, write_grid
 from swimm3r.bench.inputs import lpips_weights, reconstruction_of
 from swimm3r.bench.map_scores import COLUMNS, map_scores, trained
 from swimm3r.bench.runs import POSES_REFINED, Clip, clips_of, made_runs
-from swimm3r.bench.settings import JobSettings, Seeds
+from swimm3r.bench.settings import Seeds
 from swimm3r.bench.tables import Table
 from swimm3r.evaluate import NotComputed
 from swimm3r.io.view_names import view_stems
@@ -35,6 +35,7 @@ from swimm3r.splat.settings import (
     UwbsSettings,
     with_recipe,
 )
+from swimm3r.tasks.settings import EngineSettings
 
 _SEEDS_APART = 1_000
 
@@ -49,7 +50,7 @@ def compare_renderers(
     test: PoseRefinementSettings | None = None,
     against: str | None = None,
     references: Path | None = None,
-    how: JobSettings | None = None,
+    how: EngineSettings | None = None,
     progress: Progress = silent,
 ) -> Table:
     """Every recipe at the size and length of `base` on every run; `poses` adds them all with training poses refined.
@@ -72,7 +73,7 @@ def compare_renderers(
         test=test or PoseRefinementSettings(),
         references=references,
     )
-    cells = over_scenes(clips, work, out, how or JobSettings(), progress)
+    cells = over_scenes(clips, work, out, how or EngineSettings(), progress)
     title = "Test frames rendered, by structure from motion and renderer"
     return Table("render", title, cells, COLUMNS, against or recipes[0])
 
@@ -88,7 +89,7 @@ def compare_on_clips(
     given_poses: bool = False,
     against: str | None = None,
     references: Path | None = None,
-    how: JobSettings | None = None,
+    how: EngineSettings | None = None,
     progress: Progress = silent,
 ) -> Table:
     """`compare_renderers` on run folders and on clips, whose structure from motion is made first, in OUT/runs.

@@ -16,12 +16,12 @@ from swimm3r.bench.images import Panel, stored, write_grid
 from swimm3r.bench.inputs import reconstruction_of
 from swimm3r.bench.runs import Clip, clips_of
 from swimm3r.bench.scores import columns
-from swimm3r.bench.settings import JobSettings
 from swimm3r.bench.tables import Table
 from swimm3r.io.files.cache_key import content_digest
 from swimm3r.pipeline.restored_scores import no_reference_scores
 from swimm3r.progress import Progress, silent
 from swimm3r.scene.frames import Frames
+from swimm3r.tasks.settings import EngineSettings
 
 COLUMNS = columns("uiqm_funie", "uciqe_cielab", "uranker")
 _FILMED = "as filmed"
@@ -30,10 +30,10 @@ _SHOWN = 4  # frames side by side
 
 
 def score_restoration(
-    runs: Sequence[Path], out: Path, how: JobSettings | None = None, progress: Progress = silent
+    runs: Sequence[Path], out: Path, how: EngineSettings | None = None, progress: Progress = silent
 ) -> Table:
     """Every run's restored frames. Raises InputError where a folder holds no finished structure from motion."""
-    cells = over_scenes(clips_of(runs), partial(_cells_of_clip, out=out), out, how or JobSettings(), progress)
+    cells = over_scenes(clips_of(runs), partial(_cells_of_clip, out=out), out, how or EngineSettings(), progress)
     return Table("restoration", "Images without the water", cells, COLUMNS)
 
 

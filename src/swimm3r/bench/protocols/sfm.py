@@ -15,7 +15,7 @@ from swimm3r.bench.images import Panel, write_grid
 from swimm3r.bench.inputs import files_of
 from swimm3r.bench.runs import original_pixels
 from swimm3r.bench.scores import columns
-from swimm3r.bench.settings import JobSettings, SfmMethods
+from swimm3r.bench.settings import SfmMethods
 from swimm3r.bench.sfm_methods import Uncapped, model_scores, reference_scores, settings_for
 from swimm3r.bench.tables import Table
 from swimm3r.errors import InputError, RegistrationError
@@ -32,6 +32,7 @@ from swimm3r.scene.ground_truth import GroundTruth
 from swimm3r.scene.reconstruction import Reconstruction
 from swimm3r.scene.reconstruction_io import load_reconstruction
 from swimm3r.sfm.settings import ColmapSettings, Mast3rSettings
+from swimm3r.tasks.settings import EngineSettings
 
 COLUMNS = columns(
     "registered_pct", "epipolar_mean_px", "inlier_1px_pct", "points", "dense_points", "rra15", "rta15", "maa30",
@@ -46,7 +47,7 @@ def compare_sfm(
     settings: RunSettings,
     mast3r: Mast3rSettings,
     references: Path | None = None,
-    how: JobSettings | None = None,
+    how: EngineSettings | None = None,
     progress: Progress = silent,
 ) -> Table:
     """Every method on every clip; `settings` say how frames are taken and how COLMAP works.
@@ -67,7 +68,7 @@ def compare_sfm(
     for clip in clips:
         check_source(clip)
     work = partial(_cells_of_clip, out=out, given=given, settings=settings, mast3r=mast3r, references=references)
-    cells = over_scenes(clips, work, out, how or JobSettings(), progress)
+    cells = over_scenes(clips, work, out, how or EngineSettings(), progress)
     return Table("sfm", "Structure from motion by every method", cells, COLUMNS)
 
 

@@ -5,12 +5,13 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Annotated
 
-from swimm3r.bench.settings import ABLATION, JobSettings, SfmMethods
+from swimm3r.bench.settings import ABLATION, SfmMethods
 from swimm3r.cli.bench.table import ALL_METHODS, ONE_BY_ONE, Defaults, Jobs, Methods, show_table
 from swimm3r.cli.terminal.options import FLAT, DataRoot, Out
 from swimm3r.pipeline.presets import Preset
 from swimm3r.settings import Count
 from swimm3r.sfm.settings import ColmapSettings, Mast3rSettings
+from swimm3r.tasks.settings import EngineSettings
 
 
 @dataclass(frozen=True)
@@ -96,7 +97,7 @@ def _compare(
     images: Sequences,
     colmap: ColmapSettings,
     mast3r: Mast3rSettings,
-    jobs: JobSettings,
+    jobs: EngineSettings,
     preset: str,
 ) -> None:
     from swimm3r.bench.protocols.flsea import compare_on_flsea

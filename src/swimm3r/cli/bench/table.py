@@ -5,7 +5,7 @@ from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
 
-from swimm3r.bench.settings import JobSettings, SfmMethods
+from swimm3r.bench.settings import SfmMethods
 from swimm3r.cli.terminal.console import drawn_progress
 from swimm3r.cli.terminal.options import FLAT
 from swimm3r.pipeline.presets import MAST3R_PRESETS, PRESETS, Preset
@@ -13,14 +13,15 @@ from swimm3r.progress import Progress
 from swimm3r.scene.settings import FrameSettings
 from swimm3r.sfm.settings import ColmapSettings, Mast3rSettings
 from swimm3r.splat.settings import PoseRefinementSettings, UwbsSettings
+from swimm3r.tasks.settings import EngineSettings
 
 if TYPE_CHECKING:
     from swimm3r.bench.tables import Table
 
-Jobs = Annotated[JobSettings, FLAT]
+Jobs = Annotated[EngineSettings, FLAT]
 Methods = Annotated[SfmMethods, FLAT]
 Frames = Annotated[FrameSettings, FLAT]
-ONE_BY_ONE, ALL_METHODS = JobSettings(), SfmMethods()
+ONE_BY_ONE, ALL_METHODS = EngineSettings(), SfmMethods()
 
 
 @dataclass(frozen=True)

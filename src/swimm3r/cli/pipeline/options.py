@@ -11,11 +11,9 @@ from swimm3r.viewer.settings import Port, ViewerSettings
 
 
 @dataclass(frozen=True)
-class FolderOptions:
-    """The run folder, and the origin of the other options' defaults."""
+class OriginOptions:
+    """The origin of the other options' defaults."""
 
-    out: OutOrDefault = None
-    """Run folder that receives all results; may be left out where SOURCE is a run folder."""
     preset: Preset | None = None
     """Preset that supplies the other defaults. Without it and --config they are those of the run folder, else
     `default`."""
@@ -23,6 +21,14 @@ class FolderOptions:
     """Settings file, such as the settings.yaml of another run, that supplies the other defaults."""
     redo: bool = False
     """Repeat stages that were made with other settings; the earlier results move to RUN/old."""
+
+
+@dataclass(frozen=True)
+class FolderOptions(OriginOptions):
+    """The run folder, and the origin of the other options' defaults."""
+
+    out: OutOrDefault = None
+    """Run folder that receives all results; may be left out where SOURCE is a run folder."""
 
 
 @dataclass(frozen=True)

@@ -127,7 +127,8 @@ def refine(
             break
         start = model if kept is None else kept
         refined = _settled(store, start, name, distortion=distortion)
-        gain = 1 - refined.compute_mean_reprojection_error() / start.compute_mean_reprojection_error()
+        before = start.compute_mean_reprojection_error()  # 0 where bundle adjustment dropped every point
+        gain = 1 - refined.compute_mean_reprojection_error() / before if before else 0.0
         whole = refined.num_reg_images() >= model.num_reg_images()
         if is_lens(refined.cameras[1]) and whole and (kept is None or gain >= settings.mapping.opencv_gain):
             kept = refined
