@@ -86,8 +86,9 @@ def rewritten(path: Path, tensors: dict[str, Tensor], about: dict[str, Any]) -> 
 @pytest.mark.parametrize(
     ("tensors", "about", "said"),
     [
-        ({}, {"schema": 3}, "newer Swimm3R: its schema is 3, this version reads 2"),
-        ({}, {"schema": 1}, "an older Swimm3R: its schema is 1, this version reads 2"),
+        ({}, {"schema": 4}, "newer Swimm3R: its schema is 4, this version reads 2 and 3"),
+        ({}, {"schema": 3}, "schema 3 lists 0 blocks"),
+        ({}, {"schema": 1}, "an older Swimm3R: its schema is 1, this version reads 2 and 3"),
         ({}, {"schema": None}, "its schema is None"),
         ({}, {"recipe": "splatfacto"}, "splatfacto"),
         ({}, {"recipe": []}, "recipe: a text is expected"),

@@ -14,13 +14,14 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 import torch
-from jaxtyping import Float
+from jaxtyping import Float, Int
 from torch import Tensor
 from torch.nn.functional import normalize
 
 from swimm3r.cameras import Cameras
 from swimm3r.evaluate.images import psnr_from_errors
 from swimm3r.raster import ALPHA_MAX, ALPHA_MIN, RasterOutput, rasterize
+from swimm3r.splat.block_store import BlockEntry, StoredBlocks
 from swimm3r.splat.primitives.beta import BetaPrimitives, select
 from swimm3r.splat.primitives.gaussian import colored, covariance
 from swimm3r.splat.primitives.spherical_harmonics import Y_00
@@ -31,6 +32,7 @@ from swimm3r.splat.projection.plain import project_conditioned
 from swimm3r.splat.rendering import SplatMap, settings_in_scene_units
 from swimm3r.splat.settings import RenderSettings
 
+ASKED = 64  # cameras, spread over the dive, that say which way a primitive is looked at
 _MOST_OFF = 1.5  # factor between a mean color and the map's; beyond, something else is wrong
 
 
@@ -56,14 +58,33 @@ class ClearDifference:
 def clear_gaussians(scene: SplatMap, cameras: Cameras, time: float | None = None) -> Gaussians:
     """The map's primitives as Gaussians, Beta ones as `cameras` see them on average; what is too faint is left out.
 
+    A map in blocks asks, for each block, some of the cameras that see it, and needs the memory of one block besides.
     Raises ValueError where a dynamic map is given no time.
     """
     p = scene.primitives
+    if scene.blocks is not None:
+        return _joined([_of_block(scene, scene.blocks, entry, cameras) for entry in scene.blocks.entries])
     if isinstance(p, BetaPrimitives):
         return moment_matched(scene, cameras, time)
     p = select(p, torch.sigmoid(p.opacity) >= ALPHA_MIN)
     peak = torch.sigmoid(p.opacity).clamp(max=ALPHA_MAX)
     return Gaussians(p.xyz, 0.5 + Y_00 * p.color, peak, covariance(p), p.harmonics)
+
+
+def _of_block(scene: SplatMap, blocks: StoredBlocks, entry: BlockEntry, cameras: Cameras) -> Gaussians:
+    views = [k for k in range(len(cameras)) if entry.is_in(pinhole(cameras[k]))]
+    asked = [views[k] for k in spread(len(views), ASKED).tolist()] if views else []
+    alone = replace(scene, primitives=blocks.read(entry), blocks=None)
+    return moment_matched(alone, cameras[asked])
+
+
+def _joined(parts: list[Gaussians]) -> Gaussians:
+    return Gaussians(*(torch.cat([vars(g)[name] for g in parts]) for name in vars(parts[0])))
+
+
+def spread(count: int, most: int) -> Int[Tensor, " k"]:
+    """At most so many of `count` places, evenly spread."""
+    return torch.linspace(0, count - 1, min(most, count)).round().long()
 
 
 def moment_matched(scene: SplatMap, cameras: Cameras, time: float | None = None) -> Gaussians:
@@ -144,6 +165,6 @@ def _both(scene: SplatMap, g: Gaussians, camera: Cameras, time: float | None) ->
     settings, now = settings_in_scene_units(scene.settings, scene.length).render, scene.normalized_time(time)
     with torch.no_grad():
         view = pinhole(camera)
-        seen = project(scene.primitives, view, settings, now)
+        seen = project(scene.seen_by(view), view, settings, now)
         own = rasterize(seen.primitives, None, view.height, view.width, kernel=seen.kernel)
         return draw_gaussians(g, camera, settings.near), own

@@ -14,7 +14,14 @@ from jaxtyping import Float, Float32
 
 from swimm3r.cameras import Cameras, cameras_of
 from swimm3r.errors import DeviceError
-from swimm3r.export.gaussians import Gaussians, clear_difference, clear_gaussians, with_mean_color
+from swimm3r.export.gaussians import (
+    ASKED,
+    Gaussians,
+    clear_difference,
+    clear_gaussians,
+    spread,
+    with_mean_color,
+)
 from swimm3r.export.result import Exported
 from swimm3r.export.settings import CompressedPlySettings, SplatFileSettings, SplatPlySettings, SpzSettings
 from swimm3r.geometry import quaternion_from_rotation, rotation_from_quaternion
@@ -30,7 +37,6 @@ from swimm3r.splat.rendering import SplatMap
 SplatSettings = SplatPlySettings | CompressedPlySettings | SplatFileSettings | SpzSettings
 
 _CONDON_SHORTLEY = torch.tensor([(-1.0) ** m for degree in (1, 2, 3) for m in range(-degree, degree + 1)])
-_ASKED = 64  # cameras, spread over the dive, that say which way a primitive is looked at
 _COMPARED = 8  # of them
 _FLATTEST = 1e-6  # a scale of this share of the largest, at least: viewers divide by it
 
@@ -69,7 +75,7 @@ class ExportedMap:
         difference = clear_difference(self.scene, gaussians_of(written), self.views, self.time, self.balance.factors)
         return Exported(
             path,
-            f"{len(written.xyz):,} Gaussians of {len(self.scene.primitives.xyz):,} primitives",
+            f"{len(written.xyz):,} Gaussians of {self.scene.count:,} primitives",
             f"Beside the map's own clear images: {difference.psnr:.1f} dB, mean alpha {difference.alpha:+.3f}.",
         )
 
@@ -82,10 +88,12 @@ def open_map(folder: Path, settings: SplatSettings) -> ExportedMap:
     table = refined if refined.is_file() else folder / "sfm" / "cameras.json"
     cameras = cameras_of(cameras_json.read_cameras(table))
     time = sum(scene.span) / 2 if settings.time is None else settings.time
-    canvas = cameras[_spread(len(cameras), _ASKED)].pinhole(scene.settings.long_side)
+    canvas = cameras.pinhole(scene.settings.long_side)
     own = settings.colors == "physical" or not scene.has_water
     balance = UNBALANCED if own else read_run_balance(folder / "sfm")
-    g, views = clear_gaussians(scene, canvas, time), canvas[_spread(len(canvas), _COMPARED)]
+    asked = canvas[spread(len(canvas), ASKED)]
+    views = asked[spread(len(asked), _COMPARED)]
+    g = clear_gaussians(scene, asked if scene.blocks is None else canvas, time)
     if isinstance(scene.primitives, BetaPrimitives):
         g = with_mean_color(scene, g, views, time)
     return ExportedMap(scene, views, time, balance, balanced(g, balance))
@@ -169,7 +177,3 @@ def from_gsply(data: object) -> SplatArrays:
     harmonics = getattr(data, "shN", None)
     none = np.zeros((len(columns["xyz"]), 0, 3), np.float32)
     return SplatArrays(**columns, harmonics=none if harmonics is None else np.asarray(harmonics, np.float32))
-
-
-def _spread(count: int, most: int) -> torch.Tensor:
-    return torch.linspace(0, count - 1, min(most, count)).round().long()

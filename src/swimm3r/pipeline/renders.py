@@ -200,7 +200,7 @@ def moments_of(scene: SplatMap, path: CameraPath | CameraTable, frames: Frames, 
     if path.times is not None:
         return path.times
     unknown = [name for name in path.names if name not in set(frames.names)]
-    if not scene.primitives.dynamic:
+    if not scene.dynamic:
         return [0.0] * len(path.names)
     if unknown:
         start, end = scene.span

@@ -81,11 +81,11 @@ def splat_sections(scene: SplatMap, rec: Reconstruction, frames: Frames, folder:
     lost = NotComputed("the record of the training, metrics.jsonl, is lost")
     section = {
         "recipe": scene.settings.recipe,
-        "primitives": len(scene.primitives.xyz),
+        "primitives": scene.count,
         "iterations": scene.settings.iterations,
         "seconds_per_iteration": rows[-1].get("seconds_per_step", lost) if rows else lost,
         "cpu_seconds_per_iteration": rows[-1].get("cpu_seconds_per_step", lost) if rows else lost,
-        "device": scene.primitives.xyz.device.type,
+        "device": scene.device.type,
     }
     water = mean_medium(scene, rec, frames)
     medium = {

@@ -2,8 +2,9 @@
 
 map.safetensors (`schema` 2) holds the primitives as stored (before activation), the water, and in its header
 the recipe, its settings, the metric flag, the working unit and when the clip begins and ends; also the training
-frames' poses where they were refined, and the camera that notebooks show the map from. A checkpoint adds the
-optimizer's moments and the step.
+frames' poses where they were refined, and the camera that notebooks show the map from. That of a large map (`schema` 3)
+holds no primitives but lists the files of its blocks (`splat.block_store`), which lie in blocks/ beside it. A
+checkpoint adds the optimizer's moments and the step.
 """
 
 from collections.abc import Mapping
@@ -18,10 +19,11 @@ from swimm3r.io.files.damage import Remedy, guard
 from swimm3r.io.files.safe_names import check_names
 from swimm3r.io.files.tensor_file import read_tensors
 from swimm3r.settings_document import from_document
+from swimm3r.splat.block_store import BlockEntry, StoredBlocks
 from swimm3r.splat.primitives.kinds import primitives_from
 from swimm3r.splat.recipes import recipe_parts
-from swimm3r.splat.rendering import SCHEMA, SplatMap
-from swimm3r.splat.settings import RECIPES, RecipeName, settings_of
+from swimm3r.splat.rendering import SCHEMA, SCHEMA_IN_BLOCKS, SplatMap
+from swimm3r.splat.settings import IN_BLOCKS, RECIPES, RecipeName, settings_of
 from swimm3r.splat.training_poses import RefinedPoses
 
 
@@ -37,9 +39,12 @@ class _MapHeader:
     settings: dict[str, Any]
     metric: bool
     length: float
+    schema: int
     span: tuple[float, float] = (0.0, 1.0)  # static maps of earlier versions have none
     frames: tuple[str, ...] | None = None  # whose poses were refined
     viewpoint: _ImageSize | None = None  # of its images; None of a map without one
+    blocks: tuple[BlockEntry, ...] = ()  # of a large map
+    key: str = ""  # of the training that made them
 
     def __post_init__(self) -> None:
         if self.recipe not in RECIPES:
@@ -49,6 +54,11 @@ class _MapHeader:
         if self.span[0] > self.span[1]:
             raise ValueError(f"its clip ends before it begins: {list(self.span)}")
         check_names(self.frames or ())
+        if bool(self.blocks) != (self.schema == SCHEMA_IN_BLOCKS):
+            raise ValueError(f"a file of schema {self.schema} lists {len(self.blocks)} blocks")
+        check_names(entry.file for entry in self.blocks)
+        if self.blocks and self.recipe not in IN_BLOCKS:
+            raise ValueError(f"maps of {self.recipe} have no blocks")
 
 
 def load_map(path: str | Path) -> SplatMap:
@@ -59,12 +69,14 @@ def load_map(path: str | Path) -> SplatMap:
         cause="the file is damaged, of another version, or of another program",
         fault="is not a map that can be read",
     )
-    stored = read_tensors(path, _MapHeader, remedy, SCHEMA)
+    stored = read_tensors(path, _MapHeader, remedy, (SCHEMA, SCHEMA_IN_BLOCKS))
     about = stored.about
     with guard(path, remedy):
         settings = from_document(about.settings, settings_of(cast(RecipeName, about.recipe)))
         parts = recipe_parts(settings)
-        field, primitives = parts.field, primitives_from(stored.tensors, parts.primitives, "primitives.")
+        empty = bool(about.blocks)
+        primitives = primitives_from(stored.tensors, parts.primitives, "primitives.", may_be_empty=empty)
+        field = parts.field
         try:
             field.load_state_dict(
                 {k.removeprefix("field."): v for k, v in stored.tensors.items() if k.startswith("field.")}
@@ -75,8 +87,12 @@ def load_map(path: str | Path) -> SplatMap:
         if about.frames is not None:
             poses = RefinedPoses(about.frames, _poses(stored.tensors, len(about.frames)))
         viewpoint = None if about.viewpoint is None else _viewpoint(stored.tensors, about.viewpoint)
+        blocks = None
+        if about.blocks:
+            blocks = StoredBlocks(path.parent, about.key, about.blocks)
+            blocks.check_files()
     field.requires_grad_(False)
-    return SplatMap(primitives, field, settings, about.metric, about.length, about.span, poses, viewpoint)
+    return SplatMap(primitives, field, settings, about.metric, about.length, about.span, poses, viewpoint, blocks)
 
 
 def _viewpoint(tensors: Mapping[str, Tensor], size: _ImageSize) -> Cameras:

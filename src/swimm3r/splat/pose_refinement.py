@@ -139,9 +139,10 @@ def in_sight(scene: SplatMap, canvas: Cameras, now: Float[Tensor, ""] | None = N
     """The primitives that a camera sees, or would after a small motion."""
     with torch.no_grad():
         view = pinhole(canvas).to(scene.device)
-        seen = project(scene.primitives, view, settings_in_scene_units(scene.settings, scene.length).render, now)
+        p = scene.seen_by(view.widened(_MARGIN))
+        seen = project(p, view, settings_in_scene_units(scene.settings, scene.length).render, now)
     size = torch.tensor([canvas.width, canvas.height]).to(seen.radius)
     reach = seen.radius[:, None] + _MARGIN * size
     at = seen.primitives.mean2d
     near = ((at > -reach) & (at < size + reach)).all(-1) & (seen.primitives.depth > 0)
-    return select(scene.primitives, near)
+    return select(p, near)

@@ -1,12 +1,13 @@
 """A trained map and its images: with the water, without it, the water alone, and depth."""
 
 import copy
-from dataclasses import dataclass, replace
+from collections.abc import Callable, Iterator
+from dataclasses import asdict, dataclass, replace
 from pathlib import Path
 from typing import TypeVar
 
 import torch
-from jaxtyping import Float
+from jaxtyping import Bool, Float
 from torch import Tensor
 from torch.nn.functional import relu
 
@@ -17,6 +18,7 @@ from swimm3r.io.images import jpeg_uri
 from swimm3r.medium import Medium
 from swimm3r.raster import MediumMaps, RasterOutput, SggBuffers, rasterize
 from swimm3r.settings_document import to_document
+from swimm3r.splat.block_store import StoredBlocks, joined
 from swimm3r.splat.gaussian_settings import GaussianSettings
 from swimm3r.splat.medium.field import (
     NO_WATER,
@@ -29,6 +31,7 @@ from swimm3r.splat.medium.field import (
 )
 from swimm3r.splat.medium.kinds import Water
 from swimm3r.splat.medium.seasplat import SceneWater, WaterLayer, layer, relative_depth, seen_through
+from swimm3r.splat.primitives.beta import BetaPrimitives, select
 from swimm3r.splat.primitives.kinds import Primitives
 from swimm3r.splat.projection.dispatch import project
 from swimm3r.splat.projection.pinhole import Pinhole, Projection, pinhole
@@ -37,6 +40,7 @@ from swimm3r.splat.training_poses import RefinedPoses
 from swimm3r.splat.views import normalized_time
 
 SCHEMA = 2  # of a map's file; 1: Swimm3R 0.1, whose settings have other names
+SCHEMA_IN_BLOCKS = 3  # of one that lists blocks, which a version that knows none would leave out
 _SHOWN_SIDE = 320  # pixels of a view in a notebook
 _SEEN = 1e-3  # alpha below which a pixel has no depth
 _COVERED = 0.5  # alpha from which on a pixel's clear color is that of a surface
@@ -64,7 +68,11 @@ class RenderOutput:
 
 @dataclass(frozen=True)
 class SplatMap:
-    """Primitives and water of one scene, in the unit and axes of its reconstruction."""
+    """Primitives and water of one scene, in the unit and axes of its reconstruction.
+
+    Those of a large map lie in blocks on disk, of which a view takes what it sees; `primitives` are then none. Whoever
+    needs primitives asks `seen_by` or `parts`.
+    """
 
     primitives: Primitives
     field: Water
@@ -74,14 +82,13 @@ class SplatMap:
     span: tuple[float, float] = (0.0, 1.0)  # of the clip it was trained on, seconds
     poses: RefinedPoses | None = None  # of the training frames; None where they were held
     viewpoint: Cameras | None = None  # the pinhole camera of a training frame, from where notebooks show the map
+    blocks: StoredBlocks | None = None  # None: all primitives are in memory
 
     def __repr__(self) -> str:
-        moving = f", {self.span[0]:.1f} to {self.span[1]:.1f} s" if self.primitives.dynamic else ""
+        moving = f", {self.span[0]:.1f} to {self.span[1]:.1f} s" if self.dynamic else ""
         unit = "metres" if self.metric else "scene units"
-        return (
-            f"SplatMap({self.settings.recipe}, {len(self.primitives.xyz):,} primitives, {unit}{moving},"
-            f" on {self.device})"
-        )
+        blocks = "" if self.blocks is None else f" in {len(self.blocks)} blocks"
+        return f"SplatMap({self.settings.recipe}, {self.count:,} primitives{blocks}, {unit}{moving}, on {self.device})"
 
     def _repr_html_(self) -> str:
         """A view of the map with its water and without, in the middle of its clip; without a viewpoint, text."""
@@ -97,13 +104,41 @@ class SplatMap:
         return self.primitives.xyz.device
 
     @property
+    def dynamic(self) -> bool:
+        """Return whether it changes with time."""
+        return self.primitives.dynamic
+
+    @property
+    def count(self) -> int:
+        """Number of primitives, of all blocks."""
+        return len(self.primitives.xyz) if self.blocks is None else self.blocks.count
+
+    def seen_by(self, view: Pinhole) -> Primitives:
+        """The primitives that a view is drawn from: all, or those of the blocks that it sees."""
+        if self.blocks is None:
+            return self.primitives
+        assert isinstance(self.primitives, BetaPrimitives)
+        return joined([self.primitives, *self.blocks.seen_by(view)])
+
+    def parts(self, *, coarse: bool = False) -> Iterator[Primitives]:
+        """All primitives, of one block after another; `coarse`: the few that stand for a block from afar."""
+        return iter((self.primitives,)) if self.blocks is None else self.blocks.parts(coarse=coarse)
+
+    def within(self, holds: Callable[[Float[Tensor, "n 3"]], Bool[Tensor, " n"]]) -> "SplatMap":
+        """The map of the primitives whose centers a function of positions, in scene units, accepts."""
+        blocks = None if self.blocks is None else self.blocks.within(holds)
+        return replace(self, primitives=select(self.primitives, holds(self.primitives.xyz)), blocks=blocks)
+
+    @property
     def has_water(self) -> bool:
         """Return whether it tells water and scene apart."""
         return isinstance(self.field, SceneWater) or not self.field.is_clear
 
     def to(self, device: torch.device) -> "SplatMap":
         """The same map on a device."""
-        return replace(self, primitives=self.primitives.to(device), field=copy.deepcopy(self.field).to(device))
+        blocks = None if self.blocks is None else self.blocks.to(device)
+        field = copy.deepcopy(self.field).to(device)
+        return replace(self, primitives=self.primitives.to(device), field=field, blocks=blocks)
 
     def render(self, camera: Cameras, time: float | None = None) -> RenderOutput:
         """The view of one pinhole camera at a time of the clip (seconds; static maps need none), without gradient.
@@ -116,11 +151,14 @@ class SplatMap:
             return render(self, camera, time)
 
     def save(self, path: str | Path) -> None:
-        """Write a map.safetensors (layout: `splat.map_file`), whole or not at all; `swimm3r.load_map` reads it."""
+        """Write a map.safetensors (layout: `splat.map_file`), whole or not at all; `swimm3r.load_map` reads it.
+
+        The blocks of a large map are copied beside it, before it.
+        """
         tensors = {f"primitives.{name}": values for name, values in self.primitives._asdict().items()}
         tensors |= {f"field.{name}": values for name, values in self.field.state_dict().items()}
         about = {
-            "schema": SCHEMA,
+            "schema": SCHEMA if self.blocks is None else SCHEMA_IN_BLOCKS,
             "recipe": self.settings.recipe,
             "settings": to_document(self.settings),
             "metric": self.metric,
@@ -133,11 +171,14 @@ class SplatMap:
         if self.viewpoint is not None:
             tensors |= {"viewpoint.K": self.viewpoint.K, "viewpoint.cam2world": self.viewpoint.cam2world}
             about["viewpoint"] = {"width": self.viewpoint.width, "height": self.viewpoint.height}
+        if self.blocks is not None:
+            self.blocks.copy_to(Path(path).parent)
+            about |= {"blocks": [asdict(entry) for entry in self.blocks.entries], "key": self.blocks.key}
         write_tensors(Path(path), tensors, about)
 
     def normalized_time(self, time: float | None) -> Float[Tensor, ""] | None:
         """A time of the clip as the map's own parts take it: None in static maps, 0..1 in dynamic ones."""
-        if not self.primitives.dynamic:
+        if not self.dynamic:
             return None
         if time is None:
             start, end = self.span
@@ -232,7 +273,7 @@ def render(scene: SplatMap, camera: Cameras, time: float | None = None) -> Rende
     view, now = pinhole(camera).to(scene.device), scene.normalized_time(time)
     match scene.field:
         case MediumField():
-            drawing = draw(scene.primitives, scene.field, view, settings, now)
+            drawing = draw(scene.seen_by(view), scene.field, view, settings, now)
             images, medium = drawing.images, medium_at_pixels(drawing.grid, view.height, view.width)
             seen = drawing.projection.primitives
             black = seen._replace(color=torch.zeros_like(seen.color))
@@ -241,7 +282,7 @@ def render(scene: SplatMap, camera: Cameras, time: float | None = None) -> Rende
                 alpha_min=settings.render.alpha_min, kernel=drawing.projection.kernel,
             ).rgb  # fmt: skip
         case SceneWater():
-            images = draw(scene.primitives, NO_WATER, view, settings, now).images
+            images = draw(scene.seen_by(view), NO_WATER, view, settings, now).images
             over = layer(scene.field, relative_depth(images))
             medium, backscatter = _as_coefficients(scene.field, over, images, view), over.backscatter
             images = images._replace(rgb=seen_through(images.clear, over))

@@ -194,6 +194,19 @@ class MoverSettings(Settings):
 
 
 @dataclass(frozen=True)
+class BlockSettings(Settings):
+    """Large static maps in blocks: ground beyond what one block holds is trained in several."""
+
+    largest: NotNegative = 12.0
+    """Largest ground of a block, in the area that one image shows at the median depth; 0 trains one map however large.
+    `initial.primitives` and `densify.cap_max` are those of a block as large as this."""
+    margin: NotNegative = 0.25
+    """Ground around a block that is trained with it and then left to its neighbors, in median depths."""
+    water_steps: PositiveShare = 0.5
+    """Length of the training of the water that all blocks share, on a coarse map of the dive, in `iterations`."""
+
+
+@dataclass(frozen=True)
 class SggSettings(Settings):
     """Scattering-aware geometric gradients (Alg. 1), with the options that the paper leaves open."""
 
@@ -228,6 +241,7 @@ class UwbsSettings(MapSettings):
     densify: DensifySettings = field(default_factory=DensifySettings)
     movers: MoverSettings = field(default_factory=MoverSettings)
     sgg: SggSettings = field(default_factory=SggSettings)
+    blocks: BlockSettings = field(default_factory=BlockSettings)
 
     @property
     def recipe(self) -> Literal["uwbs-static", "uwbs-dynamic", "ubs"]:
@@ -270,6 +284,8 @@ MapDevice = Literal["auto", "cpu", "cuda"]
 
 RecipeName = Literal["uwbs-static", "uwbs-dynamic", "ubs", "watersplatting", "seasplat", "threers_gs", "mcmc_gs"]
 RECIPES: tuple[RecipeName, ...] = get_args(RecipeName)
+IN_BLOCKS: tuple[RecipeName, ...] = ("uwbs-static",)
+"""The recipes that train large maps in blocks; those of the others are one block, however large."""
 
 
 def with_recipe(settings: UwbsSettings, recipe: RecipeName) -> SplatSettings:

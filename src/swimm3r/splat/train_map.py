@@ -1,7 +1,9 @@
 """From a reconstruction to a map: the recipe of the settings, its run, and the map in the scene's own unit."""
 
-import math
-from dataclasses import asdict, replace
+import copy
+import logging
+from collections.abc import Sequence
+from dataclasses import replace
 from pathlib import Path
 
 import torch
@@ -10,19 +12,24 @@ from swimm3r import devices
 from swimm3r.cameras import Cameras
 from swimm3r.devices import CPU
 from swimm3r.errors import UsageError
-from swimm3r.io.files.cache_key import cache_key
 from swimm3r.progress import Progress, silent
 from swimm3r.scene.frames import Frames
 from swimm3r.scene.reconstruction import Reconstruction
+from swimm3r.splat.block_store import no_primitives
+from swimm3r.splat.blocks.plan import PlannedBlock, plan_blocks, surface_of
+from swimm3r.splat.blocks.training import train_in_blocks
+from swimm3r.splat.medium.field import in_unit
 from swimm3r.splat.recipes import recipe_parts
 from swimm3r.splat.rendering import SplatMap
-from swimm3r.splat.settings import SplatSettings
+from swimm3r.splat.settings import IN_BLOCKS, BlockSettings, SplatSettings, UwbsSettings
 from swimm3r.splat.training import loop
 from swimm3r.splat.training.observer import Observer
 from swimm3r.splat.training.scene import TrainingScene, path_radius
 from swimm3r.splat.training.state import map_in_scene_units
 from swimm3r.splat.training_poses import RefinedPoses, training_poses_of, write_refined
 from swimm3r.splat.views import TrainingViews, median_z_depth, working_scale
+
+log = logging.getLogger(__name__)
 
 
 def train(
@@ -36,10 +43,14 @@ def train(
 ) -> SplatMap:
     """Train a map in `folder`: checkpoint/, metrics.jsonl, and at the end map.safetensors and the refined poses.
 
-    All are in the scene's own unit; cameras.json and trajectory.tum are not written where poses are held.
+    All are in the scene's own unit; cameras.json and trajectory.tum are not written where poses are held. A static map
+    of more ground than one block holds is trained in several, in blocks/ (`splat.blocks`).
     """
     scale = working_scale(rec, settings)
     _check_near(settings, scale * median_z_depth(rec))
+    if plan := _plan(rec, settings):
+        assert isinstance(settings, UwbsSettings)
+        return _in_blocks(rec, frames, settings, plan, scale, folder, progress, device, observer)
     views = TrainingViews(rec, frames, settings, scale)
     poses_in_training = training_poses_of(rec, views.names, views.cameras, scale) if settings.poses.enabled else None
     radius = path_radius(rec, scale, settings.working_depth)
@@ -56,6 +67,29 @@ def train(
     scene = SplatMap(primitives, field, settings, rec.metric, 1 / scale, frames.span, poses, viewpoint)
     scene.save(folder / "map.safetensors")
     return scene
+
+
+def _in_blocks(
+    rec: Reconstruction,
+    frames: Frames,
+    settings: UwbsSettings,
+    plan: Sequence[PlannedBlock],
+    scale: float,
+    folder: Path,
+    progress: Progress,
+    device: torch.device,
+    observer: Observer | None,
+) -> SplatMap:
+    """A map whose primitives stay on disk."""
+    trained = train_in_blocks(rec, frames, settings, plan, scale, folder, progress, device, observer)
+    field = in_unit(copy.deepcopy(trained.water), 1 / scale)
+    viewpoint = _viewpoint(rec, TrainingViews(rec, frames, settings, scale), None)
+    blocks = trained.blocks
+    scene = SplatMap(
+        no_primitives(), field, trained.settings, rec.metric, 1 / scale, frames.span, None, viewpoint, blocks
+    )
+    scene.save(folder / "map.safetensors")
+    return scene.to(device)
 
 
 def _viewpoint(rec: Reconstruction, views: TrainingViews, poses: RefinedPoses | None) -> Cameras:
@@ -83,10 +117,25 @@ def _schedule(settings: SplatSettings, rec: Reconstruction, views: TrainingViews
     matches = []
     if settings.poses.enabled:
         matches.append(float(rec.matches.xy_i.double().sum() + rec.matches.xy_j.double().sum()))
-    return loop.Schedule(
-        iterations=settings.iterations,
-        log_every=max(1, math.ceil(settings.log_every * settings.iterations)),
-        checkpoint_every=max(1, math.ceil(settings.checkpoint_every * settings.iterations)),
-        seed=settings.seed,
-        fingerprint=cache_key(asdict(settings), views.names, views.times, *cameras, *matches)[:16],
-    )
+    return loop.schedule_of(settings, views.names, views.times, *cameras, *matches)
+
+
+def _plan(rec: Reconstruction, settings: SplatSettings) -> tuple[PlannedBlock, ...]:
+    """The blocks of a map; none where it is trained as a whole."""
+    limits = settings.blocks if isinstance(settings, UwbsSettings) else BlockSettings()
+    if not limits.largest:
+        return ()
+    depth = median_z_depth(rec)
+    surface = surface_of(rec, depth)
+    plan = plan_blocks(surface, depth, limits)
+    if len(plan) == 1:
+        return ()
+    area = float(surface.area.sum())
+    if settings.recipe not in IN_BLOCKS:
+        log.warning(
+            "the ground is %.0f images large, and maps of %s have one block, made for %g: expect less detail",
+            area, settings.recipe, limits.largest,
+        )  # fmt: skip
+        return ()
+    log.info("the ground is %.0f images large: the map has %d blocks, and the poses are held", area, len(plan))
+    return plan

@@ -10,16 +10,18 @@ from dataclasses import dataclass, replace
 import numpy as np
 import torch
 from jaxtyping import Bool, Float
+from scipy.ndimage import distance_transform_edt
 from torch import Tensor
 from torch.nn.functional import interpolate
 
-from swimm3r.cameras import Cameras, resized
+from swimm3r.cameras import Cameras, pixel_grid, resized, unproject
 from swimm3r.errors import InputError
 from swimm3r.imaging.open_water import sea_share
 from swimm3r.imaging.undistortion import nearest_pixels, undistorted
 from swimm3r.io.files.cache import ArrayCache
 from swimm3r.scene.frames import Frames
 from swimm3r.scene.reconstruction import Reconstruction
+from swimm3r.splat.ground import Window
 from swimm3r.splat.settings import SplatSettings
 
 
@@ -50,8 +52,15 @@ class TrainingView:
 class TrainingViews:
     """The registered training frames as views; images are made when asked for and kept in a bounded cache."""
 
-    def __init__(self, rec: Reconstruction, frames: Frames, settings: SplatSettings, scale: float) -> None:
-        self.rec, self.frames, self.settings, self.scale = rec, frames, settings, scale
+    def __init__(
+        self,
+        rec: Reconstruction,
+        frames: Frames,
+        settings: SplatSettings,
+        scale: float,
+        window: Window | None = None,
+    ) -> None:
+        self.rec, self.frames, self.settings, self.scale, self.window = rec, frames, settings, scale, window
         self._times = {frame.name: normalized_time(frames.span, frame.time) for frame in frames}
         train = {frame.name for frame in frames.train}
         self.names = tuple(name for name in rec.names if name in train)
@@ -88,6 +97,9 @@ class TrainingViews:
             rgb, seen = undistorted(self.frames.image(f), self.frames.mask(f), lens, canvas)
             stored = (rgb * 255).round().to(torch.uint8).permute(2, 0, 1).contiguous().numpy()
             z_depth, open_water = self._depth(name, lens, canvas, rgb, seen)
+            if self.window is not None:
+                inside = self._inside(self.window, canvas, z_depth) | open_water
+                seen, z_depth = seen & inside, torch.where(inside, z_depth, 0.0)
             return stored, seen.numpy(), z_depth.half().numpy(), open_water.numpy()
 
         rgb, seen, z_depth, open_water = self._cache.get(name, make)
@@ -117,6 +129,26 @@ class TrainingViews:
         fit = self.rec.medium
         open_water = sea_share(rgb, z_depth, None if fit is None else fit.Binf) > 0.5
         return z_depth, open_water & seen
+
+    def _inside(self, window: Window, canvas: Cameras, z_depth: Float[Tensor, "h w"]) -> Bool[Tensor, "h w"]:
+        """Mask of the pixels whose surface lies over a window; where depth is unknown it is that of the next pixel."""
+        z = filled(z_depth)
+        if z is None:
+            return torch.ones_like(z_depth, dtype=torch.bool)
+        pixels = pixel_grid(canvas.height, canvas.width).reshape(1, -1, 2).double()
+        points = unproject(canvas, pixels, z.reshape(1, -1).double() / self.scale)[0]
+        return window.holds(points).reshape(z_depth.shape)
+
+
+def filled(z_depth: Float[Tensor, "h w"]) -> Float[Tensor, "h w"] | None:
+    """A depth map whose unknown pixels have the depth of the nearest known one; None where none is known."""
+    unknown = (z_depth <= 0) | ~z_depth.isfinite()
+    if bool(unknown.all()):
+        return None
+    if not bool(unknown.any()):
+        return z_depth
+    row, column = distance_transform_edt(unknown.numpy(), return_distances=False, return_indices=True)
+    return z_depth[torch.from_numpy(row).long(), torch.from_numpy(column).long()]
 
 
 def smaller(view: TrainingView, divisor: int) -> TrainingView:

@@ -16,7 +16,6 @@ from swimm3r.cameras import Cameras, image_directions, pixel_grid, project_visib
 from swimm3r.imaging.depth_colors import depth_image
 from swimm3r.medium import Medium, linear_from_srgb, srgb_from_linear
 from swimm3r.pipeline.renders import shown_clear
-from swimm3r.splat.primitives.beta import select
 from swimm3r.splat.projection.pinhole import pinhole
 from swimm3r.splat.rendering import (
     RenderOutput,
@@ -146,16 +145,15 @@ class Painter:
         key = (id(scene), crop)
         with self._lock:
             if key not in self._crops:
-                inside = crop.holds(scene.primitives.xyz * self.run.scale)
-                self._crops[key] = replace(scene, primitives=select(scene.primitives, inside))
+                self._crops[key] = scene.within(lambda xyz: crop.holds(xyz * self.run.scale))
                 while len(self._crops) > _KEPT_CROPS:
                     self._crops.popitem(last=False)
             return self._crops[key]
 
     def _surface(self, scene: SplatMap, camera: Cameras, choice: LayerChoice) -> RenderOutput:
         """The map's view; without the parts that cost most where the layer does not show them."""
-        time = choice.time if scene.primitives.dynamic else None
-        if not len(scene.primitives.xyz):
+        time = choice.time if scene.dynamic else None
+        if not scene.count:
             return _nothing(camera)
         changed = choice.layer == "With the water" and (choice.amount != 1 or choice.water is not None)
         if changed or choice.layer in ("Without the water", "Light of the water alone"):
@@ -252,7 +250,7 @@ def _render_surface(scene: SplatMap, camera: Cameras, time: float | None) -> Ren
     settings = settings_in_scene_units(scene.settings, scene.length)
     view = pinhole(camera).to(scene.device)
     with torch.no_grad():
-        drawn = images(scene.primitives, scene.field, view, settings, scene.normalized_time(time))
+        drawn = images(scene.seen_by(view), scene.field, view, settings, scene.normalized_time(time))
     rgb, clear = (image.permute(1, 2, 0).cpu() for image in (drawn.rgb, surface_color(drawn)))
     nothing = torch.zeros_like(rgb)
     return RenderOutput(

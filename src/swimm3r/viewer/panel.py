@@ -108,7 +108,7 @@ class Panel:
         self._frame = name
         self._frame_slider.value = run.rec.names.index(name) + 1
         self._frame_name.content = _frame_line(run, name)
-        if run.scene is not None and run.scene.primitives.dynamic:
+        if run.scene is not None and run.scene.dynamic:
             self._time.value = run.time_of(name)
         self._nodes.mark(name)
         start = view_of(self._client, run)
@@ -140,7 +140,7 @@ class Panel:
         self._legend = gui.add_html(self._legend_of(first))
         self._exposure = gui.add_slider("Exposure (stops)", -3.0, 3.0, 0.1, 0.0)
         start, end = run.frames.span
-        dynamic = run.scene is not None and run.scene.primitives.dynamic
+        dynamic = run.scene is not None and run.scene.dynamic
         self._time = gui.add_slider("Time (s)", start, max(end, start + 0.01), 0.01, start, visible=dynamic)
         self._play = gui.add_checkbox("Play", False, visible=dynamic)
         has_water = run.scene is not None and run.scene.has_water
@@ -266,7 +266,10 @@ class Panel:
     def _extent(self) -> tuple[list[float], list[float]]:
         """The bounds of the crop box: those of all but the outermost points."""
         scene, run = self.run.scene, self.run
-        xyz = run.cloud(False)[0] if scene is None else (scene.primitives.xyz.cpu() * run.scale).numpy()
+        if scene is None:
+            xyz = run.cloud(False)[0]
+        else:
+            xyz = (torch.cat([part.xyz.cpu() for part in scene.parts(coarse=True)]) * run.scale).numpy()
         low, high = np.quantile(xyz[:: max(1, len(xyz) // 100_000)], [0.005, 0.995], axis=0)
         margin = 0.05 * (high - low).max() + 1e-3
         return (low - margin).round(2).tolist(), (high + margin).round(2).tolist()
@@ -416,7 +419,7 @@ def about(painter: Painter) -> str:
             f"`swimm3r run {run.folder}` trains one: it renders from everywhere, with the water and without."
         )
     else:
-        lines.append(f"Map: {scene.settings.recipe}, {len(scene.primitives.xyz):,} primitives")
+        lines.append(f"Map: {scene.settings.recipe}, {scene.count:,} primitives")
         if not scene.has_water:
             lines.append("The map was trained without water, so there is none to take away or to change.")
     if not run.has_restored_frames:

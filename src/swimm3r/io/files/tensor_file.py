@@ -1,7 +1,7 @@
 """Tensors under their names in a safetensors file, everything else as a JSON record in its header."""
 
 import json
-from collections.abc import Mapping
+from collections.abc import Collection, Mapping
 from dataclasses import dataclass
 from hashlib import sha256
 from pathlib import Path
@@ -38,7 +38,12 @@ def write_tensors(path: Path, tensors: Mapping[str, Tensor], about: Mapping[str,
 
 
 def read_tensors(
-    path: Path, kind: type[T] | GenericAlias, remedy: Remedy, schema: int | None, *, finite: bool = True
+    path: Path,
+    kind: type[T] | GenericAlias,
+    remedy: Remedy,
+    schema: int | Collection[int] | None,
+    *,
+    finite: bool = True,
 ) -> TensorFile[T]:
     """Tensors, finite ones unless told otherwise, and the header as a record of `json_file`, of this `schema` if any.
 
@@ -52,7 +57,7 @@ def read_tensors(
                 raise ValueError("it has no Swimm3R header")
             document = decode(header[_KEY])
             if schema is not None:
-                _check_schema(document, schema)
+                _check_schema(document, (schema,) if isinstance(schema, int) else schema)
             about = structure(document, kind)
             tensors = {name: file.get_tensor(name) for name in file.keys()}  # noqa: SIM118
         for name, values in tensors.items():
@@ -71,11 +76,13 @@ def tensors_digest(tensors: Mapping[str, Tensor]) -> str:
     return digest.hexdigest()
 
 
-def _check_schema(document: Any, known: int) -> None:
+def _check_schema(document: Any, known: Collection[int]) -> None:
     found = document.get("schema") if isinstance(document, dict) else None
-    if found == known:
+    if found in known:
         return
     by_whom = (
-        f"it was written by {'a newer' if found > known else 'an older'} Swimm3R: " if isinstance(found, int) else ""
+        f"it was written by {'a newer' if found > max(known) else 'an older'} Swimm3R: "
+        if isinstance(found, int)
+        else ""
     )
-    raise ValueError(f"{by_whom}its schema is {found}, this version reads {known}")
+    raise ValueError(f"{by_whom}its schema is {found}, this version reads {' and '.join(map(str, sorted(known)))}")

@@ -12,7 +12,9 @@ Primitives = BetaPrimitives | GaussianPrimitives
 """Primitives that can be projected."""
 
 
-def primitives_from(tensors: Mapping[str, Tensor], kind: type[Primitives], prefix: str) -> Primitives:
+def primitives_from(
+    tensors: Mapping[str, Tensor], kind: type[Primitives], prefix: str, *, may_be_empty: bool = False
+) -> Primitives:
     """The primitives among a file's tensors. Raises KeyError or ValueError where their parts do not fit each other."""
     p: Any = kind(*(tensors[prefix + name] for name in kind._fields))
     for name, hint in get_type_hints(kind, include_extras=True).items():
@@ -20,7 +22,7 @@ def primitives_from(tensors: Mapping[str, Tensor], kind: type[Primitives], prefi
             raise ValueError(f"{prefix}{name} has the shape {tuple(getattr(p, name).shape)}")
     if {len(values) for values in p} != {len(p.xyz)}:
         raise ValueError("its primitives' parts are of different lengths")
-    if not len(p.xyz):
+    if not len(p.xyz) and not may_be_empty:
         raise ValueError("it holds no primitives")
     if not _fit_together(p):
         raise ValueError(f"its primitives' parts are {', '.join(str(tuple(v.shape[1:])) for v in p)} numbers wide")

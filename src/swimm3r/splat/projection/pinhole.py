@@ -32,6 +32,12 @@ class Pinhole:
         """The same camera for primitives on a device."""
         return replace(self, R=self.R.to(device), t=self.t.to(device), center=self.center.to(device))
 
+    def widened(self, share: float) -> "Pinhole":
+        """The same camera with this share of the image more on every side."""
+        right, down = round(share * self.width), round(share * self.height)
+        width, height = self.width + 2 * right, self.height + 2 * down
+        return replace(self, cx=self.cx + right, cy=self.cy + down, width=width, height=height)
+
 
 @dataclass(frozen=True)
 class Projection:

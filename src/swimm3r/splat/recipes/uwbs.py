@@ -6,6 +6,7 @@ and, beyond the paper, terms that hold the water to what structure from motion m
 known surfaces opaque (`coverage`), open water empty (`open_water`) and clear colors to those that there are (`gamut`).
 """
 
+import copy
 from collections.abc import Collection
 from dataclasses import dataclass
 
@@ -20,7 +21,7 @@ from swimm3r.splat.densify import mcmc_beta, schedule
 from swimm3r.splat.densify.rows import appended, moments_after
 from swimm3r.splat.dynamic.linear_motion import ways
 from swimm3r.splat.dynamic.spawn import born
-from swimm3r.splat.medium.field import initial_field, smoothness
+from swimm3r.splat.medium.field import MediumField, initial_field, smoothness
 from swimm3r.splat.medium.prior import WaterPrior, deviation, water_prior, with_binf_prior
 from swimm3r.splat.optimizer import adam_step, log_linear
 from swimm3r.splat.pose_mlp import pose_rate
@@ -55,17 +56,25 @@ class Uwbs:
 
     def start(self) -> State:
         """Primitives on the cloud, and the reconstruction's water in every direction."""
-        settings, rec, scale = self.settings, self.scene.rec, self.scene.scale
-        p = initial_primitives(rec, settings.initial, loop.generator(settings.seed, 0, 2))
+        settings, scale = self.settings, self.scene.scale
+        p = initial_primitives(self.scene.rec, settings.initial, loop.generator(settings.seed, 0, 2))
         if settings.dynamic:
             p = with_time(p, settings.initial, loop.generator(settings.seed, 0, 5))
         p = rescaled(p, scale)
+        return first_state(
+            p, self._first_water(), self.scene.codes(settings.poses, loop.generator(settings.seed, 0, 6))
+        )
+
+    def _first_water(self) -> MediumField:
+        """The water that the blocks of a large map share; without, the reconstruction's."""
+        if self.scene.water is not None:
+            return copy.deepcopy(self.scene.water).requires_grad_(True)
+        settings, scale = self.settings, self.scene.scale
         medium = None
-        fit = measured_water(rec)
+        fit = measured_water(self.scene.rec)
         if fit is not None:
             medium = Medium(fit.Binf, fit.beta_D / scale, fit.beta_B / scale)
-        field = initial_field(medium, settings.medium, loop.generator(settings.seed, 0, 3), settings.dynamic)
-        return first_state(p, field, self.scene.codes(settings.poses, loop.generator(settings.seed, 0, 6)))
+        return initial_field(medium, settings.medium, loop.generator(settings.seed, 0, 3), settings.dynamic)
 
     def step(self, state: State, view: TrainingView, step: int) -> tuple[State, loop.Numbers]:
         """One view: forward and adjoint, densification on its cadence, Adam."""
@@ -148,7 +157,8 @@ class Uwbs:
         rates = {name: settled * getattr(r, name) for name in BetaPrimitives._fields}
         rates["xyz"] = self.scene.radius * log_linear(r.xyz, r.xyz_end, share)
         medium = log_linear(r.medium, r.medium_end, share)
-        if self.prior is not None and share <= self.settings.medium.begin:
+        untouched = self.prior is not None and share <= self.settings.medium.begin
+        if untouched or self.scene.water is not None:
             medium = 0.0
         rates |= {name: medium for name in names if name.startswith(FIELD)}
         return rates | {

@@ -5,9 +5,10 @@ and a run that was interrupted ends with the same bits as one that was not (at t
 """
 
 import logging
+import math
 import time
 from collections.abc import Callable
-from dataclasses import dataclass
+from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import Any, Protocol, runtime_checkable
 
@@ -15,6 +16,7 @@ import torch
 from torch import Tensor
 
 from swimm3r.io.files import metrics_log
+from swimm3r.io.files.cache_key import cache_key
 from swimm3r.io.files.damage import guard
 from swimm3r.progress import Progress
 from swimm3r.splat.medium.kinds import Water
@@ -76,6 +78,17 @@ class Schedule:
     fingerprint: str  # of settings and input: a checkpoint of another training is not continued
 
 
+def schedule_of(settings: SplatSettings, *made_from: object) -> Schedule:
+    """The schedule that settings ask for; a checkpoint goes on where these and what the map is made from are alike."""
+    return Schedule(
+        iterations=settings.iterations,
+        log_every=max(1, math.ceil(settings.log_every * settings.iterations)),
+        checkpoint_every=max(1, math.ceil(settings.checkpoint_every * settings.iterations)),
+        seed=settings.seed,
+        fingerprint=cache_key(asdict(settings), *made_from)[:16],
+    )
+
+
 def generator(seed: int, step: int, purpose: int) -> torch.Generator:
     """The randomness of one purpose in one step."""
     mixed = (seed * 1_000_003 + step) * 1_009 + purpose
@@ -95,6 +108,7 @@ def run(
     folder: Path,
     progress: Progress,
     observer: Observer | None = None,
+    what: str = "training the map",
 ) -> State:
     """Train from the checkpoint in `folder`, if there is one of this training, else from the start."""
     recipe = parts.build(scene)
@@ -105,7 +119,7 @@ def run(
     started, cpu_started, first = time.perf_counter(), time.process_time(), done
     sums: dict[str, tuple[float | Tensor, int]] = {}
     for step in range(done + 1, schedule.iterations + 1):
-        progress("training the map", step - 1, schedule.iterations)
+        progress(what, step - 1, schedule.iterations)
         view = recipe.scene.view(view_of_step(step, len(recipe.scene.views), schedule.seed))
         state, numbers = recipe.step(state, view, step)
         for name, value in numbers.items():
@@ -122,7 +136,7 @@ def run(
             write_state(path, stored(state), StateHeader(step, schedule.fingerprint))
         if observer is not None:
             observer(TrainingStep(step, schedule.iterations, numbers, view, recipe.scene, state))
-    progress("training the map", schedule.iterations, schedule.iterations)
+    progress(what, schedule.iterations, schedule.iterations)
     return state
 
 

@@ -9,6 +9,7 @@ from torch import Tensor
 from swimm3r.cameras import Cameras
 from swimm3r.devices import CPU
 from swimm3r.scene.reconstruction import Reconstruction
+from swimm3r.splat.medium.field import MediumField
 from swimm3r.splat.pose_mlp import PoseMlp
 from swimm3r.splat.projection.pinhole import Pinhole, pinhole
 from swimm3r.splat.shared_settings import TrainingPoseSettings
@@ -26,6 +27,7 @@ class TrainingScene:
     views: TrainingViews
     poses: TrainingPoses | None = None  # None where poses are held
     device: torch.device = CPU  # of primitives and water; frames and poses are on the processor
+    water: MediumField | None = None  # that all blocks of a large map share, per working unit; it is not trained
 
     @property
     def refined_cameras(self) -> int:

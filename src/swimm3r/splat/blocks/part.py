@@ -1,0 +1,69 @@
+"""The part of a reconstruction that one block is trained on: the views that see it, and the points in its window."""
+
+from collections.abc import Sequence
+from dataclasses import replace
+
+import torch
+from jaxtyping import Bool, Float
+from torch import Tensor
+
+from swimm3r.cameras import unproject
+from swimm3r.scene.reconstruction import DenseCloud, Matches, Points, Reconstruction, Tracks
+from swimm3r.splat.ground import Window
+from swimm3r.splat.views import filled
+
+_LEAST = 0.02  # of a view's pixels, from which on it is one of a block
+_SAMPLED = 24  # rows of pixels that say what a view sees
+
+
+def views_of_blocks(rec: Reconstruction, names: Sequence[str], windows: Sequence[Window]) -> list[tuple[str, ...]]:
+    """The frames, of `names`, that see each window: those with a fiftieth of their pixels there, or the one with most.
+
+    A frame without depth sees the windows of its sparse points.
+    """
+    shares = torch.zeros(len(names), len(windows))
+    for i, name in enumerate(names):
+        points = _looked_at(rec, name)
+        if len(points):
+            uv = windows[0].plane.coordinates(points)
+            shares[i] = torch.stack([window.holds_coordinates(uv).float().mean() for window in windows])
+    enough = (shares >= _LEAST) | ((shares > 0) & (shares == shares.amax(0)))
+    return [tuple(names[i] for i in column.nonzero()[:, 0].tolist()) for column in enough.mT]
+
+
+def _looked_at(rec: Reconstruction, name: str) -> Float[Tensor, "n 3"]:
+    """World points of some of a frame's pixels."""
+    i = rec.index(name)
+    if name in rec.depth:
+        z_depth = rec.depth[name].z_depth
+        step = max(1, z_depth.shape[0] // _SAMPLED)
+        z = filled(z_depth[step // 2 :: step, step // 2 :: step])
+        if z is not None:
+            rows, columns = (torch.arange(step // 2, size, step) + 0.5 for size in z_depth.shape)
+            pixels = torch.stack(torch.meshgrid(columns, rows, indexing="xy"), -1).reshape(1, -1, 2).double()
+            return unproject(rec.cameras[i], pixels, z.reshape(1, -1).double())[0]
+    return rec.points.xyz[rec.tracks.point[rec.tracks.frame == i]].double()
+
+
+def part_of(rec: Reconstruction, names: Sequence[str], window: Window) -> Reconstruction:
+    """The reconstruction of these frames, with the points over a window; tracks and matches are left out."""
+    none = torch.zeros(0, dtype=torch.int64)
+    flat = torch.zeros(0, 2)
+    chosen = window.holds(rec.points.xyz)
+    return replace(
+        rec,
+        names=tuple(names),
+        cameras=rec.cameras[[rec.index(name) for name in names]],
+        points=Points(rec.points.xyz[chosen], rec.points.rgb[chosen], rec.points.error[chosen]),
+        tracks=Tracks(none, none, flat),
+        matches=Matches(none, none, flat, flat, torch.zeros(0)),
+        cloud=_cloud_part(rec.cloud, window),
+        backdrop=_cloud_part(rec.backdrop, window),
+    )
+
+
+def _cloud_part(cloud: DenseCloud | None, window: Window) -> DenseCloud | None:
+    if cloud is None:
+        return None
+    inside: Bool[Tensor, " n"] = window.holds(cloud.xyz)
+    return DenseCloud(cloud.xyz[inside], cloud.raw[inside], cloud.restored[inside])

@@ -1,0 +1,78 @@
+"""The plan of a map in blocks: the ground cut into windows of equal area, with a margin around each.
+
+Area is counted in images: a piece of surface counts by the share of an image that it fills from where it was filmed
+best, but as from the median depth at least. So ground that was only seen from afar counts little, and a number of
+primitives per image's area is one per pixel.
+"""
+
+import math
+from dataclasses import dataclass
+
+import torch
+from jaxtyping import Float
+from scipy.spatial import KDTree
+from torch import Tensor
+
+from swimm3r.scene.reconstruction import Reconstruction
+from swimm3r.splat.ground import Window, plane_of
+from swimm3r.splat.settings import BlockSettings
+
+_CELLS = 8  # edges of a surface cell in the median depth
+
+
+@dataclass(frozen=True)
+class Surface:
+    """The surface of a dive in cells."""
+
+    xyz: Float[Tensor, "n 3"]  # float64, scene units
+    area: Float[Tensor, " n"]  # of each, in images
+
+
+@dataclass(frozen=True)
+class PlannedBlock:
+    """One block's ground."""
+
+    window: Window
+    margin: float  # scene units, trained with the block and then left out
+    area: float  # in images, the margin's included
+
+
+def surface_of(rec: Reconstruction, median_depth: float) -> Surface:
+    """The dense cloud, or the sparse points, as cells of an eighth of the median depth."""
+    points = (rec.points.xyz if rec.cloud is None else rec.cloud.xyz).double()
+    edge = median_depth / _CELLS
+    cells = (torch.unique((points / edge).floor().long(), dim=0).double() + 0.5) * edge
+    fx, fy = rec.cameras.K[:, [0, 1], [0, 1]].double().mean(0).tolist()
+    image = rec.cameras.width / fx * rec.cameras.height / fy * median_depth**2
+    nearest, _ = KDTree(rec.cameras.centers.double().numpy()).query(cells.numpy())
+    away = torch.from_numpy(nearest).clamp(min=median_depth)
+    return Surface(cells, edge**2 / image * (median_depth / away).square())
+
+
+def plan_blocks(surface: Surface, median_depth: float, settings: BlockSettings) -> tuple[PlannedBlock, ...]:
+    """As few blocks as hold at most the settings' area each, alike in area; one where `largest` is 0."""
+    total = float(surface.area.sum())
+    count = math.ceil(total / settings.largest) if settings.largest else 1
+    plane = plane_of(surface.xyz)
+    uv = plane.coordinates(surface.xyz)
+    margin = settings.margin * median_depth
+    return tuple(
+        PlannedBlock(window, margin, float(surface.area[window.widened(margin).holds_coordinates(uv)].sum()))
+        for window in _cut(Window(plane), uv, surface.area, count)
+    )
+
+
+def _cut(window: Window, uv: Float[Tensor, "n 2"], area: Float[Tensor, " n"], count: int) -> list[Window]:
+    """The window in `count` parts of equal area, always cut across the longer side of what it holds."""
+    inside = window.holds_coordinates(uv)
+    if count == 1 or int(inside.sum()) < 2:
+        return [window]
+    uv, area = uv[inside], area[inside]
+    axis = int((uv.amax(0) - uv.amin(0)).argmax())
+    first = count // 2
+    order = uv[:, axis].argsort()
+    shares = area[order].cumsum(0) / area.sum()
+    place = int(torch.searchsorted(shares, first / count).clamp(max=len(order) - 2))
+    at = float(uv[order[place : place + 2], axis].mean())
+    before, behind = window.halves(axis, at)
+    return _cut(before, uv, area, first) + _cut(behind, uv, area, count - first)

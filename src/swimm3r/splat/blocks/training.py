@@ -1,0 +1,207 @@
+"""A large map trained: first the water on a coarse map of the whole dive, then block after block in that water.
+
+A block is trained on the pixels whose surface lies in its window or the margin around it, and keeps the primitives in
+the window, so that neighbors join. Blocks depend on nothing but their task, and a task whose block is there already
+does nothing: any number of processes may share them, and one that was killed is repeated alone, from its checkpoint.
+"""
+
+import logging
+from collections.abc import Sequence
+from dataclasses import asdict, dataclass, replace
+from pathlib import Path
+
+import torch
+
+from swimm3r import devices
+from swimm3r.devices import CPU
+from swimm3r.errors import InputError
+from swimm3r.io.files.cache_key import cache_key
+from swimm3r.progress import Progress, silent
+from swimm3r.scene.frames import Frames
+from swimm3r.scene.reconstruction import Reconstruction
+from swimm3r.splat.block_store import FOLDER, BlockEntry, StoredBlocks, entry_of, write_block
+from swimm3r.splat.blocks.coarse import box_of, coarse_of
+from swimm3r.splat.blocks.part import part_of, views_of_blocks
+from swimm3r.splat.blocks.plan import PlannedBlock
+from swimm3r.splat.ground import Window
+from swimm3r.splat.medium.field import MediumField
+from swimm3r.splat.primitives.beta import BetaPrimitives, select
+from swimm3r.splat.recipes import recipe_parts
+from swimm3r.splat.rendering import settings_in_scene_units
+from swimm3r.splat.settings import UwbsSettings
+from swimm3r.splat.training import loop
+from swimm3r.splat.training.observer import Observer
+from swimm3r.splat.training.scene import TrainingScene, path_radius
+from swimm3r.splat.training.state import map_in_scene_units
+from swimm3r.splat.views import TrainingViews
+
+log = logging.getLogger(__name__)
+
+_FEWEST = 4  # points that a block's training starts from
+
+
+@dataclass(frozen=True, eq=False)
+class BlockTask:
+    """The training of one block, ready for another process."""
+
+    number: int
+    count: int  # of blocks
+    folder: Path  # of the map
+    key: str  # of the whole training
+    rec: Reconstruction  # its views and points alone
+    frames: Frames
+    settings: UwbsSettings
+    window: Window
+    margin: float  # scene units
+    scale: float  # working units per scene unit
+    water: MediumField  # per working unit
+    device: str
+
+    @property
+    def name(self) -> str:
+        """The name for people."""
+        return f"block {self.number + 1} of {self.count}"
+
+    @property
+    def file(self) -> str:
+        """The block's file, relative to the map's folder."""
+        return f"{FOLDER}/{self.number:04d}.safetensors"
+
+
+@dataclass(frozen=True, eq=False)
+class TrainedBlocks:
+    """The parts of a large map."""
+
+    settings: UwbsSettings  # poses held
+    water: MediumField  # per working unit
+    blocks: StoredBlocks
+
+
+def train_in_blocks(
+    rec: Reconstruction,
+    frames: Frames,
+    settings: UwbsSettings,
+    plan: Sequence[PlannedBlock],
+    scale: float,
+    folder: Path,
+    progress: Progress = silent,
+    device: torch.device = CPU,
+    observer: Observer | None = None,
+) -> TrainedBlocks:
+    """Train a map's parts in `folder`: checkpoint/ and metrics.jsonl of the water, blocks/ with those of each block.
+
+    Poses are held, as blocks have to agree on them. The observer sees the training of the water.
+    """
+    settings = replace(settings, poses=replace(settings.poses, enabled=False))
+    views = TrainingViews(rec, frames, settings, scale)
+    key = _key(rec, settings, views, plan)
+    water = _train_water(rec, settings, views, scale, folder, key, progress, device, observer)
+    tasks = _tasks(rec, frames, settings, plan, views.names, scale, folder, key, water, device)
+    for task in tasks:
+        train_block(task, progress)
+    entries = tuple(entry_of(folder, task.file, key) for task in tasks)
+    if not any(entry.primitives for entry in entries):
+        raise InputError(
+            "no block of the map holds any primitive",
+            cause="hardly any depth was found, or every primitive of the map became transparent",
+            hint="--splat.blocks.largest 0 for a map of one block, or another reconstruction",
+        )
+    return TrainedBlocks(settings, water, StoredBlocks(folder, key, entries))
+
+
+def train_block(task: BlockTask, progress: Progress = silent) -> None:
+    """Train a block from its checkpoint, if there is one, and write its files; where they are there, do nothing."""
+    if _is_finished(task):
+        return
+    device = torch.device(task.device)
+    views = TrainingViews(task.rec, task.frames, task.settings, task.scale, task.window.widened(task.margin))
+    radius = path_radius(task.rec, task.scale, task.settings.working_depth)
+    scene = TrainingScene(task.rec, task.scale, radius, views, None, device, task.water)
+    schedule = loop.schedule_of(task.settings, task.key, task.number)
+    folder = task.folder / FOLDER / f"{task.number:04d}"
+    with devices.memory_for("this block", "a smaller --splat.blocks.largest, or --map-device cpu"):
+        final = loop.run(recipe_parts(task.settings), scene, schedule, folder, progress, what=f"training {task.name}")
+    primitives, _ = map_in_scene_units(final.to(CPU), 1 / task.scale)
+    assert isinstance(primitives, BetaPrimitives)
+    own = select(primitives, task.window.holds(primitives.xyz))
+    few = coarse_of(own)
+    render = settings_in_scene_units(task.settings, 1 / task.scale).render
+    box = box_of(own, render) if len(own.xyz) else (torch.zeros(3), torch.zeros(3))
+    path = task.folder / task.file
+    low, high = (tuple(corner.tolist()) for corner in box)
+    entry = BlockEntry(task.file, len(own.xyz), len(few.primitives.xyz), few.spacing, low, high)
+    write_block(task.folder / entry.coarse_file, few.primitives, task.key)
+    write_block(path, own, task.key, entry)
+
+
+def _is_finished(task: BlockTask) -> bool:
+    """Return whether the block's files are there, whole and of this training."""
+    if not (task.folder / task.file).is_file():
+        return False
+    try:
+        entry_of(task.folder, task.file, task.key)
+    except InputError as error:
+        log.warning("%s is trained again: %s", task.name, error.what)
+        return False
+    return True
+
+
+def _train_water(
+    rec: Reconstruction,
+    settings: UwbsSettings,
+    views: TrainingViews,
+    scale: float,
+    folder: Path,
+    key: str,
+    progress: Progress,
+    device: torch.device,
+    observer: Observer | None,
+) -> MediumField:
+    """The water of a coarse map of the whole dive, with as many primitives as one block; per working unit."""
+    short = replace(settings, iterations=max(1, round(settings.blocks.water_steps * settings.iterations)))
+    scene = TrainingScene(rec, scale, path_radius(rec, scale, settings.working_depth), views, None, device)
+    schedule = loop.schedule_of(short, key, "water")
+    with devices.memory_for("the water's map", "a smaller --splat.long-side, or --map-device cpu"):
+        final = loop.run(recipe_parts(short), scene, schedule, folder, progress, observer, "training the water")
+    return final.to(CPU).field.requires_grad_(False)
+
+
+def _tasks(
+    rec: Reconstruction,
+    frames: Frames,
+    settings: UwbsSettings,
+    plan: Sequence[PlannedBlock],
+    names: tuple[str, ...],
+    scale: float,
+    folder: Path,
+    key: str,
+    water: MediumField,
+    device: torch.device,
+) -> list[BlockTask]:
+    """A task for each block that a view sees."""
+    tasks = []
+    for k, (block, seen_by) in enumerate(zip(plan, views_of_blocks(rec, names, [b.window for b in plan]), strict=True)):
+        part = part_of(rec, seen_by, block.window.widened(block.margin))
+        points = part.points.xyz if part.cloud is None else part.cloud.xyz
+        if not seen_by or len(points) < _FEWEST:
+            log.warning("block %d of %d is left empty: no training frame sees it", k + 1, len(plan))
+            continue
+        own = of_area(settings, block.area)
+        task = BlockTask(
+            k, len(plan), folder, key, part, frames, own, block.window, block.margin, scale, water, str(device)
+        )
+        tasks.append(task)
+    return tasks
+
+
+def of_area(settings: UwbsSettings, area: float) -> UwbsSettings:
+    """The settings of a block, with primitives in proportion to its area, margin included."""
+    share = area / settings.blocks.largest
+    start = replace(settings.initial, primitives=max(_FEWEST, round(share * settings.initial.primitives)))
+    most = replace(settings.densify, cap_max=max(_FEWEST, round(share * settings.densify.cap_max)))
+    return replace(settings, initial=start, densify=most)
+
+
+def _key(rec: Reconstruction, settings: UwbsSettings, views: TrainingViews, plan: Sequence[PlannedBlock]) -> str:
+    cameras = [rec.cameras.cam2world.tolist(), rec.cameras.K.tolist()]
+    return cache_key(asdict(settings), views.names, *cameras, [asdict(block) for block in plan])[:16]
