@@ -6,6 +6,7 @@ from typing import TYPE_CHECKING
 
 from swimm3r.progress import Progress, watched
 from swimm3r.splat.settings import MapDevice, SplatSettings, UwbsSettings
+from swimm3r.tasks.settings import EngineSettings
 
 if TYPE_CHECKING:
     import swimm3r.scene.frames
@@ -24,6 +25,7 @@ def train(
     progress: Progress | None = None,
     device: MapDevice = "auto",
     observer: "swimm3r.splat.training.observer.Observer | None" = None,
+    engine: EngineSettings = EngineSettings(),  # noqa: B008 - records are frozen
 ) -> "swimm3r.splat.rendering.SplatMap":
     """A map of the reconstruction, trained on the registered of `frames.train`.
 
@@ -33,7 +35,8 @@ def train(
     Works in `folder` (a new temporary one by default) and goes on exactly from what an interrupted call left there.
     It is trained on `device`, where the map then stays: CUDA where it is here and NVIDIA Warp installed, by default.
     A terminal or a notebook shows how far it is, unless `progress` is given (`swimm3r.silent`: nothing); `observer` is
-    called after every step and changes nothing of the map.
+    called after every step and changes nothing of the map. The map of a large dive is trained in blocks
+    (`UwbsSettings.blocks`), which `engine` can spread over processes or a cluster.
     Raises InputError where no training frame is registered, DeviceError where `device` is not here.
     """
     from swimm3r import devices
@@ -42,4 +45,6 @@ def train(
     place = devices.for_maps(device)
     folder = Path(folder or mkdtemp(prefix="swimm3r-splat-"))
     with watched(progress) as told:
-        return train_map.train(reconstruction, frames, settings or UwbsSettings(), folder, told, place, observer)
+        return train_map.train(
+            reconstruction, frames, settings or UwbsSettings(), folder, told, place, observer, engine
+        )

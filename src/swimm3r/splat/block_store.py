@@ -29,7 +29,7 @@ SCHEMA = 1  # of a block's files
 FOLDER = "blocks"  # beside the map's own file
 CACHE_BYTES = 1 << 30
 _COARSE_PIXELS = 1.0  # distance of neighbors among a block's few primitives, up to which they stand for all
-_SLACK = 8.0  # pixels around the image: splats are blurred there
+_SLACK = 0.05  # of the image, around it: splats are blurred, and drawn a little larger than they are
 
 Triple = tuple[float, float, float]
 
@@ -61,13 +61,13 @@ class BlockEntry:
         """Return whether the box may reach into a view."""
         corners = torch.cartesian_prod(*(torch.tensor(pair) for pair in zip(self.low, self.high, strict=True)))
         x, y, z = (corners.to(view.R) @ view.R.mT + view.t).unbind(-1)
-        right, down = view.width - view.cx + _SLACK, view.height - view.cy + _SLACK
+        view = view.widened(_SLACK)
         before_edges = (
             z,
-            x * view.fx + (view.cx + _SLACK) * z,
-            right * z - x * view.fx,
-            y * view.fy + (view.cy + _SLACK) * z,
-            down * z - y * view.fy,
+            x * view.fx + view.cx * z,
+            (view.width - view.cx) * z - x * view.fx,
+            y * view.fy + view.cy * z,
+            (view.height - view.cy) * z - y * view.fy,
         )
         return all(bool((side > 0).any()) for side in before_edges)
 

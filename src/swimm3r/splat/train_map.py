@@ -28,6 +28,7 @@ from swimm3r.splat.training.scene import TrainingScene, path_radius
 from swimm3r.splat.training.state import map_in_scene_units
 from swimm3r.splat.training_poses import RefinedPoses, training_poses_of, write_refined
 from swimm3r.splat.views import TrainingViews, median_z_depth, working_scale
+from swimm3r.tasks.settings import EngineSettings
 
 log = logging.getLogger(__name__)
 
@@ -40,6 +41,7 @@ def train(
     progress: Progress = silent,
     device: torch.device = CPU,
     observer: Observer | None = None,
+    engine: EngineSettings = EngineSettings(),  # noqa: B008 - records are frozen
 ) -> SplatMap:
     """Train a map in `folder`: checkpoint/, metrics.jsonl, and at the end map.safetensors and the refined poses.
 
@@ -50,7 +52,7 @@ def train(
     _check_near(settings, scale * median_z_depth(rec))
     if plan := _plan(rec, settings):
         assert isinstance(settings, UwbsSettings)
-        return _in_blocks(rec, frames, settings, plan, scale, folder, progress, device, observer)
+        return _in_blocks(rec, frames, settings, plan, scale, folder, progress, device, observer, engine)
     views = TrainingViews(rec, frames, settings, scale)
     poses_in_training = training_poses_of(rec, views.names, views.cameras, scale) if settings.poses.enabled else None
     radius = path_radius(rec, scale, settings.working_depth)
@@ -79,9 +81,10 @@ def _in_blocks(
     progress: Progress,
     device: torch.device,
     observer: Observer | None,
+    engine: EngineSettings,
 ) -> SplatMap:
     """A map whose primitives stay on disk."""
-    trained = train_in_blocks(rec, frames, settings, plan, scale, folder, progress, device, observer)
+    trained = train_in_blocks(rec, frames, settings, plan, scale, folder, progress, device, observer, engine)
     field = in_unit(copy.deepcopy(trained.water), 1 / scale)
     viewpoint = _viewpoint(rec, TrainingViews(rec, frames, settings, scale), None)
     blocks = trained.blocks

@@ -7,8 +7,7 @@ covered together. It is used where voxels are no larger than pixels.
 from dataclasses import dataclass
 
 import torch
-from jaxtyping import Float
-from scipy.spatial import KDTree
+from jaxtyping import Float, Int
 from torch import Tensor
 from torch.nn.functional import softplus
 
@@ -18,6 +17,7 @@ from swimm3r.splat.settings import RenderSettings
 
 _TIMES = 8.0  # fewer primitives, about
 _GROWTH = 3.0  # of one primitive's size, at most
+_BISECTIONS = 16
 _FAINT = 1e-6
 
 
@@ -33,14 +33,7 @@ def coarse_of(p: BetaPrimitives) -> CoarseBlock:
     """The few primitives that stand for a block's; a block of less than two has none."""
     if len(p.xyz) < 2:
         return CoarseBlock(select(p, torch.zeros(0, dtype=torch.int64)), 0.0)
-    nearest, _ = KDTree(p.xyz.numpy()).query(p.xyz.numpy(), k=2)
-    edge = _TIMES**0.5 * float(torch.from_numpy(nearest[:, 1]).median().clamp(min=1e-9))
-    # two faces of a surface on one voxel: as many voxels per side as make the number asked for
-    for _ in range(20):
-        voxel = _voxels(p.xyz, edge)
-        if int(voxel.max()) + 1 <= len(p.xyz) / _TIMES:
-            break
-        edge *= 1.15
+    voxel, edge = _voxels(p.xyz, max(1, round(len(p.xyz) / _TIMES)))
     size = softplus(p.scale[:, :3]).double()
     area = size.square().sum(-1)  # of the faces, up to a factor
     weight = torch.sigmoid(p.opacity).double() * area + _FAINT * float(area.mean())
@@ -72,5 +65,15 @@ def box_of(p: BetaPrimitives, settings: RenderSettings) -> tuple[Float[Tensor, "
     return (p.xyz - half).amin(0), (p.xyz + half).amax(0)
 
 
-def _voxels(xyz: Float[Tensor, "n 3"], edge: float) -> Tensor:
-    return torch.unique((xyz.double() / edge).floor().long(), dim=0, return_inverse=True)[1]
+def _voxels(xyz: Float[Tensor, "n 3"], wanted: int) -> tuple[Int[Tensor, " n"], float]:
+    """The number of each point's voxel, and the edge at which there are about as many as wanted."""
+    high = float((xyz.amax(0) - xyz.amin(0)).max().clamp(min=1e-6))
+    low = 1e-5 * high
+    for _ in range(_BISECTIONS):
+        edge = (low * high) ** 0.5
+        voxel = torch.unique((xyz.double() / edge).floor().long(), dim=0, return_inverse=True)[1]
+        found = int(voxel.max()) + 1
+        if abs(found - wanted) <= 0.05 * wanted:
+            break
+        low, high = (edge, high) if found > wanted else (low, edge)
+    return voxel, edge

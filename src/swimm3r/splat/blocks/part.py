@@ -1,7 +1,7 @@
 """The part of a reconstruction that one block is trained on: the views that see it, and the points in its window."""
 
 from collections.abc import Sequence
-from dataclasses import replace
+from dataclasses import dataclass, replace
 
 import torch
 from jaxtyping import Bool, Float
@@ -9,6 +9,7 @@ from torch import Tensor
 
 from swimm3r.cameras import unproject
 from swimm3r.scene.reconstruction import DenseCloud, Matches, Points, Reconstruction, Tracks
+from swimm3r.splat.blocks.plan import PlannedBlock
 from swimm3r.splat.ground import Window
 from swimm3r.splat.views import filled
 
@@ -16,19 +17,32 @@ _LEAST = 0.02  # of a view's pixels, from which on it is one of a block
 _SAMPLED = 24  # rows of pixels that say what a view sees
 
 
-def views_of_blocks(rec: Reconstruction, names: Sequence[str], windows: Sequence[Window]) -> list[tuple[str, ...]]:
-    """The frames, of `names`, that see each window: those with a fiftieth of their pixels there, or the one with most.
+@dataclass(frozen=True)
+class BlockViews:
+    """The frames that see a block."""
 
-    A frame without depth sees the windows of its sparse points.
+    names: tuple[str, ...]
+    images: float  # that the pixels on the block and its margin make up together
+
+
+def views_of_blocks(rec: Reconstruction, names: Sequence[str], plan: Sequence[PlannedBlock]) -> list[BlockViews]:
+    """The frames, of `names`, that see each block: those with a fiftieth of their pixels there, or the one with most.
+
+    A frame without depth sees the blocks of its sparse points.
     """
-    shares = torch.zeros(len(names), len(windows))
+    own, with_margin = torch.zeros(len(names), len(plan)), torch.zeros(len(names), len(plan))
     for i, name in enumerate(names):
         points = _looked_at(rec, name)
         if len(points):
-            uv = windows[0].plane.coordinates(points)
-            shares[i] = torch.stack([window.holds_coordinates(uv).float().mean() for window in windows])
-    enough = (shares >= _LEAST) | ((shares > 0) & (shares == shares.amax(0)))
-    return [tuple(names[i] for i in column.nonzero()[:, 0].tolist()) for column in enough.mT]
+            uv = plan[0].window.plane.coordinates(points)
+            for k, block in enumerate(plan):
+                own[i, k] = block.window.holds_coordinates(uv).float().mean()
+                with_margin[i, k] = block.window.widened(block.margin).holds_coordinates(uv).float().mean()
+    enough = (own >= _LEAST) | ((own > 0) & (own == own.amax(0)))
+    return [
+        BlockViews(tuple(names[i] for i in seen.nonzero()[:, 0].tolist()), float(shares[seen].sum()))
+        for seen, shares in zip(enough.mT, with_margin.mT, strict=True)
+    ]
 
 
 def _looked_at(rec: Reconstruction, name: str) -> Float[Tensor, "n 3"]:

@@ -8,6 +8,7 @@ does nothing: any number of processes may share them, and one that was killed is
 import logging
 from collections.abc import Sequence
 from dataclasses import asdict, dataclass, replace
+from functools import partial
 from pathlib import Path
 
 import torch
@@ -34,6 +35,8 @@ from swimm3r.splat.training.observer import Observer
 from swimm3r.splat.training.scene import TrainingScene, path_radius
 from swimm3r.splat.training.state import map_in_scene_units
 from swimm3r.splat.views import TrainingViews
+from swimm3r.tasks import run_tasks
+from swimm3r.tasks.settings import EngineSettings
 
 log = logging.getLogger(__name__)
 
@@ -59,8 +62,8 @@ class BlockTask:
 
     @property
     def name(self) -> str:
-        """The name for people."""
-        return f"block {self.number + 1} of {self.count}"
+        """The name of the task and of its log."""
+        return f"block_{self.number:04d}"
 
     @property
     def file(self) -> str:
@@ -87,18 +90,25 @@ def train_in_blocks(
     progress: Progress = silent,
     device: torch.device = CPU,
     observer: Observer | None = None,
+    engine: EngineSettings = EngineSettings(),  # noqa: B008 - records are frozen
 ) -> TrainedBlocks:
     """Train a map's parts in `folder`: checkpoint/ and metrics.jsonl of the water, blocks/ with those of each block.
 
-    Poses are held, as blocks have to agree on them. The observer sees the training of the water.
+    Poses are held, as blocks have to agree on them. The observer sees the training of the water. Raises the error of
+    the first block that failed; those that are finished stay.
     """
     settings = replace(settings, poses=replace(settings.poses, enabled=False))
     views = TrainingViews(rec, frames, settings, scale)
     key = _key(rec, settings, views, plan)
     water = _train_water(rec, settings, views, scale, folder, key, progress, device, observer)
     tasks = _tasks(rec, frames, settings, plan, views.names, scale, folder, key, water, device)
-    for task in tasks:
-        train_block(task, progress)
+    here = engine.engine == "local" and engine.at_once(1) == 1  # one after another, each with its own progress
+    work = partial(train_block, progress=progress) if here else train_block
+    failures = run_tasks(work, tasks, engine, progress, "training the blocks", logs=folder / FOLDER / "logs")
+    for failure in failures:
+        log.warning("%s of the map's %d blocks: %s", failure.name, len(tasks), failure.message)
+    if failures:
+        raise failures[0].error
     entries = tuple(entry_of(folder, task.file, key) for task in tasks)
     if not any(entry.primitives for entry in entries):
         raise InputError(
@@ -120,7 +130,14 @@ def train_block(task: BlockTask, progress: Progress = silent) -> None:
     schedule = loop.schedule_of(task.settings, task.key, task.number)
     folder = task.folder / FOLDER / f"{task.number:04d}"
     with devices.memory_for("this block", "a smaller --splat.blocks.largest, or --map-device cpu"):
-        final = loop.run(recipe_parts(task.settings), scene, schedule, folder, progress, what=f"training {task.name}")
+        final = loop.run(
+            recipe_parts(task.settings),
+            scene,
+            schedule,
+            folder,
+            progress,
+            what=f"training block {task.number + 1} of {task.count}",
+        )
     primitives, _ = map_in_scene_units(final.to(CPU), 1 / task.scale)
     assert isinstance(primitives, BetaPrimitives)
     own = select(primitives, task.window.holds(primitives.xyz))
@@ -180,13 +197,13 @@ def _tasks(
 ) -> list[BlockTask]:
     """A task for each block that a view sees."""
     tasks = []
-    for k, (block, seen_by) in enumerate(zip(plan, views_of_blocks(rec, names, [b.window for b in plan]), strict=True)):
-        part = part_of(rec, seen_by, block.window.widened(block.margin))
+    for k, (block, seen_by) in enumerate(zip(plan, views_of_blocks(rec, names, plan), strict=True)):
+        part = part_of(rec, seen_by.names, block.window.widened(block.margin))
         points = part.points.xyz if part.cloud is None else part.cloud.xyz
-        if not seen_by or len(points) < _FEWEST:
+        if not seen_by.names or len(points) < _FEWEST:
             log.warning("block %d of %d is left empty: no training frame sees it", k + 1, len(plan))
             continue
-        own = of_area(settings, block.area)
+        own = of_area(settings, block.area, len(seen_by.names) / seen_by.images)
         task = BlockTask(
             k, len(plan), folder, key, part, frames, own, block.window, block.margin, scale, water, str(device)
         )
@@ -194,12 +211,17 @@ def _tasks(
     return tasks
 
 
-def of_area(settings: UwbsSettings, area: float) -> UwbsSettings:
-    """The settings of a block, with primitives in proportion to its area, margin included."""
+def of_area(settings: UwbsSettings, area: float, views_per_image: float = 1.0) -> UwbsSettings:
+    """The settings of a block, with primitives and steps in proportion to its area, margin included.
+
+    Views of which it is a part alone are more than the images that they make up; each takes its turn, so that the
+    ground is seen as often as in a map of one block.
+    """
     share = area / settings.blocks.largest
     start = replace(settings.initial, primitives=max(_FEWEST, round(share * settings.initial.primitives)))
     most = replace(settings.densify, cap_max=max(_FEWEST, round(share * settings.densify.cap_max)))
-    return replace(settings, initial=start, densify=most)
+    steps = max(1, round(share * views_per_image * settings.iterations))
+    return replace(settings, iterations=steps, initial=start, densify=most)
 
 
 def _key(rec: Reconstruction, settings: UwbsSettings, views: TrainingViews, plan: Sequence[PlannedBlock]) -> str:

@@ -1,0 +1,122 @@
+"""The plan of a map in blocks: every piece of ground in exactly one, all alike in area."""
+
+import math
+
+import pytest
+import torch
+
+from swimm3r.splat.blocks.part import part_of, views_of_blocks
+from swimm3r.splat.blocks.plan import PlannedBlock, Surface, plan_blocks, surface_of
+from swimm3r.splat.blocks.training import of_area
+from swimm3r.splat.ground import GroundPlane, Window, plane_of
+from swimm3r.splat.settings import BlockSettings, DensifySettings, InitialSettings, UwbsSettings
+from swimm3r.splat.views import TrainingViews, filled, median_z_depth
+
+
+def l_shaped(n: int = 4000) -> Surface:
+    """Ground of uneven outline, tilted in space."""
+    rng = torch.Generator().manual_seed(3)
+    uv = torch.rand(n, 2, generator=rng, dtype=torch.float64) * torch.tensor([12.0, 7.0])
+    uv = uv[(uv[:, 0] < 4) | (uv[:, 1] < 3)]
+    turn = torch.linalg.qr(torch.randn(3, 3, generator=rng, dtype=torch.float64)).Q
+    xyz = torch.cat([uv, 0.1 * torch.rand(len(uv), 1, generator=rng, dtype=torch.float64)], -1) @ turn.mT
+    return Surface(xyz, torch.full((len(uv),), 0.01, dtype=torch.float64))
+
+
+@pytest.mark.parametrize("largest", [3.0, 5.5, 7.0, 1000.0])
+def test_every_point_lies_in_exactly_one_block_and_blocks_are_alike_in_area(largest):
+    surface = l_shaped()
+    plan = plan_blocks(surface, 1.0, BlockSettings(largest=largest))
+    total = float(surface.area.sum())
+    assert len(plan) == math.ceil(total / largest)
+    far = 1e4 * torch.randn(500, 3, generator=torch.Generator().manual_seed(1), dtype=torch.float64)
+    for points in (surface.xyz, far):
+        assert torch.stack([block.window.holds(points) for block in plan]).sum(0).eq(1).all()
+    own = torch.stack([surface.area[block.window.holds(surface.xyz)].sum() for block in plan])
+    assert own.max() < 1.1 * total / len(plan)
+    assert own.min() > 0.9 * total / len(plan)
+    assert all(block.area >= float(area) for block, area in zip(plan, own, strict=True))
+
+
+def test_a_point_on_an_edge_lies_in_the_block_whose_lower_edge_it_is():
+    before, behind = Window(GroundPlane((0, 0, 0), (1, 0, 0), (0, 1, 0))).halves(0, 2.0)
+    edge = torch.tensor([[2.0, 5.0, 1.0]])
+    assert not before.holds(edge)
+    assert behind.holds(edge)
+    assert before.widened(0.1).holds(edge)
+
+
+def test_the_ground_of_a_wall_is_the_wall():
+    rng = torch.Generator().manual_seed(0)
+    wall = torch.rand(500, 3, generator=rng) * torch.tensor([5.0, 3.0, 0.1])
+    uv = plane_of(wall).coordinates(wall)
+    torch.testing.assert_close((uv.amax(0) - uv.amin(0)).float(), torch.tensor([5.0, 3.0]), atol=0.2, rtol=0)
+
+
+def test_area_is_counted_in_images(tiny_dive):
+    """The wall is 5.2 by 1.6 and uneven, an image at its depth of 3 shows 3.2 by 2.4."""
+    depth = median_z_depth(tiny_dive.rec)
+    area = float(surface_of(tiny_dive.rec, depth).area.sum())
+    assert 0.8 * 5.2 * 1.6 < area * 3.2 * 2.4 < 3.5 * 5.2 * 1.6
+
+
+def test_no_limit_is_one_block(tiny_dive):
+    depth = median_z_depth(tiny_dive.rec)
+    assert len(plan_blocks(surface_of(tiny_dive.rec, depth), depth, BlockSettings(largest=0.0))) == 1
+
+
+def test_primitives_are_in_proportion_to_area():
+    settings = UwbsSettings(
+        initial=InitialSettings(primitives=1000), densify=DensifySettings(cap_max=3000), blocks=BlockSettings(largest=8)
+    )
+    half = of_area(settings, 4.0, views_per_image=3.0)
+    assert (half.initial.primitives, half.densify.cap_max) == (500, 1500)
+    assert half.iterations == 1.5 * settings.iterations
+
+
+def test_a_block_is_trained_on_the_frames_that_see_it_and_the_points_in_its_window(tiny_dive):
+    rec = tiny_dive.rec
+    middle = Window(plane_of(rec.cloud.xyz))
+    left, right = middle.halves(0, -0.7 if middle.plane.across[0] > 0 else 0.7)
+    plan = [PlannedBlock(left, 0.2, 1.0), PlannedBlock(right, 0.2, 1.0)]
+    seen_by = views_of_blocks(rec, rec.names, plan)
+    for window, found in zip((left, right), seen_by, strict=True):
+        images = 0.0
+        for name in rec.names:
+            share = window.holds(_points(rec, name)).float().mean()
+            assert (name in found.names) == (share >= 0.02) or 0.01 < share < 0.03
+            images += float(window.widened(0.2).holds(_points(rec, name)).float().mean()) * (name in found.names)
+        assert abs(found.images - images) < 0.03 * len(found.names)
+    part = part_of(rec, seen_by[0].names, left)
+    assert part.names == seen_by[0].names
+    assert torch.equal(part.cameras.cam2world[0], rec.cameras.cam2world[rec.index(part.names[0])])
+    assert left.holds(part.cloud.xyz).all()
+    assert 0 < len(part.cloud.xyz) < len(rec.cloud.xyz)
+
+
+def test_pixels_whose_surface_lies_outside_the_window_take_no_part(tiny_dive):
+    rec, frames = tiny_dive.rec, tiny_dive.frames
+    window, _ = Window(plane_of(rec.cloud.xyz)).halves(0, 0.0)
+    settings = UwbsSettings(long_side=64)
+    views, all_of_it = TrainingViews(rec, frames, settings, 1.0, window), TrainingViews(rec, frames, settings, 1.0)
+    view, whole = views[3], all_of_it[3]
+    inside = window.holds(_points(rec, view.name)).reshape(48, 64)
+    known = whole.z_depth > 0
+    assert torch.equal(view.seen[known], (whole.seen & inside)[known])
+    assert not view.z_depth[known & ~inside].any()
+    assert torch.equal(view.z_depth[known & inside], whole.z_depth[known & inside])
+    assert 0.2 < view.seen.float().mean() < 0.8
+
+
+def test_unknown_depth_is_that_of_the_next_pixel():
+    z = torch.tensor([[0.0, 2.0, 0.0, 0.0, 5.0], [0.0, 2.0, 0.0, 0.0, 5.0]])
+    assert torch.equal(filled(z), torch.tensor([[2.0, 2.0, 2.0, 5.0, 5.0]] * 2))
+    assert filled(torch.zeros(2, 3)) is None
+
+
+def _points(rec, name):
+    from swimm3r.cameras import pixel_grid, unproject
+
+    z = filled(rec.depth[name].z_depth)
+    pixels = pixel_grid(*z.shape).reshape(1, -1, 2).double()
+    return unproject(rec.cameras[rec.index(name)], pixels, z.reshape(1, -1).double())[0]
