@@ -84,6 +84,7 @@ def test_far_blocks_are_drawn_from_few_primitives_that_look_alike(wall, tmp_path
 
 def test_blocks_stay_in_a_memory_of_bounded_size(wall, tmp_path):
     cut = in_blocks(wall(3000), tmp_path)
+    assert cut.blocks is not None
     one = max(nbytes(p) for p in cut.blocks.parts())
     held = PartCache(max_bytes=2 * one)
     blocks = replace(cut.blocks, cache=held)

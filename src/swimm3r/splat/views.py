@@ -147,8 +147,9 @@ def filled(z_depth: Float[Tensor, "h w"]) -> Float[Tensor, "h w"] | None:
         return None
     if not bool(unknown.any()):
         return z_depth
-    row, column = distance_transform_edt(unknown.numpy(), return_distances=False, return_indices=True)
-    return z_depth[torch.from_numpy(row).long(), torch.from_numpy(column).long()]
+    nearest = distance_transform_edt(unknown.numpy(), return_distances=False, return_indices=True)
+    row, column = torch.from_numpy(np.asarray(nearest)).long()
+    return z_depth[row, column]
 
 
 def smaller(view: TrainingView, divisor: int) -> TrainingView:

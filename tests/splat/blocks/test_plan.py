@@ -110,7 +110,9 @@ def test_pixels_whose_surface_lies_outside_the_window_take_no_part(tiny_dive):
 
 def test_unknown_depth_is_that_of_the_next_pixel():
     z = torch.tensor([[0.0, 2.0, 0.0, 0.0, 5.0], [0.0, 2.0, 0.0, 0.0, 5.0]])
-    assert torch.equal(filled(z), torch.tensor([[2.0, 2.0, 2.0, 5.0, 5.0]] * 2))
+    found = filled(z)
+    assert found is not None
+    assert torch.equal(found, torch.tensor([[2.0, 2.0, 2.0, 5.0, 5.0]] * 2))
     assert filled(torch.zeros(2, 3)) is None
 
 

@@ -25,7 +25,7 @@ class BlockViews:
     images: float  # that the pixels on the block and its margin make up together
 
 
-def views_of_blocks(rec: Reconstruction, names: Sequence[str], plan: Sequence[PlannedBlock]) -> list[BlockViews]:
+def views_of_blocks(rec: Reconstruction, names: tuple[str, ...], plan: Sequence[PlannedBlock]) -> list[BlockViews]:
     """The frames, of `names`, that see each block: those with a fiftieth of their pixels there, or the one with most.
 
     A frame without depth sees the blocks of its sparse points.
@@ -40,7 +40,9 @@ def views_of_blocks(rec: Reconstruction, names: Sequence[str], plan: Sequence[Pl
                 with_margin[i, k] = block.window.widened(block.margin).holds_coordinates(uv).float().mean()
     enough = (own >= _LEAST) | ((own > 0) & (own == own.amax(0)))
     return [
-        BlockViews(tuple(names[i] for i in seen.nonzero()[:, 0].tolist()), float(shares[seen].sum()))
+        BlockViews(
+            tuple(name for name, is_one in zip(names, seen.tolist(), strict=True) if is_one), float(shares[seen].sum())
+        )
         for seen, shares in zip(enough.mT, with_margin.mT, strict=True)
     ]
 
