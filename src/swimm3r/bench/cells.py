@@ -134,10 +134,7 @@ def over_scenes(
         raise UsageError(
             "there is nothing to measure on", cause="no run folder or clip was named", hint="name at least one"
         )
-    if how.engine == "local" and how.at_once(1) == 1:
-        work = partial(work, progress=progress)
-    else:
-        work = partial(work, progress=silent)
+    work = partial(work, progress=progress if how.is_in_this_process else silent)
     folder = out / "jobs"
     items = [_Scene(f"{number}", scene) for number, scene in enumerate(scenes)]
     failures = run_tasks(partial(_keep_cells, work=work, folder=folder), items, how, progress, "scenes", logs=folder)

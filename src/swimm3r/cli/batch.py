@@ -6,14 +6,13 @@ from typing import Annotated, Literal
 
 from tyro.conf import Positional, arg
 
-from swimm3r.cli.pipeline.options import MapOptions, OriginOptions, PoseOptions
+from swimm3r.cli.pipeline.options import HERE, Engine, MapOptions, OriginOptions, PoseOptions
 from swimm3r.cli.pipeline.stages import require_adapter
 from swimm3r.cli.terminal.console import drawn_progress, outcome_console, print_line, print_results
 from swimm3r.cli.terminal.options import FLAT, Out
 from swimm3r.pipeline.presets import RunSettings
 from swimm3r.scene.settings import FrameSettings
 from swimm3r.splat.settings import PoseRefinementSettings
-from swimm3r.tasks.settings import EngineSettings
 
 Dives = Positional[Annotated[tuple[Path, ...], arg(metavar="DIVE [DIVE ...]", help_behavior_hint="(one or more)")]]
 LastStage = Literal["prepare", "sfm", "splat", "eval"]
@@ -33,7 +32,7 @@ def batch_command(defaults: RunSettings) -> Callable:
         out: Out,
         last_stage: LastStage = "eval",
         origin: Annotated[OriginOptions, FLAT] = OriginOptions(),  # noqa: B008 - records are frozen
-        engine: Annotated[EngineSettings, FLAT] = EngineSettings(),  # noqa: B008
+        engine: Engine = HERE,
         poses: Annotated[PoseOptions, FLAT] = PoseOptions(defaults.sfm.backend),  # noqa: B008
         map: Annotated[MapOptions, FLAT] = MapOptions(defaults.splat.recipe),  # noqa: B008
         frames: Annotated[FrameSettings, FLAT] = defaults.frames,

@@ -5,7 +5,6 @@ The rates are processor-seconds on a computer with two x86 cores, from runs of s
 matching is hard. Stages that a GPU or a network decides are not estimated.
 """
 
-import os
 import shutil
 from collections.abc import Iterable
 from dataclasses import dataclass
@@ -21,6 +20,7 @@ from swimm3r.scene.run_folder import STAGES
 from swimm3r.scene.settings import FrameSettings
 from swimm3r.sfm.settings import ColmapModelSettings, ColmapSettings, Mast3rSettings, PlaneSweepSettings
 from swimm3r.splat.settings import SplatSettings, UwbsSettings
+from swimm3r.tasks.threads import thread_count
 
 _TEST_SHARE = 1 / 8  # of the frames (prepare.frames_folder.TEST_EVERY)
 
@@ -98,7 +98,7 @@ def estimate_run(
         return None
     count, (width, height), decoded = found
     frame = width * height
-    wall = 1 / (_PARALLEL * max(1.0, cores if cores is not None else available_cores()))
+    wall = 1 / (_PARALLEL * max(1.0, cores if cores is not None else thread_count()))
     tests = count * _TEST_SHARE
     sfm = _sfm_seconds(count, frame, max(width, height), settings)
     step = _step_seconds(settings.splat, width, height) if on_cpu else None
@@ -135,13 +135,6 @@ def check_disk(estimate: Estimate, folder: Path) -> str:
             hint="free some space, choose an --out on another disk, or fewer or smaller frames (--fps, --long-side)",
         )
     return f"{told[0].upper()}{told[1:]}: it may become full."
-
-
-def available_cores() -> int:
-    """Cores that this process may use."""
-    if hasattr(os, "sched_getaffinity"):
-        return len(os.sched_getaffinity(0))
-    return os.cpu_count() or 1  # macOS and Windows have no affinity to ask for
 
 
 def duration(seconds: float | None) -> str:

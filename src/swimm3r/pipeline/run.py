@@ -36,6 +36,7 @@ from swimm3r.splat import train
 from swimm3r.splat.map_file import load_map
 from swimm3r.splat.settings import MapDevice
 from swimm3r.splat.training.observer import Observer
+from swimm3r.tasks.settings import EngineSettings
 
 
 def run_pipeline(
@@ -50,6 +51,7 @@ def run_pipeline(
     progress: Progress | None = None,
     on_stage: Callable[[StageStart], None] = ignore_stages,
     observer: Observer | None = None,
+    engine: EngineSettings = EngineSettings(),  # noqa: B008 - records are frozen
 ) -> dict:
     """Run the stages up to `last_stage` and return the summary (layout: docs/conventions.md).
 
@@ -58,7 +60,8 @@ def run_pipeline(
     `folder`/old and made again. `reference` is a cameras.json to score against; a synthetic dive brings its own truth.
     `map_device` is where the map is trained and rendered. A rough estimate of time and disk is logged first, and
     `on_stage` is told of every stage that starts, `observer` of every step of the map's training. A terminal or a
-    notebook shows how far it is, unless `progress` is given (`swimm3r.silent`: nothing).
+    notebook shows how far it is, unless `progress` is given (`swimm3r.silent`: nothing). `engine` can spread chunks of
+    a long clip, dense depth and blocks of a large map over processes or a cluster.
 
     Raises the errors of its stages (`swimm3r.errors`), UsageError where settings differ, the folder cannot be written
     to or another process works in it, InputError where it belongs to another input, and StorageError where the disk is
@@ -78,7 +81,7 @@ def run_pipeline(
         to_do = record.to_do(stage_keys(record.fingerprint, settings, reference))
         plan = estimate_run(source, folder, settings, to_do, on_cpu=device.type == "cpu")
         record.announce(plan, on_stage)
-        _make_stages(record, source, settings, reference, last_stage, map_device, told, observer)
+        _make_stages(record, source, settings, reference, last_stage, map_device, told, observer, engine)
         summary = record.write()
         if last_stage == "eval":
             write_report(folder)
@@ -94,6 +97,7 @@ def _make_stages(
     map_device: MapDevice,
     progress: Progress,
     observer: Observer | None,
+    engine: EngineSettings,
 ) -> None:
     """Make or reuse the stages one after another. What a stage hands on is read from disk, to the last bit as a resumed
     run finds it.
@@ -121,7 +125,10 @@ def _make_stages(
         return
 
     record.stage(
-        "sfm", keys["sfm"], make=lambda: reconstruct(frames, settings.sfm, folder / "sfm", progress), reuse=lambda: None
+        "sfm",
+        keys["sfm"],
+        make=lambda: reconstruct(frames, settings.sfm, folder / "sfm", progress, engine),
+        reuse=lambda: None,
     )
     rec = load_reconstruction(folder / "sfm", frames)
     record.add(sections.sfm_sections(rec, frames, unfiltered_matches(folder / "sfm", rec)))
@@ -131,7 +138,7 @@ def _make_stages(
     record.stage(
         "splat",
         keys["splat"],
-        make=lambda: train(rec, frames, settings.splat, folder / "splat", progress, map_device, observer),
+        make=lambda: train(rec, frames, settings.splat, folder / "splat", progress, map_device, observer, engine),
         reuse=lambda: None,
     )
     scene = load_map(folder / "splat" / "map.safetensors").to(devices.for_maps(map_device))

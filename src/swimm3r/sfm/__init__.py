@@ -8,6 +8,7 @@ from typing import TYPE_CHECKING
 from swimm3r.errors import InputError
 from swimm3r.progress import Progress, watched
 from swimm3r.sfm.settings import ColmapModelSettings, ColmapSettings, Mast3rSettings, SfmSettings
+from swimm3r.tasks.settings import EngineSettings
 
 if TYPE_CHECKING:
     import swimm3r.scene.frames
@@ -21,12 +22,14 @@ def reconstruct(
     settings: SfmSettings | None = None,
     folder: str | Path | None = None,
     progress: Progress | None = None,
+    engine: EngineSettings = EngineSettings(),  # noqa: B008 - records are frozen
 ) -> "swimm3r.scene.reconstruction.Reconstruction":
     """Cameras, points, dense depth, water and restored cloud of a set of frames, of which only `frames.train` is used.
 
     `settings` choose the method: `ColmapSettings()` by default, `swimm3r.PRESETS["fast"].sfm` the quickest. Works in
     `folder` (a new temporary one by default) and goes on from what an interrupted call left there. A terminal or a
-    notebook shows how far it is, unless `progress` is given (`swimm3r.silent`: nothing).
+    notebook shows how far it is, unless `progress` is given (`swimm3r.silent`: nothing). `engine` can spread the chunks
+    of a long clip and dense depth over processes or a cluster.
     Raises InputError for fewer than 2 frames and RegistrationError where too few can be placed.
     """
     settings = settings or ColmapSettings()
@@ -39,7 +42,7 @@ def reconstruct(
         )
     with watched(progress) as told:
         work = Path(folder or mkdtemp(prefix="swimm3r-sfm-"))
-        return _backend(settings).reconstruct(frames, settings, work, told)
+        return _backend(settings).reconstruct(frames, settings, work, told, engine)
 
 
 def check_files(settings: SfmSettings) -> None:

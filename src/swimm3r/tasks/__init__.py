@@ -76,7 +76,7 @@ def _ends(
     """The end of every item's attempt with its index, in the order in which they end."""
     match engine.engine:
         case "local":
-            if not isolated and engine.at_once(1) == 1:
+            if not isolated and engine.is_in_this_process:
                 return ((index, attempt(work, item)) for index, item in enumerate(items))
             from swimm3r.tasks.local import in_processes
 

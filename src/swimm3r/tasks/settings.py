@@ -41,6 +41,11 @@ class EngineSettings(Settings):
         """Other computers do the work."""
         return (self.engine == "slurm" and self.cluster == "slurm") or (self.engine == "ray" and self.address != "")
 
+    @property
+    def is_in_this_process(self) -> bool:
+        """No other process does any of the work."""
+        return self.engine == "local" and self.jobs in (None, 1)
+
     def at_once(self, cores: int) -> int:
         """Number of parts computed at once, on a computer of so many cores."""
         if self.jobs is not None:

@@ -14,9 +14,11 @@ from swimm3r.imaging.undistortion import covering_pinholes
 from swimm3r.io import images
 from swimm3r.scene.frames import Frame, Frames
 from swimm3r.scene.reconstruction import DepthMaps, Matches, Points, Reconstruction, Tracks
+from swimm3r.sfm.plane_sweep import estimate
 from swimm3r.sfm.plane_sweep.estimate import RawDepth, consistent, estimate_depth, sweep
 from swimm3r.sfm.plane_sweep.views import SweepView, choose_sources, depth_range, make_view
 from swimm3r.sfm.settings import PlaneSweepSettings
+from swimm3r.tasks import EngineSettings
 
 WIDTH, HEIGHT = 128, 96
 MIDDLE = (slice(16, -16), slice(24, -24))  # what enough sources see
@@ -273,3 +275,17 @@ def test_progress_counts_every_frame_of_both_passes(tmp_path: Path):
     )
     assert told == [(what, k, 5) for what in ("depth", "depth agreement") for k in range(1, 6)]
     assert not (tmp_path / "z_depth" / ".raw").exists()
+
+
+def test_several_processes_make_the_same_maps(tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
+    monkeypatch.setattr(estimate, "_OF_A_TASK", 2)
+    cameras = dive()
+    frames = frames_on_disk(cameras, FRONTAL, tmp_path)
+    here = estimate_depth(reconstruction(cameras, FRONTAL, tmp_path / "here"), frames, SETTINGS)
+    rec = reconstruction(cameras, FRONTAL, tmp_path / "there")
+    rec.save(rec.depth.folder.parent, frames)
+    seen: list[tuple[str, int, int]] = []
+    there = estimate_depth(rec, frames, SETTINGS, lambda *told: seen.append(told), EngineSettings(jobs=2))
+    for name in rec.names:
+        assert torch.equal(here[name].z_depth, there[name].z_depth)
+    assert seen == [(step, done, 3) for step in ("depth", "depth agreement") for done in range(4)]

@@ -2,11 +2,13 @@
 
 from dataclasses import dataclass
 from pathlib import Path
+from typing import Annotated
 
-from swimm3r.cli.terminal.options import OutOrDefault
+from swimm3r.cli.terminal.options import FLAT, OutOrDefault
 from swimm3r.pipeline.presets import Preset
 from swimm3r.sfm.settings import BackendName
 from swimm3r.splat.settings import MapDevice, RecipeName
+from swimm3r.tasks.settings import EngineSettings
 from swimm3r.viewer.settings import Port, ViewerSettings
 
 
@@ -52,6 +54,10 @@ class ViewOptions:
     """Network address of --view: 127.0.0.1 for this computer alone, 0.0.0.0 for everyone who can reach it."""
     port: Port = ViewerSettings().port
     """Port of --view; the next free one where it is taken."""
+
+
+Engine = Annotated[EngineSettings, FLAT]
+HERE = EngineSettings()
 
 
 @dataclass(frozen=True)

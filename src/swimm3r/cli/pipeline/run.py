@@ -3,7 +3,7 @@
 from collections.abc import Callable
 from typing import Annotated
 
-from swimm3r.cli.pipeline.options import FolderOptions, MapOptions, PoseOptions, ViewOptions
+from swimm3r.cli.pipeline.options import HERE, Engine, FolderOptions, MapOptions, PoseOptions, ViewOptions
 from swimm3r.cli.pipeline.stages import require_adapter, run_stages
 from swimm3r.cli.terminal.options import FLAT, Source
 from swimm3r.pipeline.presets import RunSettings
@@ -21,6 +21,7 @@ def run_command(defaults: RunSettings) -> Callable:
         poses: Annotated[PoseOptions, FLAT] = PoseOptions(defaults.sfm.backend),  # noqa: B008
         map: Annotated[MapOptions, FLAT] = MapOptions(defaults.splat.recipe),  # noqa: B008
         page: Annotated[ViewOptions, FLAT] = ViewOptions(),  # noqa: B008
+        engine: Engine = HERE,
         frames: Annotated[FrameSettings, FLAT] = defaults.frames,
         sfm: Annotated[type(defaults.sfm), FLAT] = defaults.sfm,
         splat: type(defaults.splat) = defaults.splat,
@@ -33,6 +34,6 @@ def run_command(defaults: RunSettings) -> Callable:
         """
         require_adapter(poses.backend, sfm)
         settings = RunSettings(frames, sfm, splat, test)
-        run_stages(source, folder, settings, "eval", poses.reference, map.map_device, page)
+        run_stages(source, folder, settings, "eval", poses.reference, map.map_device, page, engine)
 
     return run

@@ -4,7 +4,7 @@ from collections.abc import Callable
 from dataclasses import replace
 from typing import Annotated
 
-from swimm3r.cli.pipeline.options import FolderOptions, PoseOptions
+from swimm3r.cli.pipeline.options import HERE, Engine, FolderOptions, PoseOptions
 from swimm3r.cli.pipeline.stages import require_adapter, run_stages
 from swimm3r.cli.terminal.options import FLAT, Source
 from swimm3r.pipeline.presets import RunSettings
@@ -19,6 +19,7 @@ def sfm_command(defaults: RunSettings) -> Callable:
         /,
         folder: Annotated[FolderOptions, FLAT] = FolderOptions(),  # noqa: B008 - records are frozen
         poses: Annotated[PoseOptions, FLAT] = PoseOptions(defaults.sfm.backend),  # noqa: B008
+        engine: Engine = HERE,
         frames: Annotated[FrameSettings, FLAT] = defaults.frames,
         sfm: Annotated[type(defaults.sfm), FLAT] = defaults.sfm,
     ) -> None:
@@ -28,6 +29,6 @@ def sfm_command(defaults: RunSettings) -> Callable:
             source: Video, or folder of images; or a run folder, to resume with its own input and settings.
         """
         require_adapter(poses.backend, sfm)
-        run_stages(source, folder, replace(defaults, frames=frames, sfm=sfm), "sfm", poses.reference)
+        run_stages(source, folder, replace(defaults, frames=frames, sfm=sfm), "sfm", poses.reference, engine=engine)
 
     return sfm

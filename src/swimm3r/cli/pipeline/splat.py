@@ -7,7 +7,7 @@ from typing import Annotated
 
 from tyro.conf import Positional, arg
 
-from swimm3r.cli.pipeline.options import FolderOptions, MapOptions, ViewOptions
+from swimm3r.cli.pipeline.options import HERE, Engine, FolderOptions, MapOptions, ViewOptions
 from swimm3r.cli.pipeline.stages import run_stages
 from swimm3r.cli.terminal.options import FLAT
 from swimm3r.errors import UsageError
@@ -41,6 +41,7 @@ def splat_command(defaults: RunSettings) -> Callable:
         model: Annotated[ModelOptions, FLAT] = ModelOptions(),
         map: Annotated[MapOptions, FLAT] = MapOptions(defaults.splat.recipe),  # noqa: B008
         page: Annotated[ViewOptions, FLAT] = ViewOptions(),  # noqa: B008
+        engine: Engine = HERE,
         frames: Annotated[FrameSettings, FLAT] = defaults.frames,
         sfm: Annotated[type(defaults.sfm), FLAT] = defaults.sfm,
         splat: type(defaults.splat) = defaults.splat,
@@ -54,7 +55,7 @@ def splat_command(defaults: RunSettings) -> Callable:
         given, poses = _input(source, model)
         found = sfm if poses is None else with_poses_of(poses, sfm)
         settings = RunSettings(frames, found, splat, test)
-        run_stages(given, folder, settings, "eval", model.reference, map.map_device, page)
+        run_stages(given, folder, settings, "eval", model.reference, map.map_device, page, engine)
 
     return splat
 

@@ -19,6 +19,7 @@ from swimm3r.progress import Progress
 from swimm3r.scene.run_folder import input_and_folder, is_run
 from swimm3r.sfm.settings import BackendName, Mast3rSettings, SfmSettings
 from swimm3r.splat.settings import RECIPES, MapDevice
+from swimm3r.tasks.settings import EngineSettings
 from swimm3r.viewer.settings import ViewerSettings
 
 RESULTS = {  # of the stages, as far as the folder holds them
@@ -80,6 +81,7 @@ def run_stages(
     reference: Path | None = None,
     map_device: MapDevice = "cpu",  # stages before the map ask for no GPU
     page: ViewOptions | None = None,
+    engine: EngineSettings = EngineSettings(),  # noqa: B008 - records are frozen
 ) -> None:
     """Run the stages up to the last one, then print the outcome, the files that hold it and the next command."""
     source, out = input_and_folder(source, given.out)
@@ -97,6 +99,7 @@ def run_stages(
             progress=told,
             on_stage=progress.begin_stage,
             observer=observer,
+            engine=engine,
         )
     print_summary(summary)
     print_results(out, {name: what for name, what in RESULTS.items() if name.startswith(_OF_STAGE[last])})

@@ -10,18 +10,25 @@ from swimm3r.sfm.colmap import poses
 from swimm3r.sfm.medium.apply import with_water
 from swimm3r.sfm.plane_sweep.estimate import estimate_depth
 from swimm3r.sfm.settings import ColmapSettings
+from swimm3r.tasks.settings import EngineSettings
 
 
 def check_files(settings: ColmapSettings) -> None:
     """COLMAP's settings name no file."""
 
 
-def reconstruct(frames: Frames, settings: ColmapSettings, folder: Path, progress: Progress = silent) -> Reconstruction:
+def reconstruct(
+    frames: Frames,
+    settings: ColmapSettings,
+    folder: Path,
+    progress: Progress = silent,
+    engine: EngineSettings = EngineSettings(),  # noqa: B008 - records are frozen
+) -> Reconstruction:
     """Poses first, and saved at once: what comes after reads them from there when an interrupted run goes on."""
     if not (folder / "reconstruction.json").is_file():
-        poses.reconstruct(frames, settings, folder, progress).save(folder, frames)
+        poses.reconstruct(frames, settings, folder, progress, engine=engine).save(folder, frames)
     rec = load_reconstruction(folder, frames)  # also where it was just made: the same bits as after an interruption
-    estimate_depth(rec, frames, settings.depth, progress)
+    estimate_depth(rec, frames, settings.depth, progress, engine)
     rec = with_water(rec, frames, settings, folder, progress)
     rec.save(folder, frames)
     return rec

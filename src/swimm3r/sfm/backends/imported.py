@@ -29,6 +29,7 @@ from swimm3r.sfm.plane_sweep.estimate import estimate_depth
 from swimm3r.sfm.plane_sweep.views import on_frame_grid
 from swimm3r.sfm.settings import ColmapModelSettings
 from swimm3r.sfm.tracks import MatchTracks, as_points
+from swimm3r.tasks.settings import EngineSettings
 
 
 def check_files(settings: ColmapModelSettings) -> None:
@@ -37,7 +38,11 @@ def check_files(settings: ColmapModelSettings) -> None:
 
 
 def reconstruct(
-    frames: Frames, settings: ColmapModelSettings, folder: Path, progress: Progress = silent
+    frames: Frames,
+    settings: ColmapModelSettings,
+    folder: Path,
+    progress: Progress = silent,
+    engine: EngineSettings = EngineSettings(),  # noqa: B008 - records are frozen
 ) -> Reconstruction:
     """The reconstruction of the frames that the model names. Raises InputError where fewer than 2 of them are in it."""
     foreign = read_foreign(settings.model)
@@ -46,7 +51,7 @@ def reconstruct(
         rec = _with_points(rec, frames, foreign, settings, folder, progress)
     rec.save(folder, frames)
     if foreign.depth is None:
-        estimate_depth(rec, frames, settings.depth, progress)
+        estimate_depth(rec, frames, settings.depth, progress, engine)
     else:
         write_depth(rec, frames, foreign, progress)
     rec = with_water(rec, frames, settings, folder, progress)

@@ -40,6 +40,7 @@ from swimm3r.sfm.settings import Mast3rSettings
 from swimm3r.sfm.student import adapter_file
 from swimm3r.sfm.student.physics_head import PhysicsHead
 from swimm3r.sfm.tracks import FrameMatches, MatchTracks
+from swimm3r.tasks.settings import EngineSettings
 
 _WATER = "water"  # of what the physics head read, in the working folder
 _FOLDER = "mast3r"  # of what is kept until the run is done, in the working folder
@@ -53,8 +54,16 @@ def check_files(settings: Mast3rSettings) -> None:
         adapter_file.describe(settings.adapter)
 
 
-def reconstruct(frames: Frames, settings: Mast3rSettings, folder: Path, progress: Progress = silent) -> Reconstruction:
+def reconstruct(
+    frames: Frames,
+    settings: Mast3rSettings,
+    folder: Path,
+    progress: Progress = silent,
+    engine: EngineSettings = EngineSettings(),  # noqa: B008 - records are frozen
+) -> Reconstruction:
     """Cameras, points, matches, dense depth, water and restored cloud of the frames that hang together.
+
+    All is done in this process, whatever the `engine`: one network holds the device.
 
     Raises UsageError for settings that contradict each other, WeightsError for a missing, damaged or wrong checkpoint
     or one that predicts no numbers, DeviceError, and RegistrationError where the frames do not hang together.

@@ -5,7 +5,6 @@ ends where an undisturbed one does. Poses are free in scale and place: nothing h
 """
 
 import itertools
-import os
 import shutil
 from collections.abc import Iterator
 from contextlib import contextmanager
@@ -40,6 +39,8 @@ from swimm3r.sfm.features import vlad
 from swimm3r.sfm.features.database import FeatureDatabase, fill_features, match_pairs, start_database
 from swimm3r.sfm.features.sift import unit_descriptors
 from swimm3r.sfm.settings import ColmapSettings
+from swimm3r.tasks.settings import EngineSettings
+from swimm3r.tasks.threads import thread_count
 
 if TYPE_CHECKING:
     import pycolmap
@@ -53,6 +54,7 @@ def reconstruct(
     folder: Path,
     progress: Progress = silent,
     lens: Cameras | None = None,
+    engine: EngineSettings = EngineSettings(),  # noqa: B008 - records are frozen
 ) -> Reconstruction:
     """Cameras, points, tracks and matches of the frames that can be placed; depth maps are for others to fill.
 
@@ -67,7 +69,7 @@ def reconstruct(
             hint="a longer clip or a higher --fps",
         )
     silence_log()
-    threads = settings.threads or os.cpu_count() or 1
+    threads = settings.threads or thread_count()
     if lens is None:
         camera = calibration.first_camera(frames.width, frames.height, settings)
     else:
@@ -85,7 +87,7 @@ def reconstruct(
         try:
             with atomic_path(working.path) as draft:
                 shutil.copyfile(store.path, draft)
-            model, sizes, warnings = _map(working, frames, pairs, settings, progress)
+            model, sizes, warnings = _map(working, frames, pairs, settings, progress, engine)
             rec = _record(model, working, frames, folder)
             found = implausible(rec, working, frames)
         finally:
@@ -181,11 +183,12 @@ def _map(
     pairs: list[tuple[int, int]],
     settings: ColmapSettings,
     progress: Progress,
+    engine: EngineSettings,
 ) -> "tuple[pycolmap.Reconstruction, list[int], list[Warning]]":
-    n, threads = len(frames), settings.threads or os.cpu_count() or 1
+    n, threads = len(frames), settings.threads or thread_count()
     long = is_long(n, settings.mapping)
     if long:
-        models = map_long_clip(store, settings, ordered=frames.ordered, progress=progress)
+        models = map_long_clip(store, settings, ordered=frames.ordered, progress=progress, engine=engine)
     else:
         models = mapping.map_frames(store, settings, progress)
     if not models:

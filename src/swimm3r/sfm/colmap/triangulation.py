@@ -4,7 +4,6 @@ For files that name poses and no observations (transforms.json, cameras.xml): wi
 to be looked for. Poses and lenses stay as they are.
 """
 
-import os
 import tempfile
 from dataclasses import replace
 from pathlib import Path
@@ -21,6 +20,7 @@ from swimm3r.sfm.colmap import poses
 from swimm3r.sfm.features.database import fill_features, match_pairs, start_database
 from swimm3r.sfm.settings import ColmapSettings, FeatureSettings
 from swimm3r.sfm.tracks import MatchTracks, as_points
+from swimm3r.tasks.threads import thread_count
 
 
 def triangulate(
@@ -34,7 +34,7 @@ def triangulate(
 
     silence_log()
     order = [frames.index(name) for name in rec.names]
-    placed, threads = frames.select(order), os.cpu_count() or 1
+    placed, threads = frames.select(order), thread_count()
     table = rec.colmap_model()
     bare = replace(
         table, names=tuple(f"{i:06d}" for i in range(len(rec.names))),

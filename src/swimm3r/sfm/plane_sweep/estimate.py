@@ -7,12 +7,13 @@ where it is well correlated, where moving it makes it worse, and where other fra
 sand come out unknown (0), not invented. The work is done on undistorted images, the result lies on the frame's grid.
 """
 
-import os
 import shutil
 from collections.abc import Callable, Sequence
 from concurrent.futures import ThreadPoolExecutor, as_completed
 from dataclasses import dataclass
+from functools import lru_cache, partial
 from pathlib import Path
+from typing import Literal
 
 import numpy as np
 import torch
@@ -30,6 +31,7 @@ from swimm3r.io.files.damage import remake
 from swimm3r.progress import Progress, silent
 from swimm3r.scene.frames import Frames
 from swimm3r.scene.reconstruction import DepthMap, DepthMaps, Reconstruction
+from swimm3r.scene.reconstruction_io import load_reconstruction
 from swimm3r.sfm.plane_sweep import consistency, kernels
 from swimm3r.sfm.plane_sweep.level import Level, Round, SweepNumbers
 from swimm3r.sfm.plane_sweep.refinement import refine, window
@@ -43,10 +45,16 @@ from swimm3r.sfm.plane_sweep.views import (
     on_frame_grid,
 )
 from swimm3r.sfm.settings import PlaneSweepSettings
+from swimm3r.tasks import run_tasks
+from swimm3r.tasks.settings import EngineSettings
+from swimm3r.tasks.threads import thread_count
+
+Step = Literal["depth", "depth agreement"]
 
 _RAW = ".raw"  # beside the finished maps: each frame's own opinion, removed once every frame is finished
 _RAW_LAYOUTS = {"inverse_depth": Layout("h w"), "correlation": Layout("h w")}
 _STAMP = ".made_from"  # of which cameras, points and settings the folder's maps were made
+_OF_A_TASK = 16  # frames
 _NEIGHBORS = 8  # frames asked whether they agree
 _MOST_SOURCES = 16
 _REACH = np.arange(-3, 4)  # the slanted windows' pixels, along each axis
@@ -62,68 +70,123 @@ class RawDepth:
 
 
 def estimate_depth(
-    rec: Reconstruction, frames: Frames, settings: PlaneSweepSettings, progress: Progress = silent
+    rec: Reconstruction,
+    frames: Frames,
+    settings: PlaneSweepSettings,
+    progress: Progress = silent,
+    engine: EngineSettings = EngineSettings(),  # noqa: B008 - records are frozen
 ) -> DepthMaps:
     """The depth maps of every registered frame, written to `rec.depth` on the frames' own pixel grid.
 
     Maps of an interrupted call with the same cameras, points and settings are kept, others are made anew. A frame that
-    sees fewer than 8 points, or has no source views, gets a map without depth.
+    sees fewer than 8 points, or has no source views, gets a map without depth. `engine` can spread the frames over
+    processes or a cluster, which read the reconstruction from the folder that it was saved in. Raises the error of the
+    first frame that failed.
     """
-    device = for_depth(settings.device)
     folder = rec.depth.folder
     _claim(folder, _stamp(rec, frames, settings))
-    canvas = covering_pinholes(rec.cameras, settings.long_side)
-    sources = choose_sources(rec, max(settings.sources, _NEIGHBORS), settings.angle_deg)
-    pose_error = _pose_error(rec, canvas)
-    position = {name: k for k, name in enumerate(frames.names)}
-    views, raws = ArrayCache(max_bytes=256 << 20), ArrayCache(max_bytes=256 << 20)
-
-    def view(i: int) -> SweepView:
-        def load() -> tuple[np.ndarray, ...]:
-            k = position[rec.names[i]]
-            made = make_view(frames.image(k), frames.mask(k), rec.cameras[i], canvas[i])
-            return made.gray.numpy(), made.detail.numpy(), made.seen.numpy()
-
-        gray, detail, seen = (torch.from_numpy(a.copy()) for a in views.get(i, load))
-        return SweepView(gray, detail, seen, canvas.K[i], canvas[i].world2cam[0])
-
-    def raw_path(i: int) -> Path:
-        return folder / _RAW / f"{rec.names[i]}.npz"
-
-    def raw_of(i: int) -> RawDepth:
-        def load() -> tuple[np.ndarray, ...]:
-            stored = read_arrays(raw_path(i), _RAW_LAYOUTS, remake(folder))
-            return stored["inverse_depth"], stored["correlation"]
-
-        return RawDepth(*(torch.from_numpy(a.copy()) for a in raws.get(i, load)))
-
-    def sweep_one(i: int) -> None:
-        span, compared = depth_range(rec, i), sources[i][: settings.sources]
-        raw = RawDepth(torch.zeros(canvas.height, canvas.width), torch.zeros(canvas.height, canvas.width))
-        if span is not None and compared:
-            raw = sweep(view(i), [view(j) for j in compared], span, settings, device)
-        with atomic_path(raw_path(i)) as draft:
-            np.savez(draft, inverse_depth=raw.inverse_depth.numpy(), correlation=raw.correlation.numpy())
-
-    def agree_one(i: int) -> None:
-        fused = consistent(raw_of(i), [raw_of(j) for j in sources[i]], canvas[[i, *sources[i]]], pose_error, settings)
-        image = frames.image(position[rec.names[i]])
-        q, confidence = on_frame_grid(
-            fused.inverse_depth, fused.correlation, view(i).gray, image, rec.cameras[i], canvas[i]
-        )
-        usable = (q > 0) & frames.mask(position[rec.names[i]])
-        z_depth = torch.where(usable, 1 / q.clamp(min=1e-12), 0.0)
-        rec.depth.write(rec.names[i], DepthMap(z_depth, torch.where(usable, confidence, 0.0)))
-
+    passes = _Passes(rec, frames, settings)
     todo = [i for i, name in enumerate(rec.names) if name not in rec.depth]
-    wanted = sorted({j for i in todo for j in (i, *sources[i])})
-    missing = [i for i in wanted if not raw_path(i).is_file()]
-    _each(sweep_one, missing, len(wanted), settings.threads, lambda done, total: progress("depth", done, total))
-    _each(
-        agree_one, todo, len(rec.names), settings.threads, lambda done, total: progress("depth agreement", done, total)
+    wanted = sorted({j for i in todo for j in (i, *passes.sources[i])})
+    missing = [i for i in wanted if not passes.raw_path(i).is_file()]
+    steps: tuple[tuple[Step, list[int], int], ...] = (
+        ("depth", missing, len(wanted)),
+        ("depth agreement", todo, len(rec.names)),
     )
+    for name, left, total in steps:
+        if engine.is_in_this_process:
+            _each(passes.step(name), left, total, settings.threads, partial(progress, name))
+            continue
+        parts = [
+            PartOfPass(f"{name} of frames {k} to {k + _OF_A_TASK}", name, tuple(left[k : k + _OF_A_TASK]))
+            for k in range(0, len(left), _OF_A_TASK)
+        ]
+        work = partial(make_part, folder=folder.parent.resolve(), frames=frames, settings=settings)
+        if failures := run_tasks(work, parts, engine, progress, name, logs=folder.parent.resolve() / "logs"):
+            raise failures[0].error
     shutil.rmtree(folder / _RAW, ignore_errors=True)
     return rec.depth
+
+
+@dataclass(frozen=True)
+class PartOfPass:
+    """Frames, by their index in the reconstruction, that one task sweeps or compares."""
+
+    name: str
+    step: Step
+    frames: tuple[int, ...]
+
+
+def make_part(part: PartOfPass, *, folder: Path, frames: Frames, settings: PlaneSweepSettings) -> None:
+    """The task of some frames, with the reconstruction that a folder holds; finished ones are left as they are."""
+    passes = _passes_over(folder, frames, settings)
+    left = [i for i in part.frames if not passes.is_done(part.step, i)]
+    _each(passes.step(part.step), left, len(part.frames), settings.threads, lambda done, total: None)
+
+
+@lru_cache(maxsize=1)  # several tasks in one process
+def _passes_over(folder: Path, frames: Frames, settings: PlaneSweepSettings) -> "_Passes":
+    return _Passes(load_reconstruction(folder, frames), frames, settings)
+
+
+class _Passes:
+    """The two passes over the frames of a reconstruction, with the views and maps they read kept in memory."""
+
+    def __init__(self, rec: Reconstruction, frames: Frames, settings: PlaneSweepSettings) -> None:
+        self._rec, self._frames, self._settings = rec, frames, settings
+        self._device = for_depth(settings.device)
+        self._canvas = covering_pinholes(rec.cameras, settings.long_side)
+        self.sources = choose_sources(rec, max(settings.sources, _NEIGHBORS), settings.angle_deg)
+        self._pose_error = _pose_error(rec, self._canvas)
+        self._position = {name: k for k, name in enumerate(frames.names)}
+        self._views, self._raws = ArrayCache(max_bytes=256 << 20), ArrayCache(max_bytes=256 << 20)
+
+    def raw_path(self, i: int) -> Path:
+        return self._rec.depth.folder / _RAW / f"{self._rec.names[i]}.npz"
+
+    def step(self, name: Step) -> Callable[[int], None]:
+        return self._sweep_one if name == "depth" else self._agree_one
+
+    def is_done(self, name: Step, i: int) -> bool:
+        return self.raw_path(i).is_file() if name == "depth" else self._rec.names[i] in self._rec.depth
+
+    def _view(self, i: int) -> SweepView:
+        def load() -> tuple[np.ndarray, ...]:
+            k = self._position[self._rec.names[i]]
+            image, mask = self._frames.image(k), self._frames.mask(k)
+            made = make_view(image, mask, self._rec.cameras[i], self._canvas[i])
+            return made.gray.numpy(), made.detail.numpy(), made.seen.numpy()
+
+        gray, detail, seen = (torch.from_numpy(a.copy()) for a in self._views.get(i, load))
+        return SweepView(gray, detail, seen, self._canvas.K[i], self._canvas[i].world2cam[0])
+
+    def _raw_of(self, i: int) -> RawDepth:
+        def load() -> tuple[np.ndarray, ...]:
+            stored = read_arrays(self.raw_path(i), _RAW_LAYOUTS, remake(self._rec.depth.folder))
+            return stored["inverse_depth"], stored["correlation"]
+
+        return RawDepth(*(torch.from_numpy(a.copy()) for a in self._raws.get(i, load)))
+
+    def _sweep_one(self, i: int) -> None:
+        canvas, settings = self._canvas, self._settings
+        span, compared = depth_range(self._rec, i), self.sources[i][: settings.sources]
+        raw = RawDepth(torch.zeros(canvas.height, canvas.width), torch.zeros(canvas.height, canvas.width))
+        if span is not None and compared:
+            raw = sweep(self._view(i), [self._view(j) for j in compared], span, settings, self._device)
+        with atomic_path(self.raw_path(i)) as draft:
+            np.savez(draft, inverse_depth=raw.inverse_depth.numpy(), correlation=raw.correlation.numpy())
+
+    def _agree_one(self, i: int) -> None:
+        rec, frames, canvas, others = self._rec, self._frames, self._canvas, self.sources[i]
+        raws = [self._raw_of(j) for j in others]
+        fused = consistent(self._raw_of(i), raws, canvas[[i, *others]], self._pose_error, self._settings)
+        k = self._position[rec.names[i]]
+        q, confidence = on_frame_grid(
+            fused.inverse_depth, fused.correlation, self._view(i).gray, frames.image(k), rec.cameras[i], canvas[i]
+        )
+        usable = (q > 0) & frames.mask(k)
+        z_depth = torch.where(usable, 1 / q.clamp(min=1e-12), 0.0)
+        rec.depth.write(rec.names[i], DepthMap(z_depth, torch.where(usable, confidence, 0.0)))
 
 
 def sweep(
@@ -296,7 +359,7 @@ def _each(
 ) -> None:
     """Do the work for every item on several threads (the kernels release the interpreter); `tell` may stop it."""
     done = total - len(items)
-    with ThreadPoolExecutor(threads or min(8, os.cpu_count() or 1)) as pool:
+    with ThreadPoolExecutor(threads or min(8, thread_count())) as pool:
         pending = [pool.submit(work, item) for item in items]
         try:
             for future in as_completed(pending):

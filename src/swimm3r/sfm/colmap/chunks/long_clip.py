@@ -5,7 +5,6 @@ fail, and frames that a chunk leaves over, are those of no part; models that not
 largest.
 """
 
-import os
 from pathlib import Path
 from typing import TYPE_CHECKING
 
@@ -23,6 +22,8 @@ from swimm3r.sfm.colmap.chunks.place import ChunkTask, place_chunks, placed_mode
 from swimm3r.sfm.colmap.chunks.plan import order_by_matches, plan_chunks
 from swimm3r.sfm.features.database import MIN_INLIERS, FeatureDatabase
 from swimm3r.sfm.settings import ColmapSettings, MappingSettings
+from swimm3r.tasks.settings import EngineSettings
+from swimm3r.tasks.threads import thread_count
 
 if TYPE_CHECKING:
     import pycolmap
@@ -37,7 +38,12 @@ def is_long(frames: int, settings: MappingSettings) -> bool:
 
 
 def map_long_clip(
-    store: FeatureDatabase, settings: ColmapSettings, *, ordered: bool, progress: Progress
+    store: FeatureDatabase,
+    settings: ColmapSettings,
+    *,
+    ordered: bool,
+    progress: Progress,
+    engine: EngineSettings = EngineSettings(),  # noqa: B008 - records are frozen
 ) -> "list[pycolmap.Reconstruction]":
     """Models of a clip of any length, the largest first; adjusted under one lens, which is left in the database."""
     matches = match_counts(store)
@@ -50,7 +56,7 @@ def map_long_clip(
         return []
     tasks = [_task(store, chunk, lens, matches, settings, folder) for chunk in chunks]
     remove_stale(folder, {task.folder.name for task in tasks} | {PILOT})
-    place_chunks(tasks, settings.threads or os.cpu_count() or 1, _PLACING, progress)
+    place_chunks(tasks, settings.threads or thread_count(), _PLACING, progress, engine)
     parts = [part_of(model) for task in tasks for model in placed_models(task.folder)]
     return _join(store, parts, lens, settings, progress)
 

@@ -18,6 +18,8 @@ from swimm3r.sfm.colmap import calibration
 from swimm3r.sfm.colmap.mapping import map_frames
 from swimm3r.sfm.features.database import FeatureDatabase, write_excerpt
 from swimm3r.sfm.settings import ColmapSettings
+from swimm3r.tasks import run_tasks
+from swimm3r.tasks.settings import EngineSettings
 
 if TYPE_CHECKING:
     import pycolmap
@@ -56,8 +58,23 @@ def place_chunk(task: ChunkTask, progress: Progress = silent) -> None:
             model.write_binary(str(draft / str(k)))
 
 
-def place_chunks(tasks: Sequence[ChunkTask], threads: int, label: str, progress: Progress) -> None:
-    """Place several chunks at a time (COLMAP releases the interpreter); `progress` may stop it."""
+def place_chunks(
+    tasks: Sequence[ChunkTask],
+    threads: int,
+    label: str,
+    progress: Progress,
+    engine: EngineSettings = EngineSettings(),  # noqa: B008 - records are frozen
+) -> None:
+    """Place several chunks at a time, in threads (COLMAP releases the interpreter) or where `engine` says.
+
+    `progress` may stop it. Raises the error of the first chunk that could not be placed, after the others.
+    """
+    if not engine.is_in_this_process:
+        absolute = [replace(task, database=task.database.resolve(), folder=task.folder.resolve()) for task in tasks]
+        logs = absolute[0].database.parent / "logs" if absolute else None
+        if failures := run_tasks(place_chunk, absolute, engine, progress, label, logs=logs):
+            raise failures[0].error
+        return
     stopped = Event()
 
     def watch(what: str, done: int, total: int, /) -> None:
