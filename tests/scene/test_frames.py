@@ -36,6 +36,19 @@ def test_images_are_floats_from_nought_to_one_whatever_their_depth(dive, tmp_pat
     torch.testing.assert_close(dive.image(20), torch.full((100, 160, 3), 30000 / 65535))
 
 
+def test_colors_of_some_pixels_are_those_of_the_image(dive):
+    pixels = torch.tensor([0, 5, dive.width + 3, dive.width * dive.height - 1])
+    assert torch.equal(dive.colors(1, pixels), dive.image(1).reshape(-1, 3)[pixels])
+
+
+def test_the_cache_keeps_a_few_images_however_large_they_are(dive, monkeypatch):
+    cache = ArrayCache(max_bytes=1, least_entries=2)
+    monkeypatch.setattr(frames_module, "_CACHE", cache)
+    for i in range(len(dive)):
+        dive.image(i)
+    assert cache.nbytes == 2 * dive.width * dive.height * 3
+
+
 def test_a_frame_without_a_mask_may_be_used_everywhere(dive):
     assert dive.mask(3).shape == (100, 160)
     assert dive.mask(3).all()

@@ -11,11 +11,12 @@ import pytest
 import torch
 
 from swimm3r.errors import InputError
+from swimm3r.imaging.undistortion import frame_rays
 from swimm3r.medium import AttenuationCurve, Medium, MediumFit
 from swimm3r.scene.reconstruction import DepthMaps, Reconstruction
 from swimm3r.settings import Range, Settings, declarations, ranges_of
 from swimm3r.sfm.features.sift import extract_features
-from swimm3r.sfm.medium.dense_tracks import fuse_depth, shared_rays
+from swimm3r.sfm.medium.dense_tracks import fuse_depth
 from swimm3r.sfm.medium.restore import restore_image, restored_cloud
 from swimm3r.sfm.medium.seathru import estimate_medium
 from swimm3r.sfm.plane_sweep.estimate import estimate_depth
@@ -102,7 +103,7 @@ def test_images_and_points_are_restored(name: str, number: float, dive, known_wa
     tracks = fuse_depth(dive.rec, dive.frames, TrackSettings(max_tracks=500))
     cloud = restored_cloud(dive.rec, dive.frames, tracks, known_water, settings)
     assert 0 < len(cloud.xyz) <= settings.max_points
-    depth, rays = dive.rec.depth[dive.rec.names[3]], shared_rays(dive.rec.cameras)[3]
+    depth, rays = dive.rec.depth[dive.rec.names[3]], frame_rays(dive.rec.cameras[3])
     done = restore_image(dive.frames.image(3), depth, rays, known_water, settings)
     assert bool(done.clear.isfinite().all())
 

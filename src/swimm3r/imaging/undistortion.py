@@ -55,6 +55,11 @@ def pinhole_grid(camera: Cameras, pinhole: Cameras) -> tuple[np.ndarray, np.ndar
     return _pinhole_grid(_key(camera), _key(pinhole))
 
 
+def frame_rays(camera: Cameras) -> Float[Tensor, "h w 3"]:
+    """`image_directions` of a frame's camera in float32; those of a few lenses are kept."""
+    return _rays(_key(camera))
+
+
 def undistorted_pixels(
     camera: Cameras, xy: Float[Tensor, "m 2"], K: Float[Tensor, "3 3"] | None = None
 ) -> Float[Tensor, "m 2"]:
@@ -159,6 +164,11 @@ def _pinhole_grid(camera: _Key, pinhole: _Key) -> tuple[np.ndarray, np.ndarray]:
     at = undistorted_pixels(lens, pixel_grid(lens.height, lens.width).reshape(-1, 2), K) - 0.5
     column, row = torch.where(at.isfinite().all(-1, keepdim=True), at, -9.0).numpy().T
     return np.ascontiguousarray(column), np.ascontiguousarray(row)
+
+
+@lru_cache(maxsize=4)
+def _rays(camera: _Key) -> Float[Tensor, "h w 3"]:
+    return image_directions(_camera(camera)).float()
 
 
 def _lenses(cameras: Cameras) -> tuple[Cameras, Int[Tensor, " c"]]:

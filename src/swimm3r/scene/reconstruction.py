@@ -21,7 +21,7 @@ from swimm3r import notebook
 from swimm3r.cameras import Cameras, project
 from swimm3r.io import ply
 from swimm3r.io.colmap import model as colmap
-from swimm3r.io.files.array_file import Layout, read_arrays
+from swimm3r.io.files.array_file import Layout, read_arrays, write_arrays
 from swimm3r.io.files.atomic import atomic_path, write_text
 from swimm3r.io.files.cache import ArrayCache
 from swimm3r.io.files.damage import remake
@@ -31,7 +31,7 @@ from swimm3r.medium import MediumFit, save_fits
 from swimm3r.scene.frames import Frames
 from swimm3r.scene.white_balance import UNBALANCED, WHITE_BALANCE, WhiteBalance
 
-_CACHE = ArrayCache(max_bytes=1 << 30)
+_CACHE = ArrayCache(max_bytes=256 << 20, least_entries=20)
 _SHOWN_WARNINGS = 10  # in a notebook
 _DEPTH = {"z_depth": Layout("h w"), "confidence": Layout("h w")}
 
@@ -115,7 +115,7 @@ class DepthMaps:
         """Store the map of a frame: depth as float32, confidence as float16."""
         path = self.path(name)
         with atomic_path(path) as draft:
-            np.savez_compressed(
+            write_arrays(
                 draft,
                 z_depth=depth.z_depth.numpy().astype(np.float32),
                 confidence=depth.confidence.numpy().astype(np.float16),

@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 from swimm3r.errors import InputError
-from swimm3r.io.files.array_file import Layout, read_arrays
+from swimm3r.io.files.array_file import Layout, read_arrays, write_arrays
 from swimm3r.io.files.damage import remake
 
 LAYOUTS = {"i": Layout("m", "int"), "xy": Layout("m 2"), "seen": Layout("m", finite=False)}
@@ -22,8 +22,9 @@ def claiming(shape: tuple[int, ...]) -> bytes:
     return out.getvalue() + b"\0" * 24
 
 
-def test_what_was_written_is_read(tmp_path: Path):
-    np.savez_compressed(tmp_path / "a.npz", **GOOD, more=np.zeros(1))
+@pytest.mark.parametrize("write", [np.savez_compressed, write_arrays])
+def test_what_was_written_is_read(write, tmp_path: Path):
+    write(tmp_path / "a.npz", **GOOD, more=np.zeros(1))
     found = read_arrays(tmp_path / "a.npz", LAYOUTS, remake(tmp_path))
     assert found.keys() == GOOD.keys()
     for name, values in GOOD.items():

@@ -5,7 +5,7 @@ from dataclasses import replace
 import torch
 
 from swimm3r.scene.reconstruction import DepthMap, DepthMaps
-from swimm3r.sfm.medium.dense_tracks import cubes, frame_overlap, fuse_depth
+from swimm3r.sfm.medium.dense_tracks import Surfaces, cubes, fuse_depth
 from swimm3r.sfm.settings import TrackSettings
 
 
@@ -56,10 +56,13 @@ def test_fewer_tracks_are_started_where_memory_is_bounded(dive):
 
 
 def test_a_frame_farther_away_sees_all_that_a_near_one_sees(dive):
-    overlap = frame_overlap(dive.rec, list(range(len(dive.rec.names))))
-    assert overlap[0, -1] == 1.0
-    assert overlap[-1, 0] < 0.2
-    assert (overlap.diagonal() == 0).all()
+    last = len(dive.rec.names) - 1
+    surfaces = Surfaces(dive.rec, list(range(last + 1)))
+    (near, of_near), (far, of_far) = surfaces.overlap(0), surfaces.overlap(last)
+    assert of_near[near == last] == 1.0
+    assert not (near == 0).any()
+    assert 0.0 not in of_far[far == 0]
+    assert of_far[far == 0] < 0.2
 
 
 def test_points_share_a_cube_only_if_it_is_the_same_cube():
@@ -68,3 +71,27 @@ def test_points_share_a_cube_only_if_it_is_the_same_cube():
     assert which[0] == which[1]
     assert len(which[[0, 2, 3, 4]].unique()) == 4
     assert count.sum() == len(xyz)
+
+
+def test_the_surface_of_a_frame_is_looked_up_in_frames_near_it_only(dive, tmp_path):
+    """A second dive far away: the frames of either overlap with their own only, and the tracks are those of both."""
+    far = dive.rec.cameras.cam2world.clone()
+    far[:, 0, 3] += 1000.0
+    count = len(dive.rec.names)
+    cameras = replace(dive.rec.cameras, **{
+        "K": dive.rec.cameras.K.repeat(2, 1, 1), "distortion": dive.rec.cameras.distortion.repeat(2, 1),
+        "cam2world": torch.cat([dive.rec.cameras.cam2world, far]),
+    })  # fmt: skip
+    depth, twice = DepthMaps(tmp_path), tuple(f"{part}/{name}" for part in ("a", "b") for name in dive.rec.names)
+    for k, name in enumerate(twice):
+        depth.write(name, dive.rec.depth[dive.rec.names[k % count]])
+    rec = replace(dive.rec, names=twice, cameras=cameras, depth=depth)
+    frames = replace(dive.frames, frames=tuple(
+        replace(dive.frames.frames[k % count], name=name) for k, name in enumerate(twice)
+    ))  # fmt: skip
+    surfaces = Surfaces(rec, list(range(2 * count)))
+    assert (surfaces.overlap(0)[0] < count).all()
+    assert (surfaces.overlap(count)[0] >= count).all()
+    alone, both = (fuse_depth(a, b, TrackSettings()) for a, b in ((dive.rec, dive.frames), (rec, frames)))
+    assert len(both.xyz) == 2 * len(alone.xyz)
+    assert len(both.pixel) == 2 * len(alone.pixel)

@@ -16,7 +16,7 @@ from swimm3r.scene.frames import Frame, Frames
 from swimm3r.scene.reconstruction import DepthMaps, Matches, Points, Reconstruction, Tracks
 from swimm3r.sfm.plane_sweep import estimate
 from swimm3r.sfm.plane_sweep.estimate import RawDepth, consistent, estimate_depth, sweep
-from swimm3r.sfm.plane_sweep.views import SweepView, choose_sources, depth_range, make_view
+from swimm3r.sfm.plane_sweep.views import SweepView, choose_sources, depth_range, make_view, points_by_frame
 from swimm3r.sfm.settings import PlaneSweepSettings
 from swimm3r.tasks import EngineSettings
 
@@ -177,7 +177,7 @@ def test_sources_are_the_frames_with_the_better_baseline(tmp_path: Path):
 def test_the_searched_depths_enclose_the_points_with_room_behind(tmp_path: Path):
     rec = reconstruction(dive(), SLANTED, tmp_path)
     z = project(rec.cameras[2], rec.points.xyz[None])[1]
-    near, far = depth_range(rec, 2) or (0.0, 0.0)
+    near, far = depth_range(rec, 2, points_by_frame(rec)[2]) or (0.0, 0.0)
     assert 0.5 * z.min() < near < z.min()
     assert far > 1.5 * z.max()
 
@@ -249,6 +249,20 @@ def test_an_interrupted_sweep_goes_on_where_it_stopped(tmp_path: Path):
     assert all(what == "depth agreement" and done > 3 for what, done in seen)
     for name in rec.names:
         assert torch.equal(resumed[name].z_depth, whole[name].z_depth)
+
+
+def test_the_number_of_threads_changes_no_bit(tmp_path: Path):
+    cameras = dive()
+    frames = frames_on_disk(cameras, SLANTED, tmp_path)
+    one, four = (
+        estimate_depth(
+            reconstruction(cameras, SLANTED, tmp_path / str(threads)), frames, replace(SETTINGS, threads=threads)
+        )
+        for threads in (1, 4)
+    )
+    for name in frames.names:
+        assert torch.equal(one[name].z_depth, four[name].z_depth)
+        assert torch.equal(one[name].confidence, four[name].confidence)
 
 
 def test_maps_of_other_cameras_are_not_kept(tmp_path: Path):

@@ -28,6 +28,14 @@ def read_arrays(path: Path, layouts: Mapping[str, Layout], remedy: Remedy) -> di
         return {name: _array(archive, name, layout, lengths) for name, layout in layouts.items()}
 
 
+def write_arrays(path: Path, **arrays: np.ndarray) -> None:
+    """An .npz like `savez_compressed` writes it, in a third of its time: measured depth hardly packs any smaller."""
+    with zipfile.ZipFile(path, "w", zipfile.ZIP_DEFLATED, compresslevel=1) as archive:
+        for name, array in arrays.items():
+            with archive.open(f"{name}.npy", "w", force_zip64=True) as file:
+                np.lib.format.write_array(file, np.ascontiguousarray(array), version=(1, 0), allow_pickle=False)
+
+
 def _array(archive: zipfile.ZipFile, name: str, layout: Layout, lengths: dict[str, int]) -> np.ndarray:
     values = _decoded(archive, name)
     if values.dtype.kind not in {"float": "f", "int": "iu"}[layout.kind]:

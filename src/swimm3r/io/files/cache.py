@@ -11,10 +11,13 @@ Arrays = TypeVar("Arrays", bound=tuple[np.ndarray, ...])
 
 
 class ArrayCache:
-    """The least recently used arrays go first once `max_bytes` is exceeded; safe to share between threads."""
+    """The least recently used arrays go first once `max_bytes` is exceeded; safe to share between threads.
 
-    def __init__(self, max_bytes: int) -> None:
-        self.max_bytes = max_bytes
+    `least_entries` stay whatever their size: work that goes back and forth between a few large images needs them all.
+    """
+
+    def __init__(self, max_bytes: int, least_entries: int = 1) -> None:
+        self.max_bytes, self.least_entries = max_bytes, least_entries
         self._held: OrderedDict[Hashable, tuple[np.ndarray, ...]] = OrderedDict()
         self._lock = threading.Lock()
 
@@ -36,7 +39,7 @@ class ArrayCache:
         with self._lock:
             self._held[key] = arrays
             total = sum(a.nbytes for held in self._held.values() for a in held)
-            while total > self.max_bytes and len(self._held) > 1:
+            while total > self.max_bytes and len(self._held) > self.least_entries:
                 _, dropped = self._held.popitem(last=False)
                 total -= sum(a.nbytes for a in dropped)
         return arrays

@@ -12,7 +12,7 @@ from swimm3r.sfm.medium.backdrop import Backdrop
 from swimm3r.sfm.medium.dense_tracks import fuse_depth
 from swimm3r.sfm.medium.from_head import PredictedWater, dive_fit, predicted_images
 from swimm3r.sfm.medium.plausibility import water_warnings
-from swimm3r.sfm.medium.restore import restored_cloud, restored_images, white_balance
+from swimm3r.sfm.medium.restore import RestoredImage, restored_cloud, restored_images, white_balance
 from swimm3r.sfm.medium.samples import collect_samples
 from swimm3r.sfm.medium.seathru import fit_medium
 from swimm3r.sfm.settings import SfmSettings
@@ -51,16 +51,19 @@ def with_water(
     doubts = water_warnings(stored, gray=frames.gray, predicted=predicted is not None, linear=linear)
     rec = replace(rec, medium=stored, medium_linear=linear, cloud=cloud, warnings=(*rec.warnings, *doubts))
     rec = replace(rec, white_balance=white_balance(rec, settings.restore))
-    restored = (
-        restored_images(rec, frames, settings.restore, progress)
-        if predicted is None
-        else predicted_images(rec, frames, predicted, progress)
-    )
-    backdrop = Backdrop(rec, frames)
-    for i, image in restored:
-        filmed = rec.white_balance.source == "filmed"
+    filmed = rec.white_balance.source == "filmed"
+
+    def keep(i: int, image: RestoredImage) -> None:
         shown = frames.image(frames.index(rec.names[i])) if filmed else image.shown
         images.write_rgb(folder / "restored" / f"{rec.names[i]}.png", shown.numpy())
         images.write_rgb_16(folder / "restored_physical" / f"{rec.names[i]}.png", image.clear.numpy())
+
+    restored = (
+        restored_images(rec, frames, settings.restore, progress, keep)
+        if predicted is None
+        else predicted_images(rec, frames, predicted, progress, keep)
+    )
+    backdrop = Backdrop(rec, frames)
+    for i, image in restored:
         backdrop.add(i, image)
     return replace(rec, backdrop=backdrop.points())

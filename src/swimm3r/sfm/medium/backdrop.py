@@ -7,23 +7,26 @@ most of that frame's neighbors contradict: they look through the point at a surf
 there.
 """
 
+import numpy as np
 import torch
-from jaxtyping import Bool, Float
+from jaxtyping import Bool, Float, Int
 from torch import Tensor
 
 from swimm3r.cameras import Cameras, directions, project_visible
 from swimm3r.imaging.filters import blur
+from swimm3r.io.files.cache import ArrayCache
 from swimm3r.scene.frames import Frames
 from swimm3r.scene.reconstruction import DenseCloud, Reconstruction
 from swimm3r.sfm.medium.restore import RestoredImage
 
 _CELLS = 48  # cells along the long side of an image in which ground is looked for
 _POINTS = 2  # along each side of a cell
-_MAX_CLOUD = 200_000  # points of the cloud, at most, that are asked which cells it shows
+_MAX_CLOUD = 500_000  # points of the cloud, at most, that are asked which cells it shows
 _SURFACE = 0.5  # share of open water from which there is no ground
 _MEASURED = 0.1  # share of an image below which its known depth is too little to guess the rest from
 _NEIGHBORS = 8  # frames before and after that may contradict
 _IN_FRONT = 0.1  # share of a known depth by which a point in front of it hides it
+_BEHIND = 1.5  # times the farthest depth that is filled in: what lies beyond shows nothing of this ground
 _COLOR = 0.08  # difference of blurred colors between frames, in any channel, that one surface may show
 
 
@@ -34,7 +37,8 @@ class Backdrop:
         assert rec.cloud is not None
         self.rec, self.frames = rec, frames
         known = rec.cloud.xyz
-        self._shown = [known[:: max(1, len(known) // _MAX_CLOUD)].double()]
+        self._known = known[:: -(-len(known) // _MAX_CLOUD)] if len(known) else known
+        self._blurs = ArrayCache(max_bytes=0, least_entries=2 * _NEIGHBORS + 2)
         self._pieces: list[DenseCloud] = []
 
     def add(self, i: int, image: RestoredImage) -> None:
@@ -48,8 +52,12 @@ class Backdrop:
         edge = max(camera.width, camera.height) / _CELLS
         row, column = _lattice(camera, edge / _POINTS)
         take = guessed[row, column]
-        shown = _shown_cells(camera, torch.cat(self._shown), edge)
-        take &= ~shown[(row / edge).long(), (column / edge).long()]
+        row, column = row[take], column[take]
+        if not len(row):
+            return
+        reach = _BEHIND * float(image.ray_depth[row, column].max())
+        shown = _shown_cells(camera, self._nearby(camera, reach), edge)
+        take = ~shown[(row / edge).long(), (column / edge).long()]
         row, column = row[take], column[take]
         if not len(row):
             return
@@ -59,11 +67,10 @@ class Backdrop:
         xyz = in_camera @ camera.cam2world[0, :3, :3].mT + camera.cam2world[0, :3, 3]
         usable = xyz.isfinite().all(-1) & (in_camera[:, 2] > 0)
         row, column, xyz = row[usable], column[usable], xyz[usable]
-        believed = ~self._contradicted(i, xyz, self._blurred(i)[row, column])
+        believed = ~self._contradicted(i, xyz, self._blurred(i, row, column))
         row, column, xyz = row[believed], column[believed], xyz[believed]
-        raw = self.frames.image(f)[row, column]
+        raw = self.frames.colors(f, row * camera.width + column)
         self._pieces.append(DenseCloud(xyz.float(), raw, image.clear[row, column]))
-        self._shown.append(xyz)
 
     def points(self) -> DenseCloud:
         """All of it."""
@@ -83,16 +90,31 @@ class Backdrop:
             column, row = pixels[0, at].long().unbind(-1)
             known = self.rec.depth[self.rec.names[j]].z_depth[row, column].double()
             nearness = z[0, at] / torch.where(known > 0, known, z[0, at])
-            differs = (self._blurred(j)[row, column] - color[at]).abs().amax(-1) > _COLOR
+            differs = (self._blurred(j, row, column) - color[at]).abs().amax(-1) > _COLOR
             visible = (nearness < 1 + _IN_FRONT) & self.frames.mask(self.frames.index(self.rec.names[j]))[row, column]
             denied = differs | (nearness < 1 - _IN_FRONT)
             votes[at] += torch.where(visible, torch.where(denied, 1.0, -1.0), 0.0)
         return votes > 0
 
-    def _blurred(self, i: int) -> Float[Tensor, "h w 3"]:
-        """A frame's image without what is smaller than the distance between two points."""
-        image = self.frames.image(self.frames.index(self.rec.names[i]))
-        return blur(image, max(image.shape[:2]) / _CELLS / _POINTS / 2)
+    def _nearby(self, camera: Cameras, reach: float) -> Float[Tensor, "n 3"]:
+        """The cloud and the ground found so far, without what lies farther than `reach` from the camera."""
+        center = camera.centers[0].float()
+        xyz = torch.cat([self._known, *(piece.xyz for piece in self._pieces)])
+        return xyz[(xyz - center).square().sum(-1) < reach**2].double()
+
+    def _blurred(self, i: int, row: Int[Tensor, " n"], column: Int[Tensor, " n"]) -> Float[Tensor, "n 3"]:
+        """Pixels of a frame's image without what is smaller than the distance between two points."""
+        sigma = max(self.frames.width, self.frames.height) / _CELLS / _POINTS / 2
+        step = max(1, int(sigma / 3))
+
+        def load() -> tuple[np.ndarray]:
+            image = self.frames.image(self.frames.index(self.rec.names[i]))
+            return (blur(image, sigma)[step // 2 :: step, step // 2 :: step].numpy().copy(),)
+
+        (values,) = self._blurs.get(i, load)
+        rows, columns = values.shape[:2]
+        at = (row // step).clamp(max=rows - 1).numpy(), (column // step).clamp(max=columns - 1).numpy()
+        return torch.from_numpy(values[at])
 
 
 def _lattice(camera: Cameras, step: float) -> tuple[Tensor, Tensor]:

@@ -9,15 +9,19 @@ centers to that one position: errors of single depth maps do not pass for differ
 from collections.abc import Iterator
 from dataclasses import dataclass
 
+import numpy as np
 import torch
-from jaxtyping import Float, Int
+from jaxtyping import Bool, Float, Int
+from scipy.spatial import KDTree
 from torch import Tensor
 
-from swimm3r.cameras import Cameras, image_directions, project_visible, ray_depth_from_z, unproject
+from swimm3r.cameras import Cameras, project_visible, ray_depth_from_z, unproject
 from swimm3r.progress import Progress, silent
 from swimm3r.scene.frames import Frames
 from swimm3r.scene.reconstruction import Reconstruction
 from swimm3r.sfm.settings import TrackSettings
+
+_MOST_ASKED = 96  # frames that are asked whether they see a frame's surface
 
 
 @dataclass(frozen=True)
@@ -62,55 +66,81 @@ def _by_frame(
     rec: Reconstruction, frames: Frames, usable: list[int], stride: int, settings: TrackSettings, progress: Progress
 ) -> Iterator[DenseTracks]:
     """The tracks that start in each frame, numbered from 0 in each."""
-    overlap = frame_overlap(rec, usable)
-    free = {i: torch.ones(rec.cameras.height * rec.cameras.width, dtype=torch.bool) for i in usable}
+    surfaces = Surfaces(rec, usable)
+    free = _FreePixels(usable, rec.cameras.height * rec.cameras.width)
     for done, i in enumerate(usable):
         progress("fusing depth", done, len(usable))
-        yield _tracks_from(i, _neighbors(overlap, i, usable, settings), rec, frames, free, stride, settings)
+        neighbors = _neighbors(*surfaces.overlap(i), settings)
+        yield _tracks_from(i, neighbors, rec, frames, free, stride, settings)
     progress("fusing depth", len(usable), len(usable))
 
 
-def frame_overlap(rec: Reconstruction, usable: list[int]) -> Float[Tensor, "f f"]:
-    """The share of frame i's surface (rows) that lies inside frame j's image (columns); 0 on the diagonal.
+class Surfaces:
+    """The surface that each frame's depth map shows, on a grid of 12 x 16 pixels, and frames that show parts of it.
 
-    Seen from the depth maps on a grid of 12 x 16 pixels, occlusion aside.
+    Only the frames whose own surfaces lie near are asked, at most `_MOST_ASKED`, so that a long dive costs no more per
+    frame than a short one.
     """
-    cameras = rec.cameras
-    shares = torch.zeros(len(cameras), len(cameras))
-    rows = torch.linspace(0, cameras.height - 1, 12).long()
-    columns = torch.linspace(0, cameras.width - 1, 16).long()
-    grid = torch.stack(torch.meshgrid(columns + 0.5, rows + 0.5, indexing="xy"), -1).reshape(1, -1, 2).double()
-    for i in usable:
-        z = rec.depth[rec.names[i]].z_depth[rows][:, columns].reshape(-1).double()
-        if not (z > 0).any():
-            continue
-        xyz = unproject(cameras[i], grid[:, z > 0], z[None, z > 0])
-        _, _, visible = project_visible(cameras, xyz.expand(len(cameras), -1, -1))
-        shares[i] = visible.double().mean(-1).float()
-        shares[i, i] = 0
-    return shares
+
+    def __init__(self, rec: Reconstruction, usable: list[int]) -> None:
+        self.cameras = rec.cameras
+        self._points: dict[int, Tensor] = {}
+        rows = torch.linspace(0, rec.cameras.height - 1, 12).long()
+        columns = torch.linspace(0, rec.cameras.width - 1, 16).long()
+        grid = torch.stack(torch.meshgrid(columns + 0.5, rows + 0.5, indexing="xy"), -1).reshape(1, -1, 2).double()
+        for i in usable:
+            z = rec.depth[rec.names[i]].z_depth[rows][:, columns].reshape(-1).double()
+            if (z > 0).any():
+                self._points[i] = unproject(rec.cameras[i], grid[:, z > 0], z[None, z > 0])[0].float()
+        self._frames = np.array(list(self._points), dtype=np.int64)
+        middles = [points.median(0).values for points in self._points.values()]
+        self._middle = torch.stack(middles).numpy() if middles else np.zeros((0, 3))
+        self._reach = np.array(
+            [float((p - m).norm(dim=-1).max()) for p, m in zip(self._points.values(), middles, strict=True)]
+        )
+        self._tree = KDTree(self._middle) if middles else None
+        self._row = {int(i): row for row, i in enumerate(self._frames)}
+
+    def overlap(self, i: int) -> tuple[Int[Tensor, " k"], Float[Tensor, " k"]]:
+        """Other frames, and the share of frame i's surface that lies inside their images, occlusion aside."""
+        if i not in self._points or self._tree is None:
+            return torch.zeros(0, dtype=torch.long), torch.zeros(0)
+        row = self._row[i]
+        count = min(len(self._frames), _MOST_ASKED + 1)
+        distance, near = (np.atleast_1d(a) for a in self._tree.query(self._middle[row], k=count))
+        near = near[distance <= self._reach[row] + self._reach[near]]
+        others = torch.from_numpy(np.sort(self._frames[near[near != row]]))
+        if not len(others):
+            return others, torch.zeros(0)
+        points = self._points[i].double()
+        _, _, visible = project_visible(self.cameras[others], points.expand(len(others), -1, -1))
+        return others, visible.double().mean(-1).float()
 
 
-def shared_rays(cameras: Cameras) -> list[Float[Tensor, "h w 3"]]:
-    """`image_directions` of every camera; cameras of one lens share one tensor."""
-    rays: dict[bytes, Tensor] = {}
-    result = []
-    for i in range(len(cameras)):
-        lens = cameras.K[i].numpy().tobytes() + cameras.distortion[i].numpy().tobytes()
-        if lens not in rays:
-            rays[lens] = image_directions(cameras[i]).float()
-        result.append(rays[lens])
-    return result
+class _FreePixels:
+    """One bit per pixel and frame: not yet in a track."""
+
+    def __init__(self, usable: list[int], pixels: int) -> None:
+        self._bits = {i: np.full(-(-pixels // 8), 255, np.uint8) for i in usable}
+
+    def among(self, i: int, pixel: Int[Tensor, " n"]) -> Bool[Tensor, " n"]:
+        """The mask of those of these pixels of frame i that are free."""
+        at = pixel.numpy()
+        return torch.from_numpy((self._bits[i][at >> 3] >> (at & 7).astype(np.uint8)) & 1 == 1)
+
+    def take(self, i: int, pixel: Int[Tensor, " n"]) -> None:
+        """Strike these pixels off."""
+        at = pixel.numpy()
+        np.bitwise_and.at(self._bits[i], at >> 3, ~(np.uint8(1) << (at & 7).astype(np.uint8)))
 
 
-def _neighbors(overlap: Float[Tensor, "f f"], i: int, usable: list[int], settings: TrackSettings) -> list[int]:
-    """Other frames that see enough of the surface of frame i: half the best, half evenly from the rest.
+def _neighbors(frames: Int[Tensor, " k"], share: Float[Tensor, " k"], settings: TrackSettings) -> list[int]:
+    """Other frames that see enough of the surface of a frame: half the best, half evenly from the rest.
 
     The rest look from farther away or closer: observations that tell most about the water.
     """
-    known = set(usable)
-    order = [j for j in torch.argsort(overlap[i], descending=True, stable=True).tolist() if j in known]
-    order = [j for j in order if overlap[i, j] > settings.min_overlap]
+    best_first = torch.argsort(share, descending=True, stable=True)
+    order = frames[best_first[share[best_first] > settings.min_overlap]].tolist()
     best, rest = order[: settings.max_views // 2], order[settings.max_views // 2 :]
     step = max(1, -(-len(rest) // (settings.max_views - len(best)))) if rest else 1
     return best + rest[::step]
@@ -130,7 +160,7 @@ def _tracks_from(
     neighbors: list[int],
     rec: Reconstruction,
     frames: Frames,
-    free: dict[int, Tensor],
+    free: _FreePixels,
     stride: int,
     settings: TrackSettings,
 ) -> DenseTracks:
@@ -141,10 +171,11 @@ def _tracks_from(
     lattice = torch.zeros(cameras.height, cameras.width, dtype=torch.bool)
     lattice[stride // 2 :: stride, stride // 2 :: stride] = True
     usable = frames.mask(frames.index(names[i])).reshape(-1)
-    seeds = torch.nonzero(lattice.reshape(-1) & (z_map > 0) & free[i] & usable)[:, 0]
-    free[i][seeds] = False
+    seeds = torch.nonzero(lattice.reshape(-1) & (z_map > 0) & usable)[:, 0]
+    seeds = seeds[free.among(i, seeds)]
+    free.take(i, seeds)
     start = _world_points(cameras[i], seeds, z_map[seeds])
-    color = frames.image(frames.index(names[i])).reshape(-1, 3)[seeds]
+    color = frames.colors(frames.index(names[i]), seeds)
     confidence = depth.confidence.reshape(-1)[seeds]
     weight = confidence.double().clamp(min=0.01)
     total, position = weight.clone(), start * weight[:, None]
@@ -156,15 +187,14 @@ def _tracks_from(
         other = rec.depth[names[j]]
         z_other = other.z_depth.reshape(-1)[pixel].double()
         index = frames.index(names[j])
-        change = (frames.image(index).reshape(-1, 3)[pixel] - color[candidates]).abs().amax(-1)
+        change = (frames.colors(index, pixel) - color[candidates]).abs().amax(-1)
         agrees = (z_other > 0) & ((z_other - z[candidates]).abs() <= settings.tolerance * z[candidates])
-        agrees &= free[j][pixel] & frames.mask(index).reshape(-1)[pixel] & (change < settings.max_color_change)
+        agrees &= free.among(j, pixel) & frames.mask(index).reshape(-1)[pixel] & (change < settings.max_color_change)
         candidates, pixel, z_other = candidates[agrees], pixel[agrees], z_other[agrees]
-        first = torch.full((cameras.height * cameras.width,), len(seeds))
-        first.scatter_reduce_(0, pixel, candidates, "amin")  # two points in one pixel: the first keeps it
-        alone = first[pixel] == candidates
+        alone = torch.from_numpy(np.unique(pixel.numpy(), return_index=True)[1])  # the first of two keeps the pixel
+        alone = alone.sort().values
         candidates, pixel, z_other = candidates[alone], pixel[alone], z_other[alone]
-        free[j][pixel] = False
+        free.take(j, pixel)
         center = cameras.centers[j]
         seen = center + (start[candidates] - center) * (z_other / z[candidates])[:, None]
         trust = other.confidence.reshape(-1)[pixel]

@@ -12,7 +12,7 @@ and the frames' spread, added in squares; it counts as identifiable where that i
 nothing is identifiable, and every standard deviation is as large as the coefficient itself.
 """
 
-from collections.abc import Iterator, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -25,6 +25,7 @@ from torch.nn import functional as F
 from swimm3r.errors import InputError
 from swimm3r.imaging.depth_completion import fill_z_depth
 from swimm3r.imaging.open_water import sea_share
+from swimm3r.imaging.undistortion import frame_rays
 from swimm3r.io.files.atomic import atomic_path
 from swimm3r.io.files.damage import guard, remake
 from swimm3r.medium import AttenuationCurve, Medium, MediumFit, remove_water
@@ -32,8 +33,8 @@ from swimm3r.progress import Progress, silent
 from swimm3r.scene.frames import Frames
 from swimm3r.scene.reconstruction import Reconstruction
 from swimm3r.sfm.mast3r_sfm.network_frames import NetworkImages
-from swimm3r.sfm.medium.dense_tracks import ray_depth_map, shared_rays
-from swimm3r.sfm.medium.restore import RestoredImage
+from swimm3r.sfm.medium.dense_tracks import ray_depth_map
+from swimm3r.sfm.medium.restore import RestoredImage, told
 from swimm3r.sfm.settings import SeathruSettings
 from swimm3r.sfm.student.physics_head import HeadFacts, WaterMaps
 
@@ -113,12 +114,11 @@ def read(folder: Path, images: NetworkImages, head: HeadFacts) -> PredictedWater
 
 def dive_fit(water: PredictedWater, rec: Reconstruction, settings: SeathruSettings) -> MediumFit:
     """One water for the dive, on values as stored. Raises InputError where no frame has any depth."""
-    rays = shared_rays(rec.cameras)
     readings = []
     for i, name in enumerate(rec.names):
         if name not in rec.depth:
             continue
-        z = ray_depth_map(rec.depth[name].z_depth, rays[i]).flatten()
+        z = ray_depth_map(rec.depth[name].z_depth, frame_rays(rec.cameras[i])).flatten()
         pixel = torch.nonzero(z > 0)[:, 0]
         if not len(pixel):
             continue
@@ -172,28 +172,32 @@ def predicted_images(
     frames: Frames,
     water: PredictedWater,
     progress: Progress = silent,
+    keep: Callable[[int, RestoredImage], None] = lambda i, image: None,
 ) -> Iterator[tuple[int, RestoredImage]]:
     """Every frame with depth, by its place in `rec`: Eq. 4, clamped, by the frame's own water.
 
-    Unknown depth is filled in along the edges; open water keeps the color it has.
+    Unknown depth is filled in along the edges; open water keeps the color it has. `keep` is as in `restored_images`.
     """
-    rays = shared_rays(rec.cameras)
-    for i, name in enumerate(rec.names):
-        progress("restoring images", i, len(rec.names))
+
+    def restored(i: int) -> RestoredImage | None:
+        name = rec.names[i]
         depth = rec.depth[name]
         if not bool((depth.z_depth > 0).any()):
-            continue
-        image = frames.image(frames.index(name))
+            return None
+        filmed = frames.image(frames.index(name))
         own = water.frame(name)
-        sea = sea_share(image, depth.z_depth, own.Binf)
-        ray_depth = ray_depth_map(fill_z_depth(image, depth, sea), rays[i])
+        sea = sea_share(filmed, depth.z_depth, own.Binf)
+        ray_depth = ray_depth_map(fill_z_depth(filmed, depth, sea), frame_rays(rec.cameras[i]))
         z = ray_depth.flatten()
-        J = remove_water(image.reshape(-1, 3), z, own.at(z, water.place), water.head.min_transmittance)
-        J = J.clamp(0, 1).reshape(image.shape)
+        J = remove_water(filmed.reshape(-1, 3), z, own.at(z, water.place), water.head.min_transmittance)
+        J = J.clamp(0, 1).reshape(filmed.shape)
         balanced = (J * rec.white_balance.factors).clamp(0, 1)
-        clear, shown = (surface + sea[..., None] * (image - surface) for surface in (J, balanced))
-        yield i, RestoredImage(clear, shown, ray_depth, sea)
-    progress("restoring images", len(rec.names), len(rec.names))
+        clear, shown = (surface + sea[..., None] * (filmed - surface) for surface in (J, balanced))
+        image = RestoredImage(clear, shown, ray_depth, sea)
+        keep(i, image)
+        return image
+
+    yield from told(restored, len(rec.names), progress)
 
 
 def _exponential(z: Float[Tensor, " n"], beta: Float[Tensor, "n 3"]) -> tuple[Float[Tensor, "3"], Float[Tensor, "3"]]:

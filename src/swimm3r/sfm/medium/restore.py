@@ -24,6 +24,7 @@ from torch import Tensor
 from swimm3r.imaging.depth_completion import fill_z_depth
 from swimm3r.imaging.filters import LUMA, blur, local_linear
 from swimm3r.imaging.open_water import sea_share
+from swimm3r.imaging.undistortion import frame_rays
 from swimm3r.medium import (
     Medium,
     MediumFit,
@@ -37,14 +38,16 @@ from swimm3r.progress import Progress, silent
 from swimm3r.scene.frames import Frames
 from swimm3r.scene.reconstruction import DenseCloud, DepthMap, Reconstruction
 from swimm3r.scene.white_balance import WhiteBalance
-from swimm3r.sfm.medium.dense_tracks import DenseTracks, cubes, ray_depth_map, shared_rays
+from swimm3r.sfm.medium.dense_tracks import DenseTracks, cubes, ray_depth_map
 from swimm3r.sfm.medium.plausibility import any_determined, attenuation_is_a_guess
+from swimm3r.sfm.medium.side_by_side import in_order
 from swimm3r.sfm.settings import RestoreSettings
 
 MediumOfPixels = Callable[[str, Int[Tensor, " n"], Float[Tensor, " n"]], Medium]  # frame, pixels, ray depth
 
 _MAX_TINT = 1.0  # times the other channels, for blurred colors at a guessed distance
 _NEARLY_ALL = 0.95  # of the surfaces at known distance
+_SAMPLES = 20_000  # of them, which stand for all of an image
 
 
 @dataclass(frozen=True)
@@ -58,18 +61,40 @@ class RestoredImage:
 
 
 def restored_images(
-    rec: Reconstruction, frames: Frames, settings: RestoreSettings, progress: Progress = silent
+    rec: Reconstruction,
+    frames: Frames,
+    settings: RestoreSettings,
+    progress: Progress = silent,
+    keep: Callable[[int, RestoredImage], None] = lambda i, image: None,
 ) -> Iterator[tuple[int, RestoredImage]]:
-    """Every registered frame with some known depth, by its place in `rec`; needs the medium and the balance."""
+    """Every registered frame with some known depth, by its place in `rec`; needs the medium and the balance.
+
+    Frames are restored side by side and come in their order; `keep` is called with each where it was made.
+    """
     assert rec.medium is not None
-    gains = rec.white_balance.factors
-    rays = shared_rays(rec.cameras)
-    for i, name in enumerate(rec.names):
-        progress("restoring images", i, len(rec.names))
-        depth = rec.depth[name]
-        if bool((depth.z_depth > 0).any()):
-            yield i, restore_image(frames.image(frames.index(name)), depth, rays[i], rec.medium, settings, gains)
-    progress("restoring images", len(rec.names), len(rec.names))
+    medium, gains = rec.medium, rec.white_balance.factors
+
+    def restored(i: int) -> RestoredImage | None:
+        depth = rec.depth[rec.names[i]]
+        if not bool((depth.z_depth > 0).any()):
+            return None
+        filmed = frames.image(frames.index(rec.names[i]))
+        image = restore_image(filmed, depth, frame_rays(rec.cameras[i]), medium, settings, gains)
+        keep(i, image)
+        return image
+
+    yield from told(restored, len(rec.names), progress)
+
+
+def told(
+    restored: Callable[[int], RestoredImage | None], count: int, progress: Progress
+) -> Iterator[tuple[int, RestoredImage]]:
+    """The images of all frames that have one, in order, with the progress told."""
+    for i, image in enumerate(in_order(restored, range(count))):
+        progress("restoring images", i, count)
+        if image is not None:
+            yield i, image
+    progress("restoring images", count, count)
 
 
 def restore_image(
@@ -129,7 +154,7 @@ def restored_cloud(
         mine = order[bounds[i] : bounds[i + 1]]
         if len(mine) == 0:
             continue
-        I = frames.image(frames.index(name)).reshape(-1, 3)[tracks.pixel[mine]]
+        I = frames.colors(frames.index(name), tracks.pixel[mine])
         light = linear_from_srgb(I) if fit.encoding == "linear" else I
         z, trust = tracks.ray_depth[mine], tracks.confidence[mine, None].clamp(min=0.01)
         medium = fit.at(z) if medium_at is None else medium_at(name, tracks.pixel[mine], z)
@@ -184,25 +209,41 @@ def _not_beyond_white(
     That is below 0.9, and in the channel that the water takes first not far above the others (nor more than nearly all
     surfaces of known depth are): too long a path shows as a glare of that channel first, mostly red.
     """
+    if not guessed.any():
+        return ray_depth
     first = int(fit.beta_D.argmax())
     reach = 0.01 * max(I.shape[:2])
     blurred = blur(I, reach)
-    smooth, far = blurred[guessed], ray_depth[guessed]
 
     def tint(J: Float[Tensor, "n 3"]) -> Float[Tensor, " n"]:
         others = torch.cat([J[:, :first], J[:, first + 1 :]], dim=-1).amax(-1)
         return torch.where(others > 0, J[:, first] / others.clamp(min=1e-6), torch.inf)
 
-    measured = tint(remove_water(blurred[~guessed], ray_depth[~guessed], fit.at(ray_depth[~guessed])))
+    known = torch.nonzero(~guessed.flatten())[:, 0]
+    known = known[:: max(1, len(known) // _SAMPLES)]
+    path = ray_depth.flatten()[known]
+    measured = tint(remove_water(blurred.reshape(-1, 3)[known], path, fit.at(path)))
     measured = measured[measured.isfinite()].numpy()
     most = max(_MAX_TINT, float(np.quantile(measured, _NEARLY_ALL))) if len(measured) else _MAX_TINT
+    cell, pixel = _cells(guessed, max(1, round(reach / 3)))  # the blurred image is the same within a cell
+    smooth, far = blurred.reshape(-1, 3)[pixel], ray_depth.flatten()[pixel]
     shortened = torch.zeros_like(far)
     for trial in torch.linspace(0.05, 1.0, 20):
         J = remove_water(smooth, trial * far, fit.at(trial * far))
         shortened = torch.where((J.amax(-1) < 0.9) & (tint(J) < most), trial, shortened)
     share = torch.ones_like(ray_depth)
-    share[guessed] = shortened
+    share[guessed] = shortened[cell]
     return torch.where(guessed, ray_depth * blur(share[..., None], reach)[..., 0], ray_depth)
+
+
+def _cells(mask: Bool[Tensor, "h w"], edge: int) -> tuple[Int[Tensor, " n"], Int[Tensor, " cells"]]:
+    """The number of the square cell that each of the mask's pixels lies in, and one of its pixels for each cell."""
+    row, column = torch.nonzero(mask, as_tuple=True)
+    cell = row // edge * (mask.shape[1] // edge + 1) + column // edge
+    last = torch.full(((mask.shape[0] // edge + 1) * (mask.shape[1] // edge + 1),), -1)
+    last.scatter_reduce_(0, cell, row * mask.shape[1] + column, "amax")
+    used = last >= 0
+    return (used.cumsum(0) - 1)[cell], last[used]
 
 
 def _without_noise(

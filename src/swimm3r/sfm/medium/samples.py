@@ -15,11 +15,15 @@ from torch import Tensor
 from swimm3r.imaging.depth_completion import fill_z_depth
 from swimm3r.imaging.filters import blur
 from swimm3r.imaging.open_water import open_water_mask
+from swimm3r.imaging.undistortion import frame_rays
 from swimm3r.progress import Progress, silent
 from swimm3r.scene.frames import Frames
 from swimm3r.scene.reconstruction import DepthMap, Reconstruction
-from swimm3r.sfm.medium.dense_tracks import DenseTracks, cubes, ray_depth_map, shared_rays
+from swimm3r.sfm.medium.dense_tracks import DenseTracks, cubes, ray_depth_map
+from swimm3r.sfm.medium.side_by_side import in_order
 from swimm3r.sfm.settings import SeathruSettings
+
+_ALONE = 240  # frames whose single pixels are sampled: more of a long dive tell nothing new
 
 
 @dataclass(frozen=True)
@@ -37,29 +41,30 @@ class WaterSamples:
 def collect_samples(
     rec: Reconstruction, frames: Frames, tracks: DenseTracks, settings: SeathruSettings, progress: Progress = silent
 ) -> WaterSamples:
-    """Samples of every frame that has a depth map."""
+    """Samples of every frame that has a depth map: patches of all, pixels on their own of `_ALONE` at most.
+
+    The frames whose pixels are taken lie evenly over the dive.
+    """
     patches = _patches(rec, tracks, settings)
-    rays = shared_rays(rec.cameras)
     usable = [i for i, name in enumerate(rec.names) if name in rec.depth]
-    per_frame = max(1, settings.max_pixels // max(1, len(usable)))
+    alone = set(usable[:: max(1, -(-len(usable) // _ALONE))])
+    per_frame = max(1, settings.max_pixels // max(1, len(alone)))
     order = torch.argsort(tracks.frame, stable=True)
     bounds = torch.searchsorted(tracks.frame[order], torch.arange(len(rec.names) + 1))
-    parts: list[tuple[Tensor, Tensor, Tensor, Tensor]] = []
-    water: list[Tensor] = []
-    for done, i in enumerate(usable):
-        progress("sampling the water", done, len(usable))
-        index = frames.index(rec.names[i])
-        image, mask = frames.image(index), frames.mask(index)
-        ray_depth, sea = _ray_depth_nearby(image, rec.depth[rec.names[i]], rays[i])
-        pixels = torch.nonzero((ray_depth.reshape(-1) > 0) & mask.reshape(-1))[:, 0]
-        pixels = pixels[:: max(1, len(pixels) // per_frame)]
-        alone = torch.full_like(pixels, -1)
-        parts.append((image.reshape(-1, 3)[pixels], ray_depth.reshape(-1)[pixels], torch.full_like(pixels, i), alone))
+
+    def sampled(i: int) -> list[tuple[Tensor, ...]]:
         seen = order[bounds[i] : bounds[i + 1]]
-        I, z, patch = _patch_means(image.reshape(-1, 3), tracks, seen, patches, settings)
-        parts.append((I, z, torch.full_like(patch, i), patch))
-        shown = image[sea & mask]
-        water.append(shown[:: max(1, len(shown) // settings.open_water_pixels)])
+        colors = frames.colors(frames.index(rec.names[i]), tracks.pixel[seen])
+        I, z, patch = _patch_means(colors, tracks, seen, patches, settings)
+        parts: list[tuple[Tensor, ...]] = [(I, z, torch.full_like(patch, i), patch)]
+        return [*_pixels_alone(rec, frames, i, per_frame, settings), *parts] if i in alone else parts
+
+    parts: list[tuple[Tensor, ...]] = []
+    water: list[Tensor] = [torch.zeros(0, 3)]
+    for done, of_frame in enumerate(in_order(sampled, usable)):
+        progress("sampling the water", done, len(usable))
+        parts += [part for part in of_frame if len(part) > 1]
+        water += [part[0] for part in of_frame if len(part) == 1]
     progress("sampling the water", len(usable), len(usable))
     if not parts:
         none = torch.zeros(0)
@@ -67,6 +72,21 @@ def collect_samples(
     I, ray_depth, frame, track = (torch.cat(p) for p in zip(*parts, strict=True))
     plausible = _plausible_water(torch.cat(water), I, ray_depth)
     return WaterSamples(I, ray_depth, frame, track, plausible, frames.gray)
+
+
+def _pixels_alone(
+    rec: Reconstruction, frames: Frames, i: int, count: int, settings: SeathruSettings
+) -> list[tuple[Tensor, ...]]:
+    """Color, ray depth, frame and patch (none) of about `count` pixels of a frame; and open water, if it shows any."""
+    index = frames.index(rec.names[i])
+    image, mask = frames.image(index), frames.mask(index)
+    ray_depth, sea = _ray_depth_nearby(image, rec.depth[rec.names[i]], frame_rays(rec.cameras[i]))
+    pixels = torch.nonzero((ray_depth.reshape(-1) > 0) & mask.reshape(-1))[:, 0]
+    pixels = pixels[:: max(1, len(pixels) // count)]
+    of_frame, no_patch = torch.full_like(pixels, i), torch.full_like(pixels, -1)
+    shown = image[sea & mask]
+    shown = shown[:: max(1, len(shown) // settings.open_water_pixels)]
+    return [(image.reshape(-1, 3)[pixels], ray_depth.reshape(-1)[pixels], of_frame, no_patch), (shown,)]
 
 
 def _ray_depth_nearby(
@@ -109,7 +129,7 @@ def _patches(rec: Reconstruction, tracks: DenseTracks, settings: SeathruSettings
 
 
 def _patch_means(
-    colors: Float[Tensor, "pixels 3"],
+    colors: Float[Tensor, "s 3"],
     tracks: DenseTracks,
     seen: Int[Tensor, " s"],
     patches: _Patches,
@@ -124,7 +144,7 @@ def _patch_means(
 
     offset = (mean(tracks.xyz[tracks.track[seen]]) - patches.middle[patch]).norm(dim=-1) / patches.size[patch]
     whole = (count >= settings.patch_observations) & (offset < settings.patch_offset)
-    I, z = mean(colors[tracks.pixel[seen]]), mean(tracks.ray_depth[seen, None])[:, 0]
+    I, z = mean(colors), mean(tracks.ray_depth[seen, None])[:, 0]
     return I[whole], z[whole], patch[whole]
 
 

@@ -43,6 +43,7 @@ from swimm3r.sfm.plane_sweep.views import (
     likely_edge,
     make_view,
     on_frame_grid,
+    points_by_frame,
 )
 from swimm3r.sfm.settings import PlaneSweepSettings
 from swimm3r.tasks import run_tasks
@@ -137,7 +138,7 @@ class _Passes:
         self._device = for_depth(settings.device)
         self._canvas = covering_pinholes(rec.cameras, settings.long_side)
         self.sources = choose_sources(rec, max(settings.sources, _NEIGHBORS), settings.angle_deg)
-        self._pose_error = _pose_error(rec, self._canvas)
+        self._points, self._pose_error = points_by_frame(rec), _pose_error(rec, self._canvas)
         self._position = {name: k for k, name in enumerate(frames.names)}
         self._views, self._raws = ArrayCache(max_bytes=256 << 20), ArrayCache(max_bytes=256 << 20)
 
@@ -169,7 +170,7 @@ class _Passes:
 
     def _sweep_one(self, i: int) -> None:
         canvas, settings = self._canvas, self._settings
-        span, compared = depth_range(self._rec, i), self.sources[i][: settings.sources]
+        span, compared = depth_range(self._rec, i, self._points[i]), self.sources[i][: settings.sources]
         raw = RawDepth(torch.zeros(canvas.height, canvas.width), torch.zeros(canvas.height, canvas.width))
         if span is not None and compared:
             raw = sweep(self._view(i), [self._view(j) for j in compared], span, settings, self._device)

@@ -47,12 +47,13 @@ def choose_sources(rec: Reconstruction, count: int, angle_deg: float) -> list[li
     track = sparse.csr_matrix(
         (np.ones(seen.shape[1], np.float32), (seen[0], seen[1])), (len(rec.names), max(len(xyz), 1))
     )
+    seen_by = track.tocsc()
     chosen: list[list[int]] = []
     for i in range(len(rec.names)):
         mine = track[i].indices
-        shared = np.asarray(track[:, mine] @ np.ones(len(mine), np.float32))
-        shared[i] = 0
-        near_by = [int(j) for j in np.argsort(-shared, kind="stable")[:_CANDIDATES] if shared[j] > 0]
+        others, shared = np.unique(seen_by[:, mine].indices, return_counts=True)
+        others, shared = others[others != i], shared[others != i]
+        near_by = [int(j) for j in others[np.argsort(-shared, kind="stable")[:_CANDIDATES]]]
         chosen.append([])
         if not near_by:
             continue
@@ -77,12 +78,18 @@ def choose_sources(rec: Reconstruction, count: int, angle_deg: float) -> list[li
     return chosen
 
 
-def depth_range(rec: Reconstruction, i: int) -> tuple[float, float] | None:
-    """The z depths to search in frame i, from its points with a margin; None where it sees too few.
+def points_by_frame(rec: Reconstruction) -> list[np.ndarray]:
+    """The points that each frame sees, in ascending order."""
+    seen = np.unique(np.stack([rec.tracks.frame.numpy(), rec.tracks.point.numpy()]), axis=1)
+    return np.split(seen[1], np.searchsorted(seen[0], np.arange(1, len(rec.names))))
+
+
+def depth_range(rec: Reconstruction, i: int, points: np.ndarray) -> tuple[float, float] | None:
+    """The z depths to search in frame i, from the points it sees with a margin; None where they are too few.
 
     The far end lies well behind the points: open water holds none, and what stands in it may still be matched.
     """
-    mine = torch.unique(rec.tracks.point[rec.tracks.frame == i])
+    mine = torch.from_numpy(points)
     z = project(rec.cameras[i], rec.points.xyz[mine][None])[1]
     z = z[z > 0].numpy()
     if len(z) < _FEWEST_POINTS:
