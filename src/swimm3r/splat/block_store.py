@@ -198,12 +198,12 @@ def entry_of(folder: Path, file: str, key: str) -> BlockEntry:
     return entry
 
 
-def read_block(path: Path, key: str, count: int) -> BetaPrimitives:
+def read_block(path: Path, key: str, count: int | None = None) -> BetaPrimitives:
     """Read what `write_block` wrote. Raises InputError for damage, and where key or number are others."""
     stored = _read(path, key)
     with guard(path, _remedy(path)):
         p = primitives_from(stored.tensors, BetaPrimitives, "primitives.", may_be_empty=True)
-        if len(p.xyz) != count:
+        if count is not None and len(p.xyz) != count:
             raise ValueError(f"it holds {len(p.xyz)} primitives, and the map lists {count}")
     assert isinstance(p, BetaPrimitives)
     return p

@@ -7,6 +7,7 @@ share an edge, which belongs to the one whose lower edge it is, so that windows 
 """
 
 import math
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 
 import torch
@@ -48,6 +49,10 @@ class Window:
         low, high = (torch.tensor(edge, dtype=torch.float64, device=uv.device) for edge in (self.low, self.high))
         return ((uv >= low) & (uv < high)).all(-1)
 
+    def meets(self, other: "Window") -> bool:
+        """Return whether the two overlap or touch."""
+        return all(low <= high for low, high in zip((*self.low, *other.low), (*other.high, *self.high), strict=True))
+
     def widened(self, margin: float) -> "Window":
         """The rectangle with a margin on every side."""
         (u0, v0), (u1, v1) = self.low, self.high
@@ -58,6 +63,14 @@ class Window:
         high, low = list(self.high), list(self.low)
         high[axis] = low[axis] = at
         return replace(self, high=(high[0], high[1])), replace(self, low=(low[0], low[1]))
+
+
+def held_by_any(windows: Sequence[Window], xyz: Float[Tensor, "n 3"]) -> Bool[Tensor, " n"]:
+    """Mask of the points over one of some windows."""
+    held = torch.zeros(len(xyz), dtype=torch.bool, device=xyz.device)
+    for window in windows:
+        held |= window.holds(xyz)
+    return held
 
 
 def plane_of(xyz: Float[Tensor, "n 3"]) -> GroundPlane:

@@ -107,7 +107,8 @@ def test_a_block_that_was_killed_goes_on_from_its_checkpoint(tiny_dive, trained,
 
     with pytest.raises(Exception, match="block_0001"):
         train(tiny_dive.rec, tiny_dive.frames, FEW, tmp_path, cut_short, engine=EngineSettings(retries=0))
-    assert (tmp_path / "blocks" / "0002.safetensors").exists()  # the others were trained
+    first = tmp_path / "blocks" / "0000.safetensors"
+    written = first.stat().st_mtime_ns
     assert not (tmp_path / "blocks" / "0001.safetensors").exists()
     assert not (tmp_path / "map.safetensors").exists()
     reached = read_state(state).about.step
@@ -115,7 +116,8 @@ def test_a_block_that_was_killed_goes_on_from_its_checkpoint(tiny_dive, trained,
     train(tiny_dive.rec, tiny_dive.frames, FEW, tmp_path, lambda what, done, total: seen.append((what, done)))
     of_blocks = [(what, done) for what, done in seen if what.startswith("training block ")]
     assert of_blocks[0] == ("training block 2 of 3", reached)
-    assert {what for what, _ in of_blocks} == {"training block 2 of 3"}
+    assert {what for what, _ in of_blocks} == {"training block 2 of 3", "training block 3 of 3"}
+    assert first.stat().st_mtime_ns == written
     assert bits(tmp_path) == bits(trained)
 
 
@@ -148,3 +150,15 @@ def test_the_water_of_the_blocks_is_that_of_the_whole_dive(trained):
     assert names
     for name in names:
         assert all(torch.equal(states[0].tensors[name], state.tensors[name]) for state in states), name
+
+
+def test_a_later_block_leaves_the_ground_of_its_neighbor_to_it(tiny_dive, trained):
+    """The neighbor's primitives are drawn beside its own, so it begins with none there, and ends with hardly any."""
+    depth = median_z_depth(tiny_dive.rec)
+    plan = plan_blocks(surface_of(tiny_dive.rec, depth), depth, FEW.blocks)
+    assert sorted({block.turn for block in plan}) == [0, 1, 2]
+    for k, block in enumerate(plan):
+        xyz = read_state(trained / "blocks" / f"{k:04d}" / "checkpoint" / "state.safetensors").tensors["parameter.xyz"]
+        for j in block.before:
+            assert plan[j].turn < block.turn
+            assert plan[j].window.holds(xyz).float().mean() < 0.05

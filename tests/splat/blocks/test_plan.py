@@ -5,10 +5,10 @@ import math
 import pytest
 import torch
 
-from swimm3r.splat.blocks.part import part_of, views_of_blocks
+from swimm3r.splat.blocks.part import BlockViews, part_of, views_of_blocks
 from swimm3r.splat.blocks.plan import PlannedBlock, Surface, plan_blocks, surface_of
-from swimm3r.splat.blocks.training import of_area
-from swimm3r.splat.ground import GroundPlane, Window, plane_of
+from swimm3r.splat.blocks.training import of_block
+from swimm3r.splat.ground import GroundPlane, Window, held_by_any, plane_of
 from swimm3r.splat.settings import BlockSettings, DensifySettings, InitialSettings, UwbsSettings
 from swimm3r.splat.views import TrainingViews, filled, median_z_depth
 
@@ -36,6 +36,22 @@ def test_every_point_lies_in_exactly_one_block_and_blocks_are_alike_in_area(larg
     assert own.max() < 1.1 * total / len(plan)
     assert own.min() > 0.9 * total / len(plan)
     assert all(block.area >= float(area) for block, area in zip(plan, own, strict=True))
+
+
+def test_neighbors_have_different_turns_and_share_no_open_ground():
+    surface = l_shaped()
+    plan = plan_blocks(surface, 1.0, BlockSettings(largest=2.0))
+    assert len(plan) > 12
+    assert len({block.turn for block in plan}) <= 6
+    for block in plan:
+        wide = block.window.widened(block.margin)
+        for other in plan:
+            if other is not block and wide.meets(other.window.widened(other.margin)):
+                assert other.turn != block.turn
+        open_ground = wide.holds(surface.xyz) & ~held_by_any([plan[j].window for j in block.before], surface.xyz)
+        assert block.open_area == pytest.approx(float(surface.area[open_ground].sum()))
+        own = float(surface.area[block.window.holds(surface.xyz)].sum())
+        assert own <= block.open_area <= block.area + 1e-9
 
 
 def test_a_point_on_an_edge_lies_in_the_block_whose_lower_edge_it_is():
@@ -69,7 +85,8 @@ def test_primitives_are_in_proportion_to_area():
     settings = UwbsSettings(
         initial=InitialSettings(primitives=1000), densify=DensifySettings(cap_max=3000), blocks=BlockSettings(largest=8)
     )
-    half = of_area(settings, 4.0, views_per_image=3.0)
+    block = PlannedBlock(Window(GroundPlane((0, 0, 0), (1, 0, 0), (0, 1, 0))), 0.2, 4.0, open_area=4.0)
+    half = of_block(settings, block, BlockViews(("a",) * 30, 10.0))
     assert (half.initial.primitives, half.densify.cap_max) == (500, 1500)
     assert half.iterations == 1.5 * settings.iterations
 

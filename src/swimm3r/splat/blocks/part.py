@@ -1,6 +1,6 @@
 """The part of a reconstruction that one block is trained on: the views that see it, and the points in its window."""
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 
 import torch
@@ -10,7 +10,7 @@ from torch import Tensor
 from swimm3r.cameras import unproject
 from swimm3r.scene.reconstruction import DenseCloud, Matches, Points, Reconstruction, Tracks
 from swimm3r.splat.blocks.plan import PlannedBlock
-from swimm3r.splat.ground import Window
+from swimm3r.splat.ground import Window, held_by_any
 from swimm3r.splat.views import filled
 
 _LEAST = 0.02  # of a view's pixels, from which on it is one of a block
@@ -61,25 +61,34 @@ def _looked_at(rec: Reconstruction, name: str) -> Float[Tensor, "n 3"]:
     return rec.points.xyz[rec.tracks.point[rec.tracks.frame == i]].double()
 
 
-def part_of(rec: Reconstruction, names: Sequence[str], window: Window) -> Reconstruction:
-    """The reconstruction of these frames, with the points over a window; tracks and matches are left out."""
+def part_of(rec: Reconstruction, names: Sequence[str], window: Window, closed: Sequence[Window] = ()) -> Reconstruction:
+    """The reconstruction of these frames, with the points over a window but not over those `closed`.
+
+    Tracks and matches are left out.
+    """
+
+    def chosen(xyz: Float[Tensor, "n 3"]) -> Bool[Tensor, " n"]:
+        return window.holds(xyz) & ~held_by_any(closed, xyz)
+
     none = torch.zeros(0, dtype=torch.int64)
     flat = torch.zeros(0, 2)
-    chosen = window.holds(rec.points.xyz)
+    kept = chosen(rec.points.xyz)
     return replace(
         rec,
         names=tuple(names),
         cameras=rec.cameras[[rec.index(name) for name in names]],
-        points=Points(rec.points.xyz[chosen], rec.points.rgb[chosen], rec.points.error[chosen]),
+        points=Points(rec.points.xyz[kept], rec.points.rgb[kept], rec.points.error[kept]),
         tracks=Tracks(none, none, flat),
         matches=Matches(none, none, flat, flat, torch.zeros(0)),
-        cloud=_cloud_part(rec.cloud, window),
-        backdrop=_cloud_part(rec.backdrop, window),
+        cloud=_cloud_part(rec.cloud, chosen),
+        backdrop=_cloud_part(rec.backdrop, chosen),
     )
 
 
-def _cloud_part(cloud: DenseCloud | None, window: Window) -> DenseCloud | None:
+def _cloud_part(
+    cloud: DenseCloud | None, chosen: Callable[[Float[Tensor, "n 3"]], Bool[Tensor, " n"]]
+) -> DenseCloud | None:
     if cloud is None:
         return None
-    inside: Bool[Tensor, " n"] = window.holds(cloud.xyz)
-    return DenseCloud(cloud.xyz[inside], cloud.raw[inside], cloud.restored[inside])
+    kept = chosen(cloud.xyz)
+    return DenseCloud(cloud.xyz[kept], cloud.raw[kept], cloud.restored[kept])

@@ -1,4 +1,4 @@
-"""The plan of a map in blocks: the ground cut into windows of equal area, with a margin around each.
+"""The plan of a map in blocks: the ground cut into windows of equal area, with a margin around each, and their turns.
 
 Area is counted in images: a piece of surface counts by the share of an image that it fills from where it was filmed
 best, but as from the median depth at least. So ground that was only seen from afar counts little, and a number of
@@ -6,7 +6,8 @@ primitives per image's area is one per pixel.
 """
 
 import math
-from dataclasses import dataclass
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
 
 import torch
 from jaxtyping import Float
@@ -30,11 +31,14 @@ class Surface:
 
 @dataclass(frozen=True)
 class PlannedBlock:
-    """One block's ground."""
+    """One block's ground, and its turn: those of one turn have no common border, and those of earlier ones are done."""
 
     window: Window
     margin: float  # scene units, trained with the block and then left out
     area: float  # in images, the margin's included
+    turn: int = 0
+    before: tuple[int, ...] = ()  # the neighbors of earlier turns
+    open_area: float = 0.0  # in images, that of `before` left out
 
 
 def surface_of(rec: Reconstruction, median_depth: float) -> Surface:
@@ -55,11 +59,33 @@ def plan_blocks(surface: Surface, median_depth: float, settings: BlockSettings) 
     count = math.ceil(total / settings.largest) if settings.largest else 1
     plane = plane_of(surface.xyz)
     uv = plane.coordinates(surface.xyz)
-    margin = settings.margin * median_depth
-    return tuple(
-        PlannedBlock(window, margin, float(surface.area[window.widened(margin).holds_coordinates(uv)].sum()))
-        for window in _cut(Window(plane), uv, surface.area, count)
-    )
+    windows = _cut(Window(plane), uv, surface.area, count)
+    return _in_turns(windows, settings.margin * median_depth, uv, surface.area)
+
+
+def _in_turns(
+    windows: Sequence[Window], margin: float, uv: Float[Tensor, "n 2"], area: Float[Tensor, " n"]
+) -> tuple[PlannedBlock, ...]:
+    """The blocks of these windows, each in the first turn that no neighbor has."""
+    blocks: list[PlannedBlock] = []
+    for window in windows:
+        wide = window.widened(margin)
+        neighbors = [k for k, other in enumerate(blocks) if wide.meets(other.window.widened(margin))]
+        taken = {blocks[k].turn for k in neighbors}
+        turn = next(k for k in range(len(windows)) if k not in taken)
+        seen = wide.holds_coordinates(uv)
+        blocks.append(PlannedBlock(window, margin, float(area[seen].sum()), turn))
+    done = []
+    for k, block in enumerate(blocks):
+        wide = block.window.widened(margin)
+        before = tuple(
+            j for j, other in enumerate(blocks) if other.turn < block.turn and wide.meets(other.window) and j != k
+        )
+        left = wide.holds_coordinates(uv)
+        for j in before:
+            left = left & ~blocks[j].window.holds_coordinates(uv)
+        done.append(replace(block, before=before, open_area=float(area[left].sum())))
+    return tuple(done)
 
 
 def _cut(window: Window, uv: Float[Tensor, "n 2"], area: Float[Tensor, " n"], count: int) -> list[Window]:

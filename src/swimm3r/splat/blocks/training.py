@@ -1,8 +1,10 @@
 """A large map trained: first the water on a coarse map of the whole dive, then block after block in that water.
 
 A block is trained on the pixels whose surface lies in its window or the margin around it, and keeps the primitives in
-the window, so that neighbors join. Blocks depend on nothing but their task, and a task whose block is there already
-does nothing: any number of processes may share them, and one that was killed is repeated alone, from its checkpoint.
+the window. Neighbors take turns: the later one is trained beside the finished primitives of the earlier, and so the two
+join. Blocks of one turn depend on nothing but their task and files of earlier turns, and a task whose block is there
+already does nothing: any number of processes may share them, and one that was killed is repeated alone, from its
+checkpoint.
 """
 
 import logging
@@ -20,19 +22,28 @@ from swimm3r.io.files.cache_key import cache_key
 from swimm3r.progress import Progress, silent
 from swimm3r.scene.frames import Frames
 from swimm3r.scene.reconstruction import Reconstruction
-from swimm3r.splat.block_store import FOLDER, BlockEntry, StoredBlocks, entry_of, write_block
+from swimm3r.splat.block_store import (
+    FOLDER,
+    BlockEntry,
+    StoredBlocks,
+    entry_of,
+    joined,
+    no_primitives,
+    read_block,
+    write_block,
+)
 from swimm3r.splat.blocks.coarse import box_of, coarse_of
-from swimm3r.splat.blocks.part import part_of, views_of_blocks
+from swimm3r.splat.blocks.part import BlockViews, part_of, views_of_blocks
 from swimm3r.splat.blocks.plan import PlannedBlock
 from swimm3r.splat.ground import Window
 from swimm3r.splat.medium.field import MediumField
-from swimm3r.splat.primitives.beta import BetaPrimitives, select
+from swimm3r.splat.primitives.beta import BetaPrimitives, rescaled, select
 from swimm3r.splat.recipes import recipe_parts
 from swimm3r.splat.rendering import settings_in_scene_units
 from swimm3r.splat.settings import UwbsSettings
 from swimm3r.splat.training import loop
 from swimm3r.splat.training.observer import Observer
-from swimm3r.splat.training.scene import TrainingScene, path_radius
+from swimm3r.splat.training.scene import Surroundings, TrainingScene, path_radius
 from swimm3r.splat.training.state import map_in_scene_units
 from swimm3r.splat.views import TrainingViews
 from swimm3r.tasks import run_tasks
@@ -49,6 +60,7 @@ class BlockTask:
 
     number: int
     count: int  # of blocks
+    turn: int
     folder: Path  # of the map
     key: str  # of the whole training
     rec: Reconstruction  # its views and points alone
@@ -56,6 +68,8 @@ class BlockTask:
     settings: UwbsSettings
     window: Window
     margin: float  # scene units
+    closed: tuple[Window, ...]  # of the neighbors of earlier turns
+    neighbors: tuple[str, ...]  # their files, relative to the map's folder
     scale: float  # working units per scene unit
     water: MediumField  # per working unit
     device: str
@@ -104,11 +118,14 @@ def train_in_blocks(
     tasks = _tasks(rec, frames, settings, plan, views.names, scale, folder, key, water, device)
     here = engine.engine == "local" and engine.at_once(1) == 1  # one after another, each with its own progress
     work = partial(train_block, progress=progress) if here else train_block
-    failures = run_tasks(work, tasks, engine, progress, "training the blocks", logs=folder / FOLDER / "logs")
-    for failure in failures:
-        log.warning("%s of the map's %d blocks: %s", failure.name, len(tasks), failure.message)
-    if failures:
-        raise failures[0].error
+    for turn in sorted({task.turn for task in tasks}):
+        now = [task for task in tasks if task.turn == turn]
+        label = f"training blocks, turn {turn + 1}"
+        failures = run_tasks(work, now, engine, progress, label, logs=folder / FOLDER / "logs")
+        for failure in failures:
+            log.warning("%s of the map's %d blocks: %s", failure.name, len(tasks), failure.message)
+        if failures:
+            raise failures[0].error
     entries = tuple(entry_of(folder, task.file, key) for task in tasks)
     if not any(entry.primitives for entry in entries):
         raise InputError(
@@ -126,7 +143,7 @@ def train_block(task: BlockTask, progress: Progress = silent) -> None:
     device = torch.device(task.device)
     views = TrainingViews(task.rec, task.frames, task.settings, task.scale, task.window.widened(task.margin))
     radius = path_radius(task.rec, task.scale, task.settings.working_depth)
-    scene = TrainingScene(task.rec, task.scale, radius, views, None, device, task.water)
+    scene = TrainingScene(task.rec, task.scale, radius, views, None, device, surroundings_of(task, device))
     schedule = loop.schedule_of(task.settings, task.key, task.number)
     folder = task.folder / FOLDER / f"{task.number:04d}"
     with devices.memory_for("this block", "a smaller --splat.blocks.largest, or --map-device cpu"):
@@ -149,6 +166,17 @@ def train_block(task: BlockTask, progress: Progress = silent) -> None:
     entry = BlockEntry(task.file, len(own.xyz), len(few.primitives.xyz), few.spacing, low, high)
     write_block(task.folder / entry.coarse_file, few.primitives, task.key)
     write_block(path, own, task.key, entry)
+
+
+def surroundings_of(task: BlockTask, device: torch.device) -> Surroundings:
+    """The water, and the primitives of finished neighbors in the block's margin."""
+    near = task.window.widened(task.margin)
+    parts = [no_primitives()]
+    for file in task.neighbors:
+        theirs = read_block(task.folder / file, task.key)
+        parts.append(select(theirs, near.holds(theirs.xyz)))
+    neighbors = rescaled(joined(parts), task.scale).to(device)
+    return Surroundings(task.water, neighbors, task.closed, task.scale)
 
 
 def _is_finished(task: BlockTask) -> bool:
@@ -196,32 +224,35 @@ def _tasks(
     device: torch.device,
 ) -> list[BlockTask]:
     """A task for each block that a view sees."""
-    tasks = []
-    for k, (block, seen_by) in enumerate(zip(plan, views_of_blocks(rec, names, plan), strict=True)):
-        part = part_of(rec, seen_by.names, block.window.widened(block.margin))
+    tasks: dict[int, BlockTask] = {}
+    seen_by = views_of_blocks(rec, names, plan)
+    for k in sorted(range(len(plan)), key=lambda k: plan[k].turn):
+        block, views = plan[k], seen_by[k]
+        before = [tasks[j] for j in block.before if j in tasks]
+        closed = tuple(task.window for task in before)
+        part = part_of(rec, views.names, block.window.widened(block.margin), closed)
         points = part.points.xyz if part.cloud is None else part.cloud.xyz
-        if not seen_by.names or len(points) < _FEWEST:
+        if not views.names or len(points) < _FEWEST:
             log.warning("block %d of %d is left empty: no training frame sees it", k + 1, len(plan))
             continue
-        own = of_area(settings, block.area, len(seen_by.names) / seen_by.images)
-        task = BlockTask(
-            k, len(plan), folder, key, part, frames, own, block.window, block.margin, scale, water, str(device)
-        )
-        tasks.append(task)
-    return tasks
+        tasks[k] = BlockTask(
+            k, len(plan), block.turn, folder, key, part, frames, of_block(settings, block, views),
+            block.window, block.margin, closed, tuple(task.file for task in before), scale, water, str(device),
+        )  # fmt: skip
+    return [tasks[k] for k in sorted(tasks)]
 
 
-def of_area(settings: UwbsSettings, area: float, views_per_image: float = 1.0) -> UwbsSettings:
-    """The settings of a block, with primitives and steps in proportion to its area, margin included.
+def of_block(settings: UwbsSettings, block: PlannedBlock, views: BlockViews) -> UwbsSettings:
+    """The settings of a block, with primitives and steps in proportion to its area.
 
     Views of which it is a part alone are more than the images that they make up; each takes its turn, so that the
     ground is seen as often as in a map of one block.
     """
-    share = area / settings.blocks.largest
+    share, steps = (area / settings.blocks.largest for area in (block.open_area, block.area))
     start = replace(settings.initial, primitives=max(_FEWEST, round(share * settings.initial.primitives)))
     most = replace(settings.densify, cap_max=max(_FEWEST, round(share * settings.densify.cap_max)))
-    steps = max(1, round(share * views_per_image * settings.iterations))
-    return replace(settings, iterations=steps, initial=start, densify=most)
+    count = round(steps * len(views.names) / views.images * settings.iterations)
+    return replace(settings, iterations=max(1, count), initial=start, densify=most)
 
 
 def _key(rec: Reconstruction, settings: UwbsSettings, views: TrainingViews, plan: Sequence[PlannedBlock]) -> str:

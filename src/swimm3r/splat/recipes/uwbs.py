@@ -17,6 +17,7 @@ from torch import Tensor
 from swimm3r.devices import CPU
 from swimm3r.medium import Medium, MediumFit
 from swimm3r.scene.reconstruction import Reconstruction
+from swimm3r.splat.block_store import joined
 from swimm3r.splat.densify import mcmc_beta, schedule
 from swimm3r.splat.densify.rows import appended, moments_after
 from swimm3r.splat.dynamic.linear_motion import ways
@@ -34,6 +35,7 @@ from swimm3r.splat.training.sgg import differentiate
 from swimm3r.splat.training.state import FIELD, POSES, State, clip_field, first_state, parameters_of
 from swimm3r.splat.views import TrainingView
 
+_DEAD = -12.0  # logit of an opacity that is relocated
 _HORIZON_STD = 0.2  # of the open water's color around the scene's mean color, as structure from motion assumes
 
 
@@ -67,8 +69,8 @@ class Uwbs:
 
     def _first_water(self) -> MediumField:
         """The water that the blocks of a large map share; without, the reconstruction's."""
-        if self.scene.water is not None:
-            return copy.deepcopy(self.scene.water).requires_grad_(True)
+        if self.scene.surroundings is not None:
+            return copy.deepcopy(self.scene.surroundings.water).requires_grad_(True)
         settings, scale = self.settings, self.scene.scale
         medium = None
         fit = measured_water(self.scene.rec)
@@ -94,8 +96,9 @@ class Uwbs:
         p = BetaPrimitives(*(values.detach().requires_grad_() for values in state.primitives))
         filtered = settings.sgg.enabled and share <= settings.sgg.end
         pinhole_view = self.scene.pinhole_view(view, state.poses)
-        drawing = draw(p, state.field, pinhole_view, settings, view.time, sgg=filtered)
-        loss = objective(p, drawing, view, settings, self.prior, self._regularized(share))
+        drawn = self._with_neighbors(p)
+        drawing = draw(drawn, state.field, pinhole_view, settings, view.time, sgg=filtered)
+        loss = objective(drawn, drawing, view, settings, self.prior, self._regularized(share))
         numbers, total = loss.numbers | {"primitives": float(len(p.xyz))}, loss.total
         rng = loop.generator(settings.seed, step, 7)
         off = self.scene.epipolar_error(state.poses, settings.poses, share, rng)
@@ -106,12 +109,17 @@ class Uwbs:
         if not filtered:
             found = torch.autograd.grad(total, [*leaves.values()], materialize_grads=True)
             return _Adjoint(dict(zip(leaves, found, strict=True)), None, numbers)
-        sgg = differentiate(total, loss.depth, [*leaves.values()], p, drawing, pinhole_view, settings)
+        sgg = differentiate(total, loss.depth, [*leaves.values()], drawn, drawing, pinhole_view, settings)
         gradients = dict(zip(leaves, sgg.gradients, strict=True))
-        gradients["xyz"] = gradients["xyz"] + sgg.xyz
+        gradients["xyz"] = gradients["xyz"] + sgg.xyz[: len(p.xyz)]
         pulled = sgg.uncertainty > 0
         numbers |= {"medium_uncertainty": sgg.uncertainty.sum() / pulled.sum().clamp(min=1)}
-        return _Adjoint(gradients, sgg.multiplier, numbers)
+        return _Adjoint(gradients, sgg.multiplier[: len(p.xyz)], numbers)
+
+    def _with_neighbors(self, p: BetaPrimitives) -> BetaPrimitives:
+        """The primitives that a view is drawn from: those in training, and before finished blocks theirs."""
+        around = self.scene.surroundings
+        return p if around is None else joined([p, around.neighbors])
 
     @torch.no_grad()
     def _descend(self, state: State, adjoint: _Adjoint, rates: dict[str, float], step: int) -> None:
@@ -158,7 +166,7 @@ class Uwbs:
         rates["xyz"] = self.scene.radius * log_linear(r.xyz, r.xyz_end, share)
         medium = log_linear(r.medium, r.medium_end, share)
         untouched = self.prior is not None and share <= self.settings.medium.begin
-        if untouched or self.scene.water is not None:
+        if untouched or self.scene.surroundings is not None:
             medium = 0.0
         rates |= {name: medium for name in names if name.startswith(FIELD)}
         return rates | {
@@ -173,12 +181,15 @@ class Uwbs:
     @torch.no_grad()
     def _densified(self, state: State, adjoint: _Adjoint, step: int, rate: float) -> tuple[State, _Adjoint]:
         """Relocation and growth, then noise; rows that start anew get no gradient of this step."""
-        d = self.settings.densify
-        n = len(state.primitives.xyz)
+        d, before, around = self.settings.densify, state.primitives, self.scene.surroundings
+        if around is not None:  # what has come onto a neighbor's ground is left to the neighbor
+            gone = around.is_closed(before.xyz)
+            before = before._replace(opacity=torch.where(gone, _DEAD, before.opacity))
+        n = len(before.xyz)
         most = round((1 - self._kept_free(step)) * d.cap_max)
         target = schedule.grown(n, most, d.growth, d, self.settings.iterations)
         rng = loop.generator(self.settings.seed, step, 4)
-        done = mcmc_beta.relocate_and_grow(state.primitives, target, d.min_opacity, rng)
+        done = mcmc_beta.relocate_and_grow(before, target, d.min_opacity, rng)
         p = done.primitives
         if d.noise_cadence == "round":
             p = p._replace(xyz=p.xyz + self._noise(p, rate, rng))

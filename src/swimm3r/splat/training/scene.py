@@ -3,18 +3,34 @@
 from dataclasses import dataclass, replace
 
 import torch
-from jaxtyping import Float
+from jaxtyping import Bool, Float
 from torch import Tensor
 
 from swimm3r.cameras import Cameras
 from swimm3r.devices import CPU
 from swimm3r.scene.reconstruction import Reconstruction
+from swimm3r.splat.ground import Window, held_by_any
 from swimm3r.splat.medium.field import MediumField
 from swimm3r.splat.pose_mlp import PoseMlp
+from swimm3r.splat.primitives.beta import BetaPrimitives
 from swimm3r.splat.projection.pinhole import Pinhole, pinhole
 from swimm3r.splat.shared_settings import TrainingPoseSettings
 from swimm3r.splat.training_poses import TrainingPoses
 from swimm3r.splat.views import TrainingView, TrainingViews
+
+
+@dataclass(frozen=True, eq=False)
+class Surroundings:
+    """The finished parts of a large map around a block in training; none of it is trained."""
+
+    water: MediumField  # that all blocks share, per working unit
+    neighbors: BetaPrimitives  # near the block, drawn with it, working units
+    closed: tuple[Window, ...]  # of the neighbors: the block has no primitives there
+    scale: float  # working units per scene unit, which windows are in
+
+    def is_closed(self, xyz: Float[Tensor, "n 3"]) -> Bool[Tensor, " n"]:
+        """Mask of the positions, working units, that are a neighbor's."""
+        return held_by_any(self.closed, xyz / self.scale)
 
 
 @dataclass(frozen=True)
@@ -27,7 +43,7 @@ class TrainingScene:
     views: TrainingViews
     poses: TrainingPoses | None = None  # None where poses are held
     device: torch.device = CPU  # of primitives and water; frames and poses are on the processor
-    water: MediumField | None = None  # that all blocks of a large map share, per working unit; it is not trained
+    surroundings: Surroundings | None = None  # of a block of a large map
 
     @property
     def refined_cameras(self) -> int:
