@@ -8,9 +8,11 @@ import torch
 
 from swimm3r.cameras import Cameras
 from swimm3r.errors import InputError
+from swimm3r.export.gaussians import clear_difference, clear_gaussians
 from swimm3r.splat.block_store import BlockEntry, PartCache, StoredBlocks, nbytes, no_primitives, write_block
 from swimm3r.splat.blocks.coarse import box_of, coarse_of
 from swimm3r.splat.map_file import load_map
+from swimm3r.splat.pose_refinement import in_sight
 from swimm3r.splat.primitives.beta import BetaPrimitives, select
 from swimm3r.splat.projection.pinhole import pinhole
 from swimm3r.splat.rendering import SplatMap
@@ -151,3 +153,24 @@ def test_entries_are_checked(change, said):
     entry = BlockEntry("blocks/0000.safetensors", 5, 1, 0.1, (0.0, 0.0, 0.0), (1.0, 1.0, 1.0))
     with pytest.raises(ValueError, match=said):
         replace(entry, **change)
+
+
+def test_pose_refinement_sees_the_primitives_of_the_whole_map(turned_wall, tmp_path):
+    cut = in_blocks(turned_wall, tmp_path)
+    for x in (-1.0, 0.4):
+        whole, found = (in_sight(scene, looking(x)) for scene in (turned_wall, cut))
+        assert {tuple(row) for row in found.xyz.tolist()} == {tuple(row) for row in whole.xyz.tolist()}
+
+
+def test_an_export_asks_for_each_block_the_cameras_that_see_it(turned_wall, tmp_path):
+    cut = in_blocks(turned_wall, tmp_path)
+    views = [looking(x) for x in torch.linspace(-2.5, 2.5, 7).tolist()]
+    cameras = replace(views[0], K=torch.cat([v.K for v in views]), distortion=torch.zeros(7, 0, dtype=torch.float64),
+                      cam2world=torch.cat([v.cam2world for v in views]))  # fmt: skip
+    whole, found = (clear_gaussians(scene, cameras) for scene in (turned_wall, cut))
+    order = [g.xyz[:, 0].argsort() for g in (whole, found)]
+    for name in ("xyz", "rgb", "opacity", "covariance"):
+        a, b = getattr(whole, name)[order[0]], getattr(found, name)[order[1]]
+        torch.testing.assert_close(a, b, atol=1e-4, rtol=1e-3)
+    difference = clear_difference(cut, found, cameras[[1, 5]])
+    assert abs(difference.psnr - clear_difference(turned_wall, whole, cameras[[1, 5]]).psnr) < 0.1

@@ -22,6 +22,7 @@ OUTPUTS = {  # path in the run folder -> contents
     "sfm/restored": "Frames without the water, as displayed",
     "sfm/restored_physical": "Frames without the water, before the white balance, 16 bits",
     "splat/map.safetensors": "Splatting map",
+    "splat/blocks": "Its blocks, with the record of their training",
     "splat/cameras.json": "Camera poses as the map's training refined them",
     "splat/metrics.jsonl": "Record of the training",
     "renders/test": "Test frames as the map renders them",

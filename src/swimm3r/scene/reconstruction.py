@@ -204,8 +204,10 @@ class Reconstruction:
         Those behind a camera are left out.
         """
         depths = []
+        order = self.tracks.frame.argsort(stable=True)
+        of_frame = order.split(torch.bincount(self.tracks.frame, minlength=len(self.names)).tolist())
         for i in range(len(self.names)):
-            mine = self.tracks.point[self.tracks.frame == i]
+            mine = self.tracks.point[of_frame[i]]
             points = self.points.xyz[mine] if len(self.tracks.point) else self.points.xyz
             depths.append(project(self.cameras[i], points[None])[1][0])
         z = torch.cat(depths)
