@@ -1,41 +1,19 @@
 """Blocks on disk: a view takes those that it sees, in a memory of bounded size."""
 
 from dataclasses import replace
-from pathlib import Path
 
 import pytest
 import torch
+from tests.splat.cut import in_blocks
 
 from swimm3r.cameras import Cameras
 from swimm3r.errors import InputError
 from swimm3r.export.gaussians import clear_difference, clear_gaussians
-from swimm3r.splat.block_store import BlockEntry, PartCache, StoredBlocks, nbytes, no_primitives, write_block
-from swimm3r.splat.blocks.coarse import box_of, coarse_of
+from swimm3r.splat.block_store import BlockEntry, PartCache, nbytes, no_primitives, write_block
 from swimm3r.splat.map_file import load_map
 from swimm3r.splat.pose_refinement import in_sight
-from swimm3r.splat.primitives.beta import BetaPrimitives, select
 from swimm3r.splat.projection.pinhole import pinhole
 from swimm3r.splat.rendering import SplatMap
-from swimm3r.splat.settings import RenderSettings
-
-
-def in_blocks(scene: SplatMap, folder: Path, parts: int = 6) -> SplatMap:
-    """The map of a wall cut into strips."""
-    p = scene.primitives
-    assert isinstance(p, BetaPrimitives)
-    edges = torch.linspace(float(p.xyz[:, 0].min()), float(p.xyz[:, 0].max()) + 1e-3, parts + 1)
-    entries = []
-    for k in range(parts):
-        own = select(p, (p.xyz[:, 0] >= edges[k]) & (p.xyz[:, 0] < edges[k + 1]))
-        few, (low, high) = coarse_of(own), box_of(own, RenderSettings())
-        count, coarse = len(own.xyz), len(few.primitives.xyz)
-        entry = BlockEntry(
-            f"blocks/{k:04d}.safetensors", count, coarse, few.spacing, tuple(low.tolist()), tuple(high.tolist())
-        )
-        write_block(folder / entry.coarse_file, few.primitives, "key")
-        write_block(folder / entry.file, own, "key", entry)
-        entries.append(entry)
-    return replace(scene, primitives=no_primitives(), blocks=StoredBlocks(folder, "key", tuple(entries)))
 
 
 def looking(x: float, z: float = 0.0, width: int = 64, height: int = 48) -> Cameras:

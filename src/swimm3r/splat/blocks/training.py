@@ -1,10 +1,10 @@
 """A large map trained: first the water on a coarse map of the whole dive, then block after block in that water.
 
-A block is trained on the pixels whose surface lies in its window or the margin around it, and keeps the primitives in
-the window. Neighbors take turns: the later one is trained beside the finished primitives of the earlier, and so the two
-join. Blocks of one turn depend on nothing but their task and files of earlier turns, and a task whose block is there
-already does nothing: any number of processes may share them, and one that was killed is repeated alone, from its
-checkpoint.
+A block is trained on the pixels whose surface lies in its window or the margin around it, and leaves the primitives of
+the margin to later blocks. Neighbors take turns: the later one is trained beside the finished primitives of the
+earlier, and so the two join. Blocks of one turn depend on nothing but their task and files of earlier turns, and a task
+whose block is there already does nothing: any number of processes may share them, and one that was killed is repeated
+alone, from its checkpoint.
 """
 
 import logging
@@ -35,7 +35,7 @@ from swimm3r.splat.block_store import (
 from swimm3r.splat.blocks.coarse import box_of, coarse_of
 from swimm3r.splat.blocks.part import BlockViews, part_of, views_of_blocks
 from swimm3r.splat.blocks.plan import PlannedBlock
-from swimm3r.splat.ground import Window
+from swimm3r.splat.ground import Window, held_by_any
 from swimm3r.splat.medium.field import MediumField
 from swimm3r.splat.primitives.beta import BetaPrimitives, rescaled, select
 from swimm3r.splat.recipes import recipe_parts
@@ -157,7 +157,8 @@ def train_block(task: BlockTask, progress: Progress = silent) -> None:
         )
     primitives, _ = map_in_scene_units(final.to(CPU), 1 / task.scale)
     assert isinstance(primitives, BetaPrimitives)
-    own = select(primitives, task.window.holds(primitives.xyz))
+    kept = (task.window, *task.closed)  # beside what is closed there they were trained; the rest is a later block's
+    own = select(primitives, held_by_any(kept, primitives.xyz))
     few = coarse_of(own)
     render = settings_in_scene_units(task.settings, 1 / task.scale).render
     box = box_of(own, render) if len(own.xyz) else (torch.zeros(3), torch.zeros(3))
@@ -176,7 +177,7 @@ def surroundings_of(task: BlockTask, device: torch.device) -> Surroundings:
         theirs = read_block(task.folder / file, task.key)
         parts.append(select(theirs, near.holds(theirs.xyz)))
     neighbors = rescaled(joined(parts), task.scale).to(device)
-    return Surroundings(task.water, neighbors, task.closed, task.scale)
+    return Surroundings(task.water, neighbors)
 
 
 def _is_finished(task: BlockTask) -> bool:

@@ -35,7 +35,6 @@ from swimm3r.splat.training.sgg import differentiate
 from swimm3r.splat.training.state import FIELD, POSES, State, clip_field, first_state, parameters_of
 from swimm3r.splat.views import TrainingView
 
-_DEAD = -12.0  # logit of an opacity that is relocated
 _HORIZON_STD = 0.2  # of the open water's color around the scene's mean color, as structure from motion assumes
 
 
@@ -181,15 +180,12 @@ class Uwbs:
     @torch.no_grad()
     def _densified(self, state: State, adjoint: _Adjoint, step: int, rate: float) -> tuple[State, _Adjoint]:
         """Relocation and growth, then noise; rows that start anew get no gradient of this step."""
-        d, before, around = self.settings.densify, state.primitives, self.scene.surroundings
-        if around is not None:  # what has come onto a neighbor's ground is left to the neighbor
-            gone = around.is_closed(before.xyz)
-            before = before._replace(opacity=torch.where(gone, _DEAD, before.opacity))
-        n = len(before.xyz)
+        d = self.settings.densify
+        n = len(state.primitives.xyz)
         most = round((1 - self._kept_free(step)) * d.cap_max)
         target = schedule.grown(n, most, d.growth, d, self.settings.iterations)
         rng = loop.generator(self.settings.seed, step, 4)
-        done = mcmc_beta.relocate_and_grow(before, target, d.min_opacity, rng)
+        done = mcmc_beta.relocate_and_grow(state.primitives, target, d.min_opacity, rng)
         p = done.primitives
         if d.noise_cadence == "round":
             p = p._replace(xyz=p.xyz + self._noise(p, rate, rng))

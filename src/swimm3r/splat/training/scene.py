@@ -3,13 +3,12 @@
 from dataclasses import dataclass, replace
 
 import torch
-from jaxtyping import Bool, Float
+from jaxtyping import Float
 from torch import Tensor
 
 from swimm3r.cameras import Cameras
 from swimm3r.devices import CPU
 from swimm3r.scene.reconstruction import Reconstruction
-from swimm3r.splat.ground import Window, held_by_any
 from swimm3r.splat.medium.field import MediumField
 from swimm3r.splat.pose_mlp import PoseMlp
 from swimm3r.splat.primitives.beta import BetaPrimitives
@@ -25,12 +24,6 @@ class Surroundings:
 
     water: MediumField  # that all blocks share, per working unit
     neighbors: BetaPrimitives  # near the block, drawn with it, working units
-    closed: tuple[Window, ...]  # of the neighbors: the block has no primitives there
-    scale: float  # working units per scene unit, which windows are in
-
-    def is_closed(self, xyz: Float[Tensor, "n 3"]) -> Bool[Tensor, " n"]:
-        """Mask of the positions, working units, that are a neighbor's."""
-        return held_by_any(self.closed, xyz / self.scale)
 
 
 @dataclass(frozen=True)
