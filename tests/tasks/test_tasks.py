@@ -152,6 +152,41 @@ def test_submitit_runs_the_same_tasks_in_processes_of_its_own(tmp_path: Path, mo
     assert "ZeroDivisionError" in (logs / "faulty.log").read_text()
 
 
+SBATCH = """#!{python}
+import os, re, subprocess, sys
+text = open(sys.argv[-1]).read()
+open({seen!r}, "w").write(text)
+last = int(re.search(r"--array=0-(\\d+)", text)[1])
+command = "\\n".join(line for line in text.splitlines() if line.startswith("export"))
+command += "\\n" + next(line for line in text.splitlines() if line.startswith("srun"))
+for task in range(last + 1):
+    own = dict(SLURM_JOB_ID=f"{{77 + task}}", SLURM_ARRAY_JOB_ID="77", SLURM_ARRAY_TASK_ID=str(task), SLURM_NTASKS="1",
+               SLURM_PROCID="0", SLURM_LOCALID="0", SLURM_NODEID="0", SLURM_JOB_NUM_NODES="1", SLURM_JOB_NODELIST="sea")
+    subprocess.Popen(["sh", "-c", command], env=dict(os.environ, **own), stdout=-3, stderr=-3)
+print("Submitted batch job 77")
+"""
+SRUN = '#!/bin/sh\nwhile [ "$1" != --error ]; do shift; done; shift 2; exec "$@"\n'
+
+
+@without_submitit
+def test_a_cluster_gets_one_array_of_jobs(tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
+    """Slurm's commands are stand-ins that run every job of the array here, at once."""
+    programs, seen = tmp_path / "bin", tmp_path / "sent.sh"
+    programs.mkdir()
+    for name, text in (("sbatch", SBATCH.format(python=sys.executable, seen=str(seen))), ("srun", SRUN)):
+        (programs / name).write_text(text)
+        (programs / name).chmod(0o755)
+    monkeypatch.setenv("PATH", f"{programs}{os.pathsep}{os.environ['PATH']}")
+    monkeypatch.setenv("PYTHONPATH", os.pathsep.join([str(ROOT), str(ROOT / "src")]))
+    engine = EngineSettings(engine="slurm", jobs=2, cpus=3, partition="sea", minutes=5, memory=4, gpus=1)
+    failures = run_tasks(work, parts(tmp_path, ("first", "refused", "last")), engine, logs=tmp_path / "logs")
+    assert [(failure.name, failure.message) for failure in failures] == [("refused", "no frames in it")]
+    assert (tmp_path / "last.done").read_text().split()[1] == "3"
+    sent = seen.read_text()
+    for asked in ("array=0-2%2", "cpus-per-task=3", "partition=sea", "time=5", "mem=4GB", "gpus-per-node=1"):
+        assert f"#SBATCH --{asked}\n" in sent
+
+
 @without_ray
 def test_ray_runs_the_same_tasks_in_processes_of_its_own(tmp_path: Path):
     engine = EngineSettings(engine="ray", jobs=2, cpus=1)

@@ -99,7 +99,9 @@ def estimate_depth(
             _each(passes.step(name), left, total, settings.threads, partial(progress, name))
             continue
         parts = [
-            PartOfPass(f"{name} of frames {k} to {k + _OF_A_TASK}", name, tuple(left[k : k + _OF_A_TASK]))
+            PartOfPass(
+                f"{name} of frames {k + 1} to {min(k + _OF_A_TASK, len(left))}", name, tuple(left[k : k + _OF_A_TASK])
+            )
             for k in range(0, len(left), _OF_A_TASK)
         ]
         work = partial(make_part, folder=folder.parent.resolve(), frames=frames, settings=settings)
