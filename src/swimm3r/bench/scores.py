@@ -84,6 +84,14 @@ COLUMNS = (
     ),
     Column("fps_localize", "Loc. FPS", 3, "high", "all stages together, without what is done once per map"),
     Column("peak_mb", "Peak, MB", 0, "low", "resident memory of a process that localizes in this map alone"),
+    Column("ate_pct", "ATE, %", 4, "low", "of the path's length, after the similarity of the camera centers"),
+    Column("rotation_deg", "Rotation, deg", 3, "low", "mean over frames, after the rotation of all orientations"),
+    *(
+        Column(f"cpu_{part}", f"{part}, CPU s", 2, "low", "processor seconds per frame")
+        for part in ("prepare", "mapping", "depth", "water", "map", "scores")
+    ),
+    Column("cpu_minutes_100m", "100 m, CPU min", 1, "low", "processor minutes of all parts per 100 m of path"),
+    Column("peak_run_mb", "Peak, MB", 0, "low", "resident memory of the process, the largest of its stages"),
     Column("peak_vram_mb", "Peak VRAM, MB", 0, "low", "allocated by torch on the GPU while it localized"),
 )
 

@@ -4,9 +4,25 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Annotated, Literal
 
-from swimm3r.settings import Range, Settings
+from swimm3r.settings import Count, Range, Seed, Settings
 
 Seeds = Annotated[int, Range(1, 1000)]  # trainings of one method on one scene
+
+
+@dataclass(frozen=True)
+class ScaleSettings(Settings):
+    """Synthetic surveys of growing length."""
+
+    counts: tuple[Count, ...] = (100, 300, 1000)
+    """Numbers of frames; a frame every 10 cm of path."""
+    width: Count = 640
+    """Width of the frames in pixels."""
+    height: Count = 360
+    """Height of the frames in pixels."""
+    seed: Seed = 0
+    """Seed of seafloor, path and water."""
+    last: Literal["mapping", "sfm", "splat", "eval"] = "eval"
+    """Last part to run: poses alone (mapping), or a stage of the pipeline."""
 
 
 SfmMethod = Literal[

@@ -14,6 +14,7 @@ from swimm3r.cli.bench.ablation_uwbs import ablation_uwbs_command
 from swimm3r.cli.bench.flsea import ablation_sfm_command, flsea_command
 from swimm3r.cli.bench.on_runs import localization, restoration
 from swimm3r.cli.bench.render import render_command
+from swimm3r.cli.bench.scale import scale_command
 from swimm3r.cli.bench.sfm import sfm_command as bench_sfm_command
 from swimm3r.cli.bench.table import defaults_of
 from swimm3r.cli.brief import BRIEF
@@ -116,6 +117,7 @@ def commands_for(arguments: Sequence[str]) -> dict[str, Callable | Family]:
         "restoration": restoration,
         "render": render_command(tables),
         "localization": localization,
+        "scale": scale_command(tables),
         "ablation-sfm": ablation_sfm_command(tables),
         "ablation-uwbs": ablation_uwbs_command(tables),
     }

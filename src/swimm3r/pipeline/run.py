@@ -32,6 +32,7 @@ from swimm3r.scene.reconstruction import Reconstruction
 from swimm3r.scene.reconstruction_io import load_reconstruction, unfiltered_matches
 from swimm3r.scene.run_folder import open_run
 from swimm3r.sfm import reconstruct
+from swimm3r.sfm.between import read_between
 from swimm3r.splat import train
 from swimm3r.splat.map_file import load_map
 from swimm3r.splat.settings import MapDevice
@@ -115,6 +116,7 @@ def _make_stages(
         "frames": len(frames),
         "train": len(frames.train),
         "test": len(frames.test),
+        "between": len(frames.between),
         "width": frames.width,
         "height": frames.height,
         "gray": frames.gray,
@@ -131,7 +133,9 @@ def _make_stages(
         reuse=lambda: None,
     )
     rec = load_reconstruction(folder / "sfm", frames)
-    record.add(sections.sfm_sections(rec, frames, unfiltered_matches(folder / "sfm", rec)))
+    between = read_between(folder / "sfm")
+    placed = 0 if between is None else len(between.names)
+    record.add(sections.sfm_sections(rec, frames, unfiltered_matches(folder / "sfm", rec), placed))
     if last_stage == "sfm":
         return
 

@@ -30,10 +30,13 @@ from swimm3r.splat.training_poses import RefinedPoses
 _ASKED = 16  # training views that the map's mean water is taken over
 
 
-def sfm_sections(rec: Reconstruction, frames: Frames, matches: Matches | None = None) -> dict[str, object]:
+def sfm_sections(
+    rec: Reconstruction, frames: Frames, matches: Matches | None = None, placed_between: int = 0
+) -> dict[str, object]:
     """ "sfm", "medium" and "warnings": what structure from motion found.
 
-    Epipolar scores are of `matches`, by default those that the reconstruction keeps.
+    Epipolar scores are of `matches`, by default those that the reconstruction keeps. `placed_between` is the number of
+    frames between keyframes that have a pose.
     """
     epipolar = match_scores(match_errors(rec, matches or rec.matches))
     observations = torch.bincount(rec.tracks.point, minlength=len(rec.points.xyz)).double()
@@ -41,6 +44,8 @@ def sfm_sections(rec: Reconstruction, frames: Frames, matches: Matches | None = 
         "backend": rec.backend,
         "frames": len(frames.train),
         "registered": len(rec.names),
+        "between": len(frames.between),
+        "between_placed": placed_between,
         "points": len(rec.points.xyz),
         "dense_points": 0 if rec.cloud is None else len(rec.cloud.xyz),
         "reprojection_px": ((rec.points.error.double() * observations).sum() / observations.sum()).item()

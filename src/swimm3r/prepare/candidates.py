@@ -50,11 +50,11 @@ def sharpness(gray: UInt8[np.ndarray, "h w"]) -> float:
     return float(cv2.Laplacian(gray, cv2.CV_16S).var(dtype=np.float64))
 
 
-def small_gray(image: Rgb) -> UInt8[np.ndarray, "h w"]:
-    """The copy on which sharpness is judged."""
+def small_gray(image: Rgb, side: int = GRAY_SIDE) -> UInt8[np.ndarray, "h w"]:
+    """A gray copy of at most so many pixels along its longer side; by default the one on which sharpness is judged."""
     import cv2
 
-    small = scaled_down(image, GRAY_SIDE)
+    small = scaled_down(image, side)
     if small.dtype == np.uint16:
         small = (small >> 8).astype(np.uint8)
     return cv2.cvtColor(small, cv2.COLOR_RGB2GRAY)

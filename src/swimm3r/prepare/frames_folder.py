@@ -12,8 +12,12 @@ from collections.abc import Iterator
 from contextlib import contextmanager, suppress
 from dataclasses import dataclass, replace
 from datetime import datetime
+from functools import lru_cache
 from pathlib import Path
-from typing import Any, Literal
+from typing import Any
+
+import numpy as np
+from jaxtyping import UInt8
 
 from swimm3r.errors import InputError
 from swimm3r.io import images
@@ -23,18 +27,20 @@ from swimm3r.io.files.damage import guard, remake
 from swimm3r.io.files.json_file import read_json
 from swimm3r.io.files.safe_names import check_name, check_names, shown_name
 from swimm3r.io.video import Video
-from swimm3r.prepare.candidates import SelectedImages, target_size
+from swimm3r.prepare.candidates import SelectedImages, small_gray, target_size
 from swimm3r.prepare.image_folder import images_of, only_video, prepare_stills
+from swimm3r.prepare.keyframes import SIDE as MOTION_SIDE
 from swimm3r.prepare.masks import check_masks, prepare_masks
+from swimm3r.prepare.split import split_frames
 from swimm3r.prepare.video import prepare_clip
 from swimm3r.progress import Progress, silent
-from swimm3r.scene.frames import Frame, Frames, write_index
+from swimm3r.scene.frames import Frame, Frames, Part, write_index
 from swimm3r.scene.settings import FrameSettings
 
 log = logging.getLogger(__name__)
 
-TEST_EVERY = 8  # index % 8 == 0 is held back, as the paper and 3DGS count
 LEAST = 3  # frames: the first is held back for testing, and depth takes two
+_HELD = 8  # small copies in memory while the frames are split
 
 
 def read_frames(
@@ -59,7 +65,7 @@ def read_frames(
             dive = prepare_stills(source, draft, settings, progress, leave_out=[folder, folder.parent])
         else:
             dive = prepare_clip(source, draft, settings, progress)
-        _write_frames(dive, draft, source, settings)
+        _write_frames(dive, draft, source, settings, progress)
     return load_frames(folder)
 
 
@@ -70,7 +76,7 @@ class _Entry:
     name: str
     time: float
     sharpness: float
-    split: Literal["train", "test"]
+    split: Part
     mask: str | None = None
 
 
@@ -165,7 +171,7 @@ def _checked(source: Path) -> Path:
     return source
 
 
-def _write_frames(dive: SelectedImages, draft: Path, source: Path, settings: FrameSettings) -> None:
+def _write_frames(dive: SelectedImages, draft: Path, source: Path, settings: FrameSettings, progress: Progress) -> None:
     """Masks and frames.json; frames.json is the last file of the folder."""
     warnings = list(dive.warnings)
     size = target_size(dive.images[0].size, settings.long_side) if dive.images else (0, 0)
@@ -191,16 +197,23 @@ def _write_frames(dive: SelectedImages, draft: Path, source: Path, settings: Fra
             "The frames are gray: their three channels are equal. The water's coefficients are those of one channel, "
             "and removing the water restores contrast, not color."
         )
+
+    @lru_cache(maxsize=_HELD)
+    def gray_of(i: int) -> UInt8[np.ndarray, "h w"]:
+        return small_gray(images.read_rgb(draft / kept[i].name), MOTION_SIDE)
+
+    sharpness = [image.sharpness for image in kept]
+    parts = split_frames(gray_of, sharpness, settings, progress, ordered=dive.ordered)
     listed = tuple(
         Frame(
             name=image.name,
             path=draft / image.name,
             time=round(image.time, 6),
             sharpness=round(image.sharpness, 3),
-            split="test" if i % TEST_EVERY == 0 else "train",
+            split=part,
             mask=draft / masks.places[image.name] if image.name in masks.places else None,
         )
-        for i, image in enumerate(kept)
+        for image, part in zip(kept, parts, strict=True)
     )
     _remove_all_but(draft, {path for frame in listed for path in (frame.path, frame.mask)})
     frames = Frames(

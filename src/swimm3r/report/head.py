@@ -32,7 +32,9 @@ def size_of_dive(frames: Frames) -> str:
     count = f"{len(frames):,} frames of {frames.width} \u00d7 {frames.height} pixels"
     span = frames.span[1] - frames.span[0]
     length = f" over {clock(span)}" if has_times(frames) and span > 0 else ""
-    return f"{count}{length}; {len(frames.train):,} used, {len(frames.test):,} held back for testing"
+    return f"{count}{length}; {len(frames.train):,} used, {len(frames.test):,} held back for testing" + (
+        f", {len(frames.between):,} between keyframes" if len(frames.between) else ""
+    )
 
 
 def has_times(frames: Frames) -> bool:

@@ -30,6 +30,10 @@ _SHOWN = 6  # frames in a notebook
 _SHOWN_PIXELS = 12e6  # decoded for it, at most
 
 
+Part = Literal["train", "test", "between"]
+"""Frames that everything is made from, those held back for scores, and those between keyframes, which get a pose."""
+
+
 @dataclass(frozen=True)
 class Frame:
     """One prepared image."""
@@ -38,7 +42,7 @@ class Frame:
     path: Path
     time: float  # seconds since the start of the clip; the index where stills carry no time
     sharpness: float  # variance of the Laplacian of a gray copy of at most 960 px, 8-bit units
-    split: Literal["train", "test"]
+    split: Part
     mask: Path | None = None  # image of the same size, 0 where the frame is not to be used
 
 
@@ -62,7 +66,7 @@ class Frames:
         if not self.frames:
             return f"Frames(none, {self.width}x{self.height})"
         masked = sum(frame.mask is not None for frame in self.frames)
-        split = f"{len(self.train)} for training, {len(self.test)} for testing" + f", {masked} masked" * (masked > 0)
+        split = self._split_in_words + f", {masked} masked" * (masked > 0)
         first, last = self.span
         return (
             f"Frames({len(self)} of {self.width}x{self.height}, {split},\n"
@@ -73,14 +77,19 @@ class Frames:
         """A strip of a few frames, evenly spread over the dive. Raises InputError where one of them is damaged."""
         count = min(len(self), _SHOWN, max(2, int(_SHOWN_PIXELS / (self.width * self.height))))
         chosen = sorted({round(i) for i in np.linspace(0, len(self) - 1, count)}) if count else []
-        split = f"{len(self.train)} for training, {len(self.test)} for testing"
-        title = f"{len(self)} frames of {self.width}x{self.height}: {split}"
+        title = f"{len(self)} frames of {self.width}x{self.height}: {self._split_in_words}"
         shown = [(images.jpeg_uri(self._eight_bits(i), 160, 80), self._caption(i)) for i in chosen]
         return notebook.image_row(title, shown)
 
+    @property
+    def _split_in_words(self) -> str:
+        between = len(self.between)
+        words = f"{len(self.train)} for training, {len(self.test)} for testing"
+        return words + f", {between} between keyframes" * (between > 0)
+
     def _caption(self, i: int) -> str:
         frame = self.frames[i]
-        return f"{frame.name}, {frame.time:.1f} s" + ", test" * (frame.split == "test")
+        return f"{frame.name}, {frame.time:.1f} s" + f", {frame.split}" * (frame.split != "train")
 
     def __iter__(self) -> Iterator[Frame]:
         return iter(self.frames)
@@ -106,6 +115,11 @@ class Frames:
     def test(self) -> "Frames":
         """The frames held back for scoring."""
         return replace(self, frames=tuple(f for f in self.frames if f.split == "test"))
+
+    @property
+    def between(self) -> "Frames":
+        """The frames between keyframes: they get a pose, and nothing is made from them."""
+        return replace(self, frames=tuple(f for f in self.frames if f.split == "between"))
 
     @property
     def span(self) -> tuple[float, float]:

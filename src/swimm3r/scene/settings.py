@@ -24,6 +24,11 @@ class FrameSettings(Settings):
     """Largest number of frames, spread evenly over the dive; 0 sets no limit."""
     long_side: LongSideOrOwn = 1600
     """Longer side in pixels to which larger images are reduced; 0 keeps the original size."""
+    keyframe_motion: Annotated[float, Range(0, 0.5)] = 0.04
+    """Motion of the image between keyframes, as a share of its longer side. The frames between get poses only; 0 makes
+    every frame a keyframe."""
+    every_frame_to: CountOrZero = 100
+    """Number of frames up to which every frame is a keyframe."""
     masks: Path | None = None
     """Folder of masks NAME.png, NAME.jpg.png or NAME_mask.png whose black pixels are ignored; by default masks/ in the
     input, if it exists."""

@@ -24,7 +24,9 @@ def reconstruct(
     progress: Progress | None = None,
     engine: EngineSettings = EngineSettings(),  # noqa: B008 - records are frozen
 ) -> "swimm3r.scene.reconstruction.Reconstruction":
-    """Cameras, points, dense depth, water and restored cloud of a set of frames, of which only `frames.train` is used.
+    """Cameras, points, dense depth, water and restored cloud of a set of frames, made from `frames.train` alone.
+
+    Frames between keyframes get poses in cameras_between.json (`sfm.between`).
 
     `settings` choose the method: `ColmapSettings()` by default, `swimm3r.PRESETS["fast"].sfm` the quickest. Works in
     `folder` (a new temporary one by default) and goes on from what an interrupted call left there. A terminal or a
@@ -33,16 +35,21 @@ def reconstruct(
     Raises InputError for fewer than 2 frames and RegistrationError where too few can be placed.
     """
     settings = settings or ColmapSettings()
-    frames = frames.train
-    if len(frames) < 2:
+    used = frames.train
+    if len(used) < 2:
         raise InputError(
-            f"structure from motion needs at least 2 frames, got {len(frames)}",
+            f"structure from motion needs at least 2 frames, got {len(used)}",
             cause="the clip is too short or the sampling too coarse",
             hint="a longer clip or a higher --fps",
         )
     with watched(progress) as told:
         work = Path(folder or mkdtemp(prefix="swimm3r-sfm-"))
-        return _backend(settings).reconstruct(frames, settings, work, told, engine)
+        rec = _backend(settings).reconstruct(used, settings, work, told, engine)
+        if len(frames.between):
+            from swimm3r.sfm.between import place_between
+
+            place_between(rec, frames, work, told)
+        return rec
 
 
 def check_files(settings: SfmSettings) -> None:

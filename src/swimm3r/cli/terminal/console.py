@@ -174,14 +174,16 @@ def print_summary(summary: dict) -> None:
     taken = summary.get("input", {})
     if "frames" in taken:
         masks = f", {taken['masks']['used']} with a mask" if taken.get("masks", {}).get("used") else ""
+        between = f", {taken['between']} between keyframes" if taken.get("between") else ""
         console.print(
             f"{taken['frames']} frames of {taken['width']}x{taken['height']} ({taken['train']} for training,"
-            f" {taken['test']} for testing{masks})"
+            f" {taken['test']} for testing{between}{masks})"
         )
     sfm = summary.get("sfm")
     if sfm:
         console.print(
             f"Registered {sfm['registered']} of {sfm['frames']} frames, {sfm['points']:,} points, "
+            + (f"{sfm['between_placed']} of {sfm['between']} between keyframes, " if sfm.get("between") else "")
             + ("" if sfm["reprojection_px"] is None else f"reprojection error {sfm['reprojection_px']:.2f} px")
         )
     water = summary.get("medium", {}).get("sfm")

@@ -109,6 +109,11 @@ def adjust_lens(
     return model
 
 
+def adjust_poses(store: FeatureDatabase, model: "pycolmap.Reconstruction") -> "pycolmap.Reconstruction":
+    """The model after bundle adjustment of poses and points, its lens held."""
+    return _adjust(store, model, model.cameras[1].model.name)
+
+
 def refine(
     store: FeatureDatabase, model: "pycolmap.Reconstruction", settings: ColmapSettings, progress: Progress
 ) -> Calibrated:

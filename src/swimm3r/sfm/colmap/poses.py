@@ -20,7 +20,7 @@ from torch import Tensor
 from swimm3r.cameras import Cameras, cameras_of
 from swimm3r.errors import InputError, RegistrationError, StorageError
 from swimm3r.io.colmap.cameras import to_pycolmap_camera
-from swimm3r.io.colmap.model import ColmapModel, from_pycolmap, silence_log, to_pycolmap
+from swimm3r.io.colmap.model import ColmapModel, from_pycolmap, silence_log, to_pycolmap, write_model
 from swimm3r.io.files.atomic import atomic_path
 from swimm3r.progress import Progress, silent
 from swimm3r.scene.frames import Frames
@@ -34,6 +34,7 @@ from swimm3r.scene.reconstruction import (
 )
 from swimm3r.sfm.colmap import calibration, mapping
 from swimm3r.sfm.colmap.chunks.long_clip import is_long, map_long_clip
+from swimm3r.sfm.colmap.chunks.parts import without_jumps
 from swimm3r.sfm.colmap.plausibility import implausible
 from swimm3r.sfm.features import vlad
 from swimm3r.sfm.features.database import FeatureDatabase, fill_features, match_pairs, start_database
@@ -45,6 +46,8 @@ from swimm3r.tasks.threads import thread_count
 if TYPE_CHECKING:
     import pycolmap
 
+PARTS = "parts"  # folder of the models that did not join the largest
+_LEAST_OF_A_PART = 3  # frames
 _NONE, _NOWHERE = np.zeros(0), np.zeros((0, 2))  # what is joined where no pair matches
 
 
@@ -87,8 +90,9 @@ def reconstruct(
         try:
             with atomic_path(working.path) as draft:
                 shutil.copyfile(store.path, draft)
-            model, sizes, warnings = _map(working, frames, pairs, settings, progress, engine)
+            model, others, warnings = _map(working, frames, pairs, settings, progress, engine)
             rec = _record(model, working, frames, folder)
+            sizes = [model.num_reg_images(), *_write_parts(model, others, frames, folder / PARTS)]
             found = implausible(rec, working, frames)
         finally:
             working.path.unlink(missing_ok=True)
@@ -184,11 +188,14 @@ def _map(
     settings: ColmapSettings,
     progress: Progress,
     engine: EngineSettings,
-) -> "tuple[pycolmap.Reconstruction, list[int], list[Warning]]":
+) -> "tuple[pycolmap.Reconstruction, list[pycolmap.Reconstruction], list[QualityWarning]]":
+    """The model that is used, those that did not join it, and warnings."""
     n, threads = len(frames), settings.threads or thread_count()
     long = is_long(n, settings.mapping)
+    determined = False
     if long:
-        models = map_long_clip(store, settings, ordered=frames.ordered, progress=progress, engine=engine)
+        in_chunks = map_long_clip(store, settings, ordered=frames.ordered, progress=progress, engine=engine)
+        models, determined = in_chunks.models, in_chunks.lens_determined
     else:
         models = mapping.map_frames(store, settings, progress)
     if not models:
@@ -201,15 +208,17 @@ def _map(
         match_pairs(store, again, looser, threads, progress, again=True)
         if not long:
             model = calibration.refine(store, model, settings, progress).model  # a better lens places more
-        model = mapping.place_leftovers(store, model, settings, progress)
-        model = mapping.replace_misplaced(store, model, settings, progress)
-    sizes = [model.num_reg_images(), *(m.num_reg_images() for m in models[1:])]
+        more = mapping.place_leftovers(store, model, settings, progress)
+        more = mapping.replace_misplaced(store, more, settings, progress)
+        more = without_jumps(more) if long else more
+        model = more if more.num_reg_images() >= model.num_reg_images() else model
+    placed = model.num_reg_images()
     thin = model.compute_mean_observations_per_reg_image() < settings.mapping.thin_points
     share = settings.mapping.thin_share if thin else settings.mapping.min_share
-    if sizes[0] < max(min(settings.mapping.min_frames, n), share * n):
-        raise _too_few(sizes[0], n, settings)
+    if placed < max(min(settings.mapping.min_frames, n), share * n):
+        raise _too_few(placed, n, settings)
     if long:
-        mapped = calibration.Calibrated(model, refined=True)
+        mapped = calibration.Calibrated(model, refined=determined)
     else:
         mapped = calibration.refine(store, model, settings, progress)
     warnings = []
@@ -222,7 +231,28 @@ def _map(
                 "Shapes may be stretched in depth. Give --focal and --k1 of the camera, calibrated in water.",
             )
         )
-    return mapped.model, sizes, warnings
+    return mapped.model, models[1:], warnings
+
+
+def _write_parts(
+    model: "pycolmap.Reconstruction", others: "list[pycolmap.Reconstruction]", frames: Frames, folder: Path
+) -> list[int]:
+    """Write models that did not join the largest as `folder`/1, 2, ... and return how many frames each has.
+
+    Kept are those with at least three frames that no larger one has.
+    """
+    shutil.rmtree(folder, ignore_errors=True)
+    known = {model.images[i].name for i in model.reg_image_ids()}
+    sizes = []
+    for other in sorted(others, key=lambda m: m.num_reg_images(), reverse=True):
+        own = {other.images[i].name for i in other.reg_image_ids()}
+        if len(own - known) < _LEAST_OF_A_PART:
+            continue
+        known |= own
+        sizes.append(len(own))
+        table = from_pycolmap(other)
+        write_model(folder / f"{len(sizes)}", replace(table, names=tuple(frames.names[int(n)] for n in table.names)))
+    return sizes
 
 
 def _record(model: "pycolmap.Reconstruction", store: FeatureDatabase, frames: Frames, folder: Path) -> Reconstruction:
@@ -288,7 +318,8 @@ def _registration_warnings(placed: int, sizes: list[int], frames: Frames) -> lis
         parts = " + ".join(str(size) for size in (placed, *others))
         return [
             QualityWarning(
-                f"The frames fall into parts that did not join ({parts} of {len(frames)}); only the largest is used.",
+                f"The frames fall into parts that did not join ({parts} of {len(frames)}); only the largest is used;"
+                f" the others are COLMAP models in sfm/{PARTS}.",
                 "Record lines that overlap by half, cross them with one line, and keep a slow turn between them; "
                 "a higher --fps helps where the parts follow each other.",
             )

@@ -5,6 +5,7 @@ fail, and frames that a chunk leaves over, are those of no part; models that not
 largest.
 """
 
+from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING
 
@@ -14,10 +15,10 @@ from swimm3r.io.files.cache_key import cache_key
 from swimm3r.progress import Progress
 from swimm3r.sfm.colmap import calibration
 from swimm3r.sfm.colmap.chunks.assemble import assemble
-from swimm3r.sfm.colmap.chunks.join import join_parts
+from swimm3r.sfm.colmap.chunks.join import Joined, join_parts
 from swimm3r.sfm.colmap.chunks.links import link
-from swimm3r.sfm.colmap.chunks.parts import Part, part_of, shared_points
-from swimm3r.sfm.colmap.chunks.pilot import PILOT, pilot_lens
+from swimm3r.sfm.colmap.chunks.parts import Part, coherent_parts, part_of, shared_points, without_jumps
+from swimm3r.sfm.colmap.chunks.pilot import PILOT, PilotLens, pilot_lens
 from swimm3r.sfm.colmap.chunks.place import ChunkTask, place_chunks, placed_models, remove_stale
 from swimm3r.sfm.colmap.chunks.plan import order_by_matches, plan_chunks
 from swimm3r.sfm.features.database import MIN_INLIERS, FeatureDatabase
@@ -37,6 +38,14 @@ def is_long(frames: int, settings: MappingSettings) -> bool:
     return settings.method == "auto" and frames > 2 * settings.chunk_frames
 
 
+@dataclass(frozen=True)
+class LongClip:
+    """The models of a long clip, adjusted under one lens, which is left in the database; the largest first."""
+
+    models: "list[pycolmap.Reconstruction]"
+    lens_determined: bool  # by the images; else assumed, or held for the user
+
+
 def map_long_clip(
     store: FeatureDatabase,
     settings: ColmapSettings,
@@ -44,8 +53,8 @@ def map_long_clip(
     ordered: bool,
     progress: Progress,
     engine: EngineSettings = EngineSettings(),  # noqa: B008 - records are frozen
-) -> "list[pycolmap.Reconstruction]":
-    """Models of a clip of any length, the largest first; adjusted under one lens, which is left in the database."""
+) -> LongClip:
+    """Map a clip of any length in chunks; `engine` says where they are placed."""
     matches = match_counts(store)
     order = list(range(store.frames)) if ordered else order_by_matches(store.frames, matches).tolist()
     windows = plan_chunks(order, settings.mapping.chunk_frames, settings.mapping.chunk_overlap)
@@ -53,12 +62,14 @@ def map_long_clip(
     folder = store.path.parent / _FOLDER
     lens = pilot_lens(store, chunks, matches, settings, folder / PILOT, progress)
     if lens is None:
-        return []
+        return LongClip([], lens_determined=False)
     tasks = [_task(store, chunk, lens, matches, settings, folder) for chunk in chunks]
     remove_stale(folder, {task.folder.name for task in tasks} | {PILOT})
     place_chunks(tasks, settings.threads or thread_count(), _PLACING, progress, engine)
-    parts = [part_of(model) for task in tasks for model in placed_models(task.folder)]
-    return _join(store, parts, lens, settings, progress)
+    placed = [part_of(model) for task in tasks for model in placed_models(task.folder)]
+    parts = [piece for part in placed for piece in coherent_parts(part)]
+    models = _join(store, parts, lens, settings, progress) if parts else []
+    return LongClip(models, lens.determined)
 
 
 def match_counts(store: FeatureDatabase) -> dict[tuple[int, int], int]:
@@ -74,22 +85,23 @@ def match_counts(store: FeatureDatabase) -> dict[tuple[int, int], int]:
 def _task(
     store: FeatureDatabase,
     chunk: tuple[int, ...],
-    lens: "pycolmap.Camera",
+    lens: PilotLens,
     matches: dict[tuple[int, int], int],
     settings: ColmapSettings,
     folder: Path,
 ) -> ChunkTask:
-    inside = sorted((i, j, count) for (i, j), count in matches.items() if {i + 1, j + 1} <= set(chunk))
-    key = cache_key(chunk, inside, lens.model.name, lens.params.tolist(), settings.mapping)
-    params = tuple(lens.params.tolist())
-    return ChunkTask(key, store.path, store.frames, chunk, (lens.model.name, params), settings, folder / key)
+    own = set(chunk)
+    inside = sorted((i, j, count) for (i, j), count in matches.items() if i + 1 in own and j + 1 in own)
+    key = cache_key(chunk, inside, lens.model, lens.params, settings.mapping)
+    return ChunkTask(key, store.path, store.frames, chunk, (lens.model, lens.params), settings, folder / key)
 
 
 def _join(
-    store: FeatureDatabase, parts: list[Part], lens: "pycolmap.Camera", settings: ColmapSettings, progress: Progress
+    store: FeatureDatabase, parts: list[Part], pilot: PilotLens, settings: ColmapSettings, progress: Progress
 ) -> "list[pycolmap.Reconstruction]":
-    """The parts that hang together, each group one model, adjusted; the largest first."""
+    """The parts that hang together, each group one model, adjusted; the largest first, and its lens for all."""
     with store.open() as database:
+        lens = pilot.camera(database.read_camera(1))
         used = sorted({image for part in parts for image in part.images})
         pixels = {image: database.read_keypoints(image)[:, :2].astype(np.float64) for image in used}
     shared = shared_points(store, parts)
@@ -101,8 +113,18 @@ def _join(
             links.append(found)
     progress(_LINKING, len(shared), len(shared))
     groups = join_parts(len(parts), links, lens.mean_focal_length())
-    models = []
-    for group in groups:
+    models: list[pycolmap.Reconstruction] = []
+    for group in sorted(groups, key=lambda group: _frames_of(group, parts), reverse=True):
         model = assemble(store, parts, group, lens, progress)
-        models.append(calibration.adjust_lens(store, model, settings, progress))
+        if pilot.determined and not models:
+            model = calibration.adjust_lens(store, model, settings, progress)
+            lens = model.cameras[1]
+        else:
+            model = calibration.adjust_poses(store, model)
+        models.append(without_jumps(model))
+    calibration.set_camera(store, lens)
     return sorted(models, key=lambda model: model.num_reg_images(), reverse=True)
+
+
+def _frames_of(group: Joined, parts: list[Part]) -> int:
+    return len({image for part in group.from_part for image in parts[part].images})

@@ -10,11 +10,17 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 from jaxtyping import Float, Int
+from scipy.sparse import coo_array, csr_array, triu
+from scipy.sparse.csgraph import connected_components
 
 from swimm3r.sfm.features.database import FeatureDatabase
 
 if TYPE_CHECKING:
     import pycolmap
+
+LEAST_FRAMES = 3  # of a part
+_HOLDING = 15  # points that two frames must share to hold together, as many as a verified pair has matches
+_DEPTH_RATIO = 3.0  # of the points that two frames share: stills of a survey differ by less than 1.5
 
 
 @dataclass(frozen=True)
@@ -61,6 +67,59 @@ def part_of(model: "pycolmap.Reconstruction") -> Part:
         points[number] = np.array([ids[p.point3D_id] if p.has_point3D() else -1 for p in image.points2D], np.int64)
     xyz = np.array([model.points3D[p].xyz for p in ids]).reshape(-1, 3)
     return Part(poses, points, xyz)
+
+
+def coherent_parts(part: Part) -> list[Part]:
+    """The part, cut where only few points hold it together, or where those stand at quite another depth.
+
+    Along a chain of frames that share little a mapper may lose the scale between two of them, and go on in another
+    unit. Each piece has at least `LEAST_FRAMES` frames.
+    """
+    images = part.images
+    rows = {image: np.unique(points[points >= 0]) for image, points in part.point_of.items()}
+    indptr = np.concatenate([[0], np.cumsum([len(rows[image]) for image in images])])
+    seen = csr_array(
+        (np.ones(indptr[-1]), np.concatenate([rows[image] for image in images]), indptr), (len(images), len(part.xyz))
+    )
+    common = triu(seen @ seen.T, 1).tocoo()
+    kept = np.array(
+        [
+            count >= _HOLDING and _alike_depths(part, images[i], images[j], rows)
+            for i, j, count in zip(common.row, common.col, common.data, strict=True)
+        ],
+        bool,
+    )
+    edges = coo_array((common.data[kept], (common.row[kept], common.col[kept])), shape=common.shape)
+    _, label = connected_components(edges, directed=False)
+    pieces = [[images[i] for i in np.flatnonzero(label == k)] for k in range(label.max() + 1)]
+    return [_piece(part, own) for own in pieces if len(own) >= LEAST_FRAMES]
+
+
+def without_jumps(model: "pycolmap.Reconstruction") -> "pycolmap.Reconstruction":
+    """The model with the frames of its largest coherent part alone; itself where it is coherent."""
+    import pycolmap
+
+    part = part_of(model)
+    largest = max(coherent_parts(part), key=lambda piece: len(piece.images), default=part)
+    if len(largest.images) == len(part.images):
+        return model
+    kept = pycolmap.Reconstruction(model)
+    for image_id in model.reg_image_ids():
+        if int(model.images[image_id].name) + 1 not in largest.cam_from_world:
+            kept.deregister_frame(model.images[image_id].frame_id)
+    return kept
+
+
+def _alike_depths(part: Part, i: int, j: int, rows: dict[int, Int[np.ndarray, " k"]]) -> bool:
+    """Return whether the points that two images share are about as far from the one as from the other."""
+    xyz = part.xyz[np.intersect1d(rows[i], rows[j], assume_unique=True)]
+    depths = [xyz @ part.cam_from_world[image][2, :3] + part.cam_from_world[image][2, 3] for image in (i, j)]
+    ratio = np.median(np.maximum(depths[0], 1e-12) / np.maximum(depths[1], 1e-12))
+    return bool(1 / _DEPTH_RATIO < ratio < _DEPTH_RATIO)
+
+
+def _piece(part: Part, images: list[int]) -> Part:
+    return Part({i: part.cam_from_world[i] for i in images}, {i: part.point_of[i] for i in images}, part.xyz)
 
 
 def shared_points(store: FeatureDatabase, parts: list[Part]) -> dict[tuple[int, int], SharedPoints]:

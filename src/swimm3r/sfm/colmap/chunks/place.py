@@ -3,6 +3,7 @@
 The chunk's folder, models named 0, 1, ..., appears when they are whole: a killed run repeats the chunks it was at.
 """
 
+import logging
 import shutil
 import tempfile
 from collections.abc import Sequence
@@ -15,6 +16,7 @@ from typing import TYPE_CHECKING
 from swimm3r.io.files.atomic import atomic_folder
 from swimm3r.progress import Progress, silent
 from swimm3r.sfm.colmap import calibration
+from swimm3r.sfm.colmap.chunks.parts import LEAST_FRAMES
 from swimm3r.sfm.colmap.mapping import map_frames
 from swimm3r.sfm.features.database import FeatureDatabase, write_excerpt
 from swimm3r.sfm.settings import ColmapSettings
@@ -24,7 +26,8 @@ from swimm3r.tasks.settings import EngineSettings
 if TYPE_CHECKING:
     import pycolmap
 
-_LEAST_FRAMES = 3  # of a model that is kept
+
+log = logging.getLogger(__name__)
 
 
 @dataclass(frozen=True)
@@ -53,7 +56,7 @@ def place_chunk(task: ChunkTask, progress: Progress = silent) -> None:
         calibration.set_camera(store, lens_with(camera, name, parameters))
         models = map_frames(store, replace(task.settings, intrinsics="fixed"), progress)
     with atomic_folder(task.folder) as draft:
-        for k, model in enumerate(m for m in models if m.num_reg_images() >= _LEAST_FRAMES):
+        for k, model in enumerate(m for m in models if m.num_reg_images() >= LEAST_FRAMES):
             (draft / str(k)).mkdir()
             model.write_binary(str(draft / str(k)))
 
@@ -67,13 +70,14 @@ def place_chunks(
 ) -> None:
     """Place several chunks at a time, in threads (COLMAP releases the interpreter) or where `engine` says.
 
-    `progress` may stop it. Raises the error of the first chunk that could not be placed, after the others.
+    `progress` may stop it. A chunk whose process failed for good is said in the log and left out; a repeated run tries
+    it again.
     """
     if not engine.is_in_this_process:
         absolute = [replace(task, database=task.database.resolve(), folder=task.folder.resolve()) for task in tasks]
         logs = absolute[0].database.parent / "logs" if absolute else None
-        if failures := run_tasks(place_chunk, absolute, engine, progress, label, logs=logs):
-            raise failures[0].error
+        for failure in run_tasks(place_chunk, absolute, engine, progress, label, logs=logs):
+            log.warning("a chunk of frames is left out: %s", failure.message)
         return
     stopped = Event()
 
@@ -98,9 +102,11 @@ def place_chunks(
 
 
 def placed_models(folder: Path) -> "list[pycolmap.Reconstruction]":
-    """The models of a chunk that was placed; images are named by their number in the clip."""
+    """The models of a chunk, none where it was not placed; images are named by their number in the clip."""
     import pycolmap
 
+    if not folder.is_dir():
+        return []
     return [pycolmap.Reconstruction(str(path)) for path in sorted(folder.iterdir(), key=lambda path: int(path.name))]
 
 
