@@ -104,6 +104,7 @@ class NotEmpty:
 
 Count = Annotated[int, Range(1)]
 CountOrZero = Annotated[int, Range(0)]
+ImageSide = Annotated[int, Range(8, 8192)]  # pixels, of a synthetic image
 Seed = Annotated[int, Range(0, 2**32 - 1)]
 Threads = Annotated[int, Range(0, 1024)]  # 0 is every core
 LongSide = Annotated[int, Range(32, 65_536)]  # pixels; smaller images hold no neighborhood that scores look at

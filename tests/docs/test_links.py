@@ -15,7 +15,7 @@ TEXTS = tuple(
 ) + tuple(path for path in sorted(ROOT.iterdir()) if path.is_file() and path.suffix in (".md", ".toml", ".yml", ""))
 CITED = re.compile(r"(?<![\w./-])((?:[\w.-]+/)+[\w.-]+\.(?:md|py|toml|yml|ipynb))(?:#([\w-]+))?(?![\w/])")
 DOCUMENT = re.compile(r"(?<![\w./<-])([\w-]+\.md)(?!\w)")
-TABLES = ("NAME", "ablation", "ablation-sfm", "flsea", "localization", "render", "restoration", "sfm")
+TABLES = ("NAME", "ablation", "ablation-sfm", "flsea", "localization", "render", "restoration", "scale", "sfm")
 MADE = {f"{name}.md" for name in TABLES} | {"nav.md", "contributing.md", "changelog.md"}
 """Documents that `swimm3r bench` and the site's build write."""
 HOMES = (ROOT, ROOT / "src" / "swimm3r", ROOT / "tests", ROOT / "docs", ROOT / "benchmarks")

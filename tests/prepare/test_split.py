@@ -25,7 +25,7 @@ def ground() -> np.ndarray:
 
 
 def view(ground: np.ndarray, x: float) -> np.ndarray:
-    """What a camera sees that has moved by so many pixels."""
+    """The image of a camera that has moved by so many pixels."""
     M = np.float32([[1, 0, -x], [0, 1, -200]])
     return cv2.warpAffine(ground, M, (WIDTH, HEIGHT))
 

@@ -4,7 +4,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Annotated, Literal
 
-from swimm3r.settings import Count, Range, Seed, Settings
+from swimm3r.settings import Count, ImageSide, Range, Seed, Settings
 
 Seeds = Annotated[int, Range(1, 1000)]  # trainings of one method on one scene
 
@@ -15,9 +15,9 @@ class ScaleSettings(Settings):
 
     counts: tuple[Count, ...] = (100, 300, 1000)
     """Numbers of frames; a frame every 10 cm of path."""
-    width: Count = 640
+    width: ImageSide = 640
     """Width of the frames in pixels."""
-    height: Count = 360
+    height: ImageSide = 360
     """Height of the frames in pixels."""
     seed: Seed = 0
     """Seed of seafloor, path and water."""

@@ -116,6 +116,12 @@ BRIEF: dict[tuple[str, ...], Groups] = {
         "speed and quality": ("--jobs", "--engine"),
         "": _MESSAGES,
     },
+    ("bench", "scale"): {
+        "surveys": ("--counts", "--width", "--height", "--seed", "--last"),
+        "output": ("--out",),
+        "settings": ("--preset", "--splat.iterations"),
+        "": _MESSAGES,
+    },
     ("bench", "ablation-sfm"): {
         "input": ("--sequences", "--stride", "--adapters"),
         "output": ("--out",),

@@ -50,7 +50,7 @@ def sharpness(gray: UInt8[np.ndarray, "h w"]) -> float:
     return float(cv2.Laplacian(gray, cv2.CV_16S).var(dtype=np.float64))
 
 
-def small_gray(image: Rgb, side: int = GRAY_SIDE) -> UInt8[np.ndarray, "h w"]:
+def small_gray(image: Rgb, side: int = GRAY_SIDE) -> UInt8[np.ndarray, "rows columns"]:
     """A gray copy of at most so many pixels along its longer side; by default the one on which sharpness is judged."""
     import cv2
 

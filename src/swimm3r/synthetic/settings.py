@@ -4,10 +4,9 @@ from dataclasses import dataclass
 from typing import Annotated, Literal
 
 from swimm3r.errors import UsageError
-from swimm3r.settings import Range, Seed, Settings, Share
+from swimm3r.settings import ImageSide, Range, Seed, Settings, Share
 
 _Beta = Annotated[float, Range(0, 100)]
-_Pixels = Annotated[int, Range(8, 8192)]
 
 
 @dataclass(frozen=True)
@@ -39,9 +38,9 @@ class DiveSettings(Settings):
     """Frames per second."""
     altitude: Annotated[float, Range(1, 1.8)] = 1.5
     """Mean height of a survey's camera above the sand in meters."""
-    width: _Pixels = 480
+    width: ImageSide = 480
     """Width of the frames in pixels."""
-    height: _Pixels = 320
+    height: ImageSide = 320
     """Height of the frames in pixels."""
     fov: Annotated[float, Range(10, 120)] = 56.0
     """Horizontal field of view in degrees."""

@@ -56,7 +56,7 @@ class StepClock:
 
 def survey(frames: int, scale: ScaleSettings) -> DiveSettings:
     """The survey of so many frames."""
-    length = SPACING * (frames - 0.9)  # just beyond the last frame
+    length = round(SPACING * (frames - 0.9), 3)  # just beyond the last frame
     size = {"width": scale.width, "height": scale.height, "seed": scale.seed}
     return DiveSettings(path="lawnmower", length=length, speed=_SPEED, fps=_FPS, **size)
 
