@@ -8,6 +8,7 @@ alone, from its checkpoint.
 """
 
 import logging
+import math
 from collections.abc import Sequence
 from dataclasses import asdict, dataclass, replace
 from functools import partial
@@ -35,7 +36,7 @@ from swimm3r.splat.block_store import (
 from swimm3r.splat.blocks.coarse import box_of, coarse_of
 from swimm3r.splat.blocks.part import BlockViews, part_of, views_of_blocks
 from swimm3r.splat.blocks.plan import PlannedBlock
-from swimm3r.splat.ground import Window, held_by_any
+from swimm3r.splat.ground import Window, held_by_any, plane_of
 from swimm3r.splat.medium.field import MediumField
 from swimm3r.splat.primitives.beta import BetaPrimitives, rescaled, select
 from swimm3r.splat.recipes import recipe_parts
@@ -51,6 +52,7 @@ from swimm3r.tasks.settings import EngineSettings
 
 log = logging.getLogger(__name__)
 
+_WATER_VIEWS = 256  # frames that the water is trained on, at most: its images stay in memory
 _FEWEST = 4  # points that a block's training starts from
 
 
@@ -116,6 +118,8 @@ def train_in_blocks(
     key = _key(rec, settings, views, plan)
     water = _train_water(rec, settings, views, scale, folder, key, progress, device, observer)
     tasks = _tasks(rec, frames, settings, plan, views.names, scale, folder, key, water, device)
+    steps = sum(task.settings.iterations for task in tasks)
+    log.info("%d blocks are trained in %d steps in all", len(tasks), steps)
     here = engine.engine == "local" and engine.at_once(1) == 1  # one after another, each with its own progress
     work = partial(train_block, progress=progress) if here else train_block
     for turn in sorted({task.turn for task in tasks}):
@@ -203,9 +207,17 @@ def _train_water(
     device: torch.device,
     observer: Observer | None,
 ) -> MediumField:
-    """The water of a coarse map of the whole dive, with as many primitives as one block; per working unit."""
+    """The water of a coarse map of the whole dive, with as many primitives as one block; per working unit.
+
+    It is trained on some of the frames, spread over the dive.
+    """
+    names = views.names[:: math.ceil(len(views) / _WATER_VIEWS)]
+    if len(names) < len(views):
+        everywhere = Window(plane_of(rec.points.xyz))
+        views = TrainingViews(part_of(rec, names, everywhere), views.frames, settings, scale)
     short = replace(settings, iterations=max(1, round(settings.blocks.water_steps * settings.iterations)))
-    scene = TrainingScene(rec, scale, path_radius(rec, scale, settings.working_depth), views, None, device)
+    radius = path_radius(rec, scale, settings.working_depth)
+    scene = TrainingScene(views.rec, scale, radius, views, None, device)
     schedule = loop.schedule_of(short, key, "water")
     with devices.memory_for("the water's map", "a smaller --splat.long-side, or --map-device cpu"):
         final = loop.run(recipe_parts(short), scene, schedule, folder, progress, observer, "training the water")
