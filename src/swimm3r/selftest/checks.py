@@ -62,7 +62,8 @@ def check_kernels() -> Iterator[Check]:
         for c in (3, 4):
             yield from _projection(device, c)
         yield from _photometric_loss(device)
-    yield _plane_sweep()
+    for device in devices:
+        yield _plane_sweep(device)
 
 
 def _rasterizer(device: str, kernel: Kernel) -> Iterator[Check]:
@@ -129,16 +130,16 @@ def _photometric_loss(device: str) -> Iterator[Check]:
     yield Check("image loss: gradient", device, _relative(*gradients), _GRADIENTS)
 
 
-def _plane_sweep() -> Check:
+def _plane_sweep(device: str) -> Check:
     """The median error of the depth in the middle of the image, relative to the plane's."""
     cameras = cameras_before_plane()
     everywhere = torch.ones(cameras.height, cameras.width, dtype=torch.bool)
     canvas = covering_pinholes(cameras, 640)
     views = [make_view(image_of_plane(cameras[i]), everywhere, cameras[i], canvas[i]) for i in range(5)]
     settings = PlaneSweepSettings(sources=4, planes=48, threads=1)
-    found = sweep(views[2], [views[i] for i in (0, 1, 3, 4)], (2.0, 9.0), settings)
+    found = sweep(views[2], [views[i] for i in (0, 1, 3, 4)], (2.0, 9.0), settings, torch.device(device))
     middle = found.inverse_depth[16:-16, 24:-24]
-    return Check("plane sweep: depth", "cpu", float((middle * PLANE_DEPTH - 1).abs().median()), 0.005)
+    return Check("plane sweep: depth", device, float((middle * PLANE_DEPTH - 1).abs().median()), 0.005)
 
 
 def _largest(found: Sequence[Tensor], expected: Sequence[Tensor]) -> float:

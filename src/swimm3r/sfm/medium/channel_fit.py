@@ -10,9 +10,11 @@ so that brightness common to a whole frame says little about the water. Depths a
 
 from collections.abc import Callable
 from dataclasses import dataclass, replace
+from functools import cached_property
 
 import numpy as np
 
+from swimm3r.sfm.medium import kernels
 from swimm3r.sfm.settings import SeathruSettings
 
 BINF, LOG_BETA_B, LOG_BETA_D, SLOPE, DARK, LOG_MEAN = range(6)  # the unknowns
@@ -42,6 +44,16 @@ class Observations:
     point: np.ndarray
     frame: np.ndarray
     I: np.ndarray
+
+    @cached_property
+    def points(self) -> int:
+        """Number of points."""
+        return int(self.point.max()) + 1
+
+    @cached_property
+    def frames(self) -> int:
+        """One more than the last frame."""
+        return int(self.frame.max()) + 1
 
 
 @dataclass(frozen=True)
@@ -179,27 +191,17 @@ def _attenuations(x: np.ndarray, z: np.ndarray) -> tuple[np.ndarray, np.ndarray]
     return np.exp(_log_transmittance(x, z)), x[BINF] * -np.expm1(-np.exp(x[LOG_BETA_B]) * z)
 
 
-def _points(T_D: np.ndarray, direct: np.ndarray, point: np.ndarray, weight: np.ndarray) -> np.ndarray:
-    """J of every point by weighted least squares, kept within 0..1."""
-    weighted = weight * T_D
-    J = np.bincount(point, weighted * direct) / np.bincount(point, weighted * T_D).clip(1e-12)
-    return J.clip(0.0, 1.0)
-
-
 def _residuals(x: np.ndarray, seen: Observations, weight: np.ndarray) -> np.ndarray:
     """I - B - J T_D with the J of every point eliminated."""
     T_D, B = _attenuations(x, seen.z)
     direct = seen.I - B
-    return direct - _points(T_D, direct, seen.point, weight)[seen.point] * T_D
+    return direct - kernels.surface_colors(T_D, direct, weight, seen.point, seen.points)[seen.point] * T_D
 
 
 def _whitened(x: np.ndarray, seen: Observations, noise: _Noise) -> np.ndarray:
     """The residuals in units of their noise, blind to a common gain of each frame as far as gains are uncertain."""
     residuals = _residuals(x, seen, noise.weight**2)
-    r, p = noise.weight * residuals, noise.weight * (seen.I - residuals)
-    square = np.bincount(seen.frame, p * p).clip(1e-12)
-    share = (1 - 1 / np.sqrt(1 + noise.gain_std**2 * square)) / square
-    return r - p * (share * np.bincount(seen.frame, p * r))[seen.frame]
+    return kernels.whitened(residuals, seen.I, noise.weight, seen.frame, seen.frames, noise.gain_std)
 
 
 def _gains(
@@ -207,15 +209,11 @@ def _gains(
 ) -> tuple[np.ndarray, float]:
     """The gain of every frame, 1 on average and 1 where a frame has no observations, and how much gains vary."""
     T_D, B = _attenuations(x, seen.z)
-    gain, present = np.ones(frames), np.unique(seen.frame)
-    stay = 1 / gain_std**2
-    for _ in range(_SWEEPS):
-        J = _points(T_D, seen.I / gain[seen.frame] - B, seen.point, weight)
-        p = J[seen.point] * T_D + B
-        top = np.bincount(seen.frame, weight * seen.I * p, frames) + stay
-        gain = top / (np.bincount(seen.frame, weight * p * p, frames) + stay)
-        gain /= np.exp(np.log(gain)[present].mean())
-    return gain, float(np.clip(np.sqrt(np.mean(np.log(gain)[present] ** 2)), 1e-3, 0.15))
+    present = np.bincount(seen.frame, minlength=frames) > 0
+    gain = kernels.frame_gains(
+        T_D, B, seen.I, weight, seen.point, seen.frame, seen.points, present, 1 / gain_std**2, _SWEEPS
+    )
+    return gain, float(np.clip(np.sqrt(np.mean(np.log(gain[present]) ** 2)), 1e-3, 0.15))
 
 
 def _prior_residuals(x: np.ndarray, evidence: _Evidence, settings: SeathruSettings) -> np.ndarray:
@@ -253,9 +251,16 @@ def _solve(
     Six unknowns and up to 10^5 residuals: normal equations are 20 times cheaper than a general solver's SVD.
     """
 
+    last = (np.full(4, np.nan), np.zeros(0))  # the unknowns that observations see, and their residuals
+
     def residuals(x: np.ndarray) -> np.ndarray:
+        nonlocal last
         prior = _prior_residuals(x, evidence, settings)
-        return prior if seen is None or noise is None else np.concatenate([prior, _whitened(x, seen, noise)])
+        if seen is None or noise is None:
+            return prior
+        if not np.array_equal(last[0], x[:4]):
+            last = (x[:4].copy(), _whitened(x, seen, noise))
+        return np.concatenate([prior, last[1]])
 
     x = np.clip(start, evidence.lower, evidence.upper)
     r, damping = residuals(x), 1e-3
@@ -314,14 +319,15 @@ def _thinned(seen: Observations, count: int) -> Observations:
 
 
 def _jacobian(residuals: Callable[[np.ndarray], np.ndarray], x: np.ndarray, at_x: np.ndarray) -> np.ndarray:
-    """By forward differences; the unknowns are all of order 1."""
-    return np.stack([(residuals(x + 1e-6 * e) - at_x) / 1e-6 for e in np.eye(len(x))], -1)
+    """By forward differences, the last unknown first; the unknowns are all of order 1."""
+    columns = [(residuals(x + 1e-6 * e) - at_x) / 1e-6 for e in reversed(np.eye(len(x)))]
+    return np.stack(columns[::-1], -1)
 
 
 def _scores(x: np.ndarray, seen: Observations, noise: _Noise) -> tuple[np.ndarray, np.ndarray]:
     """Information of the observations about the unknowns they see, and the gradient each frame contributes."""
     r = _whitened(x, seen, noise)
-    rows = _jacobian(lambda y: _whitened(y, seen, noise), x, r)[:, :4]
+    rows = _jacobian(lambda y: _whitened(np.concatenate([y, x[4:]]), seen, noise), x[:4], r)
     gradient = np.stack([np.bincount(seen.frame, rows[:, i] * r) for i in range(rows.shape[1])], -1)
     return rows.T @ rows, gradient[np.unique(seen.frame)]
 

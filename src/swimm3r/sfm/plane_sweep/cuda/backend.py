@@ -1,5 +1,6 @@
 """The plane sweep on a CUDA device: one view's arrays go there, its planes and costs come back."""
 
+import threading
 from collections.abc import Sequence
 from typing import Any
 
@@ -10,6 +11,7 @@ from swimm3r.sfm.plane_sweep import kernels as numba_kernels
 from swimm3r.sfm.plane_sweep.cuda import kernels
 from swimm3r.sfm.plane_sweep.level import Level, Round, SweepNumbers
 
+_one_at_a_time = threading.Lock()  # a view's volume is the largest thing in the device's memory
 _DIRECTIONS = ((0, 1), (0, -1), (1, 0), (-1, 0), (1, 1), (1, -1), (-1, 1), (-1, -1))
 
 
@@ -60,9 +62,10 @@ def refined(
 def sweep(
     coarse: Level, fine: Level, numbers: SweepNumbers, rounds: Sequence[Round], device: str = "cuda"
 ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """The slanted surface of a view, its cost and its peak."""
-    surface = numba_kernels.doubled(coarse_depth(coarse, numbers, device))
-    return refined(fine, numbers, surface, rounds, device)
+    """The slanted surface of a view, its cost and its peak. Threads that prepare other frames wait for the device."""
+    with _one_at_a_time:
+        surface = numba_kernels.doubled(coarse_depth(coarse, numbers, device))
+        return refined(fine, numbers, surface, rounds, device)
 
 
 def _images(level: Level, device: str) -> tuple[Any, Any, Any, Any, Any]:
