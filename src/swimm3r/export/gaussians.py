@@ -63,7 +63,9 @@ def clear_gaussians(scene: SplatMap, cameras: Cameras, time: float | None = None
     """
     p = scene.primitives
     if scene.blocks is not None:
-        return _joined([_of_block(scene, scene.blocks, entry, cameras) for entry in scene.blocks.entries])
+        return _joined(
+            [_of_block(scene, scene.blocks, entry, cameras) for entry in scene.blocks.entries if entry.primitives]
+        )
     if isinstance(p, BetaPrimitives):
         return moment_matched(scene, cameras, time)
     p = select(p, torch.sigmoid(p.opacity) >= ALPHA_MIN)
