@@ -103,18 +103,19 @@ def running(process: int) -> bool:
 
 
 @pytest.fixture
-def waiting(tmp_path: Path) -> Iterator[tuple[subprocess.Popen, list[int]]]:
-    """A process with two child processes at work, and their numbers."""
+def waiting(tmp_path: Path, request: pytest.FixtureRequest) -> Iterator[tuple[subprocess.Popen, list[int]]]:
+    """A process with two processes at work for it, by an engine of that name, and their numbers."""
     code = (
         "from pathlib import Path; from swimm3r.tasks import *; from tests.tasks.tasks import *\n"
-        f"run_tasks(wait_long, [Part(n, Path({str(tmp_path)!r})) for n in 'ab'], EngineSettings(jobs=2))"
+        f"folder = Path({str(tmp_path)!r})\n"
+        f"engine = EngineSettings(engine={request.param!r}, cluster='local', jobs=2, cpus=1)\n"
+        "run_tasks(wait_long, [Part(name, folder) for name in 'ab'], engine, logs=folder / 'logs')"
     )
     paths = os.pathsep.join([str(ROOT), str(ROOT / "src")])
     parent = subprocess.Popen(
         [sys.executable, "-c", code], env={**os.environ, "PYTHONPATH": paths}, stderr=subprocess.PIPE
     )
-    wait_for(lambda: len(list(tmp_path.glob("*.pid"))) == 2)
-    time.sleep(0.1)
+    wait_for(lambda: sum(path.read_text() != "" for path in tmp_path.glob("*.pid")) == 2)
     yield parent, [int(path.read_text()) for path in tmp_path.glob("*.pid")]
     parent.kill()
     parent.communicate()
@@ -128,7 +129,16 @@ def wait_for(condition: Callable[[], bool]) -> None:
 
 
 @pytest.mark.skipif(not sys.platform.startswith("linux"), reason="looks into /proc")
-@pytest.mark.parametrize("sign", [signal.SIGINT, signal.SIGKILL], ids=["interrupted", "killed"])
+@pytest.mark.parametrize(
+    ("waiting", "sign"),
+    [
+        pytest.param("local", signal.SIGINT, id="local-interrupted"),
+        pytest.param("local", signal.SIGKILL, id="local-killed"),
+        pytest.param("slurm", signal.SIGINT, id="slurm-interrupted", marks=without_submitit),
+        pytest.param("ray", signal.SIGINT, id="ray-interrupted", marks=without_ray),
+    ],
+    indirect=["waiting"],
+)
 def test_nothing_goes_on_after_its_parent(waiting: tuple[subprocess.Popen, list[int]], sign: int):
     parent, children = waiting
     assert all(map(running, children))
