@@ -53,6 +53,7 @@ from swimm3r.tasks.settings import EngineSettings
 log = logging.getLogger(__name__)
 
 _WATER_VIEWS = 256  # frames that the water is trained on, at most: its images stay in memory
+_STRIP = 0.1  # of the margin: ground of finished neighbors where a block starts with primitives of its own, too
 _FEWEST = 4  # points that a block's training starts from
 
 
@@ -243,7 +244,8 @@ def _tasks(
         block, views = plan[k], seen_by[k]
         before = [tasks[j] for j in block.before if j in tasks]
         closed = tuple(task.window for task in before)
-        part = part_of(rec, views.names, block.window.widened(block.margin), closed)
+        inner = [window.widened(-_STRIP * block.margin) for window in closed]
+        part = part_of(rec, views.names, block.window.widened(block.margin), inner)
         points = part.points.xyz if part.cloud is None else part.cloud.xyz
         if not views.names or len(points) < _FEWEST:
             log.warning("block %d of %d is left empty: no training frame sees it", k + 1, len(plan))
