@@ -303,3 +303,11 @@ def test_several_processes_make_the_same_maps(tmp_path: Path, monkeypatch: pytes
     for name in rec.names:
         assert torch.equal(here[name].z_depth, there[name].z_depth)
     assert seen == [(step, done, 3) for step in ("depth", "depth agreement") for done in range(4)]
+
+
+def test_points_of_a_frame_are_those_its_tracks_show(tmp_path: Path):
+    rec = reconstruction(dive(), SLANTED, tmp_path)
+    tracks = rec.tracks
+    rec = replace(rec, tracks=Tracks(tracks.point.repeat(2), tracks.frame.repeat(2), tracks.xy.repeat(2, 1)))
+    for i, found in enumerate(points_by_frame(rec)):
+        assert np.array_equal(found, np.unique(tracks.point[tracks.frame == i].numpy()))

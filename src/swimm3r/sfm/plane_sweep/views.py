@@ -42,15 +42,13 @@ def choose_sources(rec: Reconstruction, count: int, angle_deg: float) -> list[li
     frames track it, a quarter where it only falls into the image, and less the better it is covered already.
     """
     xyz, centers = rec.points.xyz.double(), rec.cameras.centers.double()
-    frame, point = rec.tracks.frame.numpy(), rec.tracks.point.numpy()
-    seen = np.unique(np.stack([frame, point]), axis=1)
-    track = sparse.csr_matrix(
-        (np.ones(seen.shape[1], np.float32), (seen[0], seen[1])), (len(rec.names), max(len(xyz), 1))
-    )
-    seen_by = track.tocsc()
+    points = points_by_frame(rec)
+    frame = np.repeat(np.arange(len(points)), [len(mine) for mine in points])
+    ones = np.ones(len(frame), np.float32)
+    seen_by = sparse.csc_matrix((ones, (frame, np.concatenate(points))), (len(points), max(len(xyz), 1)))
     chosen: list[list[int]] = []
     for i in range(len(rec.names)):
-        mine = track[i].indices
+        mine = points[i]
         others, shared = np.unique(seen_by[:, mine].indices, return_counts=True)
         others, shared = others[others != i], shared[others != i]
         near_by = [int(j) for j in others[np.argsort(-shared, kind="stable")[:_CANDIDATES]]]
@@ -63,7 +61,7 @@ def choose_sources(rec: Reconstruction, count: int, angle_deg: float) -> list[li
         angle = torch.rad2deg(torch.arccos((to_me * to_them).sum(-1).clamp(-1, 1)))
         width = torch.where(angle < angle_deg, 0.4 * angle_deg, 1.2 * angle_deg)
         _, _, inside = project_visible(rec.cameras[near_by], P.expand(len(near_by), -1, -1))
-        both = torch.from_numpy(track[near_by][:, mine].toarray() > 0)
+        both = torch.from_numpy(np.stack([_contains(points[j], mine) for j in near_by]))
         weight = torch.exp(-0.5 * ((angle - angle_deg) / width) ** 2)
         weight = weight * torch.where(both, 1.0, torch.where(inside, 0.25, 0.0))
         covered = torch.zeros(len(mine), dtype=torch.float64)
@@ -78,10 +76,17 @@ def choose_sources(rec: Reconstruction, count: int, angle_deg: float) -> list[li
     return chosen
 
 
+def _contains(ascending: np.ndarray, wanted: np.ndarray) -> np.ndarray:
+    """The mask of those wanted that are in the other list."""
+    at = np.searchsorted(ascending, wanted).clip(max=len(ascending) - 1)
+    return ascending[at] == wanted
+
+
 def points_by_frame(rec: Reconstruction) -> list[np.ndarray]:
     """The points that each frame sees, in ascending order."""
-    seen = np.unique(np.stack([rec.tracks.frame.numpy(), rec.tracks.point.numpy()]), axis=1)
-    return np.split(seen[1], np.searchsorted(seen[0], np.arange(1, len(rec.names))))
+    count = max(1, len(rec.points.xyz))
+    frame, point = np.divmod(np.unique(rec.tracks.frame.numpy() * count + rec.tracks.point.numpy()), count)
+    return np.split(point, np.searchsorted(frame, np.arange(1, len(rec.names))))
 
 
 def depth_range(rec: Reconstruction, i: int, points: np.ndarray) -> tuple[float, float] | None:
