@@ -89,6 +89,8 @@ def test_primitives_are_in_proportion_to_area():
     half = of_block(settings, block, BlockViews(("a",) * 30, 10.0))
     assert (half.initial.primitives, half.densify.cap_max) == (500, 1500)
     assert half.iterations == 1.5 * settings.iterations
+    assert half.weights.opacity == pytest.approx(settings.weights.opacity / 3)
+    assert half.weights.scale == pytest.approx(settings.weights.scale / 3)
 
 
 def test_a_block_is_trained_on_the_frames_that_see_it_and_the_points_in_its_window(tiny_dive):

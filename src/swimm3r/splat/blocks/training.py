@@ -261,13 +261,17 @@ def of_block(settings: UwbsSettings, block: PlannedBlock, views: BlockViews) -> 
     """The settings of a block, with primitives and steps in proportion to its area.
 
     Views of which it is a part alone are more than the images that they make up; each takes its turn, so that the
-    ground is seen as often as in a map of one block.
+    ground is seen as often as in a map of one block. The image loss is a mean over whole views, so that what is weighed
+    against it, for all primitives in every step, has less weight by the share of the views that takes part.
     """
     share, steps = (area / settings.blocks.largest for area in (block.open_area, block.area))
     start = replace(settings.initial, primitives=max(_FEWEST, round(share * settings.initial.primitives)))
     most = replace(settings.densify, cap_max=max(_FEWEST, round(share * settings.densify.cap_max)))
-    count = round(steps * len(views.names) / views.images * settings.iterations)
-    return replace(settings, iterations=max(1, count), initial=start, densify=most)
+    taking_part = views.images / len(views.names)
+    count = round(steps / taking_part * settings.iterations)
+    w = settings.weights
+    weights = replace(w, opacity=taking_part * w.opacity, scale=taking_part * w.scale)
+    return replace(settings, iterations=max(1, count), initial=start, densify=most, weights=weights)
 
 
 def _key(rec: Reconstruction, settings: UwbsSettings, views: TrainingViews, plan: Sequence[PlannedBlock]) -> str:
