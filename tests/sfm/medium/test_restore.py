@@ -2,15 +2,16 @@
 
 from dataclasses import replace
 
+import pytest
 import torch
 
 from swimm3r.cameras import Cameras, image_directions, ray_depth_from_z
 from swimm3r.imaging.depth_completion import fill_z_depth
 from swimm3r.imaging.open_water import open_water_mask
 from swimm3r.medium import AttenuationCurve, Medium, MediumFit, add_water, linear_from_srgb, srgb_from_linear
-from swimm3r.scene.reconstruction import DepthMap
+from swimm3r.scene.reconstruction import DenseCloud, DepthMap
 from swimm3r.sfm.medium.dense_tracks import fuse_depth
-from swimm3r.sfm.medium.restore import display_gains, restore_image, restored_cloud
+from swimm3r.sfm.medium.restore import _thinned, display_gains, restore_image, restored_cloud
 from swimm3r.sfm.settings import RestoreSettings, TrackSettings
 
 
@@ -160,3 +161,11 @@ def test_display_gains_color_surfaces_and_leave_open_water_as_it_was(teal, dive)
     gained = restore_image(image, depth, rays_of(camera), exact(teal), gains=torch.tensor([1.2, 0.9, 0.9])).shown
     torch.testing.assert_close(gained[:20], plain[:20])
     assert (gained[70:, :, 1] < 0.95 * plain[70:, :, 1]).float().mean() > 0.9
+
+
+@pytest.mark.parametrize("length", [1.0, 300.0])
+def test_a_long_dive_keeps_as_many_points_as_a_compact_one(length: float):
+    rng = torch.Generator().manual_seed(0)
+    xyz = torch.rand(20_000, 3, generator=rng) * torch.tensor([length, 1.0, 0.0])
+    thinned = _thinned(DenseCloud(xyz, xyz.clamp(0, 1), xyz.clamp(0, 1)), 4000)
+    assert 0.8 * 4000 < len(thinned.xyz) <= 4000

@@ -47,6 +47,7 @@ MediumOfPixels = Callable[[str, Int[Tensor, " n"], Float[Tensor, " n"]], Medium]
 
 _MAX_TINT = 1.0  # times the other channels, for blurred colors at a guessed distance
 _NEARLY_ALL = 0.95  # of the surfaces at known distance
+_FULL, _TURNS = 0.85, 12  # share of the points wanted, and trials of a voxel size, that end the search for it
 _SAMPLES = 20_000  # of them, which stand for all of an image
 
 
@@ -282,17 +283,24 @@ def keep_open_water(
 
 
 def _thinned(cloud: DenseCloud, count: int) -> DenseCloud:
-    """One averaged point per voxel, with voxels just large enough to leave at most `count`."""
+    """One averaged point per voxel, with voxels just large enough to leave at most `count`, and hardly fewer.
+
+    The number of voxels of a surface falls with the square of their size, whatever the shape of the dive.
+    """
     n = len(cloud.xyz)
     if n <= count:
         return cloud
     low, high = (torch.quantile(cloud.xyz[:: max(1, n // 100_000)], q, dim=0) for q in (0.02, 0.98))
     size = float((high - low).amax()) / max(1.0, count**0.5)
-    while True:
-        which, number = cubes(cloud.xyz, torch.tensor([size]))
-        if len(number) <= count:
+    which, number = cubes(cloud.xyz, torch.tensor([size]))
+    for turn in range(_TURNS):
+        if _FULL * count <= len(number) <= count or (turn > _TURNS // 2 and len(number) <= count):
             break
+        size *= min(10.0, max(0.1, (len(number) / (0.95 * count)) ** 0.5))
+        which, number = cubes(cloud.xyz, torch.tensor([size]))
+    while len(number) > count:
         size *= max(1.05, (len(number) / count) ** 0.4)
+        which, number = cubes(cloud.xyz, torch.tensor([size]))
 
     def average(x: Tensor) -> Tensor:
         total = torch.zeros(len(number), 3, dtype=torch.float64).index_add_(0, which, x.double())
