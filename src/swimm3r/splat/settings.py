@@ -231,6 +231,8 @@ class SggSettings(Settings):
 class UwbsSettings(MapSettings):
     """Underwater Beta Splatting; static, or with primitives and water that depend on the time, too."""
 
+    coarse_until: Share = 0.0
+    """Share of the steps, from the first, that train on images of half the size."""
     dynamic: bool = False
     """Condition primitives on time besides direction (D = 7), and let the medium change with time."""
     initial: InitialSettings = field(default_factory=InitialSettings)

@@ -153,14 +153,18 @@ def filled(z_depth: Float[Tensor, "h w"]) -> Float[Tensor, "h w"] | None:
 
 
 def smaller(view: TrainingView, divisor: int) -> TrainingView:
-    """A view of fewer pixels, each the mean of those it covers; without depth or open water."""
+    """A view of fewer pixels: colors are means of those a pixel covers, depth and open water those at its center."""
     if divisor == 1:
         return view
     height, width = (max(2, size // divisor) for size in view.seen.shape)
     rgb = interpolate(view.rgb[None], (height, width), mode="area")[0]
     seen = interpolate(view.seen[None, None].float(), (height, width), mode="area")[0, 0] > 0.999
-    nothing = view.rgb.new_zeros(height, width)
-    return TrainingView(view.name, resized(view.camera, width, height), rgb, seen, nothing, nothing > 0, view.time)
+    row, column = (
+        ((torch.arange(few, device=view.seen.device) + 0.5) * (many / few)).long()
+        for few, many in zip((height, width), view.seen.shape, strict=True)
+    )
+    z_depth, open_water = (values[row[:, None], column] for values in (view.z_depth, view.open_water))
+    return TrainingView(view.name, resized(view.camera, width, height), rgb, seen, z_depth, open_water, view.time)
 
 
 def _in_working_units(cameras: Cameras, scale: float) -> Cameras:

@@ -101,6 +101,8 @@ def test_images_begin_at_a_quarter_and_are_whole_after_two_fifths(tiny_dive):
     assert small.rgb.shape == (3, 12, 16)
     torch.testing.assert_close(small.camera.K[0, 0, 0], view.camera.K[0, 0, 0] / 4)
     torch.testing.assert_close(small.rgb.mean(), view.rgb.mean())
+    torch.testing.assert_close(small.z_depth, view.z_depth[2::4, 2::4])
+    assert (small.open_water == view.open_water[2::4, 2::4]).all()
     assert smaller(view, 1) is view
 
 

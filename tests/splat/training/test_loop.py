@@ -201,3 +201,21 @@ def test_an_observer_sees_the_map_grow_and_changes_none_of_its_bits(tiny_dive, t
     assert [(step, of) for step, of, _ in seen] == [(10, 40), (20, 40), (30, 40), (40, 40)]
     assert equal(seen[-1][2], watched)
     assert not equal(seen[0][2], seen[1][2])  # each stays as it was
+
+
+def test_the_first_steps_train_on_smaller_images_and_the_rest_on_whole_ones(tiny_dive, monkeypatch: pytest.MonkeyPatch):
+    widths: list[int] = []
+    real = uwbs.draw
+    monkeypatch.setattr(
+        uwbs,
+        "draw",
+        lambda p, field, view, *rest, **more: widths.append(view.width) or real(p, field, view, *rest, **more),
+    )
+    settings = replace(SETTINGS, iterations=4, coarse_until=0.5)
+    views = TrainingViews(tiny_dive.rec, tiny_dive.frames, settings, 1.0)
+    recipe = uwbs.Uwbs(settings, TrainingScene(tiny_dive.rec, 1.0, 1.0, views))
+    state = recipe.start()
+    for step in range(1, 5):
+        state, _ = recipe.step(state, views[0], step)
+    whole = views[0].rgb.shape[-1]
+    assert widths == [whole // 2, whole // 2, whole, whole]

@@ -33,7 +33,7 @@ from swimm3r.splat.training import loop, losses
 from swimm3r.splat.training.scene import TrainingScene
 from swimm3r.splat.training.sgg import differentiate
 from swimm3r.splat.training.state import FIELD, POSES, State, clip_field, first_state, parameters_of
-from swimm3r.splat.views import TrainingView
+from swimm3r.splat.views import TrainingView, smaller
 
 _HORIZON_STD = 0.2  # of the open water's color around the scene's mean color, as structure from motion assumes
 
@@ -81,6 +81,8 @@ class Uwbs:
         """One view: forward and adjoint, densification on its cadence, Adam."""
         if self._looks_for_movers(step):
             state = self._with_movers(state, step)
+        if step <= self.settings.coarse_until * self.settings.iterations:
+            view = smaller(view, 2)
         adjoint = self._adjoint(state, view, step)
         rates = self._rates(step, adjoint.gradients)
         if schedule.has_round(self.settings.densify, step, self.settings.iterations):
