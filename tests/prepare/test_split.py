@@ -26,7 +26,7 @@ def ground() -> np.ndarray:
 
 def view(ground: np.ndarray, x: float) -> np.ndarray:
     """The image of a camera that has moved by so many pixels."""
-    M = np.float32([[1, 0, -x], [0, 1, -200]])
+    M = np.array([[1, 0, -x], [0, 1, -200]], np.float32)
     return cv2.warpAffine(ground, M, (WIDTH, HEIGHT))
 
 

@@ -17,6 +17,7 @@ _CORNERS = 300
 _FEW = 12  # tracked corners below which two frames have too little in common to measure it
 _LOST = 0.5  # share of the corners that may be lost before the view counts as another
 _CONSISTENT = 1.0  # pixels between a corner and where it returns to when tracked there and back
+_WINDOW, _LEVELS = (15, 15), 4  # pixels of Lucas-Kanade's window, and halvings
 _FROM = 0.7  # share of the wanted motion from which a sharper frame is taken instead
 
 
@@ -75,10 +76,9 @@ def tracked(
     """Positions of points in another image, and of those tracked back; infinite where they were lost."""
     import cv2
 
-    window = {"winSize": (15, 15), "maxLevel": 4}
     start = np.ascontiguousarray(xy, np.float32)[:, None]
-    there, found, _ = cv2.calcOpticalFlowPyrLK(before, after, start, None, **window)
-    back, returned, _ = cv2.calcOpticalFlowPyrLK(after, before, there, None, **window)
+    there, found, _ = cv2.calcOpticalFlowPyrLK(before, after, start, start.copy(), winSize=_WINDOW, maxLevel=_LEVELS)
+    back, returned, _ = cv2.calcOpticalFlowPyrLK(after, before, there, there.copy(), winSize=_WINDOW, maxLevel=_LEVELS)
     lost = (found[:, 0] == 0) | (returned[:, 0] == 0)
     there, back = there[:, 0], back[:, 0]
     there[lost], back[lost] = np.inf, np.inf

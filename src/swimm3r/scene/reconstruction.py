@@ -108,7 +108,9 @@ class DepthMaps:
             stored = read_arrays(self.path(name), _DEPTH, remake(self.folder.parent))
             return stored["z_depth"], stored["confidence"]
 
-        z_depth, confidence = _CACHE.get((self.folder, name), load)
+        path = self.path(name)
+        version = path.stat().st_mtime_ns if path.is_file() else 0  # a map that was made anew is read anew
+        z_depth, confidence = _CACHE.get((path, version), load)
         return DepthMap(torch.from_numpy(z_depth.astype(np.float32)), torch.from_numpy(confidence.astype(np.float32)))
 
     def write(self, name: str, depth: DepthMap) -> None:

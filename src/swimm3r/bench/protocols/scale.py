@@ -57,8 +57,15 @@ class StepClock:
 def survey(frames: int, scale: ScaleSettings) -> DiveSettings:
     """The survey of so many frames."""
     length = round(SPACING * (frames - 0.9), 3)  # just beyond the last frame
-    size = {"width": scale.width, "height": scale.height, "seed": scale.seed}
-    return DiveSettings(path="lawnmower", length=length, speed=_SPEED, fps=_FPS, **size)
+    return DiveSettings(
+        path="lawnmower",
+        length=length,
+        speed=_SPEED,
+        fps=_FPS,
+        width=scale.width,
+        height=scale.height,
+        seed=scale.seed,
+    )
 
 
 def scale_table(out: Path, scale: ScaleSettings, settings: RunSettings, progress: Progress = silent) -> Table:

@@ -13,7 +13,7 @@ FOCAL, DEPTH = 600.0, 2.0
 
 
 def similarity(rng: np.random.Generator) -> Sim3:
-    return Sim3(float(rng.uniform(0.2, 5)), Rotation.random(random_state=rng).as_matrix(), rng.normal(size=3))
+    return Sim3(float(rng.uniform(0.2, 5)), Rotation.from_rotvec(rng.normal(size=3)).as_matrix(), rng.normal(size=3))
 
 
 def make_link(a: int, b: int, from_part: list[Sim3], rng: np.random.Generator, noise: float = 0.0) -> Link:
@@ -21,7 +21,9 @@ def make_link(a: int, b: int, from_part: list[Sim3], rng: np.random.Generator, n
     world = rng.normal(size=(60, 3))
     in_a = from_part[a].inverse()(world + noise * rng.normal(size=world.shape))
     in_b = from_part[b].inverse()(world)
-    return Link(a, b, fit_similarity(in_a, in_b), in_a, in_b, np.full(60, DEPTH / from_part[b].scale), 60)
+    b_from_a = fit_similarity(in_a, in_b)
+    assert b_from_a is not None
+    return Link(a, b, b_from_a, in_a, in_b, np.full(60, DEPTH / from_part[b].scale), 60)
 
 
 def worst_miss(from_part: dict[int, Sim3], truth: list[Sim3]) -> float:

@@ -1,13 +1,14 @@
 """A clip mapped in chunks: every frame where it was; chunks repeated alone; frames between keyframes placed."""
 
 import shutil
-from dataclasses import replace
+from dataclasses import dataclass, replace
 from pathlib import Path
 
 import numpy as np
 import pytest
 import torch
 
+from swimm3r.evaluate import NotComputed
 from swimm3r.evaluate.poses import absolute_pose_errors
 from swimm3r.prepare import read_frames
 from swimm3r.progress import silent
@@ -59,9 +60,17 @@ def rec(frames: Frames, folder: Path) -> Reconstruction:
     return poses.reconstruct(frames.train, SETTINGS, folder)
 
 
-def errors(names: tuple[str, ...], cam2world, truth: GroundTruth):
+@dataclass(frozen=True)
+class Errors:
+    ate: float  # m
+    rotation_deg: float
+
+
+def errors(names: tuple[str, ...], cam2world: torch.Tensor, truth: GroundTruth) -> Errors:
     place_of = {name: i for i, name in enumerate(truth.names)}
-    return absolute_pose_errors(cam2world, truth.cameras.cam2world.double()[[place_of[name] for name in names]])
+    found = absolute_pose_errors(cam2world, truth.cameras.cam2world.double()[[place_of[name] for name in names]])
+    assert not isinstance(found.ate, NotComputed)
+    return Errors(found.ate, found.rotation_deg)
 
 
 def test_every_frame_of_a_clip_in_chunks_is_placed_where_it_was(rec: Reconstruction, frames: Frames, truth, folder):
