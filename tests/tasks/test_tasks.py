@@ -6,6 +6,7 @@ import subprocess
 import sys
 import time
 from collections.abc import Callable, Iterator
+from contextlib import suppress
 from importlib.util import find_spec
 from pathlib import Path
 
@@ -113,11 +114,16 @@ def waiting(tmp_path: Path, request: pytest.FixtureRequest) -> Iterator[tuple[su
     )
     paths = os.pathsep.join([str(ROOT), str(ROOT / "src")])
     parent = subprocess.Popen(
-        [sys.executable, "-c", code], env={**os.environ, "PYTHONPATH": paths}, stderr=subprocess.PIPE
+        [sys.executable, "-c", code],
+        env={**os.environ, "PYTHONPATH": paths},
+        stderr=subprocess.PIPE,
+        start_new_session=True,
+        preexec_fn=lambda: signal.signal(signal.SIGINT, signal.SIG_DFL),  # a suite in the background ignores it
     )
     wait_for(lambda: sum(path.read_text() != "" for path in tmp_path.glob("*.pid")) == 2)
     yield parent, [int(path.read_text()) for path in tmp_path.glob("*.pid")]
-    parent.kill()
+    with suppress(ProcessLookupError):
+        os.killpg(parent.pid, signal.SIGKILL)
     parent.communicate()
 
 

@@ -5,13 +5,14 @@ from pathlib import Path
 import pytest
 
 from swimm3r.progress import silent
-from swimm3r.sfm.colmap.chunks.place import ChunkTask, place_chunks
+from swimm3r.sfm.colmap.chunks.place import ChunkTask, place_chunks, placed_models
 from swimm3r.sfm.settings import ColmapSettings
 from swimm3r.tasks import EngineSettings
-from swimm3r.tasks.outcome import TaskError
 
 
-def test_chunks_in_processes_are_left_alone_where_they_are_finished_and_told_where_they_fail(tmp_path: Path):
+def test_chunks_in_processes_are_left_alone_where_they_are_finished_and_told_where_they_fail(
+    tmp_path: Path, caplog: pytest.LogCaptureFixture
+):
     def task(name: str) -> ChunkTask:
         database = tmp_path / "missing.db"
         return ChunkTask(name, database, 3, (1, 2, 3), ("PINHOLE", ()), ColmapSettings(), tmp_path / "chunks" / name)
@@ -21,6 +22,7 @@ def test_chunks_in_processes_are_left_alone_where_they_are_finished_and_told_whe
     engine = EngineSettings(jobs=2, retries=0)
     place_chunks([task("finished")], 1, "placing chunks", silent, engine)
     assert list(finished.iterdir()) == []
-    with pytest.raises(TaskError, match="lost failed"):
-        place_chunks([task("lost"), task("finished")], 1, "placing chunks", silent, engine)
+    place_chunks([task("lost"), task("finished")], 1, "placing chunks", silent, engine)
+    assert "a chunk of frames is left out: lost failed" in caplog.text
+    assert placed_models(tmp_path / "chunks" / "lost") == []
     assert "Traceback" in (tmp_path / "logs" / "lost.log").read_text()
