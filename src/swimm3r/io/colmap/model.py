@@ -9,7 +9,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 import numpy as np
-from jaxtyping import Float
+from jaxtyping import Float, Int
 
 from swimm3r.cameras import cameras_of, check_cameras
 from swimm3r.errors import InputError
@@ -126,7 +126,7 @@ def from_pycolmap(model: "pycolmap.Reconstruction") -> ColmapModel:
     lens = common_model({camera.model.name for camera in cameras})
     intrinsics = [from_pycolmap_camera(camera, lens) for camera in cameras]
     points = [model.points3D[i] for i in sorted(model.point3D_ids())]
-    observations = _observations(points, images)
+    track_point, track_frame, track_xy = _observations(points, images)
     return ColmapModel(
         names=tuple(image.name for image in images),
         model=lens,
@@ -138,9 +138,9 @@ def from_pycolmap(model: "pycolmap.Reconstruction") -> ColmapModel:
         xyz=np.array([point.xyz for point in points], np.float64).reshape(-1, 3),
         rgb=np.array([point.color for point in points], np.uint8).reshape(-1, 3),
         error=np.array([point.error for point in points], np.float64),
-        track_point=np.array([point for point, _, _ in observations], np.int64),
-        track_frame=np.array([frame for _, frame, _ in observations], np.int64),
-        track_xy=np.array([xy for _, _, xy in observations], np.float64).reshape(-1, 2),
+        track_point=track_point,
+        track_frame=track_frame,
+        track_xy=track_xy,
     )
 
 
@@ -166,16 +166,20 @@ def _pose(image: "pycolmap.Image") -> Float[np.ndarray, "4 4"]:
 
 def _observations(
     points: "list[pycolmap.Point3D]", images: "list[pycolmap.Image]"
-) -> list[tuple[int, int, Float[np.ndarray, "2"]]]:
-    """Point, frame and pixel of every observation in the images."""
+) -> tuple[Int[np.ndarray, " o"], Int[np.ndarray, " o"], Float[np.ndarray, "o 2"]]:
+    """Point, frame and pixel of every observation in the images, the points in order."""
     frame_of = {image.image_id: frame for frame, image in enumerate(images)}
     seen = {image.image_id: np.array([p.xy for p in image.points2D]).reshape(-1, 2) for image in images}
-    return [
-        (row, frame_of[element.image_id], seen[element.image_id][element.point2D_idx])
-        for row, point in enumerate(points)
-        for element in point.track.elements
-        if element.image_id in frame_of
-    ]
+    most = sum(point.track.length() for point in points)
+    point_rows, frame_rows, xy = np.zeros(most, np.int64), np.zeros(most, np.int64), np.zeros((most, 2))
+    count = 0
+    for row, point in enumerate(points):
+        for element in point.track.elements:
+            if element.image_id in frame_of:
+                point_rows[count], frame_rows[count] = row, frame_of[element.image_id]
+                xy[count] = seen[element.image_id][element.point2D_idx]
+                count += 1
+    return point_rows[:count].copy(), frame_rows[:count].copy(), xy[:count].copy()
 
 
 def to_pycolmap(model: ColmapModel) -> "pycolmap.Reconstruction":
