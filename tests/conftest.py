@@ -1,5 +1,6 @@
 """The suite runs with every shape annotation of the package checked (jaxtyping + beartype); users never pay for it."""
 
+import logging
 import os
 from collections.abc import Callable, Iterable, Iterator, Sequence
 from fractions import Fraction
@@ -22,15 +23,25 @@ from tests.browser import WatchedPage, headless_chromium, reason_to_skip, watche
 
 from swimm3r.sfm.mast3r.network import Architecture, Mast3r
 
-torch.set_num_threads(int(os.environ.get("SWIMM3R_TEST_THREADS", "1")))  # two xdist workers share two cores
+THREADS = int(os.environ.get("SWIMM3R_TEST_THREADS", "1"))  # two xdist workers share two cores
+torch.set_num_threads(THREADS)
 
 SHARED = Path(os.environ.get("SWIMM3R_SHARED", Path(__file__).parents[2] / "shared"))
 
 
 @pytest.fixture(autouse=True)
-def seeded() -> None:
-    """Every test draws the same numbers in every run."""
+def fresh() -> Iterator[None]:
+    """Every test draws the same numbers in every run, and finds threads and messages as a new process has them."""
     torch.manual_seed(0)
+    _as_in_a_new_process()
+    yield
+    _as_in_a_new_process()
+
+
+def _as_in_a_new_process() -> None:
+    """Take back what a test that runs commands or engines may leave behind."""
+    torch.set_num_threads(THREADS)
+    logging.getLogger("swimm3r").setLevel(logging.NOTSET)
 
 
 @pytest.fixture(scope="session")
