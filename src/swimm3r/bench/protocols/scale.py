@@ -5,6 +5,7 @@ Processor seconds are per frame and part of the work, memory is the process's pe
 """
 
 import time
+from collections.abc import Mapping, Sequence
 from functools import partial
 from pathlib import Path
 
@@ -20,6 +21,7 @@ from swimm3r.evaluate.poses import absolute_pose_errors
 from swimm3r.pipeline.inputs import truth_of
 from swimm3r.pipeline.presets import RunSettings
 from swimm3r.pipeline.run import run_pipeline
+from swimm3r.pipeline.stage_start import StageStart
 from swimm3r.prepare import load_frames, read_frames
 from swimm3r.progress import Progress, silent
 from swimm3r.scene.ground_truth import GroundTruth
@@ -40,18 +42,26 @@ COLUMNS = columns(
 
 
 class StepClock:
-    """A `Progress` that adds up the processor seconds of each step, and passes everything on."""
+    """A `Progress` that adds up the processor seconds of each step, apart for each stage of a run."""
 
-    def __init__(self, passed_on: Progress = silent) -> None:
-        self.seconds: dict[str, float] = {}
-        self._passed_on = passed_on
+    def __init__(self) -> None:
+        self.stages: list[dict[str, float]] = [{}]
         self._since = time.process_time()
 
     def __call__(self, what: str, done: int, total: int, /) -> None:
         now = time.process_time()
-        self.seconds[what] = self.seconds.get(what, 0.0) + now - self._since
+        steps = self.stages[-1]
+        steps[what] = steps.get(what, 0.0) + now - self._since
         self._since = now
-        self._passed_on(what, done, total)
+
+    @property
+    def total(self) -> float:
+        """Processor seconds of all steps."""
+        return sum(sum(steps.values()) for steps in self.stages)
+
+    def next_stage(self, start: StageStart, /) -> None:
+        """Count what follows for another stage (`run_pipeline`'s `on_stage`)."""
+        self.stages.append({})
 
 
 def survey(frames: int, scale: ScaleSettings) -> DiveSettings:
@@ -95,14 +105,16 @@ def _scores(folder: Path, dive: Path, last: str, settings: RunSettings) -> dict[
     if last == "mapping":
         assert isinstance(settings.sfm, ColmapSettings)
         frames = read_frames(dive, settings.frames, folder / "run" / "prepare", clock)
-        prepared = sum(clock.seconds.values())
+        prepared = clock.total
         rec, peaks = with_peak_mb(partial(poses.reconstruct, frames.train, settings.sfm, folder / "run" / "sfm", clock))
-        steps = {"cpu_prepare": prepared, "cpu_mapping": sum(clock.seconds.values()) - prepared}
+        steps = {"cpu_prepare": prepared, "cpu_mapping": clock.total - prepared}
         peak, psnr = peaks["peak_mb"], NotComputed("mapping alone was asked for")
     else:
-        summary = run_pipeline(dive, folder / "run", settings, last_stage=last, progress=clock)
+        summary = run_pipeline(
+            dive, folder / "run", settings, last_stage=last, progress=clock, on_stage=clock.next_stage
+        )
         frames, rec = load_frames(folder / "run" / "prepare"), load_reconstruction(folder / "run" / "sfm")
-        steps = _by_part(clock.seconds, summary["stages"])
+        steps = by_part(clock.stages, summary["stages"])
         peak = max(stage["peak_mb"] for stage in summary["stages"].values())
         psnr = summary["test"]["psnr"] if "test" in summary else NotComputed("no map was asked for")
     used = len(frames.train) + len(frames.test) + len(frames.between)
@@ -118,16 +130,14 @@ def _scores(folder: Path, dive: Path, last: str, settings: RunSettings) -> dict[
     }
 
 
-def _by_part(steps: dict[str, float], stages: dict[str, dict]) -> dict[str, float]:
+def by_part(steps_of: Sequence[dict[str, float]], stages: Mapping[str, Mapping[str, float]]) -> dict[str, float]:
     """Processor seconds of the parts of a run; structure from motion is told apart by its steps."""
-    parts = {"cpu_prepare": stages["prepare"]["cpu_seconds"]}
+    steps = next((steps for steps in steps_of if _DEPTH[0] in steps), {})
+    before = list(steps).index(_DEPTH[0]) if steps else 0
+    water = sum(seconds for name, seconds in list(steps.items())[before:] if name not in _DEPTH)
     depth = sum(steps.get(name, 0.0) for name in _DEPTH)
-    names = list(steps)
-    after = set(names[names.index(_DEPTH[-1]) + 1 :]) if _DEPTH[-1] in steps else set()
-    later = set(names[names.index("training") :]) if "training" in steps else set()
-    water = sum(steps[name] for name in after - later)
-    parts["cpu_mapping"] = stages["sfm"]["cpu_seconds"] - depth - water
-    parts |= {"cpu_depth": depth, "cpu_water": water}
+    parts = {"cpu_prepare": stages["prepare"]["cpu_seconds"]}
+    parts |= {"cpu_mapping": stages["sfm"]["cpu_seconds"] - depth - water, "cpu_depth": depth, "cpu_water": water}
     for stage, name in (("splat", "cpu_map"), ("eval", "cpu_scores")):
         if stage in stages:
             parts[name] = stages[stage]["cpu_seconds"]
