@@ -23,6 +23,8 @@ _EPIPOLAR = (
     "mean of both distances, original pixels, under each method's own poses, over the matches its map was made from:"
     " COLMAP's verified two-view ones, all of MASt3R's; of imported models observations of one point"
 )
+_RECOLORED = "after the affine map of the rendering's colors that fits best"
+_FLOW = "dense optical flow on measured ground with texture, images of at most 480 px"
 _DEPTH = "z depth, each frame scaled by its median, mean over frames"
 _AFTER = "over located frames, after the similarity of the training frames"
 _FIRST_POSES = "test frames whose refinement began at the reference's pose; else at one from 2D-3D matches"
@@ -35,6 +37,9 @@ COLUMNS = (
     Column("lpips_vgg", "LPIPS", 4, "low", "v0.1, VGG-16, inputs 0..1 as 3DGS feeds them"),
     Column("sharpness", "Sharpness", 3, "neither", "mean gradient magnitude, rendering : test frame; 1 is as sharp"),
     Column("blur4_psnr", "Blurred by 4 px", 2, "neither", "dB of the test frame against itself blurred, sigma 4 px"),
+    Column("psnr_affine", "PSNR, recolored", 2, "high", f"dB on measured ground, {_RECOLORED}"),
+    Column("flow_px", "Flow, px", 2, "low", f"median displacement of rendering against test frame, {_FLOW}"),
+    Column("flow_px_p90", "Flow p90, px", 2, "low", f"90th percentile of the displacement, {_FLOW}"),
     Column("clear_psnr", "Clear PSNR", 2, "high", "dB of the image without water where true T_D > 0.05"),
     Column("T_D_abs", "T_D error", 4, "low", f"absolute error of the direct transmittance, {_WATER}"),
     Column("B_abs", "B error", 4, "low", f"absolute error of the backscatter, {_WATER}"),

@@ -89,7 +89,7 @@ def mean_view_scores(views: Sequence[ViewScores]) -> ViewScores:
     )
 
 
-def as_8_bit(image: Float[Tensor, "h w 3"]) -> Float[Tensor, "h w 3"]:
+def as_8_bit(image: Float[Tensor, "*pixels 3"]) -> Float[Tensor, "*pixels 3"]:
     """The values a PNG of the image holds, 0..1 in steps of 1/255."""
     return (image.clamp(0, 1) * 255).round() / 255
 

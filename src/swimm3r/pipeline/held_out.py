@@ -8,7 +8,7 @@ pinhole canvas of the training size.
 
 from collections import Counter
 from collections.abc import Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, fields, replace
 from pathlib import Path
 from typing import Literal
 
@@ -21,6 +21,7 @@ from swimm3r.cameras import Cameras, project_visible
 from swimm3r.evaluate import NotComputed
 from swimm3r.evaluate.images import ViewScores, as_8_bit, blur4_psnr, mean_view_scores, psnr, view_scores
 from swimm3r.evaluate.lpips import Lpips, load_lpips
+from swimm3r.evaluate.registration import displacement, psnr_affine
 from swimm3r.geometry import best_similarity
 from swimm3r.imaging.undistortion import shown_pixels, undistorted
 from swimm3r.io.view_names import view_stems
@@ -71,6 +72,22 @@ class CoveredScores:
     share: float  # of the pixels
     psnr: float | NotComputed  # dB
     blur4_psnr: float | NotComputed  # dB
+    psnr_affine: float | NotComputed  # dB, after the affine map of the rendering's colors that fits best
+    flow_px: float | NotComputed  # median displacement between rendering and frame, `evaluate.registration`
+    flow_px_p90: float | NotComputed  # its 90th percentile
+    flow_share: float | NotComputed  # of the covered pixels, those with texture enough for it
+
+    def summary(self) -> dict[str, object]:
+        """The scores by the names of summary.json."""
+        return {
+            "covered": self.share,
+            "psnr_covered": self.psnr,
+            "blur4_psnr_covered": self.blur4_psnr,
+            "psnr_affine": self.psnr_affine,
+            "flow_px": self.flow_px,
+            "flow_px_p90": self.flow_px_p90,
+            "flow_share": self.flow_share,
+        }
 
 
 def first_poses(
@@ -199,18 +216,26 @@ def covered_scores(
     seen: Bool[Tensor, "h w"],
     covered: Bool[Tensor, "h w"],
 ) -> CoveredScores:
-    """PSNR, and that of mere blurring, over the covered pixels; both images as their 8-bit files show them."""
+    """PSNRs and displacement over the covered pixels; both images as their 8-bit files show them."""
     counted = seen & covered
     share = float(counted.sum() / seen.sum())
     if not bool(counted.any()):
         nothing = NotComputed("no training frame saw what the test frames show")
-        return CoveredScores(share, nothing, nothing)
+        return CoveredScores(share, *[nothing] * 6)
     render, target = as_8_bit(render), as_8_bit(target)
-    return CoveredScores(share, psnr(render[counted], target[counted]), blur4_psnr(target, counted))
+    moved = displacement(render, target, counted)
+    flow = [moved] * 3 if isinstance(moved, NotComputed) else [moved.median, moved.p90, moved.share]
+    return CoveredScores(
+        share,
+        psnr(render[counted], target[counted]),
+        blur4_psnr(target, counted),
+        psnr_affine(render, target, counted),
+        *flow,
+    )
 
 
 def mean_covered(views: Sequence[HeldOutView]) -> CoveredScores:
-    """Means over frames, those without a covered pixel left out of the PSNRs."""
+    """Means over frames, those without a covered pixel, or without texture, left out of what they have none of."""
 
     def mean(values: list[float | NotComputed]) -> float | NotComputed:
         numbers = [v for v in values if not isinstance(v, NotComputed)]
@@ -218,7 +243,8 @@ def mean_covered(views: Sequence[HeldOutView]) -> CoveredScores:
 
     scores = [view.covered for view in views]
     share = sum(s.share for s in scores) / len(scores)
-    return CoveredScores(share, mean([s.psnr for s in scores]), mean([s.blur4_psnr for s in scores]))
+    others = [f.name for f in fields(CoveredScores) if f.name != "share"]
+    return CoveredScores(share, **{name: mean([getattr(s, name) for s in scores]) for name in others})
 
 
 @dataclass(frozen=True)

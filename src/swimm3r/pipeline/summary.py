@@ -104,14 +104,14 @@ def splat_sections(scene: SplatMap, rec: Reconstruction, frames: Frames, folder:
 
 def test_section(views: Sequence[HeldOutView], settings: PoseRefinementSettings) -> dict[str, object]:
     """Mean scores of the frames that training did not see, and how they were placed."""
-    scores = mean_scores(views)
-    covered = mean_covered(views)
-    of_covered = {
-        "covered": covered.share,
-        "psnr_covered": covered.psnr,
-        "blur4_psnr_covered": covered.blur4_psnr,
-    }
-    return summary_entries({**vars(scores), **of_covered, "protocol": protocol(views, settings)})
+    means = {**vars(mean_scores(views)), **mean_covered(views).summary(), "protocol": protocol(views, settings)}
+    return summary_entries(means) | {"frames": [frame_entry(view) for view in views]}
+
+
+def frame_entry(view: HeldOutView) -> dict[str, object]:
+    """The scores of one test frame."""
+    of_frame = {name: getattr(view.scores, name) for name in ("psnr", "ssim", "lpips", "blur4_psnr", "sharpness")}
+    return {"name": view.name} | summary_entries({**of_frame, **view.covered.summary()})
 
 
 def mean_medium(scene: SplatMap, rec: Reconstruction, frames: Frames) -> Medium:

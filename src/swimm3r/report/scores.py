@@ -49,7 +49,20 @@ def test_figures(summary: dict[str, Any]) -> list[Figure]:
         Figure(_number(test["ssim"], 3), "SSIM, at most 1"),
         Figure(_number(test["lpips"], 3), "LPIPS, lower is better", test.get("lpips_reason") or ""),
         Figure(f"{_number(test['sharpness'], 0, 100)} %", "Sharpness of the frames kept"),
+        *_registration_figures(test),
         Figure(f"{splat['primitives']:,}", "Primitives", f"{splat['iterations']:,} steps, recipe {splat['recipe']}"),
+    ]
+
+
+def _registration_figures(test: dict[str, Any]) -> list[Figure]:
+    """Displacement and colors apart; nothing of runs that were scored before both were taken."""
+    if "flow_px" not in test:
+        return []
+    far = f"a tenth of the ground is off by more than {_number(test['flow_px_p90'], 2)} px"
+    colors = "on measured ground, after each view's colors were fitted to its frame"
+    return [
+        Figure(f"{_number(test['flow_px'], 2)} px", "Displacement, median", test.get("flow_px_reason") or far),
+        Figure(f"{_number(test['psnr_affine'], 1)} dB", "PSNR, recolored", test.get("psnr_affine_reason") or colors),
     ]
 
 

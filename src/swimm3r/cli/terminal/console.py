@@ -204,6 +204,12 @@ def print_summary(summary: dict) -> None:
             f" (if blurred by 4 px: {_shown(test['blur4_psnr'], 1)}), SSIM {test['ssim']:.3f},"
             f" sharpness {_shown(test['sharpness'], 2)}"
         )
+        if "flow_px" in test:
+            console.print(
+                f"On measured ground: displacement {_shown(test['flow_px'], 2)} px (90 % below"
+                f" {_shown(test['flow_px_p90'], 2)}), PSNR {_shown(test['psnr_covered'], 1)} dB,"
+                f" {_shown(test['psnr_affine'], 1)} dB with each view's colors fitted to its frame"
+            )
     for name, other in summary.get("other_protocols", {}).items():
         scores = other["test"]
         console.print(f"By the protocol {name}: PSNR {_shown(scores['psnr'], 1)} dB, SSIM {scores['ssim']:.3f}")
