@@ -18,7 +18,7 @@ ROWS = {  # by package: a room or module imports only rooms of rows before its o
         {"scene"},
         {"imaging", "prepare", "datasets", "synthetic"},
         {"sfm", "splat"},
-        {"localization", "export", "report", "selftest"},
+        {"localization", "export", "products", "report", "selftest"},
         {"pipeline"},
         {"batch", "bench", "viewer"},
         {"cli"},

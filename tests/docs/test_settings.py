@@ -18,8 +18,9 @@ from swimm3r.splat.settings import RECIPES
 
 COMMANDS = (
     *("run", "prepare", "sfm", "splat", "render", "export", "eval", "localize", "report", "view", "demo", "doctor"),
-    *("datasets", "train-sfm", "batch", "weights get", "bench render", "bench sfm", "bench flsea", "bench restoration"),
-    *("bench localization", "bench scale", "bench ablation-uwbs", "bench ablation-sfm", "run --backend mast3r"),
+    *("products", "datasets", "train-sfm", "batch", "weights get", "bench render", "bench sfm", "bench flsea"),
+    *("bench restoration", "bench localization", "bench scale", "bench ablation-uwbs", "bench ablation-sfm"),
+    "run --backend mast3r",
     *(f"run --recipe {recipe}" for recipe in RECIPES),
     *(f"export --format {name}" for name in FORMATS),
 )

@@ -29,6 +29,7 @@ from swimm3r.cli.pipeline.run import run_command
 from swimm3r.cli.pipeline.sfm import sfm_command
 from swimm3r.cli.pipeline.splat import splat_command
 from swimm3r.cli.pipeline.stages import starting_point
+from swimm3r.cli.products import products
 from swimm3r.cli.render import render
 from swimm3r.cli.report import report
 from swimm3r.cli.terminal.arguments import named
@@ -136,6 +137,7 @@ def commands_for(arguments: Sequence[str]) -> dict[str, Callable | Family]:
         "eval": evaluate,
         "export": export_command(named("--format", arguments, FORMATS) or "ply"),
         "render": render,
+        "products": products,
         "localize": localize,
         "report": report,
         "datasets": datasets,

@@ -39,6 +39,7 @@ FURTHER = {  # pattern of what later commands add -> contents
     "export/*": "Exported for other programs",
     "renders/views": "Views from other cameras",
     "renders/protocols": "Test frames by other protocols",
+    "products": "Maps from above",
     "localization": "Poses of localized images",
 }
 

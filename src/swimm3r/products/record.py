@@ -1,0 +1,65 @@
+"""RUN/products/products.json: the products of a run, their grid and their figures."""
+
+import json
+from dataclasses import asdict, dataclass
+from pathlib import Path
+
+from swimm3r.io.files.atomic import write_text
+from swimm3r.io.files.damage import Remedy
+from swimm3r.io.files.json_file import read_json
+
+FOLDER = "products"
+RECORD = "products.json"
+SCHEMA = 1
+_REMEDY = Remedy("swimm3r products RUN, which writes it again")
+
+
+@dataclass(frozen=True)
+class ProductsRecord:
+    """The products of a run."""
+
+    unit: str  # of lengths: m, or units where the scale of the run is not known
+    gsd: float
+    rows: int
+    columns: int
+    epsg: int | None
+    west: float  # edges in map coordinates
+    north: float
+    scale_std: float | None  # relative; None: not known
+    sources: tuple[str, ...]  # of scale and place
+    covered: float  # share of the cells with a height
+    area: float  # of the cells with a height, unit^2
+    lowest: float | None  # height in map coordinates
+    highest: float | None
+    height_std: float | None  # median over the cells, of one view
+    views: float | None  # median over the cells
+    files: tuple[str, ...]
+    notes: tuple[str, ...] = ()
+    habitat: dict[str, float | None] | None = None  # of the whole map
+    schema: int = SCHEMA
+
+    def save(self, folder: Path) -> None:
+        """Write products.json, whole or not at all."""
+        write_text(folder / RECORD, json.dumps(asdict(self), indent=2) + "\n")
+
+    def __str__(self) -> str:
+        u = self.unit
+        size = f"{self.columns * self.gsd:.4g} x {self.rows * self.gsd:.4g} {u}"
+        area_std = "" if self.scale_std is None else f" ± {2 * self.scale_std * self.area:.2g}"
+        lines = [
+            f"Map: {self.columns} x {self.rows} cells of {self.gsd:g} {u}, {size}, {self.covered:.0%} of it measured"
+            f" ({self.area:.4g}{area_std} {u}²)"
+        ]
+        if self.lowest is not None and self.highest is not None:
+            std = "" if self.height_std is None else f" ± {self.height_std:.2g} {u} (median of a cell, one view)"
+            lines.append(f"Heights: {self.lowest:.4g} to {self.highest:.4g} {u}{std}")
+        scale = "relative standard deviation not known" if self.scale_std is None else f"± {self.scale_std:.2%}"
+        if u == "m":
+            lines.append(f"Scale: {scale}, from {', '.join(self.sources) or 'the poses that were given'}")
+        return "\n".join([*lines, *(f"Note: {note}" for note in self.notes)])
+
+
+def read_record(folder: Path) -> ProductsRecord | None:
+    """The record in RUN/products; None where there is none. Raises InputError where it is damaged."""
+    path = folder / RECORD
+    return read_json(path, ProductsRecord, _REMEDY) if path.is_file() else None
