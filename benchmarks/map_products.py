@@ -24,6 +24,7 @@ from swimm3r.geometry import align_similarity
 from swimm3r.products import elevation as elevation_model
 from swimm3r.products.frame_colors import Points, blended
 from swimm3r.products.grid import Grid, Window, grid_of
+from swimm3r.products.habitat import figures
 from swimm3r.products.survey import Colors, Survey, open_survey
 from swimm3r.scene.georeference import Georeference
 from swimm3r.scene.ground_truth import GroundTruth, read_ground_truth
@@ -98,10 +99,31 @@ def compare(survey: Survey, dive: Dive) -> None:
             f"heights, at least {views} views: {len(kept) / error.size:.0%} of the cells, {1e3 * rms:.2f} mm rms"
             f" = {rms / distance:.2%} of the range, median {1e3 * np.median(np.abs(kept)):.2f} mm"
         )
+    print_rugosity(found.height, np.where(np.isnan(error), np.nan, height), grid.gsd)
     shown = np.logical_not(np.isnan(image).any(-1))
     print(f"orthophoto: {psnr(torch.from_numpy(image[shown]), torch.from_numpy(clear[shown])):.1f} dB")
     shifts = patch_shifts(image, clear, shown, grid)
     print(f"place: median {np.median(shifts):.2f} cells of {len(shifts)} patches, 90 % {np.quantile(shifts, 0.9):.2f}")
+
+
+def print_rugosity(height: np.ndarray, truth: np.ndarray, gsd: float) -> None:
+    """Rugosity by heights at several distances, relative to that of the true ones."""
+    for block in (1, 2, 5, 10):
+        one, other = (figures(means(values, block), block * gsd) for values in (height, truth))
+        if one is not None and other is not None:
+            error = one.rugosity / other.rugosity - 1
+            print(
+                f"rugosity of heights every {1e3 * block * gsd:g} mm: {one.rugosity:.3f}, {error:+.1%} from the truth"
+            )
+
+
+def means(values: np.ndarray, block: int) -> np.ndarray:
+    """Means over blocks of cells that are known to half at least."""
+    rows, columns = (n // block for n in values.shape)
+    blocks = values[: rows * block, : columns * block].reshape(rows, block, columns, block).transpose(0, 2, 1, 3)
+    blocks = blocks.reshape(rows, columns, -1)
+    count = (~np.isnan(blocks)).sum(-1)
+    return np.where(2 * count >= block**2, np.nansum(blocks, -1) / np.maximum(count, 1), np.nan)
 
 
 def patch_shifts(image: np.ndarray, truth: np.ndarray, shown: np.ndarray, grid: Grid) -> np.ndarray:

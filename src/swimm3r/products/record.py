@@ -15,6 +15,18 @@ _REMEDY = Remedy("swimm3r products RUN, which writes it again")
 
 
 @dataclass(frozen=True)
+class HabitatRecord:
+    """Habitat figures."""
+
+    resolution: float  # distance of the heights they are computed from
+    squares: int  # with figures of their own in habitat.csv
+    planar_area: float  # of these squares
+    surface_area: float
+    rugosity: float | None  # None where there is no square
+    mean_slope_deg: float | None
+
+
+@dataclass(frozen=True)
 class ProductsRecord:
     """The products of a run."""
 
@@ -35,7 +47,7 @@ class ProductsRecord:
     views: float | None  # median over the cells
     files: tuple[str, ...]
     notes: tuple[str, ...] = ()
-    habitat: dict[str, float | None] | None = None  # of the whole map
+    habitat: HabitatRecord | None = None
     schema: int = SCHEMA
 
     def save(self, folder: Path) -> None:
@@ -56,7 +68,17 @@ class ProductsRecord:
         scale = "relative standard deviation not known" if self.scale_std is None else f"± {self.scale_std:.2%}"
         if u == "m":
             lines.append(f"Scale: {scale}, from {', '.join(self.sources) or 'the poses that were given'}")
+        lines += self._habitat_lines()
         return "\n".join([*lines, *(f"Note: {note}" for note in self.notes)])
+
+    def _habitat_lines(self) -> list[str]:
+        found = self.habitat
+        if found is None or found.rugosity is None or found.mean_slope_deg is None:
+            return []
+        return [
+            f"Surface: rugosity {found.rugosity:.3f}, mean slope {found.mean_slope_deg:.1f} degrees, from heights every"
+            f" {found.resolution:.3g} {self.unit}; figures of {found.squares} squares in habitat.csv"
+        ]
 
 
 def read_record(folder: Path) -> ProductsRecord | None:

@@ -9,12 +9,14 @@ from pathlib import Path
 import numpy as np
 
 from swimm3r.io.files.outputs import output_folder
+from swimm3r.products.areas import Area, Line, read_areas
 from swimm3r.products.elevation import elevation, frames_over, hill_shade
 from swimm3r.products.frame_colors import Points, blended
 from swimm3r.products.geotiff import RGBA, Band, MapFile, as_rgba, geo_package
 from swimm3r.products.grid import Grid, Window, grid_of
+from swimm3r.products.habitat_tables import Lattice, lattice, write_areas, write_profiles, write_squares
 from swimm3r.products.preview import write_previews
-from swimm3r.products.record import FOLDER, ProductsRecord
+from swimm3r.products.record import FOLDER, HabitatRecord, ProductsRecord
 from swimm3r.products.settings import ProductSettings
 from swimm3r.products.survey import Colors, Survey, open_survey
 from swimm3r.progress import Progress, watched
@@ -33,10 +35,13 @@ def write_products(
     """Write the products of a run into `out`, by default RUN/products; see `swimm3r.products.write_products`."""
     geo_package("rasterio")
     survey = open_survey(run)
+    shapes = None if settings.areas is None else read_areas(settings.areas, survey.place)  # before the work
     grid = grid_of(survey, settings.gsd)
     with output_folder(out or run / FOLDER) as folder, watched(progress) as told:
         totals = _write_maps(survey, grid, folder, settings, told)
-        record = _record(survey, grid, totals)
+        heights = lattice(folder, grid, survey.place, settings)
+        notes, habitat = _write_habitat(heights, settings, shapes, totals.files)
+        record = _record(survey, grid, totals, notes, habitat)
         write_previews(folder, record.unit)
         record.save(folder)
     return record
@@ -132,7 +137,22 @@ def _write_tile(
         maps[Path(ORTHOPHOTOS[kind]).stem].write(window, rgba)
 
 
-def _record(survey: Survey, grid: Grid, totals: _Totals) -> ProductsRecord:
+def _write_habitat(
+    heights: Lattice,
+    settings: ProductSettings,
+    shapes: tuple[tuple[Area, ...], tuple[Line, ...]] | None,
+    files: list[str],
+) -> tuple[list[str], HabitatRecord]:
+    """Tables of habitat figures; notes about what has none, and the figures of the whole map."""
+    squares, outside = write_squares(heights, settings, files), []
+    if shapes is not None:
+        areas, lines = shapes
+        outside = [*write_areas(heights, areas, files), *write_profiles(heights, lines, files)]
+    notes = [f"no surface was measured in {', '.join(outside)} of {settings.areas}"] if outside else []
+    return notes, squares
+
+
+def _record(survey: Survey, grid: Grid, totals: _Totals, notes: list[str], habitat: HabitatRecord) -> ProductsRecord:
     place = survey.place
     west, step, _, north, _, _ = grid.affine(place)
     std, views = (np.concatenate(parts) if parts else np.zeros(0) for parts in (totals.std, totals.views))
@@ -153,5 +173,6 @@ def _record(survey: Survey, grid: Grid, totals: _Totals) -> ProductsRecord:
         height_std=float(np.median(std)) if len(std) else None,
         views=float(np.median(views)) if len(views) else None,
         files=tuple(totals.files),
-        notes=() if survey.has("restored") else (_NO_WATER,),
+        notes=(*notes, *(() if survey.has("restored") else (_NO_WATER,))),
+        habitat=habitat,
     )
