@@ -13,8 +13,10 @@ from numba import njit, types
 from numba.extending import intrinsic
 
 FLAGS = {"nnan", "ninf", "nsz", "arcp", "contract"}
-inlined = njit(fastmath=FLAGS, error_model="numpy")
-"""For what ends up inside a kernel; not cached by itself."""
+inlined = njit(fastmath=FLAGS, error_model="numpy", forceinline=True)
+"""For what ends up inside a kernel; not cached by itself. Inlined without exception: a call that is left would run the
+function's own code in the process that compiles it, and the kernel's copy, rounded otherwise, where Numba's cache is
+read."""
 
 MAGIC = np.float32(12582912.0)  # 1.5 * 2^23: adding it leaves the rounded integer in the low bits
 LOWEST_EXPONENT = np.float32(-80.0)  # deeper would be denormal after a product, which costs a microcode assist

@@ -37,10 +37,11 @@ LN_2 = np.float32(0.6931471805599453)
 LARGEST_BETA = np.float32(20.0)  # before the exponential: keeps it finite
 NEAREST = np.float32(1e-24)  # squared distance
 
-# matrices of the workspace; of S, SLOPE, B and D_S, D_B row 0 is spatial, row 1 one entry per conditioned dimension
+# Matrices of the workspace; no Python ints, for each of which Numba would compile the products anew. Of S, SLOPE, B and
+# D_S, D_B row 0 is spatial, row 1 one entry per conditioned dimension.
 (XYZ, S, SLOPE, B, O, R, L11, L21, L22, V22, LC, T, U, Q, W, X, DIRECTION, DISTANCE, WX, MEAN, N, A, COV, Y, LOG_SHARE,
  TANH, OC, D_MEAN, D_COV, D_S, D_B, D_L11, D_WX, D_N, D_W, D_Q, D_X, D_Y, D_L21, D_L22, D_V22, D_P, P, PHI, K,
- SCRATCH) = range(46)  # fmt: skip
+ SCRATCH) = map(np.uintp, range(46))  # fmt: skip
 MATRICES = 46
 
 

@@ -45,7 +45,7 @@ PX2 = np.float32(BLUR)
 POSE = 15  # gradient of R (9), t (3), center (3)
 (FX, FY, CX, CY, X_LOW, X_HIGH, Y_LOW, Y_HIGH, NEAR, UPPER) = range(15, 25)  # of the camera array, after R, t, center
 # matrices after those of conditioning
-AT, J, RV, COV_SEEN, M, M_COV, PLANE, D_AT, D_M, D_J, D_PLANE, OUTER = range(MATRICES, MATRICES + 12)
+AT, J, RV, COV_SEEN, M, M_COV, PLANE, D_AT, D_M, D_J, D_PLANE, OUTER = map(np.uintp, range(MATRICES, MATRICES + 12))
 
 
 class OnPlane(NamedTuple):
