@@ -43,7 +43,7 @@ ROWS = {  # by package: a room or module imports only rooms of rows before its o
         {"gaussian_settings", "pose_mlp"},
         {"training_poses"},
         {"settings"},
-        {"ground"},
+        {"appearance", "ground"},
         {"views", "primitives"},
         {"projection"},
         {"medium", "block_store"},

@@ -8,7 +8,7 @@ from scipy.ndimage import gaussian_filter
 
 from swimm3r.evaluate import NotComputed
 from swimm3r.evaluate.images import psnr
-from swimm3r.evaluate.registration import Displacement, displacement, fit_colors, psnr_affine
+from swimm3r.evaluate.registration import Displacement, displacement, fit_colors, psnr_affine, recolored_by_halves
 
 HEIGHT, WIDTH = 180, 240
 INNER = torch.zeros(HEIGHT, WIDTH, dtype=torch.bool)
@@ -104,3 +104,24 @@ def test_large_images_are_measured_at_the_common_size(ground):
     large = large.permute(1, 2, 0)
     everywhere = torch.ones(large.shape[:2], dtype=torch.bool)
     assert found(moved(large, 4.0, 0.0), large, everywhere).median == pytest.approx(2.0, abs=0.1)
+
+
+def test_recoloring_by_halves_undoes_an_affine_map(ground):
+    target = ground @ RECOLOR.mT + 0.05
+    after = recolored_by_halves(ground, target, torch.ones(HEIGHT, WIDTH, dtype=torch.bool))
+    assert psnr(after, target) > 35 > psnr(ground, target) + 10
+
+
+def test_no_pixel_is_compared_in_colors_that_it_was_fitted_to(ground):
+    everywhere = torch.ones(HEIGHT, WIDTH, dtype=torch.bool)
+    left = slice(None, WIDTH // 2)
+    other = ground.clone()
+    other[:, left] = other[:, left].flip(-1) * 0.5
+    first, second = (recolored_by_halves(ground, target, everywhere) for target in (ground, other))
+    torch.testing.assert_close(first[:, left], second[:, left])
+    assert (first[:, WIDTH // 2 :] - second[:, WIDTH // 2 :]).abs().mean() > 0.05
+
+
+def test_a_half_that_nobody_trusts_recolors_nothing(ground):
+    nowhere = torch.zeros(HEIGHT, WIDTH, dtype=torch.bool)
+    assert torch.equal(recolored_by_halves(ground, 0.5 * ground, nowhere), ground)

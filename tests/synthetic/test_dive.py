@@ -1,3 +1,4 @@
+import json
 from dataclasses import replace
 
 import numpy as np
@@ -7,7 +8,7 @@ import torch
 from swimm3r.cameras import directions, pixel_grid, project, unproject
 from swimm3r.errors import InputError, UsageError
 from swimm3r.io import images
-from swimm3r.medium import add_water
+from swimm3r.medium import add_water, linear_from_srgb
 from swimm3r.scene.ground_truth import read_ground_truth
 from swimm3r.synthetic import Coefficients, DiveSettings, make_dive, write_dive
 from swimm3r.synthetic.disturbances import swimming
@@ -232,3 +233,20 @@ def test_a_dive_that_is_there_already_is_left_alone(tmp_path):
     before = {path: path.stat().st_mtime_ns for path in tmp_path.rglob("*")}
     write_dive(settings, tmp_path)
     assert {path: path.stat().st_mtime_ns for path in tmp_path.rglob("*")} == before
+
+
+def test_a_camera_that_exposes_by_itself_multiplies_the_light_and_says_by_what(dive, frames, tmp_path):
+    jittery = replace(dive, settings=replace(QUIET, exposure=0.5, white_balance=0.15))
+    gains = torch.stack([jittery.gains(i) for i in range(len(dive))])
+    assert (gains[:, 1] >= 2**-0.5).all()
+    assert (gains[:, 1] <= 2**0.5).all()
+    assert ((gains[:, [0, 2]] / gains[:, 1:2] - 1).abs() <= 0.15 + 1e-6).all()
+    assert gains[:, 1].log2().std() > 0.2
+    seen, still = linear_from_srgb(jittery.frame(0).raw), linear_from_srgb(frames[0].raw)
+    unclipped = (seen < 0.99).all(-1)
+    torch.testing.assert_close(seen[unclipped], (still * gains[0])[unclipped], atol=1e-5, rtol=1e-4)
+    assert torch.equal(jittery.frame(0).clear, frames[0].clear)
+    written = replace(QUIET, frames=2, exposure=0.5)
+    write_dive(written, tmp_path)
+    stored = json.loads((tmp_path / "truth/gains.json").read_text())
+    assert stored["0001.png"] == make_dive(written).gains(1).tolist()

@@ -21,7 +21,7 @@ from swimm3r.cameras import Cameras, project_visible
 from swimm3r.evaluate import NotComputed
 from swimm3r.evaluate.images import ViewScores, as_8_bit, blur4_psnr, mean_view_scores, psnr, view_scores
 from swimm3r.evaluate.lpips import Lpips, load_lpips
-from swimm3r.evaluate.registration import displacement, psnr_affine
+from swimm3r.evaluate.registration import displacement, psnr_affine, recolored_by_halves
 from swimm3r.geometry import best_similarity
 from swimm3r.imaging.undistortion import shown_pixels, undistorted
 from swimm3r.io.view_names import view_stems
@@ -170,18 +170,21 @@ def score_views(
         camera = cut(canvas, window)
         out = scene.render(camera, time)
         write_view(folder, stems[name], out, camera, style)
-        scores = view_scores(out.rgb, target, perceptual, seen)
-        covered = covered_scores(out.rgb, target, seen, covered_by_training(rec, camera))
+        known = covered_by_training(rec, camera)
+        shown = out.rgb if scene.colors is None else recolored_by_halves(out.rgb, target, seen & known)
+        scores = view_scores(shown, target, perceptual, seen)
+        covered = covered_scores(shown, target, seen, known)
         views.append(HeldOutView(name, time, lens, canvas, window, first.source, scores, covered))
     progress("scoring test frames", len(poses), len(poses))
     return views
 
 
-def protocol(views: Sequence[HeldOutView], settings: PoseRefinementSettings) -> str:
-    """In words, how the poses of the scored frames came about."""
+def protocol(views: Sequence[HeldOutView], settings: PoseRefinementSettings, recolored: bool) -> str:
+    """In words, how the poses of the scored frames, and the colors they are compared in, came about."""
     counts = Counter(view.source for view in views)
     starts = ", ".join(f"{count} from {source}" for source, count in counts.items())
-    return f"every 8th frame; poses {starts}, refined {settings.steps} steps on the frozen map"
+    colors = "; each half in colors fitted on the other half, as frames differ in exposure" if recolored else ""
+    return f"every 8th frame; poses {starts}, refined {settings.steps} steps on the frozen map{colors}"
 
 
 def mean_scores(views: Sequence[HeldOutView]) -> ViewScores:

@@ -1,6 +1,7 @@
 """The sections of summary.json: records in, plain numbers out (layout: docs/conventions.md)."""
 
 from collections.abc import Sequence
+from dataclasses import asdict
 from pathlib import Path
 
 import torch
@@ -23,6 +24,7 @@ from swimm3r.progress import Progress, silent
 from swimm3r.scene.frames import Frames
 from swimm3r.scene.ground_truth import GroundTruth
 from swimm3r.scene.reconstruction import Matches, Reconstruction
+from swimm3r.splat.appearance import read_decision
 from swimm3r.splat.rendering import SplatMap, mean_water
 from swimm3r.splat.settings import PoseRefinementSettings
 from swimm3r.splat.training_poses import RefinedPoses
@@ -92,6 +94,9 @@ def splat_sections(scene: SplatMap, rec: Reconstruction, frames: Frames, folder:
         "cpu_seconds_per_iteration": rows[-1].get("cpu_seconds_per_step", lost) if rows else lost,
         "device": scene.device.type,
     }
+    decision = read_decision(folder)
+    if decision is not None:
+        section["appearance"] = asdict(decision)
     water = mean_medium(scene, rec, frames)
     medium = {
         **{name: value.tolist() for name, value in vars(water).items()},
@@ -102,9 +107,13 @@ def splat_sections(scene: SplatMap, rec: Reconstruction, frames: Frames, folder:
     return {"splat": summary_entries(section), "medium": {"splat": medium}}
 
 
-def test_section(views: Sequence[HeldOutView], settings: PoseRefinementSettings) -> dict[str, object]:
-    """Mean scores of the frames that training did not see, and how they were placed."""
-    means = {**vars(mean_scores(views)), **mean_covered(views).summary(), "protocol": protocol(views, settings)}
+def test_section(views: Sequence[HeldOutView], settings: PoseRefinementSettings, recolored: bool) -> dict[str, object]:
+    """Mean scores of the frames that training did not see, and how they were placed and compared."""
+    means = {
+        **vars(mean_scores(views)),
+        **mean_covered(views).summary(),
+        "protocol": protocol(views, settings, recolored),
+    }
     return summary_entries(means) | {"frames": [frame_entry(view) for view in views]}
 
 

@@ -67,6 +67,7 @@ def _of_summary(summary: dict[str, Any], folder: Path) -> dict[str, object]:
         "head_figures": head.head_figures(summary),
         "test_figures": scores.test_figures(summary) if "test" in summary else [],
         "test_protocol": summary["test"]["protocol"] if "test" in summary else "",
+        "appearance": scores.appearance_note(summary),
         "notes": [*scores.restored_notes(summary), *scores.other_notes(summary)] if "restored" in summary else [],
         "training": [Markup(svg) for svg in scores.training_charts(folder / "splat" / "metrics.jsonl")],
         "truths": scores.truth_rows(summary.get("truth")),

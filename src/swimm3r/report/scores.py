@@ -66,6 +66,15 @@ def _registration_figures(test: dict[str, Any]) -> list[Figure]:
     ]
 
 
+def appearance_note(summary: dict[str, Any]) -> str:
+    """A sentence on exposure and white balance of the frames; empty of maps without the decision."""
+    decided = summary.get("splat", {}).get("appearance")
+    if not decided:
+        return ""
+    means = "Every frame has a color map of its own" if decided["on"] else "Frames have no color maps of their own"
+    return f"{means}: {decided['reason']}."
+
+
 def restored_notes(summary: dict[str, Any]) -> list[str]:
     """One sentence per set of restored images on their scores without a reference."""
     sets = (("sfm", "restored frames"), ("splat", "the map's views without the water"))

@@ -2,9 +2,9 @@
 
 map.safetensors (`schema` 2) holds the primitives as stored (before activation), the water, and in its header
 the recipe, its settings, the metric flag, the working unit and when the clip begins and ends; also the training
-frames' poses where they were refined, and the camera that notebooks show the map from. That of a large map (`schema` 3)
-holds no primitives but lists the files of its blocks (`splat.block_store`), which lie in blocks/ beside it. A
-checkpoint adds the optimizer's moments and the step.
+frames' poses where they were refined, their colors where each has its own, and the camera that notebooks show the map
+from. That of a large map (`schema` 3) holds no primitives but lists the files of its blocks (`splat.block_store`),
+which lie in blocks/ beside it. A checkpoint adds the optimizer's moments and the step.
 """
 
 from collections.abc import Mapping
@@ -19,6 +19,7 @@ from swimm3r.io.files.damage import Remedy, guard
 from swimm3r.io.files.safe_names import check_names
 from swimm3r.io.files.tensor_file import read_tensors
 from swimm3r.settings_document import from_document
+from swimm3r.splat.appearance import FrameColors
 from swimm3r.splat.block_store import BlockEntry, StoredBlocks
 from swimm3r.splat.primitives.kinds import primitives_from
 from swimm3r.splat.recipes import recipe_parts
@@ -42,6 +43,7 @@ class _MapHeader:
     schema: int
     span: tuple[float, float] = (0.0, 1.0)  # static maps of earlier versions have none
     frames: tuple[str, ...] | None = None  # whose poses were refined
+    colors: tuple[str, ...] | None = None  # frames with colors of their own
     viewpoint: _ImageSize | None = None  # of its images; None of a map without one
     blocks: tuple[BlockEntry, ...] = ()  # of a large map
     key: str = ""  # of the training that made them
@@ -54,6 +56,7 @@ class _MapHeader:
         if self.span[0] > self.span[1]:
             raise ValueError(f"its clip ends before it begins: {list(self.span)}")
         check_names(self.frames or ())
+        check_names(self.colors or ())
         if bool(self.blocks) != (self.schema == SCHEMA_IN_BLOCKS):
             raise ValueError(f"a file of schema {self.schema} lists {len(self.blocks)} blocks")
         check_names(entry.file for entry in self.blocks)
@@ -86,13 +89,23 @@ def load_map(path: str | Path) -> SplatMap:
         poses = None
         if about.frames is not None:
             poses = RefinedPoses(about.frames, _poses(stored.tensors, len(about.frames)))
+        colors = None if about.colors is None else _colors(stored.tensors, about.colors)
         viewpoint = None if about.viewpoint is None else _viewpoint(stored.tensors, about.viewpoint)
         blocks = None
         if about.blocks:
             blocks = StoredBlocks(path.parent, about.key, about.blocks)
             blocks.check_files()
     field.requires_grad_(False)
-    return SplatMap(primitives, field, settings, about.metric, about.length, about.span, poses, viewpoint, blocks)
+    return SplatMap(
+        primitives, field, settings, about.metric, about.length, about.span, poses, viewpoint, blocks, colors
+    )
+
+
+def _colors(tensors: Mapping[str, Tensor], names: tuple[str, ...]) -> FrameColors:
+    maps = tensors["colors.maps"]
+    if maps.shape != (len(names), 3, 4) or not bool(maps.isfinite().all()):
+        raise ValueError(f"colors.maps has the shape {tuple(maps.shape)} for {len(names)} frames, or is not finite")
+    return FrameColors(names, maps)
 
 
 def _viewpoint(tensors: Mapping[str, Tensor], size: _ImageSize) -> Cameras:

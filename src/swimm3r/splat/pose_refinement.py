@@ -17,6 +17,7 @@ from jaxtyping import Bool, Float
 from torch import Tensor
 
 from swimm3r.cameras import Cameras
+from swimm3r.evaluate.registration import fit_colors
 from swimm3r.imaging.undistortion import undistorted
 from swimm3r.progress import Progress, silent
 from swimm3r.splat.pose_mlp import moved
@@ -29,6 +30,7 @@ from swimm3r.splat.settings import PoseRefinementSettings
 
 _DARK = 0.01  # sum of R, G, B below which a pixel is not looked at
 _SMALLEST = 60  # pixels of the longer side, below which an image no longer tells a pose
+_STAY = 1e-3  # hold of colors to the map's, `evaluate.registration.fit_colors`
 _MARGIN = 0.25  # of the image, within which primitives outside it are kept: the pose moves
 
 
@@ -96,6 +98,7 @@ class _Look:
         self._canvas = camera.pinhole(long_side)
         target, seen = undistorted(image, mask, camera, self._canvas)
         self._target, self._wanted = target.to(scene.device), edges(target, seen, settings).to(scene.device)
+        self._seen = seen.to(scene.device)
         self._units = settings_in_scene_units(scene.settings, scene.length)
         self._primitives = in_sight(scene, self._canvas, self._now)
 
@@ -107,7 +110,10 @@ class _Look:
         """Mean absolute difference over the edges."""
         view = pinhole(replace(self._canvas, cam2world=self.pose(delta)[None])).to(self._scene.device)
         rgb = images(self._primitives, self._scene.field, view, self._units, self._now).rgb
-        off = (rgb.permute(1, 2, 0) - self._target).abs().mean(-1)
+        rgb = rgb.permute(1, 2, 0)
+        if self._scene.colors is not None:  # the frame has colors of its own: they say nothing about the pose
+            rgb = fit_colors(rgb.detach()[self._seen], self._target[self._seen], _STAY)(rgb)
+        off = (rgb - self._target).abs().mean(-1)
         return (off * self._wanted).sum() / self._wanted.sum()
 
 

@@ -18,6 +18,7 @@ from swimm3r.io.images import jpeg_uri
 from swimm3r.medium import Medium
 from swimm3r.raster import MediumMaps, RasterOutput, SggBuffers, rasterize
 from swimm3r.settings_document import to_document
+from swimm3r.splat.appearance import FrameColors
 from swimm3r.splat.block_store import StoredBlocks, joined
 from swimm3r.splat.gaussian_settings import GaussianSettings
 from swimm3r.splat.medium.field import (
@@ -83,6 +84,7 @@ class SplatMap:
     poses: RefinedPoses | None = None  # of the training frames; None where they were held
     viewpoint: Cameras | None = None  # the pinhole camera of a training frame, from where notebooks show the map
     blocks: StoredBlocks | None = None  # None: all primitives are in memory
+    colors: FrameColors | None = None  # of the training frames; None where all have the dive's
 
     def __repr__(self) -> str:
         moving = f", {self.span[0]:.1f} to {self.span[1]:.1f} s" if self.dynamic else ""
@@ -171,6 +173,9 @@ class SplatMap:
         if self.viewpoint is not None:
             tensors |= {"viewpoint.K": self.viewpoint.K, "viewpoint.cam2world": self.viewpoint.cam2world}
             about["viewpoint"] = {"width": self.viewpoint.width, "height": self.viewpoint.height}
+        if self.colors is not None:
+            tensors["colors.maps"] = self.colors.maps
+            about["colors"] = self.colors.names
         if self.blocks is not None:
             self.blocks.copy_to(Path(path).parent)
             about |= {"blocks": [asdict(entry) for entry in self.blocks.entries], "key": self.blocks.key}

@@ -58,6 +58,21 @@ class TrainingPoseSettings(Settings):
 
 
 @dataclass(frozen=True)
+class AppearanceSettings(Settings):
+    """Exposure and white balance of single frames (`splat/appearance.py`)."""
+
+    mode: Literal["auto", "on", "off"] = "auto"
+    """Give every frame an affine color map of its own, the identity on average: always, never, or where the sparse
+    points say that frames differ in more than their distances (auto)."""
+    least_explained: Share = 0.2
+    """Smallest share that frames must explain of the variation that the water leaves, with `auto`."""
+    least_change: Share = 0.006
+    """Smallest change of colors, in pixel values, that frames must explain, with `auto`."""
+    refits: Annotated[int, Range(0, 100)] = 3
+    """Number of times that the maps are fitted again during training, evenly spaced over its second part."""
+
+
+@dataclass(frozen=True)
 class MapSettings(Settings):
     """Settings that all recipes share: length and image size of a training, and its record."""
 
@@ -68,6 +83,7 @@ class MapSettings(Settings):
     working_depth: Annotated[float, Range(1e-3, 1e6)] = 3.0
     """Median depth, in working units, that a scene without metric scale is scaled to for training."""
     poses: TrainingPoseSettings = field(default_factory=TrainingPoseSettings)
+    appearance: AppearanceSettings = field(default_factory=AppearanceSettings)
     seed: Seed = 0
     """Seed of the random number generator."""
     log_every: Cadence = 0.005

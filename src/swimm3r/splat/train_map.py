@@ -15,6 +15,7 @@ from swimm3r.errors import UsageError
 from swimm3r.progress import Progress, silent
 from swimm3r.scene.frames import Frames
 from swimm3r.scene.reconstruction import Reconstruction
+from swimm3r.splat.appearance import AppearanceDecision, decide_appearance, write_decision
 from swimm3r.splat.block_store import no_primitives
 from swimm3r.splat.blocks.plan import PlannedBlock, plan_blocks, surface_of
 from swimm3r.splat.blocks.training import train_in_blocks
@@ -43,7 +44,7 @@ def train(
     observer: Observer | None = None,
     engine: EngineSettings = EngineSettings(),  # noqa: B008 - records are frozen
 ) -> SplatMap:
-    """Train a map in `folder`: checkpoint/, metrics.jsonl, and at the end map.safetensors and the refined poses.
+    """Train a map in `folder`: checkpoint/, metrics.jsonl, appearance.json, and last map.safetensors and refined poses.
 
     All are in the scene's own unit; cameras.json and trajectory.tum are not written where poses are held. A static map
     of more ground than one block holds is trained in several, in blocks/ (`splat.blocks`).
@@ -52,8 +53,12 @@ def train(
     _check_near(settings, scale * median_z_depth(rec))
     if plan := _plan(rec, settings):
         assert isinstance(settings, UwbsSettings)
+        write_decision(folder, AppearanceDecision(False, "maps in blocks have no colors of single frames"))
         return _in_blocks(rec, frames, settings, plan, scale, folder, progress, device, observer, engine)
     views = TrainingViews(rec, frames, settings, scale)
+    appearance = decide_appearance(rec, frames, views.names, settings.appearance)
+    write_decision(folder, appearance.decision)
+    views.colors = appearance.colors
     poses_in_training = training_poses_of(rec, views.names, views.cameras, scale) if settings.poses.enabled else None
     radius = path_radius(rec, scale, settings.working_depth)
     training_scene = TrainingScene(rec, scale, radius, views, poses_in_training, device)
@@ -66,7 +71,9 @@ def train(
         poses = poses_in_training.refined(final.poses)
         write_refined(folder, rec, frames, poses)
     viewpoint = _viewpoint(rec, views, poses)
-    scene = SplatMap(primitives, field, settings, rec.metric, 1 / scale, frames.span, poses, viewpoint)
+    scene = SplatMap(
+        primitives, field, settings, rec.metric, 1 / scale, frames.span, poses, viewpoint, colors=views.colors
+    )
     scene.save(folder / "map.safetensors")
     return scene
 
@@ -120,7 +127,8 @@ def _schedule(settings: SplatSettings, rec: Reconstruction, views: TrainingViews
     matches = []
     if settings.poses.enabled:
         matches.append(float(rec.matches.xy_i.double().sum() + rec.matches.xy_j.double().sum()))
-    return loop.schedule_of(settings, views.names, views.times, *cameras, *matches)
+    colors = [] if views.colors is None else [views.colors.maps.tolist()]
+    return loop.schedule_of(settings, views.names, views.times, *cameras, *matches, *colors)
 
 
 def _plan(rec: Reconstruction, settings: SplatSettings) -> tuple[PlannedBlock, ...]:

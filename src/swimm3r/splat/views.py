@@ -21,6 +21,7 @@ from swimm3r.imaging.undistortion import nearest_pixels, undistorted
 from swimm3r.io.files.cache import ArrayCache
 from swimm3r.scene.frames import Frames
 from swimm3r.scene.reconstruction import Reconstruction
+from swimm3r.splat.appearance import FrameColors
 from swimm3r.splat.ground import Window
 from swimm3r.splat.settings import SplatSettings
 
@@ -31,7 +32,7 @@ class TrainingView:
 
     name: str
     camera: Cameras  # one pinhole, working units
-    rgb: Float[Tensor, "3 h w"]
+    rgb: Float[Tensor, "3 h w"]  # in the colors that the dive has on average (`splat.appearance`)
     seen: Bool[Tensor, "h w"]
     z_depth: Float[Tensor, "h w"]  # working units, 0 = unknown or doubtful
     open_water: Bool[Tensor, "h w"]  # looks past every surface; nowhere where depth is not read
@@ -59,7 +60,9 @@ class TrainingViews:
         settings: SplatSettings,
         scale: float,
         window: Window | None = None,
+        colors: FrameColors | None = None,
     ) -> None:
+        self.colors = colors  # of single frames; None where all have the dive's
         self.rec, self.frames, self.settings, self.scale, self.window = rec, frames, settings, scale, window
         self._times = {frame.name: normalized_time(frames.span, frame.time) for frame in frames}
         train = {frame.name for frame in frames.train}
@@ -102,11 +105,12 @@ class TrainingViews:
                 seen, z_depth = seen & inside, torch.where(inside, z_depth, 0.0)
             return stored, seen.numpy(), z_depth.half().numpy(), open_water.numpy()
 
-        rgb, seen, z_depth, open_water = self._cache.get(name, make)
+        stored, seen, z_depth, open_water = self._cache.get(name, make)
+        rgb = torch.from_numpy(stored.astype(np.float32)) / 255
         return TrainingView(
             name,
             _in_working_units(canvas, self.scale),
-            torch.from_numpy(rgb.astype(np.float32)) / 255,
+            rgb if self.colors is None else self.colors.common(name, rgb),
             torch.from_numpy(seen.copy()),
             torch.from_numpy(z_depth.astype(np.float32)),
             torch.from_numpy(open_water.copy()),

@@ -1,4 +1,4 @@
-"""Disturbances between a clean image and a camera's: a fish, marine snow, vignetting, sensor noise."""
+"""Disturbances between a clean image and a camera's: a fish, marine snow, vignetting, exposure, sensor noise."""
 
 from dataclasses import dataclass
 
@@ -8,7 +8,7 @@ from jaxtyping import Bool, Float
 from torch import Tensor
 
 from swimm3r.cameras import Cameras, ray_depth_from_z
-from swimm3r.medium import Medium, add_water
+from swimm3r.medium import Medium, add_water, linear_from_srgb, srgb_from_linear
 from swimm3r.synthetic.seafloor import Seafloor, height_at
 
 _BODY = (0.19, 0.072, 0.04)  # m, half axes: along, up, across
@@ -148,6 +148,18 @@ def vignette(raw: Float[Tensor, "h w 3"], strength: float) -> Float[Tensor, "h w
     y = (torch.arange(h) + 0.5 - h / 2)[:, None]
     x = (torch.arange(w) + 0.5 - w / 2)[None]
     return raw * (1 - strength * (x * x + y * y) / (h * h / 4 + w * w / 4))[..., None]
+
+
+def camera_gains(exposure: float, white_balance: float, rng: np.random.Generator) -> Float[Tensor, "3"]:
+    """One frame's factors on linear light: up to `exposure` stops up or down, red and blue by `white_balance` more."""
+    stops = rng.uniform(-exposure, exposure)
+    red, blue = 1 + rng.uniform(-white_balance, white_balance, 2)
+    return torch.tensor([red, 1.0, blue], dtype=torch.float32) * 2.0**stops
+
+
+def exposed(raw: Float[Tensor, "h w 3"], gains: Float[Tensor, "3"]) -> Float[Tensor, "h w 3"]:
+    """The image as a camera with other gains stores it, clipped where it is full."""
+    return srgb_from_linear(linear_from_srgb(raw) * gains).clamp(0, 1)
 
 
 def sensor_noise(raw: Float[Tensor, "h w 3"], sigma: float, rng: np.random.Generator) -> Float[Tensor, "h w 3"]:

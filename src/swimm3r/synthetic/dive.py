@@ -2,11 +2,13 @@
 
     raw = add_water(clear, ray_depth, medium), and Binf where a ray meets nothing      (paper Eqs. 2-4)
 
-on values as stored (sRGB), before fish, snow, vignetting and noise. Truth is of the still scene: depth and `clear` are
-what lies behind the fish, and `usable` is False wherever it shows. Caustics are light, not water: `clear` has them.
-Where a ray meets nothing, depth is 0 and `clear` is black.
+on values as stored (sRGB), before fish, snow, vignetting, the camera's exposure and white balance, and noise. Truth is
+of the still scene by a camera whose gains are 1: depth and `clear` are what lies behind the fish, and `usable` is False
+wherever it shows. Caustics are light, not water: `clear` has them. Where a ray meets nothing, depth is 0 and `clear` is
+black.
 
-On disk: images/NAME, and truth/ as `ground_truth` reads it, with masks/NAME.png (0 at the fish) if there is one.
+On disk: images/NAME, and truth/ as `ground_truth` reads it, with masks/NAME.png (0 at the fish) if there is one, and
+gains.json, the camera's factors on linear light per frame, if they change.
 """
 
 import json
@@ -60,6 +62,11 @@ class Dive:
     def __len__(self) -> int:
         return len(self.names)
 
+    def gains(self, i: int) -> Float[Tensor, "3"]:
+        """The camera's factors on linear light in frame i; 1 without changes of exposure and white balance."""
+        rng = np.random.default_rng([self.settings.seed, 6, i])
+        return disturbances.camera_gains(self.settings.exposure, self.settings.white_balance, rng)
+
     def frame(self, i: int) -> DiveFrame:
         """Render frame i; the same every time."""
         settings, camera = self.settings, self.cameras[i]
@@ -87,6 +94,8 @@ class Dive:
             raw = disturbances.marine_snow(raw, camera, settings.marine_snow, self.medium, rng)
         if settings.vignetting:
             raw = disturbances.vignette(raw, settings.vignetting)
+        if settings.exposure or settings.white_balance:
+            raw = disturbances.exposed(raw, self.gains(i))
         if settings.noise:
             raw = disturbances.sensor_noise(raw, settings.noise, rng)
         return DiveFrame(raw, clear, z_depth, ray_depth, usable)
@@ -137,6 +146,9 @@ def write_dive(settings: DiveSettings, folder: Path, progress: Progress = silent
             images.write_rgb(truth / "masks" / f"{name}.png", mask)
             if settings.give_masks:
                 images.write_rgb(folder / "masks" / f"{name}.png", mask)
+    if settings.exposure or settings.white_balance:
+        gains = {name: dive.gains(i).tolist() for i, name in enumerate(dive.names)}
+        write_text(truth / "gains.json", json.dumps(gains, indent=2) + "\n")
     dive.medium.save(truth / "medium.json")
     dive.cameras.save(truth / "cameras.json", dive.names, units="metres")
     write_text(record, json.dumps({**described, "whole": True}, indent=2) + "\n")

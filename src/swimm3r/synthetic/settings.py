@@ -57,6 +57,10 @@ class DiveSettings(Settings):
     """Standard deviation of the sensor noise, in pixel values 0..1."""
     vignetting: Share = 0.0
     """Share of light lost in the corners of the image."""
+    exposure: Annotated[float, Range(0, 3)] = 0.0
+    """Largest change of the camera's exposure from frame to frame, in stops up or down."""
+    white_balance: Annotated[float, Range(0, below=1)] = 0.0
+    """Largest change of the camera's gains of red and blue from frame to frame, as a share."""
     moving_object: bool = False
     """Let a fish swim across the view once during the dive."""
     give_masks: bool = False

@@ -8,7 +8,7 @@ import logging
 import math
 import time
 from collections.abc import Callable
-from dataclasses import asdict, dataclass
+from dataclasses import asdict, dataclass, replace
 from pathlib import Path
 from typing import Any, Protocol, runtime_checkable
 
@@ -19,17 +19,24 @@ from swimm3r.io.files import metrics_log
 from swimm3r.io.files.cache_key import cache_key
 from swimm3r.io.files.damage import guard
 from swimm3r.progress import Progress
+from swimm3r.splat.appearance import fit_to_view
 from swimm3r.splat.medium.kinds import Water
 from swimm3r.splat.pose_mlp import PoseMlp
 from swimm3r.splat.primitives.kinds import Primitives
+from swimm3r.splat.rendering import images
 from swimm3r.splat.settings import SplatSettings
+from swimm3r.splat.shared_settings import AppearanceSettings
 from swimm3r.splat.training.checkpoint import StateHeader, read_state, state_remedy, write_state
 from swimm3r.splat.training.observer import Observer, TrainingStep
 from swimm3r.splat.training.scene import TrainingScene
 from swimm3r.splat.training.state import State, restored, stored
-from swimm3r.splat.views import TrainingView
+from swimm3r.splat.views import TrainingView, smaller
 
 log = logging.getLogger(__name__)
+
+_FIRST_REFIT = 0.4  # of the run: every recipe has its water by then
+_REFIT_SIDE = 160  # pixels of the longer side, at least, of the images that colors are fitted on
+_COLORS = "frame_colors"  # of a checkpoint
 
 Numbers = dict[str, float | Tensor]
 """Scalars logged by one step; tensors stay on their device until the log is written."""
@@ -116,6 +123,7 @@ def run(
     folder.mkdir(parents=True, exist_ok=True)
     state, done = _resume(recipe, parts, path, metrics, schedule)
     state = state.to(recipe.scene.device)
+    refits = refit_steps(recipe.settings.appearance, schedule.iterations)
     started, cpu_started, first = time.perf_counter(), time.process_time(), done
     sums: dict[str, tuple[float | Tensor, int]] = {}
     for step in range(done + 1, schedule.iterations + 1):
@@ -132,12 +140,50 @@ def run(
             row["cpu_seconds_per_step"] = (time.process_time() - cpu_started) / (step - first)
             metrics_log.append_row(metrics, row)
             sums = {}
+        if step in refits and scene.surroundings is None:
+            fit_frame_colors_again(recipe, state)
         if step % schedule.checkpoint_every == 0 or last:
-            write_state(path, stored(state), StateHeader(step, schedule.fingerprint))
+            write_state(path, stored(state) | _stored_colors(scene), StateHeader(step, schedule.fingerprint))
         if observer is not None:
             observer(TrainingStep(step, schedule.iterations, numbers, view, recipe.scene, state))
     progress(what, schedule.iterations, schedule.iterations)
     return state
+
+
+def refit_steps(settings: AppearanceSettings, iterations: int) -> frozenset[int]:
+    """The steps after which the frames' colors are fitted again, from `_FIRST_REFIT` of the run on."""
+    shares = (_FIRST_REFIT + (1 - _FIRST_REFIT) * k / settings.refits for k in range(settings.refits))
+    return frozenset(max(1, round(share * iterations)) for share in shares)
+
+
+@torch.no_grad()
+def fit_frame_colors_again(recipe: Recipe, state: State) -> None:
+    """Fit the maps of the training frames to what the map shows of each by now; nothing where there are none."""
+    scene, settings = recipe.scene, recipe.settings
+    colors = scene.views.colors
+    if colors is None:
+        return
+    fits = []
+    for k in range(len(scene.views)):
+        view = scene.view(k)
+        view = smaller(view, max(1, max(view.seen.shape) // _REFIT_SIDE))
+        shown = images(state.primitives, state.field, scene.pinhole_view(view, state.poses), settings, view.time)
+        fits.append(fit_to_view(shown.rgb, view.rgb, view.seen.float()).cpu())
+    scene.views.colors = colors.refitted(torch.stack(fits))
+
+
+def _stored_colors(scene: TrainingScene) -> dict[str, Tensor]:
+    return {} if scene.views.colors is None else {_COLORS: scene.views.colors.maps}
+
+
+def _restore_colors(scene: TrainingScene, tensors: dict[str, Tensor]) -> None:
+    """Raises KeyError or ValueError where a state has no maps, or those of another number of frames."""
+    colors = scene.views.colors
+    if colors is not None:
+        maps = tensors[_COLORS]
+        if maps.shape != colors.maps.shape:
+            raise ValueError(f"{_COLORS} has the shape {tuple(maps.shape)} for {len(colors.names)} frames")
+        scene.views.colors = replace(colors, maps=maps)
 
 
 def _resume(recipe: Recipe, parts: RecipeParts, path: Path, metrics: Path, schedule: Schedule) -> tuple[State, int]:
@@ -151,6 +197,7 @@ def _resume(recipe: Recipe, parts: RecipeParts, path: Path, metrics: Path, sched
                 cameras = recipe.scene.refined_cameras
                 poses = PoseMlp(cameras, recipe.settings.poses) if cameras else None
                 state = restored(kept.tensors, parts.primitives, parts.field, poses)
+                _restore_colors(recipe.scene, kept.tensors)
             done = kept.about.step
             log.info("going on from step %d", done)
         else:

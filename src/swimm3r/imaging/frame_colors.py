@@ -1,0 +1,272 @@
+"""Colors that change from frame to frame though the scene does not: exposure and white balance, apart from the water.
+
+A camera that balances and exposes by itself stores I = M_f S + b_f, with S the colors (water included) that the dive
+has on average: the mean of the M_f is the identity and that of the b_f is 0, so that water and scene keep their
+meaning. Point t, seen in frame f from the ray depth z, has
+
+    S_tf = a_t + sum_k (c_k + d_k a_t) (phi_k(z) - mean_t phi_k),    phi = z, z^2
+
+the water to second order about the point's own mean distance: it moves colors toward its own, the farther the more, by
+amounts that depend on the color. Three models are compared on points that none was fitted to: with water alone, with
+frames alone, and with both. What frames explain beyond the water decides whether they are needed.
+
+The maps themselves are fitted in the water that structure from motion measured, S_tf = J_t T_D(z) + B(z): free water
+and free maps would share out between them what both can explain. Diagonal entries are nearly free, for that is what
+exposure and white balance are; the others, and offsets, are held closer to 0, as frames that look farther than others
+resemble frames with an offset.
+"""
+
+from dataclasses import dataclass
+
+import numpy as np
+import torch
+from jaxtyping import Float, Int
+from scipy.sparse import csr_matrix
+from torch import Tensor
+
+_ROUNDS = 8  # of alternating fits
+_GAIN_STD, _MIX_STD, _OFFSET_STD = 0.3, 0.05, 0.02  # of a frame's map about the identity, before anything is seen
+_REDUNDANCY = 100.0  # observations that share an error: what is common to a frame and no map of colors
+_LEAST_SCALE = 2e-3  # pixel value, the least spread that residuals are weighed by
+_BRIGHTEST = 1.2  # clear color of a point
+_TERMS = 4  # of the water, per channel
+_DARK, _FULL = 0.02, 0.97  # pixel values beyond which nothing can be told about a color
+
+
+@dataclass(frozen=True)
+class ColorTracks:
+    """Colors of points that several frames see."""
+
+    color: Float[Tensor, "o 3"]
+    ray_depth: Float[Tensor, " o"]
+    point: Int[Tensor, " o"]
+    frame: Int[Tensor, " o"]
+    frames: int
+    T_D: Float[Tensor, "o 3"] | None = None  # of the measured water; None where none was
+    backscatter: Float[Tensor, "o 3"] | None = None
+
+
+@dataclass(frozen=True)
+class ColorEvidence:
+    """Robust spreads, in pixel values, of the colors that one point has in several frames, on held-out points."""
+
+    points: int
+    alone: float  # about the point's mean color
+    water: float  # about that and the water
+    frames: float  # about that and the frames' maps
+    both: float
+
+    @property
+    def by_water(self) -> float:
+        """Share of the variance that the water explains."""
+        return _explained(self.alone, self.water)
+
+    @property
+    def by_frames(self) -> float:
+        """Share that the frames explain of what the water leaves."""
+        return _explained(self.water, self.both)
+
+
+@dataclass(frozen=True)
+class FrameColorFit:
+    """A frame's colors as an affine map of the dive's: (M, b) as [3, 4], the mean over frames being (identity, 0)."""
+
+    maps: Float[Tensor, "f 3 4"]
+    evidence: ColorEvidence
+
+
+def fit_frame_colors(tracks: ColorTracks) -> FrameColorFit | None:
+    """The maps of all frames, and how much they explain; None where fewer than 40 points are seen three times."""
+    seen = _usable(tracks)
+    points = np.unique(seen.point)
+    if len(points) < 40:
+        return None
+    half = np.searchsorted(points, seen.point) % 2 == 0
+    spreads = np.zeros((2, 4))
+    for k, (fitted, held) in enumerate(((half, ~half), (~half, half))):
+        for m, (water, frames) in enumerate(((False, False), (True, False), (False, True), (True, True))):
+            spreads[k, m] = _spread(seen.rows(held), _fitted(seen.rows(fitted), water, frames))
+    alone, water, frames, both = np.sqrt((spreads**2).mean(0)).tolist()
+    maps = _fitted(seen, True, True).maps if seen.T_D is None else _fitted_in_water(seen)
+    return FrameColorFit(torch.from_numpy(maps).float(), ColorEvidence(len(points), alone, water, frames, both))
+
+
+def identity_maps(count: int) -> Float[Tensor, "f 3 4"]:
+    """The maps of frames whose colors do not change."""
+    return torch.eye(3, 4).repeat(count, 1, 1)
+
+
+def about_identity(maps: Float[Tensor, "f 3 4"]) -> Float[Tensor, "f 3 4"]:
+    """The same maps of other common colors: those of which they are the identity on average."""
+    mean = maps.double().mean(0)
+    matrix = maps[..., :3].double() @ torch.linalg.inv(mean[:, :3])
+    offset = maps[..., 3].double() - matrix @ mean[:, 3]
+    return torch.cat([matrix, offset[..., None]], -1).to(maps)
+
+
+@dataclass(frozen=True)
+class _Seen:
+    color: np.ndarray  # [o, 3]
+    z: np.ndarray  # in medians
+    point: np.ndarray
+    frame: np.ndarray
+    frames: int
+    T_D: np.ndarray | None
+    backscatter: np.ndarray | None
+
+    def rows(self, which: np.ndarray) -> "_Seen":
+        of_water = (None if values is None else values[which] for values in (self.T_D, self.backscatter))
+        return _Seen(self.color[which], self.z[which], self.point[which], self.frame[which], self.frames, *of_water)
+
+
+@dataclass(frozen=True)
+class _Fit:
+    water: np.ndarray  # [terms, 3]
+    maps: np.ndarray  # [f, 3, 4]
+
+
+def _usable(tracks: ColorTracks) -> _Seen:
+    """Observations of points that three frames or more show neither dark nor full."""
+    color, z = tracks.color.double().numpy(), tracks.ray_depth.double().numpy()
+    point, frame = tracks.point.numpy(), tracks.frame.numpy()
+    good = (color > _DARK).all(1) & (color < _FULL).all(1) & (z > 0) & np.isfinite(z)
+    count = np.bincount(point[good], minlength=int(point.max(initial=0)) + 1)
+    good &= count[point] >= 3
+    of_water = (None if values is None else values.double().numpy() for values in (tracks.T_D, tracks.backscatter))
+    unit = np.median(z[good]) if good.any() else 1.0
+    return _Seen(color, z / unit, point, frame, tracks.frames, *of_water).rows(good)
+
+
+class _Means:
+    """Weighted means over the observations of each point."""
+
+    def __init__(self, point: np.ndarray) -> None:
+        self.point = np.unique(point, return_inverse=True)[1]
+        self.weight = np.ones(len(point))
+
+    def __call__(self, values: np.ndarray) -> np.ndarray:
+        total = np.bincount(self.point, self.weight).clip(1e-12)
+        return np.stack([np.bincount(self.point, self.weight * v) / total for v in values.T], -1)[self.point]
+
+    def reweigh(self, residuals: np.ndarray) -> float:
+        """Weigh observations by their residuals [o, 3] (Cauchy); returns the residuals' scale."""
+        size = np.linalg.norm(residuals, axis=1)
+        scale = max(_LEAST_SCALE, 1.4826 * float(np.median(size)))
+        self.weight = 1 / (1 + (size / (2 * scale)) ** 2)
+        return scale
+
+
+def _basis(seen: _Seen, mean: _Means, a: np.ndarray) -> np.ndarray:
+    """Terms [o, terms, 3] of the change that the water makes to the color of a point, per channel."""
+    phi = np.stack([seen.z, seen.z**2], -1)
+    phi = phi - mean(phi)
+    return np.concatenate([np.repeat(phi[..., None], 3, -1), phi[..., None] * a[:, None]], 1)
+
+
+def _fitted(seen: _Seen, with_water: bool, with_frames: bool) -> _Fit:
+    """Robust alternating least squares."""
+    maps = np.tile(np.eye(3, 4), (seen.frames, 1, 1))
+    water = np.zeros((_TERMS, 3))
+    mean = _Means(seen.point)
+    for _ in range(_ROUNDS if with_water or with_frames else 0):
+        S = _common(seen, maps)
+        a = mean(S)
+        basis = _basis(seen, mean, a)
+        if with_water:
+            water = np.stack([_least_squares(basis[..., c], (S - a)[:, c], mean.weight) for c in range(3)], -1)
+        of_water = np.einsum("otc,tc->oc", basis, water)
+        predicted = mean(S - of_water) + of_water
+        scale = mean.reweigh(seen.color - _filmed(seen, maps, predicted))
+        if with_frames:
+            maps = _frame_maps(seen, predicted, mean.weight, scale, maps)
+    return _Fit(water, maps)
+
+
+def _fitted_in_water(seen: _Seen) -> np.ndarray:
+    """The maps [f, 3, 4] in known water."""
+    assert seen.T_D is not None
+    assert seen.backscatter is not None
+    maps, mean = np.tile(np.eye(3, 4), (seen.frames, 1, 1)), _Means(seen.point)
+    for _ in range(_ROUNDS):
+        direct = _common(seen, maps) - seen.backscatter
+        J = (mean(seen.T_D * direct) / mean(seen.T_D**2).clip(1e-9)).clip(0.0, _BRIGHTEST)
+        predicted = J * seen.T_D + seen.backscatter
+        scale = mean.reweigh(seen.color - _filmed(seen, maps, predicted))
+        maps = _frame_maps(seen, predicted, mean.weight, scale, maps)
+    return maps
+
+
+def _spread(seen: _Seen, fit: _Fit) -> float:
+    """Robust spread of held-out points about what a fit says of their other observations."""
+    mean, off = _Means(seen.point), seen.color
+    for _ in range(3):
+        S = _common(seen, fit.maps)
+        of_water = np.einsum("otc,tc->oc", _basis(seen, mean, mean(S)), fit.water)
+        off = seen.color - _filmed(seen, fit.maps, mean(S - of_water) + of_water)
+        mean.reweigh(off)
+    return float(np.sqrt(np.average((off**2).mean(1), weights=mean.weight)))
+
+
+def _common(seen: _Seen, maps: np.ndarray) -> np.ndarray:
+    """Observed colors as the dive has them on average."""
+    inverse = np.linalg.inv(maps[..., :3])
+    return np.einsum("oij,oj->oi", inverse[seen.frame], seen.color - maps[seen.frame, :, 3])
+
+
+def _filmed(seen: _Seen, maps: np.ndarray, S: np.ndarray) -> np.ndarray:
+    return np.einsum("oij,oj->oi", maps[seen.frame, :, :3], S) + maps[seen.frame, :, 3]
+
+
+def _least_squares(x: np.ndarray, y: np.ndarray, weight: np.ndarray) -> np.ndarray:
+    information = (x * weight[:, None]).T @ x
+    return np.linalg.solve(information + 1e-6 * len(x) * np.eye(x.shape[1]), x.T @ (weight * y))
+
+
+def _frame_maps(seen: _Seen, S: np.ndarray, weight: np.ndarray, scale: float, maps: np.ndarray) -> np.ndarray:
+    """Every frame's map from the dive's colors to its own, held to the identity where little is seen.
+
+    By turns with the points' colors alone, frames that share no point would take long to agree. So the points are
+    moved first by what gains of all frames, found at once, would change them by.
+    """
+    filmed = _filmed(seen, maps, S).clip(_DARK)
+    delta = np.log(seen.color / filmed)
+    of_points = _point_changes(seen, delta, weight * (filmed**2).mean(1), scale)
+    return _affine_maps(seen, S * np.exp(of_points), weight, scale)
+
+
+def _point_changes(seen: _Seen, delta: np.ndarray, weight: np.ndarray, scale: float) -> np.ndarray:
+    """The change of each observation's point [o, 3] in delta_tf = gain_f + change_t, weighted least squares."""
+    point = np.unique(seen.point, return_inverse=True)[1]
+    links = csr_matrix((weight, (seen.frame, point)), shape=(seen.frames, int(point.max()) + 1))
+    of_point = np.asarray(links.sum(0)).ravel().clip(1e-12)
+    shared = links.multiply(1 / of_point).tocsr() @ links.T
+    stay = _REDUNDANCY * scale**2 / _GAIN_STD**2
+    system = np.diag(np.asarray(links.sum(1)).ravel() + stay) - shared.toarray()
+    changes = np.zeros((len(point), 3))
+    for c in range(3):
+        mean = np.bincount(point, weight * delta[:, c]) / of_point
+        left = np.bincount(seen.frame, weight * (delta[:, c] - mean[point]), minlength=seen.frames)
+        gains = np.linalg.solve(system, left)
+        changes[:, c] = (np.bincount(point, weight * (delta[:, c] - gains[seen.frame])) / of_point)[point]
+    return changes
+
+
+def _affine_maps(seen: _Seen, S: np.ndarray, weight: np.ndarray, scale: float) -> np.ndarray:
+    x = np.concatenate([S, np.ones((len(S), 1))], 1)
+    information, products = np.zeros((seen.frames, 4, 4)), np.zeros((seen.frames, 4, 3))
+    for i in range(4):
+        for j in range(i, 4):
+            of = np.bincount(seen.frame, weight * x[:, i] * x[:, j], minlength=seen.frames)
+            information[:, i, j] = information[:, j, i] = of
+        for c in range(3):
+            products[:, i, c] = np.bincount(seen.frame, weight * x[:, i] * seen.color[:, c], minlength=seen.frames)
+    found = np.empty((seen.frames, 3, 4))
+    for c in range(3):
+        std = np.array([_GAIN_STD if i == c else _MIX_STD for i in range(3)] + [_OFFSET_STD])
+        stay = np.diag(_REDUNDANCY * scale**2 / std**2)
+        found[:, c] = np.linalg.solve(information + stay, (products[..., c] + stay[c])[..., None])[..., 0]
+    return about_identity(torch.from_numpy(found)).numpy()
+
+
+def _explained(before: float, after: float) -> float:
+    return 1 - (after / before) ** 2 if before > 0 else 0.0

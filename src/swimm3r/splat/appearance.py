@@ -1,0 +1,164 @@
+"""Frames that a camera exposed and balanced each by itself: their maps, and whether a dive needs any.
+
+    I_f = M_f S + b_f,    mean of M_f = identity, mean of b_f = 0
+
+S being what the map renders, water included: a frame's map is applied after the water. Training compares in the colors
+of S, which the dive has on average: a view is handed out as M_f^-1 (I_f - b_f), so that every recipe is served alike.
+The first maps are those of the sparse tracks (`imaging.frame_colors`), which also decide before training whether there
+are any; a few times during training they are fitted again to what the map shows by then.
+"""
+
+import json
+import logging
+from collections.abc import Sequence
+from dataclasses import asdict, dataclass, replace
+from pathlib import Path
+
+import torch
+from jaxtyping import Float
+from torch import Tensor
+
+from swimm3r.imaging.filters import blur
+from swimm3r.imaging.frame_colors import ColorEvidence, ColorTracks, about_identity, fit_frame_colors, identity_maps
+from swimm3r.io.files.atomic import write_text
+from swimm3r.io.files.damage import Remedy, guard
+from swimm3r.medium import backscatter, transmittances
+from swimm3r.scene.frames import Frames
+from swimm3r.scene.reconstruction import Reconstruction
+from swimm3r.splat.shared_settings import AppearanceSettings
+
+log = logging.getLogger(__name__)
+
+_POINT = 1 / 320  # of the longer side, sigma of the window that a point's color is taken over
+_FILE = "appearance.json"
+_STAY_GAIN, _STAY_MIX = 1e-4, 3e-3  # hold of a refit to the map of before: gains, and mixing or offsets
+
+
+@dataclass(frozen=True)
+class FrameColors:
+    """The maps of some frames; identity on average."""
+
+    names: tuple[str, ...]
+    maps: Float[Tensor, "n 3 4"]
+
+    def common(self, name: str, rgb: Float[Tensor, "3 h w"]) -> Float[Tensor, "3 h w"]:
+        """A frame's colors as the dive has them on average."""
+        M = self.maps[self.names.index(name)]
+        inverse = torch.linalg.inv(M[:, :3].double()).float()
+        return torch.einsum("ij,jhw->ihw", inverse, rgb - M[:, 3, None, None])
+
+    def refitted(self, fits: Float[Tensor, "n 3 4"]) -> "FrameColors":
+        """The maps after `fits`, from what the map shows to each frame in the common colors of before."""
+        old, new = self.maps.double(), fits.double()
+        matrix = old[..., :3] @ new[..., :3]
+        offset = (old[..., :3] @ new[..., 3:])[..., 0] + old[..., 3]
+        return FrameColors(self.names, about_identity(torch.cat([matrix, offset[..., None]], -1)).float())
+
+
+@dataclass(frozen=True)
+class AppearanceDecision:
+    """The decision on colors of single frames, with its figures; `splat/appearance.json`."""
+
+    on: bool
+    reason: str
+    by_water: float | None = None  # share of the variance of a point's color between frames that the water explains
+    by_frames: float | None = None  # share that the frames explain of the rest
+    spread: float | None = None  # of a point's color between frames, pixel values; no outliers
+    spread_left: float | None = None  # after water and frames
+    points: int = 0
+
+
+@dataclass(frozen=True)
+class Appearance:
+    """The decision, and the first maps where there are to be any."""
+
+    decision: AppearanceDecision
+    colors: FrameColors | None
+
+
+def decide_appearance(
+    rec: Reconstruction, frames: Frames, names: Sequence[str], settings: AppearanceSettings
+) -> Appearance:
+    """Judge the colors of the frames `names` by their sparse tracks."""
+    if settings.mode == "off":
+        return Appearance(AppearanceDecision(False, "switched off"), None)
+    fit = fit_frame_colors(color_tracks(rec, frames, names)) if len(names) > 2 else None
+    if fit is None:
+        colors = FrameColors(tuple(names), identity_maps(len(names))) if settings.mode == "on" else None
+        return Appearance(AppearanceDecision(colors is not None, "too few points are seen by three frames"), colors)
+    on, reason = _judged(fit.evidence, settings)
+    e = fit.evidence
+    decision = AppearanceDecision(on, reason, e.by_water, e.by_frames, e.alone, e.both, e.points)
+    log.info("colors of single frames %s: %s", "fitted" if on else "not fitted", reason)
+    return Appearance(decision, FrameColors(tuple(names), fit.maps) if on else None)
+
+
+def _judged(e: ColorEvidence, settings: AppearanceSettings) -> tuple[bool, str]:
+    told = (
+        f"of the variation of {e.points:,} points' colors between frames the water explains {e.by_water:.0%}, and"
+        f" exposure and white balance of the frames {max(0.0, e.by_frames):.0%} of the rest"
+    )
+    if settings.mode == "on":
+        return True, f"switched on; {told}"
+    moved = max(0.0, e.water**2 - e.both**2) ** 0.5
+    return e.by_frames >= settings.least_explained and moved >= settings.least_change, told
+
+
+def color_tracks(rec: Reconstruction, frames: Frames, names: Sequence[str]) -> ColorTracks:
+    """Colors of the sparse points in some frames; masked observations are left out."""
+    place = {rec.index(name): k for k, name in enumerate(names)}
+    order = rec.tracks.frame.argsort(stable=True)
+    bounds = torch.searchsorted(rec.tracks.frame[order], torch.arange(len(rec.names) + 1))
+    parts: list[tuple[Tensor, ...]] = []
+    for i, k in place.items():
+        rows = order[bounds[i] : bounds[i + 1]]
+        f = frames.index(rec.names[i])
+        image, mask = frames.image(f), frames.mask(f)
+        column, row = rec.tracks.xy[rows].long().unbind(-1)
+        row, column = row.clamp(0, image.shape[0] - 1), column.clamp(0, image.shape[1] - 1)
+        kept = mask[row, column]
+        rows, row, column = rows[kept], row[kept], column[kept]
+        point = rec.tracks.point[rows]
+        away = rec.points.xyz[point].double() - rec.cameras.centers[i].double()
+        color = blur(image, _POINT * max(image.shape[:2]))[row, column]
+        parts.append((color, away.norm(dim=-1).float(), point, torch.full_like(point, k)))
+    if not parts:
+        nothing = torch.zeros(0, dtype=torch.int64)
+        return ColorTracks(torch.zeros(0, 3), torch.zeros(0), nothing, nothing, 0)
+    color, ray_depth, point, frame = (torch.cat(part) for part in zip(*parts, strict=True))
+    tracks = ColorTracks(color, ray_depth, point, frame, len(names))
+    if rec.medium is None or rec.medium.encoding != "srgb":
+        return tracks
+    medium = rec.medium.at(ray_depth)
+    return replace(tracks, T_D=transmittances(ray_depth, medium)[0], backscatter=backscatter(ray_depth, medium))
+
+
+def fit_to_view(
+    render: Float[Tensor, "3 h w"], target: Float[Tensor, "3 h w"], seen: Float[Tensor, "h w"]
+) -> Float[Tensor, "3 4"]:
+    """The affine map from a rendering to a view, held to the identity where the view's colors do not tell."""
+    weight = seen.reshape(-1).double()
+    x = torch.cat([render, torch.ones_like(render[:1])]).reshape(4, -1).double()
+    y = target.reshape(3, -1).double()
+    information, products = (x * weight) @ x.mT, (x * weight) @ y.mT
+    rows = []
+    for c in range(3):
+        stay = torch.full((4,), _STAY_MIX, dtype=torch.float64, device=x.device)
+        stay[c] = _STAY_GAIN
+        stay = stay * weight.sum().clamp(min=1.0)
+        rows.append(torch.linalg.solve(information + stay.diag(), products[:, c] + stay * torch.eye(4).to(stay)[c]))
+    return torch.stack(rows).float()
+
+
+def write_decision(folder: Path, decision: AppearanceDecision) -> None:
+    """Write appearance.json beside the map."""
+    write_text(folder / _FILE, json.dumps(asdict(decision), indent=2) + "\n")
+
+
+def read_decision(folder: Path) -> AppearanceDecision | None:
+    """Read what `write_decision` wrote; None beside a map without it. Raises InputError where it is damaged."""
+    path = folder / _FILE
+    if not path.is_file():
+        return None
+    with guard(path, Remedy(f"remove {folder}; the command that trained the map trains it again")):
+        return AppearanceDecision(**json.loads(path.read_text(encoding="utf-8")))

@@ -1,0 +1,98 @@
+"""Exposure and white balance of single frames, told from the water by points that several frames see."""
+
+from dataclasses import replace
+
+import pytest
+import torch
+
+from swimm3r.imaging.frame_colors import ColorTracks, about_identity, fit_frame_colors, identity_maps
+
+FRAMES, POINTS = 24, 3000
+BINF, BETA_D, BETA_B = torch.tensor([0.1, 0.5, 0.5]), torch.tensor([0.4, 0.15, 0.12]), torch.tensor([0.3, 0.25, 0.2])
+
+
+def dive(gains: torch.Tensor, rise: float = 0.0, noise: float = 0.006) -> ColorTracks:
+    """Points seen by a third of the frames, from distances that grow by `rise` over the dive."""
+    rng = torch.Generator().manual_seed(0)
+    J = 0.15 + 0.6 * torch.rand(POINTS, 3, generator=rng)
+    first = torch.randint(0, FRAMES - FRAMES // 3 + 1, (POINTS,), generator=rng)
+    point = torch.arange(POINTS).repeat_interleave(FRAMES // 3)
+    frame = first[point] + torch.arange(FRAMES // 3).repeat(POINTS)
+    z = 2.0 + torch.rand(POINTS, generator=rng)[point] + 0.8 * torch.rand(len(point), generator=rng)
+    z = z + rise * frame / FRAMES
+    T_D, B = torch.exp(-BETA_D * z[:, None]), BINF * -torch.expm1(-BETA_B * z[:, None])
+    color = gains[frame] * (J[point] * T_D + B) + noise * torch.randn(len(point), 3, generator=rng)
+    return ColorTracks(color, z, point, frame, FRAMES, T_D, B)
+
+
+def jitter() -> torch.Tensor:
+    rng = torch.Generator().manual_seed(1)
+    gains = 1 + 0.12 * (2 * torch.rand(FRAMES, 3, generator=rng) - 1) + 0.15 * torch.randn(FRAMES, 1, generator=rng)
+    return gains / gains.mean(0)
+
+
+STEADY = torch.ones(FRAMES, 3)
+
+
+def test_the_gains_of_frames_are_found_in_known_water():
+    found = fit_frame_colors(dive(jitter()))
+    assert found is not None
+    assert found.evidence.by_frames > 0.8
+    for S in (torch.tensor([0.15, 0.3, 0.3]), torch.tensor([0.25, 0.4, 0.4])):
+        shown = found.maps[..., :3] @ S + found.maps[..., 3]
+        assert float(((shown / S - jitter()) ** 2).mean().sqrt()) < 0.02
+
+
+@pytest.mark.parametrize("gains", [STEADY, jitter()])
+def test_the_maps_are_the_identity_on_average(gains):
+    found = fit_frame_colors(dive(gains))
+    assert found is not None
+    torch.testing.assert_close(found.maps.mean(0), identity_maps(1)[0], atol=1e-6, rtol=0)
+
+
+@pytest.mark.parametrize("rise", [0.0, 1.5])
+def test_water_is_not_read_as_frames(rise):
+    found = fit_frame_colors(dive(STEADY, rise))
+    assert found is not None
+    assert found.evidence.by_water > 0.5
+    assert found.evidence.by_frames < 0.05
+    assert float((found.maps - identity_maps(FRAMES)).abs().max()) < 0.03
+
+
+def test_a_camera_that_rises_while_it_exposes_keeps_both_apart():
+    found = fit_frame_colors(dive(jitter(), rise=1.5))
+    assert found is not None
+    S = torch.tensor([0.2, 0.4, 0.4])
+    shown = (found.maps[..., :3] @ S + found.maps[..., 3]) / S
+    assert float((shown - jitter()).square().mean().sqrt()) < 0.03
+
+
+def test_noise_alone_is_explained_by_nothing():
+    rng = torch.Generator().manual_seed(0)
+    tracks = dive(STEADY)
+    noise = (0.4 + 0.02 * torch.randn(len(tracks.point), 3, generator=rng)).clamp(0, 1)
+    found = fit_frame_colors(replace(tracks, color=noise, T_D=None, backscatter=None))
+    assert found is not None
+    assert found.evidence.by_frames < 0.02
+    assert found.evidence.by_water < 0.02
+
+
+def test_few_points_say_nothing():
+    tracks = dive(STEADY)
+    few = tracks.point < 30
+    for rows in (few, few & False):
+        color, z, point, frame = tracks.color[rows], tracks.ray_depth[rows], tracks.point[rows], tracks.frame[rows]
+        assert fit_frame_colors(ColorTracks(color, z, point, frame, FRAMES)) is None
+
+
+def test_maps_about_the_identity_relate_frames_as_before():
+    rng = torch.Generator().manual_seed(2)
+    maps = identity_maps(5) + 0.1 * torch.randn(5, 3, 4, generator=rng)
+    centered = about_identity(maps)
+    torch.testing.assert_close(centered.mean(0), identity_maps(1)[0], atol=1e-6, rtol=0)
+
+    def from_first_to_last(m: torch.Tensor) -> torch.Tensor:
+        S = torch.linalg.inv(m[0, :, :3]) @ (torch.tensor([0.2, 0.5, 0.4]) - m[0, :, 3])
+        return m[-1, :, :3] @ S + m[-1, :, 3]
+
+    torch.testing.assert_close(from_first_to_last(centered), from_first_to_last(maps))

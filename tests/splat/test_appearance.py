@@ -1,0 +1,212 @@
+"""Frames in colors of their own: told from the tracks, trained in common colors, kept with the map."""
+
+from dataclasses import replace
+from pathlib import Path
+
+import pytest
+import torch
+
+from swimm3r.cameras import project_visible
+from swimm3r.evaluate.images import psnr
+from swimm3r.imaging.frame_colors import identity_maps
+from swimm3r.io.images import write_rgb
+from swimm3r.scene.frames import Frames
+from swimm3r.scene.reconstruction import Reconstruction, Tracks
+from swimm3r.splat import train
+from swimm3r.splat.appearance import (
+    FrameColors,
+    decide_appearance,
+    fit_to_view,
+    read_decision,
+    write_decision,
+)
+from swimm3r.splat.map_file import load_map
+from swimm3r.splat.pose_refinement import refine_pose
+from swimm3r.splat.settings import (
+    DensifySettings,
+    InitialSettings,
+    PoseRefinementSettings,
+    RenderSettings,
+    TrainingPoseSettings,
+    UwbsSettings,
+    with_recipe,
+)
+from swimm3r.splat.shared_settings import AppearanceSettings
+from swimm3r.splat.training.loop import refit_steps
+from swimm3r.splat.views import TrainingViews
+
+SETTINGS = UwbsSettings(
+    iterations=100,
+    initial=InitialSettings(primitives=500),
+    densify=DensifySettings(cap_max=700, min_refine_every=4),
+    poses=TrainingPoseSettings(enabled=False),
+    render=RenderSettings(),
+)
+GAINS = torch.tensor([[0.8, 0.9, 1.1], [1.2, 1.1, 0.85], [1.0, 0.8, 1.0], [0.9, 1.2, 1.15], [1.1, 1.0, 0.9]])
+
+
+@pytest.fixture(scope="module")
+def tracked(tiny_dive) -> Reconstruction:
+    """The tiny dive's reconstruction, the wall's points tracked by every frame that shows them."""
+    xyz = tiny_dive.rec.points.xyz.double().expand(len(tiny_dive.rec.names), -1, 3)
+    pixels, _, visible = project_visible(tiny_dive.rec.cameras, xyz)
+    frame, point = torch.nonzero(visible).unbind(-1)
+    return replace(tiny_dive.rec, tracks=Tracks(point, frame, pixels[visible].float()))
+
+
+@pytest.fixture(scope="module")
+def relit(tiny_dive, tmp_path_factory) -> Frames:
+    """The tiny dive's frames, each exposed and balanced by itself."""
+    folder: Path = tmp_path_factory.mktemp("relit")
+    listed = []
+    for i, frame in enumerate(tiny_dive.frames):
+        path = folder / frame.name
+        write_rgb(path, (tiny_dive.frames.image(i) * GAINS[i % 5]).clamp(0, 1).numpy())
+        listed.append(replace(frame, path=path))
+    return replace(tiny_dive.frames, frames=tuple(listed))
+
+
+def test_steady_frames_need_no_colors_of_their_own(tiny_dive, tracked):
+    decided = decide_appearance(tracked, tiny_dive.frames, tracked.names, AppearanceSettings())
+    assert not decided.decision.on
+    assert decided.colors is None
+    assert decided.decision.by_frames is not None
+    assert decided.decision.by_frames < 0.1
+
+
+def test_frames_of_changing_exposure_get_colors_that_undo_it(tiny_dive, tracked, relit):
+    decided = decide_appearance(tracked, relit, tracked.names, AppearanceSettings())
+    assert decided.decision.on
+    assert decided.decision.by_frames is not None
+    assert decided.decision.by_frames > 0.5
+    colors = decided.colors
+    assert colors is not None
+    torch.testing.assert_close(colors.maps.mean(0), identity_maps(1)[0], atol=1e-6, rtol=0)
+    mean = torch.stack([GAINS[tiny_dive.frames.index(name) % 5] for name in tracked.names]).mean(0)
+    for name in tracked.names:
+        f = relit.index(name)
+        common = colors.common(name, relit.image(f).permute(2, 0, 1)).permute(1, 2, 0)
+        inner = tiny_dive.frames.image(f)[8:-8, 8:-8]
+        before, after = psnr(relit.image(f)[8:-8, 8:-8], inner * mean), psnr(common[8:-8, 8:-8], inner * mean)
+        assert after > min(30, before + 6)
+
+
+@pytest.mark.parametrize(("mode", "on"), [("off", False), ("on", True)])
+def test_the_decision_can_be_made_by_hand(tiny_dive, tracked, mode, on):
+    decided = decide_appearance(tracked, tiny_dive.frames, tracked.names, AppearanceSettings(mode=mode))
+    assert decided.decision.on == on
+    assert (decided.colors is not None) == on
+
+
+def test_without_tracks_nothing_is_fitted(tiny_dive):
+    decided = decide_appearance(tiny_dive.rec, tiny_dive.frames, tiny_dive.rec.names, AppearanceSettings())
+    assert not decided.decision.on
+    assert "too few points" in decided.decision.reason
+
+
+def test_a_map_of_relit_frames_is_that_of_steady_ones(tiny_dive, tracked, relit, tmp_path):
+    own = {name: GAINS[tiny_dive.frames.index(name) % 5] for name in tracked.names}
+    mean = torch.stack(list(own.values())).mean(0)
+    off = replace(SETTINGS, appearance=AppearanceSettings(mode="off"))
+    scores = {}
+    for name, frames, settings in (
+        ("steady", tiny_dive.frames, SETTINGS),
+        ("on", relit, SETTINGS),
+        ("off", relit, off),
+    ):
+        scene = train(tracked, frames, settings, tmp_path / name)
+        seen = scene.render(tiny_dive.cameras[8]).rgb
+        common = seen if name == "steady" else seen / mean  # those that the relit frames have on average
+        scores[name] = psnr(common, tiny_dive.frames.image(8))
+        decision = read_decision(tmp_path / name)
+        assert decision is not None
+        assert decision.on == (scene.colors is not None) == (name == "on")
+    assert scores["on"] > scores["off"] + 0.5
+    assert scores["on"] > scores["steady"] - 1.5
+
+
+def test_every_recipe_is_handed_the_same_colors(tracked, relit, tmp_path):
+    short = replace(SETTINGS, iterations=4)
+    views = TrainingViews(tracked, relit, short, 1.0)
+    filmed = views[2].rgb
+    views.colors = decide_appearance(tracked, relit, views.names, short.appearance).colors
+    assert views.colors is not None
+    assert (views[2].rgb - filmed).abs().mean() > 0.01
+    for recipe in ("mcmc_gs", "seasplat", "watersplatting", "uwbs-dynamic"):
+        peer = with_recipe(short, recipe)
+        assert peer.appearance == short.appearance
+        scene = train(tracked, relit, peer, tmp_path / recipe)
+        assert scene.colors is not None
+        torch.testing.assert_close(scene.colors.maps.mean(0), identity_maps(1)[0], atol=1e-5, rtol=0)
+
+
+class StoppedError(Exception):
+    pass
+
+
+def test_an_interrupted_training_goes_on_with_its_colors(tracked, relit, tmp_path):
+    short = replace(SETTINGS, iterations=40)
+
+    def stop(what: str, done: int, total: int, /) -> None:
+        if done == 29:
+            raise StoppedError
+
+    whole = train(tracked, relit, short, tmp_path / "whole")
+    with pytest.raises(StoppedError):
+        train(tracked, relit, short, tmp_path / "cut", stop)
+    resumed = train(tracked, relit, short, tmp_path / "cut")
+    assert whole.colors is not None
+    assert resumed.colors is not None
+    assert torch.equal(whole.colors.maps, resumed.colors.maps)
+    assert torch.equal(whole.primitives.xyz, resumed.primitives.xyz)
+    stored = load_map(tmp_path / "cut/map.safetensors").colors
+    assert stored is not None
+    assert stored.names == tracked.names
+    assert torch.equal(stored.maps, whole.colors.maps)
+
+
+def test_colors_are_fitted_again_in_the_second_part_of_a_run():
+    assert sorted(refit_steps(AppearanceSettings(refits=3), 2000)) == [800, 1200, 1600]
+    assert not refit_steps(AppearanceSettings(refits=0), 2000)
+
+
+def test_a_refit_composes_with_the_maps_of_before():
+    rng = torch.Generator().manual_seed(0)
+    colors = FrameColors(("a", "b", "c"), identity_maps(3) + 0.1 * torch.randn(3, 3, 4, generator=rng))
+    scene = 0.2 + 0.5 * torch.rand(3, 20, 24, generator=rng)
+    seen = torch.ones(20, 24)
+    images = [
+        m[:, :3] @ scene.flatten(1) + m[:, 3:] for m in identity_maps(3) + 0.1 * torch.randn(3, 3, 4, generator=rng)
+    ]
+    filmed = {name: image.reshape(3, 20, 24) for name, image in zip(colors.names, images, strict=True)}
+    fits = [fit_to_view(scene, colors.common(name, filmed[name]), seen) for name in colors.names]
+    after = colors.refitted(torch.stack(fits))
+    common = [after.common(name, filmed[name]) for name in colors.names]
+    before = [colors.common(name, filmed[name]) for name in colors.names]
+
+    def spread(images: list[torch.Tensor]) -> float:
+        return float(torch.stack(images).std(0).mean())
+
+    assert spread(common) < 0.3 * spread(before)
+    torch.testing.assert_close(after.maps.mean(0), identity_maps(1)[0], atol=1e-6, rtol=0)
+
+
+def test_a_pose_is_refined_in_the_frames_own_colors(tiny_dive):
+    moved = tiny_dive.cameras[4].cam2world.clone()
+    moved[0, 0, 3] += 0.04
+    image = tiny_dive.frames.image(4) * torch.tensor([0.6, 0.8, 1.1])
+    start = replace(tiny_dive.cameras[4], cam2world=moved)
+    off = {}
+    for name, colors in (("own", FrameColors(("a",), identity_maps(1))), ("map's", None)):
+        scene = replace(tiny_dive.truth, colors=colors)
+        found = refine_pose(scene, start, image, tiny_dive.frames.mask(4), PoseRefinementSettings(steps=200))
+        off[name] = float((found.camera.cam2world[0, :3, 3] - tiny_dive.cameras[4].cam2world[0, :3, 3]).norm())
+    assert off["own"] < 0.03
+    assert off["own"] < 0.7 * off["map's"]
+
+
+def test_the_decision_comes_back_from_disk(tiny_dive, tracked, tmp_path):
+    decision = decide_appearance(tracked, tiny_dive.frames, tracked.names, AppearanceSettings()).decision
+    assert read_decision(tmp_path) is None
+    write_decision(tmp_path, decision)
+    assert read_decision(tmp_path) == decision
