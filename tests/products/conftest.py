@@ -129,6 +129,9 @@ def write_survey(folder: Path) -> None:
         folder,
         Georeference(32631, ORIGIN, rows, SCALE, SCALE_STD, ("a scale bar",), (0.05, 0.05, 0.1)),  # pyright: ignore[reportArgumentType]
     )
+    (folder / "settings.yaml").write_text("frames:\n  fps: 5.0\n")
+    (folder / "versions.json").write_text('{"swimm3r": "0.2.0"}')
+    (folder / "log.jsonl").write_text('{"time": "2026-11-22T17:12:43+0000", "event": "opened"}\n')
     done = {name: {"status": "done", "key": name} for name in ("prepare", "sfm")}
     (folder / "summary.json").write_text(
         json.dumps({"schema": 2, "input": {"path": "dive.mp4", "fingerprint": "none"}, "stages": done})

@@ -9,6 +9,7 @@ import rasterio
 import torch
 from tests.products.conftest import ORIGIN, SCALE_STD, Seabed, color, height, in_water
 
+from swimm3r.cli.main import main
 from swimm3r.errors import DeviceError, InputError, UsageError
 from swimm3r.evaluate.images import psnr
 from swimm3r.products import ProductSettings, write_products
@@ -19,7 +20,7 @@ from swimm3r.progress import silent
 from swimm3r.scene.georeference import GEOREFERENCE
 from swimm3r.scene.reconstruction import DepthMap, DepthMaps
 
-MAPS = ProductSettings()
+MAPS = ProductSettings(mesh=False, cloud=False)
 
 
 @pytest.fixture(scope="module")
@@ -94,7 +95,7 @@ def test_cells_lie_on_multiples_of_their_size(made: tuple[Path, ProductsRecord])
 
 
 def test_tiles_leave_no_trace(seabed: Seabed, made: tuple[Path, ProductsRecord], tmp_path: Path):
-    write_products(seabed.folder, tmp_path / "tiled", ProductSettings(tile=64), silent)
+    write_products(seabed.folder, tmp_path / "tiled", ProductSettings(mesh=False, cloud=False, tile=64), silent)
     for name in ("elevation", "hillshade", "orthophoto", "views"):
         whole, tiled = (values(folder / f"{name}.tif") for folder in (made[0], tmp_path / "tiled"))
         assert np.nanquantile(np.abs(whole - tiled), 0.999) <= (1e-4 if name == "elevation" else 2)
@@ -186,3 +187,18 @@ def test_slopes_towards_the_light_are_brighter_than_level_ground():
     x, y = np.meshgrid(np.arange(5.0), -np.arange(5.0))
     level, facing, averted = (hill_shade(k * (x - y), 1.0)[2, 2] for k in (0, 0.5, -0.5))
     assert averted < level < facing
+
+
+def test_the_command_prints_the_figures_and_the_report_shows_the_maps(
+    seabed: Seabed, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+):
+    run = tmp_path / "run"
+    shutil.copytree(seabed.folder, run)
+    main(["products", str(run), "--no-mesh", "--no-cloud", "--gsd", "0.02"])
+    printed = capsys.readouterr().out
+    assert "cells of 0.02 m" in printed
+    assert "± 1.00%, from a scale bar" in printed
+    page = (run / "report.html").read_text(encoding="utf-8")
+    assert "Maps from above" in page
+    assert page.count("Orthophoto without water") >= 1
+    assert "products/" in page

@@ -57,7 +57,7 @@ def made(seabed: Seabed, tmp_path_factory: pytest.TempPathFactory) -> tuple[Path
         feature("Polygon", [on_map([[90, 90], [91, 90], [91, 91]])], "far"),
         feature("LineString", on_map(LINE), "transect"),
     )
-    settings = ProductSettings(areas=areas, habitat_resolution=0.02, habitat_cell=0.4)
+    settings = ProductSettings(areas=areas, habitat_resolution=0.02, habitat_cell=0.4, mesh=False, cloud=False)
     return folder / "products", write_products(seabed.folder, folder / "products", settings, silent)
 
 
@@ -85,7 +85,12 @@ def test_a_polygon_has_the_area_and_the_ruggedness_of_its_ground(made: tuple[Pat
 def test_the_part_of_a_polygon_off_the_map_counts_as_not_covered(seabed: Seabed, tmp_path: Path):
     wide = [[0.2, 0.1], [10.2, 0.1], [10.2, 0.9], [0.2, 0.9]]
     areas = written(tmp_path / "wide.json", feature("Polygon", [on_map(wide)]))
-    write_products(seabed.folder, tmp_path / "out", ProductSettings(areas=areas, habitat_resolution=0.02), silent)
+    write_products(
+        seabed.folder,
+        tmp_path / "out",
+        ProductSettings(areas=areas, habitat_resolution=0.02, mesh=False, cloud=False),
+        silent,
+    )
     (row,) = table(tmp_path / "out" / "areas.csv")
     assert float(row["coverage"]) == pytest.approx(float(row["planar_area_m2"]) / 8, rel=1e-5)
     assert 0.05 < float(row["coverage"]) < 0.2

@@ -1,5 +1,6 @@
 """Vertices as PLY (Turk 1994), binary little-endian; of clouds float x y z, uchar red green blue."""
 
+from collections.abc import Sequence
 from pathlib import Path
 
 import numpy as np
@@ -36,12 +37,13 @@ def write_points(path: Path, xyz: Float[np.ndarray, "n 3"], rgb: Float[np.ndarra
     write_vertices(path, points)
 
 
-def write_vertices(path: Path, vertices: np.ndarray) -> None:
+def write_vertices(path: Path, vertices: np.ndarray, comments: Sequence[str] = ()) -> None:
     """Write a structured array of float32 and uint8 fields, one property each, whole or not at all."""
     kinds = {np.dtype("<f4"): "float", np.dtype("u1"): "uchar"}
     fields = [(name, vertices.dtype[name]) for name in vertices.dtype.names or ()]
     properties = "".join(f"property {kinds[kind]} {name}\n" for name, kind in fields)
-    header = f"ply\nformat binary_little_endian 1.0\nelement vertex {len(vertices)}\n{properties}end_header\n"
+    told = "".join(f"comment {line}\n" for line in comments)
+    header = f"ply\nformat binary_little_endian 1.0\n{told}element vertex {len(vertices)}\n{properties}end_header\n"
     with atomic_path(path) as draft, draft.open("wb") as file:
         file.write(header.encode("ascii"))
         file.write(vertices.tobytes())

@@ -16,7 +16,7 @@ from jaxtyping import Float
 
 from swimm3r.errors import InputError
 from swimm3r.io.files.damage import Remedy, damaged, guard
-from swimm3r.products.geotiff import geo_package
+from swimm3r.products.packages import geo_package
 from swimm3r.scene.georeference import Georeference
 
 Ring = Float[np.ndarray, "n 2"]

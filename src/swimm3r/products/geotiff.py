@@ -3,16 +3,15 @@
 from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from types import ModuleType
 from typing import Any
 
 import numpy as np
 from jaxtyping import Float
 
-from swimm3r.errors import DeviceError
 from swimm3r.io.files.atomic import DRAFT, atomic_path
 from swimm3r.io.files.damage import Remedy, damaged
 from swimm3r.products.grid import Grid, Window
+from swimm3r.products.packages import geo_package
 from swimm3r.scene.georeference import Georeference
 
 _BLOCK = 512  # cells along the side of a block of the file
@@ -129,20 +128,6 @@ def crs_of(place: Georeference) -> Any:
     if place.epsg is not None:
         return CRS.from_epsg(place.epsg)
     return CRS.from_wkt(_LOCAL) if place.scale is not None else None
-
-
-def geo_package(name: str) -> ModuleType:
-    """A package of the extra `geo`. Raises DeviceError that says what to install."""
-    from importlib import import_module
-
-    try:
-        return import_module(name)
-    except ImportError as error:
-        raise DeviceError(
-            f"map products need {name}, which is not installed",
-            cause="the packages that write maps come with the extra geo",
-            hint="pip install 'swimm3r[geo]'",
-        ) from error
 
 
 def as_rgba(colors: Float[np.ndarray, "h w 3"], shown: np.ndarray, levels: int = 255) -> np.ndarray:

@@ -17,9 +17,10 @@ from jaxtyping import Bool, Float
 
 from swimm3r.io.files.atomic import atomic_path
 from swimm3r.products.areas import Area, Line, along
-from swimm3r.products.geotiff import Band, MapFile, StoredMap, geo_package
+from swimm3r.products.geotiff import Band, MapFile, StoredMap
 from swimm3r.products.grid import Grid, Window
 from swimm3r.products.habitat import LENGTHS, NAMES, Figures, figures
+from swimm3r.products.packages import geo_package
 from swimm3r.products.record import HabitatRecord
 from swimm3r.products.settings import ProductSettings
 from swimm3r.scene.georeference import Georeference

@@ -12,12 +12,14 @@ from swimm3r.io.files.outputs import output_folder
 from swimm3r.products.areas import Area, Line, read_areas
 from swimm3r.products.elevation import elevation, frames_over, hill_shade
 from swimm3r.products.frame_colors import Points, blended
-from swimm3r.products.geotiff import RGBA, Band, MapFile, as_rgba, geo_package
+from swimm3r.products.geotiff import RGBA, Band, MapFile, as_rgba
 from swimm3r.products.grid import Grid, Window, grid_of
 from swimm3r.products.habitat_tables import Lattice, lattice, write_areas, write_profiles, write_squares
+from swimm3r.products.packages import require_packages
 from swimm3r.products.preview import write_previews
 from swimm3r.products.record import FOLDER, HabitatRecord, ProductsRecord
 from swimm3r.products.settings import ProductSettings
+from swimm3r.products.solids.write import write_solids
 from swimm3r.products.survey import Colors, Survey, open_survey
 from swimm3r.progress import Progress, watched
 
@@ -33,7 +35,7 @@ def write_products(
     run: Path, out: Path | None, settings: ProductSettings, progress: Progress | None = None
 ) -> ProductsRecord:
     """Write the products of a run into `out`, by default RUN/products; see `swimm3r.products.write_products`."""
-    geo_package("rasterio")
+    require_packages()
     survey = open_survey(run)
     shapes = None if settings.areas is None else read_areas(settings.areas, survey.place)  # before the work
     grid = grid_of(survey, settings.gsd)
@@ -41,6 +43,7 @@ def write_products(
         totals = _write_maps(survey, grid, folder, settings, told)
         heights = lattice(folder, grid, survey.place, settings)
         notes, habitat = _write_habitat(heights, settings, shapes, totals.files)
+        notes += write_solids(survey, grid.gsd, folder, settings, totals.files, told)
         record = _record(survey, grid, totals, notes, habitat)
         write_previews(folder, record.unit)
         record.save(folder)

@@ -16,6 +16,7 @@ from swimm3r.io.video import Video
 from swimm3r.prepare import load_frames
 from swimm3r.report import frames as shown_frames
 from swimm3r.report import head, outputs, scores, verdict, water
+from swimm3r.report.maps import map_section
 from swimm3r.report.plan_view import path_overlay, plan_view
 from swimm3r.report.scene import pack_scene, shown_points
 from swimm3r.report.style import style_sheet
@@ -92,6 +93,7 @@ def _of_dive(frames: Frames, rec: Reconstruction | None, folder: Path) -> dict[s
         "bar": None,
         "scene": None,
         "plan": None,
+        "maps": map_section(folder),
         "water": None,
         "missing": [],
         "flight": _flight(folder / "renders" / "flythrough.mp4"),

@@ -56,6 +56,14 @@ class ViewOptions:
     """Port of --view; the next free one where it is taken."""
 
 
+@dataclass(frozen=True)
+class ProductOptions:
+    """Products of a finished run."""
+
+    products: bool = False
+    """Make maps, habitat figures, mesh and cloud at the end, as swimm3r products does by default."""
+
+
 Engine = Annotated[EngineSettings, FLAT]
 HERE = EngineSettings()
 

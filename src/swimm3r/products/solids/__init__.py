@@ -1,0 +1,1 @@
+"""Cloud and mesh of a run in the local frame, in the formats of other programs."""
