@@ -132,7 +132,8 @@ def write_survey(folder: Path) -> None:
     (folder / "settings.yaml").write_text("frames:\n  fps: 5.0\n")
     (folder / "versions.json").write_text('{"swimm3r": "0.2.0"}')
     (folder / "log.jsonl").write_text('{"time": "2026-11-22T17:12:43+0000", "event": "opened"}\n')
-    done = {name: {"status": "done", "key": name} for name in ("prepare", "sfm")}
+    cost = {"status": "done", "seconds": 1.0, "cpu_seconds": 1.0, "peak_mb": 100}
+    done = {name: {**cost, "key": name} for name in ("prepare", "sfm")}
     (folder / "summary.json").write_text(
         json.dumps({"schema": 2, "input": {"path": "dive.mp4", "fingerprint": "none"}, "stages": done})
     )

@@ -1,6 +1,7 @@
 """Cloud and mesh of an analytic seabed, read back by the readers of others."""
 
 from pathlib import Path
+from typing import Any
 
 import laspy
 import numpy as np
@@ -49,7 +50,7 @@ def test_the_cloud_has_local_coordinates_and_normals_that_face_the_cameras(made:
 
 
 def test_the_laz_cloud_keeps_map_coordinates_in_double_precision(made: tuple[Path, ProductsRecord]):
-    cloud = laspy.read(made[0] / "cloud.laz")
+    cloud: Any = laspy.read(made[0] / "cloud.laz")
     x, y, z = (
         np.asarray(axis, np.float64) - origin for axis, origin in zip((cloud.x, cloud.y, cloud.z), ORIGIN, strict=True)
     )
@@ -60,7 +61,7 @@ def test_the_laz_cloud_keeps_map_coordinates_in_double_precision(made: tuple[Pat
 
 
 def test_the_mesh_lies_on_the_seabed_and_ends_where_it_was_not_seen(made: tuple[Path, ProductsRecord]):
-    mesh = trimesh.load(made[0] / "mesh.ply", process=False)
+    mesh: Any = trimesh.load(made[0] / "mesh.ply", process=False)
     x, y, z = np.asarray(mesh.vertices, np.float64).T
     error = np.abs(z - height(x, y))
     assert np.median(error) < 2e-3
@@ -72,7 +73,7 @@ def test_the_mesh_lies_on_the_seabed_and_ends_where_it_was_not_seen(made: tuple[
 
 @pytest.mark.parametrize("name", ["mesh.glb", "mesh.obj"])
 def test_the_texture_shows_the_colors_of_the_ground(made: tuple[Path, ProductsRecord], name: str):
-    mesh = trimesh.load(made[0] / name, force="mesh", process=False)
+    mesh: Any = trimesh.load(made[0] / name, force="mesh", process=False)
     vertices = np.asarray(mesh.vertices, np.float64)
     vertices = vertices @ FROM_GLTF.T if name == "mesh.glb" else vertices
     material = mesh.visual.material

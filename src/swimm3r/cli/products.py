@@ -31,7 +31,7 @@ def make_products(run: Path, out: Path | None = None, settings: ProductSettings 
 
     with drawn_progress() as progress:
         record = write_products(run, out, settings, progress)
-    if out is None:
-        write_report(run)
     print(record)
     print(f"Products: {out or run / 'products'}")
+    if out is None:
+        write_report(run)

@@ -159,7 +159,7 @@ class _Sums:
         return np.clip(found, 0, 1).astype(np.float32)
 
 
-def _scaled(image: Float32[np.ndarray, "h w 3"], size: float, pixel: float) -> Float32[np.ndarray, "h w 3"]:
+def _scaled(image: Float32[np.ndarray, "h w 3"], size: float, pixel: float) -> Float32[np.ndarray, "h2 w2 3"]:
     """The image with pixels about as large as the area that a point stands for, averaged, where its own are smaller."""
     scale = pixel / size if size > 0 else 1.0
     if scale >= 0.75:
