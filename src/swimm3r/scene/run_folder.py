@@ -23,6 +23,7 @@ MARKERS = {  # what each of them leaves last, or at least
     "splat": "splat/map.safetensors",
     "eval": "renders/test",
 }
+RESCALING = Path(".swimm3r-rescale") / "journal.json"  # there while lengths in the folder are of two units
 _PRODUCTS = {"prepare": "prepared frames", "sfm": "finished structure from motion", "splat": "a finished map"}
 _REMAKE = Remedy("the command that made the run, with --redo: it moves what is there to RUN/old and starts anew")
 
@@ -72,6 +73,8 @@ class _Summary:
     restored: dict[str, Any] | None = None
     truth: dict[str, Any] | None = None
     other_protocols: dict[str, dict[str, Any]] | None = None
+    scale: dict[str, Any] | None = None
+    water: dict[str, Any] | None = None
     warnings: tuple[dict[str, str], ...] = ()
 
 
@@ -83,6 +86,12 @@ def is_run(folder: Path) -> bool:
 def read_run(folder: Path) -> RunFolder:
     """The record of a run, finished or not. Raises InputError where there is none or it is damaged."""
     path = folder / "summary.json"
+    if (folder / RESCALING).is_file():
+        raise InputError(
+            f"{folder} holds lengths of two units: its rescaling was interrupted",
+            cause="swimm3r scale was killed, or the computer stopped",
+            hint=f"swimm3r scale {folder}, which finishes it",
+        )
     if not path.is_file():
         missing = not folder.exists()
         raise InputError(

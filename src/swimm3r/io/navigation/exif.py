@@ -1,0 +1,46 @@
+"""Positions that images carry in their EXIF block -> navigation of named images."""
+
+from collections.abc import Sequence
+from pathlib import Path
+
+import numpy as np
+
+from swimm3r.io.navigation.record import Navigation
+
+_GPS = 0x8825  # the GPS part of EXIF
+_LATITUDE_REF, _LATITUDE, _LONGITUDE_REF, _LONGITUDE, _ALTITUDE_REF, _ALTITUDE = range(1, 7)
+
+
+def read_exif(folder: Path, images: Sequence[Path]) -> Navigation:
+    """The positions of the images that have one. Raises ValueError where fewer than 2 do."""
+    found = [(path, place) for path in images if (place := _place(path)) is not None]
+    if len(found) < 2:
+        raise ValueError(f"{len(found)} of its {len(images)} images have a GPS position")
+    position = np.array([place for _, place in found])
+    unknown = np.isnan(position[:, 2])
+    position[unknown, 2] = 0.0
+    std = np.full(position.shape, np.nan)
+    std[unknown, 2] = np.inf
+    names = tuple(path.name for path, _ in found)
+    time = np.arange(len(found), dtype=np.float64)
+    return Navigation(folder, "geodetic", position, "names", time, names, std=std if unknown.any() else None)
+
+
+def _place(path: Path) -> tuple[float, float, float] | None:
+    from PIL import Image
+
+    with Image.open(path) as image:
+        gps = image.getexif().get_ifd(_GPS)
+    if _LATITUDE not in gps or _LONGITUDE not in gps:
+        return None
+    latitude, longitude = (_decimal(gps[key]) for key in (_LATITUDE, _LONGITUDE))
+    latitude *= -1 if gps.get(_LATITUDE_REF) == "S" else 1
+    longitude *= -1 if gps.get(_LONGITUDE_REF) == "W" else 1
+    below = gps.get(_ALTITUDE_REF) in (1, b"\x01")
+    height = float(gps[_ALTITUDE]) * (-1 if below else 1) if _ALTITUDE in gps else float("nan")
+    return latitude, longitude, height
+
+
+def _decimal(parts: Sequence[float]) -> float:
+    degrees, minutes, seconds = (float(part) for part in parts)
+    return degrees + minutes / 60 + seconds / 3600

@@ -1,0 +1,95 @@
+"""The offset between two clocks: that under which the path of the cameras fits the navigation best.
+
+The fit of a straight path at constant speed is the same under every offset; the standard deviation, from the curvature
+of the sum of squares at its least, tells.
+"""
+
+from collections.abc import Callable
+from dataclasses import dataclass
+
+import numpy as np
+from jaxtyping import Float
+
+from swimm3r.io.navigation.record import Navigation
+from swimm3r.scale.alignment import umeyama
+from swimm3r.scale.matching import FEWEST, FrameTimes, match_times
+
+_STEPS = 4000  # of a coarse search, at most
+_FINEST = 1e-3  # seconds
+_ENOUGH = 0.6  # of the frames that overlap at best: offsets with fewer are not compared
+
+
+@dataclass(frozen=True)
+class Offset:
+    """Seconds that are added to the frames' times; `std` is infinite where the path does not show it."""
+
+    seconds: float
+    std: float
+
+
+def find_offset(
+    navigation: Navigation,
+    times: FrameTimes,
+    centers: Float[np.ndarray, "c 3"],
+    limits: tuple[float, float],
+    max_gap: float,
+) -> Offset | None:
+    """The offset within limits; None where none leaves 3 frames with a position."""
+    low, high = limits
+    spacing = float(np.median(np.diff(np.unique(times.seconds)))) if len(centers) > 1 else 1.0
+    step = max((high - low) / _STEPS, min(spacing / 4, max((high - low) / 8, _FINEST)))
+    grid = np.arange(low, high + step / 2, step)
+    misfits = [_misfit(navigation, times, centers, offset, max_gap) for offset in grid.tolist()]
+    most = max((count for count, _ in misfits), default=0)
+    if most < FEWEST:
+        return None
+    least = max(FEWEST, int(_ENOUGH * most))
+    cost = np.array([misfit if count >= least else np.inf for count, misfit in misfits])
+    at = int(cost.argmin())
+
+    def fit(offset: float) -> float:
+        return _misfit(navigation, times, centers, offset, max_gap)[1]
+
+    best = _least(fit, max(low, grid[at] - step), min(high, grid[at] + step))
+    count, variance = _misfit(navigation, times, centers, best, max_gap)
+    # the sum of squares is count * misfit / variance; half of its second derivative is 1 / std^2
+    reach = max(2 * step, 4 * _FINEST)
+    sides = [fit(best - reach), fit(best + reach)]
+    curvature = (sum(sides) - 2 * variance) / reach**2
+    freedom = max(1, 3 * count - 8)
+    std = np.sqrt(2 * variance / (curvature * freedom)) if curvature > 0 and np.isfinite(curvature) else np.inf
+    return Offset(best, float(std))
+
+
+def _misfit(
+    navigation: Navigation, times: FrameTimes, centers: Float[np.ndarray, "c 3"], offset: float, max_gap: float
+) -> tuple[int, float]:
+    """Number of frames with a position, and the mean squared distance under the best similarity, robustly."""
+    matched = match_times(navigation, times, offset, max_gap)
+    if len(matched.frame) < FEWEST:
+        return len(matched.frame), np.inf
+    source, target = centers[matched.frame], matched.navigation.position
+    weight = np.ones(len(source))
+    squared = np.zeros(len(source))
+    for _ in range(3):
+        scale, R, t = umeyama(source, target, weight)
+        squared = ((scale * source @ R.T + t - target) ** 2).sum(1)
+        weight = 1 / (1 + squared / (4 * np.median(squared) + 1e-12))
+    return len(source), float(weight @ squared / weight.sum())
+
+
+def _least(fit: Callable[[float], float], low: float, high: float) -> float:
+    """Golden-section search."""
+    ratio = (np.sqrt(5) - 1) / 2
+    inner = [high - ratio * (high - low), low + ratio * (high - low)]
+    values = [fit(inner[0]), fit(inner[1])]
+    while high - low > _FINEST:
+        if values[0] < values[1]:
+            high, inner[1], values[1] = inner[1], inner[0], values[0]
+            inner[0] = high - ratio * (high - low)
+            values[0] = fit(inner[0])
+        else:
+            low, inner[0], values[0] = inner[0], inner[1], values[1]
+            inner[1] = low + ratio * (high - low)
+            values[1] = fit(inner[1])
+    return float((low + high) / 2)
