@@ -19,7 +19,7 @@ ROWS = {  # by package: a room or module imports only rooms of rows before its o
         {"imaging", "prepare", "datasets", "synthetic"},
         {"sfm", "splat"},
         {"products"},
-        {"localization", "export", "report", "selftest"},
+        {"localization", "export", "report", "scale", "selftest"},
         {"pipeline"},
         {"batch", "bench", "viewer"},
         {"cli"},
@@ -29,6 +29,7 @@ ROWS = {  # by package: a room or module imports only rooms of rows before its o
         {"cameras_json", "depth", "medium_json", "colmap", "image_header", "ply", "trajectory", "video"},
         {"images"},
         {"image_folder", "imports"},
+        {"navigation"},
     ],
     "swimm3r.sfm": [
         {"mast3r", "tracks", "imported"},

@@ -68,6 +68,14 @@ BRIEF: dict[tuple[str, ...], Groups] = {
         "speed": ("--map-device",),
         "": _MESSAGES,
     },
+    ("scale",): {
+        "lengths": ("--scale-bar", "--points", "--distances"),
+        "markers": ("--markers", "--marker-size", "--marker-file"),
+        "camera": ("--camera-height", "--laser-dots"),
+        "navigation": ("--nav", "--nav-offset", "--clip-start", "--lever-arm"),
+        "place": ("--crs", "--control"),
+        "": _MESSAGES,
+    },
     ("export",): {
         "output": ("--format", "--out"),
         "splats and clouds": ("--colors", "--time", "--point-limit"),

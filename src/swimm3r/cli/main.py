@@ -32,6 +32,7 @@ from swimm3r.cli.pipeline.stages import starting_point
 from swimm3r.cli.products import products
 from swimm3r.cli.render import render
 from swimm3r.cli.report import report
+from swimm3r.cli.survey.scale import scale
 from swimm3r.cli.terminal.arguments import named
 from swimm3r.cli.terminal.help_views import View, brief_help, group_help
 from swimm3r.cli.terminal.output_level import FLAGS, begin_messages, with_output_level
@@ -137,6 +138,7 @@ def commands_for(arguments: Sequence[str]) -> dict[str, Callable | Family]:
         "eval": evaluate,
         "export": export_command(named("--format", arguments, FORMATS) or "ply"),
         "render": render,
+        "scale": scale,
         "products": products,
         "localize": localize,
         "report": report,

@@ -5,6 +5,7 @@ from pathlib import Path
 from swimm3r.pipeline.presets import RunSettings
 from swimm3r.prepare import check_source
 from swimm3r.prepare.masks import check_masks
+from swimm3r.scale.sources import check_sources
 from swimm3r.scene.ground_truth import FOLDER, GroundTruth, read_ground_truth
 from swimm3r.sfm import check_files
 
@@ -18,6 +19,7 @@ def check_inputs(source: Path, settings: RunSettings, reference: Path | None = N
     check_masks(settings.frames)
     truth_of(source, reference)
     check_files(settings.sfm)
+    check_sources(settings.scale)
 
 
 def truth_of(source: Path, reference: Path | None) -> GroundTruth | None:

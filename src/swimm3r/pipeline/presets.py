@@ -6,6 +6,7 @@ from typing import Any, Literal
 
 from swimm3r.errors import InputError, Swimm3rError, UsageError
 from swimm3r.io.files.damage import Remedy, first_line, guard
+from swimm3r.scale.settings import ScaleSettings
 from swimm3r.scene.settings import FrameSettings
 from swimm3r.settings import SettingError, Settings
 from swimm3r.settings_document import from_document, to_document
@@ -69,6 +70,8 @@ class RunSettings(Settings):
     """Training of the map; the class is the renderer."""
     test: PoseRefinementSettings = field(default_factory=PoseRefinementSettings)
     """Refinement of the test frames' poses before they are scored."""
+    scale: ScaleSettings = field(default_factory=ScaleSettings)
+    """Sources of the unit and the place of the run, applied to whatever is finished."""
 
 
 def to_yaml(settings: RunSettings) -> str:

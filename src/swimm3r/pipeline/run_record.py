@@ -24,6 +24,7 @@ from swimm3r.pipeline.estimate import Estimate, check_disk, duration, size
 from swimm3r.pipeline.presets import RunSettings, from_yaml
 from swimm3r.pipeline.run_settings import differences, settings_by_stage, with_stages_of
 from swimm3r.pipeline.stage_start import StageStart, ignore_stages
+from swimm3r.scale.rescale import finish_rescale
 from swimm3r.scene.run_folder import MARKERS, SCHEMA, STAGES, RunFolder, StageRecord, check_vacant, is_run, read_run
 
 log = logging.getLogger(__name__)
@@ -34,7 +35,7 @@ _OTHERS = "other_protocols"  # scores by other protocols than the run's own, by 
 _FILES = ("settings.yaml", "versions.json", "log.jsonl", "summary.json", "report.html")
 _CONTENTS = {  # what a stage leaves, and what later commands make of it
     "prepare": ("prepare",),
-    "sfm": ("sfm",),
+    "sfm": ("sfm", "georeference.json", "scale.json"),
     "splat": ("splat", "renders", "localization"),
     "eval": ("renders/test", "renders/protocols", "renders/flythrough.mp4"),
 }
@@ -64,6 +65,7 @@ def open_record(folder: Path, source: Path, fingerprint: str, *, redo: bool = Fa
         for name in _FILES:
             check_file(folder / name)
         remove_drafts(folder)
+        finish_rescale(folder)
         is_new = not is_run(folder)
         try:
             yield RunRecord(folder, source, fingerprint, redo)

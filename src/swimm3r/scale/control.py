@@ -18,8 +18,8 @@ from swimm3r.errors import InputError
 from swimm3r.io.files.damage import Remedy, guard
 from swimm3r.io.navigation.record import Navigation, check_coordinates
 from swimm3r.io.navigation.table import read_cells, read_positions
-from swimm3r.scale.alignment import Alignment, Path, align
-from swimm3r.scale.place import LocalNavigation, Place, localized
+from swimm3r.scale.navigation.alignment import Alignment, Path, align
+from swimm3r.scale.navigation.place import LocalNavigation, Place, localized
 from swimm3r.scale.settings import ScaleSettings
 from swimm3r.scale.triangulation import ScenePoint
 

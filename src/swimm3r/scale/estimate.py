@@ -10,11 +10,11 @@ import numpy as np
 from jaxtyping import Float
 
 from swimm3r.progress import Progress, silent
-from swimm3r.scale.alignment import Alignment
 from swimm3r.scale.control import ControlFit, fit_control
-from swimm3r.scale.geodesy import geodetic_from_local
-from swimm3r.scale.navigation import NavigationFit, fit_navigation
-from swimm3r.scale.place import Place
+from swimm3r.scale.navigation.alignment import Alignment
+from swimm3r.scale.navigation.fit import NavigationFit, fit_navigation
+from swimm3r.scale.navigation.geodesy import geodetic_from_local
+from swimm3r.scale.navigation.place import Place
 from swimm3r.scale.settings import ScaleSettings
 from swimm3r.scale.solve import ScaleEstimate, ScaleSolution, solve_scale
 from swimm3r.scale.sources import scale_sources

@@ -38,7 +38,7 @@ _JOURNAL = RESCALING.name
 _POSES = ("sfm/cameras.json", "sfm/cameras_between.json", "splat/cameras.json", "localization/poses.json")
 _TRAJECTORIES = ("sfm/trajectory.tum", "splat/trajectory.tum", "localization/poses.tum")
 _CLOUDS = ("points", "backdrop")
-_EXPORTS = ("gaussians*", "*.splat", "*.spz", "*.glb", "transforms.json")
+_EXPORTS = ("products/products.json", "gaussians*", "*.splat", "*.spz", "*.glb", "transforms.json")
 
 Change = tuple[str, Callable[[Path, Path], None]]  # a file of the run, and the function from the old one to the new
 

@@ -45,7 +45,8 @@ class ScaleRecord:
 def scale_run(folder: Path, settings: ScaleSettings, progress: Progress = silent) -> dict[str, Any]:
     """Give a finished run metres and a place, and return the section "scale" of its summary.
 
-    Raises InputError and UsageError that name the source and its fault; the run is then as before.
+    The report is left as it was. Raises InputError and UsageError that name the source and its fault; the run then is
+    as before.
     """
     if not (folder / "summary.json").is_file() and not (folder / ".swimm3r-rescale").is_dir():
         open_run(folder, "sfm")
@@ -55,20 +56,17 @@ def scale_run(folder: Path, settings: ScaleSettings, progress: Progress = silent
         if not settings.has_sources:
             record = read_record(folder)
             if finished and record is not None:
-                _write_report(folder)
                 return record.section
             raise UsageError(
                 "no source of scale is given",
                 cause="swimm3r scale RUN alone finishes a rescaling that was interrupted, and there is none",
                 hint="--scale-bar, --markers, --nav or another source; swimm3r scale --help lists them",
             )
-        section = scale_folder(folder, run, settings, progress)
-        _write_report(folder)
-        return section
+        return scale_folder(folder, run, settings, progress)
 
 
 def scale_folder(folder: Path, run: RunFolder, settings: ScaleSettings, progress: Progress = silent) -> dict[str, Any]:
-    """The same for a caller that holds the folder's lock; the report is not written."""
+    """The same for a caller that holds the folder's lock."""
     splat = run.stages.get("splat")
     if splat is not None and splat.status == "running":
         raise UsageError(
@@ -207,13 +205,6 @@ def _summary(sections: dict[str, Any], rec: Reconstruction, factor: float, secti
 def _in_metres(medium: dict[str, Any], factor: float) -> dict[str, Any]:
     betas = {name: [value / factor for value in medium[name]] for name in ("beta_D", "beta_B") if name in medium}
     return {**medium, **betas, "unit": "1/m"}
-
-
-def _write_report(folder: Path) -> None:
-    from swimm3r.report import write_report
-
-    if (folder / "report.html").is_file():
-        write_report(folder)
 
 
 def _json(document: Any) -> str:

@@ -1,7 +1,7 @@
 """Settings of scale and place; torch-free, so that --help is instant."""
 
 import re
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Annotated, Literal
 
@@ -134,6 +134,12 @@ class ScaleSettings(Settings):
         """Return whether anything is given that tells scale or place."""
         given = (self.nav, self.points, self.markers, self.marker_file, self.camera_height, self.laser_dots)
         return bool(self.scale_bar) or any(value is not None for value in given)
+
+
+def resolved(settings: ScaleSettings) -> ScaleSettings:
+    """The settings with absolute paths, as a run folder keeps them."""
+    paths = {name: value.resolve() for name, value in vars(settings).items() if isinstance(value, Path)}
+    return replace(settings, **paths)
 
 
 def epsg_of(crs: str) -> int | None:

@@ -14,6 +14,7 @@ from jaxtyping import Float
 
 from swimm3r.cameras import unproject
 from swimm3r.errors import InputError
+from swimm3r.io.navigation.read import read_navigation
 from swimm3r.progress import Progress, silent
 from swimm3r.scale.marked_points import (
     FrameNames,
@@ -23,7 +24,8 @@ from swimm3r.scale.marked_points import (
     read_scale_bars,
 )
 from swimm3r.scale.markers import find_markers, marker_estimates, marker_sizes
-from swimm3r.scale.navigation import NavigationFit
+from swimm3r.scale.navigation.fit import NavigationFit
+from swimm3r.scale.navigation.place import localized
 from swimm3r.scale.settings import ScaleSettings
 from swimm3r.scale.solve import ScaleEstimate
 from swimm3r.scale.triangulation import ScenePoint, Sighting, scale_of_distance, triangulate_all
@@ -92,6 +94,18 @@ def scale_sources(
             estimates.append(_altimeter(rec, settings, navigation))
         notes += navigation.notes
     return Sources(tuple(estimates), tuple(notes), points)
+
+
+def check_sources(settings: ScaleSettings) -> None:
+    """Read the files that settings name, before any work is done. Raises the error of the first that cannot be used."""
+    if settings.nav is not None:
+        localized(read_navigation(settings.nav), settings)
+    marker_sizes(settings)
+    if settings.distances is not None:
+        read_distances(settings.distances)
+    for path in (settings.points, settings.laser_dots, settings.control):
+        if path is not None and not path.is_file():
+            raise InputError(f"there is no file {path}", cause="a slip in the name", hint="the path of the CSV")
 
 
 def reprojection_noise(rec: Reconstruction) -> float:

@@ -17,6 +17,7 @@ from swimm3r.cli.products import make_products
 from swimm3r.cli.terminal.options import FLAT, Source
 from swimm3r.pipeline.presets import RunSettings
 from swimm3r.products.packages import require_packages
+from swimm3r.scale.settings import ScaleSettings, resolved
 from swimm3r.scene.run_folder import input_and_folder
 from swimm3r.scene.settings import FrameSettings
 from swimm3r.splat.settings import PoseRefinementSettings
@@ -38,6 +39,7 @@ def run_command(defaults: RunSettings) -> Callable:
         sfm: Annotated[type(defaults.sfm), FLAT] = defaults.sfm,
         splat: type(defaults.splat) = defaults.splat,
         test: PoseRefinementSettings = defaults.test,
+        scale: Annotated[ScaleSettings, FLAT] = defaults.scale,
     ) -> None:
         """Everything, from a clip to the report page. Re-run the same command to resume, or swimm3r run RUN.
 
@@ -47,7 +49,7 @@ def run_command(defaults: RunSettings) -> Callable:
         require_adapter(poses.backend, sfm)
         if products.products:
             require_packages()
-        settings = RunSettings(frames, sfm, splat, test)
+        settings = RunSettings(frames, sfm, splat, test, resolved(scale))
         run_stages(source, folder, settings, "eval", poses.reference, map.map_device, page, engine)
         if products.products:
             make_products(input_and_folder(source, folder.out)[1])

@@ -8,6 +8,7 @@ from swimm3r.cli.pipeline.options import HERE, Engine, FolderOptions, PoseOption
 from swimm3r.cli.pipeline.stages import require_adapter, run_stages
 from swimm3r.cli.terminal.options import FLAT, Source
 from swimm3r.pipeline.presets import RunSettings
+from swimm3r.scale.settings import ScaleSettings, resolved
 from swimm3r.scene.settings import FrameSettings
 
 
@@ -22,6 +23,7 @@ def sfm_command(defaults: RunSettings) -> Callable:
         engine: Engine = HERE,
         frames: Annotated[FrameSettings, FLAT] = defaults.frames,
         sfm: Annotated[type(defaults.sfm), FLAT] = defaults.sfm,
+        scale: Annotated[ScaleSettings, FLAT] = defaults.scale,
     ) -> None:
         """Poses, dense depth, water, restored images and the restored cloud, without map and scores.
 
@@ -29,6 +31,7 @@ def sfm_command(defaults: RunSettings) -> Callable:
             source: Video, or folder of images; or a run folder, to resume with its own input and settings.
         """
         require_adapter(poses.backend, sfm)
-        run_stages(source, folder, replace(defaults, frames=frames, sfm=sfm), "sfm", poses.reference, engine=engine)
+        settings = replace(defaults, frames=frames, sfm=sfm, scale=resolved(scale))
+        run_stages(source, folder, settings, "sfm", poses.reference, engine=engine)
 
     return sfm

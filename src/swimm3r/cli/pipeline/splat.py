@@ -54,7 +54,7 @@ def splat_command(defaults: RunSettings) -> Callable:
         """
         given, poses = _input(source, model)
         found = sfm if poses is None else with_poses_of(poses, sfm)
-        settings = RunSettings(frames, found, splat, test)
+        settings = RunSettings(frames, found, splat, test, defaults.scale)
         run_stages(given, folder, settings, "eval", model.reference, map.map_device, page, engine)
 
     return splat

@@ -186,6 +186,13 @@ def print_summary(summary: dict) -> None:
             + (f"{sfm['between_placed']} of {sfm['between']} between keyframes, " if sfm.get("between") else "")
             + ("" if sfm["reprojection_px"] is None else f"reprojection error {sfm['reprojection_px']:.2f} px")
         )
+    scale = summary.get("scale")
+    if scale:
+        by = ", ".join(each["source"] for each in scale["sources"] if not each["outlier"])
+        place = scale["georeference"]["crs"]
+        console.print(f"Lengths in metres, ± {100 * scale['std']:.2g}% by {by}; coordinates: {place}")
+        for note in scale["notes"]:
+            console.print("!", note, style="yellow")
     water = summary.get("medium", {}).get("sfm")
     if water:
         table = Table("water", "R", "G", "B", title=f"betas {water['unit']}, {water['encoding']} values")

@@ -2,6 +2,7 @@
 
 from collections.abc import Sequence
 from pathlib import Path
+from typing import SupportsFloat
 
 import numpy as np
 
@@ -41,6 +42,6 @@ def _place(path: Path) -> tuple[float, float, float] | None:
     return latitude, longitude, height
 
 
-def _decimal(parts: Sequence[float]) -> float:
+def _decimal(parts: Sequence[SupportsFloat]) -> float:
     degrees, minutes, seconds = (float(part) for part in parts)
     return degrees + minutes / 60 + seconds / 3600

@@ -11,12 +11,13 @@ import numpy as np
 from jaxtyping import Float
 
 from swimm3r.io.navigation.record import Navigation
-from swimm3r.scale.alignment import umeyama
-from swimm3r.scale.matching import FEWEST, FrameTimes, match_times
+from swimm3r.scale.navigation.alignment import umeyama
+from swimm3r.scale.navigation.matching import FEWEST, FrameTimes
 
 _STEPS = 4000  # of a coarse search, at most
 _FINEST = 1e-3  # seconds
-_ENOUGH = 0.6  # of the frames that overlap at best: offsets with fewer are not compared
+_LEAST_STD = 2e-3  # metres, of any position
+_ENOUGH = 0.6  # of the positions that overlap at best: offsets with fewer are not compared
 
 
 @dataclass(frozen=True)
@@ -34,12 +35,13 @@ def find_offset(
     limits: tuple[float, float],
     max_gap: float,
 ) -> Offset | None:
-    """The offset within limits; None where none leaves 3 frames with a position."""
+    """The offset within limits; None where none leaves 3 positions on the path."""
     low, high = limits
     spacing = float(np.median(np.diff(np.unique(times.seconds)))) if len(centers) > 1 else 1.0
     step = max((high - low) / _STEPS, min(spacing / 4, max((high - low) / 8, _FINEST)))
     grid = np.arange(low, high + step / 2, step)
-    misfits = [_misfit(navigation, times, centers, offset, max_gap) for offset in grid.tolist()]
+    path = _camera_path(times, centers, max_gap)
+    misfits = [_misfit(navigation, path, offset) for offset in grid.tolist()]
     most = max((count for count, _ in misfits), default=0)
     if most < FEWEST:
         return None
@@ -48,27 +50,53 @@ def find_offset(
     at = int(cost.argmin())
 
     def fit(offset: float) -> float:
-        return _misfit(navigation, times, centers, offset, max_gap)[1]
+        return _misfit(navigation, path, offset)[1]
 
     best = _least(fit, max(low, grid[at] - step), min(high, grid[at] + step))
-    count, variance = _misfit(navigation, times, centers, best, max_gap)
+    count, variance = _misfit(navigation, path, best)
     # the sum of squares is count * misfit / variance; half of its second derivative is 1 / std^2
     reach = max(2 * step, 4 * _FINEST)
     sides = [fit(best - reach), fit(best + reach)]
     curvature = (sum(sides) - 2 * variance) / reach**2
     freedom = max(1, 3 * count - 8)
-    std = np.sqrt(2 * variance / (curvature * freedom)) if curvature > 0 and np.isfinite(curvature) else np.inf
+    std = (
+        np.sqrt(2 * (variance + _LEAST_STD**2) / (curvature * freedom))
+        if curvature > 0 and np.isfinite(curvature)
+        else np.inf
+    )
     return Offset(best, float(std))
 
 
-def _misfit(
-    navigation: Navigation, times: FrameTimes, centers: Float[np.ndarray, "c 3"], offset: float, max_gap: float
-) -> tuple[int, float]:
-    """Number of frames with a position, and the mean squared distance under the best similarity, robustly."""
-    matched = match_times(navigation, times, offset, max_gap)
-    if len(matched.frame) < FEWEST:
-        return len(matched.frame), np.inf
-    source, target = centers[matched.frame], matched.navigation.position
+@dataclass(frozen=True)
+class _CameraPath:
+    """The cameras' path between frames, as a smooth curve; navigation is noisy, and interpolated noise is less."""
+
+    curve: Callable[[np.ndarray], np.ndarray]
+    seconds: Float[np.ndarray, " c"]
+    max_gap: float
+
+    def at(self, moments: Float[np.ndarray, " n"]) -> tuple[Float[np.ndarray, " n"], Float[np.ndarray, "n 3"]]:
+        """Which moments lie between frames that follow closely, as 0 or 1, and the places at all."""
+        after = np.clip(np.searchsorted(self.seconds, moments), 1, len(self.seconds) - 1)
+        near = self.seconds[after] - self.seconds[after - 1] <= self.max_gap
+        inside = (moments >= self.seconds[0]) & (moments <= self.seconds[-1]) & near
+        return inside.astype(np.float64), self.curve(moments)
+
+
+def _camera_path(times: FrameTimes, centers: Float[np.ndarray, "c 3"], max_gap: float) -> _CameraPath:
+    from scipy.interpolate import CubicSpline
+
+    seconds, first = np.unique(times.seconds, return_index=True)
+    return _CameraPath(CubicSpline(seconds, centers[first]), seconds, max_gap)
+
+
+def _misfit(navigation: Navigation, path: _CameraPath, offset: float) -> tuple[int, float]:
+    """Number of positions on the path, and their mean squared distance under the best similarity, robustly."""
+    inside, source = path.at(navigation.time - offset)
+    rows = inside > 0
+    if rows.sum() < FEWEST:
+        return int(rows.sum()), np.inf
+    source, target = source[rows], navigation.position[rows]
     weight = np.ones(len(source))
     squared = np.zeros(len(source))
     for _ in range(3):

@@ -11,7 +11,7 @@ from jaxtyping import Float
 
 from swimm3r.errors import UsageError
 from swimm3r.io.navigation.record import Navigation
-from swimm3r.scale.geodesy import Origin, geodetic_from_projected, grid_at, local_from_geodetic, utm_zone
+from swimm3r.scale.navigation.geodesy import Origin, geodetic_from_projected, grid_at, local_from_geodetic, utm_zone
 from swimm3r.scale.settings import ScaleSettings, epsg_of
 
 

@@ -15,8 +15,8 @@ from jaxtyping import Float
 from swimm3r.errors import InputError
 from swimm3r.io.navigation.read import read_navigation
 from swimm3r.io.navigation.record import Navigation, vehicle_attitude
-from swimm3r.scale.alignment import Alignment, Path, align, without_attitude
-from swimm3r.scale.matching import (
+from swimm3r.scale.navigation.alignment import Alignment, Path, align, without_attitude
+from swimm3r.scale.navigation.matching import (
     FEWEST,
     FrameTimes,
     Matched,
@@ -27,9 +27,9 @@ from swimm3r.scale.matching import (
     offset_range,
     zones_that_overlap,
 )
-from swimm3r.scale.place import Place, localized
+from swimm3r.scale.navigation.place import Place, localized
+from swimm3r.scale.navigation.time_offset import Offset, find_offset
 from swimm3r.scale.settings import ScaleSettings
-from swimm3r.scale.time_offset import Offset, find_offset
 from swimm3r.scene.frames import Frames
 from swimm3r.scene.georeference import up_from_scene
 from swimm3r.scene.reconstruction import Reconstruction
@@ -145,7 +145,7 @@ def _misfit(path: Path, alignment: Alignment) -> float:
 
 
 def _is_upside_down(path: Path, alignment: Alignment) -> bool:
-    return float((alignment.R @ path.up)[2]) < np.cos(np.radians(_BELOW))
+    return bool((alignment.R @ path.up)[2] < np.cos(np.radians(_BELOW)))
 
 
 def _check_fit(
@@ -162,7 +162,7 @@ def _check_fit(
     file = raw.path
     misfit, upside_down = _misfit(path, alignment), _is_upside_down(path, alignment)
     if path.attitude is not None:
-        _check_attitude(path, alignment, settings, file)
+        _check_attitude(path, alignment, upside_down, settings, file)
     if misfit < _MISFIT and not upside_down:
         return
     for slip, hint, other in _slips(rec, path, local, times, matched, settings):
@@ -220,7 +220,9 @@ def _slips(
                 )
 
 
-def _check_attitude(path: Path, alignment: Alignment, settings: ScaleSettings, file: FilePath) -> None:
+def _check_attitude(
+    path: Path, alignment: Alignment, upside_down: bool, settings: ScaleSettings, file: FilePath
+) -> None:
     """Raise InputError where stated angles contradict the turns of the cameras."""
     assert path.attitude is not None
     shown = alignment.attitude_residual_deg
@@ -234,18 +236,25 @@ def _check_attitude(path: Path, alignment: Alignment, settings: ScaleSettings, f
             cause="radians in columns that should hold degrees",
             hint="state the unit: heading [rad], pitch [rad], roll [rad]",
         )
-    if shown < _TURNED:
+    if shown < _TURNED and not upside_down:
         return
-    for slip, attitude in _attitude_slips(path.attitude):
-        tried = align(replace(path, attitude=attitude), settings)
-        if (tried.attitude_residual_deg or 180.0) < 0.3 * shown:
-            raise InputError(
-                f"heading, pitch and roll in {file} contradict the cameras by {shown:.0f} degrees",
-                cause=slip,
-                hint="correct the columns: heading clockwise from north, pitch bow up, roll starboard down, degrees",
-            )
+    bare = without_attitude(path)
+    alone = align(bare, settings)
+    if _misfit(bare, alone) >= _MISFIT or _is_upside_down(bare, alone):
+        return  # the positions themselves are wrong
+    told = f"heading, pitch and roll in {file} contradict the cameras by {max(shown, _TURNED):.0f} degrees or more"
+    tried = [(slip, replace(path, attitude=attitude)) for slip, attitude in _attitude_slips(path.attitude)]
+    found = [(slip, align(other, settings)) for slip, other in tried]
+    fitting = [(slip, a) for (slip, a), (_, other) in zip(found, tried, strict=True) if not _is_upside_down(other, a)]
+    slip, best = min(fitting, key=lambda pair: pair[1].attitude_residual_deg or 180.0, default=("", alone))
+    if slip and (best.attitude_residual_deg or 180.0) < 0.3 * max(shown, _TURNED):
+        raise InputError(
+            told,
+            cause=slip,
+            hint="correct the columns: heading clockwise from north, pitch bow up, roll starboard down, degrees",
+        )
     raise InputError(
-        f"heading, pitch and roll in {file} contradict the cameras by {shown:.0f} degrees",
+        told,
         cause="the camera moved on the vehicle (pan and tilt), or the angles are of another convention",
         hint="leave the columns of heading, pitch and roll out",
     )
@@ -265,8 +274,7 @@ def _attitude_slips(attitude: Float[np.ndarray, "k 3 3"]) -> Iterator[tuple[str,
     heading, pitch, roll = angles_of(attitude)
     yield "pitch and roll are exchanged", vehicle_attitude(heading, roll, pitch)
     yield "the heading counts counter-clockwise, or from east", vehicle_attitude(-heading, pitch, roll)
-    yield "the sign of the roll", vehicle_attitude(heading, pitch, -roll)
-    yield "the sign of the pitch", vehicle_attitude(heading, -pitch, roll)
+    yield "the sign of the pitch, or that of the roll", vehicle_attitude(heading, -pitch, roll)
     yield "the signs of pitch and roll", vehicle_attitude(heading, -pitch, -roll)
 
 

@@ -13,7 +13,7 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 from jaxtyping import Bool, Float
-from scipy.optimize import least_squares
+from scipy.optimize import OptimizeResult, least_squares
 from scipy.spatial.transform import Rotation
 
 from swimm3r.scale.settings import ScaleSettings
@@ -23,7 +23,10 @@ MOUNTS = {  # camera axes (right, down, ahead of the image) in those of the vehi
     "forward": np.array([[0.0, 0, 1], [1, 0, 0], [0, 1, 0]]),
 }
 _UP_STD = np.radians(20.0)
-_ROUNDS = 8
+_REFINED = 2  # of the beginnings, the best ones
+_ROUNDS = 12
+_SETTLED = 1e-7  # of the sizes of the unknowns, between rounds
+_EVALUATIONS = 25  # in a round; a good beginning takes 4
 _TUNING = 2.385  # of Cauchy's weights: 95% efficiency under Gaussian noise
 _LEAST_STD = 1e-4  # metres
 
@@ -72,6 +75,7 @@ class Alignment:
 def align(path: Path, settings: ScaleSettings) -> Alignment:
     """The best similarity, from several beginnings."""
     starts = _starts(path, settings)
+    starts = sorted(starts, key=lambda start: _first_cost(path, settings, start))[:_REFINED]
     found = [_refine(path, settings, start) for start in starts]
     return min(found, key=lambda each: each[0])[1]
 
@@ -93,7 +97,7 @@ def umeyama(
 def _starts(path: Path, settings: ScaleSettings) -> list[tuple[float, np.ndarray, np.ndarray]]:
     """Beginnings: the centers alone, and turned half about the path, and the attitude where the mounting is known."""
     target = _camera_positions(path, settings)
-    known = np.ones(3) if path.std is None else np.isfinite(path.std).any(0)
+    known = np.ones(3) if path.std is None else (~np.isinf(path.std)).any(0)
     target = target * known
     scale, R, t = umeyama(path.centers, target)
     along = np.linalg.svd(target - target.mean(0), full_matrices=False)[2][0]
@@ -121,6 +125,21 @@ def _camera_positions(path: Path, settings: ScaleSettings) -> Float[np.ndarray, 
     return path.position + np.nan_to_num(path.attitude) @ lever
 
 
+def _first_cost(path: Path, settings: ScaleSettings, start: tuple[float, np.ndarray, np.ndarray]) -> float:
+    """The misfit of a beginning as it is."""
+    scale, R, t = start
+    middle = path.centers.mean(0)
+    problem = _Problem(path, settings, middle, R, _mount_of(path, settings, R))
+    x = np.concatenate([[np.log(scale)], np.zeros(3), scale * R @ middle + t, np.zeros(3)])[: problem.count]
+    return _cost(problem, x, _first_std(path, problem.positions(x)))
+
+
+def _cost(problem: "_Problem", x: np.ndarray, std: np.ndarray) -> float:
+    """The misfit of a similarity whose positions have these standard deviations, comparable between beginnings."""
+    cost = float(np.log1p((problem.positions(x) / std) ** 2).sum() + np.log(std[np.isfinite(std)]).sum() * 2)
+    return cost + float((problem.orientation(x) ** 2).clip(max=100).sum())
+
+
 def _refine(
     path: Path, settings: ScaleSettings, start: tuple[float, np.ndarray, np.ndarray]
 ) -> tuple[float, Alignment]:
@@ -132,16 +151,15 @@ def _refine(
     std = _first_std(path, problem.positions(x))
     weight = np.ones(len(path.centers))
     for _ in range(_ROUNDS):
-        x = least_squares(problem.residuals, x, args=(std, weight), method="trf", x_scale=problem.sizes).x
+        before, x = x, problem.solved(x, std, weight).x
         residual = problem.positions(x)
         std = _first_std(path, residual)
         away = np.sqrt(((residual / std) ** 2).sum(1) / 3)
         weight = 1 / (1 + (away / _TUNING) ** 2)
-    fitted = least_squares(problem.residuals, x, args=(std, weight), method="trf", x_scale=problem.sizes)
-    residual = problem.positions(fitted.x)
-    cost = float(np.log1p((residual / std) ** 2).sum() + np.log(std[np.isfinite(std)]).sum() * 2)
-    cost += float((problem.orientation(fitted.x) ** 2).clip(max=100).sum())
-    return cost, _result(problem, fitted, std, weight)
+        if np.abs((x - before) / problem.sizes).max() < _SETTLED:
+            break
+    fitted = problem.solved(x, std, weight)
+    return _cost(problem, fitted.x, std), _result(problem, fitted, std, weight)
 
 
 def _first_std(path: Path, residual: Float[np.ndarray, "k 3"]) -> Float[np.ndarray, "k 3"]:
@@ -203,7 +221,7 @@ class _Problem:
         return Rotation.from_matrix(self.path.attitude[self.whole].transpose(0, 2, 1) @ shown).as_rotvec()
 
     def orientation(self, x: np.ndarray) -> np.ndarray:
-        """What holds the rotation beside the positions, in standard deviations."""
+        """Residuals that hold the rotation beside the positions, in standard deviations."""
         _, R, _ = self.similarity(x)
         up = R @ self.path.up
         tilt = np.arctan2(np.linalg.norm(up[:2]), up[2]) * up[:2] / max(float(np.linalg.norm(up[:2])), 1e-12)
@@ -214,19 +232,25 @@ class _Problem:
                 parts.append(x[7:10] / np.radians(self.settings.mount_std))
         return np.concatenate(parts)
 
+    def solved(self, x: np.ndarray, std: np.ndarray, weight: np.ndarray) -> OptimizeResult:
+        """The least squares under these weights."""
+        return least_squares(
+            self.residuals, x, args=(std, weight), method="trf", x_scale=self.sizes, max_nfev=_EVALUATIONS
+        )
+
     def residuals(self, x: np.ndarray, std: np.ndarray, weight: np.ndarray) -> np.ndarray:
         rows = self.positions(x) / std * np.sqrt(weight)[:, None]
         return np.concatenate([rows.ravel(), self.orientation(x)])
 
 
-def _result(problem: _Problem, fitted, std: np.ndarray, weight: np.ndarray) -> Alignment:
+def _result(problem: _Problem, fitted: OptimizeResult, std: np.ndarray, weight: np.ndarray) -> Alignment:
     scale, R, t = problem.similarity(fitted.x)
     residual = problem.positions(fitted.x)
     rows = np.sqrt(weight)[:, None] * residual / std
     used = int(np.isfinite(std).sum())
-    spread = max(1.0, float((rows**2).sum()) / max(1, used - 7))
+    spread = float((rows**2).sum()) / max(1, used - 7) * _correlation(residual / std)
     free = fitted.jac.T @ fitted.jac
-    covariance = np.linalg.pinv(free, rcond=1e-12) * spread * _correlation(residual / std)
+    covariance = np.linalg.pinv(free, rcond=1e-12) * max(1.0, spread)
     errors = np.sqrt(np.diag(covariance))
     attitudes = problem.attitudes(fitted.x)
     shown = float(np.degrees(np.sqrt((attitudes**2).sum(1).mean()))) if len(attitudes) else None

@@ -1,0 +1,1 @@
+"""Commands about the place of a run on the ground."""
