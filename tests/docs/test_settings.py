@@ -18,7 +18,7 @@ from swimm3r.splat.settings import RECIPES
 
 COMMANDS = (
     *("run", "prepare", "sfm", "splat", "render", "export", "eval", "localize", "report", "view", "demo", "doctor"),
-    *("products", "datasets", "train-sfm", "batch", "weights get", "bench render", "bench sfm", "bench flsea"),
+    *("products", "scale", "datasets", "train-sfm", "batch", "weights get", "bench render", "bench sfm", "bench flsea"),
     *("bench restoration", "bench localization", "bench scale", "bench ablation-uwbs", "bench ablation-sfm"),
     "run --backend mast3r",
     *(f"run --recipe {recipe}" for recipe in RECIPES),
@@ -64,8 +64,8 @@ def groups(kind: Any, found: dict[str, set[str]]) -> dict[str, set[str]]:
 @pytest.mark.parametrize("document", DOCUMENTS, ids=lambda path: str(path.relative_to(ROOT)))
 def test_every_setting_that_a_document_names_exists(document: Path):
     known = groups(TrainSettings, groups(RunSettings, {}))
-    for room_or_file in ("frames", "medium", "poses", "sfm", "splat"):  # names of other things, too
-        del known[room_or_file]
+    for other_thing in ("frames", "medium", "poses", "scale", "sfm", "splat", "test"):  # rooms, files, sections
+        del known[other_thing]
     assert {"weights", "densify", "sgg", "alignment", "restore", "objective"} < known.keys()
     named = re.findall(r"`(?:splat\.)?([a-z_]+)\.([a-z_]+)`", document.read_text(encoding="utf-8"))
     wrong = {f"{group}.{name}" for group, name in named if group in known and name not in known[group]}

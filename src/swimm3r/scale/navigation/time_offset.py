@@ -76,7 +76,7 @@ class _CameraPath:
     max_gap: float
 
     def at(self, moments: Float[np.ndarray, " n"]) -> tuple[Float[np.ndarray, " n"], Float[np.ndarray, "n 3"]]:
-        """Which moments lie between frames that follow closely, as 0 or 1, and the places at all."""
+        """Marks (1) of moments between frames that follow closely, and the places at all moments."""
         after = np.clip(np.searchsorted(self.seconds, moments), 1, len(self.seconds) - 1)
         near = self.seconds[after] - self.seconds[after - 1] <= self.max_gap
         inside = (moments >= self.seconds[0]) & (moments <= self.seconds[-1]) & near
