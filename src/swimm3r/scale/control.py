@@ -167,14 +167,31 @@ def _check(
             cause="points are exchanged, or heights stand in a column of depths",
             hint="compare names and coordinates with the marks in --points",
         )
-    worst = int(away.argmax())
-    if away[worst] > _OFF and len(names) > _FEWEST:
+    if away.max() > _OFF and len(names) > _FEWEST:
+        left = [_without(k, xyz, points, coordinates, std, up, settings) for k in range(len(names))]
+        worst = int(np.argmin([float(((a.residual / a.std) ** 2).sum()) for a in left]))
+        found = left[worst]
+        off = found.scale * found.R @ xyz[worst] + found.t - coordinates[worst]
         raise InputError(
-            f"control point {names[worst]} is {np.linalg.norm(found.residual[worst]):.3g} m from where the others put"
-            f" it, {away[worst]:.1f} standard deviations",
+            f"control point {names[worst]} is {np.linalg.norm(off):.3g} m from where the others put it; with it the"
+            f" points contradict each other by up to {away.max():.1f} standard deviations",
             cause="its coordinates or its marks are wrong",
             hint="correct it, or give it the role check",
         )
+
+
+def _without(
+    k: int,
+    xyz: np.ndarray,
+    points: list[ScenePoint],
+    coordinates: np.ndarray,
+    std: np.ndarray,
+    up: np.ndarray,
+    settings: ScaleSettings,
+) -> Alignment:
+    """The similarity by all points but one."""
+    kept = [i for i in range(len(xyz)) if i != k]
+    return _aligned(xyz[kept], [points[i] for i in kept], coordinates[kept], std[kept], up, settings)
 
 
 def _triple(values: np.ndarray) -> tuple[float, float, float]:

@@ -42,7 +42,7 @@ _DICTIONARIES: dict[MarkerFamily, str] = {
     "apriltag-36h10": "DICT_APRILTAG_36h10",
     "apriltag-36h11": "DICT_APRILTAG_36h11",
 }
-_CORNER_PX = 0.3  # standard deviation of a corner's place in a sharp frame
+_CORNER_PX = 0.2  # standard deviation of a corner's place in a sharp frame
 _OFF_PX = 3.0  # mean reprojection error of a corner from which a marker is not one thing at one place
 _REMEDY = Remedy("family, size, sizes, distances or board; see docs/guides/metric-scale.md", fault="cannot be used")
 
@@ -103,7 +103,7 @@ def marker_sizes(settings: ScaleSettings) -> MarkerSizes | None:
         return structure(document, MarkerSizes)
 
 
-def detect(image: UInt8[np.ndarray, "h w"], sizes: MarkerSizes) -> dict[int, Float[np.ndarray, "4 2"]]:
+def detect(image: UInt8[np.ndarray, "h w"], sizes: MarkerSizes) -> dict[int, Float[np.ndarray, "corners 2"]]:
     """Corners of the markers in a gray image by id, clockwise from the first one, pixels from the image's corner.
 
     Of a board, corners of its squares by id, one each.
@@ -112,23 +112,23 @@ def detect(image: UInt8[np.ndarray, "h w"], sizes: MarkerSizes) -> dict[int, Flo
 
     dictionary = aruco.getPredefinedDictionary(getattr(aruco, _DICTIONARIES[sizes.family]))
     parameters = aruco.DetectorParameters()
-    parameters.cornerRefinementMethod = aruco.CORNER_REFINE_SUBPIX
-    parameters.cornerRefinementWinSize = 4
+    # lines through the edges of the square: other ways draw blurred corners inwards by 0.2 to 1 pixel of a side
+    parameters.cornerRefinementMethod = aruco.CORNER_REFINE_APRILTAG
     if sizes.board is not None:
         b = sizes.board
         board = aruco.CharucoBoard((b.columns, b.rows), b.square, b.marker, dictionary)
         corners, ids, _, _ = aruco.CharucoDetector(board, aruco.CharucoParameters(), parameters).detectBoard(image)
         if ids is None:
             return {}
-        return {int(i): xy.reshape(1, 2) + 0.5 for i, xy in zip(ids.ravel(), corners, strict=True)}
+        return {int(i): xy.reshape(1, 2).astype(np.float64) + 0.5 for i, xy in zip(ids.ravel(), corners, strict=True)}
     corners, ids, _ = aruco.ArucoDetector(dictionary, parameters).detectMarkers(image)
     if ids is None:
         return {}
-    found: dict[int, Float[np.ndarray, "4 2"]] = {}
+    found: dict[int, Float[np.ndarray, "corners 2"]] = {}
     twice = {int(i) for i in ids.ravel() if (ids == i).sum() > 1}
     for i, xy in zip(ids.ravel().tolist(), corners, strict=True):
         if i not in twice:  # two markers of one id in a frame: neither is known to be the one
-            found[int(i)] = xy.reshape(4, 2).astype(np.float64) + 0.5
+            found[int(i)] = xy.reshape(4, 2).astype(np.float64)  # this refinement counts from the image's corner
     return found
 
 

@@ -100,7 +100,7 @@ def solve_scale(estimates: Sequence[ScaleEstimate], outlier: float = 4.0) -> Sca
 
 def _spread(logs: np.ndarray, stds: np.ndarray, middle: float) -> float:
     """The factor by which residuals exceed their standard deviations, robustly; at least 1."""
-    return max(1.0, 1.4826 * float(np.median(np.abs(logs - middle) / stds))) if len(logs) > 3 else 1.0
+    return max(1.0, 1.4826 * float(np.median(np.abs(logs - middle) / stds))) if len(logs) > 2 else 1.0
 
 
 def _check_pair(one: ScaleEstimate, other: ScaleEstimate) -> None:
