@@ -24,7 +24,7 @@ from swimm3r.geometry import align_similarity
 from swimm3r.products import elevation as elevation_model
 from swimm3r.products.frame_colors import Points, blended
 from swimm3r.products.grid import Grid, Window, grid_of
-from swimm3r.products.habitat import figures
+from swimm3r.products.habitat.figures import figures
 from swimm3r.products.survey import Colors, Survey, open_survey
 from swimm3r.scene.georeference import Georeference
 from swimm3r.scene.ground_truth import GroundTruth, read_ground_truth

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 from scipy.integrate import quad
 
-from swimm3r.products.habitat import Figures, figures, fractal_dimension
+from swimm3r.products.habitat.figures import Figures, figures, fractal_dimension
 
 D = 0.01
 

@@ -13,8 +13,8 @@ from tests.products.conftest import ORIGIN, SCALE_STD, Seabed, height
 
 from swimm3r.errors import InputError
 from swimm3r.products import ProductSettings, write_products
-from swimm3r.products.areas import along, read_areas
-from swimm3r.products.habitat import NAMES, figures
+from swimm3r.products.habitat.areas import along, read_areas
+from swimm3r.products.habitat.figures import NAMES, figures
 from swimm3r.products.record import ProductsRecord
 from swimm3r.progress import silent
 from swimm3r.scene.georeference import Georeference

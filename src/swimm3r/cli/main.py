@@ -29,9 +29,10 @@ from swimm3r.cli.pipeline.run import run_command
 from swimm3r.cli.pipeline.sfm import sfm_command
 from swimm3r.cli.pipeline.splat import splat_command
 from swimm3r.cli.pipeline.stages import starting_point
-from swimm3r.cli.products import products
 from swimm3r.cli.render import render
 from swimm3r.cli.report import report
+from swimm3r.cli.survey.measure import measure
+from swimm3r.cli.survey.products import products
 from swimm3r.cli.survey.scale import scale
 from swimm3r.cli.terminal.arguments import named
 from swimm3r.cli.terminal.help_views import View, brief_help, group_help
@@ -140,6 +141,7 @@ def commands_for(arguments: Sequence[str]) -> dict[str, Callable | Family]:
         "render": render,
         "scale": scale,
         "products": products,
+        "measure": measure,
         "localize": localize,
         "report": report,
         "datasets": datasets,

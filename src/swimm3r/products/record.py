@@ -45,6 +45,7 @@ class ProductsRecord:
     highest: float | None
     height_std: float | None  # median over the cells, of one view
     views: float | None  # median over the cells
+    place: str  # digest of the georeference that the maps were made with
     files: tuple[str, ...]
     notes: tuple[str, ...] = ()
     habitat: HabitatRecord | None = None

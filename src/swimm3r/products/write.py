@@ -8,13 +8,14 @@ from pathlib import Path
 
 import numpy as np
 
+from swimm3r.io.files.cache_key import cache_key
 from swimm3r.io.files.outputs import output_folder
-from swimm3r.products.areas import Area, Line, read_areas
 from swimm3r.products.elevation import elevation, frames_over, hill_shade
 from swimm3r.products.frame_colors import Points, blended
 from swimm3r.products.geotiff import RGBA, Band, MapFile, as_rgba
 from swimm3r.products.grid import Grid, Window, grid_of
-from swimm3r.products.habitat_tables import Lattice, lattice, write_areas, write_profiles, write_squares
+from swimm3r.products.habitat.areas import Area, Line, read_areas
+from swimm3r.products.habitat.tables import Lattice, lattice, write_areas, write_profiles, write_squares
 from swimm3r.products.packages import require_packages
 from swimm3r.products.preview import write_previews
 from swimm3r.products.record import FOLDER, HabitatRecord, ProductsRecord
@@ -175,6 +176,7 @@ def _record(survey: Survey, grid: Grid, totals: _Totals, notes: list[str], habit
         highest=float(totals.highest) if totals.cells else None,
         height_std=float(np.median(std)) if len(std) else None,
         views=float(np.median(views)) if len(views) else None,
+        place=cache_key(place),
         files=tuple(totals.files),
         notes=(*notes, *(() if survey.has("restored") else (_NO_WATER,))),
         habitat=habitat,

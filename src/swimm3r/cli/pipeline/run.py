@@ -13,7 +13,7 @@ from swimm3r.cli.pipeline.options import (
     ViewOptions,
 )
 from swimm3r.cli.pipeline.stages import require_adapter, run_stages
-from swimm3r.cli.products import make_products
+from swimm3r.cli.survey.products import make_products
 from swimm3r.cli.terminal.options import FLAT, Source
 from swimm3r.pipeline.presets import RunSettings
 from swimm3r.products.packages import require_packages

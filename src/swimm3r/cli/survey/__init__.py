@@ -1,1 +1,1 @@
-"""Commands about the place of a run on the ground."""
+"""Commands about a run as a survey: its place on the ground, its maps, and measurements in it."""

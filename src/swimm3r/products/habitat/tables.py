@@ -16,10 +16,10 @@ import numpy as np
 from jaxtyping import Bool, Float
 
 from swimm3r.io.files.atomic import atomic_path
-from swimm3r.products.areas import Area, Line, along
 from swimm3r.products.geotiff import Band, MapFile, StoredMap
 from swimm3r.products.grid import Grid, Window
-from swimm3r.products.habitat import LENGTHS, NAMES, Figures, figures
+from swimm3r.products.habitat.areas import Area, Line, along
+from swimm3r.products.habitat.figures import LENGTHS, NAMES, Figures, figures
 from swimm3r.products.packages import geo_package
 from swimm3r.products.record import HabitatRecord
 from swimm3r.products.settings import ProductSettings
@@ -117,10 +117,10 @@ def write_areas(heights: Lattice, areas: Sequence[Area], files: list[str]) -> li
     """areas.csv: figures of polygons. Returns the names of those that lie outside of what was measured."""
     table, outside = [], []
     for area in areas:
-        window, inside = _inside(heights, area)
+        window, own = squares_inside(heights, area)
         found = None
         if window.rows > 1 and window.columns > 1:
-            found = figures(heights.heights(window), heights.spacing, inside)
+            found = figures(heights.heights(window), heights.spacing, own)
         if found is None:
             outside.append(area.name)
             continue
@@ -211,7 +211,7 @@ def _on_map(heights: Lattice, window: Window) -> bool:
     return window.row < rows and window.column < columns and last_row > 0 and last_column > 0
 
 
-def _inside(heights: Lattice, area: Area) -> tuple[Window, Bool[np.ndarray, "h w"]]:
+def squares_inside(heights: Lattice, area: Area) -> tuple[Window, Bool[np.ndarray, "h w"]]:
     """The heights around a polygon, and the squares between them whose middle lies inside."""
     geo_package("rasterio")
     from rasterio import Affine
@@ -222,7 +222,9 @@ def _inside(heights: Lattice, area: Area) -> tuple[Window, Bool[np.ndarray, "h w
         return window, np.zeros((0, 0), bool)
     d = heights.spacing
     x, y = heights.grid.x0 + (window.column + 0.5) * d, heights.grid.y1 - (window.row + 0.5) * d
-    shapes = [{"type": "Polygon", "coordinates": [ring.tolist() for ring in part]} for part in area.parts]
+    shapes = [
+        {"type": "Polygon", "coordinates": [[*ring.tolist(), ring[0].tolist()] for ring in part]} for part in area.parts
+    ]
     burned = rasterize(
         shapes, out_shape=(window.rows - 1, window.columns - 1), transform=Affine(d, 0, x, 0, -d, y), dtype="uint8"
     )
