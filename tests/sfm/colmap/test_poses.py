@@ -361,6 +361,18 @@ def test_a_camera_that_only_turned_is_implausible(rec, frames: Frames, folder: P
     assert any("rays only" in what for what in said)
 
 
+def test_a_model_without_one_scale_is_refused(frames: Frames, folder: Path, rec, tmp_path: Path, monkeypatch) -> None:
+    """A dolphin before open water: all frames placed, the animal some billion times as far in one as in another."""
+    depth = rec.cameras.centers.sub(rec.points.xyz.mean(0)).norm(dim=1)
+    shrunk = replace(rec, cameras=replace(rec.cameras, cam2world=rec.cameras.cam2world.clone()))
+    shrunk.cameras.cam2world[0, :3, 3] -= 2000 * depth[0] * rec.cameras.cam2world[0, :3, 2]
+    assert plausibility.depth_change(rec) < 3
+    assert plausibility.depth_change(shrunk) > 1000
+    monkeypatch.setattr(colmap, "_record", lambda *_: shrunk)
+    with pytest.raises(RegistrationError, match="not in one scale"):
+        colmap.reconstruct(frames, SETTINGS, tmp_path)
+
+
 def test_a_leap_of_the_camera_is_said(rec, frames: Frames, folder: Path) -> None:
     camera = calibration.first_camera(WIDTH, HEIGHT, SETTINGS)
     store = feature_database.start_database(folder, frames, camera, SETTINGS.features)

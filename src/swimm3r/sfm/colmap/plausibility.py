@@ -95,17 +95,27 @@ def _no_parallax(rec: Reconstruction) -> QualityWarning | None:
     )
 
 
-def _runaway_depth(rec: Reconstruction) -> QualityWarning | None:
+def depth_change(rec: Reconstruction) -> float:
+    """How many times as far the points of one frame are as those of another, by their medians; inf at a distance of 0.
+
+    Frames with fewer than 10 points do not count.
+    """
     medians = []
     for i in range(len(rec.names)):
         seen = rec.points.xyz[rec.tracks.point[rec.tracks.frame == i]]
         if len(seen) >= 10:
             medians.append(project(rec.cameras[i], seen[None])[1].median().item())
-    if not medians or max(medians) <= _MAX_DEPTH_CHANGE * min(medians):
+    if not medians:
+        return 1.0
+    return max(medians) / min(medians) if min(medians) > 0 else float("inf")
+
+
+def _runaway_depth(rec: Reconstruction) -> QualityWarning | None:
+    change = depth_change(rec)
+    if change <= _MAX_DEPTH_CHANGE:
         return None
     return QualityWarning(
-        f"The reconstruction is implausible: the scene is {max(medians) / min(medians):.0f} times as far in one frame"
-        " as in another.",
+        f"The reconstruction is implausible: the scene is {change:.0f} times as far in one frame as in another.",
         "The scale drifts along the clip. Use a shorter part, or film so that the path crosses itself.",
     )
 

@@ -35,7 +35,7 @@ from swimm3r.scene.reconstruction import (
 from swimm3r.sfm.colmap import calibration, mapping
 from swimm3r.sfm.colmap.chunks.long_clip import is_long, map_long_clip
 from swimm3r.sfm.colmap.chunks.parts import without_jumps
-from swimm3r.sfm.colmap.plausibility import implausible
+from swimm3r.sfm.colmap.plausibility import depth_change, implausible
 from swimm3r.sfm.features import vlad
 from swimm3r.sfm.features.database import FeatureDatabase, fill_features, match_pairs, start_database
 from swimm3r.sfm.features.sift import unit_descriptors
@@ -48,6 +48,7 @@ if TYPE_CHECKING:
 
 PARTS = "parts"  # folder of the models that did not join the largest
 _LEAST_OF_A_PART = 3  # frames
+_LOST_SCALE = 1000.0  # change of the frames' median depth beyond which nothing of a model is right
 _NONE, _NOWHERE = np.zeros(0), np.zeros((0, 2))  # what is joined where no pair matches
 
 
@@ -93,6 +94,8 @@ def reconstruct(
             model, others, warnings = _map(working, frames, pairs, settings, progress, engine)
             rec = _record(model, working, frames, folder)
             sizes = [model.num_reg_images(), *_write_parts(model, others, frames, folder / PARTS)]
+            if depth_change(rec) > _LOST_SCALE:
+                raise _scale_lost(len(rec.names), len(frames))
             found = implausible(rec, working, frames)
         finally:
             working.path.unlink(missing_ok=True)
@@ -200,7 +203,7 @@ def _map(
         models = mapping.map_frames(store, settings, progress)
     if not models:
         raise _too_few(0, n, settings)
-    model = models[0]
+    model = without_jumps(models[0])
     if model.num_reg_images() < n:
         placed = {i - 1 for i in model.reg_image_ids()}
         again = [(i, j) for i, j in pairs if i not in placed or j not in placed]
@@ -210,7 +213,7 @@ def _map(
             model = calibration.refine(store, model, settings, progress).model  # a better lens places more
         more = mapping.place_leftovers(store, model, settings, progress)
         more = mapping.replace_misplaced(store, more, settings, progress)
-        more = without_jumps(more) if long else more
+        more = without_jumps(more)
         model = more if more.num_reg_images() >= model.num_reg_images() else model
     placed = model.num_reg_images()
     thin = model.compute_mean_observations_per_reg_image() < settings.mapping.thin_points
@@ -333,9 +336,22 @@ def _registration_warnings(placed: int, sizes: list[int], frames: Frames) -> lis
 
 
 def _too_few(placed: int, frames: int, settings: ColmapSettings) -> RegistrationError:
-    return RegistrationError(
+    return _not_placed(
         f"only {placed} of {frames} frames could be placed relative to each other"
-        + (", and on too few points to be trusted" if placed > settings.mapping.min_share * frames else ""),
+        + (", and on too few points to be trusted" if placed > settings.mapping.min_share * frames else "")
+    )
+
+
+def _scale_lost(placed: int, frames: int) -> RegistrationError:
+    return _not_placed(
+        f"{placed} of {frames} frames were placed, but not in one scale: the same scene is more than"
+        f" {_LOST_SCALE:,.0f} times as far in one frame as in another"
+    )
+
+
+def _not_placed(what: str) -> RegistrationError:
+    return RegistrationError(
+        what,
         cause="the frames share too little that stands still: open water, moving animals or divers fill the view, "
         "visibility is too poor, or the camera moved too fast or only turned",
         hint="film reef, rock or wreck slowly, from several sides, with 60 % overlap and within 3 m; "
