@@ -13,6 +13,7 @@ from pathlib import Path
 from threading import Event
 from typing import TYPE_CHECKING
 
+from swimm3r.errors import DeviceError
 from swimm3r.io.files.atomic import atomic_folder
 from swimm3r.progress import Progress, silent
 from swimm3r.sfm.colmap import calibration
@@ -21,6 +22,7 @@ from swimm3r.sfm.colmap.mapping import map_frames
 from swimm3r.sfm.features.database import FeatureDatabase, write_excerpt
 from swimm3r.sfm.settings import ColmapSettings
 from swimm3r.tasks import run_tasks
+from swimm3r.tasks.outcome import TaskError
 from swimm3r.tasks.settings import EngineSettings
 
 if TYPE_CHECKING:
@@ -70,13 +72,15 @@ def place_chunks(
 ) -> None:
     """Place several chunks at a time, in threads (COLMAP releases the interpreter) or where `engine` says.
 
-    `progress` may stop it. A chunk whose process failed for good is said in the log and left out; a repeated run tries
-    it again.
+    `progress` may stop it. A chunk that failed or was killed for good is said in the log and left out; a repeated run tries it
+    again. Any other error, of the disk or the input, is no chunk's own and raised.
     """
     if not engine.is_in_this_process:
         absolute = [replace(task, database=task.database.resolve(), folder=task.folder.resolve()) for task in tasks]
         logs = absolute[0].database.parent / "logs" if absolute else None
         for failure in run_tasks(place_chunk, absolute, engine, progress, label, logs=logs):
+            if not isinstance(failure.error, TaskError | DeviceError):
+                raise failure.error
             log.warning("a chunk of frames is left out: %s", failure.message)
         return
     stopped = Event()
