@@ -72,8 +72,8 @@ def place_chunks(
 ) -> None:
     """Place several chunks at a time, in threads (COLMAP releases the interpreter) or where `engine` says.
 
-    `progress` may stop it. A chunk that failed or was killed for good is said in the log and left out; a repeated run tries it
-    again. Any other error, of the disk or the input, is no chunk's own and raised.
+    `progress` may stop it. A chunk that failed or was killed for good is said in the log and left out; a repeated run
+    tries it again. Any other error, of the disk or the input, is no chunk's own and raised.
     """
     if not engine.is_in_this_process:
         absolute = [replace(task, database=task.database.resolve(), folder=task.folder.resolve()) for task in tasks]
