@@ -7,6 +7,8 @@ from swimm3r.io.files.folder_lock import LOCK
 
 OUTPUTS = {  # path in the run folder -> contents
     "summary.json": "Every number of this page, for scripts",
+    "georeference.json": "Unit and place of the coordinates",
+    "scale.json": "Sources of scale with their residuals",
     "prepare": "Frames as used",
     "sfm/points.ply": "Dense point cloud in the colors shown here",
     "sfm/points_physical.ply": "The same points without the water, before the white balance",

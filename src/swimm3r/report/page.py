@@ -15,7 +15,7 @@ from swimm3r.io.files.damage import Remedy, damaged, first_line, guard
 from swimm3r.io.video import Video
 from swimm3r.prepare import load_frames
 from swimm3r.report import frames as shown_frames
-from swimm3r.report import head, outputs, scores, verdict, water
+from swimm3r.report import head, outputs, scale, scores, verdict, water
 from swimm3r.report.maps import map_section
 from swimm3r.report.plan_view import path_overlay, plan_view
 from swimm3r.report.scene import pack_scene, shown_points
@@ -71,6 +71,8 @@ def _of_summary(summary: dict[str, Any], folder: Path) -> dict[str, object]:
         "appearance": scores.appearance_note(summary),
         "notes": [*scores.restored_notes(summary), *scores.other_notes(summary)] if "restored" in summary else [],
         "training": [Markup(svg) for svg in scores.training_charts(folder / "splat" / "metrics.jsonl")],
+        "scale": scale.scale_section(summary),
+        "metric_water": scale.metric_water(summary),
         "truths": scores.truth_rows(summary.get("truth")),
         "stages": [
             (title, head.clock(stage["seconds"]), head.clock(stage["cpu_seconds"]), _megabytes(stage["peak_mb"]))

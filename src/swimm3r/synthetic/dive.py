@@ -8,7 +8,7 @@ wherever it shows. Caustics are light, not water: `clear` has them. Where a ray 
 black.
 
 On disk: images/NAME, and truth/ as `ground_truth` reads it, with masks/NAME.png (0 at the fish) if there is one, and
-gains.json, the camera's factors on linear light per frame, if they change.
+gains.json, the camera's factors on linear light per frame, if they change; markers.json, the printed markers, if any.
 """
 
 import json
@@ -33,6 +33,7 @@ from swimm3r.scene.ground_truth import FOLDER
 from swimm3r.synthetic import disturbances
 from swimm3r.synthetic.path import loop, survey
 from swimm3r.synthetic.plain import Plain
+from swimm3r.synthetic.printed_markers import FAMILY, Plate, plates_along, with_plates
 from swimm3r.synthetic.render_frame import SAMPLES, render
 from swimm3r.synthetic.seafloor import Seafloor, make_seafloor
 from swimm3r.synthetic.settings import DiveSettings
@@ -58,6 +59,7 @@ class Dive:
     cameras: Cameras  # metres
     medium: Medium  # [3], 1/m
     floor: Seafloor | Plain
+    plates: tuple[Plate, ...] = ()  # with printed markers
 
     def __len__(self) -> int:
         return len(self.names)
@@ -80,6 +82,8 @@ class Dive:
             i / settings.fps,
             settings.caustics,
         )
+        if self.plates:
+            radiance, z = with_plates(radiance, z, camera, list(self.plates))
         clear = srgb_from_linear(torch.from_numpy(radiance)).clamp(0, 1).float()
         z_depth = torch.from_numpy(z).float()
         ray_depth = ray_depth_from_z(z_depth, rays.float())
@@ -120,7 +124,9 @@ def make_dive(settings: DiveSettings) -> Dive:
         width=settings.width,
         height=settings.height,
     )
-    return Dive(settings, _names(settings), cameras, water(settings), floor)
+    count = settings.markers
+    plates = plates_along(floor, poses[:, :3, 3], count, settings.marker_size, settings.seed) if count else []
+    return Dive(settings, _names(settings), cameras, water(settings), floor, tuple(plates))
 
 
 def write_dive(settings: DiveSettings, folder: Path, progress: Progress = silent) -> None:
@@ -149,6 +155,9 @@ def write_dive(settings: DiveSettings, folder: Path, progress: Progress = silent
     if settings.exposure or settings.white_balance:
         gains = {name: dive.gains(i).tolist() for i, name in enumerate(dive.names)}
         write_text(truth / "gains.json", json.dumps(gains, indent=2) + "\n")
+    if dive.plates:
+        document = {"family": FAMILY, "markers": [asdict(plate) for plate in dive.plates]}
+        write_text(truth / "markers.json", json.dumps(document, indent=2) + "\n")
     dive.medium.save(truth / "medium.json")
     dive.cameras.save(truth / "cameras.json", dive.names, units="metres")
     write_text(record, json.dumps({**described, "whole": True}, indent=2) + "\n")

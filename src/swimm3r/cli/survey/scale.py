@@ -34,6 +34,8 @@ def scale(
 
 def print_scale(section: dict[str, Any]) -> None:
     """Print the scale by every source, the scale of all, and the place."""
+    from swimm3r.report.scale import plus_minus
+
     console = outcome_console()
     table = Table("source", "m per unit", "std", "residual", "in std", "of")
     for each in section["sources"]:
@@ -47,13 +49,13 @@ def print_scale(section: dict[str, Any]) -> None:
         )
     console.print(table)
     total, std = section["metres_per_unit"], section["std"]
-    console.print(f"A unit of structure from motion is {with_std(total, std * total)} m ({100 * std:.2g}%).")
+    console.print(f"A unit of structure from motion is {plus_minus(total, std * total)} m ({100 * std:.2g}%).")
     if section["factor"] == 1.0:
         console.print("The files are in metres already, by these sources: nothing had to be rescaled.")
     place = section["georeference"]
     if place["origin_std_m"] is not None:
         east, north, height = (
-            with_std(value, error) for value, error in zip(place["origin_m"], place["origin_std_m"], strict=True)
+            plus_minus(value, error) for value, error in zip(place["origin_m"], place["origin_std_m"], strict=True)
         )
         console.print(f"Origin in {place['crs']}: east {east} m, north {north} m, height {height} m")
     if "navigation" in section:
@@ -69,13 +71,3 @@ def print_scale(section: dict[str, Any]) -> None:
         console.print(f"Note: {note}")
     if section.get("files_in_old_unit"):
         console.print(f"In the old unit still, to be made again: {', '.join(section['files_in_old_unit'])}")
-
-
-def with_std(value: float, std: float) -> str:
-    """A number with two digits of its standard deviation: 0.3804 ± 0.0017."""
-    if not std > 0:
-        return f"{value:.6g}"
-    from math import floor, log10
-
-    places = min(max(1 - floor(log10(std)), 0), 9)
-    return f"{value:.{places}f} \u00b1 {std:.{places}f}"

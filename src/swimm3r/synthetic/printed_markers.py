@@ -1,0 +1,129 @@
+"""Printed markers on level plates above the seafloor: ArUco 4x4 of 50, ids in the order of the camera's path.
+
+A plate lies just above the highest ground below it, and is rendered exactly where the rays of a frame meet its plane.
+"""
+
+from dataclasses import dataclass
+
+import numpy as np
+import torch
+from jaxtyping import Float
+
+from swimm3r.cameras import Cameras, directions, project
+from swimm3r.synthetic.plain import Plain
+from swimm3r.synthetic.seafloor import SUN, Seafloor, height_at
+
+FAMILY = "aruco-4x4-50"
+_BORDER = 1.5  # side of the plate by that of the marker's black square
+_CELLS = 6  # of the black square, its frame included
+_ASIDE = 0.35  # metres from the path, left and right in turn
+_ABOVE = 0.005  # metres between plate and ground
+_WHITE, _BLACK = 0.55, 0.03  # albedo
+_LIGHT = 0.55 + 1.05 * float(SUN[2])
+_SAMPLES = 6  # per pixel and axis
+
+
+@dataclass(frozen=True)
+class Plate:
+    """A printed marker; metres."""
+
+    marker: int
+    center: tuple[float, float, float]
+    turn: float  # radians, counter-clockwise from above
+    size: float  # of the black square
+
+    @property
+    def corners(self) -> Float[np.ndarray, "4 3"]:
+        """Corners of the black square: the marker's first one, then clockwise as seen from above."""
+        return self._square(self.size)
+
+    def _square(self, side: float) -> Float[np.ndarray, "4 3"]:
+        flat = side / 2 * np.array([[-1.0, 1, 0], [1, 1, 0], [1, -1, 0], [-1, -1, 0]])
+        cos, sin = np.cos(self.turn), np.sin(self.turn)
+        return flat @ np.array([[cos, sin, 0], [-sin, cos, 0], [0, 0, 1]]) + np.array(self.center)
+
+
+def plates_along(
+    floor: Seafloor | Plain, path: Float[np.ndarray, "f 3"], count: int, size: float, seed: int
+) -> list[Plate]:
+    """Markers beside a path of the camera, evenly spread over its frames."""
+    rng = np.random.default_rng([seed, 7])
+    plates = []
+    for marker in range(count):
+        i = min(round((marker + 0.5) * len(path) / count), len(path) - 1)
+        ahead = path[min(i + 1, len(path) - 1), :2] - path[max(i - 1, 0), :2]
+        side = np.array([ahead[1], -ahead[0]]) / max(float(np.linalg.norm(ahead)), 1e-9)
+        x, y = path[i, :2] + _ASIDE * (-1) ** marker * side
+        reach = np.linspace(-_BORDER, _BORDER, 15) * size * 0.75
+        below = height_at(floor.around(float(x), float(y)), *np.meshgrid(x + reach, y + reach))
+        plates.append(
+            Plate(marker, (float(x), float(y), float(below.max()) + _ABOVE), float(rng.uniform(0, 6.28)), size)
+        )
+    return plates
+
+
+def with_plates(
+    radiance: Float[np.ndarray, "h w 3"], z_depth: Float[np.ndarray, "h w"], camera: Cameras, plates: list[Plate]
+) -> tuple[Float[np.ndarray, "h w 3"], Float[np.ndarray, "h w"]]:
+    """Linear radiance and z depth of a frame with the plates that it shows."""
+    radiance, z_depth = radiance.copy(), z_depth.copy()
+    for plate in plates:
+        window = _window(camera, plate)
+        if window is None:
+            continue
+        rows, columns = window
+        grid = (np.arange(_SAMPLES) + 0.5) / _SAMPLES
+        y = (rows[:, None] + grid).ravel()
+        x = (columns[:, None] + grid).ravel()
+        shape = (len(rows), _SAMPLES, len(columns), _SAMPLES)
+        albedo, _ = _seen(camera, plate, x, y)
+        cover = np.isfinite(albedo).reshape(shape).mean((1, 3))
+        light = _LIGHT * np.nansum(albedo.reshape(shape), (1, 3)) / _SAMPLES**2
+        middle, z = _seen(camera, plate, columns + 0.5, rows + 0.5)
+        at = np.ix_(rows, columns)
+        visible = (z_depth[at] == 0) | (z < z_depth[at]) | ~np.isfinite(middle)
+        mixed = (1 - cover)[..., None] * radiance[at] + light[..., None]
+        radiance[at] = np.where(visible[..., None], mixed, radiance[at])
+        z_depth[at] = np.where(visible & np.isfinite(middle), z, z_depth[at])
+    return radiance, z_depth
+
+
+def _window(camera: Cameras, plate: Plate) -> tuple[np.ndarray, np.ndarray] | None:
+    """Rows and columns that may show a plate; None where it is out of view."""
+    corners = torch.from_numpy(plate._square(_BORDER * plate.size))
+    pixels, z = project(camera, corners[None])
+    if not bool((z > 0.05).all()):
+        return None
+    low, high = pixels[0].min(0).values.numpy(), pixels[0].max(0).values.numpy()
+    columns = np.arange(max(0, int(low[0]) - 1), min(camera.width, int(high[0]) + 2))
+    rows = np.arange(max(0, int(low[1]) - 1), min(camera.height, int(high[1]) + 2))
+    return (rows, columns) if len(rows) and len(columns) else None
+
+
+def _seen(
+    camera: Cameras, plate: Plate, x: Float[np.ndarray, " m"], y: Float[np.ndarray, " n"]
+) -> tuple[Float[np.ndarray, "n m"], Float[np.ndarray, "n m"]]:
+    """Albedo of the plate through a grid of pixels (NaN beside it), and the z depth of its plane there."""
+    pixels = torch.from_numpy(np.stack(np.meshgrid(x, y), -1).reshape(1, -1, 2))
+    pose = camera.cam2world[0].double().numpy()
+    rays = directions(camera, pixels)[0].numpy() @ pose[:3, :3].T
+    down = np.where(np.abs(rays[:, 2]) < 1e-9, 1e-9, rays[:, 2])
+    z = (plate.center[2] - pose[2, 3]) / down
+    east, north = (pose[:3, 3] + z[:, None] * rays)[:, :2].T - np.array(plate.center[:2])[:, None]
+    cos, sin = np.cos(plate.turn), np.sin(plate.turn)
+    u, v = (cos * east + sin * north) / plate.size, (cos * north - sin * east) / plate.size
+    on_plate = (np.maximum(np.abs(u), np.abs(v)) <= _BORDER / 2) & (z > 0)
+    column, row = (np.floor((value + 0.5) * _CELLS).astype(int) for value in (u, -v))
+    inside = (column >= 0) & (column < _CELLS) & (row >= 0) & (row < _CELLS)
+    cells = _cells(plate.marker)[row.clip(0, _CELLS - 1), column.clip(0, _CELLS - 1)]
+    albedo = np.where(inside, np.where(cells, _WHITE, _BLACK), _WHITE)
+    shape = (len(y), len(x))
+    return np.where(on_plate, albedo, np.nan).reshape(shape), z.reshape(shape)
+
+
+def _cells(marker: int) -> np.ndarray:
+    """The white cells of a marker, its black frame included."""
+    from cv2 import aruco
+
+    dictionary = aruco.getPredefinedDictionary(aruco.DICT_4X4_50)
+    return aruco.generateImageMarker(dictionary, marker, _CELLS) > 127
