@@ -15,6 +15,7 @@ from swimm3r.evaluate.images import psnr
 from swimm3r.products import ProductSettings, write_products
 from swimm3r.products.elevation import gradients, hill_shade
 from swimm3r.products.grid import Grid, Window, chosen_gsd, grid_of
+from swimm3r.products.preview import decimals_of
 from swimm3r.products.record import ProductsRecord, read_record
 from swimm3r.progress import silent
 from swimm3r.scene.georeference import GEOREFERENCE
@@ -202,3 +203,8 @@ def test_the_command_prints_the_figures_and_the_report_shows_the_maps(
     assert "Maps from above" in page
     assert page.count("Orthophoto without water") >= 1
     assert "products/" in page
+
+
+def test_marks_of_a_color_bar_tell_deep_heights_apart():
+    assert f"{-1855.5:.{decimals_of(0.5)}f}" == "-1855.50"
+    assert [decimals_of(step) for step in (0.004, 0.5, 1.0, 12.0, 300.0)] == [4, 2, 1, 0, 0]

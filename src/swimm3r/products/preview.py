@@ -1,5 +1,6 @@
 """Small images of the maps, for the report and for a first look: PNG, with a color bar where colors are numbers."""
 
+import math
 from pathlib import Path
 
 import cv2
@@ -66,14 +67,19 @@ def _color_bar(
     bar = np.full((rows, wide * 2 + round(150 * size), 3), _PAPER, np.uint8)
     ramp = np.linspace(255, 0, max(2, rows - top - bottom)).astype(np.uint8)
     bar[top : top + len(ramp), wide : 2 * wide] = cv2.applyColorMap(ramp[:, None], colors)[..., ::-1]
-    draw, figure = np.ascontiguousarray(bar), ".0f" if unit == "views" else ".3g"
+    draw, decimals = np.ascontiguousarray(bar), 0 if unit == "views" else decimals_of((high - low) / (_MARKS - 1))
     for k in range(_MARKS):
         y = top + round((len(ramp) - 1) * (1 - k / (_MARKS - 1)))
-        text = f"{low + (high - low) * k / (_MARKS - 1):{figure}}"
+        text = f"{low + (high - low) * k / (_MARKS - 1):.{decimals}f}"
         at = (2 * wide + 6, y + round(5 * size))
         cv2.putText(draw, text, at, cv2.FONT_HERSHEY_SIMPLEX, size, (40, 40, 40), 1, cv2.LINE_AA)
     cv2.putText(draw, unit, (wide, top - 6), cv2.FONT_HERSHEY_SIMPLEX, size, (40, 40, 40), 1, cv2.LINE_AA)
     return draw
+
+
+def decimals_of(step: float) -> int:
+    """Decimals with which values that far apart differ in two digits."""
+    return max(0, 1 - math.floor(math.log10(step)))
 
 
 def _on_paper(image: UInt8[np.ndarray, "h w 3"], shown: np.ndarray) -> UInt8[np.ndarray, "h w 3"]:
