@@ -10,6 +10,8 @@ import numpy as np
 import pytest
 import torch
 from tests.scale.conftest import SCALE, Survey, lines, survey_along, write_csv
+from tests.splat.conftest import make_wall
+from tests.splat.cut import in_blocks
 
 from swimm3r.cameras import project, ray_depth_from_z, unproject
 from swimm3r.cli.main import main
@@ -175,6 +177,28 @@ def test_the_map_renders_the_same_images_at_scaled_depth(run):
     torch.testing.assert_close(second.medium.beta_D, first.medium.beta_D / 0.4, rtol=1e-4, atol=1e-6)
     rays = ray_depth_from_z(first.z_depth, torch.ones(*first.z_depth.shape, 3))
     assert bool((rays > 0).any())
+
+
+def test_a_map_in_blocks_is_rescaled_block_by_block(run):
+    path = run / "splat" / "map.safetensors"
+    whole = make_wall(600)
+    path.unlink()
+    in_blocks(whole, path.parent).save(path)
+    before = load_map(path)
+    parts = [p.xyz for p in before.parts()]
+    boxes = [(entry.low, entry.high, entry.spacing) for entry in before.blocks.entries]
+    rescale_run(run, 0.4, {})
+    after = load_map(path)
+    assert after.blocks is not None
+    assert after.metric
+    for p, xyz in zip(after.parts(), parts, strict=True):
+        torch.testing.assert_close(p.xyz, 0.4 * xyz)
+    for entry, (low, high, spacing) in zip(after.blocks.entries, boxes, strict=True):
+        np.testing.assert_allclose(entry.low, 0.4 * np.array(low))
+        np.testing.assert_allclose(entry.high, 0.4 * np.array(high))
+        assert entry.spacing == pytest.approx(0.4 * spacing)
+    for one, other in zip(before.blocks.entries, after.blocks.entries, strict=True):
+        assert (one.primitives, one.coarse) == (other.primitives, other.coarse)
 
 
 def test_there_and_back_is_where_it_was(run):
