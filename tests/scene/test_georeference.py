@@ -13,6 +13,7 @@ from swimm3r.errors import InputError
 from swimm3r.geometry import DegenerateAlignmentError, pose_from, so3_exp
 from swimm3r.scene.georeference import (
     Georeference,
+    Vector,
     load_georeference,
     local_georeference,
     save_georeference,
@@ -23,8 +24,9 @@ from swimm3r.scene.reconstruction import DepthMaps, Matches, Points, Reconstruct
 DOWN = torch.tensor([[1.0, 0, 0], [0, -1, 0], [0, 0, -1]], dtype=torch.float64)  # camera axes of a view from above
 
 
-def rotation_rows(R):
-    return tuple(tuple(float(x) for x in row) for row in R)
+def rotation_rows(R: torch.Tensor) -> tuple[Vector, Vector, Vector]:
+    first, second, third = ((float(x), float(y), float(z)) for x, y, z in R)
+    return first, second, third
 
 
 def tilted(seed: int = 0):
