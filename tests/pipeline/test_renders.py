@@ -2,8 +2,10 @@
 
 import subprocess
 import sys
+from dataclasses import replace
 from pathlib import Path
 
+import cv2
 import numpy as np
 import pytest
 import torch
@@ -15,7 +17,7 @@ from swimm3r.io import images
 from swimm3r.io.depth import read_depth
 from swimm3r.medium import Medium
 from swimm3r.pipeline.camera_paths import smooth_path
-from swimm3r.pipeline.renders import DisplayStyle, shown_clear, write_view
+from swimm3r.pipeline.renders import DisplayStyle, marked, shown_clear, write_view
 from swimm3r.sfm.settings import RestoreSettings
 from swimm3r.splat.rendering import RenderOutput
 
@@ -117,3 +119,20 @@ def test_a_folder_that_holds_no_run_is_named(tmp_path: Path, capsys: pytest.Capt
         main(["render", str(tmp_path)])
     assert ended.value.code == InputError.exit_code
     assert f"{tmp_path} is no run folder" in capsys.readouterr().err
+
+
+def test_what_no_training_frame_saw_is_hatched_and_named(tmp_path):
+    out = view(z=2.0, alpha=1.0, beta_D=0.1)
+    observed = torch.ones(H, W, dtype=torch.bool)
+    observed[:, 4:] = False
+    write_view(tmp_path, "a", replace(out, observed=observed), CAMERA, LOOK)
+    write_view(tmp_path, "b", out, CAMERA, LOOK)
+    assert not (tmp_path / "b_observed.png").exists()
+    mask = cv2.imread(str(tmp_path / "a_observed.png"), cv2.IMREAD_UNCHANGED)
+    assert (mask[:, :4] == 65535).all()
+    assert (mask[:, 4:] == 0).all()
+    for kind, changed in (("rgb", True), ("clear", True), ("clear_physical", False), ("backscatter", False)):
+        marked_view, plain = (images.read_rgb(tmp_path / f"{stem}_{kind}.png").astype(int) for stem in "ab")
+        assert (marked_view[:, :4] == plain[:, :4]).all()
+        assert (marked_view[:, 4:] != plain[:, 4:]).any() == changed
+    assert torch.equal(marked(out.rgb, None), out.rgb)

@@ -9,7 +9,15 @@ from swimm3r.cameras import Cameras
 from swimm3r.evaluate import NotComputed
 from swimm3r.geometry import Similarity, align_similarity, best_similarity, pose_from, rotation_angle, so3_exp
 from swimm3r.pipeline.camera_paths import smooth_path
-from swimm3r.pipeline.held_out import covered_by_training, covered_scores, cut, first_poses, visible_window
+from swimm3r.pipeline.held_out import (
+    covered_by_training,
+    covered_scores,
+    cut,
+    first_poses,
+    mean_part,
+    observed_scores,
+    visible_window,
+)
 from swimm3r.scene.ground_truth import GroundTruth
 from swimm3r.scene.reconstruction import DenseCloud
 from swimm3r.sfm.settings import FeatureSettings
@@ -133,3 +141,20 @@ def test_orientations_that_contradict_the_track_leave_it_to_the_centers():
     torch.testing.assert_close(found.poses(theirs)[:, :3, 3], ours[:, :3, 3], atol=1e-9, rtol=0)
     still = theirs[:1].expand(6, 4, 4)
     assert best_similarity(still, ours) is None
+
+
+def test_the_observed_score_looks_at_observed_pixels_alone():
+    render, target = torch.full((20, 20, 3), 0.5), torch.full((20, 20, 3), 0.6)
+    target[:, 5:] = 0.9
+    seen, left = torch.ones(20, 20, dtype=torch.bool), torch.zeros(20, 20, dtype=torch.bool)
+    left[:, :5] = True
+    scores = observed_scores(render, target, seen, left)
+    assert scores.share == 0.25
+    assert scores.psnr == pytest.approx(20.17, abs=0.01)
+    nothing = observed_scores(render, target, seen, ~seen)
+    assert nothing.share == 0
+    assert isinstance(nothing.psnr, NotComputed)
+    assert isinstance(observed_scores(render, target, seen, None).share, NotComputed)
+    mean = mean_part([scores, nothing])
+    assert mean.share == 0.125
+    assert mean.psnr == scores.psnr

@@ -20,9 +20,8 @@ from swimm3r.splat.rendering import SplatMap
 from swimm3r.splat.settings import PoseRefinementSettings, SplatSettings
 
 COLUMNS = columns(
-    "psnr", "ssim_3dgs", "lpips_vgg", "sharpness", "blur4_psnr", "psnr_affine", "flow_px", "flow_px_p90", "clear_psnr",
-    "T_D_abs", "B_abs",
-    "from_reference_pct", "train_cpu_seconds",
+    "psnr", "psnr_observed", "ssim_3dgs", "lpips_vgg", "sharpness", "blur4_psnr", "psnr_affine", "flow_px",
+    "flow_px_p90", "clear_psnr", "T_D_abs", "B_abs", "from_reference_pct", "train_cpu_seconds",
 )  # fmt: skip
 
 
@@ -56,13 +55,15 @@ def map_scores(
         f, window = sfm.frames.index(view.name), (view.window.rows, view.window.columns)
         target, _ = undistorted(sfm.frames.image(f), sfm.frames.mask(f), view.lens, view.canvas)
         images.write_rgb(folder / "test" / f"{stems[view.name]}_target.png", target[window].numpy())
-    mean, covered = held_out.mean_scores(views), held_out.mean_covered(views)
+    mean, covered = held_out.mean_scores(views), held_out.mean_part([view.covered for view in views])
+    observed = held_out.mean_part([view.observed for view in views])
     scores: dict[str, float | NotComputed] = {
         "psnr": mean.psnr,
         "ssim_3dgs": mean.ssim,
         "lpips_vgg": mean.lpips,
         "sharpness": mean.sharpness,
         "blur4_psnr": mean.blur4_psnr,
+        "psnr_observed": observed.psnr,
         **{name: getattr(covered, name) for name in ("psnr_affine", "flow_px", "flow_px_p90")},
         "from_reference_pct": 100 * sum(view.source == "reference" for view in views) / len(views),
         "train_cpu_seconds": _training_seconds(folder, scene.settings),

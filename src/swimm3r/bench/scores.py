@@ -33,6 +33,7 @@ _COLORS = "physical colors unless the row says white-balanced"
 
 COLUMNS = (
     Column("psnr", "PSNR", 2, "high", "dB, test frames as 8-bit images, their poses refined on the frozen map"),
+    Column("psnr_observed", "PSNR, observed", 2, "high", "dB of the pixels that some training frame saw, by the map"),
     Column("ssim_3dgs", "SSIM", 4, "high", "11 x 11 Gaussian of sigma 1.5, zero padding, as 3DGS"),
     Column("lpips_vgg", "LPIPS", 4, "low", "v0.1, VGG-16, inputs 0..1 as 3DGS feeds them"),
     Column("sharpness", "Sharpness", 3, "neither", "mean gradient magnitude, rendering : test frame; 1 is as sharp"),

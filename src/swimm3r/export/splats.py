@@ -81,9 +81,13 @@ class ExportedMap:
 
 
 def open_map(folder: Path, settings: SplatSettings) -> ExportedMap:
-    """The Gaussians of a finished run's map at the settings' time and in their colors. Raises InputError without."""
+    """The Gaussians of a finished run's map at the settings' time and in their colors; of what training frames saw.
+
+    Raises InputError without a map.
+    """
     open_run(folder, "splat")
-    scene = load_map(folder / "splat" / "map.safetensors")
+    whole = load_map(folder / "splat" / "map.safetensors")
+    scene = whole.observed_part()
     refined = folder / "splat" / "cameras.json"
     table = refined if refined.is_file() else folder / "sfm" / "cameras.json"
     cameras = cameras_of(cameras_json.read_cameras(table))
@@ -96,7 +100,7 @@ def open_map(folder: Path, settings: SplatSettings) -> ExportedMap:
     g = clear_gaussians(scene, asked if scene.blocks is None else canvas, time)
     if isinstance(scene.primitives, BetaPrimitives):
         g = with_mean_color(scene, g, views, time)
-    return ExportedMap(scene, views, time, balance, balanced(g, balance))
+    return ExportedMap(whole, views, time, balance, balanced(g, balance))
 
 
 def balanced(g: Gaussians, balance: WhiteBalance) -> Gaussians:

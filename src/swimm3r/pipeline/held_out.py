@@ -10,7 +10,7 @@ from collections import Counter
 from collections.abc import Sequence
 from dataclasses import dataclass, fields, replace
 from pathlib import Path
-from typing import Literal
+from typing import Literal, TypeVar
 
 import torch
 from jaxtyping import Bool, Float
@@ -63,6 +63,7 @@ class HeldOutView:
     source: Source
     scores: ViewScores
     covered: "CoveredScores"
+    observed: "ObservedScores"
 
 
 @dataclass(frozen=True)
@@ -88,6 +89,18 @@ class CoveredScores:
             "flow_px_p90": self.flow_px_p90,
             "flow_share": self.flow_share,
         }
+
+
+@dataclass(frozen=True)
+class ObservedScores:
+    """The scores on what some training frame saw by the map's own depth, measured or guessed."""
+
+    share: float | NotComputed  # of the pixels
+    psnr: float | NotComputed  # dB
+
+    def summary(self) -> dict[str, object]:
+        """The scores by the names of summary.json."""
+        return {"observed": self.share, "psnr_observed": self.psnr}
 
 
 def first_poses(
@@ -174,7 +187,8 @@ def score_views(
         shown = out.rgb if scene.colors is None else recolored_by_halves(out.rgb, target, seen & known)
         scores = view_scores(shown, target, perceptual, seen)
         covered = covered_scores(shown, target, seen, known)
-        views.append(HeldOutView(name, time, lens, canvas, window, first.source, scores, covered))
+        observed = observed_scores(shown, target, seen, out.observed)
+        views.append(HeldOutView(name, time, lens, canvas, window, first.source, scores, covered, observed))
     progress("scoring test frames", len(poses), len(poses))
     return views
 
@@ -237,17 +251,35 @@ def covered_scores(
     )
 
 
-def mean_covered(views: Sequence[HeldOutView]) -> CoveredScores:
-    """Means over frames, those without a covered pixel, or without texture, left out of what they have none of."""
+def observed_scores(
+    render: Float[Tensor, "h w 3"],
+    target: Float[Tensor, "h w 3"],
+    seen: Bool[Tensor, "h w"],
+    observed: Bool[Tensor, "h w"] | None,
+) -> ObservedScores:
+    """Share and PSNR of the observed pixels; both images as their 8-bit files show them."""
+    if observed is None:
+        unknown = NotComputed("the map was made before it kept what training frames saw")
+        return ObservedScores(unknown, unknown)
+    counted = seen & observed
+    share = float(counted.sum() / seen.sum())
+    if not bool(counted.any()):
+        return ObservedScores(share, NotComputed("no training frame saw what the test frames show"))
+    return ObservedScores(share, psnr(as_8_bit(render)[counted], as_8_bit(target)[counted]))
+
+
+Part = TypeVar("Part", CoveredScores, ObservedScores)
+
+
+def mean_part(parts: Sequence[Part]) -> Part:
+    """Means over frames; those without a number, as without a covered pixel, are left out of what they have none of."""
 
     def mean(values: list[float | NotComputed]) -> float | NotComputed:
         numbers = [v for v in values if not isinstance(v, NotComputed)]
         return sum(numbers) / len(numbers) if numbers else values[0]
 
-    scores = [view.covered for view in views]
-    share = sum(s.share for s in scores) / len(scores)
-    others = [f.name for f in fields(CoveredScores) if f.name != "share"]
-    return CoveredScores(share, **{name: mean([getattr(s, name) for s in scores]) for name in others})
+    names = [f.name for f in fields(parts[0])]
+    return replace(parts[0], **{name: mean([getattr(part, name) for part in parts]) for name in names})
 
 
 @dataclass(frozen=True)

@@ -3,7 +3,9 @@
 NAME_rgb.png             with the water                NAME_clear.png            without it, white-balanced for display
 NAME_backscatter.png     the light of the water alone  NAME_clear_physical.png   before the white balance, 16 bits
 NAME_z_depth.png         depth in colors               NAME_z_depth.tif          z_depth, scene units, 32-bit floats
-NAME_alpha.png           opacity, 16 bits
+NAME_alpha.png           opacity, 16 bits                NAME_observed.png         white where a training frame saw it
+
+Surfaces that no training frame saw are hatched in NAME_rgb.png, NAME_clear.png and the flight: the map guesses.
 """
 
 from collections.abc import Iterable, Sequence
@@ -13,7 +15,7 @@ from pathlib import Path
 
 import numpy as np
 import torch
-from jaxtyping import Float, UInt8
+from jaxtyping import Bool, Float, UInt8
 from torch import Tensor
 
 from swimm3r import devices
@@ -44,6 +46,7 @@ from swimm3r.splat.training_poses import axes_of_map
 
 KINDS = ("rgb", "clear", "clear_physical", "backscatter", "z_depth")
 """The PNG files of one view, NAME_KIND.png."""
+_HATCH = 16  # pixels between the lines over what no training frame saw
 _RATE = 15  # images per second of the flight
 _X264 = {"crf": "23", "preset": "medium", "x264-params": "mbtree=0"}
 """Options of the video encoder, which gives the same bits for the same images: the vector code of its macroblock tree
@@ -81,14 +84,26 @@ def physical_clear(out: RenderOutput, camera: Cameras, style: DisplayStyle) -> F
     return shown_clear(out, camera, replace(style, gains=torch.ones(3)))
 
 
+def marked(image: Float[Tensor, "h w 3"], observed: Bool[Tensor, "h w"] | None) -> Float[Tensor, "h w 3"]:
+    """An image for people whose unobserved parts are gray and hatched; as it is of maps that do not know them."""
+    if observed is None:
+        return image
+    row, column = torch.meshgrid(*(torch.arange(side) for side in observed.shape), indexing="ij")
+    hatch = torch.where((row + column) % _HATCH < _HATCH // 4, 0.35, 0.55)[..., None]
+    return torch.where(observed[..., None], image, 0.3 * image.mean(-1, keepdim=True) + 0.7 * hatch)
+
+
 def write_view(folder: Path, stem: str, out: RenderOutput, camera: Cameras, style: DisplayStyle) -> None:
     """The files of one view, as the head of this module lists them."""
-    shown = {"rgb": out.rgb, "clear": shown_clear(out, camera, style), "backscatter": out.backscatter}
+    shown = {"rgb": marked(out.rgb, out.observed), "clear": marked(shown_clear(out, camera, style), out.observed)}
+    shown |= {"backscatter": out.backscatter}
     for kind, image in shown.items():
         images.write_rgb(folder / f"{stem}_{kind}.png", image.numpy())
     images.write_rgb_16(folder / f"{stem}_clear_physical.png", physical_clear(out, camera, style).numpy())
     images.write_rgb(folder / f"{stem}_z_depth.png", depth_image(out.z_depth.numpy(), *style.near_far))
     write_depth(folder / f"{stem}_z_depth.tif", out.z_depth.numpy())
+    if out.observed is not None:
+        images.write_levels(folder / f"{stem}_observed.png", out.observed.numpy().astype(np.uint16) * 65535)
     images.write_levels(folder / f"{stem}_alpha.png", (out.alpha.numpy().clip(0, 1) * 65535 + 0.5).astype(np.uint16))
 
 
@@ -125,7 +140,7 @@ def write_video(
             progress("filming the flight", i, len(times))
             camera = replace(canvas, cam2world=pose[None])
             out = scene.render(camera, times[i])
-            both = torch.cat([out.rgb, shown_clear(out, camera, style)], 1)
+            both = torch.cat([marked(image, out.observed) for image in (out.rgb, shown_clear(out, camera, style))], 1)
             yield (both.clamp(0, 1) * 255).round().to(torch.uint8).numpy()
         progress("filming the flight", len(times), len(times))
 

@@ -19,7 +19,7 @@ from swimm3r.geometry import DegenerateAlignmentError, align_poses, align_simila
 from swimm3r.imaging.undistortion import nearest_pixels, undistorted, undistorted_matches
 from swimm3r.io.files.metrics_log import read_rows
 from swimm3r.medium import Medium, MediumFit, remove_water, rescale
-from swimm3r.pipeline.held_out import HeldOutView, cut, mean_covered, mean_scores, protocol
+from swimm3r.pipeline.held_out import HeldOutView, cut, mean_part, mean_scores, protocol
 from swimm3r.progress import Progress, silent
 from swimm3r.scene.frames import Frames
 from swimm3r.scene.ground_truth import GroundTruth
@@ -111,7 +111,8 @@ def test_section(views: Sequence[HeldOutView], settings: PoseRefinementSettings,
     """Mean scores of the frames that training did not see, and how they were placed and compared."""
     means = {
         **vars(mean_scores(views)),
-        **mean_covered(views).summary(),
+        **mean_part([view.observed for view in views]).summary(),
+        **mean_part([view.covered for view in views]).summary(),
         "protocol": protocol(views, settings, recolored),
     }
     return summary_entries(means) | {"frames": [frame_entry(view) for view in views]}
@@ -120,7 +121,7 @@ def test_section(views: Sequence[HeldOutView], settings: PoseRefinementSettings,
 def frame_entry(view: HeldOutView) -> dict[str, object]:
     """The scores of one test frame."""
     of_frame = {name: getattr(view.scores, name) for name in ("psnr", "ssim", "lpips", "blur4_psnr", "sharpness")}
-    return {"name": view.name} | summary_entries({**of_frame, **view.covered.summary()})
+    return {"name": view.name} | summary_entries({**of_frame, **view.observed.summary(), **view.covered.summary()})
 
 
 def mean_medium(scene: SplatMap, rec: Reconstruction, frames: Frames) -> Medium:

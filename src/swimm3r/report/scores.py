@@ -49,9 +49,18 @@ def test_figures(summary: dict[str, Any]) -> list[Figure]:
         Figure(_number(test["ssim"], 3), "SSIM, at most 1"),
         Figure(_number(test["lpips"], 3), "LPIPS, lower is better", test.get("lpips_reason") or ""),
         Figure(f"{_number(test['sharpness'], 0, 100)} %", "Sharpness of the frames kept"),
+        *_observed_figures(test),
         *_registration_figures(test),
         Figure(f"{splat['primitives']:,}", "Primitives", f"{splat['iterations']:,} steps, recipe {splat['recipe']}"),
     ]
+
+
+def _observed_figures(test: dict[str, Any]) -> list[Figure]:
+    """The score of what training frames saw, and how much that is; nothing of maps that do not know."""
+    if not isinstance(test.get("observed"), float):
+        return []
+    rest = f"{_number(test['observed'], 0, 100)} % of the test frames; the rest is hatched in the pictures"
+    return [Figure(f"{_number(test['psnr_observed'], 1)} dB", "PSNR of what training frames saw", rest)]
 
 
 def _registration_figures(test: dict[str, Any]) -> list[Figure]:

@@ -2,9 +2,9 @@
 
 map.safetensors (`schema` 2) holds the primitives as stored (before activation), the water, and in its header
 the recipe, its settings, the metric flag, the working unit and when the clip begins and ends; also the training
-frames' poses where they were refined, their colors where each has its own, and the camera that notebooks show the map
-from. That of a large map (`schema` 3) holds no primitives but lists the files of its blocks (`splat.block_store`),
-which lie in blocks/ beside it. A checkpoint adds the optimizer's moments and the step.
+frames' poses where they were refined, their colors where each has its own, small depth images of them, and the camera
+that notebooks show the map from. That of a large map (`schema` 3) holds no primitives but lists the files of its blocks
+(`splat.block_store`), which lie in blocks/ beside it. A checkpoint adds the optimizer's moments and the step.
 """
 
 from collections.abc import Mapping
@@ -22,6 +22,7 @@ from swimm3r.settings_document import from_document
 from swimm3r.splat.appearance import FrameColors
 from swimm3r.splat.block_store import BlockEntry, StoredBlocks
 from swimm3r.splat.primitives.kinds import primitives_from
+from swimm3r.splat.projection.observed import coverage_from
 from swimm3r.splat.recipes import recipe_parts
 from swimm3r.splat.rendering import SCHEMA, SCHEMA_IN_BLOCKS, SplatMap
 from swimm3r.splat.settings import IN_BLOCKS, RECIPES, RecipeName, settings_of
@@ -86,6 +87,7 @@ def load_map(path: str | Path) -> SplatMap:
             )
         except RuntimeError as error:  # torch on missing names and other shapes
             raise ValueError(" ".join(str(error).split())) from error
+        coverage = coverage_from(stored.tensors)
         poses = None
         if about.frames is not None:
             poses = RefinedPoses(about.frames, _poses(stored.tensors, len(about.frames)))
@@ -97,7 +99,17 @@ def load_map(path: str | Path) -> SplatMap:
             blocks.check_files()
     field.requires_grad_(False)
     return SplatMap(
-        primitives, field, settings, about.metric, about.length, about.span, poses, viewpoint, blocks, colors
+        primitives,
+        field,
+        settings,
+        about.metric,
+        about.length,
+        about.span,
+        poses,
+        viewpoint,
+        blocks,
+        colors,
+        coverage,
     )
 
 

@@ -24,8 +24,9 @@ from swimm3r.splat.pose_mlp import moved
 from swimm3r.splat.primitives.beta import select
 from swimm3r.splat.primitives.kinds import Primitives
 from swimm3r.splat.projection.dispatch import project
+from swimm3r.splat.projection.observed import TrainingCoverage
 from swimm3r.splat.projection.pinhole import pinhole
-from swimm3r.splat.rendering import SplatMap, images, memory_for_views, settings_in_scene_units
+from swimm3r.splat.rendering import SplatMap, expected_z_depth, images, memory_for_views, settings_in_scene_units
 from swimm3r.splat.settings import PoseRefinementSettings
 
 _DARK = 0.01  # sum of R, G, B below which a pixel is not looked at
@@ -53,7 +54,7 @@ def refine_pose(
     progress: Progress = silent,
     time: float | None = None,
 ) -> RefinedPose:
-    """The pose near `camera`'s from which the map looks most like the image; the given one where none looks better.
+    """The pose near `camera`'s from which the map looks most like the image; the given one where that gains little.
 
     `image` and `mask` are the frame as prepared, distortion included; `time` is when it was taken, seconds.
     """
@@ -76,7 +77,7 @@ def refine_pose(
     progress("refining a pose", settings.steps, settings.steps)
     with torch.no_grad():
         end, pose = float(looks[-1].loss(delta)), looks[-1].pose(delta)
-    if end < start:
+    if end < (1 - settings.least_gain) * start:
         return RefinedPose(replace(camera, cam2world=pose[None]), start, end)
     return RefinedPose(camera, start, start)
 
@@ -101,6 +102,21 @@ class _Look:
         self._seen = seen.to(scene.device)
         self._units = settings_in_scene_units(scene.settings, scene.length)
         self._primitives = in_sight(scene, self._canvas, self._now)
+        if scene.coverage is not None:
+            self._leave_out(~self._observed(scene.coverage), settings.min_edges)
+
+    def _observed(self, coverage: TrainingCoverage) -> Bool[Tensor, "h w"]:
+        """Mask of what training frames saw of the first pose's view."""
+        with torch.no_grad():
+            view = pinhole(self._canvas).to(self._scene.device)
+            shown = images(self._primitives, self._scene.field, view, self._units, self._now)
+        return coverage.of_view(self._canvas, expected_z_depth(shown), shown.alpha).to(self._scene.device)
+
+    def _leave_out(self, unknown: Bool[Tensor, "h w"], least: float) -> None:
+        """Take no account of pixels that the map cannot know, unless hardly any is left."""
+        known = self._wanted & ~unknown
+        if int(known.sum()) >= least * known.numel():
+            self._wanted, self._seen = known, self._seen & ~unknown
 
     def pose(self, delta: Float[Tensor, "9"]) -> Float[Tensor, "4 4"]:
         """cam2world after the motion."""

@@ -35,6 +35,7 @@ from swimm3r.splat.medium.seasplat import SceneWater, WaterLayer, layer, relativ
 from swimm3r.splat.primitives.beta import BetaPrimitives, select
 from swimm3r.splat.primitives.kinds import Primitives
 from swimm3r.splat.projection.dispatch import project
+from swimm3r.splat.projection.observed import TrainingCoverage
 from swimm3r.splat.projection.pinhole import Pinhole, Projection, pinhole
 from swimm3r.splat.settings import SplatSettings, UwbsSettings
 from swimm3r.splat.training_poses import RefinedPoses
@@ -57,6 +58,7 @@ class RenderOutput:
     z_depth: Float[Tensor, "h w"]  # expected, scene units; 0 where nothing is
     alpha: Float[Tensor, "h w"]
     medium: Medium  # per pixel, [h, w, 3], per scene unit of ray depth
+    observed: Bool[Tensor, "h w"] | None = None  # what some training frame saw; None of maps without that record
 
     def __repr__(self) -> str:
         height, width = self.alpha.shape
@@ -85,6 +87,7 @@ class SplatMap:
     viewpoint: Cameras | None = None  # the pinhole camera of a training frame, from where notebooks show the map
     blocks: StoredBlocks | None = None  # None: all primitives are in memory
     colors: FrameColors | None = None  # of the training frames; None where all have the dive's
+    coverage: TrainingCoverage | None = None  # what training frames saw; None of maps made before it was kept
 
     def __repr__(self) -> str:
         moving = f", {self.span[0]:.1f} to {self.span[1]:.1f} s" if self.dynamic else ""
@@ -131,6 +134,13 @@ class SplatMap:
         blocks = None if self.blocks is None else self.blocks.within(holds)
         return replace(self, primitives=select(self.primitives, holds(self.primitives.xyz)), blocks=blocks)
 
+    def observed_part(self) -> "SplatMap":
+        """The map without what no training frame saw, nor what lies far behind what it saw; all where it is unknown."""
+        coverage = self.coverage
+        if coverage is None:
+            return self
+        return self.within(lambda xyz: coverage.needs(xyz.cpu()).to(xyz.device))
+
     @property
     def has_water(self) -> bool:
         """Return whether it tells water and scene apart."""
@@ -176,6 +186,8 @@ class SplatMap:
         if self.colors is not None:
             tensors["colors.maps"] = self.colors.maps
             about["colors"] = self.colors.names
+        if self.coverage is not None:
+            tensors |= self.coverage.tensors()
         if self.blocks is not None:
             self.blocks.copy_to(Path(path).parent)
             about |= {"blocks": [asdict(entry) for entry in self.blocks.entries], "key": self.blocks.key}
@@ -292,17 +304,21 @@ def render(scene: SplatMap, camera: Cameras, time: float | None = None) -> Rende
             medium, backscatter = _as_coefficients(scene.field, over, images, view), over.backscatter
             images = images._replace(rgb=seen_through(images.clear, over))
     there = camera.cam2world.device
+    z_depth, observed = expected_z_depth(images).to(there), None
+    if scene.coverage is not None:
+        observed = scene.coverage.of_view(camera, z_depth, images.alpha.to(there)).to(there)
     return RenderOutput(
         rgb=images.rgb.permute(1, 2, 0).to(there),
         clear=surface_color(images).permute(1, 2, 0).to(there),
         backscatter=backscatter.permute(1, 2, 0).to(there),
-        z_depth=expected_z_depth(images).to(there),
+        z_depth=z_depth,
         alpha=images.alpha.to(there),
         medium=Medium(
             Binf=medium.Binf.permute(1, 2, 0).to(there),
             beta_D=medium.beta_D.permute(1, 2, 0).to(there),
             beta_B=medium.beta_B.permute(1, 2, 0).to(there),
         ),
+        observed=observed,
     )
 
 

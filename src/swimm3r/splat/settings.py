@@ -276,6 +276,9 @@ class PoseRefinementSettings(Settings):
     """Image gradient, in medians, above which pixels count."""
     min_edges: Share = 0.01
     """Share of the image below which all pixels count instead of those at edges."""
+    least_gain: Share = 0.02
+    """Share of its loss that a refined pose must save to replace the first one; less says that the map hardly shows
+    what the frame shows."""
 
 
 SplatSettings = UwbsSettings | WaterSplattingSettings | SeaSplatSettings | McmcGsSettings

@@ -12,6 +12,7 @@ from swimm3r import devices
 from swimm3r.cameras import Cameras
 from swimm3r.devices import CPU
 from swimm3r.errors import UsageError
+from swimm3r.imaging.undistortion import nearest_pixels, shown_pixels
 from swimm3r.progress import Progress, silent
 from swimm3r.scene.frames import Frames
 from swimm3r.scene.reconstruction import Reconstruction
@@ -20,6 +21,7 @@ from swimm3r.splat.block_store import no_primitives
 from swimm3r.splat.blocks.plan import PlannedBlock, plan_blocks, surface_of
 from swimm3r.splat.blocks.training import train_in_blocks
 from swimm3r.splat.medium.field import in_unit
+from swimm3r.splat.projection.observed import MOST, SIDE, TrainingCoverage, coverage_of
 from swimm3r.splat.recipes import recipe_parts
 from swimm3r.splat.rendering import SplatMap
 from swimm3r.splat.settings import IN_BLOCKS, BlockSettings, SplatSettings, UwbsSettings
@@ -27,7 +29,7 @@ from swimm3r.splat.training import loop
 from swimm3r.splat.training.observer import Observer
 from swimm3r.splat.training.scene import TrainingScene, path_radius
 from swimm3r.splat.training.state import map_in_scene_units
-from swimm3r.splat.training_poses import RefinedPoses, training_poses_of, write_refined
+from swimm3r.splat.training_poses import RefinedPoses, as_mapped, training_poses_of, write_refined
 from swimm3r.splat.views import TrainingViews, median_z_depth, working_scale
 from swimm3r.tasks.settings import EngineSettings
 
@@ -74,6 +76,7 @@ def train(
     scene = SplatMap(
         primitives, field, settings, rec.metric, 1 / scale, frames.span, poses, viewpoint, colors=views.colors
     )
+    scene = replace(scene, coverage=seen_in_training(scene, rec, frames, views.names))
     scene.save(folder / "map.safetensors")
     return scene
 
@@ -93,13 +96,30 @@ def _in_blocks(
     """A map whose primitives stay on disk."""
     trained = train_in_blocks(rec, frames, settings, plan, scale, folder, progress, device, observer, engine)
     field = in_unit(copy.deepcopy(trained.water), 1 / scale)
-    viewpoint = _viewpoint(rec, TrainingViews(rec, frames, settings, scale), None)
+    views = TrainingViews(rec, frames, settings, scale)
+    viewpoint = _viewpoint(rec, views, None)
     blocks = trained.blocks
     scene = SplatMap(
         no_primitives(), field, trained.settings, rec.metric, 1 / scale, frames.span, None, viewpoint, blocks
     )
+    scene = scene.to(device)
+    scene = replace(scene, coverage=seen_in_training(scene, rec, frames, views.names))
     scene.save(folder / "map.safetensors")
-    return scene.to(device)
+    return scene
+
+
+def seen_in_training(scene: SplatMap, rec: Reconstruction, frames: Frames, names: Sequence[str]) -> TrainingCoverage:
+    """Small images of the training frames as the finished map renders their depth."""
+    cameras = as_mapped(rec, scene.poses).cameras
+    chosen, canvases, views, admitted = names[:: -(-len(names) // MOST)], [], [], []
+    for name in chosen:
+        lens, f = cameras[rec.index(name)], frames.index(name)
+        canvases.append(lens.pinhole(SIDE))
+        views.append(scene.render(canvases[-1], frames.frames[f].time))
+        row, column = nearest_pixels(lens, canvases[-1])
+        admitted.append(shown_pixels(lens, canvases[-1]) & frames.mask(f)[row, column])
+    small = cameras[[rec.index(name) for name in chosen]].pinhole(SIDE)
+    return coverage_of(small, [view.z_depth for view in views], [view.alpha for view in views], admitted)
 
 
 def _viewpoint(rec: Reconstruction, views: TrainingViews, poses: RefinedPoses | None) -> Cameras:
