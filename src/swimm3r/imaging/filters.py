@@ -1,10 +1,16 @@
-"""Smoothing of images: over all neighbors, or along those that look alike."""
+"""Images in gray, and smoothed: over all neighbors, or along those that look alike."""
 
+import numpy as np
 import torch
-from jaxtyping import Float
+from jaxtyping import Float, UInt8
 from torch import Tensor
 
 LUMA = torch.tensor([0.299, 0.587, 0.114])  # ITU-R BT.601
+
+
+def gray_levels(image: Float[Tensor, "h w 3"]) -> UInt8[np.ndarray, "h w"]:
+    """Luma in 0..255, as OpenCV's detectors and trackers take images."""
+    return (image.numpy() @ LUMA.numpy() * 255).round().astype(np.uint8)
 
 
 def blur(x: Float[Tensor, "h w c"], sigma: float) -> Float[Tensor, "h w c"]:

@@ -7,7 +7,7 @@ side. So the number of keyframes follows the ground that a dive covers, not the 
 from collections.abc import Callable, Sequence
 
 import numpy as np
-from jaxtyping import Float, UInt8
+from jaxtyping import Bool, Float, UInt8
 
 from swimm3r.progress import Progress, silent
 
@@ -63,23 +63,20 @@ def displacement(before: UInt8[np.ndarray, "h w"], after: UInt8[np.ndarray, "h w
     corners = cv2.goodFeaturesToTrack(before, _CORNERS, 0.005, 5)
     if corners is None or len(corners) < _FEW:
         return None
-    there, back = tracked(before, after, corners[:, 0])
-    kept = np.linalg.norm(back - corners[:, 0], axis=1) < _CONSISTENT
-    if kept.sum() < max(_FEW, _LOST * len(corners)):
+    there, found = tracked(before, after, corners[:, 0])
+    if found.sum() < max(_FEW, _LOST * len(corners)):
         return None
-    return float(np.median(np.linalg.norm((there - corners[:, 0])[kept], axis=1)) / max(before.shape))
+    return float(np.median(np.linalg.norm((there - corners[:, 0])[found], axis=1)) / max(before.shape))
 
 
 def tracked(
     before: UInt8[np.ndarray, "h w"], after: UInt8[np.ndarray, "h w"], xy: Float[np.ndarray, "n 2"]
-) -> tuple[Float[np.ndarray, "n 2"], Float[np.ndarray, "n 2"]]:
-    """Positions of points in another image, and of those tracked back; infinite where they were lost."""
+) -> tuple[Float[np.ndarray, "n 2"], Bool[np.ndarray, " n"]]:
+    """Positions of points in another image, and whether they are found: tracked back, they return to where they were."""
     import cv2
 
     start = np.ascontiguousarray(xy, np.float32)[:, None]
     there, found, _ = cv2.calcOpticalFlowPyrLK(before, after, start, start.copy(), winSize=_WINDOW, maxLevel=_LEVELS)
     back, returned, _ = cv2.calcOpticalFlowPyrLK(after, before, there, there.copy(), winSize=_WINDOW, maxLevel=_LEVELS)
-    lost = (found[:, 0] == 0) | (returned[:, 0] == 0)
-    there, back = there[:, 0], back[:, 0]
-    there[lost], back[lost] = np.inf, np.inf
-    return there, back
+    returns = np.linalg.norm(back[:, 0] - xy, axis=1) < _CONSISTENT
+    return there[:, 0], (found[:, 0] > 0) & (returned[:, 0] > 0) & returns

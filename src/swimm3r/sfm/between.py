@@ -11,11 +11,11 @@ from pathlib import Path
 
 import numpy as np
 import torch
-from jaxtyping import Float, UInt8
+from jaxtyping import Float
 from torch import Tensor
 
 from swimm3r.cameras import Cameras
-from swimm3r.imaging.filters import LUMA
+from swimm3r.imaging.filters import gray_levels
 from swimm3r.io.cameras_json import CameraTable, read_own_cameras
 from swimm3r.io.colmap.model import silence_log
 from swimm3r.io.files.damage import remake
@@ -31,7 +31,6 @@ _POINTS = 400  # of a keyframe that are tracked
 _FEWEST = 12  # points that must agree on a pose
 _MAX_ERROR = 4.0  # pixels of an image of 1000, as in mapping; never less than _LEAST_ERROR
 _LEAST_ERROR = 2.0
-_CONSISTENT = 1.0  # pixels between a point and where it returns to when tracked there and back
 _STEP = "placing frames between keyframes"
 
 
@@ -91,13 +90,12 @@ def _place(
     observations: list[tuple[np.ndarray, np.ndarray]],
 ) -> Float[Tensor, "4 4"] | None:
     """cam2world of a frame from the registered ones before and after it; None where too few points agree."""
-    image = _gray(frames, i)
+    image = gray_levels(frames.image(i))
     pixels, points = [], []
     for k, row in around:
         xy, xyz = observations[row]
         if len(xy):
-            there, back = tracked(_gray(frames, k), image, xy)
-            found = (np.linalg.norm(back - xy, axis=1) < _CONSISTENT) & np.isfinite(there).all(1)
+            there, found = tracked(gray_levels(frames.image(k)), image, xy)
             pixels.append(there[found])
             points.append(xyz[found])
     if sum(map(len, pixels)) < _FEWEST:
@@ -108,7 +106,3 @@ def _place(
     if estimate is None or int(estimate[1].sum()) < _FEWEST:
         return None
     return estimate[0]
-
-
-def _gray(frames: Frames, i: int) -> UInt8[np.ndarray, "h w"]:
-    return (frames.image(i).numpy() @ LUMA.numpy() * 255).round().astype(np.uint8)

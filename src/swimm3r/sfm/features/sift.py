@@ -14,7 +14,7 @@ import torch
 from jaxtyping import Bool, Float, Int
 from torch import Tensor
 
-from swimm3r.imaging.filters import LUMA
+from swimm3r.imaging.filters import gray_levels
 from swimm3r.sfm.settings import FeatureSettings
 
 if TYPE_CHECKING:
@@ -38,7 +38,7 @@ def extract_features(image: Float[Tensor, "h w 3"], usable: Bool[Tensor, "h w"],
     import pycolmap
 
     # Rec. 601 luma, as every SIFT is fed
-    gray = (image.numpy() @ LUMA.numpy() * 255).round().astype(np.uint8)
+    gray = gray_levels(image)
     height, width = gray.shape
     scale = min(1.0, settings.long_side / max(height, width))
     if scale < 1:
