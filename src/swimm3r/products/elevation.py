@@ -39,7 +39,7 @@ def elevation(survey: Survey, grid: Grid, window: Window, frames: list[int], min
     weights = np.zeros((layers, *shape), np.float32)
     views = np.zeros(shape, np.uint16)
     for i in frames:
-        top, confidence = seen_from_above(survey.points(i), grid, window)
+        top, confidence = seen_from_above(survey.points(i), grid, window, survey.footprint)
         _push(top, confidence, heights, weights, views)
     height, std, confidence = _medians(heights, weights, views, min_views)
     views = np.where(np.isnan(height), 0, views).astype(np.uint16)

@@ -72,7 +72,7 @@ def blended(
         for kind in colors:
             image = survey.image(kind, i)
             if image is not None:
-                sums[kind].add(_scaled(image, points.size, seen.pixel), seen, near, image.shape[1])
+                sums[kind].add(_scaled(image, points.size, seen.pixel), seen, near, survey.rec.cameras.width)
     return {kind: added.colors() for kind, added in sums.items()}
 
 
@@ -161,7 +161,7 @@ class _Sums:
 
 def _scaled(image: Float32[np.ndarray, "h w 3"], size: float, pixel: float) -> Float32[np.ndarray, "h2 w2 3"]:
     """The image with pixels about as large as the area that a point stands for, averaged, where its own are smaller."""
-    scale = pixel / size if size > 0 else 1.0
+    scale = pixel / size if size > 0 else 1.0  # of the frame, whose image is of its size
     if scale >= 0.75:
         return image
     height, width = image.shape[:2]

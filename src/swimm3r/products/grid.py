@@ -12,7 +12,7 @@ import numpy as np
 from jaxtyping import Float
 
 from swimm3r.errors import InputError, UsageError
-from swimm3r.products.survey import Survey, pixel_footprint
+from swimm3r.products.survey import Survey
 from swimm3r.scene.georeference import Georeference
 
 _STEPS = (1, 1.2, 1.5, 2, 2.5, 3, 4, 5, 6, 8, 10)  # of cell sizes chosen from the data, in every decade
@@ -78,7 +78,7 @@ def grid_of(survey: Survey, gsd: float | None = None) -> Grid:
 
     Raises InputError where nothing was measured, UsageError where the cells are too many.
     """
-    footprint, g = pixel_footprint(survey), survey.place.grid_scale
+    footprint, g = survey.footprint, survey.place.grid_scale
     on_map = chosen_gsd(footprint) if gsd is None else gsd
     low, high = _extent(survey, max(_COARSE * footprint, on_map / g))
     origin = np.asarray(survey.place.origin[:2])

@@ -63,7 +63,7 @@ def _color_bar(
     rows: int, long_side: int, low: float, high: float, unit: str, colors: int
 ) -> UInt8[np.ndarray, "rows columns 3"]:
     wide, size = max(8, round(_BAR * long_side)), max(0.35, long_side / 1600)
-    top, bottom = min(rows // 4, round(30 * size) + 4), max(1, min(rows // 4, round(12 * size) + 4))
+    top, bottom = min(rows // 4, round(52 * size) + 4), max(1, min(rows // 4, round(12 * size) + 4))
     bar = np.full((rows, wide * 2 + round(150 * size), 3), _PAPER, np.uint8)
     ramp = np.linspace(255, 0, max(2, rows - top - bottom)).astype(np.uint8)
     bar[top : top + len(ramp), wide : 2 * wide] = cv2.applyColorMap(ramp[:, None], colors)[..., ::-1]
@@ -73,7 +73,9 @@ def _color_bar(
         text = f"{low + (high - low) * k / (_MARKS - 1):.{decimals}f}"
         at = (2 * wide + 6, y + round(5 * size))
         cv2.putText(draw, text, at, cv2.FONT_HERSHEY_SIMPLEX, size, (40, 40, 40), 1, cv2.LINE_AA)
-    cv2.putText(draw, unit, (wide, top - 6), cv2.FONT_HERSHEY_SIMPLEX, size, (40, 40, 40), 1, cv2.LINE_AA)
+    cv2.putText(
+        draw, unit, (wide, top - round(18 * size) - 4), cv2.FONT_HERSHEY_SIMPLEX, size, (40, 40, 40), 1, cv2.LINE_AA
+    )
     return draw
 
 

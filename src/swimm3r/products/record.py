@@ -1,6 +1,7 @@
 """RUN/products/products.json: the products of a run, their grid and their figures."""
 
 import json
+import math
 from dataclasses import asdict, dataclass
 from pathlib import Path
 
@@ -64,8 +65,9 @@ class ProductsRecord:
             f" ({self.area:.4g}{area_std} {u}²)"
         ]
         if self.lowest is not None and self.highest is not None:
+            digits = max(0, -math.floor(math.log10(self.height_std or self.gsd)))
             std = "" if self.height_std is None else f" ± {self.height_std:.2g} {u} (median of a cell, one view)"
-            lines.append(f"Heights: {self.lowest:.4g} to {self.highest:.4g} {u}{std}")
+            lines.append(f"Heights: {self.lowest:.{digits}f} to {self.highest:.{digits}f} {u}{std}")
         scale = "relative standard deviation not known" if self.scale_std is None else f"± {self.scale_std:.2%}"
         if u == "m":
             lines.append(f"Scale: {scale}, from {', '.join(self.sources) or 'the poses that were given'}")

@@ -90,6 +90,21 @@ class Survey:
                 medians.append(float(z[z > 0].median()))
         return _FARTHEST * float(np.median(medians)) * self.scale if medians else np.inf
 
+    @cached_property
+    def footprint(self) -> float:
+        """Median size of an image's pixel on the surface, local units. Raises InputError where no frame has depth."""
+        found = []
+        for i in self.overview:
+            points, K = self.points(i, sampled=True), self.rec.cameras.K[i]
+            found.append(float(np.median(points.z_depth[points.usable])) / float(torch.sqrt(K[0, 0] * K[1, 1])))
+        if not found:
+            raise InputError(
+                f"the depth maps of {self.folder} are empty",
+                cause="no surface was confirmed by a second frame, or masks exclude all of it",
+                hint="frames with more overlap; masks of less",
+            )
+        return float(np.median(found))
+
     def points(self, i: int, *, sampled: bool = False) -> SurfacePoints:
         """The surface that a frame's depth map is of; `sampled`: a few pixels of it."""
         name = self.rec.names[i]
@@ -139,23 +154,6 @@ def open_survey(folder: Path) -> Survey:
     frames = load_frames(folder / "prepare")
     rec = load_reconstruction(folder / "sfm", frames)
     return Survey(folder, rec, frames, load_georeference(folder) or local_georeference(rec))
-
-
-def pixel_footprint(survey: Survey) -> float:
-    """Median size of an image's pixel on the surface, local units. Raises InputError where no frame has depth."""
-    found = []
-    for i in survey.indices:
-        points = survey.points(i, sampled=True)
-        if points.usable.any():
-            K = survey.rec.cameras.K[i]
-            found.append(float(np.median(points.z_depth[points.usable])) / float(torch.sqrt(K[0, 0] * K[1, 1])))
-    if not found:
-        raise InputError(
-            f"the depth maps of {survey.folder} are empty",
-            cause="no surface was confirmed by a second frame, or masks exclude all of it",
-            hint="frames with more overlap; masks of less",
-        )
-    return float(np.median(found))
 
 
 def _resized_mask(usable: Bool[np.ndarray, "h w"], width: int, height: int) -> Bool[np.ndarray, "*n"]:

@@ -44,7 +44,7 @@ def poisson_mesh(cloud: OrientedCloud, spacing: float, place: Georeference, thre
     trimesh: Any = geo_package("trimesh")
     thinned = voxel_means(cloud, spacing)
     extent = float(np.ptp(thinned.xyz, axis=0).max()) * 1.1
-    depth = min(max(math.ceil(math.log2(max(extent / spacing, 2))), _LEAST_DEPTH), _MOST_DEPTH)
+    depth = min(max(round(math.log2(max(extent / spacing, 2))), _LEAST_DEPTH), _MOST_DEPTH)
     with TemporaryDirectory() as folder:
         given, made = Path(folder) / "points.ply", Path(folder) / "mesh.ply"
         middle = thinned.xyz.mean(0)
