@@ -72,7 +72,7 @@ def displacement(before: UInt8[np.ndarray, "h w"], after: UInt8[np.ndarray, "h w
 def tracked(
     before: UInt8[np.ndarray, "h w"], after: UInt8[np.ndarray, "h w"], xy: Float[np.ndarray, "n 2"]
 ) -> tuple[Float[np.ndarray, "n 2"], Bool[np.ndarray, " n"]]:
-    """Positions of points in another image, and whether they are found: tracked back, they return to where they were."""
+    """Positions of points in another image, and whether each is found: tracked back, it returns to where it was."""
     import cv2
 
     start = np.ascontiguousarray(xy, np.float32)[:, None]
