@@ -208,3 +208,27 @@ def test_the_command_prints_the_figures_and_the_report_shows_the_maps(
 def test_marks_of_a_color_bar_tell_deep_heights_apart():
     assert f"{-1855.5:.{decimals_of(0.5)}f}" == "-1855.50"
     assert [decimals_of(step) for step in (0.004, 0.5, 1.0, 12.0, 300.0)] == [4, 2, 1, 0, 0]
+
+
+def test_run_makes_the_products_of_what_it_finished(
+    seabed: Seabed, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+):
+    run = tmp_path / "run"
+    shutil.copytree(seabed.folder, run)
+    monkeypatch.setattr("swimm3r.cli.pipeline.run.run_stages", lambda *given: None)
+    main(["run", str(tmp_path), "--out", str(run), "--preset", "fast", "--products"])
+    record = read_record(run / "products")
+    assert record is not None
+    assert {"orthophoto.tif", "elevation.tif", "habitat.csv", "mesh.glb", "cloud.laz"} <= set(record.files)
+    assert "cells of" in capsys.readouterr().out
+
+
+def test_run_asks_for_the_packages_before_its_work(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+):
+    monkeypatch.setattr("swimm3r.cli.pipeline.run.run_stages", lambda *given: pytest.fail("the work began"))
+    monkeypatch.setitem(__import__("sys").modules, "laspy", None)
+    with pytest.raises(SystemExit) as stop:
+        main(["run", str(tmp_path), "--out", str(tmp_path / "run"), "--preset", "fast", "--products"])
+    assert stop.value.code == 5
+    assert "swimm3r[geo]" in capsys.readouterr().err

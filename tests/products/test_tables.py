@@ -2,6 +2,7 @@
 
 import csv
 import json
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -13,6 +14,7 @@ from tests.products.conftest import ORIGIN, SCALE_STD, Seabed, height
 
 from swimm3r.errors import InputError
 from swimm3r.products import ProductSettings, write_products
+from swimm3r.products.geotiff import crs_of
 from swimm3r.products.habitat.areas import along, read_areas
 from swimm3r.products.habitat.figures import NAMES, figures
 from swimm3r.products.record import ProductsRecord
@@ -199,3 +201,11 @@ def test_points_along_a_line_are_evenly_spaced_and_keep_its_ends():
     assert (len(points), distance[-1]) == (15, 7)
     np.testing.assert_allclose(points[[0, -1]], [[0, 0], [3, 4]])
     np.testing.assert_allclose(np.diff(distance), 0.5)
+
+
+def test_reference_systems_that_do_not_exist_are_named(tmp_path: Path, seabed: Seabed):
+    path = written(tmp_path / "areas.json", feature("Polygon", [SQUARE]), crs="EPSG:99999")
+    with pytest.raises(InputError, match="EPSG:99999"):
+        read_areas(path, PLACE)
+    with pytest.raises(InputError, match="EPSG:99999"):
+        crs_of(replace(PLACE, epsg=99999))

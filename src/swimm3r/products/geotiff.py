@@ -1,5 +1,6 @@
 """Maps as GeoTIFF: written tile by tile, then arranged for the cloud (COG, with overviews), whole or not at all."""
 
+import os
 from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -8,6 +9,7 @@ from typing import Any
 import numpy as np
 from jaxtyping import Float
 
+from swimm3r.errors import InputError
 from swimm3r.io.files.atomic import DRAFT, atomic_path
 from swimm3r.io.files.damage import Remedy, damaged
 from swimm3r.products.grid import Grid, Window
@@ -36,7 +38,7 @@ class MapFile:
     def __init__(self, path: Path, grid: Grid, place: Georeference, bands: Sequence[Band], dtype: str) -> None:
         rasterio = geo_package("rasterio")
         path.parent.mkdir(parents=True, exist_ok=True)
-        self.path, self._draft, self._bands = path, path.parent / f"{DRAFT}{path.stem}.tif", tuple(bands)
+        self.path, self._draft, self._bands = path, path.parent / f"{DRAFT}{os.getpid()}-{path.stem}.tif", tuple(bands)
         colored = tuple(bands) == RGBA
         self._file = rasterio.open(
             self._draft, "w", driver="GTiff", width=grid.columns, height=grid.rows, count=len(bands), dtype=dtype,
@@ -121,12 +123,23 @@ class StoredMap:
 
 
 def crs_of(place: Georeference) -> Any:
-    """The reference system of maps: a projected one, local metres, or none where the unit is not known."""
+    """The reference system of maps: a projected one, local metres, or none where the unit is not known.
+
+    Raises InputError where the georeference names a system that does not exist.
+    """
     geo_package("rasterio")
     from rasterio.crs import CRS
+    from rasterio.errors import CRSError
 
     if place.epsg is not None:
-        return CRS.from_epsg(place.epsg)
+        try:
+            return CRS.from_epsg(place.epsg)
+        except CRSError as error:
+            raise InputError(
+                f"EPSG:{place.epsg}, the reference system of the run, does not exist",
+                cause="a slip in the code that was given to swimm3r scale, or georeference.json was edited",
+                hint="swimm3r scale RUN with the right code",
+            ) from error
     return CRS.from_wkt(_LOCAL) if place.scale is not None else None
 
 

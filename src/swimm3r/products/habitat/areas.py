@@ -160,7 +160,10 @@ def _converter(path: Path, epsg: int | None, every: Ring, place: Georeference) -
     if epsg is None or epsg == place.epsg:
         return to_local
     pyproj = geo_package("pyproj")
-    transform = pyproj.Transformer.from_crs(epsg, place.epsg, always_xy=True)
+    try:
+        transform = pyproj.Transformer.from_crs(epsg, place.epsg, always_xy=True)
+    except pyproj.exceptions.ProjError as error:
+        raise damaged(path, f"there is no way from its EPSG:{epsg} to EPSG:{place.epsg} of the run", _REMEDY) from error
 
     def projected(ring: Ring) -> Ring:
         x, y = transform.transform(ring[:, 0], ring[:, 1])
