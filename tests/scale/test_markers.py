@@ -6,10 +6,12 @@ from pathlib import Path
 import cv2
 import numpy as np
 import pytest
+import torch
 from tests.scale.conftest import SCALE, Survey, lines, survey_along
 
 from swimm3r.errors import InputError
 from swimm3r.io.images import write_rgb
+from swimm3r.medium import srgb_from_linear
 from swimm3r.scale.estimate import estimate_scale
 from swimm3r.scale.markers import MarkerSizes, detect, find_markers, marker_sizes
 from swimm3r.scale.settings import ScaleSettings
@@ -55,7 +57,8 @@ def filmed(folder: Path, survey: Survey) -> Frames:
         source = np.array([[0, 5], [6, 5], [6, 0], [0, 0]], np.float32) * PER_METRE
         H = cv2.getPerspectiveTransform((source - 0.5).astype(np.float32), (ends[:, :2] - 0.5).astype(np.float32))
         image = cv2.warpPerspective(paper, H, (survey.frames.width, survey.frames.height), flags=cv2.INTER_AREA)
-        write_rgb(folder / frame.name, np.repeat(cv2.GaussianBlur(image, (0, 0), 0.7)[..., None] / 255, 3, -1))
+        light = cv2.GaussianBlur(image, (0, 0), 0.7)[..., None].repeat(3, -1) / 255  # blur is the lens's: linear
+        write_rgb(folder / frame.name, srgb_from_linear(torch.from_numpy(light)).numpy())
         listed.append(replace(frame, path=folder / frame.name))
     return replace(survey.frames, frames=tuple(listed))
 

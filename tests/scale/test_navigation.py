@@ -56,7 +56,7 @@ def test_the_attitude_shows_the_mounting_of_the_camera(survey):
 def test_the_standard_deviation_of_the_scale_is_that_of_repeated_dives():
     survey = survey_along(lines(each=12))
     errors, stds = [], []
-    for seed in range(24):
+    for seed in range(16):
         noise = 0.1 * np.random.default_rng(seed).normal(size=survey.position.shape)
         found = aligned(survey, survey.position + noise, attitude=None)
         errors.append(np.log(found.scale / SCALE))
@@ -266,7 +266,7 @@ def tilting_survey() -> Survey:
     """A survey whose vehicle pitches and rolls by tens of degrees."""
     from tests.scale import conftest
 
-    turn = np.linspace(0, 5, 48)
+    turn = np.linspace(0, 5, 20)
     base = survey_along(np.stack([2 * np.cos(turn), 2 * np.sin(turn), 2 + 0.1 * np.sin(5 * turn)], -1))
     angles = base.angles * [1, 8, 6]
     attitude = conftest.vehicle_attitude(*angles.T)

@@ -51,7 +51,7 @@ def test_the_standard_deviation_of_a_bar_is_that_of_repeated_marks(survey):
     xy, seen = survey.pixels(BAR)
     chosen = np.flatnonzero(seen.all(1))[:5]
     logs, stds = [], []
-    for seed in range(150):
+    for seed in range(80):
         noisy = xy + np.random.default_rng(seed).normal(size=xy.shape)
         points = [
             triangulate(survey.rec.cameras, [Sighting(int(i), tuple(noisy[i, k])) for i in chosen], 1.0) for k in (0, 1)

@@ -66,7 +66,3 @@ def test_a_square_has_its_size_and_turn():
     sides = np.linalg.norm(plate.corners - np.roll(plate.corners, 1, 0), axis=1)
     np.testing.assert_allclose(sides, 0.3)
     np.testing.assert_allclose(plate.corners.mean(0), [1, 2, 0.1])
-
-
-def test_without_markers_a_dive_is_as_it_was():
-    assert make_dive(replace(DIVE, markers=0)).plates == ()

@@ -25,8 +25,8 @@ MOUNTS = {  # camera axes (right, down, ahead of the image) in those of the vehi
 _UP_STD = np.radians(20.0)
 _REFINED = 2  # of the beginnings, the best ones
 _ROUNDS = 12
-_SETTLED = 1e-7  # of the sizes of the unknowns, between rounds
-_EVALUATIONS = 25  # in a round; a good beginning takes 4
+_SETTLED = 1e-6  # of the sizes of the unknowns, between rounds
+_EVALUATIONS = 12  # in a round; a good beginning takes 4
 _TUNING = 2.385  # of Cauchy's weights: 95% efficiency under Gaussian noise
 _LEAST_STD = 1e-4  # metres
 
