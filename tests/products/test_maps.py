@@ -1,6 +1,7 @@
 """Maps of an analytic seabed: heights, colors, place, holes, and how they are made in tiles."""
 
 import shutil
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -232,3 +233,10 @@ def test_run_asks_for_the_packages_before_its_work(
         main(["run", str(tmp_path), "--out", str(tmp_path / "run"), "--preset", "fast", "--products"])
     assert stop.value.code == 5
     assert "swimm3r[geo]" in capsys.readouterr().err
+
+
+@pytest.mark.parametrize("settings", [{"gsd": 50.0}, {"min_views": 200}])
+def test_a_map_without_any_height_is_refused_and_leaves_nothing(seabed: Seabed, tmp_path: Path, settings: dict):
+    with pytest.raises(InputError, match="no cell of the map"):
+        write_products(seabed.folder, tmp_path / "out", replace(MAPS, **settings), silent)
+    assert not (tmp_path / "out").exists()

@@ -8,6 +8,7 @@ from pathlib import Path
 
 import numpy as np
 
+from swimm3r.errors import InputError
 from swimm3r.io.files.cache_key import cache_key
 from swimm3r.io.files.outputs import output_folder
 from swimm3r.products.elevation import elevation, frames_over, hill_shade
@@ -82,6 +83,13 @@ def _write_maps(survey: Survey, grid: Grid, folder: Path, settings: ProductSetti
             progress("making maps", done, len(tiles))
             _write_tile(survey, grid, window, maps, kinds, totals, settings.min_views)
         progress("making maps", len(tiles), len(tiles))
+        if not totals.cells:
+            raise InputError(
+                "no cell of the map has a height",
+                cause=f"cells of {grid.gsd:g} {unit} are larger than the measured ground, or none is shown by"
+                f" {settings.min_views} depth maps",
+                hint="without --gsd and --min-views",
+            )
         about = {"TIFFTAG_SOFTWARE": f"Swimm3R {version('swimm3r')}"}
         totals.files += [map.finish(**about).name for map in maps.values()]
     return totals
