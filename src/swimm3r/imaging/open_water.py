@@ -16,6 +16,8 @@ from swimm3r.imaging.filters import LUMA, blur, local_linear
 _WINDOW = 7
 _RIM = 9  # pixels around a region in which its neighbors are looked for
 _SAMPLES = 50_000  # pixels whose quantiles stand for all
+_SPILL = 0.02  # of the longer side, how far depth spills over silhouettes
+_WATER_STD, _SURFACE_STD = 0.01, 0.03  # of colors about their local mean, at least
 _FEW = 100  # pixels of known depth that decide nothing
 
 
@@ -82,6 +84,58 @@ def sea_share(
     soft = local_linear(guide, hard[..., None], torch.ones_like(hard)[..., None], reach / 2, 2e-5)[..., 0]
     share = blur(torch.maximum(soft, hard)[..., None], reach / 5)[..., 0]
     return torch.where(z_depth > 0, 0.0, share.clamp(0, 1))
+
+
+def without_fringe(
+    image: Float[Tensor, "h w 3"], z_depth: Float[Tensor, "h w"], veil: Float[Tensor, "3"] | None = None
+) -> Float[Tensor, "h w"]:
+    """The depth without that of surfaces which spilled over their silhouettes into open water.
+
+    Depth from patches is a few pixels too wide around what stands before water without texture. Within that reach of
+    open water, and joined to it, pixels whose color is more likely that of the water nearby than that of the surface
+    farther in lose their depth.
+    """
+    water = sea_share(image, z_depth, veil) > 0.5
+    if not bool(water.any()):
+        return z_depth
+    reach = max(3, round(_SPILL * max(image.shape[:2])))
+    known = z_depth > 0
+    near = torch.from_numpy(_dilated(water.numpy(), reach)) & ~water
+    top, bottom, left, right = _bounds(near, 4 * reach)
+    part = (slice(top, bottom), slice(left, right))
+    smooth = blur(image[part], 0.7)
+    of_water, of_surface = (
+        _log_likelihood(smooth, image[part], of[part], 1.5 * reach, floor)
+        for of, floor in ((water, _WATER_STD), (known & ~near & ~water, _SURFACE_STD))
+    )
+    likelier = torch.zeros_like(water)
+    likelier[part] = near[part] & (of_water > of_surface)
+    joined = water.numpy().copy()
+    for _ in range(reach):
+        joined |= _dilated(joined, 1) & likelier.numpy()
+    return torch.where(torch.from_numpy(joined) & likelier & known, 0.0, z_depth)
+
+
+def _bounds(mask: Bool[Tensor, "h w"], margin: int) -> tuple[int, int, int, int]:
+    """Rows and columns around a mask's pixels; all of an empty one's."""
+    rows, columns = torch.nonzero(mask.any(1))[:, 0], torch.nonzero(mask.any(0))[:, 0]
+    if not len(rows):
+        return 0, mask.shape[0], 0, mask.shape[1]
+    low = [max(0, int(at[0]) - margin) for at in (rows, columns)]
+    high = [int(at[-1]) + margin + 1 for at in (rows, columns)]
+    return low[0], high[0], low[1], high[1]
+
+
+def _log_likelihood(
+    color: Float[Tensor, "h w 3"], image: Float[Tensor, "h w 3"], of: Bool[Tensor, "h w"], sigma: float, floor: float
+) -> Float[Tensor, "h w"]:
+    """Log density of colors under a normal distribution of the image's colors `of` which there are around."""
+    weight = of.float()[..., None]
+    total = blur(weight, sigma)
+    mean = blur(weight * image, sigma) / total.clamp(min=1e-6)
+    variance = (blur(weight * image**2, sigma) / total.clamp(min=1e-6) - mean**2).clamp(min=0) + floor**2
+    density = -((color - mean) ** 2 / (2 * variance) + variance.log() / 2).sum(-1)
+    return torch.where(total[..., 0] > 1e-4, density, -torch.inf)
 
 
 def _without_specks(found: np.ndarray, known: np.ndarray) -> np.ndarray:

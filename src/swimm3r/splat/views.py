@@ -16,7 +16,7 @@ from torch.nn.functional import interpolate
 
 from swimm3r.cameras import Cameras, pixel_grid, resized, unproject
 from swimm3r.errors import InputError
-from swimm3r.imaging.open_water import sea_share
+from swimm3r.imaging.open_water import sea_share, without_fringe
 from swimm3r.imaging.undistortion import nearest_pixels, undistorted
 from swimm3r.io.files.cache import ArrayCache
 from swimm3r.scene.frames import Frames
@@ -131,7 +131,10 @@ class TrainingViews:
         known = seen & z_depth.isfinite() & (z_depth > 0) & (confidence >= least)
         z_depth = torch.where(known, z_depth * self.scale, 0.0)
         fit = self.rec.medium
-        open_water = sea_share(rgb, z_depth, None if fit is None else fit.Binf) > 0.5
+        veil = None if fit is None else fit.Binf
+        if veil is not None:
+            z_depth = without_fringe(rgb, z_depth, veil)
+        open_water = sea_share(rgb, z_depth, veil) > 0.5
         return z_depth, open_water & seen
 
     def _inside(self, window: Window, canvas: Cameras, z_depth: Float[Tensor, "h w"]) -> Bool[Tensor, "h w"]:

@@ -14,7 +14,7 @@ and only where the frames say which colors the water took (`plausibility`).
 """
 
 from collections.abc import Callable, Iterator
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 import torch
@@ -23,7 +23,7 @@ from torch import Tensor
 
 from swimm3r.imaging.depth_completion import fill_z_depth
 from swimm3r.imaging.filters import LUMA, blur, local_linear
-from swimm3r.imaging.open_water import sea_share
+from swimm3r.imaging.open_water import sea_share, without_fringe
 from swimm3r.imaging.undistortion import frame_rays
 from swimm3r.medium import (
     Medium,
@@ -113,6 +113,7 @@ def restore_image(
     """
     settings = settings or RestoreSettings()
     veil = srgb_from_linear(fit.Binf) if fit.encoding == "linear" else fit.Binf
+    depth = replace(depth, z_depth=without_fringe(image, depth.z_depth, veil))
     sea = sea_share(image, depth.z_depth, veil)
     z_depth = fill_z_depth(image, depth, sea)
     ray_depth = ray_depth_map(z_depth, rays)
