@@ -26,7 +26,11 @@ from swimm3r.scale.triangulation import ScenePoint
 _FEWEST = 3  # control points
 _ON_A_LINE = 0.02  # spread across the main direction, as a share of that along it
 _OFF = 5.0  # standard deviations at a control point, from which the points are refused
-_REMEDY = Remedy("name, easting, northing, depth or latitude, longitude, depth", fault="cannot be read")
+_REMEDY = Remedy(
+    "a CSV with name, easting, northing, depth or latitude, longitude, depth",
+    cause="a slip in the name, or another kind of file",
+    fault="cannot be read",
+)
 
 
 @dataclass(frozen=True)

@@ -168,7 +168,8 @@ def read_laser_dots(path: Path, frames: FrameNames) -> list[tuple[str, Sighting,
 
 def _rows(path: Path, needed: tuple[str, ...]) -> list[tuple[int, dict[str, str]]]:
     """The rows of a CSV by the names of its columns, with their line numbers."""
-    remedy = Remedy(f"a CSV with the columns {', '.join(needed)}", fault="cannot be read")
+    cause = "a slip in the name, or another kind of file"
+    remedy = Remedy(f"a CSV with the columns {', '.join(needed)}", cause, fault="cannot be read")
     with guard(path, remedy):
         lines = path.read_text(encoding="utf-8-sig").splitlines()
     separator = max(",;\t", key=(lines[0] if lines else "").count)

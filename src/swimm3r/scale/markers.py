@@ -47,7 +47,11 @@ _DICTIONARIES: dict[MarkerFamily, str] = {
 }
 _CORNER_PX = 0.2  # standard deviation of a corner's place in a sharp frame
 _OFF_PX = 3.0  # mean reprojection error of a corner from which a marker is not one thing at one place
-_REMEDY = Remedy("family, size, sizes, distances or board; see docs/guides/metric-scale.md", fault="cannot be used")
+_REMEDY = Remedy(
+    "family, size, sizes, distances or board; see docs/guides/metric-scale.md",
+    cause="a slip in its name or in its lines",
+    fault="cannot be used",
+)
 
 
 @dataclass(frozen=True)

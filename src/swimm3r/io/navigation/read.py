@@ -14,7 +14,7 @@ from swimm3r.io.navigation.table import read_table
 _REMEDY = Remedy(
     "a CSV with named columns, NMEA, Matisse .dim2, TUM, .srt, or a folder of images with GPS in EXIF; see"
     " docs/guides/metric-scale.md",
-    cause="it is cut off, or of another format",
+    cause="a slip in the name, or it is cut off or of another format",
     fault="cannot be read as navigation",
 )
 _DIM2 = re.compile(r"[^;]*;\s*\d\d/\d\d/\d{4}\s*;\s*\d\d:\d\d:")
