@@ -7,6 +7,7 @@ import pytest
 import torch
 
 from swimm3r.cameras import project_visible
+from swimm3r.errors import InputError
 from swimm3r.evaluate.images import psnr
 from swimm3r.imaging.frame_colors import identity_maps
 from swimm3r.io.images import write_rgb
@@ -210,3 +211,10 @@ def test_the_decision_comes_back_from_disk(tiny_dive, tracked, tmp_path):
     assert read_decision(tmp_path) is None
     write_decision(tmp_path, decision)
     assert read_decision(tmp_path) == decision
+
+
+@pytest.mark.parametrize("text", ["{", "[]", '{"on": true}', '{"on": "perhaps", "reason": 3}'])
+def test_a_damaged_decision_is_named(tmp_path, text):
+    (tmp_path / "appearance.json").write_text(text)
+    with pytest.raises(InputError, match=r"appearance\.json"):
+        read_decision(tmp_path)

@@ -21,7 +21,8 @@ from torch import Tensor
 from swimm3r.imaging.filters import blur
 from swimm3r.imaging.frame_colors import ColorEvidence, ColorTracks, about_identity, fit_frame_colors, identity_maps
 from swimm3r.io.files.atomic import write_text
-from swimm3r.io.files.damage import Remedy, guard
+from swimm3r.io.files.damage import Remedy
+from swimm3r.io.files.json_file import read_json
 from swimm3r.medium import backscatter, transmittances
 from swimm3r.scene.frames import Frames
 from swimm3r.scene.reconstruction import Reconstruction
@@ -160,5 +161,5 @@ def read_decision(folder: Path) -> AppearanceDecision | None:
     path = folder / _FILE
     if not path.is_file():
         return None
-    with guard(path, Remedy(f"remove {folder}; the command that trained the map trains it again")):
-        return AppearanceDecision(**json.loads(path.read_text(encoding="utf-8")))
+    remedy = Remedy(f"remove {folder}; the command that trained the map trains it again")
+    return read_json(path, AppearanceDecision, remedy)
