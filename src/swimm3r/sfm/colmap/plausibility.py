@@ -96,7 +96,7 @@ def _no_parallax(rec: Reconstruction) -> QualityWarning | None:
 
 
 def depth_change(rec: Reconstruction) -> float:
-    """How many times as far the points of one frame are as those of another, by their medians; inf at a distance of 0.
+    """Largest by smallest median depth of the frames' points; inf where the smallest is 0.
 
     Frames with fewer than 10 points do not count.
     """
