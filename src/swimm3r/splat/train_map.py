@@ -102,10 +102,9 @@ def _in_blocks(
     scene = SplatMap(
         no_primitives(), field, trained.settings, rec.metric, 1 / scale, frames.span, None, viewpoint, blocks
     )
-    scene = scene.to(device)
-    scene = replace(scene, coverage=seen_in_training(scene, rec, frames, views.names))
+    scene = replace(scene, coverage=seen_in_training(scene.to(device), rec, frames, views.names))
     scene.save(folder / "map.safetensors")
-    return scene
+    return scene.to(device)
 
 
 def seen_in_training(scene: SplatMap, rec: Reconstruction, frames: Frames, names: Sequence[str]) -> TrainingCoverage:
