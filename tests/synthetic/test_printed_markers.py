@@ -14,7 +14,7 @@ from swimm3r.synthetic import DiveSettings, make_dive
 from swimm3r.synthetic.printed_markers import Plate, with_plates
 from swimm3r.synthetic.seafloor import height_at
 
-DIVE = DiveSettings(frames=6, width=320, height=240, noise=0.0, markers=3, marker_size=0.3)
+DIVE = DiveSettings(frames=6, width=320, height=240, noise=0.0, printed_markers=3, printed_marker_size=0.3)
 
 
 @pytest.fixture(scope="module")

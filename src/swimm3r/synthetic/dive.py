@@ -124,8 +124,8 @@ def make_dive(settings: DiveSettings) -> Dive:
         width=settings.width,
         height=settings.height,
     )
-    count = settings.markers
-    plates = plates_along(floor, poses[:, :3, 3], count, settings.marker_size, settings.seed) if count else []
+    count = settings.printed_markers
+    plates = plates_along(floor, poses[:, :3, 3], count, settings.printed_marker_size, settings.seed) if count else []
     return Dive(settings, _names(settings), cameras, water(settings), floor, tuple(plates))
 
 

@@ -63,9 +63,9 @@ class DiveSettings(Settings):
     """Largest change of the camera's gains of red and blue from frame to frame, as a share."""
     moving_object: bool = False
     """Let a fish swim across the view once during the dive."""
-    markers: Annotated[int, Range(0, 50)] = 0
+    printed_markers: Annotated[int, Range(0, 50)] = 0
     """Number of printed markers (aruco-4x4-50) that lie on plates along the path."""
-    marker_size: Annotated[float, Range(0.02, 1)] = 0.2
+    printed_marker_size: Annotated[float, Range(0.02, 1)] = 0.2
     """Outer side of the markers' black square in meters."""
     give_masks: bool = False
     """Write the masks of the moving object beside images/, where the pipeline uses them, not only under truth/."""
