@@ -10,7 +10,7 @@ Seeds = Annotated[int, Range(1, 1000)]  # trainings of one method on one scene
 
 
 @dataclass(frozen=True)
-class ScaleSettings(Settings):
+class SurveySettings(Settings):
     """Synthetic surveys of growing length."""
 
     counts: tuple[Count, ...] = (100, 300, 1000)

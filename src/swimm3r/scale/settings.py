@@ -62,7 +62,7 @@ class ScaleSettings(Settings):
     nav: Path | None = None
     """Navigation of the vehicle: CSV with named columns, NMEA, Matisse .dim2, TUM, .srt, or a folder of images with
     GPS in EXIF."""
-    nav_offset: float | None = None
+    nav_offset: Annotated[float, Range(-1e10, 1e10)] | None = None
     """Seconds to add to the frames' times to get the navigation's; by default estimated, or not needed where the
     navigation names the images."""
     nav_window: Annotated[float, Range(0, 3600)] = 2.0

@@ -5,16 +5,16 @@ from pathlib import Path
 import pytest
 
 from swimm3r.bench.protocols.scale import StepClock, by_part, scale_table, survey
-from swimm3r.bench.settings import ScaleSettings
+from swimm3r.bench.settings import SurveySettings
 from swimm3r.evaluate import NotComputed
 from swimm3r.pipeline.presets import PRESETS
 from swimm3r.pipeline.stage_start import StageStart
 
-SMALL = ScaleSettings(counts=(14,), width=240, height=136, last="mapping")
+SMALL = SurveySettings(counts=(14,), width=240, height=136, last="mapping")
 
 
 def test_a_survey_has_as_many_frames_as_were_asked_for():
-    assert [survey(n, ScaleSettings()).frame_count for n in (14, 100, 300, 1000, 3000)] == [14, 100, 300, 1000, 3000]
+    assert [survey(n, SurveySettings()).frame_count for n in (14, 100, 300, 1000, 3000)] == [14, 100, 300, 1000, 3000]
 
 
 def test_steps_are_counted_for_the_stage_they_belong_to():

@@ -138,8 +138,12 @@ def test_held_out_frames_are_shown_at_their_own_times(tiny_dive, trained, tmp_pa
     assert [view.time for view in views] == [0.0, 8.0]
     for view in views:
         shown = read_rgb(tmp_path / f"{Path(view.name).stem}_rgb.png").astype(int)
-        expected = (scene.render(view.canvas, view.time).rgb.clamp(0, 1) * 255).round().int().numpy()
-        assert abs(shown - expected).max() <= 1
+        rendered = scene.render(view.canvas, view.time)
+        expected = (rendered.rgb.clamp(0, 1) * 255).round().int().numpy()
+        assert rendered.observed is not None
+        observed = rendered.observed.numpy()  # the rest is hatched
+        assert observed.mean() > 0.5
+        assert abs(shown - expected)[observed].max() <= 1
 
 
 def test_what_moves_is_scored_apart_where_the_truth_knows_it(tiny_dive, trained, tmp_path):

@@ -14,7 +14,7 @@ import torch
 from swimm3r.bench.cells import ResultKey, Scores, kept_cell
 from swimm3r.bench.memory import in_own_process, with_peak_mb
 from swimm3r.bench.scores import columns
-from swimm3r.bench.settings import ScaleSettings
+from swimm3r.bench.settings import SurveySettings
 from swimm3r.bench.tables import Table
 from swimm3r.evaluate import NotComputed
 from swimm3r.evaluate.poses import absolute_pose_errors
@@ -64,7 +64,7 @@ class StepClock:
         self.stages.append({})
 
 
-def survey(frames: int, scale: ScaleSettings) -> DiveSettings:
+def survey(frames: int, scale: SurveySettings) -> DiveSettings:
     """The survey of so many frames."""
     length = round(SPACING * (frames - 0.9), 3)  # just beyond the last frame
     return DiveSettings(
@@ -78,7 +78,7 @@ def survey(frames: int, scale: ScaleSettings) -> DiveSettings:
     )
 
 
-def scale_table(out: Path, scale: ScaleSettings, settings: RunSettings, progress: Progress = silent) -> Table:
+def scale_table(out: Path, scale: SurveySettings, settings: RunSettings, progress: Progress = silent) -> Table:
     """A row for every number of frames; surveys and runs stay in OUT, and a repeated call goes on with them."""
     cells = []
     for done, frames in enumerate(scale.counts):

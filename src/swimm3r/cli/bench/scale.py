@@ -3,7 +3,7 @@
 from collections.abc import Callable
 from typing import Annotated
 
-from swimm3r.bench.settings import ScaleSettings
+from swimm3r.bench.settings import SurveySettings
 from swimm3r.cli.bench.table import Defaults, Frames, show_table
 from swimm3r.cli.terminal.options import FLAT, Out
 from swimm3r.pipeline.presets import Preset, RunSettings
@@ -16,7 +16,7 @@ def scale_command(defaults: Defaults) -> Callable:
 
     def scale(
         out: Out,
-        surveys: Annotated[ScaleSettings, FLAT] = ScaleSettings(),  # noqa: B008 - records are frozen
+        surveys: Annotated[SurveySettings, FLAT] = SurveySettings(),  # noqa: B008 - records are frozen
         preset: Preset = defaults.preset,
         frames: Frames = defaults.frames,
         colmap: ColmapSettings = defaults.colmap,
