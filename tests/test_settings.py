@@ -272,7 +272,7 @@ def refused(capsys: pytest.CaptureFixture[str], *arguments: str) -> str:
         ("run x --out o --splat.rates.xyz nan", "--splat.rates.xyz: must be a number above 0 and at most 1, got nan"),
         ("run x --out o --threads -1", "--threads: must be a whole number at least 0 and at most 1024, got -1"),
         ("run x --out o --start inf", "--start: must be a number"),
-        ("run x --out o --k1 1e9", "--k1: must be a number at least -100 and at most 100, or None, got"),
+        ("run x --out o --k1 1e9", "--k1: must be a number at least -1e+06 and at most 1e+06, or None, got"),
         ("run x --out o --mapping.focal-ladder", "--mapping.focal-ladder: must be a list"),
         ("sfm x --out o --backend mast3r --memory-mb 0", "--memory-mb: must be"),
         ("run x --out o --recipe seasplat --splat.water.every 0", "--splat.water.every: must be"),

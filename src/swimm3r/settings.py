@@ -112,7 +112,7 @@ LongSideOrOwn = Annotated[int, Range(32, 65_536, or_zero=True)]  # 0 keeps image
 NetworkSide = Annotated[int, Range(64, 4096)]  # pixels of the network's images; less leaves wide ones no patch
 MapSize = Annotated[int, Range(4)]  # primitives; each has 3 neighbors
 ClipSecond = Annotated[float, Range(0, 1e6)]  # eleven days; beyond, containers cannot seek
-LensParameter = Annotated[float, Range(-100, 100)]  # of distortion
+LensParameter = Annotated[float, Range(-1e6, 1e6)]  # of distortion; k2 of a telephoto lens can be thousands
 Share = Annotated[float, Range(0, 1)]
 PositiveShare = Annotated[float, Range(above=0, most=1)]
 Cadence = Annotated[float, Range(1e-6, 1)]  # share of a run between two events

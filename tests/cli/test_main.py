@@ -36,6 +36,34 @@ def test_an_unknown_option_is_exit_2(capsys: pytest.CaptureFixture[str], tmp_pat
     assert outcome(capsys, "run", str(tmp_path), "--out", str(tmp_path), "--fsp", "5")[0] == 2
 
 
+LENS = "1 PINHOLE 96 64 80 80 48 32"
+
+
+@pytest.mark.parametrize(
+    ("lens", "options", "code", "message"),
+    [
+        ("1 PINHOLE 64 64 80 80 32 32", (), 3, "64x64, and the prepared frames are 96x64"),
+        ("1 PINHOLE 96 64 -80 80 48 32", (), 3, "focal lengths of -80"),
+        ("1 FOV 96 64 80 80 48 32 0.9", (), 3, "the model FOV"),
+        ("PINHOLE 80,80,48,32", (), 2, "--calibration-size WIDTH HEIGHT"),
+        (f"{LENS}\n2 PINHOLE 96 64 81 81 48 32", (), 2, "--calibration-camera 1"),
+        (LENS, ("--focal", "80"), 2, "--calibration and --focal exclude each other"),
+        (LENS, ("--calibration-size", "960", "640"), 2, "--calibration-size says 960x640"),
+    ],
+)
+def test_a_calibration_that_does_not_fit_is_told_with_its_exit_code(
+    lens: str, options: tuple[str, ...], code: int, message: str, capsys: pytest.CaptureFixture[str], tmp_path: Path
+):
+    (tmp_path / "dive").mkdir()
+    for i in range(3):
+        image = np.random.default_rng(i).random((64, 96, 3)).astype(np.float32)
+        write_rgb(tmp_path / "dive" / f"{i}.png", image)
+    (tmp_path / "lens.txt").write_text(lens)
+    command = ("sfm", str(tmp_path / "dive"), "--out", str(tmp_path / "run"))
+    found, said = outcome(capsys, *command, "--calibration", str(tmp_path / "lens.txt"), *options)
+    assert (found, message in said) == (code, True), said
+
+
 def test_half_a_colmap_model_is_exit_2(capsys: pytest.CaptureFixture[str], tmp_path: Path):
     code, message = outcome(capsys, "splat", "--colmap", str(tmp_path), "--out", str(tmp_path / "run"))
     assert code == 2

@@ -1,13 +1,16 @@
 """Every back end makes the same lens of the same numbers, and refuses the same slips."""
 
+import logging
 from dataclasses import replace
+from pathlib import Path
 from typing import Any
 
 import pytest
 import torch
 
-from swimm3r.errors import UsageError
-from swimm3r.sfm.lens import check_lens_settings, lens_of
+from swimm3r.errors import InputError, UsageError
+from swimm3r.sfm.colmap.calibration import first_camera
+from swimm3r.sfm.lens import check_calibration, check_lens_settings, lens_of, with_calibration
 from swimm3r.sfm.settings import ColmapSettings, LensSettings, Mast3rSettings
 
 GIVEN: dict[str, Any] = {"focal": 900.0, "k1": -0.1, "p2": 0.002}
@@ -32,8 +35,101 @@ def test_the_assumed_distortion_gives_way_to_one_that_is_given():
         ({"k3": 0.1}, "OPENCV", "OPENCV has no k3"),
         ({"k1": 0.1}, "PINHOLE", "PINHOLE has no k1"),
         ({"focal": 4.2}, "OPENCV", "does not fit images 640 px wide"),
+        ({"focal": 640.0, "fy": 64000.0}, "OPENCV", "does not fit images 640 px wide"),
+        ({"focal": 640.0, "cx": 960.0}, "OPENCV", r"\(960.0, middle\) is outside images of 640x480"),
     ],
 )
 def test_numbers_of_another_lens_are_refused(change: dict[str, float], model: str, message: str):
     with pytest.raises(UsageError, match=message):
-        check_lens_settings(replace(LensSettings(), **change), model, 640)
+        check_lens_settings(replace(LensSettings(), **change), model, 640, 480)
+
+
+LINES = {  # of COLMAP's cameras.txt
+    "OPENCV": "1 OPENCV 1280 720 900 910 650 350 -0.1 0.02 0.001 0.002",
+    "OPENCV_FISHEYE": "1 OPENCV_FISHEYE 1280 720 600 610 650 350 0.05 0.02 -0.01 0.002",
+    "SIMPLE_RADIAL": "1 SIMPLE_RADIAL 1280 720 900 650 350 -0.1",
+    "PINHOLE": "1 PINHOLE 1280 720 900 910 650 350",
+}
+
+
+@pytest.fixture(params=LINES)
+def calibrated(request: pytest.FixtureRequest, tmp_path: Path) -> tuple[str, Path]:
+    (tmp_path / "cameras.txt").write_text(LINES[request.param])
+    return request.param, tmp_path / "cameras.txt"
+
+
+def test_mapping_begins_with_the_lens_of_a_calibration_at_the_size_of_the_frames(calibrated: tuple[str, Path]):
+    model, path = calibrated
+    settings = with_calibration(ColmapSettings(calibration=path, intrinsics="fixed"), 640, 360)
+    camera = first_camera(640, 360, settings)
+    numbers = [float(word) for word in LINES[model].split()[4:]]
+    lens = 3 if model == "SIMPLE_RADIAL" else 4
+    expected = [value / 2 for value in numbers[:lens]] + numbers[lens:]
+    if model == "PINHOLE":  # of two focal lengths, which SIMPLE_RADIAL has not
+        model, expected = "OPENCV", [*expected, 0.0, 0.0, 0.0, 0.0]
+    assert camera.model.name == model
+    assert camera.params.tolist() == expected
+    assert camera.has_prior_focal_length
+
+
+def test_the_network_gets_the_lens_of_a_calibration(calibrated: tuple[str, Path]):
+    model, path = calibrated
+    settings = with_calibration(Mast3rSettings(calibration=path), 640, 360)
+    assert settings.focal is not None
+    check_lens_settings(settings, settings.camera, 640, 360)
+    lens = lens_of(settings, settings.camera, 640, 360, settings.focal)
+    assert settings.camera == model
+    assert (lens.K[0, 0, 2], lens.K[0, 1, 2]) == (325, 175)
+
+
+def test_a_flat_port_multiplies_both_focal_lengths_of_a_calibration(tmp_path: Path):
+    (tmp_path / "a").write_text(LINES["OPENCV"])
+    settings = with_calibration(ColmapSettings(calibration=tmp_path / "a", housing="flat"), 1280, 720)
+    params = first_camera(1280, 720, settings).params
+    assert params[:4].tolist() == pytest.approx([900 * 1.333, 910 * 1.333, 650, 350])
+
+
+def test_the_lens_of_a_calibration_is_printed_in_pixels_of_the_frames(tmp_path: Path, caplog: pytest.LogCaptureFixture):
+    (tmp_path / "a").write_text(LINES["OPENCV"])
+    with caplog.at_level(logging.INFO, "swimm3r"):
+        with_calibration(ColmapSettings(calibration=tmp_path / "a"), 640, 360)
+    said = "in frames of 640x360: OPENCV, fx 450.00, fy 455.00, cx 325.00, cy 175.00 px, k1 -0.1, k2 0.02"
+    assert said in caplog.text
+
+
+def test_settings_without_a_calibration_stay_as_they_are():
+    settings = ColmapSettings(**GIVEN)
+    assert with_calibration(settings, 1280, 720) is settings
+    check_calibration(settings)
+
+
+@pytest.mark.parametrize("kind", [ColmapSettings, Mast3rSettings])
+@pytest.mark.parametrize(
+    ("change", "message"),
+    [
+        ({"calibration": Path("a.yaml"), "focal": 900.0}, "--calibration and --focal exclude each other"),
+        ({"calibration": Path("a.yaml"), "k1": 0.0}, "--calibration and --k1 exclude each other"),
+        ({"calibration_camera": "cam0"}, "--calibration-camera needs --calibration"),
+        ({"calibration_size": (640, 480)}, "--calibration-size needs --calibration"),
+        ({"cx": 320.0}, "--cx needs --focal"),
+    ],
+)
+def test_settings_of_a_lens_that_contradict_each_other_are_refused(kind: type, change: dict[str, Any], message: str):
+    with pytest.raises(UsageError, match=message):
+        check_calibration(kind(**change))
+
+
+def test_another_camera_model_than_that_of_the_calibration_is_refused(tmp_path: Path):
+    (tmp_path / "a").write_text(LINES["OPENCV"])
+    settings = ColmapSettings(calibration=tmp_path / "a", camera="SIMPLE_RADIAL")
+    with pytest.raises(UsageError, match="of the model OPENCV, and --camera says SIMPLE_RADIAL"):
+        with_calibration(settings, 1280, 720)
+    (tmp_path / "a").write_text(LINES["SIMPLE_RADIAL"])
+    wider = with_calibration(ColmapSettings(calibration=tmp_path / "a", camera="OPENCV"), 1280, 720)
+    assert (wider.k1, wider.k2, wider.p1, wider.p2) == (-0.1, 0.0, 0.0, 0.0)
+
+
+def test_a_calibration_that_cannot_be_used_is_refused_before_any_frame_is_read(tmp_path: Path):
+    (tmp_path / "a").write_text("not a calibration")
+    with pytest.raises(InputError, match="cannot be read as a calibration"):
+        check_calibration(ColmapSettings(calibration=tmp_path / "a"))

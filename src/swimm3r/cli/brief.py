@@ -32,7 +32,7 @@ BRIEF: dict[tuple[str, ...], Groups] = {
         "input": _INPUT,
         "output": _OUTPUT,
         "speed and quality": _SETTINGS,
-        "camera and poses": ("--backend", *_CAMERA, "--reference"),
+        "camera and poses": ("--backend", *_CAMERA, "--calibration", "--reference"),
         "": _MESSAGES,
     },
     ("splat",): {

@@ -1,16 +1,103 @@
-"""The lens that settings describe: one camera at the origin, principal point in the middle of the image."""
+"""The lens that settings describe: one camera at the origin, in pixels of the prepared frames.
+
+The principal point is in the middle of the image unless it is given.
+"""
+
+import logging
+from dataclasses import replace
+from typing import TypeVar
 
 import torch
 
 from swimm3r.cameras import DISTORTION_PARAMETERS, Cameras
 from swimm3r.errors import UsageError
-from swimm3r.sfm.settings import LensSettings
+from swimm3r.io.calibration.read import read_calibration, read_lens
+from swimm3r.sfm.settings import ColmapSettings, LensSettings, Mast3rSettings
 
 DISTORTION = ("k1", "k2", "k3", "k4", "p1", "p2")
 
+_SPECIAL_CASES = {  # of a model, those that it has with zeros
+    "PINHOLE": (),
+    "SIMPLE_RADIAL": ("PINHOLE",),
+    "OPENCV": ("PINHOLE", "SIMPLE_RADIAL"),
+    "OPENCV_FISHEYE": (),
+}
 
-def check_lens_settings(settings: LensSettings, model: str, width: int) -> None:
-    """Raise UsageError where the numbers are not those of a lens of this model in images of this width."""
+log = logging.getLogger(__name__)
+
+Given = TypeVar("Given", ColmapSettings, Mast3rSettings)
+
+
+def check_calibration(settings: LensSettings) -> None:
+    """Raise InputError or UsageError where the calibration file that the settings name cannot be used, and UsageError
+    where parts of a lens are given without the whole.
+    """
+    _check_whole(settings)
+    if settings.calibration is not None:
+        read_calibration(settings.calibration, settings.calibration_camera, settings.calibration_size)
+
+
+def with_calibration(settings: Given, width: int, height: int) -> Given:
+    """The settings with the numbers of their calibration file, in pixels of frames of this size, in its place.
+
+    Raises InputError where the file cannot be used or is of images of another shape, and UsageError where the settings
+    ask for another camera model.
+    """
+    _check_whole(settings)
+    path = settings.calibration
+    if path is None:
+        return settings
+    read = read_lens(path, width, height, settings.calibration_camera, settings.calibration_size)
+    lens = read.camera
+    model = _chosen_model(settings, lens.model)
+    (fx, _, cx), (_, fy, cy), _ = lens.K[0].tolist()
+    found = dict(zip(DISTORTION_PARAMETERS[lens.model], lens.distortion[0].tolist(), strict=True))
+    numbers = {name: found.get(name, 0.0) for name in DISTORTION_PARAMETERS[model]}
+    said = ", ".join(f"{name} {value:.6g}" for name, value in numbers.items())
+    log.info(
+        "lens of %s in frames of %dx%d: %s, fx %.2f, fy %.2f, cx %.2f, cy %.2f px%s%s",
+        *(path, width, height, model, fx, fy, cx, cy, f", {said}" if said else ""),
+        f"; within {read.error:.2g} px of the file's" if read.error > 1e-6 else "",
+    )
+    blank = dict.fromkeys(("calibration", "calibration_camera", "calibration_size"))
+    changed = replace(settings, **blank, focal=fx, fy=fy, cx=cx, cy=cy, **numbers)
+    undecided = isinstance(settings, ColmapSettings) and model != "OPENCV_FISHEYE"  # auto goes by the numbers
+    return changed if undecided else replace(changed, camera=model)
+
+
+def _check_whole(settings: LensSettings) -> None:
+    beside = [name for name in ("calibration_camera", "calibration_size") if getattr(settings, name) is not None]
+    if settings.calibration is None and beside:
+        raise UsageError(
+            f"--{beside[0].replace('_', '-')} needs --calibration FILE",
+            cause="it says how a calibration file is read, and none was given",
+            hint="add --calibration FILE, or leave it out",
+        )
+    alone = [name for name in ("fy", "cx", "cy") if getattr(settings, name) is not None]
+    if settings.focal is None and alone:
+        raise UsageError(
+            f"--{alone[0]} needs --focal",
+            cause="a principal point and a second focal length say little without the first",
+            hint="add --focal, in pixels of the prepared frames",
+        )
+
+
+def _chosen_model(settings: ColmapSettings | Mast3rSettings, model: str) -> str:
+    """The camera model under which a lens of this one is written."""
+    asked = settings.camera
+    if asked in ("auto", "PINHOLE", model):
+        return "SIMPLE_RADIAL" if isinstance(settings, ColmapSettings) and model == "PINHOLE" else model
+    if model in _SPECIAL_CASES[asked]:
+        return asked
+    raise UsageError(
+        f"the calibration is of a lens of the model {model}, and --camera says {asked}",
+        cause="the file decides the model of its lens",
+        hint="leave out --camera",
+    )
+
+
+def check_lens_settings(settings: LensSettings, model: str, width: int, height: int) -> None:
+    """Raise UsageError where the numbers are not those of a lens of this model in images of this size."""
     names = DISTORTION_PARAMETERS[model]
     if foreign := [k for k in DISTORTION if getattr(settings, k) is not None and k not in names]:
         raise UsageError(
@@ -18,17 +105,28 @@ def check_lens_settings(settings: LensSettings, model: str, width: int) -> None:
             cause=f"its distortion is {', '.join(names) or 'none'}",
             hint="choose the camera model that the numbers were calibrated with (--camera)",
         )
-    if settings.focal is not None and not 0.1 * width < settings.focal < 20 * width:
+    focal = next((f for f in (settings.focal, settings.fy) if f is not None and not 0.1 * width < f < 20 * width), None)
+    if focal is not None:
         raise UsageError(
-            f"a focal length of {settings.focal:g} px does not fit images {width} px wide",
+            f"a focal length of {focal:g} px does not fit images {width} px wide",
             cause="it may be in millimetres, or belong to another image size",
             hint="give it in pixels of the prepared frames: millimetres / sensor width in millimetres * image width",
+        )
+    cx, cy = settings.cx, settings.cy
+    if (cx is not None and cx >= width) or (cy is not None and cy >= height):
+        raise UsageError(
+            f"a principal point at ({'middle' if cx is None else cx}, {'middle' if cy is None else cy}) is outside"
+            f" images of {width}x{height}",
+            cause="it may belong to another image size",
+            hint="give it in pixels of the prepared frames, from the upper left corner",
         )
 
 
 def lens_of(settings: LensSettings, model: str, width: int, height: int, focal: float, k1: float = 0.0) -> Cameras:
     """A lens of this focal length (pixels) with the distortion that is given; `k1` where that one is not."""
-    K = torch.tensor([[[focal, 0, width / 2], [0, focal, height / 2], [0, 0, 1]]], dtype=torch.float64)
+    tall = 1.0 if settings.fy is None or settings.focal is None else settings.fy / settings.focal
+    cx, cy = (half if own is None else own for own, half in ((settings.cx, width / 2), (settings.cy, height / 2)))
+    K = torch.tensor([[[focal, 0, cx], [0, focal * tall, cy], [0, 0, 1]]], dtype=torch.float64)
     assumed = {"k1": k1}
     given = {name: getattr(settings, name) for name in DISTORTION_PARAMETERS[model]}
     distortion = [assumed.get(name, 0.0) if value is None else value for name, value in given.items()]

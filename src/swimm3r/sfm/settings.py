@@ -4,6 +4,7 @@ from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Annotated, Literal
 
+from swimm3r.errors import UsageError
 from swimm3r.settings import (
     Count,
     CountOrZero,
@@ -20,6 +21,9 @@ from swimm3r.settings import (
     Threads,
 )
 from swimm3r.sfm.mast3r.settings import AlignmentSettings, MatchingSettings
+
+LENS_NUMBERS = ("focal", "fy", "cx", "cy", "k1", "k2", "k3", "k4", "p1", "p2")
+"""Settings that give a lens number by number."""
 
 BackendName = Literal["colmap", "mast3r", "swimm3r"]
 
@@ -234,6 +238,12 @@ class LensSettings(Settings):
     focal: Positive | None = None
     """Focal length in pixels of the prepared frames, measured in water, or in air if `housing` is flat: a start value,
     which `intrinsics` or `alignment.intrinsics` can fix. MASt3R always fixes a lens with distortion."""
+    fy: Positive | None = None
+    """Vertical focal length in pixels of the prepared frames; by default `focal`, which then is the horizontal one."""
+    cx: Positive | None = None
+    """Column of the principal point in pixels of the prepared frames, from the left border; by default the middle."""
+    cy: Positive | None = None
+    """Row of the principal point in pixels of the prepared frames, from the upper border; by default the middle."""
     k1: LensParameter | None = None
     """First radial distortion coefficient of the lens, in COLMAP's convention."""
     k2: LensParameter | None = None
@@ -246,6 +256,23 @@ class LensSettings(Settings):
     """First tangential distortion coefficient, for OPENCV only."""
     p2: LensParameter | None = None
     """Second tangential distortion coefficient, for OPENCV only."""
+    calibration: Path | None = None
+    """Calibration file: Kalibr, ROS camera_info, OpenCV YAML or XML, COLMAP cameras.txt, Agisoft XML, transforms.json.
+    Its lens takes the place of `focal`, `k1` and their kin."""
+    calibration_camera: str | None = None
+    """Name of the camera to use of a calibration file that holds several."""
+    calibration_size: tuple[Count, Count] | None = None
+    """Width and height in pixels of the images of the calibration, where its file does not state them."""
+
+    def __post_init__(self) -> None:
+        super().__post_init__()
+        given = [name for name in LENS_NUMBERS if getattr(self, name) is not None]
+        if self.calibration is not None and given:
+            raise UsageError(
+                f"--calibration and --{given[0]} exclude each other",
+                cause="both say what the lens is",
+                hint="leave out one of them; the lens of a calibration is changed in its file",
+            )
 
 
 @dataclass(frozen=True)

@@ -11,6 +11,7 @@ and orientation on the globe are left out: coordinates of millions of metres wou
 
 import math
 import xml.etree.ElementTree as ET
+from dataclasses import dataclass
 from pathlib import Path, PurePosixPath
 
 import numpy as np
@@ -40,17 +41,17 @@ def read(path: Path) -> ForeignModel:
         label, sensor = camera.get("label") or "", sensors.get(camera.get("sensor_id"))
         if sensor is None:
             raise ValueError(f"the camera {label} has a sensor that is not in it")
-        kind, size, k, coefficients = _lens(sensor)
+        lens = sensor_lens(sensor)
         scale = whole if whole is not None else scales.get(camera.get("component_id"))
         pose = np.array(transform.split(), np.float64).reshape(4, 4)
         pose[:3, 3] *= 1.0 if scale is None else scale
         metric = metric and scale is not None
         names.append(PurePosixPath(label.replace("\\", "/")).name)
-        K.append(k)
-        distortion.append(coefficients)
+        K.append(lens.K)
+        distortion.append(lens.distortion)
         poses.append(pose)
-        sizes.add(size)
-        kinds.add(kind)
+        sizes.add(lens.size)
+        kinds.add(lens.model)
     if not names:
         raise ValueError("no camera in it has been placed")
     if len(kinds) > 1:
@@ -76,7 +77,19 @@ def _number(text: str) -> float:
     return value
 
 
-def _lens(sensor: ET.Element) -> tuple[str, tuple[int, int], np.ndarray, np.ndarray]:
+@dataclass(frozen=True)
+class SensorLens:
+    """The lens of a sensor."""
+
+    model: str
+    size: tuple[int, int]
+    K: np.ndarray
+    distortion: np.ndarray
+    error: float = 0.0  # pixels that it is from the file's lens, at most
+
+
+def sensor_lens(sensor: ET.Element) -> SensorLens:
+    """The adjusted lens of a sensor, else the one that it began with. Raises ValueError where it has none."""
     calibrations = sensor.findall("calibration")
     adjusted = [c for c in calibrations if c.get("class") == "adjusted"]
     if not calibrations:
@@ -85,20 +98,30 @@ def _lens(sensor: ET.Element) -> tuple[str, tuple[int, int], np.ndarray, np.ndar
     resolution = calibration.find("resolution")
     if resolution is None:
         raise ValueError("a calibration has no resolution")
-    width, height = int(resolution.attrib["width"]), int(resolution.attrib["height"])
+    size = int(resolution.attrib["width"]), int(resolution.attrib["height"])
+    return calibrated_lens(
+        calibration, calibration.get("type", sensor.get("type", "frame")), size, sensor.get("label") or ""
+    )
+
+
+def calibrated_lens(calibration: ET.Element, kind: str, size: tuple[int, int], label: str) -> SensorLens:
+    """The lens that the elements f, cx, cy, b1, b2, k1 to k4, p1 and p2 describe.
+
+    Raises ValueError, and InputError where it is more than half a pixel away from any that is supported.
+    """
+    width, height = size
     value = {name: _number(calibration.findtext(name) or "0") for name in _NAMES}
     K = np.array(
         [[value["f"] + value["b1"], 0, width / 2 + value["cx"]], [0, value["f"], height / 2 + value["cy"]], [0, 0, 1]]
     )
     if not min(K[0, 0], K[1, 1]) > 0:
-        raise ValueError(f"the sensor {sensor.get('label')} has a focal length of {value['f']:g} px")
+        raise ValueError(f"the sensor {label} has a focal length of {value['f']:g} px")
     k = tuple(value[f"k{i}"] for i in (1, 2, 3, 4))
     p1, p2, skew = value["p1"], value["p2"], value["b2"] / K[0, 0]
-    kind = calibration.get("type", sensor.get("type", "frame"))
     if kind in ("fisheye", "equidistant_fisheye"):
         if p1 or p2 or skew:
             raise ValueError("its fisheye lens has tangential distortion or skew, which no supported lens has")
-        return "OPENCV_FISHEYE", (width, height), K, np.array(k)
+        return SensorLens("OPENCV_FISHEYE", size, K, np.array(k))
     if kind != "frame":
         raise ValueError(f"its sensor is of type {kind}; supported are frame and fisheye")
 
@@ -108,4 +131,5 @@ def _lens(sensor: ET.Element) -> tuple[str, tuple[int, int], np.ndarray, np.ndar
         dy = y * radial(k, r2) + p2 * (r2 + 2 * y * y) + 2 * p1 * x * y
         return dx + skew * dy, dy
 
-    return "OPENCV", (width, height), K, nearest_opencv(distort, K, width, height)
+    fit = nearest_opencv(distort, K, width, height)
+    return SensorLens("OPENCV", size, K, fit.distortion, fit.error)

@@ -73,23 +73,20 @@ class _Document(_Lens):
 def read(path: Path, document: dict[str, Any]) -> ForeignModel:
     """Poses, lens and cloud. Raises InputError or ValueError for a file that is not one."""
     file = structure(document, _Document)
-    lenses = [_of_frame(frame, file) for frame in file.frames]
-    kinds = {_kind(lens) for lens in lenses}
+    lenses = [_intrinsics(_of_frame(frame, file)) for frame in file.frames]
+    kinds = {lens.model for lens in lenses}
     if len(kinds) > 1:
         raise ValueError(f"it mixes camera models: {', '.join(sorted(kinds))}")
-    kind = kinds.pop()
-    if any(lens.k3 or lens.k4 for lens in lenses) and kind == "OPENCV":
-        raise ValueError("its OPENCV lens has k3 or k4, which that model does not have")
     poses = np.array([frame.transform_matrix for frame in file.frames]) @ _FLIP
     back = _original_world(file)
     poses = back @ poses
     poses[:, :3, 3] /= file.applied_scale
     model = without_points(
         _names(file),
-        "PINHOLE" if not _MODELS[kind] else kind,
-        one_size({(int(_given(lens, "w")), int(_given(lens, "h"))) for lens in lenses}),
-        np.stack([_K(lens) for lens in lenses]),
-        np.array([[getattr(lens, k) or 0.0 for k in _MODELS[kind]] for lens in lenses]).reshape(len(lenses), -1),
+        kinds.pop(),
+        one_size({lens.size for lens in lenses}),
+        np.stack([lens.K for lens in lenses]),
+        np.array([lens.distortion for lens in lenses]).reshape(len(lenses), -1),
         poses,
     )
     if file.ply_file_path is not None:
@@ -98,6 +95,25 @@ def read(path: Path, document: dict[str, Any]) -> ForeignModel:
         xyz = (xyz.astype(np.float64) @ back[:3, :3].T + back[:3, 3]) / file.applied_scale
         model = replace(model, xyz=xyz, rgb=(rgb * 255).round().astype(np.uint8), error=np.zeros(len(xyz)))
     return ForeignModel("nerfstudio", model)
+
+
+@dataclass(frozen=True)
+class FrameLens:
+    """The lens of a frame."""
+
+    model: str
+    size: tuple[int, int]
+    K: np.ndarray
+    distortion: tuple[float, ...]
+
+
+def lenses_of(document: dict[str, Any]) -> dict[str, FrameLens]:
+    """The lens of every frame by its name; of a file without frames the one of the clip. Raises ValueError."""
+    if "frames" not in document:
+        return {"camera": _intrinsics(structure(document, _Lens))}
+    file = structure(document, _Document)
+    lenses = [_intrinsics(_of_frame(frame, file)) for frame in file.frames]
+    return dict(zip(_names(file), lenses, strict=True))
 
 
 def images_folder(path: Path) -> Path:
@@ -141,6 +157,15 @@ def _given(lens: _Lens, name: str) -> float:
     if value is None:
         raise ValueError(f"there is no {name}")
     return value
+
+
+def _intrinsics(lens: _Lens) -> FrameLens:
+    kind = _kind(lens)
+    if kind == "OPENCV" and (lens.k3 or lens.k4):
+        raise ValueError("its OPENCV lens has k3 or k4, which that model does not have")
+    size = int(_given(lens, "w")), int(_given(lens, "h"))
+    distortion = tuple(getattr(lens, k) or 0.0 for k in _MODELS[kind])
+    return FrameLens("PINHOLE" if not _MODELS[kind] else kind, size, _K(lens), distortion)
 
 
 def _kind(lens: _Lens) -> str:

@@ -4,6 +4,7 @@ A lens of k1, k2, p1, p2 is linear in them, so the nearest one over the image is
 """
 
 from collections.abc import Callable
+from dataclasses import dataclass
 
 import numpy as np
 
@@ -13,9 +14,17 @@ _WORST = 0.5  # pixels
 _SAMPLES = 33
 
 
+@dataclass(frozen=True)
+class OpencvFit:
+    """The OPENCV lens nearest to another one."""
+
+    distortion: np.ndarray  # k1, k2, p1, p2
+    error: float  # pixels, the largest of the image
+
+
 def nearest_opencv(
     distort: Callable[[np.ndarray, np.ndarray], tuple[np.ndarray, np.ndarray]], K: np.ndarray, width: int, height: int
-) -> np.ndarray:
+) -> OpencvFit:
     """k1, k2, p1, p2 of a lens given as a map of points (x, y) at z = 1; exact where it is one of that kind.
 
     Raises ValueError where K is no camera's, InputError where the nearest lens is more than half a pixel away.
@@ -37,7 +46,7 @@ def nearest_opencv(
             cause="its distortion has strong higher terms (k3, k4, skew)",
             hint="undistort the images in the program that calibrated them and export again",
         )
-    return found
+    return OpencvFit(found, worst)
 
 
 def radial(k: tuple[float, ...], r2: np.ndarray) -> np.ndarray:

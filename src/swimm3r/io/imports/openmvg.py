@@ -213,7 +213,7 @@ def _lens(name: str, data: _Lens) -> tuple[str, tuple[int, int], np.ndarray, np.
         dx = x * radial(k, r2) + 2 * p1 * x * y + p2 * (r2 + 2 * x * x)
         return dx, y * radial(k, r2) + p1 * (r2 + 2 * y * y) + 2 * p2 * x * y
 
-    return "OPENCV", (width, height), K, nearest_opencv(distort, K, width, height)
+    return "OPENCV", (width, height), K, nearest_opencv(distort, K, width, height).distortion
 
 
 def _given(data: _Lens, name: str) -> Any:

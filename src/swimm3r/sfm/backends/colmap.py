@@ -7,6 +7,7 @@ from swimm3r.scene.frames import Frames
 from swimm3r.scene.reconstruction import Reconstruction
 from swimm3r.scene.reconstruction_io import load_reconstruction
 from swimm3r.sfm.colmap import poses
+from swimm3r.sfm.lens import check_calibration
 from swimm3r.sfm.medium.apply import with_water
 from swimm3r.sfm.plane_sweep.estimate import estimate_depth
 from swimm3r.sfm.settings import ColmapSettings
@@ -14,7 +15,8 @@ from swimm3r.tasks.settings import EngineSettings
 
 
 def check_files(settings: ColmapSettings) -> None:
-    """COLMAP's settings name no file."""
+    """Raise InputError or UsageError where the calibration file cannot be used."""
+    check_calibration(settings)
 
 
 def reconstruct(

@@ -28,6 +28,7 @@ from swimm3r.sfm.alignment.optimize import Alignment, align, dense_z_depth
 from swimm3r.sfm.alignment.problem import AnchoredPair, Known
 from swimm3r.sfm.colmap import poses as colmap
 from swimm3r.sfm.features.pair_graph import groups, parse_graph
+from swimm3r.sfm.lens import check_calibration
 from swimm3r.sfm.mast3r.matching import PixelMatches
 from swimm3r.sfm.mast3r_sfm.encodings import EncodingStore
 from swimm3r.sfm.mast3r_sfm.network_frames import NetworkImages, network_images
@@ -47,8 +48,11 @@ _FOLDER = "mast3r"  # of what is kept until the run is done, in the working fold
 
 
 def check_files(settings: Mast3rSettings) -> None:
-    """Raise UsageError for a pair graph that is none, WeightsError for weights or an adapter that cannot be used."""
+    """Raise UsageError for a pair graph that is none, WeightsError for weights or an adapter that cannot be used, and
+    InputError or UsageError for a calibration file that cannot.
+    """
     parse_graph(settings.graph)
+    check_calibration(settings)
     weights.require("mast3r", settings.weights)
     if settings.adapter is not None:
         adapter_file.describe(settings.adapter)

@@ -45,12 +45,12 @@ def first_camera(width: int, height: int, settings: ColmapSettings) -> "pycolmap
     Raises UsageError where the settings contradict themselves.
     """
     name = _model_name(settings)
-    check_lens_settings(settings, name, width)
+    check_lens_settings(settings, name, width, height)
     if settings.intrinsics == "fixed" and settings.focal is None:
         raise UsageError(
             "fixed intrinsics need a focal length",
-            cause="--intrinsics fixed was given without --focal",
-            hint="add --focal (and --k1), or leave --intrinsics at prior",
+            cause="--intrinsics fixed was given without --focal or --calibration",
+            hint="add --calibration, or --focal (and --k1), or leave --intrinsics at prior",
         )
     return ladder(width, height, settings)[0]
 

@@ -39,6 +39,7 @@ from swimm3r.sfm.colmap.plausibility import depth_change, implausible
 from swimm3r.sfm.features import vlad
 from swimm3r.sfm.features.database import FeatureDatabase, fill_features, match_pairs, start_database
 from swimm3r.sfm.features.sift import unit_descriptors
+from swimm3r.sfm.lens import with_calibration
 from swimm3r.sfm.settings import ColmapSettings
 from swimm3r.tasks.settings import EngineSettings
 from swimm3r.tasks.threads import thread_count
@@ -75,6 +76,7 @@ def reconstruct(
     silence_log()
     threads = settings.threads or thread_count()
     if lens is None:
+        settings = with_calibration(settings, frames.width, frames.height)
         camera = calibration.first_camera(frames.width, frames.height, settings)
     else:
         camera, settings = to_pycolmap_camera(lens), replace(settings, intrinsics="fixed")

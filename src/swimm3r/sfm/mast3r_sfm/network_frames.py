@@ -18,7 +18,7 @@ from swimm3r.io.files.cache_key import bytes_digest
 from swimm3r.io.imports.read import read_foreign
 from swimm3r.scene.frames import Frames
 from swimm3r.sfm.imported.match_frames import model_cameras
-from swimm3r.sfm.lens import DISTORTION, check_lens_settings, lens_of
+from swimm3r.sfm.lens import check_lens_settings, lens_of, with_calibration
 from swimm3r.sfm.mast3r.preprocess import (
     Framing,
     K_to_image,
@@ -29,7 +29,7 @@ from swimm3r.sfm.mast3r.preprocess import (
     pixels_to_network,
     to_network,
 )
-from swimm3r.sfm.settings import Mast3rSettings
+from swimm3r.sfm.settings import LENS_NUMBERS, Mast3rSettings
 
 _SAME_LENS = 0.01  # pixels, or of a distortion
 _ASSUMED = 0.75  # focal length over width of an unknown lens; only says how to write K, nothing is computed with it
@@ -114,13 +114,14 @@ def network_images(frames: Frames, settings: Mast3rSettings) -> NetworkImages:
     if settings.known is not None:
         lens, poses = _from_file(frames, settings, settings.known)
         return NetworkImages(frames, lens, True, frame, poses)
+    settings = with_calibration(settings, frames.width, frames.height)
     lens = _lens(frames.width, frames.height, settings)
     return NetworkImages(frames, lens, settings.focal is not None, frame)
 
 
 def _from_file(frames: Frames, settings: Mast3rSettings, path: Path) -> tuple[Cameras, KnownPoses]:
     """Lens and poses of a file of known cameras."""
-    given = [name for name in ("focal", *DISTORTION) if getattr(settings, name) is not None]
+    given = [name for name in ("calibration", *LENS_NUMBERS) if getattr(settings, name) is not None]
     if given or settings.bundle_adjustment:
         other = given[0] if given else "bundle-adjustment"
         raise UsageError(
@@ -153,12 +154,12 @@ def _from_file(frames: Frames, settings: Mast3rSettings, path: Path) -> tuple[Ca
 
 
 def _lens(width: int, height: int, settings: Mast3rSettings) -> Cameras:
-    check_lens_settings(settings, settings.camera, width)
+    check_lens_settings(settings, settings.camera, width, height)
     if settings.focal is None and settings.camera != "PINHOLE":
         raise UsageError(
             f"a lens with distortion ({settings.camera}) must be known before the network sees its images",
             cause="--camera was given without --focal",
-            hint="add --focal and the distortion of a calibration, or leave --camera at PINHOLE",
+            hint="add --calibration, or --focal and the distortion of one, or leave --camera at PINHOLE",
         )
     focal = _ASSUMED * width if settings.focal is None else settings.focal
     return lens_of(settings, settings.camera, width, height, focal)
