@@ -34,6 +34,7 @@ from swimm3r.cli.report import report
 from swimm3r.cli.survey.measure import measure
 from swimm3r.cli.survey.products import products
 from swimm3r.cli.survey.scale import scale
+from swimm3r.cli.survey.telemetry import telemetry
 from swimm3r.cli.terminal.arguments import named
 from swimm3r.cli.terminal.help_views import View, brief_help, group_help
 from swimm3r.cli.terminal.output_level import FLAGS, begin_messages, with_output_level
@@ -142,6 +143,7 @@ def commands_for(arguments: Sequence[str]) -> dict[str, Callable | Family]:
         "scale": scale,
         "products": products,
         "measure": measure,
+        "telemetry": telemetry,
         "localize": localize,
         "report": report,
         "datasets": datasets,

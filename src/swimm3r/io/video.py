@@ -88,6 +88,11 @@ class Video:
         self._quarter_turns = round(decoded.rotation / 90) % 4  # counter-clockwise, as numpy turns
         self.width, self.height = self._sensor_size[:: -1 if self._quarter_turns % 2 else 1]
 
+    @property
+    def begin(self) -> float:
+        """Time of the first frame in the container, seconds; times of frames count from it."""
+        return float(self._origin * self._tick)
+
     def frames(self, start: float = 0.0, end: float = math.inf) -> Iterator[VideoFrame]:
         """The frames from second `start` up to before second `end`, in time order."""
         for index, frame in enumerate(self._decode(start)):

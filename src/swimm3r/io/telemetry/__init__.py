@@ -1,0 +1,1 @@
+"""Measurements that a camera writes into its video beside the images: GoPro's GPMF."""
