@@ -171,6 +171,7 @@ def write_clip(path: Path, payloads: list[bytes], **options: str) -> Path:
         file.mux(video.encode())
         for k, payload in enumerate(payloads):
             packet = av.Packet(payload)
+            assert track is not None
             packet.stream, packet.time_base = track, Fraction(1, 1000)
             packet.pts = packet.dts = 1000 * k
             packet.duration = 1000
