@@ -29,9 +29,9 @@ def demo(
         redo: Repeat stages that were made with other settings; the earlier results move to OUT/old.
         dive: The synthetic dive.
     """
-    size = PRESETS["fast"].splat
-    assert isinstance(size, UwbsSettings)
-    settings = replace(PRESETS["default"], splat=with_recipe(size, recipe))
+    fast = PRESETS["fast"]
+    assert isinstance(fast.splat, UwbsSettings)
+    settings = replace(PRESETS["default"], splat=with_recipe(fast.splat, recipe), test=fast.test)
     from swimm3r.io.files.outputs import output_folder
     from swimm3r.pipeline.run import run_pipeline
     from swimm3r.scene.run_folder import check_vacant
