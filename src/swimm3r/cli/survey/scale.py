@@ -33,41 +33,20 @@ def scale(
 
 
 def print_scale(section: dict[str, Any]) -> None:
-    """Print the scale by every source, the scale of all, and the place."""
-    from swimm3r.report.scale import plus_minus
+    """Print what the report says of the scale by every source, the scale of all, and the place."""
+    from swimm3r.report.scale import scale_section
 
     console = outcome_console()
-    table = Table("source", "m per unit", "std", "residual", "in std", "of")
-    for each in section["sources"]:
-        table.add_row(
-            each["source"] + (" (outlier)" if each["outlier"] else ""),
-            f"{each['scale']:.6g}",
-            f"{100 * each['std']:.2g}%",
-            f"{100 * each['residual']:+.2f}%",
-            f"{each['residual_in_std']:+.1f}",
-            each["detail"],
-        )
+    shown = scale_section({"scale": section})
+    assert shown is not None
+    table = Table("source", "m per unit", "residual", "in std", "of")
+    for row in shown.rows:
+        table.add_row(row.name + (" (outlier)" if row.outlier else ""), row.scale, row.residual, row.in_std, row.detail)
     console.print(table)
-    total, std = section["metres_per_unit"], section["std"]
-    console.print(f"A unit of structure from motion is {plus_minus(total, std * total)} m ({100 * std:.2g}%).")
+    console.print(shown.lead)
     if section["factor"] == 1.0:
         console.print("The files are in metres already, by these sources: nothing had to be rescaled.")
-    place = section["georeference"]
-    if place["origin_std_m"] is not None:
-        east, north, height = (
-            plus_minus(value, error) for value, error in zip(place["origin_m"], place["origin_std_m"], strict=True)
-        )
-        console.print(f"Origin in {place['crs']}: east {east} m, north {north} m, height {height} m")
-    if "navigation" in section:
-        navigation = section["navigation"]
-        told = f"Navigation: {navigation['rms_m']:.3g} m root mean square over {navigation['positions']} positions"
-        if navigation["outliers"]:
-            told += f", {navigation['outliers']} of them outliers"
-        console.print(told)
-    for role, key in (("control", "control_rms_m"), ("check", "check_rms_m")):
-        if section.get("control", {}).get(key) is not None:
-            console.print(f"Residual at {role} points: {section['control'][key]:.3g} m root mean square")
-    for note in section["notes"]:
-        console.print(f"Note: {note}")
+    for line in shown.lines:
+        console.print(line)
     if section.get("files_in_old_unit"):
         console.print(f"In the old unit still, to be made again: {', '.join(section['files_in_old_unit'])}")
