@@ -7,7 +7,7 @@ fit: their residuals tell its accuracy.
 """
 
 from collections.abc import Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path as FilePath
 from typing import Literal
 
@@ -77,7 +77,7 @@ def fit_control(
             hint="the same names in --points and --control; or fewer points with the role check",
         )
     chosen = [points[names[i]] for i in used]
-    xyz, coordinates = np.stack([point.xyz for point in chosen]), local.navigation.position[used]
+    xyz = np.stack([point.xyz for point in chosen])
     spread = np.linalg.svd(xyz - xyz.mean(0), compute_uv=False)
     if spread[1] < _ON_A_LINE * spread[0]:
         raise InputError(
@@ -85,8 +85,17 @@ def fit_control(
             cause="they leave the turn about it open",
             hint="a point beside the line; or navigation",
         )
-    alignment = _aligned(xyz, chosen, coordinates, std[used], up, settings)
-    _check(alignment, xyz, chosen, coordinates, std[used], up, settings, [names[i] for i in used])
+    pairs = _Pairs(
+        names=tuple(names[i] for i in used),
+        xyz=xyz,
+        covariance=np.stack([point.covariance for point in chosen]),
+        coordinates=local.navigation.position[used],
+        std=std[used],
+        up=up,
+        outlier=settings.outlier,
+    )
+    alignment = pairs.aligned()
+    _check(alignment, pairs, settings.control)
     found = []
     for i in np.flatnonzero(seen).tolist():
         point = points[names[i]]
@@ -122,80 +131,76 @@ def _read(
     return localized(record, settings, place), roles, given
 
 
-def _aligned(
-    xyz: np.ndarray,
-    points: list[ScenePoint],
-    coordinates: np.ndarray,
-    std: np.ndarray,
-    up: np.ndarray,
-    settings: ScaleSettings,
-) -> Alignment:
-    """The similarity, errors of the marks turned to metres by a first one."""
-    eye = np.tile(np.eye(3), (len(xyz), 1, 1))
-    bare = ScaleSettings(outlier=settings.outlier)
-    path = Path(xyz, eye, coordinates, std, None, np.zeros((len(xyz), 3)), up)
-    first = align(path, bare)
-    marks = np.stack([first.scale**2 * np.diag(first.R @ point.covariance @ first.R.T) for point in points])
-    return align(Path(xyz, eye, coordinates, np.sqrt(std**2 + marks), None, np.zeros((len(xyz), 3)), up), bare)
+@dataclass(frozen=True)
+class _Pairs:
+    """Control points in the run and as they are stated."""
+
+    names: tuple[str, ...]
+    xyz: Float[np.ndarray, "n 3"]
+    covariance: Float[np.ndarray, "n 3 3"]  # of xyz
+    coordinates: Float[np.ndarray, "n 3"]  # local metres
+    std: Float[np.ndarray, "n 3"]  # of the coordinates
+    up: Float[np.ndarray, "3"]  # in the run
+    outlier: float
+
+    def aligned(self) -> Alignment:
+        """The similarity, errors of the marks turned to metres by a first one."""
+        first = self._align(self.std)
+        marks = first.scale**2 * np.diagonal(first.R @ self.covariance @ first.R.T, axis1=1, axis2=2)
+        return self._align(np.sqrt(self.std**2 + marks))
+
+    def _align(self, std: Float[np.ndarray, "n 3"]) -> Alignment:
+        eye = np.tile(np.eye(3), (len(self.xyz), 1, 1))
+        path = Path(self.xyz, eye, self.coordinates, std, None, np.zeros((len(self.xyz), 3)), self.up)
+        return align(path, ScaleSettings(outlier=self.outlier))
+
+    def without(self, k: int) -> "_Pairs":
+        """All points but one."""
+        kept = np.arange(len(self.xyz)) != k
+        names = tuple(name for i, name in enumerate(self.names) if i != k)
+        arrays = {name: getattr(self, name)[kept] for name in ("xyz", "covariance", "coordinates", "std")}
+        return replace(self, names=names, **arrays)
+
+    def swapped(self) -> "_Pairs":
+        """East as north and north as east."""
+        order = [1, 0, 2]
+        return replace(self, coordinates=self.coordinates[:, order], std=self.std[:, order])
 
 
-def _check(
-    found: Alignment,
-    xyz: np.ndarray,
-    points: list[ScenePoint],
-    coordinates: np.ndarray,
-    std: np.ndarray,
-    up: np.ndarray,
-    settings: ScaleSettings,
-    names: list[str],
-) -> None:
+def _check(found: Alignment, pairs: _Pairs, file: FilePath) -> None:
     """Refuse points that contradict each other, or that put the ground above the cameras."""
     away = np.abs(found.residual / found.std).max(1)
-    extent = float(np.linalg.norm(coordinates - coordinates.mean(0), axis=1).mean())
-    upside_down = float((found.R @ up)[2]) < 0.5
+    extent = float(np.linalg.norm(pairs.coordinates - pairs.coordinates.mean(0), axis=1).mean())
+    upside_down = float((found.R @ pairs.up)[2]) < 0.5
     bad = np.median(np.linalg.norm(found.residual, axis=1)) > 0.1 * extent
     if upside_down or bad:
-        swapped = _aligned(xyz, points, coordinates[:, [1, 0, 2]], std[:, [1, 0, 2]], up, settings)
+        swapped = pairs.swapped().aligned()
         fits = np.median(np.linalg.norm(swapped.residual, axis=1)) < 0.05 * extent
-        if fits and float((swapped.R @ up)[2]) > 0.5:
+        if fits and float((swapped.R @ pairs.up)[2]) > 0.5:
             raise InputError(
-                f"with {settings.control} the cameras would film from below the ground"
+                f"with {file} the cameras would film from below the ground"
                 if upside_down
-                else f"the points of {settings.control} do not fit the run",
+                else f"the points of {file} do not fit the run",
                 cause="the columns of easting and northing (or longitude and latitude) are swapped",
                 hint="exchange the names of the two columns",
             )
         raise InputError(
-            f"the points of {settings.control} do not fit the run: {found.rms:.3g} m root mean square over an extent of"
+            f"the points of {file} do not fit the run: {found.rms:.3g} m root mean square over an extent of"
             f" {extent:.3g} m",
             cause="points are exchanged, or heights stand in a column of depths",
             hint="compare names and coordinates with the marks in --points",
         )
-    if away.max() > _OFF and len(names) > _FEWEST:
-        left = [_without(k, xyz, points, coordinates, std, up, settings) for k in range(len(names))]
+    if away.max() > _OFF and len(pairs.names) > _FEWEST:
+        left = [pairs.without(k).aligned() for k in range(len(pairs.names))]
         worst = int(np.argmin([float(((a.residual / a.std) ** 2).sum()) for a in left]))
         found = left[worst]
-        off = found.scale * found.R @ xyz[worst] + found.t - coordinates[worst]
+        off = found.scale * found.R @ pairs.xyz[worst] + found.t - pairs.coordinates[worst]
         raise InputError(
-            f"control point {names[worst]} is {np.linalg.norm(off):.3g} m from where the others put it; with it the"
-            f" points contradict each other by up to {away.max():.1f} standard deviations",
+            f"control point {pairs.names[worst]} is {np.linalg.norm(off):.3g} m from where the others put it; with"
+            f" it the points contradict each other by up to {away.max():.1f} standard deviations",
             cause="its coordinates or its marks are wrong",
             hint="correct it, or give it the role check",
         )
-
-
-def _without(
-    k: int,
-    xyz: np.ndarray,
-    points: list[ScenePoint],
-    coordinates: np.ndarray,
-    std: np.ndarray,
-    up: np.ndarray,
-    settings: ScaleSettings,
-) -> Alignment:
-    """The similarity by all points but one."""
-    kept = [i for i in range(len(xyz)) if i != k]
-    return _aligned(xyz[kept], [points[i] for i in kept], coordinates[kept], std[kept], up, settings)
 
 
 def _triple(values: np.ndarray) -> tuple[float, float, float]:
