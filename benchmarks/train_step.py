@@ -1,6 +1,6 @@
 """CPU time of a whole training step beside that of the rasterizer alone, part by part.
 
-    python benchmarks/train_step.py [--sizes S M L] [--threads N] [--repeats N]
+    python benchmarks/train_step.py [--sizes XS S M L] [--threads N] [--repeats N]
 
 The primitives are those of benchmarks/raster.py, lifted into space so that one camera sees them all, with conditioning
 that does something. CPU-ms are process CPU time summed over threads, medians. The bar is a ratio of 1.5 at M. Where
@@ -120,10 +120,13 @@ def measure(size: Size, repeats: int, device: torch.device) -> dict[str, float]:
     p, field = state.primitives, state.field
     prior = 1 + 9 * torch.rand(height, width, generator=rng)
     view = TrainingView(
-        "benchmark", camera(size), torch.rand(3, height, width, generator=rng),
-        torch.ones(height, width, dtype=torch.bool), prior, torch.full((height, width), 1.8),
-        prior < 0,
-    ).to(device)  # fmt: skip
+        name="benchmark",
+        camera=camera(size),
+        rgb=torch.rand(3, height, width, generator=rng),
+        seen=torch.ones(height, width, dtype=torch.bool),
+        z_depth=prior,
+        open_water=prior < 0,
+    ).to(device)
     sight = pinhole(view.camera).to(device)
     leaves = BetaPrimitives(*(t.clone().requires_grad_() for t in p))
 
@@ -182,7 +185,7 @@ def measure(size: Size, repeats: int, device: torch.device) -> dict[str, float]:
 def main() -> None:
     """Print the table."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument("--sizes", nargs="+", default=["S", "M"], choices=["S", "M", "L"])
+    parser.add_argument("--sizes", nargs="+", default=["S", "M"], choices=["XS", "S", "M", "L"])
     parser.add_argument("--threads", type=int, default=torch.get_num_threads())
     parser.add_argument("--repeats", type=int, default=7)
     arguments = parser.parse_args()

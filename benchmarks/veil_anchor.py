@@ -1,5 +1,7 @@
 """The effect of the physics losses on the water: L_sat's anchor and the floor under T_D, on exact images.
 
+    python benchmarks/veil_anchor.py [--waters N] [--steps N]
+
 Nothing is learned here. Frames of synthetic dives are seen through water of each family; Binf, beta_B and a constant
 beta_D minimize L_for + L_inv + L_sat by Adam from the head's start: as printed, without the anchor, and with a floor
 eps_inv that is never reached.

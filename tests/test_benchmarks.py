@@ -1,0 +1,36 @@
+"""The scripts of benchmarks/ still run: what they call changes, and nobody runs them for months."""
+
+import subprocess
+import sys
+from importlib.util import module_from_spec, spec_from_file_location
+from pathlib import Path
+from types import ModuleType
+
+FOLDER = Path(__file__).parents[1] / "benchmarks"
+
+
+def script(name: str) -> ModuleType:
+    spec = spec_from_file_location(f"benchmarks_{name}", FOLDER / f"{name}.py")
+    assert spec is not None
+    assert spec.loader is not None
+    module = module_from_spec(spec)
+    spec.loader.exec_module(module)
+    return module
+
+
+def test_a_training_step_is_measured_part_by_part():
+    command = [sys.executable, str(FOLDER / "train_step.py"), "--sizes", "XS", "--threads", "1", "--repeats", "1"]
+    run = subprocess.run(command, capture_output=True, text=True, check=True)
+    heads, cells = (
+        [cell.strip() for cell in line.strip("|").split("|")]
+        for line in run.stdout.splitlines()
+        if line.startswith(("| size", "| XS"))
+    )
+    assert len(heads) == len(cells)
+    assert all(float(cell) >= 0 for cell in cells[2:])
+
+
+def test_every_script_loads_and_names_its_command():
+    for path in sorted(FOLDER.glob("*.py")):
+        module = script(path.stem)
+        assert f"python benchmarks/{path.name}" in (module.__doc__ or ""), path.name
