@@ -9,6 +9,7 @@ import torch
 
 from swimm3r.medium import Medium, backscatter
 from swimm3r.splat.medium.field import (
+    FieldGrid,
     grid_of,
     initial_field,
     medium_at_pixels,
@@ -65,6 +66,18 @@ def test_interpolating_between_grid_points_changes_a_rough_field_little(camera):
     coarse = medium_at_pixels(grid_of(field, view, 8), view.height, view.width)
     for a, b in zip(coarse, exact, strict=True):
         assert (a - b).abs().max() < 0.02 * (b.max() - b.min())
+
+
+def test_the_field_is_interpolated_as_torch_interpolates_and_so_are_its_gradients():
+    rng = torch.Generator().manual_seed(1)
+    values = torch.rand(9, 7, 11, generator=rng, requires_grad=True)
+    weights = torch.rand(9, 45, 70, generator=rng)
+    maps = medium_at_pixels(FieldGrid(values, (1.0, 1.0)), 45, 70)
+    ours = torch.cat([maps.Binf, maps.beta_B, maps.beta_D])
+    torchs = torch.nn.functional.interpolate(values[None], (45, 70), mode="bilinear", align_corners=True)[0]
+    torch.testing.assert_close(ours, torchs, rtol=0, atol=1e-6)
+    (found,), (expected,) = (torch.autograd.grad((x * weights).sum(), values) for x in (ours, torchs))
+    torch.testing.assert_close(found, expected, rtol=1e-5, atol=1e-5)
 
 
 def test_the_field_is_seen_at_pixel_centers_of_the_turned_camera(camera):

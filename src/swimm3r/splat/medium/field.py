@@ -15,7 +15,7 @@ from dataclasses import dataclass
 import torch
 from jaxtyping import Float
 from torch import Tensor, nn
-from torch.nn.functional import interpolate, sigmoid, softplus
+from torch.nn.functional import sigmoid, softplus
 
 from swimm3r.medium import Medium
 from swimm3r.raster import MediumMaps
@@ -135,11 +135,19 @@ def grid_of(field: MediumField, view: Pinhole, stride: int, time: Float[Tensor, 
 
 def medium_at_pixels(grid: FieldGrid, height: int, width: int) -> MediumMaps:
     """The field at every pixel, betas per unit of ray depth."""
+    Binf, beta_B, beta_D = grid.values.split(3)
     if grid.values.shape[1:] != (height, width):
-        maps = interpolate(grid.values[None], (height, width), mode="bilinear", align_corners=True)[0]
-    else:
-        maps = grid.values
-    return MediumMaps(maps[:3], beta_B=maps[3:6], beta_D=maps[6:])
+        # as matrix products: torch's own bilinear interpolation takes four times as long on a processor
+        rows, columns = grid.values.shape[1:]
+        down, right = _hats(rows, height, grid.values), _hats(columns, width, grid.values)
+        Binf, beta_B, beta_D = (down @ values @ right.mT for values in (Binf, beta_B, beta_D))
+    return MediumMaps(Binf, beta_B=beta_B, beta_D=beta_D)
+
+
+def _hats(few: int, many: int, like: Tensor) -> Float[Tensor, "many few"]:
+    """Weights of linear interpolation from `few` to `many` places along an edge whose ends they share."""
+    at = torch.linspace(0, few - 1, many, dtype=torch.float64, device=like.device)
+    return (1 - (at[:, None] - torch.arange(few, device=like.device)).abs()).clamp(min=0).to(like)
 
 
 def ray_lengths(view: Pinhole) -> Float[Tensor, "h w"]:

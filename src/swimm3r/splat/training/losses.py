@@ -78,7 +78,8 @@ def mean_opacity(p: BetaPrimitives) -> Float[Tensor, ""]:
 
 def mean_scale(p: BetaPrimitives, ubs_bug: bool = False) -> Float[Tensor, ""]:
     """L_scale (Eq. 15), of the spatial scales of all primitives; UBS's slip takes all of three primitives."""
-    return softplus(p.scale[:3] if ubs_bug else p.scale[:, :3]).mean()
+    scale = p.scale[:3] if ubs_bug else p.scale[:, :3]
+    return softplus(scale.contiguous()).mean()  # across a stride it takes three times as long
 
 
 def oversize(p: BetaPrimitives, radius: Float[Tensor, " n"], limit: float) -> Float[Tensor, ""]:

@@ -24,7 +24,7 @@ _weights = np.exp(-0.5 * (_offsets / SIGMA) ** 2)
 W0, W1, W2, W3, W4, W5 = (np.float32(w) for w in (_weights / _weights.sum())[HALF:])  # symmetric: the middle first
 ZERO, ONE, TWO = np.float32(0.0), np.float32(1.0), np.float32(2.0)
 
-kernel = njit(nogil=True, cache=True, error_model="numpy", fastmath=math.FLAGS)
+kernel = njit(nogil=True, cache=True, error_model="numpy", fastmath=math.FLAGS | {"reassoc"})  # for sums along rows
 
 
 @no_type_check
