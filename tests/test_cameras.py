@@ -14,6 +14,7 @@ from swimm3r.cameras import (
     project_visible,
     ray_depth_from_z,
     resized,
+    rows_of_frames,
     unproject,
     z_depth_from_ray,
 )
@@ -105,3 +106,9 @@ def test_wrong_number_of_distortion_parameters_is_refused():
 
 def test_no_pixels_have_no_rays():
     assert directions(two_cameras("OPENCV"), torch.zeros(2, 0, 2, dtype=torch.float64)).shape == (2, 0, 3)
+
+
+def test_rows_of_frames_are_those_that_name_the_frame():
+    frame = torch.tensor([2, 0, 2, 1, 0])
+    assert [rows.tolist() for rows in rows_of_frames(frame, 4)] == [[1, 4], [3], [0, 2], []]
+    assert [rows.tolist() for rows in rows_of_frames(frame[:0], 2)] == [[], []]

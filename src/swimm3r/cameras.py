@@ -339,6 +339,11 @@ def z_depth_from_ray(ray_depth: Float[Tensor, "*pixels"], rays: Float[Tensor, "*
     return ray_depth / torch.linalg.vector_norm(rays, dim=-1)
 
 
+def rows_of_frames(frame: Int[Tensor, " n"], count: int) -> tuple[Int[Tensor, " _"], ...]:
+    """The rows that belong to each of `count` frames, given the frame of every row: one sort for all of them."""
+    return frame.argsort(stable=True).split(torch.bincount(frame, minlength=count).tolist())
+
+
 def resized(cameras: Cameras, width: int, height: int) -> Cameras:
     """The same cameras on images of another size; K scales per axis because pixel centers sit at +0.5."""
     scale = torch.diag(torch.tensor([width / cameras.width, height / cameras.height, 1.0])).to(cameras.K)

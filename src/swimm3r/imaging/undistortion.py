@@ -13,7 +13,16 @@ import torch
 from jaxtyping import Bool, Float, Int
 from torch import Tensor
 
-from swimm3r.cameras import Cameras, directions, distort, image_directions, inside_image, pixel_grid, resized
+from swimm3r.cameras import (
+    Cameras,
+    directions,
+    distort,
+    image_directions,
+    inside_image,
+    pixel_grid,
+    resized,
+    rows_of_frames,
+)
 
 _WIDEST = 2.5  # tangent of the half angle that covering pinhole images show at most: 136 degrees
 
@@ -73,8 +82,7 @@ def undistorted_matches(
 ) -> Float[Tensor, "m 2"]:
     """`undistorted_pixels` of pixels that lie in the images of various cameras."""
     straight = torch.empty_like(xy, dtype=torch.float64)
-    for i in frame.unique().tolist():
-        rows = frame == i
+    for i, rows in enumerate(rows_of_frames(frame, len(cameras))):
         straight[rows] = undistorted_pixels(cameras[i], xy[rows], None if K is None else K[i])
     return straight
 

@@ -12,7 +12,7 @@ import numpy as np
 import torch
 from jaxtyping import Float
 
-from swimm3r.cameras import unproject
+from swimm3r.cameras import rows_of_frames, unproject
 from swimm3r.errors import InputError
 from swimm3r.io.navigation.read import read_navigation
 from swimm3r.progress import Progress, silent
@@ -139,10 +139,10 @@ def placed_points(
 def ground_below(rec: Reconstruction, up: Float[np.ndarray, "3"]) -> Float[np.ndarray, " c"]:
     """Height of every camera above the ground straight below, in the run's unit; NaN where no points are there."""
     centers, xyz = rec.cameras.centers.double().numpy(), rec.points.xyz.double().numpy()
-    tracks = rec.tracks
+    points = rec.tracks.point.numpy()
     out = np.full(len(centers), np.nan)
-    for i, center in enumerate(centers):
-        mine = tracks.point[tracks.frame == i].numpy() if len(tracks.point) else np.arange(len(xyz))
+    for i, rows in enumerate(rows_of_frames(rec.tracks.frame, len(centers))):
+        center, mine = centers[i], points[rows.numpy()] if len(points) else np.arange(len(xyz))
         to_point = xyz[mine] - center
         fall = -to_point @ up
         below = fall > _CONE * np.linalg.norm(to_point, axis=1)

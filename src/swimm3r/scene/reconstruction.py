@@ -18,7 +18,7 @@ from jaxtyping import Float, Int
 from torch import Tensor
 
 from swimm3r import notebook
-from swimm3r.cameras import Cameras, project
+from swimm3r.cameras import Cameras, project, rows_of_frames
 from swimm3r.io import ply
 from swimm3r.io.colmap import model as colmap
 from swimm3r.io.files.array_file import Layout, read_arrays, write_arrays
@@ -206,10 +206,8 @@ class Reconstruction:
         Those behind a camera are left out.
         """
         depths = []
-        order = self.tracks.frame.argsort(stable=True)
-        of_frame = order.split(torch.bincount(self.tracks.frame, minlength=len(self.names)).tolist())
-        for i in range(len(self.names)):
-            mine = self.tracks.point[of_frame[i]]
+        for i, rows in enumerate(rows_of_frames(self.tracks.frame, len(self.names))):
+            mine = self.tracks.point[rows]
             points = self.points.xyz[mine] if len(self.tracks.point) else self.points.xyz
             depths.append(project(self.cameras[i], points[None])[1][0])
         z = torch.cat(depths)

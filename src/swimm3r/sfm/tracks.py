@@ -15,7 +15,7 @@ from scipy.sparse import coo_array
 from scipy.sparse.csgraph import connected_components
 from torch import Tensor
 
-from swimm3r.cameras import Cameras, project
+from swimm3r.cameras import Cameras, project, rows_of_frames
 from swimm3r.scene.frames import Frames
 from swimm3r.scene.reconstruction import Points, Tracks
 
@@ -134,8 +134,7 @@ def as_points(
     color = torch.zeros(len(tracks.xyz), 3)
     x = xy[:, 0].long().clamp(0, frames.width - 1)
     y = xy[:, 1].long().clamp(0, frames.height - 1)
-    for k, i in enumerate(order):
-        rows = tracks.frame == k
+    for rows, i in zip(rows_of_frames(tracks.frame, len(order)), order, strict=True):
         color.index_add_(0, tracks.point[rows], frames.image(i)[y[rows], x[rows]])
     points = Points(tracks.xyz, color / seen[:, None], mean)
     return points, Tracks(tracks.point, tracks.frame, xy.double())

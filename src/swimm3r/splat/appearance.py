@@ -18,6 +18,7 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
+from swimm3r.cameras import rows_of_frames
 from swimm3r.imaging.filters import blur
 from swimm3r.imaging.frame_colors import ColorEvidence, ColorTracks, about_identity, fit_frame_colors, identity_maps
 from swimm3r.io.files.atomic import write_text
@@ -108,11 +109,10 @@ def _judged(e: ColorEvidence, settings: AppearanceSettings) -> tuple[bool, str]:
 def color_tracks(rec: Reconstruction, frames: Frames, names: Sequence[str]) -> ColorTracks:
     """Colors of the sparse points in some frames; masked observations are left out."""
     place = {rec.index(name): k for k, name in enumerate(names)}
-    order = rec.tracks.frame.argsort(stable=True)
-    bounds = torch.searchsorted(rec.tracks.frame[order], torch.arange(len(rec.names) + 1))
+    rows_of = rows_of_frames(rec.tracks.frame, len(rec.names))
     parts: list[tuple[Tensor, ...]] = []
     for i, k in place.items():
-        rows = order[bounds[i] : bounds[i + 1]]
+        rows = rows_of[i]
         f = frames.index(rec.names[i])
         image, mask = frames.image(f), frames.mask(f)
         column, row = rec.tracks.xy[rows].long().unbind(-1)

@@ -95,13 +95,21 @@ def lenses_of_pairs(store: FeatureDatabase, settings: ColmapSettings) -> "list[p
 
 
 def adjust_lens(
-    store: FeatureDatabase, model: "pycolmap.Reconstruction", settings: ColmapSettings, progress: Progress
+    store: FeatureDatabase,
+    model: "pycolmap.Reconstruction",
+    settings: ColmapSettings,
+    progress: Progress,
+    *,
+    is_large: bool = False,
 ) -> "pycolmap.Reconstruction":
-    """The model after one bundle adjustment with its lens; as it was where that gives no lens or loses frames."""
+    """The model after one bundle adjustment with its lens; as it was where that gives no lens or loses frames.
+
+    Poses and lens of a large model are adjusted without its redundant points, which follow afterwards.
+    """
     if settings.intrinsics == "fixed":
         return model
     progress("refining the lens", 0, 1)
-    adjusted = _adjust(store, model, model.cameras[1].model.name, focal=True, distortion=True)
+    adjusted = _adjust(store, model, model.cameras[1].model.name, focal=True, distortion=True, is_large=is_large)
     progress("refining the lens", 1, 1)
     if is_lens(adjusted.cameras[1]) and adjusted.num_reg_images() >= model.num_reg_images():
         return adjusted
@@ -110,8 +118,8 @@ def adjust_lens(
 
 
 def adjust_poses(store: FeatureDatabase, model: "pycolmap.Reconstruction") -> "pycolmap.Reconstruction":
-    """The model after bundle adjustment of poses and points, its lens held."""
-    return _adjust(store, model, model.cameras[1].model.name)
+    """A large model after bundle adjustment of poses and points, its lens held; see `adjust_lens`."""
+    return _adjust(store, model, model.cameras[1].model.name, is_large=True)
 
 
 def refine(
@@ -190,7 +198,13 @@ def _settled(
 
 
 def _adjust(
-    store: FeatureDatabase, model: "pycolmap.Reconstruction", name: str, focal: bool = False, distortion: bool = False
+    store: FeatureDatabase,
+    model: "pycolmap.Reconstruction",
+    name: str,
+    *,
+    focal: bool = False,
+    distortion: bool = False,
+    is_large: bool = False,
 ) -> "pycolmap.Reconstruction":
     import pycolmap
 
@@ -208,6 +222,8 @@ def _adjust(
     mapping = pycolmap.IncrementalMapperOptions()
     mapping.random_seed = SEED
     mapping.num_threads = THREADS
+    # half the time and memory of 262 frames; their path is off by 0.0029 % of its length instead of 0.0024 %
+    mapping.ba_global_ignore_redundant_points3D = is_large
     triangulation = pycolmap.IncrementalTriangulatorOptions()
     triangulation.random_seed = SEED
     adjustment = pycolmap.BundleAdjustmentOptions()

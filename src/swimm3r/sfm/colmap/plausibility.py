@@ -7,10 +7,11 @@ on; the figures are beside them.
 import numpy as np
 import torch
 from jaxtyping import Float
+from scipy.sparse import coo_array
 from scipy.sparse.csgraph import connected_components
 from torch import Tensor
 
-from swimm3r.cameras import project
+from swimm3r.cameras import project, rows_of_frames
 from swimm3r.geometry import relative_poses, rotation_angle
 from swimm3r.scene.frames import Frames
 from swimm3r.scene.reconstruction import QualityWarning, Reconstruction
@@ -101,8 +102,8 @@ def depth_change(rec: Reconstruction) -> float:
     Frames with fewer than 10 points do not count.
     """
     medians = []
-    for i in range(len(rec.names)):
-        seen = rec.points.xyz[rec.tracks.point[rec.tracks.frame == i]]
+    for i, rows in enumerate(rows_of_frames(rec.tracks.frame, len(rec.names))):
+        seen = rec.points.xyz[rec.tracks.point[rows]]
         if len(seen) >= 10:
             medians.append(project(rec.cameras[i], seen[None])[1].median().item())
     if not medians:
@@ -141,10 +142,10 @@ def _jump(rec: Reconstruction, frames: Frames) -> QualityWarning | None:
 
 
 def _weak_link(rec: Reconstruction) -> QualityWarning | None:
-    seen = np.zeros((len(rec.points.xyz), len(rec.names)), np.float32)
-    seen[rec.tracks.point.numpy(), rec.tracks.frame.numpy()] = 1
+    at = (rec.tracks.point.numpy(), rec.tracks.frame.numpy())
+    seen = coo_array((np.ones(len(at[0])), at), shape=(len(rec.points.xyz), len(rec.names))).tocsr()
+    seen.data[:] = 1  # a point that a frame observes twice counts once
     shared = seen.T @ seen
-    np.fill_diagonal(shared, 0)
     parts = sorted(np.bincount(connected_components(shared >= _WEAK_LINK)[1]).tolist(), reverse=True)
     if len(parts) == 1 or parts[1] < 2:
         return None

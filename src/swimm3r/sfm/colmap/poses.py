@@ -17,7 +17,7 @@ import torch
 from jaxtyping import Bool, Float
 from torch import Tensor
 
-from swimm3r.cameras import Cameras, cameras_of
+from swimm3r.cameras import Cameras, cameras_of, rows_of_frames
 from swimm3r.errors import InputError, RegistrationError, StorageError
 from swimm3r.io.colmap.cameras import to_pycolmap_camera
 from swimm3r.io.colmap.model import ColmapModel, from_pycolmap, silence_log, to_pycolmap, write_model
@@ -280,8 +280,7 @@ def _colors(table: ColmapModel, frames: Frames, index: list[int]) -> Float[Tenso
     point, frame = torch.from_numpy(table.track_point), torch.from_numpy(table.track_frame)
     x = torch.from_numpy(table.track_xy[:, 0]).long().clamp(0, frames.width - 1)
     y = torch.from_numpy(table.track_xy[:, 1]).long().clamp(0, frames.height - 1)
-    for row, i in enumerate(index):
-        seen = frame == row
+    for seen, i in zip(rows_of_frames(frame, len(index)), index, strict=True):
         total.index_add_(0, point[seen], frames.image(i)[y[seen], x[seen]])
     return total / torch.bincount(point, minlength=len(total)).clamp(min=1)[:, None]
 

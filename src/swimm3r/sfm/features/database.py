@@ -37,7 +37,7 @@ log = logging.getLogger(__name__)
 MIN_INLIERS = 15  # of a pair; COLMAP's limit, below it chance agrees with some geometry
 _HINT_OF_OVERLAP = 8  # matches
 _BATCH = 32  # frames or pairs worked on together: what a killed run loses
-_HELD = 200  # frames in memory while matching: 0.3 GB
+_HELD = 64  # frames in memory while matching: 0.1 GB
 
 
 @dataclass(frozen=True)

@@ -117,7 +117,7 @@ def _join(
     for group in sorted(groups, key=lambda group: _frames_of(group, parts), reverse=True):
         model = assemble(store, parts, group, lens, progress)
         if pilot.determined and not models:
-            model = calibration.adjust_lens(store, model, settings, progress)
+            model = calibration.adjust_lens(store, model, settings, progress, is_large=True)
             lens = model.cameras[1]
         else:
             model = calibration.adjust_poses(store, model)
