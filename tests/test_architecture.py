@@ -20,7 +20,7 @@ ROWS = {  # by package: a room or module imports only rooms of rows before its o
         {"sfm", "splat"},
         {"products"},
         {"localization", "export", "report", "scale", "selftest"},
-        {"pipeline"},
+        {"pipeline", "visits"},
         {"batch", "bench", "viewer"},
         {"cli"},
     ],

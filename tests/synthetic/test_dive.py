@@ -165,7 +165,7 @@ def test_water_can_be_drawn_from_a_family_or_given():
 
 
 def test_a_written_dive_is_read_back_as_its_truth(fishy, tmp_path, monkeypatch):
-    monkeypatch.setattr("swimm3r.synthetic.dive.make_seafloor", lambda seed: fishy.floor)  # seconds saved
+    monkeypatch.setattr("swimm3r.synthetic.dive.make_seafloor", lambda *_: fishy.floor)  # seconds saved
     settings = replace(FISHY, frames=2, width=60, height=40, noise=0.0, give_masks=True)
     seen = []
     write_dive(settings, tmp_path, lambda what, done, total: seen.append((what, done, total)))

@@ -29,6 +29,9 @@ _DEPTH = "z depth, each frame scaled by its median, mean over frames"
 _AFTER = "over located frames, after the similarity of the training frames"
 _FIRST_POSES = "test frames whose refinement began at the reference's pose; else at one from 2D-3D matches"
 _WATER = "mean over held-out pixels at true ray depth and over channels"
+_IN_TRUTH = "the first visit is placed by its true camera centers"
+_STATED = "three stated standard deviations"
+_RIGHT = "reported cells whose truth has changed by one stated standard deviation or more, in that direction"
 _COLORS = "physical colors unless the row says white-balanced"
 
 COLUMNS = (
@@ -98,6 +101,19 @@ COLUMNS = (
     ),
     Column("cpu_minutes_100m", "100 m, CPU min", 1, "low", "processor minutes of all parts per 100 m of path"),
     Column("peak_run_mb", "Peak, MB", 0, "low", "resident memory of the process, the largest of its stages"),
+    Column(
+        "alignment_pct",
+        "Alignment, %",
+        3,
+        "low",
+        f"RMS of the later cameras, of the site's extent; {_IN_TRUTH}",
+    ),
+    Column("height_recall_pct", "Height recall, %", 1, "high", f"of cells whose true change is above {_STATED}"),
+    Column("height_precision_pct", "Height precision, %", 1, "high", _RIGHT),
+    Column("volume_error_pct", "Volume, %", 1, "neither", "error of the volume of all reported cells, of the true one"),
+    Column("bleached_recall_pct", "Bleached recall, %", 1, "high", "cells of bleached corals, reported as paler"),
+    Column("paler_precision_pct", "Paler precision, %", 1, "high", _RIGHT),
+    Column("false_area_pct", "False area, %", 2, "low", "of unchanged ground, reported as changed in height or color"),
     Column("peak_vram_mb", "Peak VRAM, MB", 0, "low", "allocated by torch on the GPU while it localized"),
 )
 

@@ -25,6 +25,22 @@ class SurveySettings(Settings):
     """Last part to run: poses alone (mapping), or a stage of the pipeline."""
 
 
+@dataclass(frozen=True)
+class RevisitSettings(Settings):
+    """Synthetic repeat visits in pairs of waters."""
+
+    pairs: Annotated[int, Range(1, 4)] = 4
+    """Number of pairs of waters."""
+    length: Annotated[float, Range(5, 100)] = 10.0
+    """Length of the path of each visit in meters."""
+    width: ImageSide = 320
+    """Width of the frames in pixels."""
+    height: ImageSide = 214
+    """Height of the frames in pixels."""
+    seed: Seed = 5
+    """Seed of the first pair's seafloor, paths and water; each further pair has the next one."""
+
+
 SfmMethod = Literal[
     "colmap-incremental",
     "colmap-global",

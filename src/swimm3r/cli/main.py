@@ -14,6 +14,7 @@ from swimm3r.cli.bench.ablation_uwbs import ablation_uwbs_command
 from swimm3r.cli.bench.flsea import ablation_sfm_command, flsea_command
 from swimm3r.cli.bench.on_runs import localization, restoration
 from swimm3r.cli.bench.render import render_command
+from swimm3r.cli.bench.revisits import revisits_command
 from swimm3r.cli.bench.scale import scale_command
 from swimm3r.cli.bench.sfm import sfm_command as bench_sfm_command
 from swimm3r.cli.bench.table import defaults_of
@@ -35,6 +36,7 @@ from swimm3r.cli.survey.measure import measure
 from swimm3r.cli.survey.products import products
 from swimm3r.cli.survey.scale import scale
 from swimm3r.cli.survey.telemetry import telemetry
+from swimm3r.cli.survey.visits import visits
 from swimm3r.cli.terminal.arguments import named
 from swimm3r.cli.terminal.help_views import View, brief_help, group_help
 from swimm3r.cli.terminal.output_level import FLAGS, begin_messages, with_output_level
@@ -122,6 +124,7 @@ def commands_for(arguments: Sequence[str]) -> dict[str, Callable | Family]:
         "render": render_command(tables),
         "localization": localization,
         "scale": scale_command(tables),
+        "revisits": revisits_command(tables),
         "ablation-sfm": ablation_sfm_command(tables),
         "ablation-uwbs": ablation_uwbs_command(tables),
     }
@@ -144,6 +147,7 @@ def commands_for(arguments: Sequence[str]) -> dict[str, Callable | Family]:
         "products": products,
         "measure": measure,
         "telemetry": telemetry,
+        "visits": visits,
         "localize": localize,
         "report": report,
         "datasets": datasets,

@@ -14,7 +14,7 @@ from dataclasses import dataclass
 import cv2
 import numpy as np
 import torch
-from jaxtyping import Float, Float32
+from jaxtyping import Float, Float32, Int64
 
 from swimm3r.cameras import project
 from swimm3r.products.survey import Colors, Survey
@@ -74,6 +74,32 @@ def blended(
             if image is not None:
                 sums[kind].add(_scaled(image, points.size, seen.pixel), seen, near, survey.rec.cameras.width)
     return {kind: added.colors() for kind, added in sums.items()}
+
+
+@dataclass(frozen=True)
+class Shown:
+    """Points as one frame shows them."""
+
+    which: Int64[np.ndarray, " k"]  # indices of the points that it sees
+    colors: Float32[np.ndarray, "k 3"]  # 0..1
+    rank: Float32[np.ndarray, " k"]
+
+
+def shown_by(survey: Survey, points: Points, i: int, kind: Colors) -> Shown | None:
+    """The colors of the points that a frame sees, not blended with others'; None where it sees none."""
+    (near,) = np.nonzero(_within_reach(survey, points, i))
+    if not len(near):
+        return None
+    seen = sight(survey, points.select(near), i)
+    kept = seen.rank > 0
+    image = survey.image(kind, i) if kept.any() else None
+    if image is None:
+        return None
+    seen, near = seen.select(kept), near[kept]
+    image = _scaled(image, points.size, seen.pixel)
+    shrink = image.shape[1] / survey.rec.cameras.width
+    column, row = ((at + 0.5) * shrink - 0.5 for at in (seen.column, seen.row))
+    return Shown(near, _sampled(image, column, row, cv2.INTER_LINEAR), seen.rank)
 
 
 def sight(survey: Survey, points: Points, i: int) -> Sight:

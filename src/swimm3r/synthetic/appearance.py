@@ -14,6 +14,7 @@ import numpy as np
 from swimm3r.synthetic.noise import fractal, hashed, noise, share
 from swimm3r.synthetic.raycast import bilinear
 from swimm3r.synthetic.seafloor import SPONGE, STAR, SUN, outline
+from swimm3r.synthetic.season import CORAL
 
 _SKY = 0.55
 _SUNLIGHT = 1.05
@@ -192,6 +193,8 @@ def radiance(
             pattern = np.exp(0.45 * fractal(x, y, z, 0.03, 4, 0.8, footprint, seed + 9))
             if animal[0] == STAR:
                 pattern *= 1.25 - 0.5 * min(distance, 1.0)
+            elif animal[0] == CORAL:  # broad lobes, so that views of it match
+                pattern *= np.exp(0.8 * fractal(x, y, z, 0.09, 3, 0.7, footprint, seed + 12))
             elif animal[0] == SPONGE:
                 pore = noise(x / 0.012, y / 0.012, z / 0.012, seed + 10)
                 pattern *= 1 - 0.6 * min(max(pore * 3, 0.0), 1.0) * min(1.0, max(0.0, 2 - footprint / 0.006))

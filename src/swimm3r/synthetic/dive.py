@@ -66,7 +66,7 @@ class Dive:
 
     def gains(self, i: int) -> Float[Tensor, "3"]:
         """The camera's factors on linear light in frame i; 1 without changes of exposure and white balance."""
-        rng = np.random.default_rng([self.settings.seed, 6, i])
+        rng = np.random.default_rng(self.settings.stream(6, i))
         return disturbances.camera_gains(self.settings.exposure, self.settings.white_balance, rng)
 
     def frame(self, i: int) -> DiveFrame:
@@ -84,12 +84,13 @@ class Dive:
         )
         if self.plates:
             radiance, z = with_plates(radiance, z, camera, list(self.plates))
+        radiance = radiance * np.array(settings.light)
         clear = srgb_from_linear(torch.from_numpy(radiance)).clamp(0, 1).float()
         z_depth = torch.from_numpy(z).float()
         ray_depth = ray_depth_from_z(z_depth, rays.float())
         raw = torch.where((z_depth > 0)[..., None], add_water(clear, ray_depth, self.medium), self.medium.Binf)
         usable = torch.ones_like(z_depth, dtype=torch.bool)
-        rng = np.random.default_rng([settings.seed, 2, i])
+        rng = np.random.default_rng(settings.stream(2, i))
         if settings.moving_object:
             there = disturbances.swimming(floor, i / max(len(self) - 1, 1), settings.seed)
             seen = disturbances.fish(sample_rays, z_depth, there.seen_from(camera.cam2world[0]))
@@ -111,10 +112,10 @@ def make_dive(settings: DiveSettings) -> Dive:
     Raises UsageError where a survey's camera would see too far.
     """
     if settings.path == "loop":
-        floor = make_seafloor(settings.seed)
-        poses = loop(floor, settings.frames, settings.seed)
+        floor = make_seafloor(settings.seed, settings.corals, settings.season)
+        poses = loop(floor, settings.frames, settings.stream(1))
     else:
-        floor, poses = Plain(settings.seed), survey(settings)
+        floor, poses = Plain(settings.seed, settings.corals, settings.season), survey(settings)
     focal = settings.width / 2 / np.tan(np.radians(settings.fov) / 2)
     K = torch.tensor([[focal, 0, settings.width / 2], [0, focal, settings.height / 2], [0, 0, 1]], dtype=torch.float64)
     cameras = Cameras(
@@ -189,7 +190,7 @@ def _holds_others(folder: Path) -> InputError:
 def water(settings: DiveSettings) -> Medium:
     """The water of a dive: drawn from a family, or as given."""
     if settings.family is not None:
-        return water_types.sample(settings.family, torch.Generator().manual_seed(settings.seed))
+        return water_types.sample(settings.family, torch.Generator().manual_seed(settings.seed + 1009 * settings.visit))
     given = settings.coefficients
     return Medium(torch.tensor(given.Binf), torch.tensor(given.beta_D), torch.tensor(given.beta_B))
 

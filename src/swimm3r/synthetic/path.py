@@ -11,9 +11,9 @@ from swimm3r.synthetic.settings import DiveSettings
 CLEARANCE = 0.65  # m above what is below, after smoothing
 
 
-def loop(floor: Seafloor, frames: int, seed: int) -> np.ndarray:
-    """cam2world [frames, 4, 4] (OpenCV axes) along the loop."""
-    rng = np.random.default_rng([seed, 1])
+def loop(floor: Seafloor, frames: int, stream: list[int]) -> np.ndarray:
+    """cam2world [frames, 4, 4] (OpenCV axes) along the loop; `stream` seeds what differs from visit to visit."""
+    rng = np.random.default_rng(stream)
     phase = rng.uniform(-0.3, 0.3, 6)
     fine = np.arange(512) / 512
     turn = 2 * np.pi * fine
@@ -34,6 +34,7 @@ PITCH = np.radians(65)  # below the horizon, of a survey's camera
 _SIDELAP = 0.5  # of two neighboring lines of a lawnmower path
 _SWAY = (0.08, 0.08, np.radians(5), np.radians(3), np.radians(4))  # aside and up in meters; yaw, pitch, roll
 _PERIODS = (3.1, 4.7, 7.3, 11.9)  # s
+_ASTRAY = (0.15, np.radians(6))  # of a later visit's start in meters, and of its heading
 _HOLLOWS = 0.3  # m below the sand's mean that the ground may lie
 
 
@@ -47,13 +48,24 @@ def survey(settings: DiveSettings) -> np.ndarray:
     seconds = np.arange(settings.frame_count) / settings.fps
     at = seconds * settings.speed
     x, y = (np.interp(at, along, fine[:, k]) for k in range(2))
+    fine = _as_of_visit(fine, settings)
     smooth = ndimage.gaussian_filter1d(np.gradient(fine, axis=0), 20, axis=0, mode="nearest")
     heading = np.interp(at, along, np.unwrap(np.arctan2(smooth[:, 0], smooth[:, 1])))
-    aside, up, yaw, pitch, roll = _sway(seconds, np.random.default_rng([settings.seed, 5]))
+    aside, up, yaw, pitch, roll = _sway(seconds, np.random.default_rng(settings.stream(5)))
     x, y = x + aside * np.cos(heading), y - aside * np.sin(heading)
     poses = _poses(np.stack([x, y, settings.altitude + up], 1), heading + yaw, PITCH + pitch, roll)
     _check_reach(poses, settings)
     return poses
+
+
+def _as_of_visit(fine: np.ndarray, settings: DiveSettings) -> np.ndarray:
+    """The path of a later visit: nobody finds the first one's start and heading again exactly."""
+    if settings.visit == 0:
+        return fine
+    rng = np.random.default_rng(settings.stream(10))
+    (east, north), turn = rng.uniform(-_ASTRAY[0], _ASTRAY[0], 2), rng.uniform(-_ASTRAY[1], _ASTRAY[1])
+    middle, R = (fine.min(0) + fine.max(0)) / 2, np.array([[np.cos(turn), -np.sin(turn)], [np.sin(turn), np.cos(turn)]])
+    return middle + (fine - middle) @ R.T + np.array([east, north])
 
 
 def _line(length: float) -> np.ndarray:

@@ -7,7 +7,7 @@ their edges, where light and boulders of the neighbors are missing; no camera se
 Axes as on the terrace (`seafloor`): x to the right, y ahead, z up, metres; the sand lies near z = 0.
 """
 
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from functools import lru_cache
 
 import numpy as np
@@ -28,7 +28,10 @@ from swimm3r.synthetic.seafloor import (
     some_boulder,
     terrain,
     with_animals,
+    with_corals,
+    with_shifted_sand,
 )
+from swimm3r.synthetic.settings import Season
 
 STEP = 896  # cells between two patches: a multiple of the steps that wide blurs take (`seafloor`)
 BORDER = 1.2  # m along a patch's edges that differ from patch to patch
@@ -43,15 +46,18 @@ class Plain:
     """The plain of a seed."""
 
     seed: int
+    corals: float = 0.0  # per square meter
+    season: Season = field(default_factory=Season)
 
     def around(self, x: float, y: float) -> Seafloor:
         """The patch whose middle is nearest to a place, metres."""
-        return _patch(self.seed, round(x / (STEP * CELL)), round(y / (STEP * CELL)))
+        return _patch(self, round(x / (STEP * CELL)), round(y / (STEP * CELL)))
 
 
 @lru_cache(maxsize=_KEPT)
-def _patch(seed: int, i: int, j: int) -> Seafloor:
+def _patch(plain: Plain, i: int, j: int) -> Seafloor:
     """The patch in column i and row j."""
+    seed = plain.seed
     x0, y0 = (i * STEP - CELLS // 2) * CELL, (j * STEP - CELLS // 2) * CELL
     sand, ground = terrain(CELLS + 1, x0, y0, CELL, seed * 7919 + 1, np.inf)
     squares = [
@@ -68,6 +74,13 @@ def _patch(seed: int, i: int, j: int) -> Seafloor:
     rock = np.clip((height - sand) / 0.03, 0, 1)
     animals = [animal for square in squares for animal in _animals(*square, height, rock, x0, y0)]
     rows = np.array(animals, np.float64).reshape(-1, ANIMAL_FIELDS)
+    height, rock = with_shifted_sand(height, rock, sand, x0, y0, plain.season, seed)
+    within = [  # whole, wherever a season moves them
+        (column, row)
+        for column, row, _ in squares
+        if min(column - x0, row - y0) >= 1 and max(column - x0, row - y0) <= EXTENT - 2
+    ]
+    rows = with_corals(rows, within, plain.corals, plain.season, seed)
     owner = with_animals(height, rows, x0, y0)
     return lit_floor(height, rock, rows, owner, x0, y0, seed)
 

@@ -13,6 +13,8 @@ from scipy import ndimage
 
 from swimm3r.synthetic.noise import fractal
 from swimm3r.synthetic.raycast import Heightfield, heightfield
+from swimm3r.synthetic.season import algae_of, corals_of, planted, sand_shift
+from swimm3r.synthetic.settings import Season
 
 CELLS = 2048
 EXTENT = 14.0  # m, side of the grid
@@ -43,8 +45,8 @@ class Seafloor:
         return self
 
 
-def make_seafloor(seed: int) -> Seafloor:
-    """The terrace of a seed."""
+def make_seafloor(seed: int, corals: float = 0.0, season: Season = Season()) -> Seafloor:  # noqa: B008 - frozen
+    """The terrace of a seed, after a season."""
     rng = np.random.default_rng(seed)
     x0, y0 = CENTER[0] - EXTENT / 2, CENTER[1] - EXTENT / 2
     sand, height = terrain(CELLS + 1, x0, y0, CELL, int(seed) * 7919 + 1, RIM + 1.2)
@@ -52,9 +54,38 @@ def make_seafloor(seed: int) -> Seafloor:
         add_boulder(height, height, x0, y0, CELL, boulder, int(rng.integers(1 << 30)))
     rock = np.clip((height - sand) / 0.03, 0, 1)
     animals = _animals(rng, height, rock, x0, y0, CELL)
+    squares = [
+        (column, row)
+        for row in range(-4, 9)
+        for column in range(-6, 6)
+        if np.hypot(column + 0.5 - CENTER[0], row + 0.5 - CENTER[1]) < RIM - 1
+    ]
+    height, rock = with_shifted_sand(height, rock, sand, x0, y0, season, seed)
+    animals = with_corals(animals, squares, corals, season, seed)
     owner = with_animals(height, animals, x0, y0)
     _add_rim(height, x0, y0, CELL, int(seed) * 7919 + 5)
     return lit_floor(height, rock, animals, owner, x0, y0, seed)
+
+
+def with_shifted_sand(
+    height: np.ndarray, rock: np.ndarray, sand: np.ndarray, x0: float, y0: float, season: Season, seed: int
+) -> tuple[np.ndarray, np.ndarray]:
+    """Height and share of rock once the sand has shifted: over rock where it rises, and off what it covered."""
+    if season.sand == 0:
+        return height, rock
+    x, y = x0 + CELL * np.arange(sand.shape[1])[None], y0 + CELL * np.arange(sand.shape[0])[:, None]
+    later = sand + sand_shift(x, y, season, seed)
+    shifted = np.maximum(np.where(height > sand, height, later), later)
+    return shifted, np.clip((shifted - later) / 0.03, 0, 1)
+
+
+def with_corals(
+    animals: np.ndarray, squares: list[tuple[int, int]], density: float, season: Season, seed: int
+) -> np.ndarray:
+    """The animals, and the corals and algae of these squares after a season; those in their way are left out."""
+    corals = [coral for column, row in squares for coral in corals_of(column, row, density, season, seed)]
+    algae = [patch for column, row in squares for patch in algae_of(column, row, season, seed)]
+    return np.array(planted(animals.tolist(), corals, algae), np.float64).reshape(-1, ANIMAL_FIELDS)
 
 
 def with_animals(height: np.ndarray, animals: np.ndarray, x0: float, y0: float) -> np.ndarray:

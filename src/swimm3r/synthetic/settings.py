@@ -7,6 +7,7 @@ from swimm3r.errors import UsageError
 from swimm3r.settings import ImageSide, Range, Seed, Settings, Share
 
 _Beta = Annotated[float, Range(0, 100)]
+_Light = Annotated[float, Range(0.1, 10)]
 
 
 @dataclass(frozen=True)
@@ -19,6 +20,34 @@ class Coefficients(Settings):
     """Attenuation of the scene's light per channel, 1/m of ray depth."""
     beta_B: tuple[_Beta, _Beta, _Beta] = (0.36, 0.26, 0.24)
     """Build-up of backscatter per channel, 1/m of ray depth."""
+
+
+@dataclass(frozen=True)
+class Season(Settings):
+    """Changes of the seafloor since the first visit."""
+
+    grown: Share = 0.0
+    """Share of the corals that have grown, 30 % wider and 50 % higher."""
+    bleached: Share = 0.0
+    """Share of the corals that have bleached."""
+    broken: Share = 0.0
+    """Share of the corals that have lost 70 % of their height."""
+    moved: Share = 0.0
+    """Share of the corals that lie 42 cm further to the right."""
+    algae: Share = 0.0
+    """Share of the square meters on which a patch of algae has grown."""
+    sand: Annotated[float, Range(0, 0.3)] = 0.0
+    """Height in meters of the highest bank of sand that has built up, and depth of the deepest hollow."""
+
+    def __post_init__(self) -> None:
+        super().__post_init__()
+        total = self.grown + self.bleached + self.broken + self.moved
+        if total > 1 + 1e-9:
+            raise UsageError(
+                f"the shares of corals that have grown, bleached, broken and moved are {total:g} together",
+                cause="each coral has one fate at most",
+                hint="shares whose sum is at most 1",
+            )
 
 
 @dataclass(frozen=True)
@@ -49,6 +78,13 @@ class DiveSettings(Settings):
     family: Literal["cyan", "teal", "green", "warm"] | None = None
     """Family of the paper's water types to draw from, instead of `coefficients`."""
     coefficients: Coefficients = Coefficients()
+    visit: Annotated[int, Range(0, 1000)] = 0
+    """Number of the visit to the seafloor of `seed`; each has a path and disturbances of its own."""
+    corals: Share = 0.0
+    """Share of the square meters on which a massive coral stands."""
+    season: Season = Season()
+    light: tuple[_Light, _Light, _Light] = (1.0, 1.0, 1.0)
+    """Light on the scene per channel, by that of a plain day, in linear light."""
     caustics: Annotated[float, Range(0, 10)] = 0.0
     """Strength of the moving light pattern; 0.5 is a bright day in 3 m of water."""
     marine_snow: Annotated[int, Range(0, 100_000)] = 0
@@ -78,6 +114,10 @@ class DiveSettings(Settings):
                 cause=f"moving_object was asked for together with path={self.path!r}",
                 hint="path='loop', or no moving object",
             )
+
+    def stream(self, *of: int) -> list[int]:
+        """Seed of random numbers of a kind: every visit but the first has streams of its own."""
+        return [self.seed, *of] if self.visit == 0 else [self.seed, *of, self.visit + (1 << 20)]
 
     @property
     def frame_count(self) -> int:

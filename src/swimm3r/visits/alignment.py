@@ -1,0 +1,224 @@
+"""The similarity from one visit to another by points that both have: RANSAC, then least squares of reprojections.
+
+A point of visit b, moved to visit a, must project onto the feature that sees it there, and the other way round. The
+residuals count with the soft L1 norm, so that points on changed ground, which fit badly, do not pull. The covariance
+of the seven parameters is the sandwich estimate with the frames of visit b as clusters: points of one frame share the
+error of its pose, and do not count as independent.
+"""
+
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+import torch
+from jaxtyping import Bool, Float
+from scipy.optimize import least_squares
+from scipy.spatial.transform import Rotation
+
+from swimm3r.cameras import project
+from swimm3r.errors import RegistrationError
+from swimm3r.products.survey import Survey
+from swimm3r.scene.reconstruction import Reconstruction
+from swimm3r.sfm.colmap.chunks.links import Sim3, fit_similarity
+from swimm3r.visits.matches import VisitMatches
+
+LEAST = 25  # points that agree
+_LEAST_SHARE = 0.1  # of all matches
+_LEAST_FRAMES = 3  # of either visit, with points that agree
+_MAX_ERROR = 12.0  # pixels of an image of 1000; never less than _LEAST_ERROR
+_LEAST_ERROR = 5.0
+_TRIALS = 2000
+_BEND = 1.5  # pixels at which a residual begins to count less
+_REFITS = 5
+
+
+@dataclass(frozen=True)
+class Alignment:
+    """Visit a from visit b, in the files' coordinates of both."""
+
+    a_from_b: Sim3
+    covariance: Float[np.ndarray, "7 7"]  # of log scale, turn (rad) about `pivot` and shift, in a's axes and unit
+    pivot: Float[np.ndarray, "3"]  # mean of the shared points, in a
+    inlier: Bool[np.ndarray, " n"]  # of the matches
+    error_px: float | None  # median over the inliers, of the larger reprojection error; None without matches
+
+    def covariance_at(self, points: Float[np.ndarray, "n 3"]) -> Float[np.ndarray, "n 3 3"]:
+        """Covariance of the places of points, in a's axes and unit, by the uncertainty of the alignment alone."""
+        arm = points - self.pivot
+        J = np.zeros((len(points), 3, 7))
+        J[:, :, 0] = arm
+        J[:, 0, 2], J[:, 0, 3] = arm[:, 2], -arm[:, 1]  # turn x arm
+        J[:, 1, 1], J[:, 1, 3] = -arm[:, 2], arm[:, 0]
+        J[:, 2, 1], J[:, 2, 2] = arm[:, 1], -arm[:, 0]
+        J[:, :, 4:] = np.eye(3)
+        return J @ self.covariance @ J.transpose(0, 2, 1)
+
+
+def align(a: Reconstruction, b: Reconstruction, matches: VisitMatches, names: tuple[str, str]) -> Alignment:
+    """The alignment of two visits by their matches; `names` are for messages.
+
+    Raises RegistrationError where too few points agree: the dives show different places.
+    """
+    pairs = Pairs(a, b, matches)
+    found = _ransac(pairs)
+    if found is None:
+        raise _apart(names, 0, len(matches))
+    for _ in range(_REFITS):
+        inlier = pairs.errors(found) < pairs.max_error
+        again = _refined(pairs, found, inlier)
+        if np.array_equal(inlier, pairs.errors(again) < pairs.max_error):
+            break
+        found = again
+    errors = pairs.errors(found)
+    inlier = errors < pairs.max_error
+    agreeing = matches.select(inlier)
+    frames = min(len(np.unique(agreeing.frame_a)), len(np.unique(agreeing.frame_b)))
+    if len(agreeing) < max(LEAST, _LEAST_SHARE * len(matches)) or frames < _LEAST_FRAMES:
+        raise _apart(names, len(agreeing), len(matches))
+    pivot = pairs.xyz_a[inlier].mean(0)
+    covariance = _covariance(pairs, found, inlier, pivot)
+    return Alignment(found, covariance, pivot, inlier, float(np.median(errors[inlier])))
+
+
+def by_georeference(a: Survey, b: Survey) -> tuple[Alignment, float, float] | None:
+    """The alignment that the georeferences of two runs tell, and its horizontal and vertical standard deviation, local.
+
+    None where either has none, or they are of different reference systems.
+    """
+    one, other = a.place, b.place
+    if one.epsg is None or one.epsg != other.epsg or one.scale is None or other.scale is None:
+        return None
+    R = one.R.T @ other.R
+    scale = other.scale / one.scale
+    t = one.from_crs(other.to_crs(np.zeros(3)))
+    stds = [np.array(place.origin_std or (1.0, 1.0, 1.0)) for place in (one, other)]
+    turns = [np.radians(place.rotation_std_deg or (2.0, 2.0, 2.0)) for place in (one, other)]
+    relative = sum((place.scale_std or 0.01) ** 2 for place in (one, other))
+    covariance = np.zeros((7, 7))
+    covariance[0, 0] = relative
+    covariance[1:4, 1:4] = one.R.T @ np.diag(turns[0] ** 2 + turns[1] ** 2) @ one.R
+    covariance[4:, 4:] = one.R.T @ np.diag(stds[0] ** 2 + stds[1] ** 2) @ one.R / one.scale**2
+    found = Alignment(Sim3(scale, R, t), covariance, t, np.zeros(0, bool), None)
+    both = np.hypot(*stds)
+    return found, float(np.hypot(both[0], both[1]) / np.sqrt(2)), float(both[2])
+
+
+class Pairs:
+    """Matched points of two visits with the cameras that observe them."""
+
+    def __init__(self, a: Reconstruction, b: Reconstruction, matches: VisitMatches) -> None:
+        self.a, self.b, self.matches = a, b, matches
+        self.xyz_a = a.points.xyz.double().numpy()[matches.point_a]
+        self.xyz_b = b.points.xyz.double().numpy()[matches.point_b]
+        self.z_b = _projected(b, matches.frame_b, self.xyz_b)[1]
+        self.focal_b = b.cameras.K[:, 0, 0].double().numpy()[matches.frame_b]
+        longest = max(a.cameras.width, a.cameras.height, b.cameras.width, b.cameras.height)
+        self.max_error = max(_LEAST_ERROR, _MAX_ERROR * longest / 1000)
+
+    def apart(self, found: Sim3, rows: np.ndarray) -> Float[np.ndarray, " n"]:
+        """Distance of the points of some pairs, in pixels of b's frames: cheap, and blind to the direction of view."""
+        back = found.inverse()(self.xyz_a[rows])
+        away = np.linalg.norm(back - self.xyz_b[rows], axis=1)
+        return away * self.focal_b[rows] / np.maximum(self.z_b[rows], 1e-9)
+
+    def residuals(self, found: Sim3, rows: np.ndarray) -> Float[np.ndarray, "n 4"]:
+        """Reprojection errors in the frame of a (x, y), then of b, pixels; infinite behind a camera."""
+        chosen = self.matches.select(rows)
+        in_a, z_a = _projected(self.a, chosen.frame_a, found(self.xyz_b[rows]))
+        in_b, z_b = _projected(self.b, chosen.frame_b, found.inverse()(self.xyz_a[rows]))
+        out = np.column_stack([in_a - chosen.xy_a, in_b - chosen.xy_b])
+        return np.where(((z_a > 0) & (z_b > 0))[:, None], out, np.inf)
+
+    def errors(self, found: Sim3) -> Float[np.ndarray, " n"]:
+        """The larger of both reprojection errors of each pair, pixels."""
+        off = self.residuals(found, np.arange(len(self.matches)))
+        return np.maximum(np.linalg.norm(off[:, :2], axis=1), np.linalg.norm(off[:, 2:], axis=1))
+
+
+def _ransac(pairs: Pairs) -> Sim3 | None:
+    """The similarity of three pairs with which most others agree; None without any."""
+    count = len(pairs.matches)
+    if count < LEAST:
+        return None
+    rng, everything = np.random.default_rng(0), np.arange(count)
+    best, most = None, 0
+    for _ in range(_TRIALS):
+        three = rng.choice(count, 3, replace=False)
+        trial = fit_similarity(pairs.xyz_b[three], pairs.xyz_a[three])
+        if trial is None:
+            continue
+        agree = int((pairs.apart(trial, everything) < 2 * pairs.max_error).sum())  # depth adds to the distance
+        if agree > most:
+            best, most = trial, agree
+    return best if most >= LEAST else None
+
+
+def _refined(pairs: Pairs, start: Sim3, inlier: Bool[np.ndarray, " n"]) -> Sim3:
+    (rows,) = np.nonzero(inlier)
+    if len(rows) < LEAST:
+        return start
+    pivot = pairs.xyz_a[rows].mean(0)
+    found: Any = least_squares(
+        lambda x: _finite(pairs.residuals(_moved(start, x, pivot), rows)).ravel(),
+        np.zeros(7), x_scale=_steps(pairs, rows, pivot), loss="soft_l1", f_scale=_BEND, max_nfev=40,
+    )  # fmt: skip
+    return _moved(start, found.x, pivot)
+
+
+def _covariance(
+    pairs: Pairs, found: Sim3, inlier: Bool[np.ndarray, " n"], pivot: Float[np.ndarray, "3"]
+) -> Float[np.ndarray, "7 7"]:
+    """Cluster-robust covariance of the seven parameters; clusters are the frames of b."""
+    (rows,) = np.nonzero(inlier)
+    step = 1e-4 * _steps(pairs, rows, pivot)
+
+    def residuals(x: np.ndarray) -> np.ndarray:
+        return _finite(pairs.residuals(_moved(found, x, pivot), rows))
+
+    ahead_behind = [residuals(d) - residuals(-d) for d in np.diag(step)]
+    J = np.stack(ahead_behind, -1) / (2 * step)  # [n, 4, 7]
+    r = residuals(np.zeros(7))
+    weight = 1 / np.sqrt(1 + (r / _BEND) ** 2)
+    bread = np.linalg.pinv(np.einsum("nkp,nk,nkq->pq", J, weight, J), hermitian=True)
+    scores = np.einsum("nkp,nk->np", J, weight * r)
+    frame = pairs.matches.frame_b[rows]
+    clusters = np.unique(frame)
+    sums = np.stack([scores[frame == f].sum(0) for f in clusters])
+    few = len(clusters) / max(1, len(clusters) - 1)
+    return few * bread @ (sums.T @ sums) @ bread
+
+
+def _moved(start: Sim3, x: Float[np.ndarray, " 7"], pivot: Float[np.ndarray, "3"]) -> Sim3:
+    """A similarity changed by log scale, turn about a pivot and shift."""
+    grown, turn = float(np.exp(x[0])), Rotation.from_rotvec(x[1:4]).as_matrix()
+    return Sim3(grown, turn, pivot - grown * turn @ pivot + x[4:]).after(start)
+
+
+def _steps(pairs: Pairs, rows: np.ndarray, pivot: Float[np.ndarray, "3"]) -> Float[np.ndarray, " 7"]:
+    """Changes of the parameters that move points by like amounts."""
+    spread = float(np.sqrt(((pairs.xyz_a[rows] - pivot) ** 2).sum(1).mean()))
+    return np.array([1e-2] * 4 + [1e-2 * spread] * 3)
+
+
+def _finite(residuals: Float[np.ndarray, "n 4"]) -> Float[np.ndarray, "n 4"]:
+    return np.nan_to_num(residuals, posinf=1e3, neginf=-1e3)
+
+
+def _projected(
+    rec: Reconstruction, frame: np.ndarray, xyz: Float[np.ndarray, "n 3"]
+) -> tuple[Float[np.ndarray, "n 2"], Float[np.ndarray, " n"]]:
+    """Pixels and z depths of points, each in its own frame."""
+    xy, z = np.zeros((len(frame), 2)), np.zeros(len(frame))
+    for i in np.unique(frame):
+        mine = frame == i
+        found, depth = project(rec.cameras[int(i)], torch.from_numpy(xyz[mine])[None])
+        xy[mine], z[mine] = found[0].double().numpy(), depth[0].double().numpy()
+    return xy, z
+
+
+def _apart(names: tuple[str, str], agreeing: int, matches: int) -> RegistrationError:
+    return RegistrationError(
+        f"{names[1]} could not be aligned with {names[0]}: {agreeing} of {matches} matched points agree",
+        cause="the dives show different places, overlap too little, or too little of the ground is unchanged",
+        hint="dives that overlap by a third or more, seen from like heights and directions; or runs of more frames",
+    )

@@ -1,0 +1,212 @@
+"""Visits of one site from runs to files: one frame, one grid, each visit's maps, and the layers of each change."""
+
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+from itertools import pairwise
+from pathlib import Path
+
+import numpy as np
+
+from swimm3r.errors import RegistrationError, UsageError
+from swimm3r.io.files.outputs import output_folder
+from swimm3r.products.grid import Grid
+from swimm3r.products.packages import require_packages
+from swimm3r.products.survey import Survey, open_survey
+from swimm3r.progress import Progress, watched
+from swimm3r.scene.reconstruction import Reconstruction
+from swimm3r.visits import color
+from swimm3r.visits.change import Change, compare
+from swimm3r.visits.ground import Ground, common_grid, observe
+from swimm3r.visits.layers import write_change, write_maps
+from swimm3r.visits.matches import Landmarks, landmarks_of
+from swimm3r.visits.misfit import Fit, align_visit, misfit_at
+from swimm3r.visits.page import Pair, pair, write_page
+from swimm3r.visits.places import Place
+from swimm3r.visits.record import AlignmentRecord, ChangeRecord, VisitRecord, VisitsRecord
+from swimm3r.visits.renders import rendered_views
+from swimm3r.visits.settings import VisitSettings
+
+
+@dataclass(frozen=True)
+class Visit:
+    """A visit in the frame of the first."""
+
+    name: str
+    run: Path
+    own: Reconstruction  # in the axes and unit of its own files
+    survey: Survey
+    fit: Fit | None  # None for the first
+    ground: Ground
+
+
+def write_visits(
+    runs: Sequence[Path], out: Path, settings: VisitSettings, progress: Progress | None = None
+) -> VisitsRecord:
+    """Align the runs, compare each with the one before it, and write everything into `out`."""
+    require_packages()
+    names = _names(runs)
+    surveys = [open_survey(run) for run in runs]
+    with watched(progress) as told:
+        placed = _aligned(surveys, names, settings, told)
+        grid = common_grid([survey for survey, _ in placed], settings.gsd)
+        visits = [
+            Visit(name, run, opened.rec, survey, fit, observe(survey, grid, told))
+            for name, run, opened, (survey, fit) in zip(names, runs, surveys, placed, strict=True)
+        ]
+        with output_folder(out) as folder:
+            return _write(visits, grid, folder, settings, told)
+
+
+def _names(runs: Sequence[Path]) -> list[str]:
+    """A name for each run: that of its folder, with a number where several share it."""
+    if len(runs) < 2:
+        raise UsageError(
+            "visits are compared with each other, and one run alone was given",
+            cause="the second run was left out",
+            hint="swimm3r visits RUN_A RUN_B --out DIR",
+        )
+    resolved = [run.resolve() for run in runs]
+    for k, path in enumerate(resolved):
+        if path in resolved[:k]:
+            raise UsageError(
+                f"{runs[k]} was given twice",
+                cause="a slip in the command",
+                hint="each run once, in the order of the visits",
+            )
+    names = [path.name for path in resolved]
+    return [name if names.count(name) == 1 else f"{name} ({k})" for k, name in enumerate(names, 1)]
+
+
+def _aligned(
+    surveys: Sequence[Survey], names: Sequence[str], settings: VisitSettings, progress: Progress
+) -> list[tuple[Survey, Fit | None]]:
+    """The surveys in the frame of the first, each aligned with the earliest one that it can be aligned with."""
+    placed: list[tuple[Survey, Fit | None]] = [(surveys[0], None)]
+    landmarks: list[list[Landmarks]] = [landmarks_of(surveys[0], settings.max_frames, progress)]
+    for k in range(1, len(surveys)):
+        landmarks.append(landmarks_of(surveys[k], settings.max_frames, progress))
+        refused: RegistrationError | None = None
+        for j in range(k):
+            try:
+                fit = align_visit(
+                    (names[j], placed[j][0], landmarks[j]), (names[k], surveys[k], landmarks[k]), settings, progress
+                )
+            except RegistrationError as error:
+                refused = refused or error
+                continue
+            moved = replace(surveys[k], rec=fit.rec, place=surveys[0].place)
+            placed.append((moved, fit))
+            break
+        else:
+            assert refused is not None
+            raise refused
+    return placed
+
+
+@dataclass(frozen=True)
+class _Compared:
+    """Two visits that follow each other, and the change between them."""
+
+    earlier: Visit
+    later: Visit
+    change: Change
+    record: ChangeRecord
+    places: list[Place]
+
+
+def _write(
+    visits: Sequence[Visit], grid: Grid, folder: Path, settings: VisitSettings, progress: Progress
+) -> VisitsRecord:
+    """Write layers, maps, page and record."""
+    place = visits[0].survey.place
+    factors = [color.neutral(visits[0].ground.color)]  # on linear colors, into the light of the first visit
+    compared: list[_Compared] = []
+    for k, (earlier, later) in enumerate(pairwise(visits), 1):
+        misfit = misfit_at(earlier.fit, later.fit, earlier.ground, grid, place)
+        change = compare(earlier.ground, later.ground, misfit, grid.gsd, factors[-1], settings)
+        factors.append(factors[-1] * change.gains)
+        names = earlier.name, later.name
+        compared.append(
+            _Compared(earlier, later, change, *write_change(names, change, grid, place, folder / f"change_{k}_{k + 1}"))
+        )
+    orthophotos = [
+        write_maps(
+            visit.survey, visit.ground, factors[k], grid,
+            (folder / f"elevation_{k + 1}.tif", folder / f"orthophoto_{k + 1}.tif"), progress,
+        )
+        for k, visit in enumerate(visits)
+    ]  # fmt: skip
+    west, step, _, north, _, _ = grid.affine(place)
+    record = VisitsRecord(
+        unit=place.unit,
+        gsd=step,
+        rows=grid.rows,
+        columns=grid.columns,
+        epsg=place.epsg,
+        west=west,
+        north=north,
+        threshold=settings.threshold,
+        visits=tuple(_visit_record(visit, grid.gsd) for visit in visits),
+        changes=tuple(each.record for each in compared),
+        notes=tuple(note for each in compared for note in _notes(each)),
+    )
+    pages = [
+        _page_of(each, record, (orthophotos[k], orthophotos[k + 1]), (factors[k], factors[k + 1]), progress)
+        for k, each in enumerate(compared)
+    ]
+    write_page(record, pages, folder)
+    record.save(folder)
+    return record
+
+
+def _page_of(
+    compared: _Compared,
+    record: VisitsRecord,
+    orthophotos: tuple[np.ndarray, np.ndarray],
+    factors: tuple[np.ndarray, np.ndarray],
+    progress: Progress,
+) -> Pair:
+    earlier, later = compared.earlier, compared.later
+    runs = (earlier.run, earlier.own, earlier.fit, factors[0]), (later.run, later.own, later.fit, factors[1])
+    views = rendered_views(earlier.survey, runs, compared.places, progress)
+    return pair(compared.record, compared.places, orthophotos, compared.change, views, record)
+
+
+def _notes(compared: _Compared) -> list[str]:
+    names, found = f"{compared.earlier.name} to {compared.later.name}", []
+    if compared.change.color is None:
+        found.append(f"no change of color from {names}: a run has no frames without water")
+    if not compared.change.comparable.any():
+        found.append(f"no ground was seen by both visits from {names}")
+    return found
+
+
+def _visit_record(visit: Visit, gsd: float) -> VisitRecord:
+    fit = visit.fit
+    return VisitRecord(
+        name=visit.name,
+        run=str(visit.run),
+        frames=len(visit.survey.rec.names),
+        area=float(visit.ground.seen.sum()) * gsd**2,
+        clear_colors=visit.survey.has("physical"),
+        alignment=None if fit is None else _alignment_record(fit),
+    )
+
+
+def _alignment_record(fit: Fit) -> AlignmentRecord:
+    found = fit.alignment
+    rows = [(float(x), float(y), float(z)) for x, y, z in found.a_from_b.R]
+    x, y, z = (float(value) for value in found.a_from_b.t)
+    return AlignmentRecord(
+        onto=fit.onto,
+        source=fit.source,
+        matches=len(found.inlier),
+        agreeing=int(found.inlier.sum()),
+        error_px=found.error_px,
+        scale=float(found.a_from_b.scale),
+        rotation=tuple(rows),
+        shift=(x, y, z),
+        check_points=fit.check_points,
+        level_std=fit.level,
+        up_std=fit.up,
+    )
