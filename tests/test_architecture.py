@@ -29,7 +29,9 @@ ROWS = {  # by package: a room or module imports only rooms of rows before its o
         {"cameras_json", "depth", "medium_json", "colmap", "image_header", "ply", "trajectory", "video"},
         {"images"},
         {"image_folder", "imports"},
-        {"calibration", "navigation", "telemetry"},
+        {"calibration"},
+        {"bags"},
+        {"navigation", "telemetry"},
     ],
     "swimm3r.sfm": [
         {"mast3r", "tracks", "imported"},

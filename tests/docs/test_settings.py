@@ -19,7 +19,7 @@ from swimm3r.splat.settings import RECIPES
 COMMANDS = (
     *("run", "prepare", "sfm", "splat", "render", "export", "eval", "localize", "report", "view", "demo", "doctor"),
     *("products", "measure", "scale", "datasets", "train-sfm", "batch", "weights get", "bench render", "bench sfm"),
-    *("telemetry", "visits", "bench flsea", "bench revisits"),
+    *("telemetry", "topics", "visits", "bench flsea", "bench revisits"),
     *("bench restoration", "bench localization", "bench scale", "bench ablation-uwbs", "bench ablation-sfm"),
     "run --backend mast3r",
     *(f"run --recipe {recipe}" for recipe in RECIPES),

@@ -32,8 +32,18 @@ from swimm3r.io.cameras_json import read_cameras
 from swimm3r.io.depth import read_depth
 from swimm3r.io.imports.read import read_foreign
 
-WITHOUT_A_MAP: tuple[FormatName, ...] = ("glb", "colmap", "nerfstudio", "tum", "kitti", "depth", "cameras")
-FOLDERS = ("colmap", "nerfstudio", "depth")
+WITHOUT_A_MAP: tuple[FormatName, ...] = (
+    "glb",
+    "colmap",
+    "nerfstudio",
+    "tum",
+    "kitti",
+    "rosbag",
+    "rosbag2",
+    "depth",
+    "cameras",
+)
+FOLDERS = ("colmap", "nerfstudio", "rosbag2", "depth")
 
 
 @pytest.fixture(scope="module")

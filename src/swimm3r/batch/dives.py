@@ -10,6 +10,7 @@ from swimm3r.batch.dive import Dive, check_names
 from swimm3r.batch.sheet import read_sheet
 from swimm3r.errors import InputError
 from swimm3r.io import images
+from swimm3r.io.bags.bag import is_bag
 from swimm3r.pipeline.presets import RunSettings
 from swimm3r.prepare import check_source
 from swimm3r.prepare.image_folder import VIDEO_SUFFIXES
@@ -94,6 +95,8 @@ def _reason_against(path: Path, out: Path) -> str | None:
     """The reason why a path is no dive; None where it is one."""
     if path.resolve() == out.resolve():
         return "it is the folder of the results"
+    if is_bag(path):
+        return _refusal(path)
     if path.is_dir():
         if is_run(path):
             return "it is the folder of a run"
@@ -101,7 +104,7 @@ def _reason_against(path: Path, out: Path) -> str | None:
         if not suffixes & {*images.SUFFIXES, *VIDEO_SUFFIXES} and not (path / "images").is_dir():
             return "it holds no images, no folder images/ and no video"
     elif path.suffix.lower() not in VIDEO_SUFFIXES:
-        return "it is neither a folder nor a video"
+        return "it is neither a folder nor a video nor a bag"
     return _refusal(path)
 
 

@@ -80,7 +80,7 @@ BRIEF: dict[tuple[str, ...], Groups] = {
         "output": ("--format", "--out"),
         "splats and clouds": ("--colors", "--time", "--point-limit"),
         "data sets": ("--with-images", "--text"),
-        "trajectories and cameras": ("--refined",),
+        "trajectories and cameras": ("--refined", "--storage"),
         "depth": ("--type",),
         "": _MESSAGES,
     },

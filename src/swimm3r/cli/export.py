@@ -24,7 +24,7 @@ def export_command(name: FormatName) -> Callable:
 
         Args:
             run: Run folder to export.
-            out: File to write, or a new folder for colmap, nerfstudio and depth; by default a place in RUN.
+            out: File to write, or a new folder for colmap, nerfstudio, rosbag2 and depth; by default a place in RUN.
             format: Format to write. `--format NAME --help` lists its options.
             settings: Options of the format.
         """

@@ -36,6 +36,7 @@ from swimm3r.cli.survey.measure import measure
 from swimm3r.cli.survey.products import products
 from swimm3r.cli.survey.scale import scale
 from swimm3r.cli.survey.telemetry import telemetry
+from swimm3r.cli.survey.topics import topics
 from swimm3r.cli.survey.visits import visits
 from swimm3r.cli.terminal.arguments import named
 from swimm3r.cli.terminal.help_views import View, brief_help, group_help
@@ -147,6 +148,7 @@ def commands_for(arguments: Sequence[str]) -> dict[str, Callable | Family]:
         "products": products,
         "measure": measure,
         "telemetry": telemetry,
+        "topics": topics,
         "visits": visits,
         "localize": localize,
         "report": report,

@@ -13,6 +13,8 @@ from swimm3r.export.settings import (
     GlbSettings,
     KittiSettings,
     NerfstudioSettings,
+    Rosbag2Settings,
+    RosbagSettings,
     SplatFileSettings,
     SplatPlySettings,
     SpzSettings,
@@ -39,7 +41,7 @@ def export_run(
     return _format(settings).export_run(folder, path, settings)
 
 
-def _format(settings: ExportSettings) -> ModuleType:
+def _format(settings: ExportSettings) -> ModuleType:  # noqa: C901 - a branch per format
     """The module of a format: `export_run`."""
     match settings:
         case SplatPlySettings():
@@ -78,6 +80,14 @@ def _format(settings: ExportSettings) -> ModuleType:
             from swimm3r.export.formats import kitti
 
             return kitti
+        case RosbagSettings():
+            from swimm3r.export.formats import rosbag
+
+            return rosbag
+        case Rosbag2Settings():
+            from swimm3r.export.formats import rosbag2
+
+            return rosbag2
         case CamerasSettings():
             from swimm3r.export.formats import cameras
 

@@ -19,6 +19,17 @@ class TimedCameras:
     times: tuple[float, ...]  # seconds of the clip
     cameras: Cameras
     units: str
+    stamps: tuple[int, ...] | None = None  # nanoseconds since 1970 of the images' headers, of a run of a bag
+
+    @property
+    def nanoseconds(self) -> tuple[int, ...]:
+        """The stamps of the images' headers, else the times of the clip."""
+        return self.stamps or tuple(round(time * 1e9) for time in self.times)
+
+    @property
+    def clock(self) -> str:
+        """The clock of `nanoseconds` in words."""
+        return "seconds of the clip" if self.stamps is None else "times of the images' headers"
 
 
 def wanted_poses(folder: Path, *, refined: bool) -> TimedCameras:
@@ -32,8 +43,9 @@ def wanted_poses(folder: Path, *, refined: bool) -> TimedCameras:
             hint="leave out --refined: they are the same",
         )
     table = cameras_json.read_own_cameras(room / "cameras.json", remake(room))
-    times = table.times or load_frames(folder / "prepare").times_of(table.names)
-    return TimedCameras(table.names, times, cameras_of(table), table.units)
+    frames = load_frames(folder / "prepare")
+    times = table.times or frames.times_of(table.names)
+    return TimedCameras(table.names, times, cameras_of(table), table.units, frames.stamps_of(table.names))
 
 
 def unit_of(table: TimedCameras) -> str:

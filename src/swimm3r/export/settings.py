@@ -6,7 +6,19 @@ from typing import Annotated, Literal
 from swimm3r.settings import ClipSecond, Range, Settings
 
 FormatName = Literal[
-    "ply", "compressed-ply", "splat", "spz", "glb", "colmap", "nerfstudio", "tum", "kitti", "depth", "cameras"
+    "ply",
+    "compressed-ply",
+    "splat",
+    "spz",
+    "glb",
+    "colmap",
+    "nerfstudio",
+    "tum",
+    "kitti",
+    "rosbag",
+    "rosbag2",
+    "depth",
+    "cameras",
 ]
 
 
@@ -142,6 +154,29 @@ class KittiSettings(_TrajectorySettings):
 
 
 @dataclass(frozen=True)
+class RosbagSettings(_TrajectorySettings):
+    """A ROS 1 bag: a PoseStamped per frame and a Path, at the times of the images."""
+
+    @property
+    def file_name(self) -> str:
+        """Place in the run folder where none is given."""
+        return "export/poses.bag"
+
+
+@dataclass(frozen=True)
+class Rosbag2Settings(_TrajectorySettings):
+    """A ROS 2 bag: a PoseStamped per frame and a Path, at the times of the images."""
+
+    storage: Literal["mcap", "sqlite3"] = "mcap"
+    """Kind of file in the bag."""
+
+    @property
+    def file_name(self) -> str:
+        """Place in the run folder where none is given."""
+        return "export/poses"
+
+
+@dataclass(frozen=True)
 class CamerasSettings(_TrajectorySettings):
     """A cameras.json: lens, poses and times as plain numbers."""
 
@@ -174,6 +209,8 @@ ExportSettings = (
     | NerfstudioSettings
     | TumSettings
     | KittiSettings
+    | RosbagSettings
+    | Rosbag2Settings
     | CamerasSettings
     | DepthSettings
 )
@@ -189,9 +226,11 @@ FORMATS: dict[FormatName, ExportSettings] = {
     "nerfstudio": NerfstudioSettings(),
     "tum": TumSettings(),
     "kitti": KittiSettings(),
+    "rosbag": RosbagSettings(),
+    "rosbag2": Rosbag2Settings(),
     "depth": DepthSettings(),
     "cameras": CamerasSettings(),
 }
 
-FOLDERS = (ColmapExportSettings, NerfstudioSettings, DepthSettings)
+FOLDERS = (ColmapExportSettings, NerfstudioSettings, DepthSettings, Rosbag2Settings)
 """Those that are folders."""

@@ -51,10 +51,18 @@ def read_header(path: Path) -> ImageHeader:
     try:
         require_regular_file(path, "an image")
         with path.open("rb") as file:
-            header = _tiff_header(file) if file.read(4) in TIFF_MAGIC else _pillow_header(file)
+            return header_in(file, path.stat().st_size, path)
     except DAMAGED as error:
         raise unreadable(path, error) from error
-    _check_size(header, path, path.stat().st_size)
+
+
+def header_in(file: io.BufferedReader | io.BytesIO, byte_count: int, path: Path) -> ImageHeader:
+    """As `read_header`, of an open file or of bytes; `path` is the place that errors name."""
+    try:
+        header = _tiff_header(file) if file.read(4) in TIFF_MAGIC else _pillow_header(file)
+    except DAMAGED as error:
+        raise unreadable(path, error) from error
+    _check_size(header, path, byte_count)
     return header
 
 
@@ -113,7 +121,7 @@ def _check_size(header: ImageHeader, path: Path, file_bytes: int) -> None:
         raise too_large_for_memory(path, header.size, header.decoding_bytes)
 
 
-def _tiff_header(file: io.BufferedReader) -> ImageHeader:
+def _tiff_header(file: io.BufferedReader | io.BytesIO) -> ImageHeader:
     file.seek(0)
     with tifffile.TiffFile(file) as tiff:
         page: Any = tiff.pages[0]
@@ -122,7 +130,7 @@ def _tiff_header(file: io.BufferedReader) -> ImageHeader:
     return _header("TIFF", size, orientation, False, sample_bytes)
 
 
-def _pillow_header(file: io.BufferedReader) -> ImageHeader:
+def _pillow_header(file: io.BufferedReader | io.BytesIO) -> ImageHeader:
     try:
         with _opened(file) as image:
             orientation = Image.Image.getexif(image).get(_ORIENTATION, 1)  # PngImageFile's own decodes the image first
@@ -142,7 +150,7 @@ def _header(kind: str, size: tuple[int, int], orientation: int, plain: bool, sam
 
 
 @contextmanager
-def _opened(file: io.BufferedReader) -> Iterator[ImageFile.ImageFile]:
+def _opened(file: io.BufferedReader | io.BytesIO) -> Iterator[ImageFile.ImageFile]:
     """An image of which only the header is read, by Pillow's plug-ins, which `Image.open` alone would limit in size."""
     file.seek(0)
     start = file.read(16)

@@ -17,6 +17,8 @@ from swimm3r.io.files.atomic import atomic_path
 from swimm3r.io.image_header import (
     DAMAGED,
     TRANSPOSED,
+    ImageHeader,
+    header_in,
     read_header,
     tiff_orientation,
     too_large_for_memory,
@@ -38,6 +40,12 @@ def read_rgb(path: Path) -> Rgb:
     0..255, up to 65536 it is 0..65535; what exceeds the scale is clipped. Raises InputError on a file that is damaged.
     """
     return _three_channels(_upright(*_decode(path)), path)
+
+
+def decode_rgb(data: bytes, place: Path) -> Rgb:
+    """As `read_rgb`, of the bytes of an image file within another file; errors name its `place`."""
+    header = header_in(io.BytesIO(data), len(data), place)
+    return _three_channels(_upright(*_decode_bytes(data, header, place)), place)
 
 
 def read_mask(path: Path) -> Bool[np.ndarray, "h w"]:
@@ -106,6 +114,15 @@ def _decode(path: Path) -> tuple[np.ndarray, int]:
     header = read_header(path)
     try:
         data = path.read_bytes()
+    except OSError as error:
+        raise unreadable(path, error) from error
+    except MemoryError as error:
+        raise too_large_for_memory(path, header.size, header.decoding_bytes) from error
+    return _decode_bytes(data, header, path)
+
+
+def _decode_bytes(data: bytes, header: ImageHeader, path: Path) -> tuple[np.ndarray, int]:
+    try:
         if header.kind == "TIFF":
             return _decode_tiff(data)
         if header.kind == "PNG":

@@ -104,6 +104,21 @@ class Video:
             if seconds >= start - 1e-6:
                 yield VideoFrame(seconds, frame, self)
 
+    def warnings(self) -> list[str]:
+        """Faults that were met so far, in plain words."""
+        name, found = self.path.name, []
+        if self.damaged:
+            found.append(
+                f"{self.damaged} damaged packets of {name} were passed over; frames are missing or smeared there. "
+                "Copy the video again if the original is whole."
+            )
+        if self.interlaced:
+            found.append(
+                f"{name} is interlaced, which tears moving images into combs. "
+                "Deinterlace it first: ffmpeg -i IN -vf bwdif OUT.mp4"
+            )
+        return found
+
     def _open(self) -> "InputContainer":
         import av
 

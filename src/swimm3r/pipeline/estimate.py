@@ -11,10 +11,11 @@ from dataclasses import dataclass
 from pathlib import Path
 
 from swimm3r.errors import InputError, StorageError
+from swimm3r.io.bags.bag import is_bag
 from swimm3r.io.images import image_size
-from swimm3r.io.video import Video
 from swimm3r.pipeline.presets import RunSettings
 from swimm3r.prepare import check_source
+from swimm3r.prepare.clip import open_clip
 from swimm3r.prepare.image_folder import images_of
 from swimm3r.scene.run_folder import STAGES
 from swimm3r.scene.settings import FrameSettings
@@ -154,14 +155,14 @@ def size(count: float) -> str:
 def _frames_to_come(source: Path, folder: Path, settings: FrameSettings) -> tuple[int, tuple[int, int], float] | None:
     """Number and size of the prepared frames, and pixels that are decoded for them."""
     source = check_source(source)
-    if source.is_dir():
+    if source.is_dir() and not is_bag(source):
         paths = images_of(source, [folder]).paths
         whole = next((found for path in paths[:5] if (found := _size_of(path)) is not None), None)
         if whole is None:
             return None
         count = decoded = len(paths)
     else:
-        video = Video(source)
+        video = open_clip(source, settings)
         if video.seconds is None:
             return None
         seconds = max(0.0, min(settings.end or video.seconds, video.seconds) - settings.start)

@@ -2,8 +2,10 @@
 
 from pathlib import Path
 
+from swimm3r.io.bags.bag import is_bag
 from swimm3r.pipeline.presets import RunSettings
 from swimm3r.prepare import check_source
+from swimm3r.prepare.clip import open_clip
 from swimm3r.prepare.masks import check_masks
 from swimm3r.scale.sources import check_sources
 from swimm3r.scene.ground_truth import FOLDER, GroundTruth, read_ground_truth
@@ -15,7 +17,8 @@ def check_inputs(source: Path, settings: RunSettings, reference: Path | None = N
 
     A model is read whole, which takes seconds where preparing frames takes minutes.
     """
-    check_source(source)
+    if is_bag(check_source(source)):
+        open_clip(source, settings.frames)  # its camera is chosen
     check_masks(settings.frames)
     truth_of(source, reference)
     check_files(settings.sfm)

@@ -1,4 +1,4 @@
-"""A video or a folder of stills -> the frames a run works on, on disk, with frames.json beside them."""
+"""A video, a ROS bag or a folder of stills -> the frames a run works on, on disk, with frames.json beside them."""
 
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -19,7 +19,7 @@ def read_frames(
     progress: Progress | None = None,
     **changes: Any,
 ) -> "swimm3r.scene.frames.Frames":
-    """The frames of a video or a folder of stills, prepared into `folder`.
+    """The frames of a video, a ROS bag or a folder of stills, prepared into `folder`.
 
     Without a folder they go into the user's cache and are found there the next time. `changes` replace single settings:
     `read_frames("dive.mp4", fps=2)`. What `folder` held of an earlier preparation is replaced. Raises InputError on
@@ -41,7 +41,7 @@ def load_frames(folder: str | Path) -> "swimm3r.scene.frames.Frames":
 
 
 def check_source(source: Path) -> Path:
-    """The video or folder of images that a source stands for: a folder's only video where it has no images.
+    """The video, bag or folder of images that a source stands for: a folder's only video where it has no images.
 
     Cheap, and writes nothing. Raises InputError where a source is plainly none of them, or cannot be read.
     """

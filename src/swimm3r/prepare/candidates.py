@@ -41,6 +41,8 @@ class SelectedImages:
     originals: list[Path]  # what a mask may belong to, frames left out included
     files: frozenset[Path] = frozenset()  # the originals of stills where they lie: no masks, whatever their names
     recorded: str | None = None  # begin of the recording, ISO 8601
+    start_ns: int | None = None  # nanoseconds since 1970 at second 0, where the source stamps its images
+    calibration: Path | None = None  # a calibration file in the draft folder
 
 
 def sharpness(gray: UInt8[np.ndarray, "h w"]) -> float:

@@ -1,8 +1,8 @@
 """From a source to a complete folder of frames, and back from the folder.
 
 The folder appears when it is complete, and not before. frames.json holds name, time, split, sharpness and mask of each
-frame, and width, height, ordered, gray, masks (how many are used and unused), source, date of the recording and
-warnings of them all.
+frame, and width, height, ordered, gray, masks (how many are used and unused), source, date of the recording, stamp of
+second 0, lens and warnings of them all.
 """
 
 import logging
@@ -21,6 +21,7 @@ from jaxtyping import UInt8
 
 from swimm3r.errors import InputError
 from swimm3r.io import images
+from swimm3r.io.bags.bag import is_bag, open_bag
 from swimm3r.io.files.atomic import DRAFT
 from swimm3r.io.files.cache_key import cache_key, stat_digest
 from swimm3r.io.files.damage import guard, remake
@@ -28,11 +29,11 @@ from swimm3r.io.files.json_file import read_json
 from swimm3r.io.files.safe_names import check_name, check_names, shown_name
 from swimm3r.io.video import Video
 from swimm3r.prepare.candidates import SelectedImages, small_gray, target_size
+from swimm3r.prepare.clip import prepare_clip
 from swimm3r.prepare.image_folder import images_of, only_video, prepare_stills
 from swimm3r.prepare.keyframes import SIDE as MOTION_SIDE
 from swimm3r.prepare.masks import check_masks, prepare_masks
 from swimm3r.prepare.split import split_frames
-from swimm3r.prepare.video import prepare_clip
 from swimm3r.progress import Progress, silent
 from swimm3r.scene.frames import Frame, Frames, Part, write_index
 from swimm3r.scene.settings import FrameSettings
@@ -61,7 +62,7 @@ def read_frames(
         if (folder / "frames.json").is_file():
             return load_frames(folder)
     with _whole_folder(folder) as draft:
-        if source.is_dir():
+        if source.is_dir() and not is_bag(source):
             dive = prepare_stills(source, draft, settings, progress, leave_out=[folder, folder.parent])
         else:
             dive = prepare_clip(source, draft, settings, progress)
@@ -97,6 +98,8 @@ class _Document:
     gray: bool = False
     masks: _Masks = _Masks()
     recorded: str | None = None
+    start_ns: int | None = None
+    calibration: str | None = None
 
     def __post_init__(self) -> None:
         if min(self.width, self.height) < 1:
@@ -124,6 +127,7 @@ def load_frames(folder: Path) -> Frames:
             )
             for entry in document.frames
         )
+        calibration = _inside(folder, document.calibration) if document.calibration else None
     return Frames(
         frames,
         document.width,
@@ -133,6 +137,8 @@ def load_frames(folder: Path) -> Frames:
         gray=document.gray,
         unused_masks=document.masks.unused,
         recorded=document.recorded,
+        start_ns=document.start_ns,
+        calibration=calibration,
     )
 
 
@@ -149,6 +155,9 @@ def check_source(source: Path) -> Path:
 
 
 def _checked(source: Path) -> Path:
+    if is_bag(source):
+        with open_bag(source):
+            return source
     if source.is_dir():
         video = only_video(source)
         if video is None:
@@ -159,7 +168,7 @@ def _checked(source: Path) -> Path:
         raise InputError(
             f"there is no {source}",
             cause="a slip in the name, or a disk that is not mounted",
-            hint="give the path of a video, or of a folder with images",
+            hint="give the path of a video, of a ROS bag, or of a folder with images",
         )
     elif source.suffix.lower() in images.SUFFIXES:
         raise InputError(
@@ -208,14 +217,14 @@ def _write_frames(dive: SelectedImages, draft: Path, source: Path, settings: Fra
         Frame(
             name=image.name,
             path=draft / image.name,
-            time=round(image.time, 6),
+            time=round(image.time, 9),
             sharpness=round(image.sharpness, 3),
             split=part,
             mask=draft / masks.places[image.name] if image.name in masks.places else None,
         )
         for image, part in zip(kept, parts, strict=True)
     )
-    _remove_all_but(draft, {path for frame in listed for path in (frame.path, frame.mask)})
+    _remove_all_but(draft, {dive.calibration, *(path for frame in listed for path in (frame.path, frame.mask))})
     frames = Frames(
         listed,
         *size,
@@ -224,6 +233,8 @@ def _write_frames(dive: SelectedImages, draft: Path, source: Path, settings: Fra
         gray=gray,
         unused_masks=masks.unused,
         recorded=dive.recorded,
+        start_ns=dive.start_ns,
+        calibration=dive.calibration,
     )
     write_index(draft, frames, str(source.resolve()))
 

@@ -99,7 +99,7 @@ def scale_sources(
 def check_sources(settings: ScaleSettings) -> None:
     """Read the files that settings name, before any work is done. Raises the error of the first that cannot be used."""
     if settings.nav is not None:
-        localized(read_navigation(settings.nav), settings)
+        localized(read_navigation(settings.nav, settings.nav_topic), settings)
     marker_sizes(settings)
     if settings.distances is not None:
         read_distances(settings.distances)

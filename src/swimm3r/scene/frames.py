@@ -57,7 +57,9 @@ class Frames:
     warnings: tuple[str, ...] = ()  # what was left out or looks odd, in plain words
     gray: bool = False  # the three channels of every image are equal
     unused_masks: int = 0  # masks given that belong to no frame
-    recorded: str | None = None  # begin of the recording, ISO 8601, as the files state it: EXIF or the container
+    recorded: str | None = None  # begin of the recording, ISO 8601, as the files state it: EXIF, container or headers
+    start_ns: int | None = None  # nanoseconds since 1970 at second 0, where every image is stamped: those of a bag
+    calibration: Path | None = None  # the lens as the source states it, a file beside the frames
 
     def __len__(self) -> int:
         return len(self.frames)
@@ -133,6 +135,11 @@ class Frames:
             raise ValueError(f"no frame is called {name}")
         return self._position[name]
 
+    def stamps_of(self, names: Sequence[str]) -> tuple[int, ...] | None:
+        """Nanoseconds since 1970 of the frames of these names; None where the source does not stamp its images."""
+        start = self.start_ns
+        return None if start is None else tuple(start + round(time * 1e9) for time in self.times_of(names))
+
     def times_of(self, names: Sequence[str]) -> tuple[float, ...]:
         """Times of the frames of these names, seconds since the start of the clip."""
         times = {frame.name: frame.time for frame in self.frames}
@@ -168,7 +175,9 @@ class Frames:
                 path = _copied(frame.path, draft / frame.name)
                 mask = None if frame.mask is None else _copied(frame.mask, draft / MASKS / f"{frame.name}.png")
                 copied.append(replace(frame, path=path, mask=mask))
-            write_index(draft, replace(self, frames=tuple(copied)))
+            lens = self.calibration
+            calibration = None if lens is None else _copied(lens, draft / lens.name)
+            write_index(draft, replace(self, frames=tuple(copied), calibration=calibration))
 
     def _eight_bits(self, i: int) -> np.ndarray:
         stored = self._stored(i)
@@ -208,6 +217,8 @@ def write_index(folder: Path, frames: Frames, source: str = "") -> None:
         "masks": {"used": sum(frame.mask is not None for frame in frames), "unused": frames.unused_masks},
         "warnings": list(frames.warnings),
         "recorded": frames.recorded,
+        "start_ns": frames.start_ns,
+        "calibration": None if frames.calibration is None else frames.calibration.relative_to(folder).as_posix(),
         "frames": [
             {
                 "name": frame.name,

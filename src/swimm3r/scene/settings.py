@@ -10,10 +10,10 @@ from swimm3r.settings import ClipSecond, CountOrZero, LongSideOrOwn, Range, Sett
 
 @dataclass(frozen=True)
 class FrameSettings(Settings):
-    """Sampling of a video, and checks of a folder of images (`prepare.read_frames`)."""
+    """Sampling of a video or a bag, and checks of a folder of images (`prepare.read_frames`)."""
 
     fps: Annotated[float, Range(0, 1000)] = 5.0
-    """Frames per second taken from a video; 0 takes every frame. Folders of images are used completely."""
+    """Frames per second taken from a video or a bag; 0 takes every frame. Folders of images are used completely."""
     pick: Literal["sharpest", "uniform"] = "sharpest"
     """Frame taken from each interval of 1/fps seconds: the sharpest, or the first."""
     start: ClipSecond = 0.0
@@ -32,6 +32,12 @@ class FrameSettings(Settings):
     masks: Path | None = None
     """Folder of masks NAME.png, NAME.jpg.png or NAME_mask.png whose black pixels are ignored; by default masks/ in the
     input, if it exists."""
+    topic: str | None = None
+    """Topic of images of a ROS bag that holds several cameras; `swimm3r topics BAG` lists them."""
+    stamps: Literal["header", "received"] = "header"
+    """Times of a bag's images: those of their headers, or those at which they were recorded."""
+    camera_info: bool = True
+    """Start from the lens that a bag's camera_info states, where neither --calibration nor --focal gives another."""
     odd_sizes: Literal["refuse", "skip"] = "refuse"
     """Handling of images whose size differs from most others: refuse the input, or skip them."""
 

@@ -5,6 +5,7 @@ The principal point is in the middle of the image unless it is given.
 
 import logging
 from dataclasses import replace
+from pathlib import Path
 from typing import TypeVar
 
 import torch
@@ -12,7 +13,7 @@ import torch
 from swimm3r.cameras import DISTORTION_PARAMETERS, Cameras
 from swimm3r.errors import UsageError
 from swimm3r.io.calibration.read import read_calibration, read_lens
-from swimm3r.sfm.settings import ColmapSettings, LensSettings, Mast3rSettings
+from swimm3r.sfm.settings import LENS_NUMBERS, ColmapSettings, LensSettings, Mast3rSettings
 
 DISTORTION = ("k1", "k2", "k3", "k4", "p1", "p2")
 
@@ -37,14 +38,16 @@ def check_calibration(settings: LensSettings) -> None:
         read_calibration(settings.calibration, settings.calibration_camera, settings.calibration_size)
 
 
-def with_calibration(settings: Given, width: int, height: int) -> Given:
+def with_calibration(settings: Given, width: int, height: int, stated: Path | None = None) -> Given:
     """The settings with the numbers of their calibration file, in pixels of frames of this size, in its place.
 
-    Raises InputError where the file cannot be used or is of images of another shape, and UsageError where the settings
-    ask for another camera model.
+    Settings without a lens take the one of the file that the frames' source states. Raises InputError where the file
+    cannot be used or is of images of another shape, and UsageError where the settings ask for another camera model.
     """
     _check_whole(settings)
     path = settings.calibration
+    if path is None and all(getattr(settings, name) is None for name in LENS_NUMBERS):
+        path = stated
     if path is None:
         return settings
     read = read_lens(path, width, height, settings.calibration_camera, settings.calibration_size)
@@ -92,7 +95,7 @@ def _chosen_model(settings: ColmapSettings | Mast3rSettings, model: str) -> str:
     raise UsageError(
         f"the calibration is of a lens of the model {model}, and --camera says {asked}",
         cause="the file decides the model of its lens",
-        hint="leave out --camera",
+        hint="leave out --camera; or --no-camera-info, where the lens is that of a bag",
     )
 
 

@@ -1,1 +1,1 @@
-"""Navigation of vehicles: CSV, NMEA, Matisse .dim2, TUM, EXIF GPS and .srt files to one record."""
+"""Navigation of vehicles: CSV, NMEA, Matisse .dim2, TUM, EXIF GPS, .srt files and ROS bags to one record."""

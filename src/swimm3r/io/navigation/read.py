@@ -3,16 +3,18 @@
 import re
 from pathlib import Path
 
-from swimm3r.errors import InputError
+from swimm3r.errors import InputError, UsageError
+from swimm3r.io.bags.bag import is_bag
 from swimm3r.io.files.damage import Remedy, guard
 from swimm3r.io.image_folder import find_images
+from swimm3r.io.navigation.bag import read_bag
 from swimm3r.io.navigation.exif import read_exif
 from swimm3r.io.navigation.formats import read_dim2, read_nmea, read_srt, read_tum
 from swimm3r.io.navigation.record import Navigation, in_time_order
 from swimm3r.io.navigation.table import read_table
 
 _REMEDY = Remedy(
-    "a CSV with named columns, NMEA, Matisse .dim2, TUM, .srt, or a folder of images with GPS in EXIF; see"
+    "a CSV with named columns, NMEA, Matisse .dim2, TUM, .srt, a ROS bag, or a folder of images with GPS in EXIF; see"
     " docs/guides/metric-scale.md",
     cause="a slip in the name, or it is cut off or of another format",
     fault="cannot be read as navigation",
@@ -21,8 +23,18 @@ _DIM2 = re.compile(r"[^;]*;\s*\d\d/\d\d/\d{4}\s*;\s*\d\d:\d\d:")
 _BEGIN = 4096  # bytes that tell the format
 
 
-def read_navigation(path: Path) -> Navigation:
-    """Positions in the order of time. Raises InputError that names what is wrong, as swapped columns."""
+def read_navigation(path: Path, topic: str | None = None) -> Navigation:
+    """Positions in the order of time; `topic` is that of positions in a bag.
+
+    Raises InputError that names what is wrong, as swapped columns, and UsageError where a topic is to be chosen.
+    """
+    if is_bag(path):
+        with guard(path, _REMEDY):
+            return in_time_order(read_bag(path, topic))
+    if topic is not None:
+        raise UsageError(
+            f"{path} has no topics", cause="--nav-topic is for ROS bags alone", hint="leave out --nav-topic"
+        )
     if path.is_dir():
         with guard(path, _REMEDY):
             return in_time_order(read_exif(path, find_images(path).paths))

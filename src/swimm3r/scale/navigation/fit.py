@@ -57,7 +57,7 @@ class NavigationFit:
 def fit_navigation(rec: Reconstruction, frames: Frames, settings: ScaleSettings) -> NavigationFit:
     """The similarity from the run to local metres. Raises InputError where the navigation does not fit."""
     assert settings.nav is not None
-    raw = read_navigation(settings.nav)
+    raw = read_navigation(settings.nav, settings.nav_topic)
     local = localized(raw, settings)
     times = frame_times(rec.names, frames, settings.clip_start)
     matched, offset, notes = _match(local.navigation, times, rec, settings)

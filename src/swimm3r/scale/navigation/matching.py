@@ -12,7 +12,7 @@ import numpy as np
 from jaxtyping import Bool, Float, Int
 
 from swimm3r.errors import InputError
-from swimm3r.io.navigation.clock import seconds_of, seconds_of_name, utc
+from swimm3r.io.navigation.clock import is_date, seconds_of, seconds_of_name, utc
 from swimm3r.io.navigation.record import Navigation
 from swimm3r.scene.frames import Frames
 
@@ -47,6 +47,9 @@ def frame_times(names: Sequence[str], frames: Frames, clip_start: str | None) ->
     stated = [seconds_of_name(name) for name in names]
     if clip_start is None and all(moment is not None for moment in stated):
         return FrameTimes(tuple(names), "utc", np.array(stated, np.float64))
+    if clip_start is None and frames.start_ns is not None:  # a bag's, of a clock that need not count from 1970
+        seconds = frames.start_ns * 1e-9 + times
+        return FrameTimes(tuple(names), "utc" if is_date(float(seconds[0])) else "clip", seconds)
     begin = clip_start or frames.recorded
     if begin is None:
         return FrameTimes(tuple(names), "clip", times)

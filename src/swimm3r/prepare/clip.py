@@ -1,6 +1,7 @@
-"""A video -> one frame of each bin of 1/fps seconds; only the best frame of the current bin is in memory."""
+"""A video or the camera of a bag -> one frame of each bin of 1/fps seconds, of which the best alone is in memory."""
 
 from collections.abc import Iterator
+from dataclasses import replace
 from itertools import groupby
 from math import ceil, inf
 from pathlib import Path
@@ -8,6 +9,9 @@ from typing import Literal
 
 from swimm3r.errors import InputError
 from swimm3r.io import images
+from swimm3r.io.bags.bag import is_bag
+from swimm3r.io.bags.clip import BagClip, BagImage
+from swimm3r.io.files.atomic import write_text
 from swimm3r.io.video import Video, VideoFrame
 from swimm3r.prepare.candidates import (
     BLANK,
@@ -24,10 +28,20 @@ from swimm3r.prepare.candidates import (
 from swimm3r.progress import Progress
 from swimm3r.scene.settings import FrameSettings
 
+Clip = Video | BagClip
+ClipFrame = VideoFrame | BagImage
+
+LENS = "camera_info.yaml"  # the lens that a bag states, beside the frames
+
+
+def open_clip(source: Path, settings: FrameSettings) -> Clip:
+    """A video, or the camera of a bag. Raises InputError, and UsageError where a bag holds several cameras."""
+    return BagClip(source, settings.topic, settings.stamps) if is_bag(source) else Video(source)
+
 
 def prepare_clip(source: Path, draft: Path, settings: FrameSettings, progress: Progress) -> SelectedImages:
-    """Write the frames of a video into `draft`, in one pass. Raises InputError."""
-    video = Video(source)
+    """Write the frames of a clip into `draft`, in one pass. Raises InputError."""
+    video = open_clip(source, settings)
     end = settings.end if settings.end is not None else inf
     last = min(end, video.seconds if video.seconds is not None else inf)
     rate = settings.fps or inf
@@ -37,14 +51,14 @@ def prepare_clip(source: Path, draft: Path, settings: FrameSettings, progress: P
     seen = 0
     reached = 0.0
 
-    def watched() -> Iterator[VideoFrame]:
+    def watched() -> Iterator[ClipFrame]:
         nonlocal seen, reached
         for frame in video.frames(settings.start, end):
             progress(STEP, seen, max(expected, seen))
             seen, reached = seen + 1, frame.time
             yield frame
 
-    def bin_of(frame: VideoFrame) -> int:
+    def bin_of(frame: ClipFrame) -> int:
         return int((frame.time - settings.start) * rate + 1e-6) if rate < inf else seen
 
     found: list[SourceImage] = []
@@ -72,33 +86,29 @@ def prepare_clip(source: Path, draft: Path, settings: FrameSettings, progress: P
     mask_folders = [settings.masks] if settings.masks is not None else []
     kept = thinned(found, settings.max_frames)
     originals = [image.original for image in found]
-    return SelectedImages(kept, True, warnings, mask_folders, originals, recorded=video.recorded)
+    chosen = SelectedImages(kept, True, warnings, mask_folders, originals, recorded=video.recorded)
+    if not isinstance(video, BagClip):
+        return chosen
+    lens = draft / LENS if video.lens is not None and settings.camera_info else None
+    if lens is not None and video.lens is not None:
+        write_text(lens, video.lens)
+    return replace(chosen, start_ns=video.start_ns, calibration=lens)
 
 
-def _warnings(video: Video, last: float, reached: float) -> list[str]:
-    """The warning about a video that was read up to second `reached` and should last until `last`."""
-    name, warnings = video.path.name, []
-    if video.damaged:
-        warnings.append(
-            f"{video.damaged} damaged packets of {name} were passed over; frames are missing or smeared there. "
-            "Copy the video again if the original is whole."
-        )
+def _warnings(video: Clip, last: float, reached: float) -> list[str]:
+    """The warnings about a clip that was read up to second `reached` and should last until `last`."""
+    name, warnings = video.path.name, video.warnings()
     if last < inf and last - reached > max(1.0, 0.02 * last, 2 / video.rate):
         warnings.append(
             f"{name} should last {last:.1f} s, but ends at {reached:.1f} s: it is cut off or damaged. "
             "What decoded is used; copy it again if the original is longer."
         )
-    if video.interlaced:
-        warnings.append(
-            f"{name} is interlaced, which tears moving images into combs. "
-            "Deinterlace it first: ffmpeg -i IN -vf bwdif OUT.mp4"
-        )
     return warnings
 
 
-def _best(frames: Iterator[VideoFrame], pick: Literal["sharpest", "uniform"]) -> tuple[VideoFrame, float] | None:
+def _best(frames: Iterator[ClipFrame], pick: Literal["sharpest", "uniform"]) -> tuple[ClipFrame, float] | None:
     """The frame to take of a bin with its sharpness; None where all show nothing."""
-    best: tuple[VideoFrame, float] | None = None
+    best: tuple[ClipFrame, float] | None = None
     for frame in frames:
         if best and pick == "uniform":
             continue

@@ -1,0 +1,196 @@
+"""The images of one topic as a clip, like those of a video (`swimm3r.io.video.Video`).
+
+Times are those of the headers, counted from the first image. A header that is zero, or a clock that runs back or leaps
+ahead, is refused with the number of the image: times of recording (`stamps="received"`) take their place if asked.
+"""
+
+import math
+from collections.abc import Iterator
+from dataclasses import dataclass
+from datetime import UTC, datetime
+from functools import cached_property
+from pathlib import Path
+from typing import Any, Literal
+
+import numpy as np
+from jaxtyping import UInt8
+
+from swimm3r.errors import InputError, Swimm3rError
+from swimm3r.io.bags.bag import Bag, Message, open_bag
+from swimm3r.io.bags.lens import lens_text
+from swimm3r.io.bags.pixels import compressed_image_of, image_of
+from swimm3r.io.bags.topics import IMAGE, Topic, choose_images, lens_topic, topics_of
+from swimm3r.io.calibration.documents import from_yaml, read_document
+from swimm3r.io.calibration.record import lens_at
+from swimm3r.io.files.damage import first_line
+from swimm3r.io.images import Rgb
+
+Stamps = Literal["header", "received"]
+
+_LEAP = 60.0  # seconds that a header may be ahead of the recording between two images: buffers hold less
+_FIRST_YEAR = 631_152_000  # 1990 in seconds since 1970: earlier stamps are of a clock that was never set
+
+
+@dataclass(frozen=True)
+class BagImage:
+    """An image message; its pixels are only decoded when asked for."""
+
+    time: float  # seconds since the first image
+    _message: Message
+    _clip: "BagClip"
+    _bag: Bag
+
+    def gray(self, long_side: int) -> UInt8[np.ndarray, "h w"]:
+        """A small gray copy."""
+        import cv2
+
+        height, width = self._pixels.shape[:2]
+        scale = min(1.0, long_side / max(width, height))
+        size = max(1, round(width * scale)), max(1, round(height * scale))
+        small = cv2.resize(self._pixels, size, interpolation=cv2.INTER_AREA)
+        small = small if small.dtype == np.uint8 else (small >> 8).astype(np.uint8)
+        return cv2.cvtColor(small, cv2.COLOR_RGB2GRAY)
+
+    def rgb(self) -> Rgb:
+        """The image at full size."""
+        return self._pixels
+
+    @cached_property
+    def _pixels(self) -> Rgb:
+        return self._clip.decoded(self._bag.content(self._message), self._message)
+
+
+class BagClip:
+    """The images of a topic, looked into; each call of `frames` reads the bag anew."""
+
+    path: Path
+    topic: Topic
+    width: int
+    height: int
+    seconds: float | None  # from the first header to the last
+    rate: float  # images per second on average
+    recorded: str | None  # date of the first header, ISO 8601; None of a clock that was not set
+    start_ns: int  # stamp of the first image
+    lens: str | None  # ROS camera_info of the images, as YAML; None where the bag has none that can be used
+    damaged: int  # messages that did not decode so far
+    interlaced: bool
+
+    def __init__(self, path: Path, topic: str | None = None, stamps: Stamps = "header") -> None:
+        """Raises InputError where the bag cannot be read or has no images, UsageError where a topic is to be chosen."""
+        self.path, self.stamps = path, stamps
+        self.damaged, self.interlaced, self._notes, self._cut = 0, False, [], None
+        with open_bag(path) as bag:
+            topics = topics_of(bag)
+            self.topic = choose_images(topics, topic)
+            first, last = bag.first(self.topic.name), bag.last(self.topic.name)
+            assert first is not None  # or it would be no topic
+            assert last is not None
+            image = self._first_decoded(bag)
+            self.height, self.width = image.shape[:2]
+            self.lens = self._lens(bag, lens_topic(topics, self.topic))
+        self.start_ns, end = self._stamp(first), self._stamp(last)
+        self.seconds = (end - self.start_ns) * 1e-9 if end > self.start_ns else None
+        self.rate = (self.topic.count - 1) / self.seconds if self.seconds else 1.0
+        known = self.start_ns > _FIRST_YEAR * 10**9
+        begin = datetime.fromtimestamp(self.start_ns // 1000 * 1e-6, UTC) if known else None
+        self.recorded = None if begin is None else begin.strftime("%Y-%m-%dT%H:%M:%S.%f")
+
+    def frames(self, start: float = 0.0, end: float = math.inf) -> Iterator[BagImage]:
+        """The images from second `start` up to before second `end`. Raises InputError where the clock is no clock."""
+        with open_bag(self.path) as bag:
+            before: Message | None = None
+            for number, message in enumerate(bag.messages(self.topic.name), 1):
+                self._check_clock(message, before, number)
+                if before is not None and self._stamp(message) == self._stamp(before):
+                    continue  # the same image twice
+                before = message
+                time = (self._stamp(message) - self.start_ns) * 1e-9
+                if time >= end:
+                    break
+                if time >= start - 1e-6:
+                    image = BagImage(time, message, self, bag)
+                    if self._decodes(image):
+                        yield image
+            self._cut = bag.cut
+
+    def warnings(self) -> list[str]:
+        """Faults that were met so far, in plain words."""
+        name, found = self.path.name, list(self._notes)
+        if self.damaged:
+            found.append(f"{self.damaged} images of {self.topic.name} in {name} are damaged and were left out.")
+        if self._cut is not None:
+            found.append(f"{name} cannot be read to its end ({self._cut}): what was read until there is used.")
+        return found
+
+    def decoded(self, content: Any, message: Message) -> Rgb:
+        """The pixels of a message. Raises ValueError or InputError where they are damaged."""
+        place = Path(f"{self.path}:{message.topic}")
+        return image_of(content) if message.type == IMAGE else compressed_image_of(content, place)
+
+    def _decodes(self, image: BagImage) -> bool:
+        """Return whether an image decodes in the size of the clip; damaged ones are counted."""
+        try:
+            shape = image.rgb().shape
+        except (ValueError, InputError):
+            self.damaged += 1
+            return False
+        if shape[:2] == (self.height, self.width):
+            return True
+        raise InputError(
+            f"the images of {self.topic.name} in {self.path} change their size from {self.width}x{self.height} to"
+            f" {shape[1]}x{shape[0]} after {image.time:.1f} s",
+            cause="the mode of the camera was changed while it was recorded, or two cameras publish under one name",
+            hint=f"--end {image.time:.1f}, or --start {image.time:.1f} for the images after",
+        )
+
+    def _first_decoded(self, bag: Bag) -> Rgb:
+        why: object = "the bag is cut off before it"
+        for message in bag.messages(self.topic.name):
+            try:
+                return self.decoded(bag.content(message), message)
+            except (ValueError, InputError) as error:
+                why = error.what if isinstance(error, InputError) else error
+        raise InputError(
+            f"no image of {self.topic.name} in {self.path} can be decoded: {why}",
+            cause="the encoding is not one of sensor_msgs, or the bag is damaged",
+            hint=f"swimm3r topics {self.path} lists the encodings; another --topic",
+        )
+
+    def _lens(self, bag: Bag, topic: Topic | None) -> str | None:
+        """The camera_info of the images; without a calibration in it None, and a note."""
+        space = self.topic.name
+        if topic is None:
+            self._notes.append(
+                f"There is no camera_info beside {space}: the lens is estimated unless --calibration tells it."
+            )
+            return None
+        message = bag.first(topic.name)
+        assert message is not None  # or it would be no topic
+        try:
+            text = lens_text(bag.content(message), topic.name, rectified="rect" in space.rpartition("/")[2])
+            lens_at(read_document(from_yaml(text))[0], self.width, self.height)
+        except (ValueError, Swimm3rError) as error:
+            self._notes.append(f"The lens in {topic.name} is not used: {first_line(error)}.")
+            return None
+        return text
+
+    def _stamp(self, message: Message) -> int:
+        return message.stamp if self.stamps == "header" else message.received
+
+    def _check_clock(self, message: Message, before: Message | None, number: int) -> None:
+        """Raise InputError for a stamp that is zero, earlier than the one before, or far ahead of the recording."""
+        fault = None
+        if self._stamp(message) == 0:
+            fault = f"image {number} has a stamp of zero"
+        elif before is not None:
+            step = (self._stamp(message) - self._stamp(before)) * 1e-9
+            if step < 0:
+                fault = f"the clock runs back by {-step:.3g} s at image {number}"
+            elif step - (message.received - before.received) * 1e-9 > _LEAP:
+                fault = f"the clock leaps ahead by {step:.3g} s at image {number}"
+        if fault is not None:
+            raise InputError(
+                f"the headers of {self.topic.name} in {self.path} are no times: {fault}",
+                cause="the driver does not stamp its images, or its clock was set while they were recorded",
+                hint="--stamps received, which takes the times at which they were recorded",
+            )
