@@ -37,7 +37,7 @@ def _texture(seed: int) -> np.ndarray:
     """Colors of the ground 0..1, a cell every 4 mm over 4 x 4 m."""
     rng = np.random.default_rng(seed)
     layers = [ndimage.gaussian_filter(rng.normal(size=(1000, 1000)), s) * s for s in (1.2, 2.5, 6, 15)]
-    gray = sum(layers) / np.std(sum(layers))
+    gray = np.sum(layers, axis=0) / np.std(np.sum(layers, axis=0))
     tint = ndimage.gaussian_filter(rng.normal(size=(1000, 1000, 3)), (8, 8, 0)) * 8
     return np.clip(0.42 + 0.13 * gray[..., None] + 0.03 * tint, 0.05, 0.95)
 

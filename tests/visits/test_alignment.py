@@ -107,7 +107,7 @@ def test_the_stated_uncertainty_covers_the_error(tmp_path):
             )
             for rec in (a, b)
         ]
-        found = align(*noisy, matched(a, b, seed=seed), NAMES)
+        found = align(noisy[0], noisy[1], matched(a, b, seed=seed), NAMES)
         at = a.points.xyz.numpy()[:50]
         error = found.a_from_b(b.points.xyz.numpy()[:50]) - at
         ratios.append(np.sqrt((error**2).sum() / np.trace(found.covariance_at(at).sum(0))))
@@ -133,7 +133,7 @@ def test_the_joint_adjustment_takes_a_bend_out(tmp_path):
     bent = ground()
     bent[:, 2] += 0.02 * (bent[:, 0] - 1.5) ** 2  # 45 mm at the ends of 3 m
     b = dive(tmp_path, ground(), 2, 0.2)
-    scale = float((b.points.xyz[0] - b.points.xyz[1]).norm() / np.linalg.norm(ground()[0] - ground()[1]))
+    scale = float((b.points.xyz[0] - b.points.xyz[1]).norm()) / float(np.linalg.norm(ground()[0] - ground()[1]))
     shape = torch.from_numpy(bent - ground()) * scale
     R = torch.linalg.lstsq(torch.from_numpy(ground() - ground().mean(0)), b.points.xyz - b.points.xyz.mean(0)).solution
     bend = shape @ (R / scale)

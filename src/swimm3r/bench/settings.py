@@ -29,9 +29,9 @@ class SurveySettings(Settings):
 class RevisitSettings(Settings):
     """Synthetic repeat visits in pairs of waters."""
 
-    pairs: Annotated[int, Range(1, 4)] = 4
+    water_pairs: Annotated[int, Range(1, 4)] = 4
     """Number of pairs of waters."""
-    length: Annotated[float, Range(5, 100)] = 10.0
+    path_length: Annotated[float, Range(5, 100)] = 10.0
     """Length of the path of each visit in meters."""
     width: ImageSide = 320
     """Width of the frames in pixels."""

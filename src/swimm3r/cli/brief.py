@@ -130,6 +130,12 @@ BRIEF: dict[tuple[str, ...], Groups] = {
         "settings": ("--preset", "--splat.iterations"),
         "": _MESSAGES,
     },
+    ("bench", "revisits"): {
+        "visits": ("--water-pairs", "--path-length", "--width", "--height", "--seed"),
+        "output": ("--out",),
+        "settings": ("--preset",),
+        "": _MESSAGES,
+    },
     ("bench", "ablation-sfm"): {
         "input": ("--sequences", "--stride", "--adapters"),
         "output": ("--out",),

@@ -163,11 +163,11 @@ def _places(
     core = ndimage.binary_opening(core, np.ones((2, 2), bool))
     labels, count = connected(wide)
     hit = np.zeros(count + 1, bool)
-    hit[np.unique(labels[core])] = True
+    hit[np.unique(np.extract(core, labels))] = True
     cells = np.bincount(labels.ravel(), minlength=count + 1)
     hit &= cells >= least_cells
     hit[0] = False
-    return hit[labels]
+    return np.take(hit, labels)
 
 
 def connected(mask: Bool[np.ndarray, "h w"]) -> tuple[Int[np.ndarray, "h w"], int]:

@@ -22,5 +22,5 @@ class VisitSettings(Settings):
     """Least change of the clear color that is reported, as a CIELAB difference, in addition to the threshold."""
     candidates: Count = 8
     """Number of the most similar frames of the other visit that a frame is matched with."""
-    max_frames: Annotated[int, Range(2)] = 400
+    matched_frames: Annotated[int, Range(2)] = 400
     """Largest number of frames of a visit that are matched with another one, spread evenly."""

@@ -82,9 +82,9 @@ def _aligned(
 ) -> list[tuple[Survey, Fit | None]]:
     """The surveys in the frame of the first, each aligned with the earliest one that it can be aligned with."""
     placed: list[tuple[Survey, Fit | None]] = [(surveys[0], None)]
-    landmarks: list[list[Landmarks]] = [landmarks_of(surveys[0], settings.max_frames, progress)]
+    landmarks: list[list[Landmarks]] = [landmarks_of(surveys[0], settings.matched_frames, progress)]
     for k in range(1, len(surveys)):
-        landmarks.append(landmarks_of(surveys[k], settings.max_frames, progress))
+        landmarks.append(landmarks_of(surveys[k], settings.matched_frames, progress))
         refused: RegistrationError | None = None
         for j in range(k):
             try:

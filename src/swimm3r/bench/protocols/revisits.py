@@ -67,10 +67,10 @@ class Truth:
 def revisit_table(out: Path, revisits: RevisitSettings, settings: RunSettings, progress: Progress = silent) -> Table:
     """Two rows for every pair of waters; dives and runs stay in OUT, and a repeated call goes on with them."""
     cells = []
-    for number in range(revisits.pairs):
+    for number in range(revisits.water_pairs):
         first, later, same = pair_of_dives(number, revisits)
         for kind, second in (("season", later), ("water only", same)):
-            progress("pairs of visits", len(cells), 2 * revisits.pairs)
+            progress("pairs of visits", len(cells), 2 * revisits.water_pairs)
             key = ResultKey(f"{first.family} to {second.family}", kind)
 
             def make(folder: Path, dives: tuple[DiveSettings, DiveSettings] = (first, second)) -> Scores:
@@ -78,7 +78,7 @@ def revisit_table(out: Path, revisits: RevisitSettings, settings: RunSettings, p
                 return scores_of(runs[0], runs[1], dives, folder / "visits", progress)
 
             cells.append(kept_cell(out, key, [first, second, settings], make))
-    progress("pairs of visits", 2 * revisits.pairs, 2 * revisits.pairs)
+    progress("pairs of visits", 2 * revisits.water_pairs, 2 * revisits.water_pairs)
     return Table("revisits", "Changes between repeat visits, against the truth", cells, COLUMNS)
 
 
@@ -88,7 +88,8 @@ def pair_of_dives(number: int, revisits: RevisitSettings) -> tuple[DiveSettings,
 
     def dive(family: Family, visit: int, season: Season) -> DiveSettings:
         return DiveSettings(
-            path="lawnmower", length=revisits.length, speed=0.25, fps=1, width=revisits.width, height=revisits.height,
+            path="lawnmower", length=revisits.path_length, speed=0.25, fps=1,
+            width=revisits.width, height=revisits.height,
             seed=revisits.seed + number, corals=0.7, family=family, visit=visit, season=season,
             light=_LIGHT if visit else (1.0, 1.0, 1.0),
         )  # fmt: skip

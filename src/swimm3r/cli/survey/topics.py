@@ -30,7 +30,7 @@ def topics(bag: Bag, /) -> None:
 
 
 def _lines(found: "Topics") -> Iterator[str]:
-    rows = [_TITLES]
+    rows: list[tuple[str, ...]] = [_TITLES]
     for topic in found.known:
         use = _OPTIONS.get(topic.use or "", topic.use or "not used")
         use += f" ({topic.detail})" * bool(topic.detail)

@@ -48,7 +48,7 @@ class BagImage:
         scale = min(1.0, long_side / max(width, height))
         size = max(1, round(width * scale)), max(1, round(height * scale))
         small = cv2.resize(self._pixels, size, interpolation=cv2.INTER_AREA)
-        small = small if small.dtype == np.uint8 else (small >> 8).astype(np.uint8)
+        small = small if small.dtype == np.uint8 else np.right_shift(small, 8).astype(np.uint8)
         return cv2.cvtColor(small, cv2.COLOR_RGB2GRAY)
 
     def rgb(self) -> Rgb:
