@@ -19,6 +19,7 @@ from torch import Tensor
 
 from swimm3r import notebook
 from swimm3r.io.files.atomic import write_text
+from swimm3r.lamp import Lamp, LightEvidence, lamp_distance, lamp_document, log_light, rescaled_lamp, share_scattered
 
 Encoding = Literal["srgb", "linear"]
 Estimator = Literal["Sea-Thru", "physics head"]
@@ -92,11 +93,24 @@ class MediumFit:
     z_range: tuple[float, float]  # ray depths the fit has seen
     encoding: Encoding  # of the pixel values it explains
     estimator: Estimator = "Sea-Thru"  # that found it, and restored the images and points it goes with
+    lamp: Lamp | None = None  # that lights the scene from the camera; None in daylight
+    light: LightEvidence | None = None  # for the one or the other; None where the light was given
 
-    def at(self, ray_depth: Float[Tensor, "*pixels"]) -> Medium:
-        """The medium as each pixel sees it: beta_D follows the curve, held constant outside `z_range`."""
+    def at(self, ray_depth: Float[Tensor, "*pixels"], direction: Float[Tensor, "*pixels 3"] | None = None) -> Medium:
+        """The medium as each pixel sees it: beta_D follows the curve, held constant outside `z_range`.
+
+        Under a lamp, `direction` (unit, camera axes) adds its light: T_D is then the share of J that arrives, and Binf
+        makes the backscatter that of its beam. Without directions it is the water alone.
+        """
         beta_D = self.curve.at(ray_depth.clamp(*self.z_range))
-        return Medium(self.Binf.expand_as(beta_D), beta_D, self.beta_B.expand_as(beta_D))
+        Binf, beta_B = self.Binf.expand_as(beta_D), self.beta_B.expand_as(beta_D)
+        if self.lamp is None or direction is None:
+            return Medium(Binf, beta_D, beta_B)
+        z = ray_depth.clamp(min=_NEAREST * self.lamp.reference)[..., None]
+        points = direction * z
+        before = beta_D * lamp_distance(points, self.lamp)[..., None] - log_light(points, self.lamp)[..., None]
+        scattered = share_scattered(direction, z[..., 0], self.lamp, self.beta_D)
+        return Medium(Binf * scattered / -torch.expm1(-beta_B * z), beta_D + before / z, beta_B)
 
     def constant(self) -> Medium:
         """The three numbers per channel alone, without the curve."""
@@ -123,6 +137,7 @@ class MediumFit:
         return notebook.table(title + "; in brackets: not determined" * bracketed, rows, _HEADER)
 
 
+_NEAREST = 1e-3  # of a lamp's reference distance: the ray depth of what has none
 _HEADER = ("", "red", "green", "blue")
 _LABELS = {"Binf": "veiling light Binf", "beta_D": "attenuation beta_D", "beta_B": "backscatter beta_B"}
 
@@ -157,6 +172,8 @@ def save_fits(path: Path, fits: Mapping[str, MediumFit]) -> None:
             "z_range": list(fit.z_range),
             "encoding": fit.encoding,
             "estimator": fit.estimator,
+            **({} if fit.lamp is None else {"lamp": lamp_document(fit.lamp)}),
+            **({} if fit.light is None else {"light": vars(fit.light)}),
         }
         for name, fit in fits.items()
     }
@@ -214,6 +231,7 @@ def rescale(fit: MediumFit, scale: float) -> MediumFit:
         std=per_length(fit.std),
         curve=AttenuationCurve(c.a / scale, c.b / scale, c.c / scale, c.d / scale),
         z_range=(fit.z_range[0] * scale, fit.z_range[1] * scale),
+        lamp=None if fit.lamp is None else rescaled_lamp(fit.lamp, scale),
     )
 
 

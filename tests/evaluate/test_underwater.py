@@ -9,8 +9,17 @@ from PIL import Image
 from skimage.color import rgb2lab
 
 from swimm3r.evaluate import NotComputed
-from swimm3r.evaluate.underwater import _lab_from_srgb, clear_psnr, uciqe, uiqm, water_scores, water_scores_from_views
-from swimm3r.medium import AttenuationCurve, Medium, MediumFit, add_water, remove_water
+from swimm3r.evaluate.underwater import (
+    _lab_from_srgb,
+    clear_psnr,
+    lit_enough,
+    strength_gain,
+    uciqe,
+    uiqm,
+    water_scores,
+    water_scores_from_views,
+)
+from swimm3r.medium import AttenuationCurve, Medium, MediumFit, add_water, backscatter, remove_water
 
 # name: UICM, UISM, UIConM, UIQM, UIQM after 256 x 256 bicubic, UCIQE (README of the vectors)
 PUBLISHED = {
@@ -166,3 +175,24 @@ def test_the_true_water_restores_the_clear_image():
     score = clear_psnr(restored, J, Z, WATER)
     assert isinstance(score, float)
     assert score > 80
+
+
+def test_colors_under_a_lamp_are_compared_after_its_one_unknown_gain():
+    J = torch.rand(5, 8, 3, generator=torch.Generator().manual_seed(0))
+    counted = lit_enough(Z, WATER)
+    gain = strength_gain([(0.5 * J, J, counted), (0.5 * J.flip(0), J.flip(0), counted)])
+    assert gain == pytest.approx(2.0, rel=1e-5)
+
+
+def test_pixels_count_where_enough_of_a_lamps_light_arrives():
+    dim = torch.full((5, 8, 3), 0.1)
+    assert lit_enough(Z, WATER, light=dim).sum() < lit_enough(Z, WATER).sum()
+    assert torch.equal(lit_enough(Z, WATER, light=torch.ones_like(dim)), lit_enough(Z, WATER))
+
+
+def test_backscatter_under_a_lamp_is_compared_with_the_given_one():
+    glow = torch.full((5, 8, 3), 0.25)
+    views = [(Z, WATER, backscatter(Z, WATER) + glow)]
+    scores = water_scores_from_views(views, WATER, fit_of(WATER).identifiable, WATER)
+    assert scores.B_abs == pytest.approx([0.25] * 3, rel=1e-4)
+    assert scores.T_D_abs == [0, 0, 0]

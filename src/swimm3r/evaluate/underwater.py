@@ -110,21 +110,22 @@ def water_scores(
 
 
 def water_scores_from_views(
-    views: Iterable[tuple[Float[Tensor, "_ _"], Medium]],
+    views: Iterable[tuple[Float[Tensor, "_ _"], Medium] | tuple[Float[Tensor, "_ _"], Medium, Float[Tensor, "_ _ 3"]]],
     coefficients: Medium,
     identifiable: dict[str, Bool[Tensor, "3"]],
     true: Medium,
 ) -> WaterScores:
     """The same for a water that varies over the image: per view the true ray depth and the medium at its pixels.
 
-    `coefficients` are the scene's three numbers per channel that are reported and compared with the truth.
+    A third entry of a view is its true backscatter where that of the true water is not it: under a lamp. `coefficients`
+    are the scene's three numbers per channel that are reported and compared with the truth.
     """
     T_D_error, B_error, pixels = torch.zeros(3).double(), torch.zeros(3).double(), 0
-    for ray_depth, estimated in views:
+    for ray_depth, estimated, *given in views:
         z = ray_depth.double()
         seen = torch.isfinite(z) & (z > 0)
         T_D_off = (transmittances(z, estimated)[0] - transmittances(z, true)[0]).abs()
-        B_off = (backscatter(z, estimated) - backscatter(z, true)).abs()
+        B_off = (backscatter(z, estimated) - (given[0] if given else backscatter(z, true))).abs()
         T_D_error += T_D_off[seen].sum(0)
         B_error += B_off[seen].sum(0)
         pixels += int(seen.sum())
@@ -151,21 +152,49 @@ def clear_psnr(
     ray_depth: Float[Tensor, "h w"],
     true: Medium,
     min_transmittance: float = 0.05,
+    light: Float[Tensor, "h w 3"] | None = None,
 ) -> float | NotComputed:
     """PSNR, dB, of restored against true clear colors, as shown (clamped to 0..1), where the light allows a judgement.
 
-    A pixel counts in a channel when its true ray depth is known and its true T_D there is above `min_transmittance`.
+    A pixel counts in a channel when its true ray depth is known and its true T_D there is above `min_transmittance`;
+    under a lamp when the share of its light that arrives is, `light` being that on the surface.
     """
-    z = ray_depth.double()
-    seen = torch.isfinite(z) & (z > 0)
-    T_D, _ = transmittances(torch.where(seen, z, 0.0), true)
-    counted = seen[..., None] & T_D.gt(min_transmittance)
+    counted = lit_enough(ray_depth, true, min_transmittance, light)
     if not counted.any():
         return NotComputed(f"no pixel has a true depth and a transmittance above {min_transmittance}")
     errors = (restored.double().clamp(0, 1) - clear.double())[counted]
     if errors.isnan().any():
         raise ValueError("the restored image has values that are not numbers where it is scored")
     return psnr_from_errors(errors)
+
+
+def lit_enough(
+    ray_depth: Float[Tensor, "h w"],
+    true: Medium,
+    min_transmittance: float = 0.05,
+    light: Float[Tensor, "h w 3"] | None = None,
+) -> Bool[Tensor, "h w 3"]:
+    """Mask of the values that `clear_psnr` counts."""
+    z = ray_depth.double()
+    seen = torch.isfinite(z) & (z > 0)
+    T_D, _ = transmittances(torch.where(seen, z, 0.0), true)
+    arriving = T_D if light is None else T_D * light.double()
+    return seen[..., None] & arriving.gt(min_transmittance)
+
+
+def strength_gain(
+    views: Iterable[tuple[Float[Tensor, "h w 3"], Float[Tensor, "h w 3"], Bool[Tensor, "h w 3"]]],
+) -> float:
+    """The one gain of restored to true clear colors, over all counted values of all views.
+
+    Images do not tell the strength of a lamp from the brightness of the scene, so that colors under a lamp are compared
+    after it.
+    """
+    along, square = 0.0, 0.0
+    for restored, clear, counted in views:
+        found, true = restored.double()[counted], clear.double()[counted]
+        along, square = along + float((found * true).sum()), square + float((found * found).sum())
+    return along / square if square > 0 else 1.0
 
 
 def _colorfulness(rgb: ndarray) -> float:

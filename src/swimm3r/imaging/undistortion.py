@@ -69,6 +69,11 @@ def frame_rays(camera: Cameras) -> Float[Tensor, "h w 3"]:
     return _rays(_key(camera))
 
 
+def frame_directions(camera: Cameras) -> Float[Tensor, "h w 3"]:
+    """Unit directions of a frame's pixels in its camera's axes; 0 where the lens model has none."""
+    return torch.nn.functional.normalize(torch.nan_to_num(frame_rays(camera), nan=0.0), dim=-1)
+
+
 def undistorted_pixels(
     camera: Cameras, xy: Float[Tensor, "m 2"], K: Float[Tensor, "3 3"] | None = None
 ) -> Float[Tensor, "m 2"]:

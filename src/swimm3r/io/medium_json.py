@@ -11,6 +11,7 @@ import torch
 
 from swimm3r.io.files.damage import Remedy, guard
 from swimm3r.io.files.json_file import decode, structure
+from swimm3r.lamp import Lamp, LightEvidence
 from swimm3r.medium import AttenuationCurve, Encoding, Estimator, Medium, MediumFit
 
 _REMEDY = Remedy(
@@ -19,6 +20,7 @@ _REMEDY = Remedy(
     fault="is not a medium.json",
 )
 _Channels = tuple[float, float, float]
+_Pattern = tuple[float, float, float, float, float, float]
 _Flags = tuple[bool, bool, bool]
 
 
@@ -33,6 +35,27 @@ class MediumRecord:
     def medium(self) -> Medium:
         """The same as tensors."""
         return Medium(torch.tensor(self.Binf), torch.tensor(self.beta_D), torch.tensor(self.beta_B))
+
+
+@dataclass(frozen=True)
+class LampRecord:
+    """A lamp as a file has it."""
+
+    position: _Channels
+    reference: float
+    fall_off: float
+    strength: float
+    beam: _Pattern
+    veil: _Pattern
+
+    def __post_init__(self) -> None:
+        if self.reference <= 0 or self.strength <= 0:
+            raise ValueError(f"a lamp has a distance and a strength above 0, got {self.reference} and {self.strength}")
+
+    def lamp(self) -> Lamp:
+        """The same as tensors."""
+        position, beam, veil = (torch.tensor(values) for values in (self.position, self.beam, self.veil))
+        return Lamp(position, self.reference, self.fall_off, self.strength, beam, veil)
 
 
 @dataclass(frozen=True)
@@ -59,6 +82,8 @@ class _Fit:
     z_range: tuple[float, float]
     encoding: Encoding
     estimator: Estimator = "Sea-Thru"  # earlier versions did not say
+    lamp: LampRecord | None = None
+    light: LightEvidence | None = None
 
     def __post_init__(self) -> None:
         if not 0 <= self.z_range[0] <= self.z_range[1]:
@@ -104,6 +129,8 @@ def _fits(document: object) -> dict[str, MediumFit]:
             z_range=fit.z_range,
             encoding=fit.encoding,
             estimator=fit.estimator,
+            lamp=None if fit.lamp is None else fit.lamp.lamp(),
+            light=fit.light,
         )
         for name, fit in structure(document, dict[str, _Fit]).items()
     }

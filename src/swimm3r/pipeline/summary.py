@@ -1,12 +1,13 @@
 """The sections of summary.json: records in, plain numbers out (layout: docs/conventions.md)."""
 
 from collections.abc import Sequence
-from dataclasses import asdict
+from dataclasses import asdict, dataclass, replace
 from pathlib import Path
 
 import torch
 from jaxtyping import Bool, Float
 from torch import Tensor
+from torch.nn.functional import normalize
 
 from swimm3r.cameras import image_directions, ray_depth_from_z
 from swimm3r.evaluate import NotComputed, summary_entries
@@ -14,10 +15,11 @@ from swimm3r.evaluate.depth import depth_scores
 from swimm3r.evaluate.images import as_8_bit, psnr
 from swimm3r.evaluate.matches import epipolar_errors, match_scores
 from swimm3r.evaluate.poses import absolute_pose_errors, pose_scores
-from swimm3r.evaluate.underwater import clear_psnr, water_scores, water_scores_from_views
+from swimm3r.evaluate.underwater import clear_psnr, lit_enough, strength_gain, water_scores_from_views
 from swimm3r.geometry import DegenerateAlignmentError, align_poses, align_similarity
 from swimm3r.imaging.undistortion import nearest_pixels, undistorted, undistorted_matches
 from swimm3r.io.files.metrics_log import read_rows
+from swimm3r.lamp import lamp_document
 from swimm3r.medium import Medium, MediumFit, remove_water, rescale
 from swimm3r.pipeline.held_out import HeldOutView, cut, mean_part, mean_scores, protocol
 from swimm3r.progress import Progress, silent
@@ -201,6 +203,9 @@ def _medium_section(fit: MediumFit, metric: bool) -> dict[str, object]:
         "unit": "1/m" if metric else "per scene unit",
         "encoding": fit.encoding,
         "estimator": fit.estimator,
+        "light": "sun" if fit.lamp is None else "lamp",
+        **({} if fit.light is None else {"light_evidence": asdict(fit.light)}),
+        **({} if fit.lamp is None else {"lamp": lamp_document(fit.lamp)}),
     }
 
 
@@ -231,22 +236,46 @@ def _depth_section(rec: Reconstruction, truth: GroundTruth, scale: float) -> dic
 def _water_section(fit: MediumFit, held_out: Frames, truth: GroundTruth, progress: Progress) -> dict[str, object]:
     """The water's errors, and the clear colors it gives at true depth, over the frames nothing was fitted to."""
     assert truth.medium is not None
-    ray_depths, psnrs = [], []
+    media, compared = [], []
     for done, frame in enumerate(held_out):
         progress("scoring against the truth", done, len(held_out))
         z_depth, clear = truth.z_depth(frame.name), truth.clear(frame.name)
         if z_depth is None or clear is None:
             continue
         rays = image_directions(truth.cameras[truth.names.index(frame.name)]).float()
-        ray_depth = ray_depth_from_z(z_depth, rays)
-        ray_depths.append(ray_depth)
-        restored = remove_water(held_out.image(done), ray_depth, fit.at(ray_depth))
-        psnrs.append(clear_psnr(restored, clear, ray_depth, truth.medium))
-    if not ray_depths:
+        ray_depth, direction = ray_depth_from_z(z_depth, rays), normalize(rays, dim=-1)
+        lit, lamp = fit.at(ray_depth, direction), truth.lamp(frame.name)
+        restored = remove_water(held_out.image(done), ray_depth, lit)
+        medium = replace(fit.at(ray_depth), Binf=lit.Binf)
+        media.append((ray_depth, medium) if lamp is None else (ray_depth, medium, lamp.backscatter))
+        compared.append(_Compared(restored, clear, ray_depth, None if lamp is None else lamp.light))
+    if not media:
         return summary_entries({"clear_psnr": NotComputed("the truth has no depth of a held-out frame")})
+    scores = water_scores_from_views(media, fit.constant(), fit.identifiable, truth.medium)
+    return summary_entries(_clear_section(compared, truth.medium)) | scores.summary()
+
+
+@dataclass(frozen=True)
+class _Compared:
+    """Clear colors of one view, found and true."""
+
+    restored: Float[Tensor, "h w 3"]
+    clear: Float[Tensor, "h w 3"]
+    ray_depth: Float[Tensor, "h w"]
+    light: Float[Tensor, "h w 3"] | None  # of a lamp on the surfaces; None in daylight
+
+
+def _clear_section(compared: Sequence[_Compared], medium: Medium) -> dict[str, object]:
+    """Mean PSNR of clear colors; under a lamp after the one gain that images do not tell, which is kept beside it."""
+    lit = any(view.light is not None for view in compared)
+    gain = 1.0
+    if lit:
+        counted = (lit_enough(view.ray_depth, medium, light=view.light) for view in compared)
+        gain = strength_gain((v.restored, v.clear, each) for v, each in zip(compared, counted, strict=True))
+    psnrs = [clear_psnr(gain * v.restored, v.clear, v.ray_depth, medium, light=v.light) for v in compared]
     known = [value for value in psnrs if not isinstance(value, NotComputed)]
     mean = sum(known) / len(known) if known else psnrs[0]
-    return summary_entries({"clear_psnr": mean}) | water_scores(fit, ray_depths, truth.medium).summary()
+    return {"clear_psnr": mean, "clear_gain": gain} if lit else {"clear_psnr": mean}
 
 
 def _map_water_section(
@@ -254,7 +283,7 @@ def _map_water_section(
 ) -> dict[str, object]:
     """The same of a map: its water field at true ray depth, and its own clear rendering, on the held-out views."""
     assert truth.medium is not None
-    media, psnrs = [], []
+    media, compared = [], []
     for view in views:
         z_depth, clear = truth.z_depth(view.name), truth.clear(view.name)
         if z_depth is None or clear is None:
@@ -265,16 +294,21 @@ def _map_water_section(
         true_z = torch.where(shown, z_depth[nearest_pixels(view.lens, view.canvas)], 0.0)
         ray_depth = ray_depth_from_z(true_z, image_directions(view.canvas).float())[rows, columns]
         out = scene.render(cut(view.canvas, view.window), view.time)
-        media.append((ray_depth, Medium(out.medium.Binf, out.medium.beta_D / scale, out.medium.beta_B / scale)))
-        psnrs.append(clear_psnr(out.clear, true_clear[rows, columns], ray_depth, truth.medium))
+        medium = Medium(out.medium.Binf, out.medium.beta_D / scale, out.medium.beta_B / scale)
+        light, lamp = None, truth.lamp(view.name)
+        if lamp is not None:
+            light, glow = (undistorted(values, everything, view.lens, view.canvas)[0] for values in vars(lamp).values())
+            light, glow = light[rows, columns], glow[rows, columns]
+            media.append((ray_depth, medium, glow))
+        else:
+            media.append((ray_depth, medium))
+        compared.append(_Compared(out.clear, true_clear[rows, columns], ray_depth, light))
     if not media:
         return summary_entries({"clear_psnr": NotComputed("the truth has no depth of a held-out frame")})
     water = mean_medium(scene, rec, frames)
     coefficients = Medium(water.Binf, water.beta_D / scale, water.beta_B / scale)
-    known = [value for value in psnrs if not isinstance(value, NotComputed)]
-    mean = sum(known) / len(known) if known else psnrs[0]
     scores = water_scores_from_views(media, coefficients, _identifiable(rec), truth.medium)
-    return summary_entries({"clear_psnr": mean}) | scores.summary()
+    return summary_entries(_clear_section(compared, truth.medium)) | scores.summary()
 
 
 def _moving_section(

@@ -45,6 +45,7 @@ class Water:
     tables: tuple[Table, ...]
     guessed: bool
     unit: str
+    light: str  # sun or lamp, in words; empty for the sun
 
 
 def water_section(rec: Reconstruction) -> Water | None:
@@ -61,7 +62,19 @@ def water_section(rec: Reconstruction) -> Water | None:
         tuple(_table(each, rec.metric) for each in (rec.medium_linear, fit) if each is not None),
         attenuation_is_a_guess(fit),
         unit,
+        _light_note(fit),
     )
+
+
+def _light_note(fit: MediumFit) -> str:
+    """The light of the dive, where it is a lamp's, with the evidence."""
+    if fit.lamp is None:
+        return ""
+    told = "given by --light"
+    if (evidence := fit.light) is not None:
+        told = f"{evidence.explained:.0%} of what distance leaves of the light of {evidence.points:,} points stays with"
+        told += f" their place in the image, which changes it by {evidence.change:.0%}"
+    return f"The dive is lit by a lamp on the camera ({told}). Colors without the water are evenly lit."
 
 
 def restored_as(fit: MediumFit) -> str:

@@ -1,7 +1,8 @@
 """Ground truth of a dive: reference poses, and for synthetic dives depth, clear colors and the water.
 
 On disk a folder beside the images: cameras.json; z_depth/NAME.npz (key z_depth), clear/NAME.png, masks/NAME.png (0
-where something moves) and medium.json where they exist. A cameras.json alone is a reference, too.
+where something moves) and medium.json where they exist; under a lamp lamp/NAME.npz (keys light and backscatter). A
+cameras.json alone is a reference, too.
 """
 
 from dataclasses import dataclass
@@ -25,6 +26,14 @@ _REMEDY = Remedy(
     cause="it was cut off or edited, or is of another dive",
 )
 FOLDER = "truth"  # where a synthetic dive keeps it, beside images/
+
+
+@dataclass(frozen=True)
+class LampImages:
+    """A lamp's share in one image."""
+
+    light: Float[Tensor, "h w 3"]  # on the surfaces, through the water before them
+    backscatter: Float[Tensor, "h w 3"]
 
 
 @dataclass(frozen=True)
@@ -54,6 +63,15 @@ class GroundTruth:
         rgb = images.read_rgb(path)
         self._check_size(path, rgb)
         return torch.from_numpy(rgb.astype(np.float32)) / (255.0 if rgb.dtype == np.uint8 else 65535.0)
+
+    def lamp(self, name: str) -> LampImages | None:
+        """Light on the surfaces and backscatter of a dive under a lamp; None in daylight."""
+        path = self._path("lamp", f"{name}.npz")
+        if path is None:
+            return None
+        found = read_arrays(path, {"light": Layout("h w 3"), "backscatter": Layout("h w 3")}, _REMEDY)
+        self._check_size(path, found["light"])
+        return LampImages(*(torch.from_numpy(found[key].astype(np.float32)) for key in ("light", "backscatter")))
 
     def moving(self, name: str) -> Bool[Tensor, "h w"] | None:
         """True where the image shows something that moves; None where the reference does not say."""

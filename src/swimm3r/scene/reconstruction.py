@@ -27,6 +27,7 @@ from swimm3r.io.files.cache import ArrayCache
 from swimm3r.io.files.damage import remake
 from swimm3r.io.files.outputs import check_empty
 from swimm3r.io.trajectory import write_tum
+from swimm3r.lamp import Lamp, rescaled_lamp
 from swimm3r.medium import MediumFit, save_fits
 from swimm3r.scene.frames import Frames
 from swimm3r.scene.white_balance import UNBALANCED, WHITE_BALANCE, WhiteBalance
@@ -195,6 +196,11 @@ class Reconstruction:
             shown = [(each.what, each.advice) for each in self.warnings[:_SHOWN_WARNINGS]]
             parts.append(notebook.table(f"{len(self.warnings)} warnings", shown))
         return f"<div>{''.join(parts)}</div>"
+
+    def lamp(self, scale: float) -> Lamp | None:
+        """The lamp on the camera, with lengths times `scale`; None in daylight."""
+        lamp = None if self.medium is None else self.medium.lamp
+        return None if lamp is None else rescaled_lamp(lamp, scale)
 
     def index(self, name: str) -> int:
         """The position of a registered frame by its name."""

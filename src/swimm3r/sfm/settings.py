@@ -107,6 +107,9 @@ class RestoreSettings(Settings):
     The colors in restored_physical/ and points_physical.ply, and all scores, stay physical."""
 
 
+LightChoice = Literal["auto", "sun", "lamp"]
+
+
 @dataclass(frozen=True)
 class SeathruSettings(Settings):
     """The water from images and depth (`sfm/medium/seathru.py`); values are 0..1, standard deviations without unit."""
@@ -174,6 +177,11 @@ class SeathruSettings(Settings):
     """Initial standard deviation of exposure and white balance between frames, which is then estimated."""
     gain_evidence: Share = 0.85
     """Share of the residuals below which gains per frame must bring them to be used."""
+    lamp_explained: Share = 0.25
+    """Smallest share of the variance of points' light, after distance, that their places in the images explain under a
+    lamp, with `light auto`."""
+    lamp_change: NotNegative = 0.1
+    """Smallest standard deviation, over the images, of the logarithm of a lamp's light, with `light auto`."""
     std_inflation: Positive = 2.0
     """Factor on the standard deviations beyond that of the residuals (benchmarks/seathru_calibration.py)."""
     identifiable_std: NotNegative = 0.065
@@ -300,6 +308,8 @@ class ColmapSettings(LensSettings):
     features: FeatureSettings = field(default_factory=FeatureSettings)
     mapping: MappingSettings = field(default_factory=MappingSettings)
     depth: PlaneSweepSettings = field(default_factory=PlaneSweepSettings)
+    light: LightChoice = "auto"
+    """Light of the dive: the sun, a lamp on the camera, or the one of them that the frames tell (auto)."""
     water: SeathruSettings = field(default_factory=SeathruSettings)
     restore: RestoreSettings = field(default_factory=RestoreSettings)
 
@@ -358,6 +368,8 @@ class Mast3rSettings(LensSettings):
     alignment: AlignmentSettings = field(default_factory=lambda: AlignmentSettings(intrinsics="shared"))
     features: FeatureSettings = field(default_factory=FeatureSettings)
     """By which held-out frames find their place beside a finished reconstruction."""
+    light: LightChoice = "auto"
+    """Light of the dive: the sun, a lamp on the camera, or the one of them that the frames tell (auto)."""
     water: SeathruSettings = field(default_factory=SeathruSettings)
     restore: RestoreSettings = field(default_factory=RestoreSettings)
 
@@ -376,6 +388,8 @@ class ColmapModelSettings(Settings):
     (`swimm3r.io.imports.read.read_foreign`)."""
     features: FeatureSettings = field(default_factory=FeatureSettings)
     depth: PlaneSweepSettings = field(default_factory=PlaneSweepSettings)
+    light: LightChoice = "auto"
+    """Light of the dive: the sun, a lamp on the camera, or the one of them that the frames tell (auto)."""
     water: SeathruSettings = field(default_factory=SeathruSettings)
     restore: RestoreSettings = field(default_factory=RestoreSettings)
 

@@ -17,8 +17,9 @@ from pathlib import Path
 import torch
 from jaxtyping import Float
 from torch import Tensor
+from torch.nn.functional import normalize
 
-from swimm3r.cameras import rows_of_frames
+from swimm3r.cameras import directions, rows_of_frames
 from swimm3r.imaging.filters import blur
 from swimm3r.imaging.frame_colors import ColorEvidence, ColorTracks, about_identity, fit_frame_colors, identity_maps
 from swimm3r.io.files.atomic import write_text
@@ -122,15 +123,16 @@ def color_tracks(rec: Reconstruction, frames: Frames, names: Sequence[str]) -> C
         point = rec.tracks.point[rows]
         away = rec.points.xyz[point].double() - rec.cameras.centers[i].double()
         color = blur(image, _POINT * max(image.shape[:2]))[row, column]
-        parts.append((color, away.norm(dim=-1).float(), point, torch.full_like(point, k)))
+        toward = normalize(directions(rec.cameras[i], rec.tracks.xy[rows].double()[None])[0], dim=-1)
+        parts.append((color, away.norm(dim=-1).float(), point, torch.full_like(point, k), toward.float()))
     if not parts:
         nothing = torch.zeros(0, dtype=torch.int64)
         return ColorTracks(torch.zeros(0, 3), torch.zeros(0), nothing, nothing, 0)
-    color, ray_depth, point, frame = (torch.cat(part) for part in zip(*parts, strict=True))
+    color, ray_depth, point, frame, toward = (torch.cat(part) for part in zip(*parts, strict=True))
     tracks = ColorTracks(color, ray_depth, point, frame, len(names))
     if rec.medium is None or rec.medium.encoding != "srgb":
         return tracks
-    medium = rec.medium.at(ray_depth)
+    medium = rec.medium.at(ray_depth, toward)
     return replace(tracks, T_D=transmittances(ray_depth, medium)[0], backscatter=backscatter(ray_depth, medium))
 
 

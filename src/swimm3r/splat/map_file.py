@@ -21,6 +21,7 @@ from swimm3r.io.files.tensor_file import read_tensors
 from swimm3r.settings_document import from_document
 from swimm3r.splat.appearance import FrameColors
 from swimm3r.splat.block_store import BlockEntry, StoredBlocks
+from swimm3r.splat.medium.lamp import NO_LIGHT
 from swimm3r.splat.primitives.kinds import primitives_from
 from swimm3r.splat.projection.observed import coverage_from
 from swimm3r.splat.recipes import recipe_parts
@@ -77,7 +78,8 @@ def load_map(path: str | Path) -> SplatMap:
     about = stored.about
     with guard(path, remedy):
         settings = from_document(about.settings, settings_of(cast(RecipeName, about.recipe)))
-        parts = recipe_parts(settings)
+        lit = any(name.startswith("field.lamp.") for name in stored.tensors)
+        parts = recipe_parts(settings, NO_LIGHT if lit else None)
         empty = bool(about.blocks)
         primitives = primitives_from(stored.tensors, parts.primitives, "primitives.", may_be_empty=empty)
         field = parts.field

@@ -213,6 +213,7 @@ class Drawing:
     maps: MediumMaps | None  # as the rasterizer reads them, per unit of z depth; None in clear water
     sgg: SggBuffers | None  # filled when the gradient is taken
     time: Float[Tensor, ""] | None = None  # that primitives were conditioned on
+    light: Float[Tensor, "n 3"] | None = None  # of a lamp on the primitives, in their colors; None in daylight
 
 
 def draw(
@@ -226,7 +227,11 @@ def draw(
     """Project, evaluate the water and rasterize; differentiable in everything but time, the pose included."""
     time = time if p.dynamic else None
     projection = project(p, view, settings.render, time)
-    grid = grid_of(field, view, field.stride, time)
+    grid, light = grid_of(field, view, field.stride, time), None
+    if field.lamp is not None:
+        light = field.lamp.light(p.xyz, view, grid.values[6:].mean((1, 2)), field.length)
+        lit = projection.primitives._replace(color=projection.primitives.color * light)
+        projection = replace(projection, primitives=lit)
     maps = None if field.is_clear else medium_at_pixels(grid, view.height, view.width)
     if maps is not None and settings.render.depth == "ray":
         maps = per_z_depth(maps, view)
@@ -236,7 +241,19 @@ def draw(
         alpha_min=settings.render.alpha_min, kernel=projection.kernel,
         medium_depth_grad=settings.render.medium_depth_grad == "full", sgg=buffers,
     )  # fmt: skip
-    return Drawing(images, projection, grid, maps, buffers, time)
+    return Drawing(images, projection, grid, maps, buffers, time, light)
+
+
+def evenly_lit(drawing: Drawing, view: Pinhole, settings: UwbsSettings | GaussianSettings) -> RasterOutput:
+    """The images of a drawing, with a clear one without the light of a lamp."""
+    if drawing.light is None:
+        return drawing.images
+    lit = drawing.projection.primitives
+    even = lit._replace(color=lit.color / drawing.light)
+    alone = rasterize(
+        even, None, view.height, view.width, alpha_min=settings.render.alpha_min, kernel=drawing.projection.kernel
+    )
+    return drawing.images._replace(clear=alone.clear)
 
 
 def images(
@@ -291,7 +308,10 @@ def render(scene: SplatMap, camera: Cameras, time: float | None = None) -> Rende
     match scene.field:
         case MediumField():
             drawing = draw(scene.seen_by(view), scene.field, view, settings, now)
-            images, medium = drawing.images, medium_at_pixels(drawing.grid, view.height, view.width)
+            images, medium = (
+                evenly_lit(drawing, view, settings),
+                medium_at_pixels(drawing.grid, view.height, view.width),
+            )
             seen = drawing.projection.primitives
             black = seen._replace(color=torch.zeros_like(seen.color))
             backscatter = rasterize(

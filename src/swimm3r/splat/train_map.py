@@ -66,7 +66,7 @@ def train(
     training_scene = TrainingScene(rec, scale, radius, views, poses_in_training, device)
     with devices.memory_for("this map", "fewer primitives, a smaller --splat.long-side, or --map-device cpu"):
         schedule = _schedule(settings, rec, views)
-        final = loop.run(recipe_parts(settings), training_scene, schedule, folder, progress, observer)
+        final = loop.run(recipe_parts(settings, rec.lamp(scale)), training_scene, schedule, folder, progress, observer)
     primitives, field = map_in_scene_units(final, 1 / scale)
     poses = None
     if poses_in_training is not None and final.poses is not None:

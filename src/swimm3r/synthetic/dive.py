@@ -2,17 +2,18 @@
 
     raw = add_water(clear, ray_depth, medium), and Binf where a ray meets nothing      (paper Eqs. 2-4)
 
-on values as stored (sRGB), before fish, snow, vignetting, the camera's exposure and white balance, and noise. Truth is
-of the still scene by a camera whose gains are 1: depth and `clear` are what lies behind the fish, and `usable` is False
-wherever it shows. Caustics are light, not water: `clear` has them. Where a ray meets nothing, depth is 0 and `clear` is
-black.
+on values as stored (sRGB), before fish, snow, vignetting, the camera's exposure and white balance, and noise; under a
+lamp, `lamp_light` says how both terms change, and `clear` is the scene evenly lit. Truth is of the still scene by a
+camera whose gains are 1: depth and `clear` are what lies behind the fish, and `usable` is False wherever it shows.
+Caustics are light, not water: `clear` has them. Where a ray meets nothing, depth is 0 and `clear` is black.
 
 On disk: images/NAME, and truth/ as `ground_truth` reads it, with masks/NAME.png (0 at the fish) if there is one, and
-gains.json, the camera's factors on linear light per frame, if they change; markers.json, the printed markers, if any.
+gains.json, the camera's factors on linear light per frame, if they change; markers.json, the printed markers, if any;
+lamp.json and lamp/NAME.npz, the lamp and its light and backscatter per pixel, if there is one.
 """
 
 import json
-from dataclasses import asdict, dataclass
+from dataclasses import asdict, dataclass, replace
 from pathlib import Path
 from typing import Any
 
@@ -27,10 +28,12 @@ from swimm3r.errors import InputError
 from swimm3r.io import images
 from swimm3r.io.files.atomic import atomic_path, write_text
 from swimm3r.io.files.damage import Remedy, guard
-from swimm3r.medium import Medium, add_water, srgb_from_linear
+from swimm3r.lamp import Lamp, lamp_document
+from swimm3r.medium import Medium, add_water, srgb_from_linear, transmittances
 from swimm3r.progress import Progress, silent
 from swimm3r.scene.ground_truth import FOLDER
 from swimm3r.synthetic import disturbances
+from swimm3r.synthetic.lamp_light import lamp_backscatter, lamp_of, light_on
 from swimm3r.synthetic.path import loop, survey
 from swimm3r.synthetic.plain import Plain
 from swimm3r.synthetic.printed_markers import FAMILY, Plate, plates_along, with_plates
@@ -48,6 +51,8 @@ class DiveFrame:
     z_depth: Float[Tensor, "h w"]  # m, 0 where the ray meets nothing
     ray_depth: Float[Tensor, "h w"]  # m
     usable: Bool[Tensor, "h w"]  # False where the moving object shows
+    light: Float[Tensor, "h w 3"] | None = None  # of the lamp on the surfaces; None in daylight
+    backscatter: Float[Tensor, "h w 3"] | None = None  # of the lamp
 
 
 @dataclass(frozen=True)
@@ -63,6 +68,11 @@ class Dive:
 
     def __len__(self) -> int:
         return len(self.names)
+
+    @property
+    def lamp(self) -> Lamp | None:
+        """The lamp on the camera; None in daylight."""
+        return lamp_of(self.settings.lamp) if self.settings.light == "lamp" else None
 
     def gains(self, i: int) -> Float[Tensor, "3"]:
         """The camera's factors on linear light in frame i; 1 without changes of exposure and white balance."""
@@ -88,7 +98,13 @@ class Dive:
         clear = srgb_from_linear(torch.from_numpy(radiance)).clamp(0, 1).float()
         z_depth = torch.from_numpy(z).float()
         ray_depth = ray_depth_from_z(z_depth, rays.float())
-        raw = torch.where((z_depth > 0)[..., None], add_water(clear, ray_depth, self.medium), self.medium.Binf)
+        light, glow = None, None
+        if (lamp := self.lamp) is None:
+            raw = torch.where((z_depth > 0)[..., None], add_water(clear, ray_depth, self.medium), self.medium.Binf)
+        else:
+            light = light_on(rays.float(), ray_depth, lamp, self.medium)
+            glow = lamp_backscatter(rays.float(), ray_depth, lamp, self.medium)
+            raw = clear * light * transmittances(ray_depth, self.medium)[0] + glow
         usable = torch.ones_like(z_depth, dtype=torch.bool)
         rng = np.random.default_rng(settings.stream(2, i))
         if settings.moving_object:
@@ -103,7 +119,7 @@ class Dive:
             raw = disturbances.exposed(raw, self.gains(i))
         if settings.noise:
             raw = disturbances.sensor_noise(raw, settings.noise, rng)
-        return DiveFrame(raw, clear, z_depth, ray_depth, usable)
+        return DiveFrame(raw, clear, z_depth, ray_depth, usable, light, glow)
 
 
 def make_dive(settings: DiveSettings) -> Dive:
@@ -148,6 +164,11 @@ def write_dive(settings: DiveSettings, folder: Path, progress: Progress = silent
         images.write_rgb(truth / "clear" / f"{name}.png", frame.clear.numpy())
         with atomic_path(truth / "z_depth" / f"{name}.npz") as draft:
             np.savez_compressed(draft, z_depth=frame.z_depth.numpy())
+        if frame.light is not None and frame.backscatter is not None:
+            with atomic_path(truth / "lamp" / f"{name}.npz") as draft:
+                np.savez_compressed(
+                    draft, light=frame.light.half().numpy(), backscatter=frame.backscatter.half().numpy()
+                )
         if settings.moving_object:
             mask = frame.usable.numpy().astype(np.uint8)[..., None].repeat(3, 2) * 255
             images.write_rgb(truth / "masks" / f"{name}.png", mask)
@@ -159,6 +180,8 @@ def write_dive(settings: DiveSettings, folder: Path, progress: Progress = silent
     if dive.plates:
         document = {"family": FAMILY, "markers": [asdict(plate) for plate in dive.plates]}
         write_text(truth / "markers.json", json.dumps(document, indent=2) + "\n")
+    if dive.lamp is not None:
+        write_text(truth / "lamp.json", json.dumps(lamp_document(dive.lamp), indent=2) + "\n")
     dive.medium.save(truth / "medium.json")
     dive.cameras.save(truth / "cameras.json", dive.names, units="metres")
     write_text(record, json.dumps({**described, "whole": True}, indent=2) + "\n")
@@ -188,11 +211,13 @@ def _holds_others(folder: Path) -> InputError:
 
 
 def water(settings: DiveSettings) -> Medium:
-    """The water of a dive: drawn from a family, or as given."""
-    if settings.family is not None:
-        return water_types.sample(settings.family, torch.Generator().manual_seed(settings.seed + 1009 * settings.visit))
+    """The water of a dive: drawn from a family, or as given; under a lamp with the lamp's veiling light."""
     given = settings.coefficients
-    return Medium(torch.tensor(given.Binf), torch.tensor(given.beta_D), torch.tensor(given.beta_B))
+    medium = Medium(torch.tensor(given.Binf), torch.tensor(given.beta_D), torch.tensor(given.beta_B))
+    if settings.family is not None:
+        seed = settings.seed + 1009 * settings.visit
+        medium = water_types.sample(settings.family, torch.Generator().manual_seed(seed))
+    return replace(medium, Binf=settings.lamp.glow * medium.Binf) if settings.light == "lamp" else medium
 
 
 def _names(settings: DiveSettings) -> tuple[str, ...]:

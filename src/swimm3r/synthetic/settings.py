@@ -8,6 +8,7 @@ from swimm3r.settings import ImageSide, Range, Seed, Settings, Share
 
 _Beta = Annotated[float, Range(0, 100)]
 _Light = Annotated[float, Range(0.1, 10)]
+_Offset = Annotated[float, Range(-10, 10)]
 
 
 @dataclass(frozen=True)
@@ -48,6 +49,21 @@ class Season(Settings):
                 cause="each coral has one fate at most",
                 hint="shares whose sum is at most 1",
             )
+class LampSettings(Settings):
+    """A lamp that the camera carries, in deep water without daylight; it acts on pixel values as stored."""
+
+    position: tuple[_Offset, _Offset, _Offset] = (0.35, -0.3, 0.0)
+    """Position of the lamp in meters: to the right of the camera, below it, and ahead of it."""
+    beam: Annotated[float, Range(5, 170)] = 90.0
+    """Full angle of the beam in degrees, between the directions of half the axis's light."""
+    fall_off: Annotated[float, Range(0, 4)] = 0.91
+    """Power of the distance that the light falls with on values as stored: 2 in linear light, 2 / 2.2 as stored."""
+    reference: Annotated[float, Range(0.1, 20)] = 2.0
+    """Distance on the optical axis, in meters, at which the light without water is `strength`."""
+    strength: Annotated[float, Range(0.01, 100)] = 1.3
+    """Light at the reference distance; 1 shows a surface in its clear colors."""
+    glow: Share = 0.35
+    """Backscatter of the lamp in open water, as a share of the veiling light of the same water in daylight."""
 
 
 @dataclass(frozen=True)
@@ -85,6 +101,9 @@ class DiveSettings(Settings):
     season: Season = Season()
     light: tuple[_Light, _Light, _Light] = (1.0, 1.0, 1.0)
     """Light on the scene per channel, by that of a plain day, in linear light."""
+    light: Literal["sun", "lamp"] = "sun"
+    """Light of the dive: the sun, or a lamp on the camera."""
+    lamp: LampSettings = LampSettings()
     caustics: Annotated[float, Range(0, 10)] = 0.0
     """Strength of the moving light pattern; 0.5 is a bright day in 3 m of water."""
     marine_snow: Annotated[int, Range(0, 100_000)] = 0
@@ -113,6 +132,12 @@ class DiveSettings(Settings):
                 "the moving object swims in loops only",
                 cause=f"moving_object was asked for together with path={self.path!r}",
                 hint="path='loop', or no moving object",
+            )
+        if self.light == "lamp" and (self.moving_object or self.marine_snow or self.caustics):
+            raise UsageError(
+                "the moving object, marine snow and caustics are of dives in daylight",
+                cause="one of them was asked for together with light='lamp'",
+                hint="light='sun', or a lamp's dive without them",
             )
 
     def stream(self, *of: int) -> list[int]:

@@ -1,21 +1,40 @@
 """The water of a reconstruction with known cameras and depth, and everything restored with it."""
 
+import logging
 from dataclasses import replace
 from pathlib import Path
 
 from swimm3r.errors import InputError
 from swimm3r.io import images
+from swimm3r.medium import MediumFit
 from swimm3r.progress import Progress, silent
 from swimm3r.scene.frames import Frames
 from swimm3r.scene.reconstruction import QualityWarning, Reconstruction
 from swimm3r.sfm.medium.backdrop import Backdrop
 from swimm3r.sfm.medium.dense_tracks import fuse_depth
 from swimm3r.sfm.medium.from_head import PredictedWater, dive_fit, predicted_images
+from swimm3r.sfm.medium.light import judge_light
 from swimm3r.sfm.medium.plausibility import water_warnings
 from swimm3r.sfm.medium.restore import RestoredImage, restored_cloud, restored_images, white_balance
-from swimm3r.sfm.medium.samples import collect_samples
+from swimm3r.sfm.medium.samples import WaterSamples, collect_samples
 from swimm3r.sfm.medium.seathru import fit_medium
-from swimm3r.sfm.settings import SfmSettings
+from swimm3r.sfm.settings import LightChoice, SeathruSettings, SfmSettings
+
+log = logging.getLogger(__name__)
+
+
+def fit_lit(samples: WaterSamples, settings: SeathruSettings, light: LightChoice) -> tuple[MediumFit, MediumFit]:
+    """The water on values as stored and in linear light, under the sun or a lamp as given or as the samples tell."""
+    evidence = None
+    stored = fit_medium(samples, settings, "srgb", "lamp" if light == "lamp" else "sun")
+    if light == "auto":
+        evidence = judge_light(samples, stored, settings)
+        light = "sun" if evidence is None else evidence.light
+        if light == "lamp":
+            stored = fit_medium(samples, settings, "srgb", "lamp")
+        log.info("the light is taken for %s", "a lamp's on the camera" if light == "lamp" else "the sun's")
+    linear = fit_medium(samples, settings, "linear", light)
+    return replace(stored, light=evidence), replace(linear, light=evidence)
 
 
 def with_water(
@@ -34,12 +53,11 @@ def with_water(
     tracks = fuse_depth(rec, frames, settings.water.tracks, progress)
     samples = collect_samples(rec, frames, tracks, settings.water, progress)
     try:
-        stored = (
-            fit_medium(samples, settings.water, "srgb")
-            if predicted is None
-            else dive_fit(predicted, rec, settings.water)
-        )
-        linear = fit_medium(samples, settings.water, "linear")
+        if predicted is None:
+            stored, linear = fit_lit(samples, settings.water, settings.light)
+        else:  # the head knows of no lamp
+            stored = dive_fit(predicted, rec, settings.water)
+            linear = fit_medium(samples, settings.water, "linear")
     except InputError as failure:
         warning = QualityWarning(f"The water was not estimated: {failure.what}.", f"Try: {failure.hint}")
         return replace(rec, warnings=(*rec.warnings, warning))

@@ -6,6 +6,9 @@ with the water, and the residuals of a frame are whitened against the gain error
     r' = r - (1 - 1 / sqrt(1 + tau^2 |p|^2)) p (p . r) / |p|^2,    p = its prediction in units of its noise,
 
 so that brightness common to a whole frame says little about the water. Depths are in units of their median.
+
+Under a lamp on the camera (`lamp_fit.py`), T_D stands for all that becomes of its light, and the growth of backscatter
+with distance is that of the beam: beta_B is then not fitted.
 """
 
 from collections.abc import Callable
@@ -25,12 +28,36 @@ _SWEEPS = 30  # alternations between gains and J; each is a few sums
 
 
 @dataclass(frozen=True)
+class Ways:
+    """Ways of light to pixels: from the surface at `z`, and before from the lamp to the surface if there is one."""
+
+    z: np.ndarray
+    path: np.ndarray  # length that light is attenuated over: z in daylight
+    log_gain: np.ndarray  # of the light on the surface: 0 in daylight
+    scatter: np.ndarray | None = None  # B over Binf under a lamp; None in daylight, where beta_B tells it
+
+    def rows(self, which: np.ndarray) -> "Ways":
+        """The ways of some pixels."""
+        return self.each(lambda values: values[which])
+
+    def each(self, change: Callable[[np.ndarray], np.ndarray]) -> "Ways":
+        """The ways with every array changed."""
+        scatter = None if self.scatter is None else change(self.scatter)
+        return Ways(change(self.z), change(self.path), change(self.log_gain), scatter)
+
+
+def daylight(z: np.ndarray) -> Ways:
+    """Ways of light that falls evenly."""
+    return Ways(z, z, np.zeros_like(z))
+
+
+@dataclass(frozen=True)
 class Pixels:
     """All samples of one channel."""
 
     I: np.ndarray
     brightness: np.ndarray  # mean of the channels: what "darkest" means
-    z: np.ndarray
+    ways: Ways
     frame: np.ndarray  # 0.. without gaps
     open_water: np.ndarray
 
@@ -40,7 +67,7 @@ class Observations:
     """Those samples that show points seen from several distances; `point` counts 0.. without gaps."""
 
     rows: np.ndarray  # into the samples
-    z: np.ndarray
+    ways: Ways
     point: np.ndarray
     frame: np.ndarray
     I: np.ndarray
@@ -66,14 +93,14 @@ class ChannelFit:
 
 @dataclass(frozen=True)
 class _RangeBins:
-    z_dark: np.ndarray  # median depth of the darkest pixels of each bin
+    of_dark: Ways  # medians of the darkest pixels of each bin
     dark: np.ndarray
-    z_mean: np.ndarray
+    of_mean: Ways  # medians of all
     mean: np.ndarray
 
 
 @dataclass(frozen=True)
-class _Evidence:
+class Evidence:
     """Evidence besides the observations."""
 
     bins: _RangeBins
@@ -98,8 +125,8 @@ def fit_channel(pixels: Pixels, observations: Observations | None, settings: Sea
     gains that are not needed would only blur the answer.
     """
     if observations is None:
-        evidence = _evidence(pixels, 0.0, True, settings)
-        x = _best_start(evidence, None, 0.0, settings)
+        evidence = evidence_of(pixels, settings, alone=True)
+        x = best_start(evidence, None, 0.0, settings)
         return ChannelFit(x, _covariance(x, evidence, None, None, settings))
     fit, spread = _fit_observations(pixels, observations, 0.0, settings)
     if len(np.unique(observations.frame)) > 2:
@@ -117,9 +144,9 @@ def _fit_observations(
     Residuals count in units of `scale * sqrt(redundancy)`: their spread, and how many of them repeat the same error
     (estimated from how much the gradients of whole frames scatter).
     """
-    evidence = _evidence(pixels, 0.0, False, settings)
-    x = _best_start(evidence, observations, gain_std, settings)
-    robust, redundancy = np.ones(len(observations.z)), settings.min_redundancy
+    evidence = evidence_of(pixels, settings)
+    x = best_start(evidence, observations, gain_std, settings)
+    robust, redundancy = np.ones(len(observations.I)), settings.min_redundancy
     gain, tau = np.ones(pixels.frame.max() + 1), gain_std
     seen, noise = observations, _Noise(robust, tau)
     for _ in range(settings.reweightings):
@@ -129,7 +156,7 @@ def _fit_observations(
         if gain_std > 0:
             gain, tau = _gains(x, observations, robust / scale**2, tau, len(gain))
             seen = replace(observations, I=observations.I / gain[observations.frame])
-            evidence = _evidence(replace(pixels, I=pixels.I / gain[pixels.frame]), tau, False, settings)
+            evidence = evidence_of(replace(pixels, I=pixels.I / gain[pixels.frame]), settings, tau)
         noise = _Noise(np.sqrt(robust / redundancy) / scale, tau)
         x = _solve(x, evidence, seen, noise, settings)
         redundancy = max(settings.min_redundancy, _redundancy(x, seen, _Noise(np.sqrt(robust) / scale, tau)))
@@ -137,34 +164,44 @@ def _fit_observations(
     return ChannelFit(x, _covariance(x, evidence, seen, noise, settings)), spread
 
 
-def _evidence(pixels: Pixels, gain_std: float, alone: bool, settings: SeathruSettings) -> _Evidence:
+def evidence_of(pixels: Pixels, settings: SeathruSettings, gain_std: float = 0.0, alone: bool = False) -> Evidence:
+    """Everything that pixels tell besides the points among them; gains of frames are uncertain by `gain_std`."""
     water = _open_water_color(pixels.open_water, gain_std, settings)
     lower, upper = LOWER.copy(), UPPER.copy()
-    upper[BINF] = _largest_Binf(pixels.I, pixels.z)
+    upper[BINF] = _largest_Binf(pixels.I, pixels.ways.z)
     if water is None:
-        far = float(np.mean(pixels.I[pixels.z >= np.quantile(pixels.z, 0.9)]))
-        return _Evidence(_range_bins(pixels, settings), (far, settings.far_color_std), alone, lower, upper)
+        far = float(np.mean(pixels.I[pixels.ways.z >= np.quantile(pixels.ways.z, 0.9)]))
+        return Evidence(_range_bins(pixels, settings), (far, settings.far_color_std), alone, lower, upper)
     upper[BINF] = min(1.0, max(upper[BINF], water[0] + 3 * water[1]))
-    return _Evidence(_range_bins(pixels, settings), water, alone, lower, upper)
+    return Evidence(_range_bins(pixels, settings), water, alone, lower, upper)
 
 
 def _range_bins(pixels: Pixels, settings: SeathruSettings) -> _RangeBins:
     """The darkest pixels (by brightness) and the average of each of `range_bins` equal depth intervals."""
-    I, brightness, z = pixels.I, pixels.brightness, pixels.z
+    I, brightness, z = pixels.I, pixels.brightness, pixels.ways.z
     edges = np.linspace(np.quantile(z, 0.002), np.quantile(z, 0.998), settings.range_bins + 1)
     which = np.digitize(z, edges[1:-1])
-    rows = []
+    dark, all_of_bin = [], []
     for k in range(settings.range_bins):
         inside = np.flatnonzero(which == k)
         if len(inside) < settings.min_bin_pixels:
             continue
         count = int(np.ceil(settings.dark_fraction * len(inside)))
-        darkest = inside[np.argpartition(brightness[inside], count - 1)[:count]]
-        rows.append((np.median(z[darkest]), np.median(I[darkest]), np.median(z[inside]), np.mean(I[inside])))
-    if not rows:  # few samples: one bin is all there is
-        darkest = np.argsort(brightness, kind="stable")[: max(1, int(settings.dark_fraction * len(z)))]
-        rows.append((np.median(z[darkest]), np.median(I[darkest]), np.median(z), np.mean(I)))
-    return _RangeBins(*np.array(rows).T)
+        dark.append(inside[np.argpartition(brightness[inside], count - 1)[:count]])
+        all_of_bin.append(inside)
+    if not dark:  # few samples: one bin is all there is
+        dark.append(np.argsort(brightness, kind="stable")[: max(1, int(settings.dark_fraction * len(z)))])
+        all_of_bin.append(np.arange(len(z)))
+    return _RangeBins(
+        _median_ways(pixels.ways, dark),
+        np.array([np.median(I[which]) for which in dark]),
+        _median_ways(pixels.ways, all_of_bin),
+        np.array([np.mean(I[which]) for which in all_of_bin]),
+    )
+
+
+def _median_ways(ways: Ways, bins: list[np.ndarray]) -> Ways:
+    return ways.each(lambda values: np.array([np.median(values[rows]) for rows in bins]))
 
 
 def _open_water_color(I: np.ndarray, gain_std: float, settings: SeathruSettings) -> tuple[float, float] | None:
@@ -181,19 +218,20 @@ def _largest_Binf(I: np.ndarray, z: np.ndarray) -> float:
     return float(np.clip(1.2 * np.quantile(I[far], 0.98), 0.02, 1.0))
 
 
-def _log_transmittance(x: np.ndarray, z: np.ndarray) -> np.ndarray:
-    """ln T_D at depths z: finite where T_D itself underflows, at many times the median depth."""
-    return -np.exp(x[LOG_BETA_D] + x[SLOPE] * z) * z
+def _log_transmittance(x: np.ndarray, ways: Ways) -> np.ndarray:
+    """ln T_D: finite where T_D itself underflows, at many times the median depth."""
+    return ways.log_gain - np.exp(x[LOG_BETA_D] + x[SLOPE] * ways.z) * ways.path
 
 
-def _attenuations(x: np.ndarray, z: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """T_D and B at depths z."""
-    return np.exp(_log_transmittance(x, z)), x[BINF] * -np.expm1(-np.exp(x[LOG_BETA_B]) * z)
+def attenuations(x: np.ndarray, ways: Ways) -> tuple[np.ndarray, np.ndarray]:
+    """T_D and B of light on its ways."""
+    scatter = -np.expm1(-np.exp(x[LOG_BETA_B]) * ways.z) if ways.scatter is None else ways.scatter
+    return np.exp(_log_transmittance(x, ways)), x[BINF] * scatter
 
 
 def _residuals(x: np.ndarray, seen: Observations, weight: np.ndarray) -> np.ndarray:
     """I - B - J T_D with the J of every point eliminated."""
-    T_D, B = _attenuations(x, seen.z)
+    T_D, B = attenuations(x, seen.ways)
     direct = seen.I - B
     return direct - kernels.surface_colors(T_D, direct, weight, seen.point, seen.points)[seen.point] * T_D
 
@@ -208,7 +246,7 @@ def _gains(
     x: np.ndarray, seen: Observations, weight: np.ndarray, gain_std: float, frames: int
 ) -> tuple[np.ndarray, float]:
     """The gain of every frame, 1 on average and 1 where a frame has no observations, and how much gains vary."""
-    T_D, B = _attenuations(x, seen.z)
+    T_D, B = attenuations(x, seen.ways)
     present = np.bincount(seen.frame, minlength=frames) > 0
     gain = kernels.frame_gains(
         T_D, B, seen.I, weight, seen.point, seen.frame, seen.points, present, 1 / gain_std**2, _SWEEPS
@@ -216,22 +254,22 @@ def _gains(
     return gain, float(np.clip(np.sqrt(np.mean(np.log(gain[present]) ** 2)), 1e-3, 0.15))
 
 
-def _prior_residuals(x: np.ndarray, evidence: _Evidence, settings: SeathruSettings) -> np.ndarray:
+def prior_residuals(x: np.ndarray, evidence: Evidence, settings: SeathruSettings) -> np.ndarray:
     """Everything but the tracks, each in its own standard deviations.
 
     Light cannot be missing, so B above the dark envelope is a fault, and a bin without anything black is none. Without
     observations nothing tells J' from B: then the darkest pixels are taken for black, as Sea-Thru does.
     """
     bins = evidence.bins
-    T_D, B = _attenuations(x, bins.z_dark)
+    T_D, B = attenuations(x, bins.of_dark)
     dark = (bins.dark - B - x[DARK] * T_D) / settings.dark_std
     if not evidence.alone:
         dark = np.where(dark < 0, 3.0 * dark, np.sqrt(2 * (np.sqrt(1 + dark.clip(0) ** 2) - 1)))
-    _, B = _attenuations(x, bins.z_mean)
+    _, B = attenuations(x, bins.of_mean)
     floor = settings.dark_std
     excess = ((bins.mean - B) / floor).clip(-500.0)  # exp(-500) still is a number
     direct = np.logaddexp(0.0, excess) * floor  # a soft max(., 0)
-    expected = x[LOG_MEAN] + _log_transmittance(x, bins.z_mean)
+    expected = x[LOG_MEAN] + _log_transmittance(x, bins.of_mean)
     average = (np.log(direct) - expected) / np.hypot(settings.average_std, floor / direct)
     single = [
         x[DARK] / 0.003 if evidence.alone else (x[DARK] - settings.dark_reflectance) / settings.dark_reflectance_std,
@@ -244,7 +282,7 @@ def _prior_residuals(x: np.ndarray, evidence: _Evidence, settings: SeathruSettin
 
 
 def _solve(
-    start: np.ndarray, evidence: _Evidence, seen: Observations | None, noise: _Noise | None, settings: SeathruSettings
+    start: np.ndarray, evidence: Evidence, seen: Observations | None, noise: _Noise | None, settings: SeathruSettings
 ) -> np.ndarray:
     """Levenberg-Marquardt within the bounds: unknowns that press against a bound are left out of the step.
 
@@ -255,7 +293,7 @@ def _solve(
 
     def residuals(x: np.ndarray) -> np.ndarray:
         nonlocal last
-        prior = _prior_residuals(x, evidence, settings)
+        prior = prior_residuals(x, evidence, settings)
         if seen is None or noise is None:
             return prior
         if not np.array_equal(last[0], x[:4]):
@@ -285,16 +323,16 @@ def _solve(
     return x
 
 
-def _best_start(
-    evidence: _Evidence, observations: Observations | None, gain_std: float, settings: SeathruSettings
+def best_start(
+    evidence: Evidence, observations: Observations | None, gain_std: float, settings: SeathruSettings
 ) -> np.ndarray:
     """The best local optimum from a grid of starts, on few observations."""
-    few = None if observations is None else _thinned(observations, settings.start_observations)
-    noise = None if few is None else _Noise(np.full(len(few.z), 1 / settings.loss_scale), gain_std)
+    few = None if observations is None else thinned(observations, settings.start_observations)
+    noise = None if few is None else _Noise(np.full(len(few.I), 1 / settings.loss_scale), gain_std)
     best, lowest = None, np.inf
     for start in _starts(evidence):
         x = _solve(start, evidence, few, noise, settings)
-        cost = (_prior_residuals(x, evidence, settings) ** 2).sum()
+        cost = (prior_residuals(x, evidence, settings) ** 2).sum()
         if few is not None and noise is not None:
             cost += 2 * (np.sqrt(1 + _whitened(x, few, noise) ** 2) - 1).sum()
         if cost < lowest:
@@ -303,7 +341,7 @@ def _best_start(
     return best
 
 
-def _starts(evidence: _Evidence) -> list[np.ndarray]:
+def _starts(evidence: Evidence) -> list[np.ndarray]:
     return [
         np.array([evidence.Binf[0], np.log(beta_B), np.log(beta_D), 0.0, 0.02, np.log(0.4)])
         for beta_B in (0.1, 0.5, 2.0)
@@ -311,11 +349,11 @@ def _starts(evidence: _Evidence) -> list[np.ndarray]:
     ]
 
 
-def _thinned(seen: Observations, count: int) -> Observations:
+def thinned(seen: Observations, count: int) -> Observations:
     """Every k-th point, so that about `count` observations remain."""
-    step = max(1, int(np.ceil(len(seen.z) / count)))
+    step = max(1, int(np.ceil(len(seen.I) / count)))
     rows = np.flatnonzero(seen.point % step == 0)
-    return Observations(seen.rows[rows], seen.z[rows], seen.point[rows] // step, seen.frame[rows], seen.I[rows])
+    return Observations(seen.rows[rows], seen.ways.rows(rows), seen.point[rows] // step, seen.frame[rows], seen.I[rows])
 
 
 def _jacobian(residuals: Callable[[np.ndarray], np.ndarray], x: np.ndarray, at_x: np.ndarray) -> np.ndarray:
@@ -343,20 +381,20 @@ def _redundancy(x: np.ndarray, seen: Observations, noise: _Noise) -> float:
 
 
 def _covariance(
-    x: np.ndarray, evidence: _Evidence, seen: Observations | None, noise: _Noise | None, settings: SeathruSettings
+    x: np.ndarray, evidence: Evidence, seen: Observations | None, noise: _Noise | None, settings: SeathruSettings
 ) -> np.ndarray:
     """From the curvature at the optimum; unknowns at a bound keep their freedom to leave it.
 
     On top comes what errors of depth do, which no residual shows: where observations of a point differ by s in ln z and
     each is wrong by `depth_error`, differences in depth are overrated by depth_error^2 / s^2, and the betas with them.
     """
-    at_x = _prior_residuals(x, evidence, settings)
-    prior = _jacobian(lambda y: _prior_residuals(y, evidence, settings), x, at_x)
+    at_x = prior_residuals(x, evidence, settings)
+    prior = _jacobian(lambda y: prior_residuals(y, evidence, settings), x, at_x)
     information = prior.T @ prior
     if seen is None or noise is None:
         return np.linalg.inv(information + 1e-9 * np.eye(len(x)))
     information[:4, :4] += _scores(x, seen, noise)[0]
-    log_z = np.log(seen.z)
+    log_z = np.log(seen.ways.z)
     log_z = log_z - (np.bincount(seen.point, log_z) / np.bincount(seen.point))[seen.point]
     overrated = settings.depth_error**2 / np.mean(log_z**2)
     extra = np.zeros(len(x))

@@ -9,8 +9,9 @@ Where T_D is small the quotient is noise, so per channel with s = T_D:
               G: the channels weighted by how well they see; k: this channel's share of color where it does see
     horizon   in open water, and where no channel sees (max w -> 0), the image's own veil remains
 
-Near the camera all weights are 1 and J is the plain inverse. Nothing is stretched; white balance serves the eye alone,
-and only where the frames say which colors the water took (`plausibility`).
+Under a lamp on the camera T_D is the share of its light that arrives (`MediumFit.at`), so that J is evenly lit. Near
+the camera all weights are 1 and J is the plain inverse. Nothing is stretched; white balance serves the eye alone, and
+only where the frames say which colors the water took (`plausibility`).
 """
 
 from collections.abc import Callable, Iterator
@@ -24,7 +25,7 @@ from torch import Tensor
 from swimm3r.imaging.depth_completion import fill_z_depth
 from swimm3r.imaging.filters import LUMA, blur, local_linear
 from swimm3r.imaging.open_water import sea_share, without_fringe
-from swimm3r.imaging.undistortion import frame_rays
+from swimm3r.imaging.undistortion import frame_directions, frame_rays
 from swimm3r.medium import (
     Medium,
     MediumFit,
@@ -118,8 +119,9 @@ def restore_image(
     z_depth = fill_z_depth(image, depth, sea)
     ray_depth = ray_depth_map(z_depth, rays)
     I = linear_from_srgb(image) if fit.encoding == "linear" else image
-    path = _not_beyond_white(I, ray_depth, depth.z_depth == 0, fit)
-    medium = fit.at(path)
+    direction = torch.nn.functional.normalize(torch.nan_to_num(rays, nan=0.0), dim=-1)
+    path = _not_beyond_white(I, ray_depth, direction, depth.z_depth == 0, fit)
+    medium = fit.at(path, direction)
     T_D, _ = transmittances(path, medium)
     direct = I - backscatter(path, medium)
     J = _without_noise(direct, T_D, I @ LUMA, settings)
@@ -159,7 +161,10 @@ def restored_cloud(
         I = frames.colors(frames.index(name), tracks.pixel[mine])
         light = linear_from_srgb(I) if fit.encoding == "linear" else I
         z, trust = tracks.ray_depth[mine], tracks.confidence[mine, None].clamp(min=0.01)
-        medium = fit.at(z) if medium_at is None else medium_at(name, tracks.pixel[mine], z)
+        if medium_at is None:
+            medium = fit.at(z, frame_directions(rec.cameras[i]).reshape(-1, 3)[tracks.pixel[mine]])
+        else:
+            medium = medium_at(name, tracks.pixel[mine], z)
         T_D, _ = transmittances(z, medium)
         weight = trust * T_D.clamp(min=0.01) ** 2
         raw.index_add_(0, tracks.track[mine], I * trust)
@@ -204,7 +209,11 @@ def display_gains(restored: Float[Tensor, "n 3"]) -> Float[Tensor, "3"]:
 
 
 def _not_beyond_white(
-    I: Float[Tensor, "h w 3"], ray_depth: Float[Tensor, "h w"], guessed: Bool[Tensor, "h w"], fit: MediumFit
+    I: Float[Tensor, "h w 3"],
+    ray_depth: Float[Tensor, "h w"],
+    direction: Float[Tensor, "h w 3"],
+    guessed: Bool[Tensor, "h w"],
+    fit: MediumFit,
 ) -> Float[Tensor, "h w"]:
     """Ray depth, shortened where it is a guess until the blurred J is a color that surfaces have.
 
@@ -223,15 +232,15 @@ def _not_beyond_white(
 
     known = torch.nonzero(~guessed.flatten())[:, 0]
     known = known[:: max(1, len(known) // _SAMPLES)]
-    path = ray_depth.flatten()[known]
-    measured = tint(remove_water(blurred.reshape(-1, 3)[known], path, fit.at(path)))
+    path, toward = ray_depth.flatten()[known], direction.reshape(-1, 3)
+    measured = tint(remove_water(blurred.reshape(-1, 3)[known], path, fit.at(path, toward[known])))
     measured = measured[measured.isfinite()].numpy()
     most = max(_MAX_TINT, float(np.quantile(measured, _NEARLY_ALL))) if len(measured) else _MAX_TINT
     cell, pixel = _cells(guessed, max(1, round(reach / 3)))  # the blurred image is the same within a cell
     smooth, far = blurred.reshape(-1, 3)[pixel], ray_depth.flatten()[pixel]
     shortened = torch.zeros_like(far)
     for trial in torch.linspace(0.05, 1.0, 20):
-        J = remove_water(smooth, trial * far, fit.at(trial * far))
+        J = remove_water(smooth, trial * far, fit.at(trial * far, toward[pixel]))
         shortened = torch.where((J.amax(-1) < 0.9) & (tint(J) < most), trial, shortened)
     share = torch.ones_like(ray_depth)
     share[guessed] = shortened[cell]

@@ -15,7 +15,7 @@ from torch import Tensor
 from swimm3r.imaging.depth_completion import fill_z_depth
 from swimm3r.imaging.filters import blur
 from swimm3r.imaging.open_water import open_water_mask
-from swimm3r.imaging.undistortion import frame_rays
+from swimm3r.imaging.undistortion import frame_directions, frame_rays
 from swimm3r.progress import Progress, silent
 from swimm3r.scene.frames import Frames
 from swimm3r.scene.reconstruction import DepthMap, Reconstruction
@@ -36,6 +36,8 @@ class WaterSamples:
     track: Int[Tensor, " n"]  # which patch of surface; -1 for pixels on their own
     open_water: Float[Tensor, "m 3"]  # pixels beyond every surface; empty where the frames show none
     gray: bool = False  # the three channels are one (`Frames.gray`)
+    direction: Float[Tensor, "n 3"] | None = None  # unit, camera axes; without, no lamp can be told from the sun
+    water_direction: Float[Tensor, "m 3"] | None = None  # of the open water's pixels
 
 
 def collect_samples(
@@ -55,38 +57,45 @@ def collect_samples(
     def sampled(i: int) -> list[tuple[Tensor, ...]]:
         seen = order[bounds[i] : bounds[i + 1]]
         colors = frames.colors(frames.index(rec.names[i]), tracks.pixel[seen])
-        I, z, patch = _patch_means(colors, tracks, seen, patches, settings)
-        parts: list[tuple[Tensor, ...]] = [(I, z, torch.full_like(patch, i), patch)]
+        direction = frame_directions(rec.cameras[i]).reshape(-1, 3)[tracks.pixel[seen]]
+        I, z, patch, toward = _patch_means(colors, direction, tracks, seen, patches, settings)
+        parts: list[tuple[Tensor, ...]] = [(I, z, torch.full_like(patch, i), patch, toward)]
         return [*_pixels_alone(rec, frames, i, per_frame, settings), *parts] if i in alone else parts
 
     parts: list[tuple[Tensor, ...]] = []
-    water: list[Tensor] = [torch.zeros(0, 3)]
+    water: list[tuple[Tensor, ...]] = [(torch.zeros(0, 3), torch.zeros(0, 3))]
     for done, of_frame in enumerate(in_order(sampled, usable)):
         progress("sampling the water", done, len(usable))
-        parts += [part for part in of_frame if len(part) > 1]
-        water += [part[0] for part in of_frame if len(part) == 1]
+        parts += [part for part in of_frame if len(part) > 2]
+        water += [part for part in of_frame if len(part) == 2]
     progress("sampling the water", len(usable), len(usable))
     if not parts:
         none = torch.zeros(0)
         return WaterSamples(none.reshape(0, 3), none, none.long(), none.long(), none.reshape(0, 3), frames.gray)
-    I, ray_depth, frame, track = (torch.cat(p) for p in zip(*parts, strict=True))
-    plausible = _plausible_water(torch.cat(water), I, ray_depth)
-    return WaterSamples(I, ray_depth, frame, track, plausible, frames.gray)
+    I, ray_depth, frame, track, direction = (torch.cat(p) for p in zip(*parts, strict=True))
+    open_water, toward = (torch.cat(p) for p in zip(*water, strict=True))
+    kept = _plausible_water(open_water, I, ray_depth)
+    return WaterSamples(I, ray_depth, frame, track, open_water[kept], frames.gray, direction, toward[kept])
 
 
 def _pixels_alone(
     rec: Reconstruction, frames: Frames, i: int, count: int, settings: SeathruSettings
 ) -> list[tuple[Tensor, ...]]:
-    """Color, ray depth, frame and patch (none) of about `count` pixels of a frame; and open water, if it shows any."""
+    """Color, ray depth, frame, patch (none) and direction of about `count` pixels of a frame; and color and direction
+    of open water, if it shows any.
+    """
     index = frames.index(rec.names[i])
     image, mask = frames.image(index), frames.mask(index)
     ray_depth, sea = _ray_depth_nearby(image, rec.depth[rec.names[i]], frame_rays(rec.cameras[i]))
     pixels = torch.nonzero((ray_depth.reshape(-1) > 0) & mask.reshape(-1))[:, 0]
     pixels = pixels[:: max(1, len(pixels) // count)]
     of_frame, no_patch = torch.full_like(pixels, i), torch.full_like(pixels, -1)
-    shown = image[sea & mask]
+    direction = frame_directions(rec.cameras[i]).reshape(-1, 3)
+    shown = torch.nonzero((sea & mask).reshape(-1))[:, 0]
     shown = shown[:: max(1, len(shown) // settings.open_water_pixels)]
-    return [(image.reshape(-1, 3)[pixels], ray_depth.reshape(-1)[pixels], of_frame, no_patch), (shown,)]
+    colors = image.reshape(-1, 3)
+    alone = (colors[pixels], ray_depth.reshape(-1)[pixels], of_frame, no_patch, direction[pixels])
+    return [alone, (colors[shown], direction[shown])]
 
 
 def _ray_depth_nearby(
@@ -130,12 +139,13 @@ def _patches(rec: Reconstruction, tracks: DenseTracks, settings: SeathruSettings
 
 def _patch_means(
     colors: Float[Tensor, "s 3"],
+    direction: Float[Tensor, "s 3"],
     tracks: DenseTracks,
     seen: Int[Tensor, " s"],
     patches: _Patches,
     settings: SeathruSettings,
-) -> tuple[Float[Tensor, "k 3"], Float[Tensor, " k"], Int[Tensor, " k"]]:
-    """Mean color and ray depth of each patch one frame shows; patches shown in part only are left out."""
+) -> tuple[Float[Tensor, "k 3"], Float[Tensor, " k"], Int[Tensor, " k"], Float[Tensor, "k 3"]]:
+    """Mean color and ray depth, number and direction of each patch one frame shows, without those shown in part."""
     patch, which = torch.unique(patches.of_track[tracks.track[seen]], return_inverse=True)
     count = torch.bincount(which, minlength=len(patch)).float()
 
@@ -145,15 +155,15 @@ def _patch_means(
     offset = (mean(tracks.xyz[tracks.track[seen]]) - patches.middle[patch]).norm(dim=-1) / patches.size[patch]
     whole = (count >= settings.patch_observations) & (offset < settings.patch_offset)
     I, z = mean(colors), mean(tracks.ray_depth[seen, None])[:, 0]
-    return I[whole], z[whole], patch[whole]
+    return I[whole], z[whole], patch[whole], torch.nn.functional.normalize(mean(direction), dim=-1)[whole]
 
 
 def _plausible_water(
     open_water: Float[Tensor, "m 3"], I: Float[Tensor, "n 3"], ray_depth: Float[Tensor, " n"]
-) -> Float[Tensor, "m 3"]:
-    """Drops what is darker than the dark envelope of the farthest tenth: veil grows with distance, shadow does not."""
+) -> Bool[Tensor, " m"]:
+    """False where darker than the dark envelope of the farthest tenth: veil grows with distance, shadow does not."""
     if len(open_water) == 0 or len(I) == 0:
-        return open_water
+        return torch.ones(len(open_water), dtype=torch.bool)
     far = ray_depth >= torch.quantile(ray_depth[:: max(1, len(ray_depth) // 100_000)], 0.9)
     envelope = torch.quantile(I[far][:100_000], 0.02, dim=0)
-    return open_water[(open_water >= envelope - 0.02).all(-1)]
+    return (open_water >= envelope - 0.02).all(-1)

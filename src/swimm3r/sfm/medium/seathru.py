@@ -13,15 +13,20 @@ and one bounded least-squares problem finds Binf, beta_B and beta_D(z) = a exp(b
                 only what the tracks leave open
     open water  pixels that look past every surface show Binf; without any, Binf is not far from what is farthest
 
+Under a lamp on the camera (`lamp_fit.py`), J_t is multiplied by its light, and the way from the lamp attenuates, too.
+
 `channel_fit.py` holds the least squares. Depths enter in units of their median, so the fit commutes with any rescaling
 of the scene.
 """
+
+from dataclasses import replace
 
 import numpy as np
 import torch
 from torch import Tensor
 
 from swimm3r.errors import InputError
+from swimm3r.lamp import Light, share_scattered
 from swimm3r.medium import AttenuationCurve, Encoding, Medium, MediumFit, linear_from_srgb
 from swimm3r.progress import Progress, silent
 from swimm3r.scene.frames import Frames
@@ -35,9 +40,11 @@ from swimm3r.sfm.medium.channel_fit import (
     ChannelFit,
     Observations,
     Pixels,
+    daylight,
     fit_channel,
 )
 from swimm3r.sfm.medium.dense_tracks import fuse_depth
+from swimm3r.sfm.medium.lamp_fit import LampPixels, fit_lamp, in_scene_unit
 from swimm3r.sfm.medium.samples import WaterSamples, collect_samples
 from swimm3r.sfm.settings import SeathruSettings
 
@@ -54,11 +61,11 @@ def estimate_medium(
     return fit_medium(collect_samples(rec, frames, tracks, settings, progress), settings, encoding)
 
 
-def fit_medium(samples: WaterSamples, settings: SeathruSettings, encoding: Encoding) -> MediumFit:
-    """The water that explains the samples, on values as stored ("srgb") or in linear light.
+def fit_medium(samples: WaterSamples, settings: SeathruSettings, encoding: Encoding, light: Light = "sun") -> MediumFit:
+    """The water that explains the samples, on values as stored ("srgb") or in linear light, under the sun or a lamp.
 
     Gray samples are one channel, which is fitted once and stands for all three. Raises InputError where fewer than
-    `settings.min_samples` pixels have a depth.
+    `settings.min_samples` pixels have a depth, and under a lamp where no point is seen from several distances.
     """
     n = len(samples.ray_depth)
     if n < settings.min_samples:
@@ -67,29 +74,67 @@ def fit_medium(samples: WaterSamples, settings: SeathruSettings, encoding: Encod
             cause="the dense depth stage found almost no surface",
             hint=f"use clearer or slower footage; at least {settings.min_samples} pixels are needed",
         )
+    color, open_water = encoded(samples, encoding)
+    ray_depth = samples.ray_depth.double().numpy()
+    unit = float(np.median(ray_depth))
+    z = ray_depth / unit
+    frame = np.unique(samples.frame.numpy(), return_inverse=True)[1]
+    chosen = telling_rows(samples, z, settings)
+    if light == "lamp":
+        if chosen is None:
+            raise _too_little_for_a_lamp()
+        lit = _lit(samples, color, z, frame, open_water)
+        lamp, beta_D = fit_lamp(lit, *chosen, settings, encoding)
+        scatter = lit.scatter(lamp, beta_D)
+        every = [lit.of_channel(c, lamp, scatter) for c in range(color.shape[1])]
+    else:
+        lamp, brightness, ways = None, color.mean(1), daylight(z)
+        every = [Pixels(color[:, c], brightness, ways, frame, open_water[:, c]) for c in range(color.shape[1])]
+    channels = []
+    for pixels in every:
+        observations = None
+        if chosen is not None:
+            rows, point = chosen
+            observations = Observations(rows, pixels.ways.rows(rows), point, frame[rows], pixels.I[rows])
+        channels.append(fit_channel(pixels, observations, settings))
+    fit = _medium_fit(channels * (3 // len(channels)), unit, ray_depth, settings, encoding)
+    if lamp is None:
+        return fit
+    lamp = in_scene_unit(lamp, fit.beta_D.double().numpy() * unit, unit)
+    ahead = torch.tensor([0.0, 0.0, 1.0])
+    half = share_scattered(ahead, torch.tensor(unit), lamp, fit.beta_D)  # as much as beta_B has at the median depth
+    return replace(fit, beta_B=-torch.log1p(-half.clamp(max=0.99)) / unit, lamp=lamp)
+
+
+def encoded(samples: WaterSamples, encoding: Encoding) -> tuple[np.ndarray, np.ndarray]:
+    """Colors of samples and of open water in an encoding; of gray frames in one channel."""
     values = [samples.I.double(), samples.open_water.double()]
     if encoding == "linear":
         values = [linear_from_srgb(v) for v in values]
     if samples.gray:
         values = [v.mean(1, keepdim=True) for v in values]
-    color, open_water = (v.numpy() for v in values)
-    ray_depth = samples.ray_depth.double().numpy()
-    unit = float(np.median(ray_depth))
-    z = ray_depth / unit
-    frame = np.unique(samples.frame.numpy(), return_inverse=True)[1]
-    chosen = _telling_rows(samples, z, settings)
-    channels = []
-    for c in range(color.shape[1]):
-        pixels = Pixels(color[:, c], color.mean(1), z, frame, open_water[:, c])
-        observations = None
-        if chosen is not None:
-            rows, point = chosen
-            observations = Observations(rows, z[rows], point, frame[rows], color[rows, c])
-        channels.append(fit_channel(pixels, observations, settings))
-    return _medium_fit(channels * (3 // len(channels)), unit, ray_depth, settings, encoding)
+    return values[0].numpy(), values[1].numpy()
 
 
-def _telling_rows(
+def _lit(
+    samples: WaterSamples, color: np.ndarray, z: np.ndarray, frame: np.ndarray, open_water: np.ndarray
+) -> LampPixels:
+    if samples.direction is None or samples.water_direction is None:
+        raise ValueError("a lamp's light is told by the directions of pixels, and these samples have none")
+    directions = (values.double().numpy() for values in (samples.direction, samples.water_direction))
+    direction, toward_water = directions
+    return LampPixels(color, z, direction, frame, open_water, toward_water)
+
+
+def _too_little_for_a_lamp() -> InputError:
+    return InputError(
+        "the light of a lamp cannot be told from these frames",
+        cause="too few points of the scene are seen from several distances",
+        hint="footage that comes nearer to what it shows; or --light sun",
+    )
+
+
+def telling_rows(
     samples: WaterSamples, z: np.ndarray, settings: SeathruSettings
 ) -> tuple[np.ndarray, np.ndarray] | None:
     """Rows and point numbers of the points with the largest ratio of depths, at most `max_observations` rows."""

@@ -153,7 +153,7 @@ def train_block(task: BlockTask, progress: Progress = silent) -> None:
     folder = task.folder / FOLDER / f"{task.number:04d}"
     with devices.memory_for("this block", "a smaller --splat.blocks.largest, or --map-device cpu"):
         final = loop.run(
-            recipe_parts(task.settings),
+            recipe_parts(task.settings, task.rec.lamp(task.scale)),
             scene,
             schedule,
             folder,
@@ -221,7 +221,9 @@ def _train_water(
     scene = TrainingScene(views.rec, scale, radius, views, None, device)
     schedule = loop.schedule_of(short, key, "water")
     with devices.memory_for("the water's map", "a smaller --splat.long-side, or --map-device cpu"):
-        final = loop.run(recipe_parts(short), scene, schedule, folder, progress, observer, "training the water")
+        final = loop.run(
+            recipe_parts(short, rec.lamp(scale)), scene, schedule, folder, progress, observer, "training the water"
+        )
     return final.to(CPU).field.requires_grad_(False)
 
 

@@ -7,6 +7,9 @@ alone, is a learned linear map of sines and cosines of octaves of t, 0..1 over t
 training frame has. A_phi is a 1x1 convolutional network with ReLU hidden layers, sigma_med a sigmoid for Binf and a
 softplus for the betas, which are per unit of ray depth. The field is smooth, so it is evaluated on a grid of pixels and
 interpolated in between (stride 1 is exact).
+
+Under a lamp on the camera, u are the directions in the camera's axes, as light and backscatter move with it, and Binf
+is multiplied by the pattern of the lamp's backscatter (`splat.medium.lamp`).
 """
 
 import math
@@ -17,8 +20,10 @@ from jaxtyping import Float
 from torch import Tensor, nn
 from torch.nn.functional import sigmoid, softplus
 
+from swimm3r.lamp import Lamp, veil_pattern
 from swimm3r.medium import Medium
 from swimm3r.raster import MediumMaps
+from swimm3r.splat.medium.lamp import CameraLamp
 from swimm3r.splat.primitives.beta import inverse_softplus
 from swimm3r.splat.primitives.spherical_harmonics import HARMONICS, spherical_harmonics
 from swimm3r.splat.projection.pinhole import Pinhole
@@ -30,8 +35,9 @@ class MediumField(nn.Module):
 
     length: Tensor  # scene units per working unit; betas are divided by it
 
-    def __init__(self, settings: MediumFieldSettings, dynamic: bool = False) -> None:
+    def __init__(self, settings: MediumFieldSettings, dynamic: bool = False, lamp: Lamp | None = None) -> None:
         super().__init__()
+        self.lamp = None if lamp is None or settings.model == "none" else CameraLamp(lamp)
         self.stride = settings.stride
         width = settings.time_features if dynamic else 0
         self.gamma = nn.Linear(2 * settings.frequencies, width) if dynamic else None
@@ -53,7 +59,10 @@ class MediumField(nn.Module):
     def forward(
         self, directions: Float[Tensor, "h w 3"], time: Float[Tensor, ""] | None = None
     ) -> Float[Tensor, "9 h w"]:
-        """Binf, beta_B and beta_D, in this order, of unit directions in world axes, at a time in 0..1 of the clip."""
+        """Binf, beta_B and beta_D, in this order, of unit directions in world axes, at a time in 0..1 of the clip.
+
+        Under a lamp directions are in camera axes, and Binf is without the pattern of the backscatter.
+        """
         if self.is_clear:
             return directions.new_zeros(9, *directions.shape[:2])
         features = spherical_harmonics(directions)
@@ -77,16 +86,21 @@ class FieldGrid:
 
     values: Float[Tensor, "9 gh gw"]
     step: tuple[float, float]  # pixels between neighbors, down and right
+    veil: Float[Tensor, "gh gw"] | None = None  # pattern of a lamp's backscatter; None in daylight
 
 
 def initial_field(
-    medium: Medium | None, settings: MediumFieldSettings, rng: torch.Generator, dynamic: bool = False
+    medium: Medium | None,
+    settings: MediumFieldSettings,
+    rng: torch.Generator,
+    dynamic: bool = False,
+    lamp: Lamp | None = None,
 ) -> MediumField:
     """A field that is `medium` (coefficients per working unit) everywhere; without one, gray and thin water.
 
     Without biases it cannot be, and begins at random.
     """
-    field = MediumField(settings, dynamic)
+    field = MediumField(settings, dynamic, lamp)
     if settings.model == "none":
         return field
     with torch.no_grad():
@@ -128,14 +142,18 @@ def grid_of(field: MediumField, view: Pinhole, stride: int, time: Float[Tensor, 
         ],
         -1,
     )
-    directions = torch.nn.functional.normalize(rays @ view.R, dim=-1)  # R^T to the world
+    rays = rays if field.lamp else rays @ view.R  # R^T to the world
+    directions = torch.nn.functional.normalize(rays, dim=-1).to(field.length)
     step = ((view.height - 1) / (rows - 1), (view.width - 1) / (columns - 1))
-    return FieldGrid(field(directions.to(field.length), time), step)
+    veil = None if field.lamp is None else veil_pattern(directions, field.lamp.lamp)
+    return FieldGrid(field(directions, time), step, veil)
 
 
 def medium_at_pixels(grid: FieldGrid, height: int, width: int) -> MediumMaps:
     """The field at every pixel, betas per unit of ray depth."""
     Binf, beta_B, beta_D = grid.values.split(3)
+    if grid.veil is not None:
+        Binf = Binf * grid.veil
     if grid.values.shape[1:] != (height, width):
         # as matrix products: torch's own bilinear interpolation takes four times as long on a processor
         rows, columns = grid.values.shape[1:]

@@ -7,13 +7,16 @@ from swimm3r.splat.settings import McmcGsSettings, SeaSplatSettings, SplatSettin
 from swimm3r.splat.shared_settings import MediumFieldSettings
 
 if TYPE_CHECKING:
+    import swimm3r.lamp
     import swimm3r.splat.training.loop
 
 __all__ = ["recipe_parts"]
 
 
-def recipe_parts(settings: SplatSettings) -> "swimm3r.splat.training.loop.RecipeParts":
-    """The primitives, the water and the training that settings ask for."""
+def recipe_parts(
+    settings: SplatSettings, lamp: "swimm3r.lamp.Lamp | None" = None
+) -> "swimm3r.splat.training.loop.RecipeParts":
+    """The primitives, the water and the training that settings ask for; a lamp lights maps of Beta primitives alone."""
     from swimm3r.splat.medium.field import MediumField
     from swimm3r.splat.medium.seasplat import SceneWater
     from swimm3r.splat.primitives.beta import BetaPrimitives
@@ -23,7 +26,7 @@ def recipe_parts(settings: SplatSettings) -> "swimm3r.splat.training.loop.Recipe
 
     match settings:
         case UwbsSettings():
-            field = MediumField(settings.medium, settings.dynamic)
+            field = MediumField(settings.medium, settings.dynamic, lamp)
             return RecipeParts(BetaPrimitives, field, partial(uwbs.recipe, settings))
         case McmcGsSettings():
             field = MediumField(MediumFieldSettings(model="none"))

@@ -75,7 +75,8 @@ class Uwbs:
         fit = measured_water(self.scene.rec)
         if fit is not None:
             medium = Medium(fit.Binf, fit.beta_D / scale, fit.beta_B / scale)
-        return initial_field(medium, settings.medium, loop.generator(settings.seed, 0, 3), settings.dynamic)
+        rng, lamp = loop.generator(settings.seed, 0, 3), self.scene.rec.lamp(scale)
+        return initial_field(medium, settings.medium, rng, settings.dynamic, lamp)
 
     def step(self, state: State, view: TrainingView, step: int) -> tuple[State, loop.Numbers]:
         """One view: forward and adjoint, densification on its cadence, Adam."""

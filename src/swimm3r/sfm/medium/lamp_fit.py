@@ -1,0 +1,218 @@
+"""A lamp on the camera from the pixels that tell the water (see seathru.py), as `swimm3r.lamp` describes it.
+
+    I_k = J_t L(X_k) exp(-beta_D (|X_k - p| + z_k)) + Binf G(d_k, z_k) / G(axis, infinity)
+
+One robust least-squares problem over all channels finds strength, beam and position of the lamp, which the channels
+share, with the water of each, which is then fitted again by itself. The colors J_t are eliminated. G is that of the
+lamp and the water found in the round before: it changes slowly with both.
+
+Known is the light on the same point in several places of the image and at several distances. Its strength is known as a
+product with J alone: it is what makes surfaces reflect 1 / f on average. The power of its fall-off is not fitted, as
+attenuation looks much like it over the distances of a dive: it is that of a small lamp, 2 in linear light. For the same
+reason the lamp stands beside the camera, not ahead of it or behind.
+"""
+
+from dataclasses import dataclass, replace
+from typing import Any, cast
+
+import numpy as np
+import torch
+from scipy.optimize import least_squares
+
+from swimm3r.lamp import (
+    INVERSE_SQUARE,
+    STORED,
+    TERMS,
+    Lamp,
+    lamp_distance,
+    log_light,
+    rescaled_lamp,
+    share_scattered,
+    single_scattering_pattern,
+)
+from swimm3r.medium import Encoding
+from swimm3r.sfm.medium import kernels
+from swimm3r.sfm.medium.channel_fit import (
+    BINF,
+    LOG_BETA_D,
+    SLOPE,
+    Evidence,
+    Observations,
+    Pixels,
+    Ways,
+    attenuations,
+    best_start,
+    daylight,
+    evidence_of,
+    prior_residuals,
+    thinned,
+)
+from swimm3r.sfm.settings import SeathruSettings
+
+_BEAM_STD, _STRENGTH_STD = 3.0, 1.0  # of the beam's coefficients, and of the strength's logarithm
+_OFFSET_STD = 0.2  # of the lamp's position beside the camera, in median depths
+_WIDEST = 3.0  # of these that an unknown may reach
+_OBSERVATIONS = 12_000  # of the points, which stand for all
+_WATER = 400  # pixels of open water, likewise
+_WATER_SHARED = 20.0  # of them that share an error
+_STEPS = 40
+_ROUNDS = 12
+_SETTLED = 0.01  # change of the lamp's unknowns in a round, in their standard deviations, that ends the rounds
+_SHARED = 1 + TERMS + 2  # unknowns of the lamp
+_START_BETA = 0.4  # attenuation over a median depth before anything is known
+
+
+@dataclass(frozen=True)
+class LampPixels:
+    """Pixels of a dive, lengths in medians of the ray depth."""
+
+    color: np.ndarray  # [n, c]
+    z: np.ndarray
+    direction: np.ndarray  # [n, 3], unit, camera axes
+    frame: np.ndarray
+    open_water: np.ndarray  # [m, c]
+    water_direction: np.ndarray
+
+    def scatter(self, lamp: Lamp, beta_D: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        """B over Binf of the pixels and of open water, [n, c] and [m, c]."""
+        direction, water, beta = (torch.from_numpy(v) for v in (self.direction, self.water_direction, beta_D))
+        far = torch.full((len(water),), torch.inf, dtype=torch.float64)
+        at_pixels = share_scattered(direction, torch.from_numpy(self.z), lamp, beta)
+        return at_pixels.numpy(), share_scattered(water, far, lamp, beta).numpy()
+
+    def ways(self, lamp: Lamp, scatter: np.ndarray | None = None) -> Ways:
+        """Ways of the lamp's light; `scatter` is that of one channel."""
+        points = torch.from_numpy(self.direction) * torch.from_numpy(self.z)[:, None]
+        path = lamp_distance(points, lamp).numpy() + self.z
+        return Ways(self.z, path, log_light(points, lamp).numpy(), scatter)
+
+    def of_channel(self, c: int, lamp: Lamp, scatter: tuple[np.ndarray, np.ndarray]) -> Pixels:
+        """One channel of them; open water as it would be on the optical axis."""
+        here, water = (values[:, c] for values in scatter)
+        return Pixels(
+            self.color[:, c], self.color.mean(1), self.ways(lamp, here), self.frame, self.open_water[:, c] / water
+        )
+
+
+def fit_lamp(
+    pixels: LampPixels, rows: np.ndarray, point: np.ndarray, settings: SeathruSettings, encoding: Encoding
+) -> tuple[Lamp, np.ndarray]:
+    """The lamp that pixels and the points among them (`rows`, numbered by `point`) tell of, lengths in medians.
+
+    With it comes beta_D per median depth and channel, of which its backscatter is made.
+    """
+    fall_off = INVERSE_SQUARE if encoding == "linear" else INVERSE_SQUARE / STORED
+    channels = range(pixels.color.shape[1])
+    unit = np.ones(len(rows))
+    every = thinned(Observations(rows, daylight(unit), point, pixels.frame[rows], unit), _OBSERVATIONS)
+    few = LampPixels(
+        pixels.color[every.rows], pixels.z[every.rows], pixels.direction[every.rows], every.frame,
+        *(values[:: max(1, len(values) // _WATER)] for values in (pixels.open_water, pixels.water_direction)),
+    )  # fmt: skip
+    unknowns, lamp, beta_D = np.zeros(_SHARED), _lamp(np.zeros(_SHARED), fall_off), np.full(len(channels), _START_BETA)
+    noise = np.full(len(channels), settings.loss_scale)
+    for _ in range(_ROUNDS):  # backscatter, range bins of the priors and noise are those of the light found so far
+        whole, scatter = pixels.scatter(lamp, beta_D), few.scatter(lamp, beta_D)
+        priors = [evidence_of(pixels.of_channel(c, lamp, whole), settings) for c in channels]
+        if len(unknowns) == _SHARED:
+            waters = []
+            for c in channels:
+                ways = few.ways(lamp, scatter[0][:, c])
+                seen = Observations(every.rows, ways, every.point, every.frame, few.color[:, c])
+                waters.append(best_start(priors[c], seen, 0.0, settings))
+            unknowns = np.concatenate([unknowns, *waters])
+        problem = _Problem(few, every.point, scatter, priors, noise, fall_off, settings)
+        before, unknowns = unknowns[:_SHARED], problem.solved(unknowns)
+        noise, lamp = problem.noise_at(unknowns), _lamp(unknowns[:_SHARED], fall_off)
+        x = unknowns[_SHARED:].reshape(len(priors), -1)
+        beta_D = np.exp(x[:, LOG_BETA_D] + x[:, SLOPE])
+        if np.all(np.abs(unknowns[:_SHARED] - before) < _SETTLED * _std()):
+            break
+    return lamp, beta_D
+
+
+def in_scene_unit(lamp: Lamp, beta_D: np.ndarray, unit: float) -> Lamp:
+    """A lamp whose lengths are in medians, `unit` scene units each, with the pattern of its backscatter."""
+    pattern = single_scattering_pattern(lamp, torch.from_numpy(beta_D))
+    return rescaled_lamp(replace(lamp, veil=pattern), unit)
+
+
+def _lamp(shared: np.ndarray, fall_off: float) -> Lamp:
+    values = torch.from_numpy(np.asarray(shared, dtype=np.float64))
+    strength, beam, beside = values.split([1, TERMS, 2])
+    position = torch.cat([beside, beside.new_zeros(1)])
+    return Lamp(position, 1.0, fall_off, float(strength.exp()), beam, torch.zeros_like(beam))
+
+
+@dataclass(frozen=True)
+class _Problem:
+    """Least squares for the lamp and the waters of all channels together."""
+
+    few: LampPixels  # that see the points
+    point: np.ndarray
+    scatter: tuple[np.ndarray, np.ndarray]  # B over Binf of these pixels and of open water
+    priors: list[Evidence]  # of the channels
+    noise: np.ndarray  # of the channels' pixels
+    fall_off: float
+    settings: SeathruSettings
+
+    def solved(self, start: np.ndarray) -> np.ndarray:
+        """Lamp and waters by bounded least squares with a soft L1 loss."""
+        std = _std()
+        lower = np.concatenate([-_WIDEST * std, *(prior.lower for prior in self.priors)])
+        upper = np.concatenate([_WIDEST * std, *(prior.upper for prior in self.priors)])
+        inside = np.clip(start, lower + 1e-6, upper - 1e-6)
+        return least_squares(
+            self.residuals, inside, jac=cast(Any, self.jacobian), bounds=(lower, upper), x_scale="jac", loss="soft_l1",
+            max_nfev=_STEPS, xtol=1e-5, ftol=1e-5,
+        ).x  # fmt: skip
+
+    def noise_at(self, unknowns: np.ndarray) -> np.ndarray:
+        """Robust spread of each channel's pixels about a solution."""
+        lit, waters = self._lit(unknowns), unknowns[_SHARED:].reshape(len(self.priors), -1)
+        off = [np.median(np.abs(self._off(c, x, lit))) for c, x in enumerate(waters)]
+        return np.clip(1.4826 * np.array(off), 1e-3, self.settings.loss_scale)
+
+    def residuals(self, unknowns: np.ndarray) -> np.ndarray:
+        """Everything in its own standard deviations: the lamp, then the channels one after another."""
+        lit, waters = self._lit(unknowns), unknowns[_SHARED:].reshape(len(self.priors), -1)
+        return np.concatenate(
+            [unknowns[:_SHARED] / _std(), *(self._of_channel(c, x, lit) for c, x in enumerate(waters))]
+        )
+
+    def jacobian(self, unknowns: np.ndarray) -> np.ndarray:
+        """By forward differences; the water of a channel moves its own rows alone."""
+        here = self.residuals(unknowns)
+        rows = np.zeros((len(here), len(unknowns)))
+        for k in range(_SHARED):
+            rows[:, k] = (self.residuals(unknowns + 1e-6 * np.eye(len(unknowns))[k]) - here) / 1e-6
+        lit, waters = self._lit(unknowns), unknowns[_SHARED:].reshape(len(self.priors), -1)
+        each = (len(here) - _SHARED) // len(waters)
+        for c, x in enumerate(waters):
+            mine = slice(_SHARED + c * each, _SHARED + (c + 1) * each)
+            for k in range(len(x)):
+                moved = self._of_channel(c, x + 1e-6 * np.eye(len(x))[k], lit)
+                rows[mine, _SHARED + c * len(x) + k] = (moved - here[mine]) / 1e-6
+        return rows
+
+    def _lit(self, unknowns: np.ndarray) -> Ways:
+        return self.few.ways(_lamp(unknowns[:_SHARED], self.fall_off))
+
+    def _off(self, c: int, x: np.ndarray, lit: Ways) -> np.ndarray:
+        """Pixels of a channel less what they should be, with the J of every point eliminated."""
+        T_D, B = attenuations(x, Ways(lit.z, lit.path, lit.log_gain, self.scatter[0][:, c]))
+        direct = self.few.color[:, c] - B
+        J = kernels.surface_colors(T_D, direct, np.ones(len(T_D)), self.point, int(self.point.max()) + 1)
+        return direct - J[self.point] * T_D
+
+    def _of_channel(self, c: int, x: np.ndarray, lit: Ways) -> np.ndarray:
+        settings, water = self.settings, self.few.open_water[:, c]
+        off = self._off(c, x, lit) / (self.noise[c] * np.sqrt(settings.min_redundancy))
+        shared = settings.open_water_std * np.sqrt(max(1.0, len(water) / _WATER_SHARED))
+        of_water = (water - x[BINF] * self.scatter[1][:, c]) / shared
+        return np.concatenate([off, of_water, prior_residuals(x, self.priors[c], settings)])
+
+
+def _std() -> np.ndarray:
+    """Standard deviations of the lamp's unknowns about 0, before anything is seen."""
+    return np.repeat([_STRENGTH_STD, _BEAM_STD, _OFFSET_STD], [1, TERMS, 2])

@@ -1,0 +1,104 @@
+"""Sun or lamp: whether the light on a dive's surfaces stays with the world or with the camera.
+
+Where the water of daylight is taken off, a point of surface keeps its light in every frame under the sun. Under a lamp
+on the camera its light changes with its place in the image,
+
+    ln (I - B) / T_D = ln J_t + h(z) + g . phi(d),
+
+h being what the water's fit leaves over the distance z, and phi the pattern of `swimm3r.lamp`. Both models, with and
+without phi, are fitted to half of the points and judged on the others, points that none was fitted to. Frames whose
+exposure changes do not pass for either: they have gains of their own. A lens that darkens the corners looks the same as
+a lamp, but less so.
+"""
+
+import numpy as np
+import torch
+
+from swimm3r.lamp import TERMS, LightEvidence, pattern
+from swimm3r.medium import MediumFit, backscatter, transmittances
+from swimm3r.sfm.medium.samples import WaterSamples
+from swimm3r.sfm.settings import SeathruSettings
+
+_LEAST_LIGHT, _LEAST_T_D = 0.02, 0.1  # direct light and T_D of channels whose logarithm tells something
+_MOST = 60_000  # observations
+_ROUNDS = 3  # of reweighting
+
+
+def judge_light(samples: WaterSamples, fit: MediumFit, settings: SeathruSettings) -> LightEvidence | None:
+    """The light that the samples tell, given the water as fitted under the sun; None where too few points do."""
+    if samples.direction is None:
+        return None
+    z = samples.ray_depth
+    medium = fit.at(z)
+    direct, T_D = samples.I - backscatter(z, medium), transmittances(z, medium)[0]
+    exposed = (samples.I.amin(-1) > settings.black) & (samples.I.amax(-1) < settings.saturated)
+    told = (direct > _LEAST_LIGHT) & (T_D > _LEAST_T_D)
+    logs = torch.where(told, (direct.clamp(min=_LEAST_LIGHT) / T_D).log(), 0.0)
+    channel = told.float().mean(0).argmax()  # one for all, as points differ in color
+    rows = torch.nonzero((samples.track >= 0) & exposed & told[:, channel])[:, 0]
+    points = torch.unique(samples.track[rows])
+    if len(points) < settings.min_tracks:
+        return None
+    step = -(-len(rows) // _MOST)
+    rows = rows[samples.track[rows] % step == 0] if step > 1 else rows
+    light = logs[rows, channel].double().numpy()
+    point = np.unique(samples.track[rows].numpy(), return_inverse=True)[1]
+    frame = np.unique(samples.frame[rows].numpy(), return_inverse=True)[1]
+    patterns = pattern_terms(samples.direction[rows].double())
+    unit = float(z[rows].median())
+    far = (z[rows].double() / unit).numpy()
+    distance = np.stack([far, np.log(far)], -1)
+    held = point % 2 == 0
+    spreads = []
+    for terms in (distance, np.concatenate([distance, patterns], -1)):
+        both = [_held_out(light, terms, point, frame, which) for which in (held, ~held)]
+        spreads.append(float(np.mean([value**2 for value in both])))
+    found = _fitted(light, np.concatenate([distance, patterns], -1), point, frame)[-TERMS:]
+    alone = samples.direction[samples.track < 0]
+    everywhere = alone if len(alone) else samples.direction
+    change = float((pattern(everywhere.double(), torch.from_numpy(found))).std())
+    explained = 1 - spreads[1] / max(spreads[0], 1e-12)
+    lamp = explained >= settings.lamp_explained and change >= settings.lamp_change
+    return LightEvidence("lamp" if lamp else "sun", explained, change, len(points))
+
+
+def pattern_terms(direction: torch.Tensor) -> np.ndarray:
+    """phi of unit directions, [n, 6]."""
+    return torch.stack([pattern(direction, one) for one in torch.eye(TERMS, dtype=torch.float64)], -1).numpy()
+
+
+def _centered(values: np.ndarray, group: np.ndarray, weight: np.ndarray) -> np.ndarray:
+    """Values less the weighted mean of their group."""
+    total = np.bincount(group, weight).clip(1e-12)
+    columns = values.reshape(len(values), -1).T
+    means = np.stack([np.bincount(group, weight * column) / total for column in columns], -1)[group]
+    return (values.reshape(len(values), -1) - means).reshape(values.shape)
+
+
+def _without_groups(values: np.ndarray, point: np.ndarray, frame: np.ndarray, weight: np.ndarray) -> np.ndarray:
+    """Values less what is common to a point and what is common to a frame, by turns."""
+    for _ in range(4):
+        values = _centered(_centered(values, frame, weight), point, weight)
+    return values
+
+
+def _fitted(light: np.ndarray, terms: np.ndarray, point: np.ndarray, frame: np.ndarray) -> np.ndarray:
+    """Coefficients of the terms by reweighted least squares; every point and every frame has a level of its own."""
+    weight = np.ones(len(light))
+    found = np.zeros(terms.shape[1])
+    for _ in range(_ROUNDS):
+        x, y = (_without_groups(values, point, frame, weight) for values in (terms, light))
+        information = (x * weight[:, None]).T @ x
+        found = np.linalg.solve(information + 1e-6 * len(x) * np.eye(len(found)), x.T @ (weight * y))
+        off = y - x @ found
+        scale = 1.4826 * np.median(np.abs(off)) + 1e-6
+        weight = 1 / (1 + (off / (2 * scale)) ** 2)
+    return found
+
+
+def _held_out(light: np.ndarray, terms: np.ndarray, point: np.ndarray, frame: np.ndarray, held: np.ndarray) -> float:
+    """Robust spread of the light of held-out points about what the terms, fitted to the others, say of it."""
+    found = _fitted(light[~held], terms[~held], point[~held], frame[~held])
+    even = np.ones(int(held.sum()))
+    off = _without_groups(light[held] - terms[held] @ found, point[held], frame[held], even)
+    return 1.4826 * float(np.median(np.abs(off)))

@@ -1,0 +1,142 @@
+"""A lamp's light from points that a moving camera sees, with the truth of the synthetic dive's lamp."""
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+import torch
+from torch.nn.functional import normalize
+
+from swimm3r.errors import InputError
+from swimm3r.io.medium_json import load_medium
+from swimm3r.lamp import LightEvidence, log_light
+from swimm3r.medium import add_water, backscatter, remove_water, rescale, transmittances
+from swimm3r.sfm.medium.light import judge_light
+from swimm3r.sfm.medium.samples import WaterSamples
+from swimm3r.sfm.medium.seathru import fit_medium
+from swimm3r.sfm.settings import SeathruSettings
+from swimm3r.synthetic.lamp_light import lamp_backscatter, lamp_of, light_on
+from swimm3r.synthetic.settings import LampSettings
+
+SETTINGS = SeathruSettings()
+LAMP = lamp_of(LampSettings(strength=1.0))
+
+
+def lamp_samples(medium, *, points: int = 1200, views: int = 8, open_water: int = 400) -> tuple[WaterSamples, dict]:
+    """Points seen `views` times each from 1 to 6 m at any place of the image, with pixel noise of 0.004."""
+    g = torch.Generator().manual_seed(7)
+    count = points * views
+    track = torch.arange(points).repeat_interleave(views)
+    frame = torch.randint(0, 32, (count,), generator=g)
+    place = 2 * torch.rand(count, 2, generator=g) - 1
+    rays = torch.cat([place * torch.tensor([0.53, 0.36]), torch.ones(count, 1)], -1)
+    near = 1.2 + 2.5 * torch.rand(points, generator=g)
+    z = near[track] * torch.exp(0.7 * torch.rand(count, generator=g))
+    gray = 0.1 + 0.7 * torch.rand(points, 1, generator=g)
+    gray[torch.rand(points, generator=g) < 0.03] = 0.0
+    J = (gray * (0.8 + 0.4 * torch.rand(points, 3, generator=g)))[track]
+    light = light_on(rays[None], z[None], LAMP, medium)[0]
+    glow = lamp_backscatter(rays[None], z[None], LAMP, medium)[0]
+    I = J * light * transmittances(z, medium)[0] + glow
+    I = (I + 0.004 * torch.randn(I.shape, generator=g)).clamp(0, 1)
+    sea_rays = rays[:open_water]
+    sea = lamp_backscatter(sea_rays[None], torch.zeros(1, len(sea_rays)), LAMP, medium)[0]
+    sea = sea + 0.004 * torch.randn(sea.shape, generator=g)
+    direction, toward = normalize(rays, dim=-1), normalize(sea_rays, dim=-1)
+    samples = WaterSamples(I, z, frame, track, sea, direction=direction, water_direction=toward)
+    return samples, {"J": J, "light": light, "backscatter": glow}
+
+
+@pytest.fixture(scope="module")
+def water(request):
+    medium = request.getfixturevalue("teal")
+    return replace(medium, Binf=0.35 * medium.Binf)
+
+
+@pytest.fixture(scope="module")
+def drawn(water):
+    return lamp_samples(water)
+
+
+@pytest.fixture(scope="module")
+def fit(drawn):
+    return fit_medium(drawn[0], SETTINGS, "srgb", "lamp")
+
+
+def test_attenuation_and_backscatter_are_recovered_under_a_lamp(drawn, water, fit):
+    samples, truth = drawn
+    z = samples.ray_depth
+    T_D = transmittances(z, fit.at(z))[0] - transmittances(z, water)[0]
+    B = backscatter(z, fit.at(z, samples.direction)) - truth["backscatter"]
+    assert T_D.abs().mean(0).max() < 0.03
+    assert B.abs().mean(0).max() < 0.02
+
+
+def test_the_light_is_recovered_up_to_its_strength(drawn, fit):
+    samples, _ = drawn
+    points = samples.direction * samples.ray_depth[:, None]
+    off = log_light(points, fit.lamp) - log_light(points, LAMP)
+    assert off.std() < 0.02
+
+
+def test_colors_are_restored_evenly_lit(drawn, fit):
+    samples, truth = drawn
+    medium = fit.at(samples.ray_depth, samples.direction)
+    told = truth["light"] * transmittances(samples.ray_depth, fit.at(samples.ray_depth))[0] > 0.1
+    J = remove_water(samples.I, samples.ray_depth, medium)
+    gain = (J * truth["J"])[told].sum() / J[told].square().sum()
+    assert (gain * J - truth["J"])[told].abs().mean() < 0.03
+    torch.testing.assert_close(add_water(J, samples.ray_depth, medium)[told], samples.I[told], rtol=0, atol=1e-4)
+    assert float(np.quantile(J[told], 0.98)) < 1.05
+
+
+def test_the_reference_point_has_the_lamps_light_and_far_water_on_the_axis_the_veiling_light(fit):
+    axis, z = torch.tensor([0.0, 0.0, 1.0]), torch.tensor(fit.lamp.reference)
+    unlit, lit = fit.at(z), fit.at(z, axis)
+    way = torch.linalg.vector_norm(axis * z - fit.lamp.position.float())
+    share = transmittances(z, lit)[0] / (transmittances(z, unlit)[0] * torch.exp(-unlit.beta_D * way))
+    torch.testing.assert_close(share, log_light(axis * z, fit.lamp).exp().expand(3).float())
+    far = torch.tensor(15 * fit.lamp.reference)
+    torch.testing.assert_close(backscatter(far, fit.at(far, axis)), fit.Binf, rtol=0.02, atol=0)
+
+
+def test_a_lamp_is_not_told_from_single_pixels(drawn):
+    samples, _ = drawn
+    alone = replace(samples, track=torch.full_like(samples.track, -1))
+    with pytest.raises(InputError, match="lamp"):
+        fit_medium(alone, SETTINGS, "srgb", "lamp")
+
+
+def test_a_lamp_is_kept_in_the_file_of_the_water(fit, tmp_path):
+    evidence = LightEvidence("lamp", 0.5, 0.2, 1200)
+    replace(fit, light=evidence).save(tmp_path / "medium.json")
+    again = load_medium(tmp_path / "medium.json")
+    assert again.light == evidence
+    z, axis = torch.tensor([2.0, 4.0]), normalize(torch.tensor([[0.1, 0.2, 1.0], [0.0, 0.0, 1.0]]), dim=-1)
+    for found, kept in zip(vars(again.at(z, axis)).values(), vars(fit.at(z, axis)).values(), strict=True):
+        torch.testing.assert_close(found, kept.float(), rtol=1e-4, atol=1e-5)
+
+
+def test_stretching_the_scene_leaves_the_images_of_a_lamp(fit):
+    z, axis = torch.tensor([2.0, 4.0]), normalize(torch.tensor([[0.1, 0.2, 1.0], [0.0, 0.0, 1.0]]), dim=-1)
+    near, far = fit.at(z, axis), rescale(fit, 5.0).at(5 * z, axis)
+    torch.testing.assert_close(transmittances(5 * z, far)[0], transmittances(z, near)[0])
+    torch.testing.assert_close(backscatter(5 * z, far), backscatter(z, near))
+
+
+def test_a_lamp_is_told_from_the_sun_by_the_light_of_points(drawn, water):
+    samples, truth = drawn
+    sunlit = add_water(truth["J"], samples.ray_depth, water)
+    daylight = replace(samples, I=sunlit, open_water=torch.zeros(0, 3), water_direction=torch.zeros(0, 3))
+    for light, seen in (("lamp", samples), ("sun", daylight)):
+        evidence = judge_light(seen, fit_medium(seen, SETTINGS, "srgb"), SETTINGS)
+        assert evidence.light == light
+
+
+def test_the_corners_of_a_lens_are_not_taken_for_a_lamp(drawn, water):
+    samples, truth = drawn
+    sunlit = add_water(truth["J"], samples.ray_depth, water)
+    corner = (samples.direction[:, :2] / samples.direction[:, 2:]).square().sum(-1) / (0.53**2 + 0.36**2)
+    darkened = sunlit * (1 - 0.25 * corner)[:, None]
+    samples = replace(samples, I=darkened, open_water=torch.zeros(0, 3), water_direction=torch.zeros(0, 3))
+    assert judge_light(samples, fit_medium(samples, SETTINGS, "srgb"), SETTINGS).light == "sun"
