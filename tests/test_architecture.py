@@ -11,7 +11,7 @@ PACKAGE = Path(swimm3r.__file__).parent
 ROWS = {  # by package: a room or module imports only rooms of rows before its own; "a.b" is a part in a row of its own
     "swimm3r": [
         {"errors", "progress", "notebook"},
-        {"io.files"},
+        {"io.files", "lamp"},
         {"medium", "geometry", "cameras"},
         {"settings", "water_types", "devices", "memory", "evaluate", "weights"},
         {"settings_document", "io", "raster", "tasks"},
