@@ -16,7 +16,7 @@ from swimm3r.synthetic import DiveSettings, make_dive, write_dive
 from swimm3r.synthetic.lamp_light import lamp_backscatter, lamp_of, light_on
 from swimm3r.synthetic.settings import LampSettings
 
-DIVE = DiveSettings(frames=24, width=60, height=40, noise=0.0, light="lamp")
+DIVE = DiveSettings(frames=24, width=60, height=40, noise=0.0, lit_by="lamp")
 WATER = Medium(torch.tensor([0.1, 0.3, 0.3]), torch.tensor([0.8, 0.2, 0.1]), torch.ones(3))
 AXIS = torch.tensor([[[0.0, 0.0, 1.0]]])
 EVEN = Lamp(torch.zeros(3), 1.0, 0.0, 1.0, torch.zeros(6), torch.zeros(6))
@@ -36,7 +36,7 @@ def test_images_are_the_evenly_lit_scene_under_the_lamp_and_its_backscatter(dive
 
 
 def test_the_scene_itself_is_the_one_that_the_sun_lights(dive):
-    sunlit = make_dive(replace(DIVE, light="sun")).frame(4)
+    sunlit = make_dive(replace(DIVE, lit_by="sun")).frame(4)
     assert torch.equal(dive.frame(4).clear, sunlit.clear)
 
 
@@ -90,4 +90,4 @@ def test_the_truth_on_disk_has_the_lamp_and_its_light(tmp_path, dive):
 
 def test_a_fish_under_a_lamp_is_refused():
     with pytest.raises(UsageError, match="daylight"):
-        DiveSettings(light="lamp", moving_object=True)
+        DiveSettings(lit_by="lamp", moving_object=True)

@@ -72,7 +72,7 @@ class Dive:
     @property
     def lamp(self) -> Lamp | None:
         """The lamp on the camera; None in daylight."""
-        return lamp_of(self.settings.lamp) if self.settings.light == "lamp" else None
+        return lamp_of(self.settings.lamp) if self.settings.lit_by == "lamp" else None
 
     def gains(self, i: int) -> Float[Tensor, "3"]:
         """The camera's factors on linear light in frame i; 1 without changes of exposure and white balance."""
@@ -217,7 +217,7 @@ def water(settings: DiveSettings) -> Medium:
     if settings.family is not None:
         seed = settings.seed + 1009 * settings.visit
         medium = water_types.sample(settings.family, torch.Generator().manual_seed(seed))
-    return replace(medium, Binf=settings.lamp.glow * medium.Binf) if settings.light == "lamp" else medium
+    return replace(medium, Binf=settings.lamp.glow * medium.Binf) if settings.lit_by == "lamp" else medium
 
 
 def _names(settings: DiveSettings) -> tuple[str, ...]:

@@ -49,6 +49,9 @@ class Season(Settings):
                 cause="each coral has one fate at most",
                 hint="shares whose sum is at most 1",
             )
+
+
+@dataclass(frozen=True)
 class LampSettings(Settings):
     """A lamp that the camera carries, in deep water without daylight; it acts on pixel values as stored."""
 
@@ -101,7 +104,7 @@ class DiveSettings(Settings):
     season: Season = Season()
     light: tuple[_Light, _Light, _Light] = (1.0, 1.0, 1.0)
     """Light on the scene per channel, by that of a plain day, in linear light."""
-    light: Literal["sun", "lamp"] = "sun"
+    lit_by: Literal["sun", "lamp"] = "sun"
     """Light of the dive: the sun, or a lamp on the camera."""
     lamp: LampSettings = LampSettings()
     caustics: Annotated[float, Range(0, 10)] = 0.0
@@ -133,11 +136,11 @@ class DiveSettings(Settings):
                 cause=f"moving_object was asked for together with path={self.path!r}",
                 hint="path='loop', or no moving object",
             )
-        if self.light == "lamp" and (self.moving_object or self.marine_snow or self.caustics):
+        if self.lit_by == "lamp" and (self.moving_object or self.marine_snow or self.caustics):
             raise UsageError(
                 "the moving object, marine snow and caustics are of dives in daylight",
-                cause="one of them was asked for together with light='lamp'",
-                hint="light='sun', or a lamp's dive without them",
+                cause="one of them was asked for together with lit_by='lamp'",
+                hint="lit_by='sun', or a lamp's dive without them",
             )
 
     def stream(self, *of: int) -> list[int]:
