@@ -308,7 +308,7 @@ class ColmapSettings(LensSettings):
     features: FeatureSettings = field(default_factory=FeatureSettings)
     mapping: MappingSettings = field(default_factory=MappingSettings)
     depth: PlaneSweepSettings = field(default_factory=PlaneSweepSettings)
-    light: LightChoice = "auto"
+    light: LightChoice = "sun"
     """Light of the dive: the sun, a lamp on the camera, or the one of them that the frames tell (auto)."""
     water: SeathruSettings = field(default_factory=SeathruSettings)
     restore: RestoreSettings = field(default_factory=RestoreSettings)
@@ -368,7 +368,7 @@ class Mast3rSettings(LensSettings):
     alignment: AlignmentSettings = field(default_factory=lambda: AlignmentSettings(intrinsics="shared"))
     features: FeatureSettings = field(default_factory=FeatureSettings)
     """By which held-out frames find their place beside a finished reconstruction."""
-    light: LightChoice = "auto"
+    light: LightChoice = "sun"
     """Light of the dive: the sun, a lamp on the camera, or the one of them that the frames tell (auto)."""
     water: SeathruSettings = field(default_factory=SeathruSettings)
     restore: RestoreSettings = field(default_factory=RestoreSettings)
@@ -388,7 +388,7 @@ class ColmapModelSettings(Settings):
     (`swimm3r.io.imports.read.read_foreign`)."""
     features: FeatureSettings = field(default_factory=FeatureSettings)
     depth: PlaneSweepSettings = field(default_factory=PlaneSweepSettings)
-    light: LightChoice = "auto"
+    light: LightChoice = "sun"
     """Light of the dive: the sun, a lamp on the camera, or the one of them that the frames tell (auto)."""
     water: SeathruSettings = field(default_factory=SeathruSettings)
     restore: RestoreSettings = field(default_factory=RestoreSettings)
