@@ -10,7 +10,7 @@ from torch.nn.functional import normalize
 from swimm3r.errors import InputError
 from swimm3r.io.medium_json import load_medium
 from swimm3r.lamp import LightEvidence, log_light
-from swimm3r.medium import add_water, backscatter, remove_water, rescale, transmittances
+from swimm3r.medium import MediumFit, add_water, backscatter, remove_water, rescale, transmittances
 from swimm3r.sfm.medium.light import judge_light
 from swimm3r.sfm.medium.samples import WaterSamples
 from swimm3r.sfm.medium.seathru import fit_medium
@@ -111,6 +111,7 @@ def test_a_lamp_is_kept_in_the_file_of_the_water(fit, tmp_path):
     evidence = LightEvidence("lamp", 0.5, 0.2, 1200)
     replace(fit, light=evidence).save(tmp_path / "medium.json")
     again = load_medium(tmp_path / "medium.json")
+    assert isinstance(again, MediumFit)
     assert again.light == evidence
     z, axis = torch.tensor([2.0, 4.0]), normalize(torch.tensor([[0.1, 0.2, 1.0], [0.0, 0.0, 1.0]]), dim=-1)
     for found, kept in zip(vars(again.at(z, axis)).values(), vars(fit.at(z, axis)).values(), strict=True):

@@ -59,6 +59,7 @@ def test_backscatter_stays_with_the_camera_and_has_the_lamps_pattern(camera):
     here, there = (medium_at_pixels(grid_of(field, v, 1), view.height, view.width).Binf for v in (view, turned))
     torch.testing.assert_close(here, there)
     grid = grid_of(field, view, 1)
+    assert grid.veil is not None
     torch.testing.assert_close(here, grid.values[:3] * grid.veil)
     assert veil_pattern(torch.tensor([0.0, 0.0, 1.0]), LAMP) == 1
 

@@ -76,7 +76,7 @@ def reconstruct(
     silence_log()
     threads = settings.threads or thread_count()
     if lens is None:
-        settings = with_calibration(settings, frames)
+        settings = with_calibration(settings, frames.width, frames.height, frames.calibration)
         camera = calibration.first_camera(frames.width, frames.height, settings)
     else:
         camera, settings = to_pycolmap_camera(lens), replace(settings, intrinsics="fixed")

@@ -114,7 +114,7 @@ def network_images(frames: Frames, settings: Mast3rSettings) -> NetworkImages:
     if settings.known is not None:
         lens, poses = _from_file(frames, settings, settings.known)
         return NetworkImages(frames, lens, True, frame, poses)
-    settings = with_calibration(settings, frames)
+    settings = with_calibration(settings, frames.width, frames.height, frames.calibration)
     lens = _lens(frames.width, frames.height, settings)
     return NetworkImages(frames, lens, settings.focal is not None, frame)
 
