@@ -94,7 +94,7 @@ class Dive:
         )
         if self.plates:
             radiance, z = with_plates(radiance, z, camera, list(self.plates))
-        radiance = radiance * np.array(settings.light)
+        radiance = radiance * np.array(settings.daylight)
         clear = srgb_from_linear(torch.from_numpy(radiance)).clamp(0, 1).float()
         z_depth = torch.from_numpy(z).float()
         ray_depth = ray_depth_from_z(z_depth, rays.float())

@@ -102,7 +102,7 @@ class DiveSettings(Settings):
     corals: Share = 0.0
     """Share of the square meters on which a massive coral stands."""
     season: Season = Season()
-    light: tuple[_Light, _Light, _Light] = (1.0, 1.0, 1.0)
+    daylight: tuple[_Light, _Light, _Light] = (1.0, 1.0, 1.0)
     """Light on the scene per channel, by that of a plain day, in linear light."""
     lit_by: Literal["sun", "lamp"] = "sun"
     """Light of the dive: the sun, or a lamp on the camera."""

@@ -91,7 +91,7 @@ def pair_of_dives(number: int, revisits: RevisitSettings) -> tuple[DiveSettings,
             path="lawnmower", length=revisits.path_length, speed=0.25, fps=1,
             width=revisits.width, height=revisits.height,
             seed=revisits.seed + number, corals=0.7, family=family, visit=visit, season=season,
-            light=_LIGHT if visit else (1.0, 1.0, 1.0),
+            daylight=_LIGHT if visit else (1.0, 1.0, 1.0),
         )  # fmt: skip
 
     return dive(one, 0, Season()), dive(other, 1, SEASON), dive(other, 2, Season())
