@@ -1,10 +1,12 @@
 """Bags of all three kinds: their topics, the choice of a camera, its lens, its times, and what damaged ones say."""
 
+from dataclasses import replace
 from pathlib import Path
 from types import SimpleNamespace
 
 import numpy as np
 import pytest
+import torch
 from tests.bag_files import SECOND, START, VERSIONS, Sent, camera_info, compressed, image, write_bag
 
 from swimm3r.cli.main import main
@@ -16,6 +18,8 @@ from swimm3r.io.calibration.read import read_lens
 from swimm3r.io.image_folder import find_images
 from swimm3r.io.images import read_rgb, write_rgb
 from swimm3r.prepare import check_source, load_frames, read_frames
+from swimm3r.sfm.colmap.poses import reconstruct
+from swimm3r.sfm.settings import ColmapSettings, FeatureSettings
 
 K = (60.0, 0, 32, 0, 61, 24, 0, 0, 1)
 TEXTURE = np.random.default_rng(0).integers(0, 255, (12, 16, 3), dtype=np.uint8).repeat(4, 0).repeat(4, 1)
@@ -244,3 +248,27 @@ def test_a_bag_of_a_real_clip_gives_the_frames_of_its_folder(version: str, tmp_p
     assert [(f.time, f.split, f.sharpness) for f in found] == [(f.time, f.split, f.sharpness) for f in expected]
     for one, other in zip(expected, found, strict=True):
         np.testing.assert_array_equal(read_rgb(one.path), read_rgb(other.path))
+
+
+def test_bags_of_a_real_clip_give_the_reconstruction_of_its_folder_under_the_same_lens(tmp_path: Path, shared: Path):
+    images = [read_rgb(path) for path in find_images(shared / "data" / "ruie_teal_rocks" / "images").paths[:10]]
+    height, width = images[0].shape[:2]
+    folder = tmp_path / "folder"
+    folder.mkdir()
+    for i, rgb in enumerate(images):
+        write_rgb(folder / f"{i:03d}.png", rgb)
+    settings = ColmapSettings(features=FeatureSettings(count=800))
+    sent = [image("/cam/image_raw", rgb, "rgb8", START + i * SECOND) for i, rgb in enumerate(images)]
+    sent.append(lens(K=(300.0, 0, width / 2, 0, 300, height / 2, 0, 0, 1), D=(0.08, 0, 0, 0, 0), size=(width, height)))
+    made = {}
+    for version in VERSIONS:
+        frames = read_frames(write_bag(tmp_path, version, sent), folder=tmp_path / version).train
+        made[version] = reconstruct(frames, settings, tmp_path / f"{version}_sfm")
+    frames = read_frames(folder, folder=tmp_path / "prepared").train
+    given = replace(settings, calibration=tmp_path / "bag" / "camera_info.yaml")
+    expected = reconstruct(frames, given, tmp_path / "folder_sfm")
+    assert len(expected.names) == 8
+    for found in made.values():
+        torch.testing.assert_close(found.cameras.cam2world, expected.cameras.cam2world, rtol=0, atol=0)
+        torch.testing.assert_close(found.cameras.K, expected.cameras.K, rtol=0, atol=0)
+        torch.testing.assert_close(found.points.xyz, expected.points.xyz, rtol=0, atol=0)
