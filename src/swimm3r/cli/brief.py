@@ -9,7 +9,7 @@ from swimm3r.cli.terminal.help_views import Groups
 _INPUT = ("--fps", "--start", "--end", "--max-frames", "--masks")
 _OUTPUT = ("--out", "--redo")
 _SETTINGS = ("--preset", "--config")
-_CAMERA = ("--housing", "--focal", "--light", "--adapter", "--weights")
+_CAMERA = ("--housing", "--focal", "--adapter", "--weights")
 _PAGE = ("--view",)
 _MESSAGES = ("--quiet", "--verbose")
 
