@@ -1,11 +1,16 @@
 """Changes of the ground: found where they are, silent where only light or noise differ, unknown where nobody looked."""
 
+import json
+
 import numpy as np
 import pytest
 
+from swimm3r.products.grid import Grid
+from swimm3r.scene.georeference import Georeference
 from swimm3r.visits.change import LESS, MORE, UNCHANGED, UNKNOWN, Misfit, compare
 from swimm3r.visits.color import lab, light_gains, neutral
 from swimm3r.visits.ground import Ground
+from swimm3r.visits.places import find_places, write_polygons
 from swimm3r.visits.settings import VisitSettings
 
 SIDE, GSD, NOISE = 120, 0.01, 0.002
@@ -49,6 +54,25 @@ def test_ground_gained_and_lost_is_found_with_its_volume():
         volume = change.height.value[found].sum() * GSD**2
         assert volume == pytest.approx(height * mask.sum() * GSD**2, rel=0.05)
     assert not ((change.color_kind == MORE) | (change.color_kind == LESS)).any()
+
+
+def test_a_place_of_color_without_heights_says_so_instead_of_nan(tmp_path):
+    bleached = disc(60, 60, 14)
+    change = compare(ground(1), ground(2, albedo=1 + 2 * bleached), NO_MISFIT, GSD, WHITE, VisitSettings())
+    grid = Grid(0.0, 0.0, GSD, SIDE, SIDE)
+    somewhere = Georeference(None, (0.0, 0.0, 0.0), ((1.0, 0.0, 0.0), (0.0, 1.0, 0.0), (0.0, 0.0, 1.0)), 1.0)
+    (place,), _ = find_places(change, grid, somewhere)
+    assert place.kind == "paler"
+    assert place.height == pytest.approx(0.0, abs=2 * NOISE)
+    change.height.value[:, :60] = np.nan
+    (half,), _ = find_places(change, grid, somewhere)
+    assert half.height == pytest.approx(0.0, abs=2 * NOISE)
+    change.height.value[:] = np.nan
+    (none,), outlines = find_places(change, grid, somewhere)
+    assert none.height is None
+    assert none.height_std is None
+    write_polygons(tmp_path / "places.geojson", [none], outlines, grid, somewhere)
+    assert json.loads((tmp_path / "places.geojson").read_text())["features"][0]["properties"]["height"] is None
 
 
 def test_noise_alone_changes_nothing():

@@ -139,7 +139,7 @@ def _enlarged(image: UInt8[np.ndarray, "h w 3"]) -> UInt8[np.ndarray, "h2 w2 3"]
 
 
 def _row(place: Place, unit: str) -> tuple[str, ...]:
-    height = f"{place.height:+.3g} ± {place.height_std:.1g} {unit}"
+    height = "" if place.height is None else f"{place.height:+.3g} ± {place.height_std:.1g} {unit}"
     volume = "" if place.volume is None else f"{place.volume:+.3g} ± {place.volume_std:.1g} {unit}³"
     color = "" if place.color is None else f"{place.color:.1f}, L* {place.lightness:+.1f}"
     return (

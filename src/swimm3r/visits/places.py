@@ -34,8 +34,8 @@ class Place:
     x: float  # middle in map coordinates
     y: float
     area: float
-    height: float  # mean difference
-    height_std: float  # typical, of a cell
+    height: float | None  # mean difference; None where no cell of a place of color has heights of both visits
+    height_std: float | None  # typical, of a cell
     volume: float | None  # None for changes of color
     volume_std: float | None
     color: float | None  # mean CIELAB difference; None without clear colors
@@ -77,9 +77,8 @@ def _figures(
 ) -> Place:
     by_height = kind in HEIGHT_KINDS.values()
     height, std = change.height.value[at].astype(np.float64), change.height.std[at].astype(np.float64)
+    told = np.isfinite(height)
     cell = grid.gsd**2
-    volume = float(height.sum()) * cell
-    volume_std = float(std.sum()) * cell
     color = None if change.color is None else _mean(change.color.value[at])
     axes = [None] * 3 if change.lab is None else [_mean(change.lab[..., k][at]) for k in range(3)]
     of = change.height if by_height or change.color is None else change.color
@@ -90,10 +89,10 @@ def _figures(
         x=west + step * (float(at[1].mean()) + 0.5),
         y=north - step * (float(at[0].mean()) + 0.5),
         area=len(height) * cell,
-        height=float(height.mean()),
-        height_std=float(np.median(std)),
-        volume=volume if by_height else None,
-        volume_std=volume_std if by_height else None,
+        height=_mean(height),
+        height_std=float(np.median(std[told])) if told.any() else None,
+        volume=float(height.sum()) * cell if by_height else None,
+        volume_std=float(std.sum()) * cell if by_height else None,
         color=color,
         lightness=axes[0],
         red_green=axes[1],
@@ -137,7 +136,7 @@ def write_polygons(
     document: dict[str, object] = {"type": "FeatureCollection", "features": features}
     if place.epsg is not None:
         document["crs"] = {"type": "name", "properties": {"name": f"urn:ogc:def:crs:EPSG::{place.epsg}"}}
-    write_text(path, json.dumps(document) + "\n")
+    write_text(path, json.dumps(document, allow_nan=False) + "\n")
 
 
 def _row(place: Place) -> list[object]:
