@@ -57,8 +57,8 @@ BRIEF: dict[tuple[str, ...], Groups] = {
         "": _MESSAGES,
     },
     ("localize",): {
-        "input": ("--lens",),
-        "output": ("--out",),
+        "input": ("--lens", "--stream", "--follow", "--idle", "--fps"),
+        "output": ("--out", "--tum"),
         "matching": ("--matcher", "--weights", "--device", "--candidates", "--rounds", "--min-inliers"),
         "": _MESSAGES,
     },

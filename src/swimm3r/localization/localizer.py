@@ -25,9 +25,9 @@ from torch import Tensor
 
 from swimm3r.cameras import Cameras, project, resized
 from swimm3r.errors import InputError, RegistrationError
-from swimm3r.geometry import pose_from, so3_exp
 from swimm3r.imaging.undistortion import undistorted
 from swimm3r.localization.matchers import Matcher, matcher_for
+from swimm3r.localization.pose_covariance import pose_jacobian
 from swimm3r.localization.references import FilmedReferences, Reference, References, RenderedReferences, rendered
 from swimm3r.localization.settings import LocalizationSettings
 from swimm3r.progress import Progress, silent
@@ -91,10 +91,10 @@ class _Solved:
         if self.cam2world is None:
             return math.inf
         residuals = self.errors(self.cam2world)[self.inlier]
-        J = _pose_jacobian(self.camera, self.cam2world, self.points[self.inlier])
+        J = pose_jacobian(self.camera, self.cam2world, self.points[self.inlier])
         variance = residuals.square().sum() / max(1, 2 * len(residuals) - 6)
         covariance = variance * torch.linalg.pinv(J.mT @ J, hermitian=True)
-        moved = _pose_jacobian(self.camera, self.cam2world, at)
+        moved = pose_jacobian(self.camera, self.cam2world, at)
         return float(torch.einsum("ij,jk,ik->i", moved, covariance, moved).sum().div(max(1, len(at))).sqrt())
 
 
@@ -259,18 +259,6 @@ class Localizer:
         if estimate is None or int(estimate[1].sum()) < self.settings.min_inliers:
             return _Solved(pixels, points, camera, max_error, None, torch.zeros(len(pixels), dtype=torch.bool))
         return _Solved(pixels, points, camera, max_error, *estimate)
-
-
-def _pose_jacobian(
-    camera: Cameras, cam2world: Float[Tensor, "4 4"], points: Float[Tensor, "n 3"], step: float = 1e-5
-) -> Float[Tensor, "n2 6"]:
-    """Central differences of the points' pixels, rows u and v in turn, by the pose's turn and shift in camera axes."""
-    columns = []
-    for axis in torch.eye(6, dtype=torch.float64) * step:
-        both = [pose_from(so3_exp(sign * axis[:3]), sign * axis[3:]) for sign in (1.0, -1.0)]
-        views = [project(replace(camera, cam2world=(cam2world @ motion)[None]), points[None])[0][0] for motion in both]
-        columns.append((views[0] - views[1]).flatten() / (2 * step))
-    return torch.stack(columns, -1)
 
 
 @contextmanager

@@ -32,8 +32,13 @@ class Features:
     descriptors: np.ndarray  # [n, 128] uint8
 
 
-def extract_features(image: Float[Tensor, "h w 3"], usable: Bool[Tensor, "h w"], settings: FeatureSettings) -> Features:
-    """Keypoints of an image outside its mask."""
+def extract_features(
+    image: Float[Tensor, "h w 3"], usable: Bool[Tensor, "h w"], settings: FeatureSettings, *, upsample: bool = True
+) -> Features:
+    """Keypoints of an image outside its mask.
+
+    Small images are enlarged to twice their size first, unless `upsample` is off: that takes four times as long.
+    """
     import cv2
     import pycolmap
 
@@ -50,10 +55,11 @@ def extract_features(image: Float[Tensor, "h w 3"], usable: Bool[Tensor, "h w"],
     options.num_threads = 1
     options.sift.max_num_features = settings.count
     options.sift.peak_threshold = settings.peak_threshold
-    options.sift.first_octave = -1 if max(gray.shape) < _UPSAMPLE_BELOW else 0
+    options.sift.first_octave = -1 if upsample and max(gray.shape) < _UPSAMPLE_BELOW else 0
     gray = np.ascontiguousarray(gray)
     found, described = _detect(gray, options)
-    if len(found) < settings.count:  # water this murky leaves little else than faint keypoints
+    if len(found) < settings.count and settings.faint_threshold < settings.peak_threshold:
+        # water this murky leaves little else than faint keypoints
         options.sift.peak_threshold = settings.faint_threshold
         found, described = _detect(gray, options)
     if len(found) == 0:
@@ -72,7 +78,26 @@ def match_descriptors(a: Float[Tensor, "m 128"], b: Float[Tensor, "n 128"], max_
     """Pairs of rows that agree; descriptors have unit length."""
     if len(a) < 2 or len(b) < 2:
         return torch.zeros(0, 2, dtype=torch.int64)
-    row, column = _mutual((a @ b.mT).numpy(), max_ratio, _MAX_ANGLE)
+    return _agreeing(a @ b.mT, max_ratio)
+
+
+def match_nearby(
+    a: Float[Tensor, "m 128"],
+    b: Float[Tensor, "n 128"],
+    xy_a: Float[Tensor, "m 2"],
+    xy_b: Float[Tensor, "n 2"],
+    radius: float,
+    max_ratio: float,
+) -> Int[Tensor, "k 2"]:
+    """Pairs of rows that agree among those whose pixels lie within `radius`; descriptors have unit length."""
+    if not len(a) or not len(b):
+        return torch.zeros(0, 2, dtype=torch.int64)
+    far = torch.cdist(xy_a.float(), xy_b.float()) > radius
+    return _agreeing((a @ b.mT).masked_fill_(far, -1.0), max_ratio)
+
+
+def _agreeing(similarity: Float[Tensor, "m n"], max_ratio: float) -> Int[Tensor, "k 2"]:
+    row, column = _mutual(similarity.numpy(), max_ratio, _MAX_ANGLE)
     return torch.from_numpy(np.stack([row, column], 1))
 
 

@@ -1,0 +1,46 @@
+"""The landmarks of a run on disk, RUN/localization/landmarks.npz: made once, read by every later stream."""
+
+from pathlib import Path
+
+import numpy as np
+import torch
+
+from swimm3r.io.files.atomic import atomic_path
+from swimm3r.io.files.cache_key import cache_key, code_version, content_digest
+from swimm3r.io.files.damage import guard, remake
+from swimm3r.localization.online.landmark_map import LandmarkMap, landmark_map
+from swimm3r.prepare import load_frames
+from swimm3r.progress import Progress, silent
+from swimm3r.scene.reconstruction import Reconstruction
+from swimm3r.scene.reconstruction_io import load_reconstruction
+from swimm3r.sfm.settings import FeatureSettings
+
+_ARRAYS = ("xyz", "point", "frame", "descriptors", "words", "looks")
+
+
+def landmarks_of_run(folder: Path, settings: FeatureSettings, progress: Progress = silent) -> LandmarkMap:
+    """The landmarks of a run with finished structure from motion, made where the file is of another state of it.
+
+    Raises InputError where the file is damaged.
+    """
+    frames = load_frames(folder / "prepare")
+    rec = load_reconstruction(folder / "sfm", frames)
+    path = folder / "localization" / "landmarks.npz"
+    made_from = (content_digest(folder / "sfm" / name) for name in ("cameras.json", "sparse"))
+    key = cache_key(settings, code_version(), *made_from)
+    found = _read(path, key, rec) if path.is_file() else None
+    if found is None:
+        found = landmark_map(rec, frames, settings, progress)
+        with atomic_path(path) as draft:
+            arrays = {name: getattr(found, name).numpy() for name in _ARRAYS}
+            np.savez(draft, key=np.array(key), distance=np.array(found.distance), **arrays)
+    return found
+
+
+def _read(path: Path, key: str, rec: Reconstruction) -> LandmarkMap | None:
+    """The landmarks in the file; None where it was made from something else."""
+    with guard(path, remake(path)), np.load(path, allow_pickle=False) as stored:
+        if str(stored["key"]) != key:
+            return None
+        arrays = {name: torch.from_numpy(stored[name]) for name in _ARRAYS}
+        return LandmarkMap(cameras=rec.cameras, metric=rec.metric, distance=float(stored["distance"]), **arrays)

@@ -1,0 +1,219 @@
+"""A camera tracked in a map of landmarks, one image after another.
+
+1. predict     the last two poses carried on to the image's time;
+2. match       landmarks that should be visible with keypoints within a radius of where they should be;
+3. solve       PnP with RANSAC, then once more with all landmarks near their pixels from there;
+4. judge       inliers, their share, the pose's covariance and the motion since the last pose;
+5. relocalize  where no pose stands: the map frames that look most like the image, all their landmarks, and from 3 on.
+
+An image is lost unless a pose passes every test of step 4. No map is rendered.
+"""
+
+import math
+from dataclasses import dataclass, replace
+from typing import Literal
+
+import torch
+from jaxtyping import Bool, Float
+from torch import Tensor
+
+from swimm3r.cameras import Cameras, project, resized
+from swimm3r.errors import InputError
+from swimm3r.geometry import rotation_angle
+from swimm3r.io.colmap.model import silence_log
+from swimm3r.localization.interpolation import between
+from swimm3r.localization.online.landmark_map import LandmarkMap
+from swimm3r.localization.pose_covariance import pose_covariance
+from swimm3r.localization.settings import TrackingSettings
+from swimm3r.sfm.colmap.poses import absolute_pose
+from swimm3r.sfm.features.sift import extract_features, match_descriptors, match_nearby, unit_descriptors
+from swimm3r.sfm.settings import FeatureSettings
+
+Status = Literal["tracked", "relocalized", "lost"]
+
+_RETRIEVED = 5  # map frames that a lost image is matched with
+_MAX_RATIO = 0.85  # of descriptors, where the place already tells most candidates apart
+_NEAR_ENOUGH = 2.0  # times the agreement: radius of the second matching
+_LEAST_STEP = 0.2  # seconds that pass between two images at least, whatever their stamps
+_SAME_SHAPE = 0.01  # of the ratio of width to height
+_SLACK = 0.05, 5.0  # median distances and degrees: errors of two poses and jerks between them
+
+
+@dataclass(frozen=True)
+class TrackedPose:
+    """The answer to one image: a pose and what speaks for it, or that there is none."""
+
+    status: Status
+    cam2world: Float[Tensor, "4 4"] | None  # None where lost
+    covariance: Float[Tensor, "6 6"] | None  # as `pose_covariance`
+    inliers: int
+    matches: int
+    reason: str = ""  # why the image is lost
+
+
+@dataclass(frozen=True)
+class Keypoints:
+    """The keypoints of an image."""
+
+    xy: Float[Tensor, "n 2"]  # pixels
+    descriptors: Float[Tensor, "n 128"]  # of unit length
+    lens: Cameras  # of the image; its pose unused
+
+
+@dataclass(frozen=True)
+class _Estimate:
+    cam2world: Float[Tensor, "4 4"]
+    covariance: Float[Tensor, "6 6"]
+    inliers: int
+    matches: int
+    most: int  # landmarks in view, or keypoints where they are fewer
+
+
+@dataclass(frozen=True)
+class _Known:
+    time: float
+    cam2world: Float[Tensor, "4 4"]
+
+
+class Tracker:
+    """Places the images of one camera, in the order they were taken; poses are in the axes and unit of the map."""
+
+    def __init__(self, landmarks: LandmarkMap, settings: TrackingSettings | None = None) -> None:
+        silence_log()
+        self.map, self.settings = landmarks, settings or TrackingSettings()
+        s = self.settings
+        self._features = replace(FeatureSettings(), count=s.keypoints, long_side=s.image_side)
+        self._last: _Known | None = None  # the last pose that was believed
+        self._before: _Known | None = None  # the one before, where tracking did not break off between
+
+    def describe(
+        self, image: Float[Tensor, "h w 3"], mask: Bool[Tensor, "h w"] | None = None, lens: Cameras | None = None
+    ) -> Keypoints:
+        """The keypoints of an image (0..1) taken through `lens`, by default that of the map; no state is touched.
+
+        Raises InputError where the image's shape is not that of its lens.
+        """
+        height, width = image.shape[:2]
+        lens = _at_size(self.map.cameras[0] if lens is None else lens, width, height)
+        usable = torch.ones(height, width, dtype=torch.bool) if mask is None else mask
+        found = extract_features(image, usable, self._features, upsample=False)
+        return Keypoints(torch.from_numpy(found.keypoints[:, :2]).double(), unit_descriptors(found.descriptors), lens)
+
+    def locate(self, seen: Keypoints, time: float) -> TrackedPose:
+        """The pose of the next image, taken at `time`, seconds, by what `describe` found in it."""
+        estimate, status = (None if self._last is None else self._tracked(seen, time)), "tracked"
+        if estimate is None or self._fault(estimate, time):
+            estimate, status = self._relocalized(seen), "relocalized"
+        reason = "no landmarks agree on a pose" if estimate is None else self._fault(estimate, time)
+        if estimate is None or reason:
+            self._before = None
+            counts = (0, 0) if estimate is None else (estimate.inliers, estimate.matches)
+            return TrackedPose("lost", None, None, *counts, reason)
+        self._before = self._last if status == "tracked" else None
+        self._last = _Known(time, estimate.cam2world)
+        return TrackedPose(status, estimate.cam2world, estimate.covariance, estimate.inliers, estimate.matches)
+
+    def _predicted(self, time: float) -> Float[Tensor, "4 4"]:
+        """The last pose carried on at the speed and turn rate between the last two."""
+        assert self._last is not None
+        if self._before is None or self._last.time <= self._before.time:
+            return self._last.cam2world
+        share = (time - self._before.time) / (self._last.time - self._before.time)
+        return between(self._before.cam2world, self._last.cam2world, share)
+
+    def _tracked(self, seen: Keypoints, time: float) -> _Estimate | None:
+        """From the landmarks near where the predicted pose sees them."""
+        camera = replace(seen.lens, cam2world=self._predicted(time)[None])
+        pixels, points, _ = self._matches(seen, camera, self.settings.radius * max(camera.width, camera.height))
+        return self._solved(seen, pixels, points)
+
+    def _relocalized(self, seen: Keypoints) -> _Estimate | None:
+        """From the landmarks of the map frames that look most like the image, wherever they are."""
+        pixels, points = [], []
+        for frame in self.map.alike(seen.descriptors, _RETRIEVED):
+            rows = self.map.of_frame(frame)
+            pairs = match_descriptors(seen.descriptors, self.map.described(rows), self._features.max_ratio)
+            pixels.append(seen.xy[pairs[:, 0]])
+            points.append(self.map.xyz[self.map.point[rows[pairs[:, 1]]]])
+        if not pixels:
+            return None
+        # one point seen by several frames counts once
+        both = torch.unique(torch.cat([torch.cat(pixels), torch.cat(points)], -1), dim=0)
+        return self._solved(seen, both[:, :2], both[:, 2:])
+
+    def _solved(self, seen: Keypoints, pixels: Float[Tensor, "m 2"], points: Float[Tensor, "m 3"]) -> _Estimate | None:
+        """The pose that most matches agree on, then that of all landmarks near their pixels from there."""
+        first = self._pose(seen, pixels, points)
+        if first is None:
+            return None
+        camera = replace(seen.lens, cam2world=first[0][None])
+        pixels, points, visible = self._matches(seen, camera, _NEAR_ENOUGH * self._agreement(camera))
+        final = self._pose(seen, pixels, points)
+        if final is None:
+            return None
+        cam2world, inlier = final
+        covariance = pose_covariance(camera, cam2world, points[inlier], pixels[inlier])
+        return _Estimate(cam2world, covariance, int(inlier.sum()), len(pixels), min(visible, len(seen.xy)))
+
+    def _pose(
+        self, seen: Keypoints, pixels: Float[Tensor, "m 2"], points: Float[Tensor, "m 3"]
+    ) -> tuple[Float[Tensor, "4 4"], Bool[Tensor, " m"]] | None:
+        if len(pixels) < self.settings.least_inliers:
+            return None
+        return absolute_pose(pixels, points, seen.lens, self._agreement(seen.lens))
+
+    def _matches(
+        self, seen: Keypoints, camera: Cameras, radius: float
+    ) -> tuple[Float[Tensor, "m 2"], Float[Tensor, "m 3"], int]:
+        """Keypoints and the landmarks that they show within `radius` of where the camera sees them, and how many it
+        should see."""
+        rows = self.map.visible(camera, self.settings.map_frames)
+        points = self.map.xyz[self.map.point[rows]]
+        there = project(camera, points[None])[0][0]
+        pairs = match_nearby(self.map.described(rows), seen.descriptors, there, seen.xy, radius, _MAX_RATIO)
+        return seen.xy[pairs[:, 1]], points[pairs[:, 0]], len(rows)
+
+    def _agreement(self, camera: Cameras) -> float:
+        """Largest reprojection error of an inlier, in pixels of the image."""
+        return self.settings.agreement * max(1.0, max(camera.width, camera.height) / self.settings.image_side)
+
+    def _fault(self, found: _Estimate, time: float) -> str:
+        """The fault by which an estimate is no pose; empty where it is one."""
+        s = self.settings
+        if found.inliers < s.least_inliers:
+            return f"{found.inliers} landmarks agree on a pose, fewer than {s.least_inliers}"
+        if found.inliers < s.least_share * found.matches:
+            return f"only {found.inliers} of {found.matches} matches agree on a pose"
+        if found.inliers < s.least_seen * found.most:
+            return f"only {found.inliers} of {found.most} keypoints or landmarks in view agree on the pose"
+        variance = found.covariance.diagonal()
+        shift, turn = float(variance[:3].sum().sqrt()), math.degrees(float(variance[3:].sum().sqrt()))
+        if not shift <= s.most_shift_error * self.map.distance:
+            return f"the standard error of the camera's place is {shift / self.map.distance:.1%} of the distance"
+        if not turn <= s.most_turn_error:
+            return f"the standard error of the camera's direction is {turn:.2g} degrees"
+        return self._leap(found, time)
+
+    def _leap(self, found: _Estimate, time: float) -> str:
+        """The fault of a motion that no camera makes since the last pose; empty where one may."""
+        if self._last is None:
+            return ""
+        s, seconds = self.settings, max(_LEAST_STEP, abs(time - self._last.time))
+        shift = float((found.cam2world[:3, 3] - self._last.cam2world[:3, 3]).norm()) / self.map.distance
+        turn = math.degrees(float(rotation_angle(self._last.cam2world[:3, :3].mT @ found.cam2world[:3, :3])))
+        if shift > s.most_speed * seconds + _SLACK[0]:
+            return f"the pose lies {shift:.2g} median distances from the last one, {seconds:.2g} s before"
+        if turn > s.most_turn_rate * seconds + _SLACK[1]:
+            return f"the pose is turned by {turn:.0f} degrees from the last one, {seconds:.2g} s before"
+        return ""
+
+
+def _at_size(lens: Cameras, width: int, height: int) -> Cameras:
+    """A lens for an image of this size, which may be reduced. Raises InputError for another shape."""
+    if abs(width / height - lens.width / lens.height) > _SAME_SHAPE * lens.width / lens.height:
+        raise InputError(
+            f"the image is {width} x {height}, its lens is of images of {lens.width} x {lens.height}",
+            cause="it comes from another camera, or was cropped or turned",
+            hint="its own lens: --lens with a cameras.json that has it",
+        )
+    return resized(lens, width, height)
