@@ -14,7 +14,7 @@ ROWS = {  # by package: a room or module imports only rooms of rows before its o
         {"io.files", "lamp"},
         {"medium", "geometry", "cameras"},
         {"settings", "water_types", "devices", "memory", "evaluate", "weights"},
-        {"settings_document", "io", "raster", "tasks"},
+        {"settings_document", "io", "raster", "refraction", "tasks"},
         {"scene"},
         {"imaging", "prepare", "datasets", "synthetic"},
         {"sfm", "splat"},

@@ -9,8 +9,9 @@ import pytest
 import torch
 
 from swimm3r.errors import InputError, UsageError
+from swimm3r.refraction.settings import PortSettings
 from swimm3r.sfm.colmap.calibration import first_camera
-from swimm3r.sfm.lens import check_calibration, check_lens_settings, lens_of, with_calibration
+from swimm3r.sfm.lens import behind_port, check_calibration, check_lens_settings, lens_of, with_calibration
 from swimm3r.sfm.settings import ColmapSettings, LensSettings, Mast3rSettings
 
 GIVEN: dict[str, Any] = {"focal": 900.0, "k1": -0.1, "p2": 0.002}
@@ -82,11 +83,30 @@ def test_the_network_gets_the_lens_of_a_calibration(calibrated: tuple[str, Path]
     assert (lens.K[0, 0, 2], lens.K[0, 1, 2]) == (325, 175)
 
 
-def test_a_flat_port_multiplies_both_focal_lengths_of_a_calibration(tmp_path: Path):
+@pytest.mark.parametrize("backend", ["colmap", "mast3r"])
+def test_a_flat_port_multiplies_both_focal_lengths_of_a_calibration(tmp_path: Path, backend: str):
     (tmp_path / "a").write_text(LINES["OPENCV"])
-    settings = with_calibration(ColmapSettings(calibration=tmp_path / "a", housing="flat"), 1280, 720)
-    params = first_camera(1280, 720, settings).params
-    assert params[:4].tolist() == pytest.approx([900 * 1.333, 910 * 1.333, 650, 350])
+    given: dict[str, Any] = {"calibration": tmp_path / "a", "housing": "flat"}
+    if backend == "colmap":
+        in_air = with_calibration(ColmapSettings(**given), 1280, 720)
+    else:
+        in_air = with_calibration(Mast3rSettings(**given), 1280, 720)
+    settings, housed = behind_port(in_air, 1280, 720)
+    assert housed is not None
+    assert (settings.cx, settings.cy) == (650, 350)
+    assert [settings.focal, settings.fy] == pytest.approx([900 * 1.333, 910 * 1.333], rel=2e-3)
+    assert settings.k1 != in_air.k1
+
+
+def test_a_lens_unknown_in_air_stays_unknown_behind_a_port():
+    settings = ColmapSettings(housing="flat")
+    assert behind_port(settings, 640, 480) == (settings, None)
+
+
+def test_a_dome_that_hides_the_view_is_refused():
+    settings = ColmapSettings(housing="dome", focal=100.0, port=PortSettings(distance=0.3, radius=0.02))
+    with pytest.raises(UsageError, match="no image through this dome port"):
+        behind_port(settings, 640, 480)
 
 
 def test_the_lens_of_a_calibration_is_printed_in_pixels_of_the_frames(tmp_path: Path, caplog: pytest.LogCaptureFixture):

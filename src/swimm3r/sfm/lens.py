@@ -1,6 +1,7 @@
 """The lens that settings describe: one camera at the origin, in pixels of the prepared frames.
 
-The principal point is in the middle of the image unless it is given.
+The principal point is in the middle of the image unless it is given. A lens that is known in air becomes the central
+one of its port (`swimm3r.refraction.central`).
 """
 
 import logging
@@ -13,6 +14,8 @@ import torch
 from swimm3r.cameras import DISTORTION_PARAMETERS, Cameras
 from swimm3r.errors import UsageError
 from swimm3r.io.calibration.read import read_calibration, read_lens
+from swimm3r.refraction.central import CameraInWater, camera_in_water
+from swimm3r.refraction.ports import port_of
 from swimm3r.sfm.settings import LENS_NUMBERS, ColmapSettings, LensSettings, Mast3rSettings
 
 DISTORTION = ("k1", "k2", "k3", "k4", "p1", "p2")
@@ -23,6 +26,8 @@ _SPECIAL_CASES = {  # of a model, those that it has with zeros
     "OPENCV": ("PINHOLE", "SIMPLE_RADIAL"),
     "OPENCV_FISHEYE": (),
 }
+
+_TOLD = (0.5, 1.0, 2.0, 5.0)  # m from the port
 
 log = logging.getLogger(__name__)
 
@@ -66,6 +71,42 @@ def with_calibration(settings: Given, width: int, height: int, stated: Path | No
     changed = replace(settings, **blank, focal=fx, fy=fy, cx=cx, cy=cy, **numbers)
     undecided = isinstance(settings, ColmapSettings) and model != "OPENCV_FISHEYE"  # auto goes by the numbers
     return changed if undecided else replace(changed, camera=model)
+
+
+def behind_port(settings: Given, width: int, height: int) -> tuple[Given, CameraInWater | None]:
+    """The settings with the lens that a known one in air becomes behind its port, and this lens; unchanged without.
+
+    Raises UsageError where the numbers are not those of a lens, or its light does not get through the port.
+    """
+    port = port_of(settings.housing, settings.port)
+    if port is None or settings.focal is None:
+        return settings, None
+    model = model_of(settings)
+    check_lens_settings(settings, model, width, height)
+    try:
+        housed = camera_in_water(lens_of(settings, model, width, height, settings.focal), port, settings.port.range)
+    except ValueError as error:
+        raise UsageError(
+            f"there is no image through this {settings.housing} port: {error}",
+            cause="the dome is small or far ahead of the lens, or the lens in air has another focal length",
+            hint="check --port.distance and --port.radius, in meters, and --focal, in pixels of the prepared frames",
+        ) from error
+    lens = housed.central
+    (fx, _, cx), (_, fy, cy), _ = lens.K[0].tolist()
+    numbers = dict(zip(DISTORTION_PARAMETERS[lens.model], lens.distortion[0].tolist(), strict=True))
+    log.info(
+        "central lens behind the %s port: %s, fx %.2f, fy %.2f px, %s; its error is %s",
+        *(settings.housing, lens.model, fx, fy, ", ".join(f"{name} {value:.4g}" for name, value in numbers.items())),
+        ", ".join(f"{e.rms:.2g} px at {e.distance:g} m" for e in housed.errors(torch.tensor(_TOLD))),
+    )
+    return replace(settings, camera=lens.model, focal=fx, fy=fy, cx=cx, cy=cy, **numbers), housed
+
+
+def model_of(settings: ColmapSettings | Mast3rSettings) -> str:
+    """The camera model of the lens that settings begin with."""
+    if settings.camera != "auto":
+        return settings.camera
+    return "SIMPLE_RADIAL" if settings.k2 is settings.p1 is settings.p2 is None else "OPENCV"
 
 
 def _check_whole(settings: LensSettings) -> None:

@@ -5,6 +5,7 @@ from pathlib import Path
 from typing import Annotated, Literal
 
 from swimm3r.errors import UsageError
+from swimm3r.refraction.settings import HousingKind, PortSettings
 from swimm3r.settings import (
     Count,
     CountOrZero,
@@ -244,8 +245,8 @@ class LensSettings(Settings):
     """The one lens of a clip, as far as it is known (`sfm/lens.py`)."""
 
     focal: Positive | None = None
-    """Focal length in pixels of the prepared frames, measured in water, or in air if `housing` is flat: a start value,
-    which `intrinsics` or `alignment.intrinsics` can fix. MASt3R always fixes a lens with distortion."""
+    """Focal length in pixels of the prepared frames, in water, or in air if `housing` is given: a start value, which
+    `intrinsics` or `alignment.intrinsics` can fix. MASt3R always fixes a lens with distortion."""
     fy: Positive | None = None
     """Vertical focal length in pixels of the prepared frames; by default `focal`, which then is the horizontal one."""
     cx: Positive | None = None
@@ -271,6 +272,9 @@ class LensSettings(Settings):
     """Name of the camera to use of a calibration file that holds several."""
     calibration_size: tuple[Count, Count] | None = None
     """Width and height in pixels of the images of the calibration, where its file does not state them."""
+    housing: HousingKind = "none"
+    """Port of the camera housing: flat or dome, where `focal` or `calibration` are of the lens in air."""
+    port: PortSettings = field(default_factory=PortSettings)
 
     def __post_init__(self) -> None:
         super().__post_init__()
@@ -291,8 +295,6 @@ class ColmapSettings(LensSettings):
     """Lens model of the whole clip; auto uses SIMPLE_RADIAL, or OPENCV where it explains the matches clearly better."""
     intrinsics: Literal["prior", "fixed"] = "prior"
     """Use of the given focal length and distortion: as a start to refine, or fixed."""
-    housing: Literal["none", "flat", "dome"] = "none"
-    """Port of the camera housing; for a flat one, focal lengths are multiplied by water's refractive index of 1.333."""
     pairs: Literal["auto", "exhaustive", "sequential"] = "auto"
     """Frames to match: every pair, or neighbors in time and similar frames; auto matches every pair up to
     `exhaustive_to` frames."""

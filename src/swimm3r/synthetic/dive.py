@@ -5,15 +5,19 @@
 on values as stored (sRGB), before fish, snow, vignetting, the camera's exposure and white balance, and noise; under a
 lamp, `lamp_light` says how both terms change, and `clear` is the scene evenly lit. Truth is of the still scene by a
 camera whose gains are 1: depth and `clear` are what lies behind the fish, and `usable` is False wherever it shows.
-Caustics are light, not water: `clear` has them. Where a ray meets nothing, depth is 0 and `clear` is black.
+Caustics are light, not water: `clear` has them. Where a ray meets nothing, depth is 0 and `clear` is black. Behind a
+port every ray is traced through it (`optics`), attenuation begins at its outer surface, and the cameras are the central
+ones of `swimm3r.refraction.central`.
 
 On disk: images/NAME, and truth/ as `ground_truth` reads it, with masks/NAME.png (0 at the fish) if there is one, and
 gains.json, the camera's factors on linear light per frame, if they change; markers.json, the printed markers, if any;
-lamp.json and lamp/NAME.npz, the lamp and its light and backscatter per pixel, if there is one.
+lamp.json and lamp/NAME.npz, the lamp and its light and backscatter per pixel, if there is one; behind a port lens.json,
+the lens in air.
 """
 
 import json
 from dataclasses import asdict, dataclass, replace
+from functools import cached_property
 from pathlib import Path
 from typing import Any
 
@@ -23,7 +27,7 @@ from jaxtyping import Bool, Float
 from torch import Tensor
 
 from swimm3r import water_types
-from swimm3r.cameras import Cameras, directions, pixel_grid, ray_depth_from_z, resized
+from swimm3r.cameras import Cameras
 from swimm3r.errors import InputError
 from swimm3r.io import images
 from swimm3r.io.files.atomic import atomic_path, write_text
@@ -31,9 +35,11 @@ from swimm3r.io.files.damage import Remedy, guard
 from swimm3r.lamp import Lamp, lamp_document
 from swimm3r.medium import Medium, add_water, srgb_from_linear, transmittances
 from swimm3r.progress import Progress, silent
+from swimm3r.refraction.central import CameraInWater
 from swimm3r.scene.ground_truth import FOLDER
 from swimm3r.synthetic import disturbances
 from swimm3r.synthetic.lamp_light import lamp_backscatter, lamp_of, light_on
+from swimm3r.synthetic.optics import PixelRays, behind_port, lens_of, rays_of
 from swimm3r.synthetic.path import loop, survey
 from swimm3r.synthetic.plain import Plain
 from swimm3r.synthetic.printed_markers import FAMILY, Plate, plates_along, with_plates
@@ -49,7 +55,7 @@ class DiveFrame:
     raw: Float[Tensor, "h w 3"]  # what the camera stores, 0..1 (noise may overshoot)
     clear: Float[Tensor, "h w 3"]  # J
     z_depth: Float[Tensor, "h w"]  # m, 0 where the ray meets nothing
-    ray_depth: Float[Tensor, "h w"]  # m
+    ray_depth: Float[Tensor, "h w"]  # m of water along the ray
     usable: Bool[Tensor, "h w"]  # False where the moving object shows
     light: Float[Tensor, "h w 3"] | None = None  # of the lamp on the surfaces; None in daylight
     backscatter: Float[Tensor, "h w 3"] | None = None  # of the lamp
@@ -65,6 +71,7 @@ class Dive:
     medium: Medium  # [3], 1/m
     floor: Seafloor | Plain
     plates: tuple[Plate, ...] = ()  # with printed markers
+    housed: CameraInWater | None = None  # the lens behind a port, for which `cameras` are the central ones
 
     def __len__(self) -> int:
         return len(self.names)
@@ -73,6 +80,11 @@ class Dive:
     def lamp(self) -> Lamp | None:
         """The lamp on the camera; None in daylight."""
         return lamp_of(self.settings.lamp) if self.settings.lit_by == "lamp" else None
+
+    @cached_property
+    def rays(self) -> tuple[PixelRays, PixelRays]:
+        """The rays of pixel centers, and those of the samples that colors are means of."""
+        return rays_of(self.cameras[0], self.housed), rays_of(self.cameras[0], self.housed, SAMPLES)
 
     def gains(self, i: int) -> Float[Tensor, "3"]:
         """The camera's factors on linear light in frame i; 1 without changes of exposure and white balance."""
@@ -83,21 +95,15 @@ class Dive:
         """Render frame i; the same every time."""
         settings, camera = self.settings, self.cameras[i]
         floor = self.floor.around(*camera.centers[0, :2].tolist())
-        rays, sample_rays = _rays(camera), _rays(resized(camera, SAMPLES * camera.width, SAMPLES * camera.height))
-        radiance, z = render(
-            floor,
-            camera.cam2world[0].numpy(),
-            rays.numpy(),
-            sample_rays.numpy(),
-            i / settings.fps,
-            settings.caustics,
-        )
+        centers, samples = self.rays
+        rays, sample_rays = centers.direction, samples.direction
+        radiance, z = render(floor, camera.cam2world[0].numpy(), centers, samples, i / settings.fps, settings.caustics)
         if self.plates:
             radiance, z = with_plates(radiance, z, camera, list(self.plates))
         radiance = radiance * np.array(settings.daylight)
         clear = srgb_from_linear(torch.from_numpy(radiance)).clamp(0, 1).float()
         z_depth = torch.from_numpy(z).float()
-        ray_depth = ray_depth_from_z(z_depth, rays.float())
+        ray_depth = centers.water_path(z_depth)
         light, glow = None, None
         if (lamp := self.lamp) is None:
             raw = torch.where((z_depth > 0)[..., None], add_water(clear, ray_depth, self.medium), self.medium.Binf)
@@ -132,18 +138,17 @@ def make_dive(settings: DiveSettings) -> Dive:
         poses = loop(floor, settings.frames, settings.stream(1))
     else:
         floor, poses = Plain(settings.seed, settings.corals, settings.season), survey(settings)
-    focal = settings.width / 2 / np.tan(np.radians(settings.fov) / 2)
-    K = torch.tensor([[focal, 0, settings.width / 2], [0, focal, settings.height / 2], [0, 0, 1]], dtype=torch.float64)
-    cameras = Cameras(
-        K=K.repeat(len(poses), 1, 1),
-        distortion=torch.zeros(len(poses), 0, dtype=torch.float64),
+    housed, count = behind_port(settings), len(poses)
+    lens = housed.central if housed else lens_of(settings)
+    cameras = replace(
+        lens,
+        K=lens.K.repeat(count, 1, 1),
+        distortion=lens.distortion.repeat(count, 1),
         cam2world=torch.from_numpy(poses),
-        width=settings.width,
-        height=settings.height,
     )
-    count = settings.printed_markers
-    plates = plates_along(floor, poses[:, :3, 3], count, settings.printed_marker_size, settings.seed) if count else []
-    return Dive(settings, _names(settings), cameras, water(settings), floor, tuple(plates))
+    marked = settings.printed_markers
+    plates = plates_along(floor, poses[:, :3, 3], marked, settings.printed_marker_size, settings.seed) if marked else []
+    return Dive(settings, _names(settings), cameras, water(settings), floor, tuple(plates), housed)
 
 
 def write_dive(settings: DiveSettings, folder: Path, progress: Progress = silent) -> None:
@@ -182,6 +187,8 @@ def write_dive(settings: DiveSettings, folder: Path, progress: Progress = silent
         write_text(truth / "markers.json", json.dumps(document, indent=2) + "\n")
     if dive.lamp is not None:
         write_text(truth / "lamp.json", json.dumps(lamp_document(dive.lamp), indent=2) + "\n")
+    if dive.housed is not None:
+        dive.housed.lens.save(truth / "lens.json", ["lens"], units="metres")
     dive.medium.save(truth / "medium.json")
     dive.cameras.save(truth / "cameras.json", dive.names, units="metres")
     write_text(record, json.dumps({**described, "whole": True}, indent=2) + "\n")
@@ -222,9 +229,3 @@ def water(settings: DiveSettings) -> Medium:
 
 def _names(settings: DiveSettings) -> tuple[str, ...]:
     return tuple(f"{i:04d}.png" for i in range(settings.frame_count))
-
-
-def _rays(camera: Cameras) -> Float[Tensor, "h w 3"]:
-    """`cameras.image_directions` in float64: the ray cast is exact to less than a float32 of a pixel."""
-    grid = pixel_grid(camera.height, camera.width).double().reshape(1, -1, 2)
-    return directions(camera, grid).reshape(camera.height, camera.width, 3)

@@ -1,9 +1,10 @@
 """Every number of a synthetic dive; torch-free, so that --help is instant."""
 
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from typing import Annotated, Literal
 
 from swimm3r.errors import UsageError
+from swimm3r.refraction.settings import HousingKind, PortSettings
 from swimm3r.settings import ImageSide, Range, Seed, Settings, Share
 
 _Beta = Annotated[float, Range(0, 100)]
@@ -90,8 +91,13 @@ class DiveSettings(Settings):
     """Width of the frames in pixels."""
     height: ImageSide = 320
     """Height of the frames in pixels."""
-    fov: Annotated[float, Range(10, 120)] = 56.0
-    """Horizontal field of view in degrees."""
+    fov: Annotated[float, Range(10, 170)] = 56.0
+    """Field of view in degrees in air: horizontal, or diagonal of a fisheye lens."""
+    fisheye: bool = False
+    """Film through an equidistant fisheye lens, whose image grows evenly with the angle from the axis."""
+    housing: HousingKind = "none"
+    """Port of the camera housing, through which every ray is traced."""
+    port: PortSettings = field(default_factory=PortSettings)
     seed: Seed = 0
     """Seed of seafloor, path, water and disturbances."""
     family: Literal["cyan", "teal", "green", "warm"] | None = None
@@ -141,6 +147,22 @@ class DiveSettings(Settings):
                 "the moving object, marine snow and caustics are of dives in daylight",
                 cause="one of them was asked for together with lit_by='lamp'",
                 hint="lit_by='sun', or a lamp's dive without them",
+            )
+
+        self._check_lens()
+
+    def _check_lens(self) -> None:
+        if self.fisheye and self.path != "loop":
+            raise UsageError(
+                "a fisheye lens would see further than the synthetic plain shows",
+                cause=f"fisheye was asked for together with path={self.path!r}",
+                hint="path='loop', or no fisheye lens",
+            )
+        if self.housing != "none" and (self.moving_object or self.printed_markers or self.lit_by == "lamp"):
+            raise UsageError(
+                "the moving object, printed markers and lamps are of dives without a port",
+                cause=f"one of them was asked for together with housing={self.housing!r}",
+                hint="housing='none', or a dive without them",
             )
 
     def stream(self, *of: int) -> list[int]:

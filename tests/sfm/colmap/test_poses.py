@@ -16,6 +16,7 @@ from swimm3r.scene.frames import Frame, Frames
 from swimm3r.scene.reconstruction import Points, Reconstruction
 from swimm3r.sfm.colmap import calibration, plausibility
 from swimm3r.sfm.colmap import poses as colmap
+from swimm3r.sfm.colmap.adjustment import bundle_adjust
 from swimm3r.sfm.features import database as feature_database
 from swimm3r.sfm.settings import ColmapSettings, MappingSettings
 
@@ -186,13 +187,25 @@ def test_the_global_method_finds_the_same_cameras(frames: Frames, folder: Path, 
     assert _worst_rotation_deg(found, _cameras()) < 0.3
 
 
-def test_fixed_intrinsics_stay_as_given_but_for_a_flat_port_which_is_confessed(frames: Frames, tmp_path: Path) -> None:
-    settings = replace(SETTINGS, focal=FOCAL / calibration.WATER, k1=0.01, housing="flat", intrinsics="fixed")
+def test_fixed_intrinsics_stay_as_given(frames: Frames, tmp_path: Path) -> None:
+    settings = replace(SETTINGS, focal=FOCAL, k1=0.01, intrinsics="fixed")
     found = colmap.reconstruct(frames, settings, tmp_path)
     assert found.cameras.model == "SIMPLE_RADIAL"
     assert found.cameras.K[0, 0, 0].item() == pytest.approx(FOCAL)
     assert found.cameras.distortion[0].tolist() == [0.01]
-    assert any("flat port" in warning.what for warning in found.warnings)
+
+
+def test_a_flat_port_before_an_unknown_lens_is_confessed(frames: Frames, tmp_path: Path) -> None:
+    found = colmap.reconstruct(frames, replace(SETTINGS, housing="flat"), tmp_path)
+    assert any("flat port is not modeled" in warning.what for warning in found.warnings)
+
+
+def test_the_lens_of_a_centered_dome_is_that_in_air(frames: Frames, tmp_path: Path) -> None:
+    settings = replace(SETTINGS, focal=FOCAL, k1=0.01, housing="dome", intrinsics="fixed")
+    found = colmap.reconstruct(frames, settings, tmp_path)
+    assert found.cameras.model == "OPENCV"
+    torch.testing.assert_close(found.cameras.K[0, 0, 0], torch.tensor(FOCAL).double(), rtol=1e-6, atol=0)
+    assert found.cameras.distortion[0].tolist() == pytest.approx([0.01, 0, 0, 0], abs=1e-6)
 
 
 def test_a_lens_that_is_given_is_held(frames: Frames, folder: Path, tmp_path: Path) -> None:
@@ -316,7 +329,7 @@ def test_bundle_adjustment_mends_shaken_poses(rec: Reconstruction) -> None:
     generator = torch.Generator().manual_seed(0)
     shaken = rec.cameras.cam2world.clone()
     shaken[:, :3, 3] += 0.01 * rec.cameras.centers.std() * torch.randn(COUNT, 3, generator=generator)
-    mended = colmap.bundle_adjust(replace(rec, cameras=replace(rec.cameras, cam2world=shaken)))
+    mended = bundle_adjust(replace(rec, cameras=replace(rec.cameras, cam2world=shaken)))
     assert mended.names == rec.names
     assert _worst_rotation_deg(mended, _cameras()) < 0.3
     assert mended.points.error.mean() < 1.1 * rec.points.error.mean()

@@ -26,7 +26,7 @@ from swimm3r.sfm.alignment import depth_cleaning
 from swimm3r.sfm.alignment.canonical import AnchoredFrame, anchors_of
 from swimm3r.sfm.alignment.optimize import Alignment, align, dense_z_depth
 from swimm3r.sfm.alignment.problem import AnchoredPair, Known
-from swimm3r.sfm.colmap import poses as colmap
+from swimm3r.sfm.colmap.adjustment import bundle_adjust
 from swimm3r.sfm.features.pair_graph import groups, parse_graph
 from swimm3r.sfm.lens import check_calibration
 from swimm3r.sfm.mast3r.matching import PixelMatches
@@ -144,7 +144,7 @@ def _place(
         points_found=len(found.xyz),
     )
     if settings.bundle_adjustment:
-        rec = colmap.bundle_adjust(rec)
+        rec = bundle_adjust(rec)
     _write_depth(rec, said, kept, pairs, aligned.alignment, images, settings, progress)
     if water is not None:
         for k, f in enumerate(kept):

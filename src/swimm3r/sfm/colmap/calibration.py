@@ -17,13 +17,12 @@ from swimm3r.io.colmap.cameras import from_pycolmap_camera, to_pycolmap_camera, 
 from swimm3r.progress import Progress
 from swimm3r.sfm.colmap.pair_focal import focal_of_pairs
 from swimm3r.sfm.features.database import MIN_INLIERS, FeatureDatabase
-from swimm3r.sfm.lens import check_lens_settings, lens_of
+from swimm3r.sfm.lens import check_lens_settings, lens_of, model_of
 from swimm3r.sfm.settings import ColmapSettings
 
 if TYPE_CHECKING:
     import pycolmap
 
-WATER = 1.333  # refractive index; a flat port multiplies the focal length by it (to first order)
 SEED = 0
 THREADS = 1  # sums in a changing order end in poses 0.01 degrees apart, on weak clips more; a resumed run must not
 _MAX_TANGENTIAL = 0.1  # a lens some 10 degrees askew behind its port, or an image cut off-center by a tenth
@@ -44,7 +43,7 @@ def first_camera(width: int, height: int, settings: ColmapSettings) -> "pycolmap
 
     Raises UsageError where the settings contradict themselves.
     """
-    name = _model_name(settings)
+    name = model_of(settings)
     check_lens_settings(settings, name, width, height)
     if settings.intrinsics == "fixed" and settings.focal is None:
         raise UsageError(
@@ -57,11 +56,11 @@ def first_camera(width: int, height: int, settings: ColmapSettings) -> "pycolmap
 
 def ladder(width: int, height: int, settings: ColmapSettings) -> "list[pycolmap.Camera]":
     """The lenses to try in turn, likelier ones first."""
-    name = _model_name(settings)
-    port = WATER if settings.housing == "flat" else 1.0
+    name = model_of(settings)
     if settings.focal is not None:
-        focals = [settings.focal * port]
+        focals = [settings.focal]
     elif name == "OPENCV_FISHEYE":
+        port = settings.port.water if settings.housing == "flat" else 1.0
         focals = [f * width * port for f in (0.45, 0.33, 0.6)]  # 110, 170 and 90 degrees across
     else:
         focals = [f * width for f in settings.mapping.focal_ladder]
@@ -236,9 +235,3 @@ def _adjust(
     mapper.end_reconstruction(False)
     out.update_point_3d_errors()
     return out
-
-
-def _model_name(settings: ColmapSettings) -> str:
-    if settings.camera != "auto":
-        return settings.camera
-    return "SIMPLE_RADIAL" if settings.k2 is settings.p1 is settings.p2 is None else "OPENCV"

@@ -20,7 +20,7 @@ from torch import Tensor
 from swimm3r.cameras import Cameras, cameras_of, rows_of_frames
 from swimm3r.errors import InputError, RegistrationError, StorageError
 from swimm3r.io.colmap.cameras import to_pycolmap_camera
-from swimm3r.io.colmap.model import ColmapModel, from_pycolmap, silence_log, to_pycolmap, write_model
+from swimm3r.io.colmap.model import ColmapModel, from_pycolmap, silence_log, write_model
 from swimm3r.io.files.atomic import atomic_path
 from swimm3r.progress import Progress, silent
 from swimm3r.scene.frames import Frames
@@ -33,13 +33,14 @@ from swimm3r.scene.reconstruction import (
     Tracks,
 )
 from swimm3r.sfm.colmap import calibration, mapping
+from swimm3r.sfm.colmap.adjustment import adjust_through_port
 from swimm3r.sfm.colmap.chunks.long_clip import is_long, map_long_clip
 from swimm3r.sfm.colmap.chunks.parts import without_jumps
 from swimm3r.sfm.colmap.plausibility import depth_change, implausible
 from swimm3r.sfm.features import vlad
 from swimm3r.sfm.features.database import FeatureDatabase, fill_features, match_pairs, start_database
 from swimm3r.sfm.features.sift import unit_descriptors
-from swimm3r.sfm.lens import with_calibration
+from swimm3r.sfm.lens import behind_port, with_calibration
 from swimm3r.sfm.settings import ColmapSettings
 from swimm3r.tasks.settings import EngineSettings
 from swimm3r.tasks.threads import thread_count
@@ -75,8 +76,10 @@ def reconstruct(
         )
     silence_log()
     threads = settings.threads or thread_count()
+    housed = None
     if lens is None:
         settings = with_calibration(settings, frames.width, frames.height, frames.calibration)
+        settings, housed = behind_port(settings, frames.width, frames.height)
         camera = calibration.first_camera(frames.width, frames.height, settings)
     else:
         camera, settings = to_pycolmap_camera(lens), replace(settings, intrinsics="fixed")
@@ -95,6 +98,9 @@ def reconstruct(
                 shutil.copyfile(store.path, draft)
             model, others, warnings = _map(working, frames, pairs, settings, progress, engine)
             rec = _record(model, working, frames, folder)
+            if housed is not None:
+                free = settings.intrinsics != "fixed"
+                rec = adjust_through_port(rec, housed, settings.port.range, lens=free, progress=progress)
             sizes = [model.num_reg_images(), *_write_parts(model, others, frames, folder / PARTS)]
             if depth_change(rec) > _LOST_SCALE:
                 raise _scale_lost(len(rec.names), len(frames))
@@ -102,11 +108,12 @@ def reconstruct(
         finally:
             working.path.unlink(missing_ok=True)
     warnings += _registration_warnings(len(rec.names), sizes, frames)
-    if settings.housing == "flat":
+    if settings.housing == "flat" and housed is None:
         warnings.append(
             QualityWarning(
-                "The flat port is only approximated, by a longer focal length and radial distortion.",
-                "Expect distances that drift toward the corners; a dome port or a calibration in water is better.",
+                "The refraction at the flat port is not modeled, as the lens in air is unknown; the focal length and"
+                " radial distortion found in water stand for it.",
+                "Give --focal or --calibration of the lens in air, and --port.distance and --port.thickness.",
             )
         )
     return replace(rec, warnings=(*found, *warnings))
@@ -149,27 +156,6 @@ def absolute_pose(
     pose = torch.eye(4, dtype=torch.float64)
     pose[:3] = torch.from_numpy(found["cam_from_world"].inverse().matrix())
     return pose, torch.from_numpy(np.asarray(found["inlier_mask"], bool))
-
-
-def bundle_adjust(rec: Reconstruction, *, lens: bool = False) -> Reconstruction:
-    """The same frames and tracks with poses and points that reproject best, and the lens too where asked."""
-    import pycolmap
-
-    options = pycolmap.BundleAdjustmentOptions()
-    options.refine_focal_length = options.refine_extra_params = lens
-    options.print_summary = False
-    options.ceres.loss_function_type = pycolmap.LossFunctionType.SOFT_L1
-    options.ceres.solver_options.num_threads = 1  # as in mapping: the same sums in the same order
-    model = to_pycolmap(rec.colmap_model())
-    pycolmap.bundle_adjustment(model, options)
-    model.update_point_3d_errors()
-    table = from_pycolmap(model)
-    return replace(
-        rec,
-        cameras=cameras_of(table),
-        points=replace(rec.points, xyz=torch.from_numpy(table.xyz), error=torch.from_numpy(table.error)),
-        tracks=Tracks(*(torch.from_numpy(a) for a in (table.track_point, table.track_frame, table.track_xy))),
-    )
 
 
 @contextmanager

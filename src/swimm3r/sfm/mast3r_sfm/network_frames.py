@@ -18,7 +18,7 @@ from swimm3r.io.files.cache_key import bytes_digest
 from swimm3r.io.imports.read import read_foreign
 from swimm3r.scene.frames import Frames
 from swimm3r.sfm.imported.match_frames import model_cameras
-from swimm3r.sfm.lens import check_lens_settings, lens_of, with_calibration
+from swimm3r.sfm.lens import behind_port, check_lens_settings, lens_of, with_calibration
 from swimm3r.sfm.mast3r.preprocess import (
     Framing,
     K_to_image,
@@ -115,6 +115,7 @@ def network_images(frames: Frames, settings: Mast3rSettings) -> NetworkImages:
         lens, poses = _from_file(frames, settings, settings.known)
         return NetworkImages(frames, lens, True, frame, poses)
     settings = with_calibration(settings, frames.width, frames.height, frames.calibration)
+    settings, _ = behind_port(settings, frames.width, frames.height)
     lens = _lens(frames.width, frames.height, settings)
     return NetworkImages(frames, lens, settings.focal is not None, frame)
 

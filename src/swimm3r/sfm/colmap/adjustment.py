@@ -1,0 +1,69 @@
+"""Bundle adjustment of a finished reconstruction, plain and behind a port.
+
+Behind a port the exact image of a point differs from that of the central lens by a shift that depends on its depth
+(`swimm3r.refraction.central`). So depth and shift are found in turn: observations are moved to where the central lens
+has the points that they show at their present depth, and poses and points are adjusted to them; what this converges to
+is the adjustment under exact refraction.
+"""
+
+from dataclasses import replace
+
+import torch
+
+from swimm3r.cameras import cameras_of, project, rows_of_frames
+from swimm3r.io.colmap.model import from_pycolmap, to_pycolmap
+from swimm3r.progress import Progress, silent
+from swimm3r.refraction.central import CameraInWater
+from swimm3r.scene.reconstruction import Reconstruction, Tracks
+
+_TURNS = 3  # the shift changes with the change of depth, a hundredth of a pixel after the second
+
+
+def bundle_adjust(rec: Reconstruction, *, lens: bool = False) -> Reconstruction:
+    """The same frames and tracks with poses and points that reproject best, and the lens too where asked."""
+    import pycolmap
+
+    options = pycolmap.BundleAdjustmentOptions()
+    options.refine_focal_length = options.refine_extra_params = lens
+    options.print_summary = False
+    options.ceres.loss_function_type = pycolmap.LossFunctionType.SOFT_L1
+    options.ceres.solver_options.num_threads = 1  # as in mapping: the same sums in the same order
+    model = to_pycolmap(rec.colmap_model())
+    pycolmap.bundle_adjustment(model, options)
+    model.update_point_3d_errors()
+    table = from_pycolmap(model)
+    return replace(
+        rec,
+        cameras=cameras_of(table),
+        points=replace(rec.points, xyz=torch.from_numpy(table.xyz), error=torch.from_numpy(table.error)),
+        tracks=Tracks(*(torch.from_numpy(a) for a in (table.track_point, table.track_frame, table.track_xy))),
+    )
+
+
+def adjust_through_port(
+    rec: Reconstruction, housed: CameraInWater, distance: float, *, lens: bool, progress: Progress = silent
+) -> Reconstruction:
+    """The reconstruction under exact refraction, its lens the central one of the port, or adjusted from there.
+
+    `distance` is the median distance of the points from the port in meters: a reconstruction has no scale of its own.
+    Tracks keep the pixels that were observed; errors of points are those under refraction.
+    """
+    for turn in range(_TURNS):
+        progress("refraction", turn, _TURNS)
+        pixels = _through_central_lens(rec, housed, distance)
+        moved = bundle_adjust(replace(rec, tracks=replace(rec.tracks, xy=pixels)), lens=lens)
+        points = replace(rec.points, xyz=moved.points.xyz, error=moved.points.error)
+        rec = replace(rec, cameras=moved.cameras, points=points)
+    progress("refraction", _TURNS, _TURNS)
+    return rec
+
+
+def _through_central_lens(rec: Reconstruction, housed: CameraInWater, distance: float) -> torch.Tensor:
+    """The pixels of the tracks as the central lens has their points."""
+    tracks, z = rec.tracks, torch.zeros(len(rec.tracks.point), dtype=torch.float64)
+    for i, rows in enumerate(rows_of_frames(tracks.frame, len(rec.names))):
+        z[rows] = project(rec.cameras[i], rec.points.xyz[tracks.point[rows]].double()[None])[1][0]
+    meters = z * ((distance + housed.outside) / z[z > 0].median())
+    shift = housed.shift(tracks.xy, meters)
+    usable = (meters > housed.outside) & shift.isfinite().all(-1)
+    return tracks.xy + torch.where(usable[:, None], shift, 0.0).to(tracks.xy)
