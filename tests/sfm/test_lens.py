@@ -87,6 +87,7 @@ def test_the_network_gets_the_lens_of_a_calibration(calibrated: tuple[str, Path]
 def test_a_flat_port_multiplies_both_focal_lengths_of_a_calibration(tmp_path: Path, backend: str):
     (tmp_path / "a").write_text(LINES["OPENCV"])
     given: dict[str, Any] = {"calibration": tmp_path / "a", "housing": "flat"}
+    in_air: Any
     if backend == "colmap":
         in_air = with_calibration(ColmapSettings(**given), 1280, 720)
     else:
