@@ -34,7 +34,7 @@ ROWS = {  # by package: a room or module imports only rooms of rows before its o
         {"navigation", "telemetry"},
     ],
     "swimm3r.sfm": [
-        {"mast3r", "tracks", "imported"},
+        {"mast3r", "tracks", "imported", "rig_poses"},
         {"settings"},
         {"features", "lens", "plane_sweep"},
         {"alignment", "student", "colmap"},

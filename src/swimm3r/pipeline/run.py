@@ -26,6 +26,7 @@ from swimm3r.pipeline.stage_start import StageStart, ignore_stages
 from swimm3r.prepare import check_source, load_frames, read_frames
 from swimm3r.progress import Progress, silent, watched
 from swimm3r.report import write_report
+from swimm3r.scale.rig import has_known_baseline
 from swimm3r.scale.run import read_record, scale_folder, scale_sections, source_key
 from swimm3r.scene.frames import Frames
 from swimm3r.scene.ground_truth import GroundTruth
@@ -137,7 +138,7 @@ def _make_stages(
     between = read_between(folder / "sfm")
     placed = 0 if between is None else len(between.names)
     record.add(sections.sfm_sections(rec, frames, unfiltered_matches(folder / "sfm", rec), placed))
-    if _scaled(record, settings, progress):
+    if _scaled(record, rec, settings, progress):
         rec = load_reconstruction(folder / "sfm", frames)
         record.add(sections.sfm_sections(rec, frames, unfiltered_matches(folder / "sfm", rec), placed))
     record.add(scale_sections(folder, rec))
@@ -159,9 +160,9 @@ def _make_stages(
     _own_scores(record, run, Protocol(settings.test, reference), truth, progress, reuse=True)
 
 
-def _scaled(record: RunRecord, settings: RunSettings, progress: Progress) -> bool:
-    """Give the run the unit and the place that its settings name; return whether anything had to be done."""
-    if not settings.scale.has_sources:
+def _scaled(record: RunRecord, rec: Reconstruction, settings: RunSettings, progress: Progress) -> bool:
+    """Give the run the unit and the place that its settings or its rig tell; return whether anything was to be done."""
+    if not settings.scale.has_sources and not has_known_baseline(rec):
         return False
     record.write()
     run = open_run(record.folder, "sfm")

@@ -101,14 +101,16 @@ def score_restored_frames(run: MappedRun, progress: Progress = silent) -> dict[s
 def film_flight(run: MappedRun, progress: Progress = silent) -> None:
     """Write RUN/renders/flythrough.mp4, at the size the map was trained at."""
     scene, path = run.scene, as_mapped(run.rec, run.scene.poses)
+    first = None if run.frames.rig is None else run.frames.rig.names[0]
+    rows = [i for i, name in enumerate(path.names) if run.frames.frames[run.frames.index(name)].camera == first]
     lens = path.cameras[0]
     canvas = lens.pinhole(scene.settings.long_side)
     write_flythrough(
         run.folder / "renders" / "flythrough.mp4",
         scene,
         held_out.cut(canvas, held_out.visible_window(lens, canvas)),
-        path.cameras.cam2world,
-        run.frames.times_of(path.names),
+        path.cameras.cam2world[rows],
+        run.frames.times_of([path.names[i] for i in rows]),
         _FLIGHT,
         display_style(scene, run.rec, run.settings.sfm.restore),
         progress,

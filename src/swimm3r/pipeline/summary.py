@@ -37,7 +37,7 @@ _ASKED = 16  # training views that the map's mean water is taken over
 def sfm_sections(
     rec: Reconstruction, frames: Frames, matches: Matches | None = None, placed_between: int = 0
 ) -> dict[str, object]:
-    """ "sfm", "medium" and "warnings": what structure from motion found.
+    """ "sfm", "rig", "medium" and "warnings": what structure from motion found.
 
     Epipolar scores are of `matches`, by default those that the reconstruction keeps. `placed_between` is the number of
     frames between keyframes that have a pose.
@@ -61,6 +61,8 @@ def sfm_sections(
         "metric": rec.metric,
     }
     sections: dict[str, object] = {"sfm": summary_entries(sfm)}
+    if rec.rig is not None:
+        sections["rig"] = asdict(rec.rig)
     if rec.medium is not None:
         sections["medium"] = {"sfm": _medium_section(rec.medium, rec.metric)}
         if rec.medium_linear is not None:

@@ -10,12 +10,23 @@ from jaxtyping import UInt8, UInt16
 
 from swimm3r.io.files.safe_names import shown_name
 from swimm3r.io.images import Rgb
+from swimm3r.scene.rig import Rig
 
 STEP = "preparing frames"  # what progress calls it
 GRAY_SIDE = 960  # pixels; sharpness is judged on a copy of this size, so that it compares across cameras
 BLANK = 1.0  # standard deviation of an 8-bit gray copy below which a frame shows nothing: lens cap, fade, slate
 
 Item = TypeVar("Item")
+
+
+@dataclass(frozen=True)
+class Taken:
+    """An image of the input that is used."""
+
+    path: Path
+    time: float  # seconds since the first one; its number where images carry no time
+    camera: str | None = None  # of a rig
+    instant: int | None = None  # of a rig: its images of one instant were taken together
 
 
 @dataclass(frozen=True)
@@ -28,6 +39,8 @@ class SourceImage:
     time: float
     sharpness: float
     gray: bool  # three equal channels
+    camera: str | None = None  # of a rig
+    instant: int | None = None  # of a rig
 
 
 @dataclass(frozen=True)
@@ -43,6 +56,7 @@ class SelectedImages:
     recorded: str | None = None  # begin of the recording, ISO 8601
     start_ns: int | None = None  # nanoseconds since 1970 at second 0, where the source stamps its images
     calibration: Path | None = None  # a calibration file in the draft folder
+    rig: Rig | None = None
 
 
 def sharpness(gray: UInt8[np.ndarray, "h w"]) -> float:

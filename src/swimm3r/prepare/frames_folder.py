@@ -36,6 +36,7 @@ from swimm3r.prepare.masks import check_masks, prepare_masks
 from swimm3r.prepare.split import split_frames
 from swimm3r.progress import Progress, silent
 from swimm3r.scene.frames import Frame, Frames, Part, write_index
+from swimm3r.scene.rig import Rig, first_of_instants
 from swimm3r.scene.settings import FrameSettings
 
 log = logging.getLogger(__name__)
@@ -79,6 +80,8 @@ class _Entry:
     sharpness: float
     split: Part
     mask: str | None = None
+    camera: str | None = None
+    instant: int | None = None
 
 
 @dataclass(frozen=True)
@@ -100,6 +103,7 @@ class _Document:
     recorded: str | None = None
     start_ns: int | None = None
     calibration: str | None = None
+    rig: Rig | None = None
 
     def __post_init__(self) -> None:
         if min(self.width, self.height) < 1:
@@ -109,6 +113,9 @@ class _Document:
         if self.recorded is not None:
             datetime.fromisoformat(self.recorded)
         check_names(entry.name for entry in self.frames)
+        cameras = {None} if self.rig is None else set(self.rig.names)
+        if unknown := {entry.camera for entry in self.frames} - cameras:
+            raise ValueError(f"its frames are of a camera {unknown.pop()}, which its rig does not have")
 
 
 def load_frames(folder: Path) -> Frames:
@@ -124,6 +131,8 @@ def load_frames(folder: Path) -> Frames:
                 sharpness=entry.sharpness,
                 split=entry.split,
                 mask=_inside(folder, entry.mask) if entry.mask else None,
+                camera=entry.camera,
+                instant=entry.instant,
             )
             for entry in document.frames
         )
@@ -139,6 +148,7 @@ def load_frames(folder: Path) -> Frames:
         recorded=document.recorded,
         start_ns=document.start_ns,
         calibration=calibration,
+        rig=document.rig,
     )
 
 
@@ -207,12 +217,16 @@ def _write_frames(dive: SelectedImages, draft: Path, source: Path, settings: Fra
             "and removing the water restores contrast, not color."
         )
 
+    starts = first_of_instants([image.instant for image in kept])
+
     @lru_cache(maxsize=_HELD)
     def gray_of(i: int) -> UInt8[np.ndarray, "h w"]:
-        return small_gray(images.read_rgb(draft / kept[i].name), MOTION_SIDE)
+        return small_gray(images.read_rgb(draft / kept[starts[i]].name), MOTION_SIDE)
 
-    sharpness = [image.sharpness for image in kept]
-    parts = split_frames(gray_of, sharpness, settings, progress, ordered=dive.ordered)
+    sharpness = [kept[start].sharpness for start in starts]
+    of_instant = split_frames(gray_of, sharpness, settings, progress, ordered=dive.ordered)
+    counts = np.diff([*starts, len(kept)])
+    parts: list[Part] = [part for part, count in zip(of_instant, counts, strict=True) for _ in range(count)]
     listed = tuple(
         Frame(
             name=image.name,
@@ -221,6 +235,8 @@ def _write_frames(dive: SelectedImages, draft: Path, source: Path, settings: Fra
             sharpness=round(image.sharpness, 3),
             split=part,
             mask=draft / masks.places[image.name] if image.name in masks.places else None,
+            camera=image.camera,
+            instant=image.instant,
         )
         for image, part in zip(kept, parts, strict=True)
     )
@@ -235,6 +251,7 @@ def _write_frames(dive: SelectedImages, draft: Path, source: Path, settings: Fra
         recorded=dive.recorded,
         start_ns=dive.start_ns,
         calibration=dive.calibration,
+        rig=dive.rig,
     )
     write_index(draft, frames, str(source.resolve()))
 

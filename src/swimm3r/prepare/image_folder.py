@@ -5,7 +5,7 @@ import shutil
 from collections import Counter
 from collections.abc import Callable, Sequence
 from concurrent.futures import ThreadPoolExecutor
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from datetime import UTC, datetime
 from functools import partial
 from pathlib import Path
@@ -23,6 +23,7 @@ from swimm3r.prepare.candidates import (
     STEP,
     SelectedImages,
     SourceImage,
+    Taken,
     blank_warning,
     is_gray,
     scaled_down,
@@ -31,7 +32,9 @@ from swimm3r.prepare.candidates import (
     some_names,
     thinned,
 )
+from swimm3r.prepare.rig import cameras_of_folder, pair_images
 from swimm3r.progress import Progress
+from swimm3r.scene.rig import Rig, RigCamera
 from swimm3r.scene.settings import FrameSettings
 
 MASKS = "masks"  # a folder of this name in the input is not searched for frames
@@ -45,7 +48,6 @@ class _Still:
     source: Path
     original: Path  # relative name
     name: str  # of the prepared image
-    time: float
     linked: bool  # the original serves as it is
 
 
@@ -63,6 +65,9 @@ def prepare_stills(
 ) -> SelectedImages:
     """Write the frames of a folder of images into `draft`. Raises InputError."""
     folder = images_of(source, [*leave_out, *([settings.masks] if settings.masks else [])])
+    cameras = cameras_of_folder(folder.root, settings)
+    if cameras:
+        folder = replace(folder, paths=[p for p in folder.paths if p.relative_to(folder.root).parts[0] in cameras])
     root, originals = folder.root, [path.relative_to(folder.root) for path in folder.paths]
     headers: dict[Path, ImageHeader] = {}
     refused: dict[Path, InputError] = {}
@@ -73,12 +78,18 @@ def prepare_stills(
             refused[path] = error
     sizes = {path: header.size for path, header in headers.items()}
     paths, warnings = _one_size(list(headers), sizes, root, settings)
-    paths, times, ordered, recorded = _in_time_order(paths, warnings)
-    chosen = thinned(list(zip(paths, times, strict=True)), settings.max_frames)
+    if cameras:
+        of_rig = pair_images(root, paths, cameras, settings)
+        chosen, ordered, recorded = list(of_rig.images), of_rig.ordered, of_rig.recorded
+        warnings += of_rig.warnings
+    else:
+        paths, times, ordered, recorded = _in_time_order(paths, warnings)
+        taken = [Taken(path, time) for path, time in zip(paths, times, strict=True)]
+        chosen = thinned(taken, settings.max_frames)
     work = _named(chosen, root, settings.long_side, headers)
     most = max((headers[path].decoding_bytes for path in paths), default=0)
     results = _in_threads(partial(_prepare_still, draft=draft, long_side=settings.long_side), work, most, progress)
-    images, blank = [], 0
+    images, blank, of_path = [], 0, {taken.path: taken for taken in chosen}
     for still, result in zip(work, results, strict=True):
         match result:
             case InputError():
@@ -86,7 +97,11 @@ def prepare_stills(
             case None:
                 blank += 1
             case (sharp, gray):
-                images.append(SourceImage(still.name, still.original, sizes[still.source], still.time, sharp, gray))
+                one = of_path[still.source]
+                size = sizes[still.source]
+                images.append(
+                    SourceImage(still.name, still.original, size, one.time, sharp, gray, one.camera, one.instant)
+                )
     warnings += _left_out(refused, folder)
     if blank:
         warnings.append(blank_warning(blank, "images"))
@@ -97,7 +112,8 @@ def prepare_stills(
             dict.fromkeys([root, root / MASKS, source / MASKS, *([root.parent / MASKS] * (root.name == "images"))])
         )
     files = frozenset(root.resolve() / original for original in originals)
-    return SelectedImages(images, ordered, warnings, mask_folders, originals, files, recorded)
+    rig = Rig(tuple(RigCamera(name) for name in cameras)) if cameras else None
+    return SelectedImages(images, ordered, warnings, mask_folders, originals, files, recorded, rig=rig)
 
 
 def images_of(source: Path, leave_out: Sequence[Path] = ()) -> ImageFolder:
@@ -197,23 +213,22 @@ def _in_time_order(paths: list[Path], warnings: list[str]) -> tuple[list[Path], 
     return [paths[i] for i in order], [known[i] - min(known) for i in order], True, recorded
 
 
-def _named(
-    chosen: list[tuple[Path, float]], root: Path, long_side: int, headers: dict[Path, ImageHeader]
-) -> list[_Still]:
+def _named(chosen: list[Taken], root: Path, long_side: int, headers: dict[Path, ImageHeader]) -> list[_Still]:
     """Names that every file system takes, and that stay unique even without their suffix and where case is ignored."""
-    relatives = [path.relative_to(root) for path, _ in chosen]
+    relatives = [taken.path.relative_to(root) for taken in chosen]
     wanted = [safe_name(relative) for relative in relatives]
     stems = Counter(stem.lower() for stem in wanted)
-    taken = set(stems)
+    given = set(stems)
     work = []
-    for relative, stem, (path, time) in zip(relatives, wanted, chosen, strict=True):
+    for relative, stem, taken in zip(relatives, wanted, chosen, strict=True):
         if stems[stem.lower()] > 1:  # a.jpg beside a.png
             stem += f"_{relative.suffix[1:]}"
-            while stem.lower() in taken:
+            while stem.lower() in given:
                 stem += "_"
-            taken.add(stem.lower())
+            given.add(stem.lower())
+        path = taken.path
         linked = headers[path].plain and (not long_side or max(headers[path].size) <= long_side)
-        work.append(_Still(path, relative, f"{stem}{path.suffix if linked else '.png'}", time, linked))
+        work.append(_Still(path, relative, f"{stem}{path.suffix if linked else '.png'}", linked))
     return work
 
 

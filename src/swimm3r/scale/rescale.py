@@ -103,7 +103,7 @@ def _changes(folder: Path, factor: float) -> list[Change]:
     changes += [(name, lambda old, new: _cloud(old, new, factor)) for name in clouds]
     changes += [(name, lambda old, new: _frame_water(old, new, factor)) for name in below("sfm/water/**/*.npz")]
     changes += [(name, lambda old, new: _medium(old, new, factor)) for name in there(("sfm/medium.json",))]
-    changes += [(name, _metric) for name in there(("sfm/reconstruction.json",))]
+    changes += [(name, lambda old, new: _about(old, new, factor)) for name in there(("sfm/reconstruction.json",))]
     changes += [(name, lambda old, new: _rendered(old, new, factor)) for name in below("renders/**/*_z_depth.tif")]
     if (folder / "splat/map.safetensors").is_file():
         changes.append(("splat/map.safetensors", lambda old, new: _map(old, new, factor)))
@@ -172,9 +172,14 @@ def _medium(old: Path, new: Path, factor: float) -> None:
     save_fits(new, {name: rescale(fit, factor) for name, fit in fits.items()})
 
 
-def _metric(old: Path, new: Path) -> None:
+def _about(old: Path, new: Path, factor: float) -> None:
+    """The metric flag, and the rig."""
     with guard(old, remake(old.parent)):
         document = json.loads(old.read_text(encoding="utf-8"))
+        for camera in (document.get("rig") or {}).get("cameras", []):
+            camera["baseline"] *= factor
+            for row in camera["camera_from_rig"][:3]:
+                row[3] *= factor
     write_text(new, json.dumps({**document, "metric": True}, indent=2) + "\n")
 
 

@@ -49,6 +49,10 @@ class ScaleSettings(Settings):
     """YAML of markers: family, size, sizes per id, distances between ids, or a ChArUco board."""
     marker_std: Positive = 0.0005
     """Standard deviation of the printed size of markers, in metres."""
+    baseline: Annotated[float, Range(0.001, 100)] | None = None
+    """Distance of the first two cameras of a rig, in metres."""
+    baseline_std: Positive = 0.0005
+    """Standard deviation of --baseline, and of the baselines of --rig-calibration, in metres."""
     camera_height: Positive | None = None
     """Mean height of the camera above the ground, in metres."""
     camera_height_std: Positive = 0.1
@@ -134,7 +138,8 @@ class ScaleSettings(Settings):
     @property
     def has_sources(self) -> bool:
         """Return whether anything is given that tells scale or place."""
-        given = (self.nav, self.points, self.markers, self.marker_file, self.camera_height, self.laser_dots)
+        given = (self.nav, self.points, self.markers, self.marker_file, self.baseline, self.camera_height)
+        given = (*given, self.laser_dots)
         return bool(self.scale_bar) or any(value is not None for value in given)
 
 

@@ -26,6 +26,7 @@ from swimm3r.scale.marked_points import (
 from swimm3r.scale.markers import find_markers, marker_estimates, marker_sizes
 from swimm3r.scale.navigation.fit import NavigationFit
 from swimm3r.scale.navigation.place import localized
+from swimm3r.scale.rig import rig_estimates, rig_notes
 from swimm3r.scale.settings import ScaleSettings
 from swimm3r.scale.solve import ScaleEstimate
 from swimm3r.scale.triangulation import ScenePoint, Sighting, scale_of_distance, triangulate_all
@@ -86,6 +87,9 @@ def scale_sources(
         notes += told
     if settings.laser_dots is not None and settings.laser_spacing is not None:
         estimates += laser_estimates(rec, read_laser_dots(settings.laser_dots, names), settings)
+    of_rig = rig_estimates(rec, settings)
+    estimates += of_rig
+    notes += rig_notes(rec, of_rig)
     if settings.camera_height is not None:
         estimates.append(_camera_height(rec, settings, navigation))
     if navigation is not None:

@@ -7,7 +7,7 @@ eighth frame (index % 8 == 0) is a test frame, as the paper and 3DGS count; SfM 
 import json
 import shutil
 from collections.abc import Iterator, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import asdict, dataclass, replace
 from functools import cached_property
 from pathlib import Path
 from typing import Literal
@@ -23,6 +23,7 @@ from swimm3r.io import images
 from swimm3r.io.files.atomic import atomic_folder, write_text
 from swimm3r.io.files.cache import ArrayCache
 from swimm3r.io.files.outputs import check_empty
+from swimm3r.scene.rig import Rig
 
 _CACHE = ArrayCache(max_bytes=256 << 20, least_entries=20)  # of 8-bit images: 40 frames of 1080p, 20 of 4K
 MASKS = "masks"  # the folder of the masks beside the frames
@@ -44,6 +45,8 @@ class Frame:
     sharpness: float  # variance of the Laplacian of a gray copy of at most 960 px, 8-bit units
     split: Part
     mask: Path | None = None  # image of the same size, 0 where the frame is not to be used
+    camera: str | None = None  # of a rig
+    instant: int | None = None  # of a rig: frames of one instant were taken together
 
 
 @dataclass(frozen=True)
@@ -60,6 +63,7 @@ class Frames:
     recorded: str | None = None  # begin of the recording, ISO 8601, as the files state it: EXIF, container or headers
     start_ns: int | None = None  # nanoseconds since 1970 at second 0, where every image is stamped: those of a bag
     calibration: Path | None = None  # the lens as the source states it, a file beside the frames
+    rig: Rig | None = None  # cameras that are fixed to each other; frames of one instant are neighbors in the list
 
     def __len__(self) -> int:
         return len(self.frames)
@@ -219,9 +223,11 @@ def write_index(folder: Path, frames: Frames, source: str = "") -> None:
         "recorded": frames.recorded,
         "start_ns": frames.start_ns,
         "calibration": None if frames.calibration is None else frames.calibration.relative_to(folder).as_posix(),
+        "rig": None if frames.rig is None else asdict(frames.rig),
         "frames": [
             {
                 "name": frame.name,
+                **({} if frame.camera is None else {"camera": frame.camera, "instant": frame.instant}),
                 "time": frame.time,
                 "split": frame.split,
                 "sharpness": frame.sharpness,

@@ -9,7 +9,7 @@ guessed depth.
 
 import json
 import shutil
-from dataclasses import dataclass
+from dataclasses import asdict, dataclass
 from pathlib import Path
 
 import numpy as np
@@ -30,6 +30,7 @@ from swimm3r.io.trajectory import write_tum
 from swimm3r.lamp import Lamp, rescaled_lamp
 from swimm3r.medium import MediumFit, save_fits
 from swimm3r.scene.frames import Frames
+from swimm3r.scene.rig import RigFit
 from swimm3r.scene.white_balance import UNBALANCED, WHITE_BALANCE, WhiteBalance
 
 _CACHE = ArrayCache(max_bytes=256 << 20, least_entries=20)
@@ -168,6 +169,7 @@ class Reconstruction:
     warnings: tuple[QualityWarning, ...] = ()
     white_balance: WhiteBalance = UNBALANCED  # of everything that is shown
     points_found: int | None = None  # sparse ones, before the settings' cap; None: nothing was left out
+    rig: RigFit | None = None  # of a clip of several cameras that are fixed to each other
 
     def __repr__(self) -> str:
         dense = "" if self.cloud is None else f", {len(self.cloud.xyz):,} dense points"
@@ -262,6 +264,7 @@ class Reconstruction:
         self.white_balance.save(folder / WHITE_BALANCE)
         about = {"backend": self.backend, "metric": self.metric, "warnings": [vars(each) for each in self.warnings]}
         about["points_found"] = self.points_found
+        about["rig"] = None if self.rig is None else asdict(self.rig)
         write_text(folder / "reconstruction.json", json.dumps(about, indent=2) + "\n")
 
     def _place_depth(self, folder: Path) -> None:

@@ -18,6 +18,7 @@ from swimm3r.io.files.damage import guard, remake
 from swimm3r.io.files.json_file import read_json
 from swimm3r.scene.frames import Frames
 from swimm3r.scene.reconstruction import DenseCloud, DepthMaps, Matches, Points, QualityWarning, Reconstruction, Tracks
+from swimm3r.scene.rig import RigFit
 from swimm3r.scene.white_balance import UNBALANCED, WHITE_BALANCE, WhiteBalance, read_white_balance
 
 _UNFILTERED = "matches_unfiltered.npz"
@@ -38,6 +39,7 @@ class _About:
     metric: bool
     warnings: tuple[QualityWarning, ...]
     points_found: int | None = None  # earlier versions did not count
+    rig: RigFit | None = None
 
 
 def load_reconstruction(folder: str | Path, frames: Frames | None = None) -> Reconstruction:
@@ -74,6 +76,7 @@ def load_reconstruction(folder: str | Path, frames: Frames | None = None) -> Rec
         warnings=about.warnings,
         white_balance=read_run_balance(folder),
         points_found=about.points_found,
+        rig=about.rig,
     )
 
 

@@ -5,7 +5,7 @@ from pathlib import Path
 from typing import Annotated, Literal
 
 from swimm3r.errors import UsageError
-from swimm3r.settings import ClipSecond, CountOrZero, LongSideOrOwn, Range, Settings
+from swimm3r.settings import ClipSecond, CountOrZero, LongSideOrOwn, Range, Settings, Share
 
 
 @dataclass(frozen=True)
@@ -38,6 +38,19 @@ class FrameSettings(Settings):
     """Times of a bag's images: those of their headers, or those at which they were recorded."""
     camera_info: bool = True
     """Start from the lens that a bag's camera_info states, where neither --calibration nor --focal gives another."""
+    rig: tuple[str, ...] = ()
+    """Cameras of a rig: names of sub-folders or videos of SOURCE, topics of a bag, `side-by-side` for a video that
+    shows two, or `none`. By default sub-folders left and right are a stereo pair."""
+    rig_calibration: Path | None = None
+    """Calibration of the rig, its cameras in their order: Kalibr camchain, or stereo calibration of OpenCV or ROS.
+    It gives the scale, too."""
+    rig_pairs: Literal["auto", "name", "time", "order"] = "auto"
+    """Images of one instant: those of the same name, of the same time (in names or EXIF), or of the same place in
+    their folders; auto takes names, and where they differ times."""
+    rig_tolerance: Annotated[float, Range(above=0, most=10)] = 0.01
+    """Largest difference of the times of one instant in seconds."""
+    rig_missing: Share = 0.1
+    """Largest share of instants at which a camera of the rig may have no image."""
     odd_sizes: Literal["refuse", "skip"] = "refuse"
     """Handling of images whose size differs from most others: refuse the input, or skip them."""
 

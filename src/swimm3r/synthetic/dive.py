@@ -40,7 +40,7 @@ from swimm3r.scene.ground_truth import FOLDER
 from swimm3r.synthetic import disturbances
 from swimm3r.synthetic.lamp_light import lamp_backscatter, lamp_of, light_on
 from swimm3r.synthetic.optics import PixelRays, behind_port, lens_of, rays_of
-from swimm3r.synthetic.path import loop, survey
+from swimm3r.synthetic.path import loop, right_of, survey
 from swimm3r.synthetic.plain import Plain
 from swimm3r.synthetic.printed_markers import FAMILY, Plate, plates_along, with_plates
 from swimm3r.synthetic.render_frame import SAMPLES, render
@@ -86,6 +86,11 @@ class Dive:
         """The rays of pixel centers, and those of the samples that colors are means of."""
         return rays_of(self.cameras[0], self.housed), rays_of(self.cameras[0], self.housed, SAMPLES)
 
+    def seconds(self, i: int) -> float:
+        """Time at which image i is taken, from that of the first one on."""
+        instant, side = divmod(i, max(1, len(self.settings.sides)))
+        return instant / self.settings.fps + side * self.settings.stereo_delay
+
     def gains(self, i: int) -> Float[Tensor, "3"]:
         """The camera's factors on linear light in frame i; 1 without changes of exposure and white balance."""
         rng = np.random.default_rng(self.settings.stream(6, i))
@@ -94,10 +99,11 @@ class Dive:
     def frame(self, i: int) -> DiveFrame:
         """Render frame i; the same every time."""
         settings, camera = self.settings, self.cameras[i]
+        seconds = self.seconds(i)
         floor = self.floor.around(*camera.centers[0, :2].tolist())
         centers, samples = self.rays
         rays, sample_rays = centers.direction, samples.direction
-        radiance, z = render(floor, camera.cam2world[0].numpy(), centers, samples, i / settings.fps, settings.caustics)
+        radiance, z = render(floor, camera.cam2world[0].numpy(), centers, samples, seconds, settings.caustics)
         if self.plates:
             radiance, z = with_plates(radiance, z, camera, list(self.plates))
         radiance = radiance * np.array(settings.daylight)
@@ -114,7 +120,9 @@ class Dive:
         usable = torch.ones_like(z_depth, dtype=torch.bool)
         rng = np.random.default_rng(settings.stream(2, i))
         if settings.moving_object:
-            there = disturbances.swimming(floor, i / max(len(self) - 1, 1), settings.seed)
+            there = disturbances.swimming(
+                floor, seconds * settings.fps / max(settings.frame_count - 1, 1), settings.seed
+            )
             seen = disturbances.fish(sample_rays, z_depth, there.seen_from(camera.cam2world[0]))
             raw, usable = disturbances.with_fish(raw, seen, self.medium), disturbances.untouched(seen)
         if settings.marine_snow:
@@ -133,11 +141,16 @@ def make_dive(settings: DiveSettings) -> Dive:
 
     Raises UsageError where a survey's camera would see too far.
     """
+    later = settings.stereo_delay
     if settings.path == "loop":
         floor = make_seafloor(settings.seed, settings.corals, settings.season)
-        poses = loop(floor, settings.frames, settings.stream(1))
+        of_side = [loop(floor, settings.frames, settings.stream(1), t * settings.fps) for t in (0.0, later)]
     else:
-        floor, poses = Plain(settings.seed, settings.corals, settings.season), survey(settings)
+        floor = Plain(settings.seed, settings.corals, settings.season)
+        of_side = [survey(settings, t) for t in (0.0, later)]
+    poses = of_side[0]
+    if settings.sides:
+        poses = np.stack([of_side[0], right_of(of_side[1], settings.stereo)], 1).reshape(-1, 4, 4)
     housed, count = behind_port(settings), len(poses)
     lens = housed.central if housed else lens_of(settings)
     cameras = replace(
@@ -228,4 +241,5 @@ def water(settings: DiveSettings) -> Medium:
 
 
 def _names(settings: DiveSettings) -> tuple[str, ...]:
-    return tuple(f"{i:04d}.png" for i in range(settings.frame_count))
+    sides = [f"{side}/" for side in settings.sides] or [""]
+    return tuple(f"{side}{i:04d}.png" for i in range(settings.frame_count) for side in sides)

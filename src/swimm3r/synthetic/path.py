@@ -2,6 +2,7 @@
 
 import numpy as np
 from scipy import ndimage
+from scipy.spatial.transform import Rotation
 
 from swimm3r.errors import UsageError
 from swimm3r.synthetic.plain import REACH
@@ -11,8 +12,11 @@ from swimm3r.synthetic.settings import DiveSettings
 CLEARANCE = 0.65  # m above what is below, after smoothing
 
 
-def loop(floor: Seafloor, frames: int, stream: list[int]) -> np.ndarray:
-    """cam2world [frames, 4, 4] (OpenCV axes) along the loop; `stream` seeds what differs from visit to visit."""
+def loop(floor: Seafloor, frames: int, stream: list[int], later: float = 0.0) -> np.ndarray:
+    """cam2world [frames, 4, 4] (OpenCV axes) along the loop; `stream` seeds what differs from visit to visit.
+
+    `later` is the share of an interval between frames by which all of them are taken later.
+    """
     rng = np.random.default_rng(stream)
     phase = rng.uniform(-0.3, 0.3, 6)
     fine = np.arange(512) / 512
@@ -23,7 +27,7 @@ def loop(floor: Seafloor, frames: int, stream: list[int]) -> np.ndarray:
     around = [height_at(floor, x + r * np.cos(a), y + r * np.sin(a)) for r in (0.0, 0.25, 0.5) for a in ring]
     below = ndimage.gaussian_filter1d(np.max(around, axis=0), 40, mode="wrap")
     z = below + CLEARANCE + 0.16 * np.sin(2 * turn + phase[3]) + 0.1
-    at = np.arange(frames) * len(fine) // max(frames, 1)
+    at = ((np.arange(frames) + later) * len(fine) // max(frames, 1)).astype(int) % len(fine)
     yaw = 0.30 * np.sin(turn + np.pi + phase[4]) + 0.10 * np.sin(2 * turn + phase[5])
     pitch = np.radians(20) + np.radians(4) * np.sin(2 * turn + phase[1])
     roll = np.radians(5) * np.sin(turn + phase[2]) + np.radians(2.5) * np.sin(3 * turn + phase[0])
@@ -38,14 +42,15 @@ _ASTRAY = (0.15, np.radians(6))  # of a later visit's start in meters, and of it
 _HOLLOWS = 0.3  # m below the sand's mean that the ground may lie
 
 
-def survey(settings: DiveSettings) -> np.ndarray:
+def survey(settings: DiveSettings, later: float = 0.0) -> np.ndarray:
     """cam2world [frames, 4, 4] (OpenCV axes) of a transect or of parallel lines, with the sway of a vehicle.
 
-    Raises UsageError where the camera would see further than the plain's patches reach.
+    `later` is the seconds by which all frames are taken later. Raises UsageError where the camera would see further
+    than the plain's patches reach.
     """
     fine = _line(settings.length) if settings.path == "transect" else _lines(settings)
     along = np.concatenate([[0.0], np.cumsum(np.linalg.norm(np.diff(fine, axis=0), axis=1))])
-    seconds = np.arange(settings.frame_count) / settings.fps
+    seconds = np.arange(settings.frame_count) / settings.fps + later
     at = seconds * settings.speed
     x, y = (np.interp(at, along, fine[:, k]) for k in range(2))
     fine = _as_of_visit(fine, settings)
@@ -56,6 +61,17 @@ def survey(settings: DiveSettings) -> np.ndarray:
     poses = _poses(np.stack([x, y, settings.altitude + up], 1), heading + yaw, PITCH + pitch, roll)
     _check_reach(poses, settings)
     return poses
+
+
+_TOE = np.radians([0.4, -0.9, 0.3])  # turns of the right camera about its x, y and z axes: no two are quite parallel
+
+
+def right_of(poses: np.ndarray, baseline: float) -> np.ndarray:
+    """cam2world [n, 4, 4] of a second camera `baseline` meters to the right of the first ones, toed in by a degree."""
+    mounted = np.eye(4)
+    mounted[:3, :3] = Rotation.from_rotvec(_TOE).as_matrix()
+    mounted[0, 3] = baseline
+    return poses @ mounted
 
 
 def _as_of_visit(fine: np.ndarray, settings: DiveSettings) -> np.ndarray:

@@ -98,6 +98,11 @@ class DiveSettings(Settings):
     housing: HousingKind = "none"
     """Port of the camera housing, through which every ray is traced."""
     port: PortSettings = field(default_factory=PortSettings)
+    stereo: Annotated[float, Range(0, 2)] = 0.0
+    """Distance in meters of a second camera to the right of the first; 0 for a single camera. Images are in left/ and
+    right/ then."""
+    stereo_delay: Annotated[float, Range(0, 10)] = 0.0
+    """Seconds by which the second camera takes its images later: a pair that is not synchronized."""
     seed: Seed = 0
     """Seed of seafloor, path, water and disturbances."""
     family: Literal["cyan", "teal", "green", "warm"] | None = None
@@ -170,6 +175,11 @@ class DiveSettings(Settings):
         return [self.seed, *of] if self.visit == 0 else [self.seed, *of, self.visit + (1 << 20)]
 
     @property
+    def sides(self) -> tuple[str, ...]:
+        """Names of the cameras of a stereo dive; none of a single camera."""
+        return ("left", "right") if self.stereo else ()
+
+    @property
     def frame_count(self) -> int:
-        """Number of frames of the dive."""
+        """Number of frames of the dive, of each of its cameras."""
         return self.frames if self.path == "loop" else int(self.length / self.speed * self.fps) + 1

@@ -5,6 +5,7 @@ cam2world.
 """
 
 from dataclasses import dataclass
+from itertools import pairwise
 from pathlib import Path
 from typing import TYPE_CHECKING
 
@@ -193,10 +194,8 @@ def to_pycolmap(model: ColmapModel) -> "pycolmap.Reconstruction":
 
     order = np.argsort(model.track_frame, kind="stable")
     starts = np.searchsorted(model.track_frame[order], np.arange(len(model.names) + 1))
-    point2d = np.empty(len(order), np.int64)
     for i, name in enumerate(model.names):
         rows = order[starts[i] : starts[i + 1]]
-        point2d[rows] = np.arange(len(rows))
         image = pycolmap.Image(
             name=name, keypoints=model.track_xy[rows], camera_id=1 if shared else i + 1, image_id=i + 1
         )
@@ -204,6 +203,19 @@ def to_pycolmap(model: ColmapModel) -> "pycolmap.Reconstruction":
         out.add_image_with_trivial_frame(
             image, pycolmap.Rigid3d(pycolmap.Rotation3d(world2cam[:3, :3]), world2cam[:3, 3])
         )
+    add_points(out, model)
+    return out
+
+
+def add_points(out: "pycolmap.Reconstruction", model: ColmapModel) -> None:
+    """Add the points of the arrays to a reconstruction whose images have ids from 1 and their pixels in order."""
+    import pycolmap
+
+    order = np.argsort(model.track_frame, kind="stable")
+    starts = np.searchsorted(model.track_frame[order], np.arange(len(model.names) + 1))
+    point2d = np.empty(len(order), np.int64)
+    for first, last in pairwise(starts):
+        point2d[order[first:last]] = np.arange(last - first)
     by_point = np.argsort(model.track_point, kind="stable")
     starts = np.searchsorted(model.track_point[by_point], np.arange(len(model.xyz) + 1))
     for p, (xyz, rgb, error) in enumerate(zip(model.xyz, model.rgb, model.error, strict=True)):
@@ -213,4 +225,3 @@ def to_pycolmap(model: ColmapModel) -> "pycolmap.Reconstruction":
         point = pycolmap.Point3D()
         point.xyz, point.color, point.error, point.track = xyz, rgb, error, track
         out.add_point3D_with_id(p + 1, point)
-    return out

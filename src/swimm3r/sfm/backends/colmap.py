@@ -7,6 +7,7 @@ from swimm3r.scene.frames import Frames
 from swimm3r.scene.reconstruction import Reconstruction
 from swimm3r.scene.reconstruction_io import load_reconstruction
 from swimm3r.sfm.colmap import poses
+from swimm3r.sfm.colmap.rig import as_rig
 from swimm3r.sfm.lens import check_calibration
 from swimm3r.sfm.medium.apply import with_water
 from swimm3r.sfm.plane_sweep.estimate import estimate_depth
@@ -28,7 +29,9 @@ def reconstruct(
 ) -> Reconstruction:
     """Poses first, and saved at once: what comes after reads them from there when an interrupted run goes on."""
     if not (folder / "reconstruction.json").is_file():
-        poses.reconstruct(frames, settings, folder, progress, engine=engine).save(folder, frames)
+        rec = poses.reconstruct(frames, settings, folder, progress, engine=engine)
+        rec = rec if frames.rig is None else as_rig(rec, frames, settings, progress)
+        rec.save(folder, frames)
     rec = load_reconstruction(folder, frames)  # also where it was just made: the same bits as after an interruption
     estimate_depth(rec, frames, settings.depth, progress, engine)
     rec = with_water(rec, frames, settings, folder, progress)

@@ -122,15 +122,17 @@ def _runaway_depth(rec: Reconstruction) -> QualityWarning | None:
 
 
 def _jump(rec: Reconstruction, frames: Frames) -> QualityWarning | None:
-    if not frames.ordered or len(rec.names) < 5:
+    camera = None if frames.rig is None else frames.rig.names[0]
+    path = {name: k for k, name in enumerate(frame.name for frame in frames if frame.camera == camera)}
+    order = sorted((i for i, name in enumerate(rec.names) if name in path), key=lambda i: path[rec.names[i]])
+    if not frames.ordered or len(order) < 5:
         return None
-    order = sorted(range(len(rec.names)), key=lambda i: frames.index(rec.names[i]))
     poses = rec.cameras.cam2world[order]
     step = poses[1:, :3, 3].sub(poses[:-1, :3, 3]).norm(dim=1)
     turn = torch.rad2deg(rotation_angle(relative_poses(poses[:-1], poses[1:])[..., :3, :3]))
     jumps = ((step > _MAX_STEP * step.median()) | (turn > _MAX_TURN)).nonzero().flatten().tolist()
     # a gap where frames are missing, or a cut of the film, is no jump
-    numbers = [frames.index(rec.names[i]) for i in order]
+    numbers = [path[rec.names[i]] for i in order]
     jumps = [k for k in jumps if numbers[k + 1] == numbers[k] + 1]
     if not jumps:
         return None

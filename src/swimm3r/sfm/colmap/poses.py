@@ -9,6 +9,7 @@ import shutil
 from collections.abc import Iterator
 from contextlib import contextmanager
 from dataclasses import replace
+from itertools import pairwise
 from pathlib import Path
 from typing import TYPE_CHECKING
 
@@ -32,6 +33,7 @@ from swimm3r.scene.reconstruction import (
     Reconstruction,
     Tracks,
 )
+from swimm3r.scene.rig import first_of_instants
 from swimm3r.sfm.colmap import calibration, mapping
 from swimm3r.sfm.colmap.adjustment import adjust_through_port
 from swimm3r.sfm.colmap.chunks.long_clip import is_long, map_long_clip
@@ -131,8 +133,25 @@ def choose_pairs(store: FeatureDatabase, frames: Frames, settings: ColmapSetting
     if not frames.ordered and settings.pairs == "auto":
         return vlad.alike_pairs(described, 5 * settings.loops)
     steps = {*range(1, settings.overlap + 1), *(2**k for k in range(settings.overlap.bit_length(), 8))}
-    near = {(i, i + step) for i in range(n) for step in steps if i + step < n}
-    return sorted(near | set(vlad.alike_pairs(described, settings.loops, apart=settings.overlap)))
+    cameras = 1 if frames.rig is None else len(frames.rig.cameras)
+    near = _near(frames, steps)
+    return sorted(near | set(vlad.alike_pairs(described, settings.loops, apart=settings.overlap * cameras)))
+
+
+def _near(frames: Frames, steps: set[int]) -> set[tuple[int, int]]:
+    """Pairs of frames that lie so many steps apart.
+
+    Of a rig each camera is paired with itself so many instants later, and all of them at an instant and with the next.
+    """
+    starts = first_of_instants([frame.instant for frame in frames])
+    groups = [range(first, last) for first, last in pairwise([*starts, len(frames)])]
+    camera = [frame.camera for frame in frames]
+    found = {pair for group in groups for pair in itertools.combinations(group, 2)}
+    for k, step in itertools.product(range(len(groups)), steps):
+        if k + step < len(groups):
+            both = itertools.product(groups[k], groups[k + step])
+            found |= {(i, j) for i, j in both if step == 1 or camera[i] == camera[j]}
+    return found
 
 
 def absolute_pose(
