@@ -36,7 +36,7 @@ def run(survey, tmp_path) -> Path:
 def scaled(run: Path, settings: ScaleSettings) -> bool:
     with open_record(run, Path("dive.mp4"), "none") as record:
         record.summary |= json.loads((run / "summary.json").read_text())
-        done = _scaled(record, RunSettings(scale=settings), silent)
+        done = _scaled(record, load_reconstruction(run / "sfm"), RunSettings(scale=settings), silent)
         record.add(scale_sections(run, load_reconstruction(run / "sfm")))
         record.write()
     return done

@@ -29,7 +29,8 @@ def run():
 
 
 def solved(run, **options):
-    return estimate_scale(*run, ScaleSettings(**options))
+    rec, frames = run
+    return estimate_scale(rec, frames, ScaleSettings(**options))
 
 
 def with_known(run, length):
