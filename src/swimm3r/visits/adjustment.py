@@ -30,7 +30,7 @@ if TYPE_CHECKING:
 
 IDENTITY = Sim3(1.0, np.eye(3), np.zeros(3))
 _CHECK_EVERY = 5  # shared points of which one is a check point
-_ROUNDS = 2
+_ROUNDS = 4
 _STABLE = 4.0  # median reprojection errors within which a shared point lies on stable ground
 _LEAST_ERROR = 0.5  # pixels
 _LEAST_OBSERVED = 8  # points of a frame that tell how its depth has changed
@@ -67,16 +67,16 @@ class Placed:
 def place(a: Reconstruction, b: Reconstruction, matches: VisitMatches, alignment: Alignment) -> Placed:
     """Visit b in the axes and unit of visit a, adjusted to the points that both have."""
     moved = _moved(b, alignment.a_from_b)
-    shared = matches.select(alignment.inlier)
+    shared = matches.select(alignment.verified)
     if not len(shared):
         factors = dict.fromkeys(b.names, float(alignment.a_from_b.scale))
         nothing = np.zeros((0, 3))
         return Placed(replace(moved, depth=ScaledDepthMaps(b.depth.folder, factors)), CheckPoints(nothing, nothing))
     check = np.unique(shared.point_b, return_inverse=True)[1].reshape(-1) % _CHECK_EVERY == 0
-    adjusted, stable = moved, check
+    adjusted, stable = moved, alignment.inlier[alignment.verified]
     for _ in range(_ROUNDS):
         errors = Pairs(a, adjusted, shared).errors(IDENTITY)
-        stable = errors <= max(_LEAST_ERROR, _STABLE * float(np.median(errors)))
+        stable = errors <= max(_LEAST_ERROR, _STABLE * float(np.median(errors[stable])))
         adjusted = _adjusted(a, moved, shared.select(stable & ~check))
     factors = _depth_factors(moved, adjusted, b, alignment.a_from_b.scale)
     placed = replace(adjusted, depth=ScaledDepthMaps(b.depth.folder, factors))

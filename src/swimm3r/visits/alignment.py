@@ -1,4 +1,4 @@
-"""The similarity from one visit to another by points that both have: RANSAC, then least squares of reprojections.
+"""The similarity from one visit to another: that of the localized frame with which most agree, then least squares.
 
 A point of visit b, moved to visit a, must project onto the feature that sees it there, and the other way round. The
 residuals count with the soft L1 norm, so that points on changed ground, which fit badly, do not pull. The covariance
@@ -6,6 +6,7 @@ of the seven parameters is the sandwich estimate with the frames of visit b as c
 error of its pose, and do not count as independent.
 """
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Any
 
@@ -19,15 +20,16 @@ from swimm3r.cameras import project
 from swimm3r.errors import RegistrationError
 from swimm3r.products.survey import Survey
 from swimm3r.scene.reconstruction import Reconstruction
-from swimm3r.sfm.colmap.chunks.links import Sim3, fit_similarity
+from swimm3r.sfm.colmap.chunks.links import Sim3
+from swimm3r.visits.localized import Localized, among, localized_frames
 from swimm3r.visits.matches import VisitMatches
 
 LEAST = 25  # points that agree
-_LEAST_SHARE = 0.1  # of all matches
+_LEAST_SHARE = 0.1  # of the verified matches: the adjustment brings in more, where models are bent
 _LEAST_FRAMES = 3  # of either visit, with points that agree
 _MAX_ERROR = 12.0  # pixels of an image of 1000; never less than _LEAST_ERROR
 _LEAST_ERROR = 5.0
-_TRIALS = 2000
+_TRIED = 60  # localized frames, those with the most matches
 _BEND = 1.5  # pixels at which a residual begins to count less
 _REFITS = 5
 
@@ -39,7 +41,9 @@ class Alignment:
     a_from_b: Sim3
     covariance: Float[np.ndarray, "7 7"]  # of log scale, turn (rad) about `pivot` and shift, in a's axes and unit
     pivot: Float[np.ndarray, "3"]  # mean of the shared points, in a
-    inlier: Bool[np.ndarray, " n"]  # of the matches
+    inlier: Bool[np.ndarray, " n"]  # of the matches, once for every two points
+    verified: Bool[np.ndarray, " n"]  # inliers, and others that agree with the pose of a localized frame
+    matched: int  # pairs of points
     error_px: float | None  # median over the inliers, of the larger reprojection error; None without matches
 
     def covariance_at(self, points: Float[np.ndarray, "n 3"]) -> Float[np.ndarray, "n 3 3"]:
@@ -60,24 +64,28 @@ def align(a: Reconstruction, b: Reconstruction, matches: VisitMatches, names: tu
     Raises RegistrationError where too few points agree: the dives show different places.
     """
     pairs = Pairs(a, b, matches)
-    found = _ransac(pairs)
+    localized = localized_frames(a, b, matches, pairs.max_error)
+    verified = among(matches, localized)
+    distinct = matches.one_of_each(verified)
+    verified &= distinct
+    found = _most_agreed(pairs, localized, verified)
     if found is None:
-        raise _apart(names, 0, len(matches))
+        raise _apart(names, 0, int(distinct.sum()))
     for _ in range(_REFITS):
-        inlier = pairs.errors(found) < pairs.max_error
-        again = _refined(pairs, found, inlier)
-        if np.array_equal(inlier, pairs.errors(again) < pairs.max_error):
+        inlier = distinct & (pairs.errors(found) < pairs.max_error)
+        found = _refined(pairs, found, inlier)
+        if np.array_equal(inlier, distinct & (pairs.errors(found) < pairs.max_error)):
             break
-        found = again
     errors = pairs.errors(found)
-    inlier = errors < pairs.max_error
+    inlier = distinct & (errors < pairs.max_error)
     agreeing = matches.select(inlier)
     frames = min(len(np.unique(agreeing.frame_a)), len(np.unique(agreeing.frame_b)))
-    if len(agreeing) < max(LEAST, _LEAST_SHARE * len(matches)) or frames < _LEAST_FRAMES:
-        raise _apart(names, len(agreeing), len(matches))
+    if len(agreeing) < max(LEAST, _LEAST_SHARE * verified.sum()) or frames < _LEAST_FRAMES:
+        raise _apart(names, len(agreeing), int(distinct.sum()))
     pivot = pairs.xyz_a[inlier].mean(0)
     covariance = _covariance(pairs, found, inlier, pivot)
-    return Alignment(found, covariance, pivot, inlier, float(np.median(errors[inlier])))
+    error = float(np.median(errors[inlier]))
+    return Alignment(found, covariance, pivot, inlier, inlier | verified, int(distinct.sum()), error)
 
 
 def by_georeference(a: Survey, b: Survey) -> tuple[Alignment, float, float] | None:
@@ -98,7 +106,7 @@ def by_georeference(a: Survey, b: Survey) -> tuple[Alignment, float, float] | No
     covariance[0, 0] = relative
     covariance[1:4, 1:4] = one.R.T @ np.diag(turns[0] ** 2 + turns[1] ** 2) @ one.R
     covariance[4:, 4:] = one.R.T @ np.diag(stds[0] ** 2 + stds[1] ** 2) @ one.R / one.scale**2
-    found = Alignment(Sim3(scale, R, t), covariance, t, np.zeros(0, bool), None)
+    found = Alignment(Sim3(scale, R, t), covariance, t, np.zeros(0, bool), np.zeros(0, bool), 0, None)
     both = np.hypot(*stds)
     return found, float(np.hypot(both[0], both[1]) / np.sqrt(2)), float(both[2])
 
@@ -110,16 +118,8 @@ class Pairs:
         self.a, self.b, self.matches = a, b, matches
         self.xyz_a = a.points.xyz.double().numpy()[matches.point_a]
         self.xyz_b = b.points.xyz.double().numpy()[matches.point_b]
-        self.z_b = _projected(b, matches.frame_b, self.xyz_b)[1]
-        self.focal_b = b.cameras.K[:, 0, 0].double().numpy()[matches.frame_b]
         longest = max(a.cameras.width, a.cameras.height, b.cameras.width, b.cameras.height)
         self.max_error = max(_LEAST_ERROR, _MAX_ERROR * longest / 1000)
-
-    def apart(self, found: Sim3, rows: np.ndarray) -> Float[np.ndarray, " n"]:
-        """Distance of the points of some pairs, in pixels of b's frames: cheap, and blind to the direction of view."""
-        back = found.inverse()(self.xyz_a[rows])
-        away = np.linalg.norm(back - self.xyz_b[rows], axis=1)
-        return away * self.focal_b[rows] / np.maximum(self.z_b[rows], 1e-9)
 
     def residuals(self, found: Sim3, rows: np.ndarray) -> Float[np.ndarray, "n 4"]:
         """Reprojection errors in the frame of a (x, y), then of b, pixels; infinite behind a camera."""
@@ -129,27 +129,20 @@ class Pairs:
         out = np.column_stack([in_a - chosen.xy_a, in_b - chosen.xy_b])
         return np.where(((z_a > 0) & (z_b > 0))[:, None], out, np.inf)
 
-    def errors(self, found: Sim3) -> Float[np.ndarray, " n"]:
-        """The larger of both reprojection errors of each pair, pixels."""
-        off = self.residuals(found, np.arange(len(self.matches)))
+    def errors(self, found: Sim3, rows: np.ndarray | None = None) -> Float[np.ndarray, " n"]:
+        """The larger of both reprojection errors of each pair, or of some of them, pixels."""
+        off = self.residuals(found, np.arange(len(self.matches)) if rows is None else rows)
         return np.maximum(np.linalg.norm(off[:, :2], axis=1), np.linalg.norm(off[:, 2:], axis=1))
 
 
-def _ransac(pairs: Pairs) -> Sim3 | None:
-    """The similarity of three pairs with which most others agree; None without any."""
-    count = len(pairs.matches)
-    if count < LEAST:
-        return None
-    rng, everything = np.random.default_rng(0), np.arange(count)
+def _most_agreed(pairs: Pairs, localized: Sequence[Localized], verified: Bool[np.ndarray, " n"]) -> Sim3 | None:
+    """The similarity of the localized frame with which most verified matches agree; None without any."""
+    rows = np.flatnonzero(verified)
     best, most = None, 0
-    for _ in range(_TRIALS):
-        three = rng.choice(count, 3, replace=False)
-        trial = fit_similarity(pairs.xyz_b[three], pairs.xyz_a[three])
-        if trial is None:
-            continue
-        agree = int((pairs.apart(trial, everything) < 2 * pairs.max_error).sum())  # depth adds to the distance
+    for each in localized[:_TRIED]:
+        agree = int((pairs.errors(each.a_from_b, rows) < 2 * pairs.max_error).sum())  # its scale is a rough one
         if agree > most:
-            best, most = trial, agree
+            best, most = each.a_from_b, agree
     return best if most >= LEAST else None
 
 

@@ -1,12 +1,14 @@
 """Differences of two visits, cell by cell, with standard deviations that the pair of visits itself has confirmed.
 
     d  = h_b - h_a
-    s2 = s_a^2 + s_b^2 + slope^2 (s_xy^2 + s_r^2) + s_z^2
+    s2 = s_a^2 + s_b^2 + |grad h|^2 (s_xy^2 + s_p^2) + s_z^2 + |grad d|^2 s_r^2
 
-s_r is the resolution of the heights; s_xy and s_z are what check points say of the alignment (`adjustment`), s_z with
-its covariance at the cell. Errors that both visits have in common cancel, those of a surface that looks different now
-do not: there the deviations are larger. Most of the ground is taken to be unchanged: where the spread of d / s over all
-cells, found from its median absolute value, is above 1, it is the factor by which s was too small.
+s_p is the place that a height was taken at within its cell; s_xy and s_z are what check points say of the alignment
+(`misfit`), at the cell. s_r is the place of a rim: maps smear a change over the ground beside it. Errors that both
+visits have in common cancel, those of a surface that looks different now do not: there the deviations are larger.
+Most of the ground, near and far from the cameras, is taken to be unchanged: where the spread of d / s over the cells at
+like distances, found from its median absolute value, is above 1, it is the factor by which s was too small. Depth and
+water are known the less, the farther away the ground was.
 
 A change is significant from `threshold` s on. From such cells it is followed to neighbors of at least two thirds of it
 in the same direction, so that flanks belong to the place; places smaller than `min_area` are left out. Cells that one
@@ -33,6 +35,8 @@ _SMOOTH = 1.0  # cells, standard deviation of the filter that both visits pass: 
 _MIN_CELLS = 40  # of a place, by default
 _UNLIKE = 15.0  # CIELAB difference at which deviations of heights are larger by the square root of 2
 _NEAR = 2  # cells around one whose heights tell how steep the ground is
+_CLASSES, _CLASS_CELLS = 8, 400  # of distances: how many at most, and the cells of each at least
+_RIM = 0.5  # cells, standard deviation of the place of a change's rim, which the filter leaves
 _PLACED = 0.25  # cells, standard deviation of where a cell's height was taken: half a pixel of a frame
 
 
@@ -40,9 +44,8 @@ _PLACED = 0.25  # cells, standard deviation of where a cell's height was taken: 
 class Misfit:
     """Uncertainty of the place of one visit on another one's ground, local units."""
 
-    level: float  # horizontal, per axis
-    up: float
-    up_at: Float[np.ndarray, "h w"]  # of the similarity alone, at the cells
+    level: Float[np.ndarray, "h w"]  # horizontal, per axis
+    up: Float[np.ndarray, "h w"]
 
 
 @dataclass(frozen=True)
@@ -51,7 +54,7 @@ class Difference:
 
     value: Float32[np.ndarray, "h w"]
     std: Float32[np.ndarray, "h w"]
-    inflation: float  # factor that the standard deviations were multiplied by
+    inflation: float  # factor that the standard deviations were multiplied by, median over the cells
 
     @property
     def significance(self) -> Float32[np.ndarray, "h w"]:
@@ -104,13 +107,18 @@ def _height_difference(a: Ground, b: Ground, misfit: Misfit, gsd: float) -> tupl
     value = (smooth_b - smooth_a).astype(np.float64)
     slope = np.maximum(_slope(smooth_a), _slope(smooth_b)) / gsd
     variance = a.height_std.astype(np.float64) ** 2 + b.height_std.astype(np.float64) ** 2
-    variance += slope**2 * (misfit.level**2 + (_PLACED * gsd) ** 2) + misfit.up**2 + misfit.up_at**2
+    variance += slope**2 * (misfit.level**2 + (_PLACED * gsd) ** 2) + misfit.up**2
+    variance += _smeared(value)
     shifted = float(np.nanmedian(value)) if np.isfinite(value).any() else 0.0
-    return _calibrated(value - shifted, np.sqrt(variance)), shifted
+    return _calibrated(value - shifted, np.sqrt(variance), np.fmax(a.distance, b.distance)), shifted
 
 
 def _color_difference(
-    a: Ground, b: Ground, gains: Float[np.ndarray, "3"], white: Float[np.ndarray, "3"], level: float
+    a: Ground,
+    b: Ground,
+    gains: Float[np.ndarray, "3"],
+    white: Float[np.ndarray, "3"],
+    level: Float[np.ndarray, "h w"],
 ) -> tuple[Difference, Float32[np.ndarray, "h w 3"]]:
     """CIELAB distance, and the differences of L*, a*, b*; `level` is the misfit in cells."""
     lights = [_smoothed(ground.color) * factor for ground, factor in ((a, white), (b, white * gains))]
@@ -122,9 +130,10 @@ def _color_difference(
     variance = lab_variance(lights[0], stds[0]) + lab_variance(lights[1], stds[1])
     for k in range(3):
         detail = np.maximum(*(_slope(each[..., k]) for each in labs))
-        variance[..., k] += detail**2 * (level**2 + _PLACED**2)
-    # one factor for each of L*, a*, b*: their errors differ in origin
-    each = [_calibrated(by_axis[..., k], np.sqrt(variance[..., k])) for k in range(3)]
+        variance[..., k] += detail**2 * (level**2 + _PLACED**2) + _smeared(by_axis[..., k])
+    # factors of their own for L*, a*, b*: their errors differ in origin
+    distance = np.fmax(a.distance, b.distance)
+    each = [_calibrated(by_axis[..., k], np.sqrt(variance[..., k]), distance) for k in range(3)]
     std = np.stack([one.std for one in each], -1)
     value = np.sqrt((by_axis**2).sum(-1))
     along = np.sqrt((by_axis**2 * std**2).sum(-1)) / np.maximum(value, 1e-9)
@@ -133,13 +142,24 @@ def _color_difference(
     return found, by_axis.astype(np.float32)
 
 
-def _calibrated(value: Float[np.ndarray, "h w"], std: Float[np.ndarray, "h w"]) -> Difference:
-    """The difference with its deviations made as large as the spread of most cells says."""
+def _calibrated(
+    value: Float[np.ndarray, "h w"], std: Float[np.ndarray, "h w"], distance: Float32[np.ndarray, "h w"]
+) -> Difference:
+    """The difference with its deviations made as large as the spread of most cells at like distances says."""
     known = np.isfinite(value) & np.isfinite(std)
-    ratio = np.abs(value[known] / std[known])
-    inflation = max(1.0, _MAD * float(np.median(ratio))) if len(ratio) else 1.0
-    scaled = inflation * std
-    return Difference(value.astype(np.float32), scaled.astype(np.float32), inflation)
+    factor = np.ones(value.shape)
+    if known.any():
+        factor[known] = _inflations(np.abs(value[known] / std[known]), distance[known].astype(np.float64))
+    inflation = float(np.median(factor[known])) if known.any() else 1.0
+    return Difference(value.astype(np.float32), (factor * std).astype(np.float32), inflation)
+
+
+def _inflations(ratio: Float[np.ndarray, " n"], distance: Float[np.ndarray, " n"]) -> Float[np.ndarray, " n"]:
+    """Factors on deviations by the differences in deviations, found in classes of distance and interpolated."""
+    classes = np.array_split(np.argsort(distance, kind="stable"), max(1, min(_CLASSES, len(ratio) // _CLASS_CELLS)))
+    at = [float(np.median(distance[rows])) for rows in classes]
+    factors = [max(1.0, _MAD * float(np.median(ratio[rows]))) for rows in classes]
+    return np.interp(distance, at, factors)
 
 
 def _kinds(
@@ -194,6 +214,12 @@ def _slope(height: Float[np.ndarray, "h w"]) -> Float[np.ndarray, "h w"]:
     """Largest difference of heights near a cell, per cell: steps count in full, unlike in a gradient."""
     filled = _filled(height)
     return (ndimage.maximum_filter(filled, 2 * _NEAR + 1) - ndimage.minimum_filter(filled, 2 * _NEAR + 1)) / (2 * _NEAR)
+
+
+def _smeared(difference: Float[np.ndarray, "h w"]) -> Float[np.ndarray, "h w"]:
+    """Variance of a difference beside a rim."""
+    down, across = np.gradient(_filled(difference))
+    return _RIM**2 * (down**2 + across**2)
 
 
 def _filled(values: Float[np.ndarray, "h w"]) -> Float[np.ndarray, "h w"]:

@@ -13,6 +13,7 @@ from typing import Any
 import numpy as np
 import torch
 from jaxtyping import Bool, Float32, UInt16
+from scipy.spatial import KDTree
 
 from swimm3r.errors import UsageError
 from swimm3r.medium import linear_from_srgb
@@ -40,6 +41,7 @@ class Ground:
     views: UInt16[np.ndarray, "h w"]
     color: Float32[np.ndarray, "h w 3"]  # without the water, linear light
     color_std: Float32[np.ndarray, "h w 3"]
+    distance: Float32[np.ndarray, "h w"]  # from the nearest camera, local units
 
     @property
     def seen(self) -> Bool[np.ndarray, "h w"]:
@@ -73,6 +75,7 @@ def observe(survey: Survey, grid: Grid, progress: Progress = silent) -> Ground:
     ground = Ground(
         np.full(shape, np.nan, np.float32), np.full(shape, np.nan, np.float32), np.zeros(shape, np.uint16),
         np.full((*shape, 3), np.nan, np.float32), np.full((*shape, 3), np.nan, np.float32),
+        np.full(shape, np.nan, np.float32),
     )  # fmt: skip
     tiles = list(grid.tiles(_TILE))
     for done, window in enumerate(tiles):
@@ -93,10 +96,14 @@ def _fill(ground: Ground, survey: Survey, grid: Grid, window: Window) -> None:
     ground.height_std[own] = _MEDIAN * found.std / np.sqrt(np.maximum(found.views, 1))
     ground.views[own] = found.views
     rows, columns = np.nonzero(~np.isnan(found.height))
-    if not survey.has("physical") or not len(rows):
+    if not len(rows):
         return
     x, y = grid.centers(window)
     points = Points(np.stack([x[columns], y[rows], found.height[rows, columns]], -1), size=grid.gsd)
+    nearest: Any = KDTree(survey.centers[list(survey.indices)]).query(points.xyz)
+    ground.distance[own][rows, columns] = nearest[0]
+    if not survey.has("physical"):
+        return
     mean, std = _colors(survey, points, frames)
     ground.color[own][rows, columns], ground.color_std[own][rows, columns] = mean, std
 

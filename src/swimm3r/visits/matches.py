@@ -1,7 +1,7 @@
 """Matches between two visits: keypoints on triangulated points of either, of frames that look alike.
 
 Frames are compared by VLAD over a vocabulary learned from both visits; keypoints by SIFT, which sees gradients and not
-the color of the water. A pair of points that several pairs of frames match counts once.
+the color of the water. Several pairs of frames may match the same two points.
 """
 
 from collections.abc import Sequence
@@ -10,7 +10,7 @@ from typing import Any
 
 import numpy as np
 import torch
-from jaxtyping import Float, Int
+from jaxtyping import Bool, Float, Int
 from scipy.spatial import KDTree
 from torch import Tensor
 
@@ -37,7 +37,7 @@ class Landmarks:
 
 @dataclass(frozen=True)
 class VisitMatches:
-    """Points that two visits share, one row each, and a frame of either visit that observes the point."""
+    """Points of two visits that may be the same, a frame of either visit that observes each, and where."""
 
     point_a: Int[np.ndarray, " n"]
     point_b: Int[np.ndarray, " n"]
@@ -52,6 +52,18 @@ class VisitMatches:
     def select(self, rows: np.ndarray) -> "VisitMatches":
         """Some of the matches."""
         return VisitMatches(*(getattr(self, field.name)[rows] for field in fields(self)))
+
+    def reversed(self) -> "VisitMatches":
+        """The matches with the visits exchanged."""
+        return VisitMatches(self.point_b, self.point_a, self.frame_b, self.frame_a, self.xy_b, self.xy_a)
+
+    def one_of_each(self, preferred: Bool[np.ndarray, " n"]) -> Bool[np.ndarray, " n"]:
+        """True for one match of every two points, a preferred one where there is any."""
+        order = np.argsort(~preferred, kind="stable")
+        first = np.unique(np.column_stack([self.point_a, self.point_b])[order], axis=0, return_index=True)[1]
+        found = np.zeros(len(self), bool)
+        found[order[first]] = True
+        return found
 
 
 def landmarks_of(survey: Survey, max_frames: int, progress: Progress = silent) -> list[Landmarks]:
@@ -102,8 +114,6 @@ def match_visits(
         rows.append(np.column_stack([*ends, one.xy[found[:, 0]], other.xy[found[:, 1]]]))
     progress("matching the visits", len(pairs), len(pairs))
     table = np.concatenate(rows) if rows else np.zeros((0, 8))
-    _, first = np.unique(table[:, :2].astype(np.int64), axis=0, return_index=True)
-    table = table[np.sort(first)]
     whole = table[:, :4].astype(np.int64)
     return VisitMatches(whole[:, 0], whole[:, 1], whole[:, 2], whole[:, 3], table[:, 4:6], table[:, 6:8])
 

@@ -1,7 +1,12 @@
 """One visit brought onto another, and the uncertainty of its place on the other's ground.
 
 Check points, averaged over neighborhoods of the site, show the bends that are left: the error of a single point is its
-own and no matter of the ground. The covariance of the similarity adds what grows away from the shared points.
+own and no matter of the ground. m_j is the offset of the neighborhood nearest to a cell, d its distance:
+
+    s^2 = max(s_0, |m_j|)^2 + (r d)^2,   s_0 = 1.4826 median |m|,   r = median |m_i - m_j| / |x_i - x_j|
+
+so that the uncertainty grows away from the points that both visits share. With too few check points, the covariance of
+the similarity takes their place.
 """
 
 from dataclasses import dataclass
@@ -26,7 +31,39 @@ from swimm3r.visits.settings import VisitSettings
 
 _NEIGHBORS = 8  # check points of a neighborhood
 _MAD = 1.4826
-_LEAST_CHECKS = 4
+_LEAST_CHECKS = 10
+_PAIRS = 2000  # of neighborhoods, whose offsets tell how fast bends change
+
+
+@dataclass(frozen=True)
+class Bends:
+    """Offsets of neighborhoods of check points, local axes and units."""
+
+    xy: Float[np.ndarray, "n 2"]
+    off: Float[np.ndarray, "n 3"]  # of the later visit from the earlier one
+
+    @property
+    def spread(self) -> tuple[float, float]:
+        """Standard deviation of a typical neighborhood, horizontal per axis and vertical."""
+        x, y, up = np.sqrt(np.median(self.off**2, axis=0)) * _MAD
+        return float(np.hypot(x, y) / np.sqrt(2)), float(up)
+
+    def at(self, xy: Float[np.ndarray, "k 2"]) -> tuple[Float[np.ndarray, " k"], Float[np.ndarray, " k"]]:
+        """Horizontal and vertical standard deviation at places."""
+        nearest: Any = KDTree(self.xy).query(xy)
+        distance, j = nearest
+        rng = np.random.default_rng(0)
+        one, other = rng.integers(len(self.xy), size=(2, _PAIRS))
+        apart = np.linalg.norm(self.xy[one] - self.xy[other], axis=1)
+        told = apart > np.median(apart) / 4  # nearer ones share check points
+        off = np.column_stack([np.hypot(self.off[:, 0], self.off[:, 1]) / np.sqrt(2), np.abs(self.off[:, 2])])
+        change = np.column_stack([
+            np.linalg.norm(self.off[one, :2] - self.off[other, :2], axis=1) / np.sqrt(2),
+            np.abs(self.off[one, 2] - self.off[other, 2]),
+        ])  # fmt: skip
+        rate = np.median(change[told] / apart[told, None], axis=0) if told.any() else np.zeros(2)
+        level, up = (np.hypot(np.maximum(least, off[j, k]), rate[k] * distance) for k, least in enumerate(self.spread))
+        return level, up
 
 
 @dataclass(frozen=True)
@@ -40,6 +77,7 @@ class Fit:
     check_points: int
     level: float  # standard deviation of its place on the other's ground, horizontal per axis, local units
     up: float
+    bends: Bends | None = None  # None with too few check points
 
 
 def align_visit(
@@ -65,8 +103,12 @@ def align_visit(
         moved = place(a.rec, b.rec, matches.select(np.zeros(0, np.int64)), alignment)
         return Fit(name_a, "georeference", moved.rec, alignment, 0, level, up)
     placed = place(a.rec, b.rec, matches, alignment)
-    level, up = _left(placed.check, a.place, alignment)
-    return Fit(name_a, "images", placed.rec, alignment, len(placed.check.xyz_a), level, up)
+    checks = len(placed.check.xyz_a)
+    if checks < _LEAST_CHECKS:
+        size = float(np.sqrt(np.trace(alignment.covariance[4:, 4:]) / 3)) * a.scale
+        return Fit(name_a, "images", placed.rec, alignment, checks, size, size)
+    bends = _bends(placed.check, a.place)
+    return Fit(name_a, "images", placed.rec, alignment, checks, *bends.spread, bends)
 
 
 def misfit_at(earlier: Fit | None, later: Fit | None, ground: Ground, grid: Grid, georeference: Georeference) -> Misfit:
@@ -76,34 +118,33 @@ def misfit_at(earlier: Fit | None, later: Fit | None, ground: Ground, grid: Grid
         fits = [later]
     x, y = grid.centers(Window(0, 0, grid.rows, grid.columns))
     height = np.where(np.isnan(ground.height), np.nanmedian(ground.height), ground.height)
-    step = max(1, min(grid.rows, grid.columns) // 64)  # the covariance is smooth
+    step = max(1, min(grid.rows, grid.columns) // 64)  # bends and covariance are smooth
     coarse = np.stack(np.broadcast_arrays(x[None, ::step], y[::step, None], height[::step, ::step]), -1)
-    shape, points = coarse.shape[:2], georeference.from_local(coarse.reshape(-1, 3).astype(np.float64))
-    variance = np.zeros(shape)
+    shape, points = coarse.shape[:2], coarse.reshape(-1, 3).astype(np.float64)
+    variance = np.zeros((2, *shape))
     for fit in fits:
-        up = georeference.up
-        along = np.einsum("i,nij,j->n", up, fit.alignment.covariance_at(points), up)
-        variance += along.reshape(shape) * (georeference.scale or 1.0) ** 2
+        variance += np.stack(_stds(fit, points, georeference)).reshape(2, *shape) ** 2
     rows, columns = np.minimum(np.arange(grid.rows) // step, shape[0] - 1), np.arange(grid.columns) // step
-    up_at = np.sqrt(variance)[np.ix_(rows, np.minimum(columns, shape[1] - 1))]
-    return Misfit(
-        level=float(np.sqrt(sum(fit.level**2 for fit in fits))),
-        up=float(np.sqrt(sum(fit.up**2 for fit in fits))),
-        up_at=up_at,
-    )
+    level, up = np.sqrt(variance)[:, rows[:, None], np.minimum(columns, shape[1] - 1)[None]]
+    return Misfit(level, up)
 
 
-def _left(check: CheckPoints, georeference: Georeference, alignment: Alignment) -> tuple[float, float]:
-    """Horizontal and vertical standard deviation of neighborhoods of check points, local units."""
-    if len(check.xyz_a) < _LEAST_CHECKS:
-        scale = georeference.scale or 1.0
-        sizes = np.sqrt(np.trace(alignment.covariance[4:, 4:]) / 3) * scale
-        return float(sizes), float(sizes)
-    off = georeference.to_local(check.xyz_b - check.xyz_a)
-    nearby = _neighborhoods(georeference.to_local(check.xyz_a)[:, :2])
-    middle = np.median(off[nearby], axis=1)
-    spread = np.sqrt(np.median(middle**2, axis=0)) * _MAD
-    return float(np.hypot(*spread[:2]) / np.sqrt(2)), float(spread[2])
+def _stds(
+    fit: Fit, points: Float[np.ndarray, "n 3"], georeference: Georeference
+) -> tuple[Float[np.ndarray, " n"], Float[np.ndarray, " n"]]:
+    """Horizontal and vertical standard deviation of a fit at local points."""
+    if fit.bends is not None:
+        return fit.bends.at(points[:, :2])
+    up = georeference.up
+    along = np.einsum("i,nij,j->n", up, fit.alignment.covariance_at(georeference.from_local(points)), up)
+    return np.full(len(points), fit.level), np.sqrt(along * (georeference.scale or 1.0) ** 2 + fit.up**2)
+
+
+def _bends(check: CheckPoints, georeference: Georeference) -> Bends:
+    xy = georeference.to_local(check.xyz_a)[:, :2]
+    off = georeference.to_local(check.xyz_b) - georeference.to_local(check.xyz_a)
+    nearby = _neighborhoods(xy)
+    return Bends(np.median(xy[nearby], axis=1), np.median(off[nearby], axis=1))
 
 
 def _neighborhoods(xy: Float[np.ndarray, "n 2"]) -> Int[np.ndarray, "n k"]:

@@ -118,10 +118,11 @@ def write_polygons(
     rasterio = geo_package("rasterio")
     from rasterio.features import shapes
 
-    whole = rasterio.Affine.from_gdal(*grid.affine(place))
+    west, step, _, north, _, _ = grid.affine(place)
     parts = []
     for outline in outlines:
-        transform = whole * rasterio.Affine.translation(outline.column, outline.row)
+        corner = west + outline.column * step, north - outline.row * step
+        transform = rasterio.Affine.from_gdal(corner[0], step, 0, corner[1], 0, -step)
         found = shapes(outline.mask.astype(np.uint8), mask=outline.mask, transform=transform)
         parts.append([shape["coordinates"] for shape, _ in found])
     features = [

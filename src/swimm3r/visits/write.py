@@ -200,7 +200,7 @@ def _alignment_record(fit: Fit) -> AlignmentRecord:
     return AlignmentRecord(
         onto=fit.onto,
         source=fit.source,
-        matches=len(found.inlier),
+        matches=found.matched,
         agreeing=int(found.inlier.sum()),
         error_px=found.error_px,
         scale=float(found.a_from_b.scale),
