@@ -132,7 +132,7 @@ def serve(viewer: Viewer, ready: Callable[[str], None] = print) -> None:
     """Draw for browsers until Ctrl-C or SIGTERM; `ready` receives the lines that say where they find it."""
     drawing = threading.Thread(target=viewer.loop.run, name="pictures")
     try:
-        with _ended_by_signals() as ended:
+        with ended_by_signals() as ended:
             drawing.start()
             for line in address_lines(viewer.settings, viewer.port):
                 ready(line)
@@ -217,7 +217,7 @@ def address_lines(settings: ViewerSettings, port: int) -> list[str]:
 
 
 @contextlib.contextmanager
-def _ended_by_signals() -> Iterator[threading.Event]:
+def ended_by_signals() -> Iterator[threading.Event]:
     """An event that Ctrl-C and SIGTERM set, in the place of what they do otherwise."""
     ended = threading.Event()
     before = {}
