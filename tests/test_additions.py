@@ -95,7 +95,7 @@ def test_every_back_end_module_makes_a_reconstruction():
     found = modules(import_module("swimm3r.sfm.backends"))
     assert len(found) == len(get_args(SfmSettings))
     takes = {tuple(inspect.signature(module.reconstruct).parameters) for module in found.values()}
-    assert takes == {("frames", "settings", "folder", "progress", "engine")}
+    assert takes == {("frames", "settings", "folder", "progress", "engine", "navigator")}
     kinds = {inspect.signature(module.reconstruct).parameters["settings"].annotation for module in found.values()}
     assert kinds == set(get_args(SfmSettings))
 

@@ -116,6 +116,6 @@ def write_csv(path: Path, survey: Survey, **changed: object) -> Path:
     }  # fmt: skip
     columns = {name: values for name, values in columns.items() if values is not None}
     rows = zip(*columns.values(), strict=True)  # type: ignore[call-overload]
-    lines_ = [",".join(columns), *(",".join(repr(float(value)) for value in row) for row in rows)]
+    lines_ = [",".join(columns), *(",".join(v if isinstance(v, str) else repr(float(v)) for v in row) for row in rows)]
     path.write_text("\n".join(lines_) + "\n")
     return path

@@ -10,17 +10,19 @@ import pytest
 from tests.scale.conftest import SCALE, Survey, lines, survey_along, write_csv
 from tests.scale.test_rescale import write_run
 
-from swimm3r.errors import InputError
+from swimm3r.errors import InputError, UsageError
 from swimm3r.io.images import write_rgb
 from swimm3r.pipeline.presets import PRESETS, RunSettings, from_yaml, to_yaml
 from swimm3r.pipeline.run import _scaled, run_pipeline
-from swimm3r.pipeline.run_record import _set_aside, open_record
+from swimm3r.pipeline.run_record import _set_aside, open_record, stage_keys
+from swimm3r.pipeline.run_settings import differences
 from swimm3r.progress import silent
 from swimm3r.scale.rescale import RESCALING
 from swimm3r.scale.run import read_record, scale_sections
 from swimm3r.scale.settings import ScaleSettings
 from swimm3r.scene.georeference import load_georeference
 from swimm3r.scene.reconstruction_io import load_reconstruction
+from swimm3r.sfm.settings import ColmapSettings
 
 
 @pytest.fixture
@@ -93,3 +95,27 @@ def test_settings_of_scale_are_kept_in_the_run_folder(tmp_path):
     scale = ScaleSettings(scale_bar=("a.png:1,2", "0.5"), nav=Path("/data/nav.csv"), lever_arm=(0.1, 0.0, -0.2))
     (tmp_path / "settings.yaml").write_text(to_yaml(replace(PRESETS["fast"], scale=scale)))
     assert from_yaml(tmp_path / "settings.yaml").scale == scale
+
+
+def test_navigation_belongs_to_mapping_unless_mapping_does_without(tmp_path):
+    plain = PRESETS["fast"]
+    given = replace(plain, scale=ScaleSettings(nav=Path("/data/nav.csv")))
+    assert isinstance(plain.sfm, ColmapSettings)
+    sfm = replace(plain.sfm, mapping=replace(plain.sfm.mapping, navigation=False))
+    keys = [stage_keys("digest", settings, None)["sfm"] for settings in (plain, given, replace(given, sfm=sfm))]
+    assert keys[0] != keys[1]
+    assert keys[2] == stage_keys("digest", replace(plain, sfm=sfm), None)["sfm"]
+    assert "scale.nav: None -> /data/nav.csv" in differences(plain, given, ["sfm"])
+
+
+def test_a_run_that_was_mapped_without_navigation_is_told_how_to_get_it(tmp_path):
+    plain = PRESETS["fast"]
+    given = replace(plain, scale=ScaleSettings(nav=Path("/data/nav.csv")))
+    (tmp_path / "run").mkdir()
+    with open_record(tmp_path / "run", Path("dive.mp4"), "none") as record:
+        (tmp_path / "run" / "settings.yaml").write_text(to_yaml(plain))
+        key = stage_keys(record.fingerprint, plain, None)["sfm"]
+        record.stage("sfm", key, make=lambda: None)
+        with pytest.raises(UsageError, match="mapped with another navigation, or none") as refused:
+            record.make_room(given, None)
+    assert "swimm3r scale" in str(refused.value.hint)

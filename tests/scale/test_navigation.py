@@ -4,16 +4,18 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
+from scipy.interpolate import CubicSpline
 from scipy.spatial.transform import Rotation
 from tests.scale.conftest import ORIGIN, SCALE, TURN, Survey, lines, survey_along, write_csv
 
 from swimm3r.errors import InputError, UsageError
 from swimm3r.scale.estimate import estimate_scale
 from swimm3r.scale.navigation import geodesy
-from swimm3r.scale.navigation.alignment import align
+from swimm3r.scale.navigation.alignment import Path, align
 from swimm3r.scale.navigation.fit import fit_navigation, path_of
 from swimm3r.scale.navigation.geodesy import Origin, geodetic_from_local, grid_at, local_from_geodetic, utm_zone
-from swimm3r.scale.navigation.matching import FrameTimes, match_times
+from swimm3r.scale.navigation.latency import find_latency
+from swimm3r.scale.navigation.matching import FrameTimes, match_names, match_times
 from swimm3r.scale.navigation.time_offset import find_offset
 from swimm3r.scale.settings import ScaleSettings
 
@@ -142,6 +144,58 @@ def test_noisy_navigation_off_by_a_third_of_a_second_gives_the_scale_within_one_
     assert fit.alignment.scale == pytest.approx(SCALE, rel=0.01)
     assert fit.offset is not None
     assert fit.offset.seconds == pytest.approx(0.3, abs=0.15)
+
+
+def heaving(speed: float = 0.12) -> Survey:
+    """Stills every 3 s from a vehicle that heaves and turns about."""
+    t = np.arange(24) * 3.0
+    return survey_along(
+        np.stack([speed * t + 0.3 * np.sin(t / 5), 0.4 * np.cos(t / 7), 4 + np.sin(t / 9)], -1), spacing=3.0
+    )
+
+
+def named(survey: Survey, latency: float, noise: float = 0.02, seed: int = 0) -> tuple[Path, np.ndarray]:
+    """Positions and moments of the frames, by a navigation whose clock is ahead."""
+    path = CubicSpline(survey.seconds, survey.position)
+    position = path(survey.seconds - latency) + noise * np.random.default_rng(seed).normal(size=survey.position.shape)
+    navigation = replace(survey.navigation(position), names=survey.rec.names)
+    matched = match_names(navigation, survey.rec.names)
+    assert matched is not None
+    return path_of(survey.rec, matched, ScaleSettings()), survey.seconds
+
+
+@pytest.mark.parametrize("latency", [-0.6, 0.0, 0.45])
+def test_the_latency_of_named_positions_is_found_with_its_standard_deviation(latency):
+    survey = heaving()
+    found = [find_latency(*named(survey, latency, seed=seed), ScaleSettings()) for seed in range(4)]
+    errors = [each.seconds - latency for each in found if each is not None]
+    assert len(errors) == 4
+    assert np.abs(errors).max() < 0.15
+    assert np.sqrt(np.mean(np.square(errors))) < 2 * np.mean([each.std for each in found if each is not None])
+
+
+def test_along_a_straight_path_at_constant_speed_the_latency_stays_that_of_the_prior():
+    line = np.stack([np.arange(20) * 0.3, np.zeros(20), np.full(20, 2.0)], -1)
+    found = find_latency(*named(survey_along(line), 0.4), ScaleSettings())
+    assert found is not None
+    assert found.seconds == pytest.approx(0, abs=0.3)
+    assert found.std == pytest.approx(0.5, rel=0.2)
+
+
+def test_a_latency_of_named_positions_does_not_reach_the_scale(tmp_path):
+    survey = heaving()
+    path = CubicSpline(survey.seconds, survey.position)
+    noise = 0.02 * np.random.default_rng(1).normal(size=survey.position.shape)
+    stated = survey.geodetic(path(survey.seconds - 0.5) + noise)
+    columns = {"latitude": stated[:, 0], "longitude": stated[:, 1], "depth": -stated[:, 2], "image": survey.rec.names}
+    file = write_csv(tmp_path / "nav.csv", survey, **columns)
+    with_offset, without = (
+        fit_navigation(survey.rec, survey.frames, ScaleSettings(nav=file, nav_latency_std=std)) for std in (0.5, 0.0)
+    )
+    assert with_offset.by == "name"
+    assert without.offset is None
+    assert abs(np.log(with_offset.alignment.scale / SCALE)) < 2 * with_offset.alignment.scale_std
+    assert with_offset.alignment.rms < 0.7 * without.alignment.rms
 
 
 def test_local_metres_of_latitude_and_longitude_are_exact():

@@ -21,12 +21,14 @@ from swimm3r.pipeline.estimate import estimate_run
 from swimm3r.pipeline.inputs import check_inputs, truth_of
 from swimm3r.pipeline.presets import RunSettings, from_yaml, to_yaml
 from swimm3r.pipeline.run_record import RunRecord, open_record, stage_keys
+from swimm3r.pipeline.run_settings import navigation_of_mapping
 from swimm3r.pipeline.scoring import MappedRun, Protocol, film_flight, score_map, score_restored_frames, start_poses
 from swimm3r.pipeline.stage_start import StageStart, ignore_stages
 from swimm3r.prepare import check_source, load_frames, read_frames
 from swimm3r.progress import Progress, silent, watched
 from swimm3r.report import write_report
 from swimm3r.scale.rig import has_known_baseline
+from swimm3r.scale.navigation.navigator import NavigationFile
 from swimm3r.scale.run import read_record, scale_folder, scale_sections, source_key
 from swimm3r.scene.frames import Frames
 from swimm3r.scene.ground_truth import GroundTruth
@@ -128,10 +130,12 @@ def _make_stages(
     if last_stage == "prepare":
         return
 
+    navigation = navigation_of_mapping(settings)
+    navigator = None if navigation is None else NavigationFile(navigation)
     record.stage(
         "sfm",
         keys["sfm"],
-        make=lambda: reconstruct(frames, settings.sfm, folder / "sfm", progress, engine),
+        make=lambda: reconstruct(frames, settings.sfm, folder / "sfm", progress, engine, navigator),
         reuse=lambda: None,
     )
     rec = load_reconstruction(folder / "sfm", frames)

@@ -346,6 +346,13 @@ def _text(path: Path | None) -> str | None:
 
 def _superseded(folder: Path, stages: list[str], listed: list[str]) -> UsageError:
     shown = "".join(f"\n    {line}" for line in listed) or " (settings.yaml, which names them, cannot be read)"
+    if listed and all(line.startswith("scale.") for line in listed):
+        return UsageError(
+            f"{folder} was mapped with another navigation, or none:{shown}",
+            cause="navigation is used in mapping, too",
+            hint=f"swimm3r scale {folder} with these options gives it unit and place as it is mapped; --redo moves"
+            f" what was made to {folder / 'old'} and maps again",
+        )
     return UsageError(
         f"{folder} holds stages made with other settings ({', '.join(stages)}):{shown}",
         cause="options or the preset are others than those the folder was made with",

@@ -5,7 +5,8 @@ from pathlib import Path
 from typing import Any
 
 from swimm3r.pipeline.presets import MAST3R_PRESETS, PRESETS, Preset, RunSettings
-from swimm3r.sfm.settings import BACKENDS, BackendName, ColmapModelSettings, SfmSettings
+from swimm3r.scale.settings import NAVIGATION, ScaleSettings
+from swimm3r.sfm.settings import BACKENDS, BackendName, ColmapModelSettings, ColmapSettings, SfmSettings
 from swimm3r.splat.settings import RecipeName, UwbsSettings, with_recipe
 
 _PARTS = {"prepare": "frames", "sfm": "sfm", "splat": "splat", "eval": "test"}  # of RunSettings, by the stage they make
@@ -17,7 +18,7 @@ def settings_by_stage(settings: RunSettings) -> dict[str, dict[str, Any]]:
     """Every setting by name, under the stage that it decides."""
     return {
         "prepare": asdict(settings.frames),
-        "sfm": {type(settings.sfm).__name__: asdict(settings.sfm)},
+        "sfm": {type(settings.sfm).__name__: asdict(settings.sfm), **_mapping_navigation(settings)},
         "splat": asdict(settings.splat),
         "eval": asdict(settings.test),
     }
@@ -37,8 +38,24 @@ def differences(old: RunSettings, new: RunSettings, stages: list[str]) -> list[s
             lines.append(f"{part}.kind: {type(before).__name__} -> {type(after).__name__}")
             continue
         was, will = _flat(asdict(before), part), _flat(asdict(after), part)
-        lines += [f"{name}: {was[name]} -> {will[name]}" for name in was if was[name] != will[name]]
+        if part == "sfm":
+            was, will = (found | _mapping_navigation(each) for found, each in ((was, old), (will, new)))
+        names = dict.fromkeys((*was, *will))
+        lines += [f"{name}: {was.get(name)} -> {will.get(name)}" for name in names if was.get(name) != will.get(name)]
     return lines
+
+
+def navigation_of_mapping(settings: RunSettings) -> ScaleSettings | None:
+    """The settings of the navigation that mapping uses; None where it uses none."""
+    sfm, scale = settings.sfm, settings.scale
+    return scale if scale.nav is not None and isinstance(sfm, ColmapSettings) and sfm.mapping.navigation else None
+
+
+def _mapping_navigation(settings: RunSettings) -> dict[str, Any]:
+    """The same by the names in settings.yaml."""
+    if navigation_of_mapping(settings) is None:
+        return {}
+    return {f"scale.{name}": _plain(getattr(settings.scale, name)) for name in NAVIGATION}
 
 
 def starting_settings(
@@ -74,5 +91,9 @@ def _flat(values: dict[str, Any], under: str) -> dict[str, Any]:
         if isinstance(value, dict):
             flat |= _flat(value, f"{under}.{name}")
         else:
-            flat[f"{under}.{name}"] = str(value) if isinstance(value, Path) else value
+            flat[f"{under}.{name}"] = _plain(value)
     return flat
+
+
+def _plain(value: object) -> object:
+    return str(value) if isinstance(value, Path) else value

@@ -75,8 +75,9 @@ def _place_lines(scale: dict[str, Any]) -> list[str]:
         told = f"Distance of the cameras from the navigation: {navigation['rms_m']:.3g} m root mean square over"
         lines.append(f"{told} {navigation['positions']} positions, {navigation['outliers']} of them outliers.")
         if navigation["offset_std_s"] is not None:
-            offset = plus_minus(navigation["offset_s"], navigation["offset_std_s"])
-            lines.append(f"The clock of the navigation is {offset} s ahead of that of the frames, as estimated.")
+            offset = plus_minus(abs(navigation["offset_s"]), navigation["offset_std_s"])
+            side = "ahead of" if navigation["offset_s"] >= 0 else "behind"
+            lines.append(f"The clock of the navigation is {offset} s {side} that of the frames, as estimated.")
     for role, name in (("control", "control_rms_m"), ("check", "check_rms_m")):
         if scale.get("control", {}).get(name) is not None:
             lines.append(f"Residual at {role} points: {scale['control'][name]:.3g} m root mean square.")

@@ -24,6 +24,12 @@ MarkerFamily = Literal[
 _CRS = re.compile(r"auto|local|(?:epsg:)?\d{4,6}", re.IGNORECASE)
 
 
+NAVIGATION = (  # the settings that a path by navigation depends on
+    "nav", "nav_topic", "nav_offset", "nav_window", "nav_latency_std", "nav_gap", "nav_std", "attitude_std",
+    "clip_start", "lever_arm", "camera_mount", "mount_std",
+)  # fmt: skip
+
+
 @dataclass(frozen=True)
 class ScaleSettings(Settings):
     """Sources of the unit and the place of a run; any number of them, solved together."""
@@ -73,6 +79,9 @@ class ScaleSettings(Settings):
     navigation names the images."""
     nav_window: Annotated[float, Range(0, 3600)] = 2.0
     """Largest offset that is searched where both clocks state the date, in seconds."""
+    nav_latency_std: Annotated[float, Range(0, 10)] = 0.5
+    """Standard deviation of the offset between the clocks of camera and vehicle where the navigation names the images,
+    in seconds; 0 for none."""
     nav_gap: Positive = 5.0
     """Longest gap between positions that is bridged, in seconds."""
     nav_std: tuple[Positive, Positive, Positive] | None = None

@@ -12,6 +12,7 @@ from swimm3r.tasks.settings import EngineSettings
 
 if TYPE_CHECKING:
     import swimm3r.scene.frames
+    import swimm3r.scene.placement
     import swimm3r.scene.reconstruction
 
 __all__ = ["ColmapModelSettings", "ColmapSettings", "Mast3rSettings", "SfmSettings", "reconstruct"]
@@ -23,6 +24,7 @@ def reconstruct(
     folder: str | Path | None = None,
     progress: Progress | None = None,
     engine: EngineSettings = EngineSettings(),  # noqa: B008 - records are frozen
+    navigator: "swimm3r.scene.placement.Navigator | None" = None,
 ) -> "swimm3r.scene.reconstruction.Reconstruction":
     """Cameras, points, dense depth, water and restored cloud of a set of frames, made from `frames.train` alone.
 
@@ -31,7 +33,8 @@ def reconstruct(
     `settings` choose the method: `ColmapSettings()` by default, `swimm3r.PRESETS["fast"].sfm` the quickest. Works in
     `folder` (a new temporary one by default) and goes on from what an interrupted call left there. A terminal or a
     notebook shows how far it is, unless `progress` is given (`swimm3r.silent`: nothing). `engine` can spread the chunks
-    of a long clip and dense depth over processes or a cluster.
+    of a long clip and dense depth over processes or a cluster. A `navigator` (`swimm3r.scale.navigation`)
+    holds the path of COLMAP's mapping, and joins parts that share no ground; other back ends do without.
     Raises InputError for fewer than 2 frames and RegistrationError where too few can be placed.
     """
     settings = settings or ColmapSettings()
@@ -44,7 +47,7 @@ def reconstruct(
         )
     with watched(progress) as told:
         work = Path(folder or mkdtemp(prefix="swimm3r-sfm-"))
-        rec = _backend(settings).reconstruct(used, settings, work, told, engine)
+        rec = _backend(settings).reconstruct(used, settings, work, told, engine, navigator)
         if len(frames.between):
             from swimm3r.sfm.between import place_between
 

@@ -227,6 +227,9 @@ class MappingSettings(Settings):
     """Share of registered frames at which no further focal lengths are tried."""
     retry_ratio: PositiveShare = 0.9
     """Ratio test of the second matching of frames that were not registered."""
+    navigation: bool = True
+    """Use the navigation that is given (`--nav`): its positions as priors of those of the cameras, and to join parts
+    that share no ground."""
     min_frames: Annotated[int, Range(2)] = 3
     """Smallest number of registered frames of a result."""
     min_share: Share = 0.2

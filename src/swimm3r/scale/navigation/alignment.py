@@ -43,6 +43,18 @@ class Path:
     attitude_std: Float[np.ndarray, "k 3"]  # about the vehicle's forward, starboard and down axes, radians
     up: Float[np.ndarray, "3"]  # of the scene, in the run
 
+    def rows(self, marked: Bool[np.ndarray, " k"]) -> "Path":
+        """The marked rows alone."""
+        return replace(
+            self,
+            centers=self.centers[marked],
+            rotations=self.rotations[marked],
+            position=self.position[marked],
+            std=None if self.std is None else self.std[marked],
+            attitude=None if self.attitude is None else self.attitude[marked],
+            attitude_std=self.attitude_std[marked],
+        )
+
 
 @dataclass(frozen=True)
 class Alignment:
@@ -57,6 +69,7 @@ class Alignment:
     residual: Float[np.ndarray, "k 3"]  # metres, aligned less stated
     std: Float[np.ndarray, "k 3"]  # metres, as used
     weight: Float[np.ndarray, " k"]  # 0..1
+    correlation: float  # factor by which neighbors that err alike lower the number of independent rows
     attitude_residual_deg: float | None  # root mean square
     mount: Float[np.ndarray, "3 3"] | None
 
@@ -78,6 +91,14 @@ def align(path: Path, settings: ScaleSettings) -> Alignment:
     starts = sorted(starts, key=lambda start: _first_cost(path, settings, start))[:_REFINED]
     found = [_refine(path, settings, start) for start in starts]
     return min(found, key=lambda each: each[0])[1]
+
+
+def realign(path: Path, settings: ScaleSettings, start: Alignment) -> Alignment:
+    """The similarity of a path near that of another one, by its standard deviations and weights of positions."""
+    middle = path.centers.mean(0)
+    problem = _Problem(path, settings, middle, start.R, start.mount)
+    x = np.concatenate([[np.log(start.scale)], np.zeros(3), start.scale * start.R @ middle + start.t, np.zeros(3)])
+    return _result(problem, problem.solved(x[: problem.count], start.std, start.weight), start.std, start.weight)
 
 
 def umeyama(
@@ -248,14 +269,15 @@ def _result(problem: _Problem, fitted: OptimizeResult, std: np.ndarray, weight: 
     residual = problem.positions(fitted.x)
     rows = np.sqrt(weight)[:, None] * residual / std
     used = int(np.isfinite(std).sum())
-    spread = float((rows**2).sum()) / max(1, used - 7) * _correlation(residual / std)
+    correlation = _correlation(residual / std)
+    spread = float((rows**2).sum()) / max(1, used - 7) * correlation
     free = fitted.jac.T @ fitted.jac
     covariance = np.linalg.pinv(free, rcond=1e-12) * max(1.0, spread)
     errors = np.sqrt(np.diag(covariance))
     attitudes = problem.attitudes(fitted.x)
     shown = float(np.degrees(np.sqrt((attitudes**2).sum(1).mean()))) if len(attitudes) else None
     return Alignment(
-        scale, R, t, float(errors[0]), np.degrees(errors[1:4]), errors[4:7], residual, std, weight, shown,
+        scale, R, t, float(errors[0]), np.degrees(errors[1:4]), errors[4:7], residual, std, weight, correlation, shown,
         problem.mount(fitted.x),
     )  # fmt: skip
 

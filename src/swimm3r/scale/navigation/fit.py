@@ -15,7 +15,8 @@ from jaxtyping import Float
 from swimm3r.errors import InputError
 from swimm3r.io.navigation.read import read_navigation
 from swimm3r.io.navigation.record import Navigation, vehicle_attitude
-from swimm3r.scale.navigation.alignment import Alignment, Path, align, without_attitude
+from swimm3r.scale.navigation.alignment import Alignment, Path, align, realign, without_attitude
+from swimm3r.scale.navigation.latency import at_offset, find_latency, within_path
 from swimm3r.scale.navigation.matching import (
     FEWEST,
     FrameTimes,
@@ -49,7 +50,7 @@ class NavigationFit:
     alignment: Alignment
     place: Place
     by: Literal["name", "time"]
-    offset: Offset | None  # None where images are named
+    offset: Offset | None  # None where images are named and their times are not known
     offset_found: bool  # rather than given
     notes: tuple[str, ...] = ()
 
@@ -65,9 +66,30 @@ def fit_navigation(rec: Reconstruction, frames: Frames, settings: ScaleSettings)
     _check_spread(path, settings.nav)
     alignment = align(path, settings)
     _check_fit(rec, path, alignment, local.navigation, raw, times, matched, settings)
+    if matched.by == "name" and times.clock == "utc":
+        matched, alignment, offset = _at_latency(path, matched, alignment, times, settings)
     return NavigationFit(
         settings.nav, matched, alignment, local.place, matched.by, offset, settings.nav_offset is None, tuple(notes)
     )
+
+
+def _at_latency(
+    path: Path, matched: Matched, alignment: Alignment, times: FrameTimes, settings: ScaleSettings
+) -> tuple[Matched, Alignment, Offset | None]:
+    """The alignment under the offset of the clocks that the path shows; its scale is as uncertain as that offset."""
+    seconds = times.seconds[matched.frame]
+    offset = find_latency(path, seconds, settings)
+    if offset is None:
+        return matched, alignment, None
+    rows = within_path(seconds, offset.seconds, settings)
+    matched = Matched(matched.frame[rows], matched.navigation.rows(np.flatnonzero(rows)), matched.by)
+    found = align(at_offset(path, seconds, offset.seconds).rows(rows), settings)
+    sides = [
+        realign(at_offset(path, seconds, offset.seconds + side).rows(rows), settings, found).scale
+        for side in (-offset.std, offset.std)
+    ]
+    by_offset = abs(np.log(sides[1] / sides[0])) / 2
+    return matched, replace(found, scale_std=float(np.hypot(found.scale_std, by_offset))), offset
 
 
 def path_of(rec: Reconstruction, matched: Matched, settings: ScaleSettings) -> Path:

@@ -4,6 +4,7 @@ from pathlib import Path
 
 from swimm3r.progress import Progress, silent
 from swimm3r.scene.frames import Frames
+from swimm3r.scene.placement import Navigator
 from swimm3r.scene.reconstruction import Reconstruction
 from swimm3r.scene.reconstruction_io import load_reconstruction
 from swimm3r.sfm.colmap import poses
@@ -26,10 +27,11 @@ def reconstruct(
     folder: Path,
     progress: Progress = silent,
     engine: EngineSettings = EngineSettings(),  # noqa: B008 - records are frozen
+    navigator: Navigator | None = None,
 ) -> Reconstruction:
     """Poses first, and saved at once: what comes after reads them from there when an interrupted run goes on."""
     if not (folder / "reconstruction.json").is_file():
-        rec = poses.reconstruct(frames, settings, folder, progress, engine=engine)
+        rec = poses.reconstruct(frames, settings, folder, progress, engine=engine, navigator=navigator)
         rec = rec if frames.rig is None else as_rig(rec, frames, settings, progress)
         rec.save(folder, frames)
     rec = load_reconstruction(folder, frames)  # also where it was just made: the same bits as after an interruption

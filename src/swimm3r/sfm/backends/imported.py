@@ -21,6 +21,7 @@ from swimm3r.io.imports.read import read_foreign
 from swimm3r.io.imports.record import ForeignModel
 from swimm3r.progress import Progress, silent
 from swimm3r.scene.frames import Frames
+from swimm3r.scene.placement import Navigator
 from swimm3r.scene.reconstruction import DepthMap, DepthMaps, Matches, Points, QualityWarning, Reconstruction, Tracks
 from swimm3r.sfm.colmap.triangulation import triangulate
 from swimm3r.sfm.imported.match_frames import at_frame_size, named_frames
@@ -43,6 +44,7 @@ def reconstruct(
     folder: Path,
     progress: Progress = silent,
     engine: EngineSettings = EngineSettings(),  # noqa: B008 - records are frozen
+    navigator: Navigator | None = None,
 ) -> Reconstruction:
     """The reconstruction of the frames that the model names. Raises InputError where fewer than 2 of them are in it."""
     foreign = read_foreign(settings.model)

@@ -19,6 +19,7 @@ from swimm3r.errors import RegistrationError
 from swimm3r.imaging.filters import LUMA
 from swimm3r.progress import Progress, silent
 from swimm3r.scene.frames import Frames
+from swimm3r.scene.placement import Navigator
 from swimm3r.scene.reconstruction import DepthMap, DepthMaps, Matches, QualityWarning, Reconstruction
 from swimm3r.scene.reconstruction_io import load_reconstruction, write_unfiltered_matches
 from swimm3r.sfm import tracks as match_tracks
@@ -64,6 +65,7 @@ def reconstruct(
     folder: Path,
     progress: Progress = silent,
     engine: EngineSettings = EngineSettings(),  # noqa: B008 - records are frozen
+    navigator: Navigator | None = None,
 ) -> Reconstruction:
     """Cameras, points, matches, dense depth, water and restored cloud of the frames that hang together.
 

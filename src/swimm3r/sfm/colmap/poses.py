@@ -8,7 +8,7 @@ import itertools
 import shutil
 from collections.abc import Iterator
 from contextlib import contextmanager
-from dataclasses import replace
+from dataclasses import dataclass, replace
 from itertools import pairwise
 from pathlib import Path
 from typing import TYPE_CHECKING
@@ -25,6 +25,7 @@ from swimm3r.io.colmap.model import ColmapModel, from_pycolmap, silence_log, wri
 from swimm3r.io.files.atomic import atomic_path
 from swimm3r.progress import Progress, silent
 from swimm3r.scene.frames import Frames
+from swimm3r.scene.placement import Navigator
 from swimm3r.scene.reconstruction import (
     DepthMaps,
     Matches,
@@ -38,6 +39,7 @@ from swimm3r.sfm.colmap import calibration, mapping
 from swimm3r.sfm.colmap.adjustment import adjust_through_port
 from swimm3r.sfm.colmap.chunks.long_clip import is_long, map_long_clip
 from swimm3r.sfm.colmap.chunks.parts import without_jumps
+from swimm3r.sfm.colmap.navigated import with_navigation
 from swimm3r.sfm.colmap.plausibility import depth_change, implausible
 from swimm3r.sfm.features import vlad
 from swimm3r.sfm.features.database import FeatureDatabase, fill_features, match_pairs, start_database
@@ -56,6 +58,16 @@ _LOST_SCALE = 1000.0  # change of the frames' median depth beyond which nothing 
 _NONE, _NOWHERE = np.zeros(0), np.zeros((0, 2))  # what is joined where no pair matches
 
 
+@dataclass(frozen=True)
+class _Mapped:
+    """The model that is used, those that did not join it, and warnings."""
+
+    model: "pycolmap.Reconstruction"
+    others: "list[pycolmap.Reconstruction]"
+    lens_refined: bool  # from the images; else assumed, or held for the user
+    warnings: list[QualityWarning]
+
+
 def reconstruct(
     frames: Frames,
     settings: ColmapSettings,
@@ -63,11 +75,13 @@ def reconstruct(
     progress: Progress = silent,
     lens: Cameras | None = None,
     engine: EngineSettings = EngineSettings(),  # noqa: B008 - records are frozen
+    navigator: Navigator | None = None,
 ) -> Reconstruction:
     """Cameras, points, tracks and matches of the frames that can be placed; depth maps are for others to fill.
 
-    `lens` (one camera, its pose unused) is held where it is given; else the settings say what is known of it. Raises
-    InputError for fewer than 2 frames and RegistrationError where too few can be placed.
+    `lens` (one camera, its pose unused) is held where it is given; else the settings say what is known of it. A
+    `navigator` joins what shares no ground, and holds long paths straight. Raises InputError for fewer than 2 frames or
+    navigation that contradicts them, and RegistrationError where too few can be placed.
     """
 
     if len(frames) < 2:
@@ -98,18 +112,21 @@ def reconstruct(
         try:
             with atomic_path(working.path) as draft:
                 shutil.copyfile(store.path, draft)
-            model, others, warnings = _map(working, frames, pairs, settings, progress, engine)
-            rec = _record(model, working, frames, folder)
+            mapped = _map(working, frames, pairs, settings, progress, engine)
+            if navigator is not None:
+                mapped = _navigated(mapped, working, frames, folder, navigator, progress)
+            _check_placed(mapped.model, len(frames), settings)
+            rec = _record(mapped.model, working, frames, folder)
             if housed is not None:
                 free = settings.intrinsics != "fixed"
                 rec = adjust_through_port(rec, housed, settings.port.range, lens=free, progress=progress)
-            sizes = [model.num_reg_images(), *_write_parts(model, others, frames, folder / PARTS)]
+            sizes = [mapped.model.num_reg_images(), *_write_parts(mapped.model, mapped.others, frames, folder / PARTS)]
             if depth_change(rec) > _LOST_SCALE:
                 raise _scale_lost(len(rec.names), len(frames))
             found = implausible(rec, working, frames)
         finally:
             working.path.unlink(missing_ok=True)
-    warnings += _registration_warnings(len(rec.names), sizes, frames)
+    warnings = [*mapped.warnings, *_registration_warnings(len(rec.names), sizes, frames)]
     if settings.housing == "flat" and housed is None:
         warnings.append(
             QualityWarning(
@@ -198,8 +215,8 @@ def _map(
     settings: ColmapSettings,
     progress: Progress,
     engine: EngineSettings,
-) -> "tuple[pycolmap.Reconstruction, list[pycolmap.Reconstruction], list[QualityWarning]]":
-    """The model that is used, those that did not join it, and warnings."""
+) -> "_Mapped":
+    """The largest model, its lens refined. Raises RegistrationError where no two frames can be placed."""
     n, threads = len(frames), settings.threads or thread_count()
     long = is_long(n, settings.mapping)
     determined = False
@@ -222,18 +239,13 @@ def _map(
         more = mapping.replace_misplaced(store, more, settings, progress)
         more = without_jumps(more)
         model = more if more.num_reg_images() >= model.num_reg_images() else model
-    placed = model.num_reg_images()
-    thin = model.compute_mean_observations_per_reg_image() < settings.mapping.thin_points
-    share = settings.mapping.thin_share if thin else settings.mapping.min_share
-    if placed < max(min(settings.mapping.min_frames, n), share * n):
-        raise _too_few(placed, n, settings)
     if long:
-        mapped = calibration.Calibrated(model, refined=determined)
+        calibrated = calibration.Calibrated(model, refined=determined)
     else:
-        mapped = calibration.refine(store, model, settings, progress)
+        calibrated = calibration.refine(store, model, settings, progress)
     warnings = []
-    if not mapped.refined and settings.intrinsics != "fixed":
-        camera = mapped.model.cameras[1]
+    if not calibrated.refined and settings.intrinsics != "fixed":
+        camera = calibrated.model.cameras[1]
         warnings.append(
             QualityWarning(
                 f"The lens could not be calibrated from this clip; {camera.focal_length_x:.0f} px was assumed as its"
@@ -241,7 +253,37 @@ def _map(
                 "Shapes may be stretched in depth. Give --focal and --k1 of the camera, calibrated in water.",
             )
         )
-    return mapped.model, models[1:], warnings
+    return _Mapped(calibrated.model, models[1:], calibrated.refined, warnings)
+
+
+def _navigated(
+    mapped: "_Mapped",
+    store: FeatureDatabase,
+    frames: Frames,
+    folder: Path,
+    navigator: Navigator,
+    progress: Progress,
+) -> "_Mapped":
+    found = with_navigation(
+        store,
+        mapped.model,
+        mapped.others,
+        frames,
+        navigator,
+        lambda model: _record(model, store, frames, folder),
+        progress,
+        lens=mapped.lens_refined,
+    )
+    return replace(mapped, model=found.model, others=found.others, warnings=[*mapped.warnings, *found.warnings])
+
+
+def _check_placed(model: "pycolmap.Reconstruction", frames: int, settings: ColmapSettings) -> None:
+    """Raise RegistrationError where a model holds too small a share of the frames."""
+    placed = model.num_reg_images()
+    thin = model.compute_mean_observations_per_reg_image() < settings.mapping.thin_points
+    share = settings.mapping.thin_share if thin else settings.mapping.min_share
+    if placed < max(min(settings.mapping.min_frames, frames), share * frames):
+        raise _too_few(placed, frames, settings)
 
 
 def _write_parts(

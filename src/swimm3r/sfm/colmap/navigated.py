@@ -1,0 +1,174 @@
+"""Navigation in mapping: parts of a clip that share no ground joined by it, and positions as COLMAP's pose priors.
+
+    sum rho(reprojection) + sum_i |Sigma_i^-1/2 (c_i - p_i)|^2
+
+over poses, points and, where the images determine it, the lens; c_i are camera centers, p_i positions by navigation in
+the axes and the unit of the largest part, Sigma_i their covariances.
+"""
+
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+from typing import TYPE_CHECKING
+
+import numpy as np
+from jaxtyping import Float
+
+from swimm3r.progress import Progress
+from swimm3r.scene.frames import Frames
+from swimm3r.scene.placement import Navigator, Placement
+from swimm3r.scene.reconstruction import QualityWarning, Reconstruction
+from swimm3r.sfm.colmap import calibration
+from swimm3r.sfm.colmap.chunks.assemble import assemble
+from swimm3r.sfm.colmap.chunks.join import Joined
+from swimm3r.sfm.colmap.chunks.links import Sim3
+from swimm3r.sfm.colmap.chunks.parts import LEAST_FRAMES, part_of
+from swimm3r.sfm.features.database import FeatureDatabase
+
+if TYPE_CHECKING:
+    import pycolmap
+
+_STEP = "adjusting to the navigation"
+_MAX_ERROR, _MIN_ANGLE = 4.0, 1.5  # pixels and degrees of a point that stays, as in COLMAP's mapper
+_UNKNOWN = 1e3  # extents of the path: the standard deviation of a coordinate that is not known
+_ROUNDS = 2  # of adjustment, points that miss dropped between them
+
+
+@dataclass(frozen=True)
+class Prior:
+    """Position of a camera in the axes and the unit of a model."""
+
+    position: Float[np.ndarray, "3"]
+    covariance: Float[np.ndarray, "3 3"]
+
+
+@dataclass(frozen=True)
+class Navigated:
+    """A model adjusted to the navigation, the models that it could not join, and warnings."""
+
+    model: "pycolmap.Reconstruction"
+    others: "list[pycolmap.Reconstruction]"
+    warnings: list[QualityWarning]
+
+
+def with_navigation(
+    store: FeatureDatabase,
+    model: "pycolmap.Reconstruction",
+    others: "Sequence[pycolmap.Reconstruction]",
+    frames: Frames,
+    navigator: Navigator,
+    record: "Callable[[pycolmap.Reconstruction], Reconstruction]",
+    progress: Progress,
+    *,
+    lens: bool,
+) -> Navigated:
+    """The largest model with the parts that navigation places beside it, adjusted; its lens, too, where `lens`.
+
+    Raises InputError where the navigation contradicts the largest model.
+    """
+    placed = navigator.place(record(model), frames)
+    known = {model.images[i].name for i in model.reg_image_ids()}
+    parts: list[tuple[pycolmap.Reconstruction, Placement]] = []
+    left = []
+    for other in sorted(others, key=lambda m: m.num_reg_images(), reverse=True):
+        own = {other.images[i].name for i in other.reg_image_ids()}
+        is_new = len(own - known) >= LEAST_FRAMES
+        found = navigator.place_part(record(other), frames, placed) if is_new else None
+        if found is None:
+            left.append(other)
+            continue
+        known |= own
+        parts.append((other, found))
+    if parts:
+        model = _joined(store, model, parts, placed, progress)
+    placements = [placed, *(found for _, found in parts)]
+    model = adjust_to_positions(model, _priors(placements, frames), progress, lens=lens)
+    warnings = [_joined_warning(placed, parts)] if parts else []
+    return Navigated(model, left, warnings)
+
+
+def adjust_to_positions(
+    model: "pycolmap.Reconstruction", priors: dict[str, Prior], progress: Progress, *, lens: bool
+) -> "pycolmap.Reconstruction":
+    """The model after bundle adjustment with priors of camera centers, by name of the image."""
+    import pycolmap
+
+    out = pycolmap.Reconstruction(model)
+    images = {out.images[i].name: out.images[i] for i in out.reg_image_ids()}
+    stated = [_pose_prior(images[name], prior) for name, prior in sorted(priors.items()) if name in images]
+    options = pycolmap.BundleAdjustmentOptions()
+    options.print_summary = False
+    options.refine_focal_length = options.refine_extra_params = lens
+    options.ceres.solver_options.num_threads = calibration.THREADS
+    options.ceres.solver_options.function_tolerance = calibration.STILL
+    options.ceres.loss_function_type = pycolmap.LossFunctionType.SOFT_L1
+    prior_options = pycolmap.PosePriorBundleAdjustmentOptions()
+    prior_options.alignment_ransac.random_seed = calibration.SEED
+    prior_options.ceres.prior_position_loss_function_type = pycolmap.LossFunctionType.CAUCHY
+    for done in range(_ROUNDS):
+        progress(_STEP, done, _ROUNDS)
+        config = pycolmap.BundleAdjustmentConfig()
+        for image in out.reg_image_ids():
+            config.add_image(image)
+        pycolmap.create_pose_prior_bundle_adjuster(options, prior_options, config, stated, out).solve()
+        pycolmap.ObservationManager(out).filter_all_points3D(_MAX_ERROR, _MIN_ANGLE)
+    progress(_STEP, _ROUNDS, _ROUNDS)
+    out.update_point_3d_errors()
+    return out
+
+
+def _joined(
+    store: FeatureDatabase,
+    model: "pycolmap.Reconstruction",
+    parts: "list[tuple[pycolmap.Reconstruction, Placement]]",
+    placed: Placement,
+    progress: Progress,
+) -> "pycolmap.Reconstruction":
+    """One model of all parts, in the axes of the largest and under its lens, its points triangulated anew."""
+    model_from_local = _similarity(placed).inverse()
+    from_part = {0: Sim3(1.0, np.eye(3), np.zeros(3))}
+    for k, (_, found) in enumerate(parts, 1):
+        from_part[k] = model_from_local.after(_similarity(found))
+    pieces = [part_of(model), *(part_of(part) for part, _ in parts)]
+    return assemble(store, pieces, Joined(from_part, ()), model.cameras[1], progress)
+
+
+def _similarity(placed: Placement) -> Sim3:
+    return Sim3(placed.scale, placed.R, placed.t)
+
+
+def _priors(placements: Sequence[Placement], frames: Frames) -> dict[str, Prior]:
+    """The positions of all parts in the model of the first, by the names of the database."""
+    first = placements[0]
+    model_from_local = _similarity(first).inverse()
+    number = {name: f"{i:06d}" for i, name in enumerate(frames.names)}
+    priors: dict[str, Prior] = {}
+    for placed in placements:
+        std = np.where(np.isfinite(placed.std), placed.std, _UNKNOWN * np.ptp(placed.position, axis=0).max())
+        for name, position, each in zip(
+            placed.names, model_from_local(placed.position), std / first.scale, strict=True
+        ):
+            covariance = first.R.T @ np.diag(each**2) @ first.R
+            priors.setdefault(number[name], Prior(position, covariance))
+    return priors
+
+
+def _pose_prior(image: "pycolmap.Image", prior: Prior) -> "pycolmap.PosePrior":
+    import pycolmap
+
+    return pycolmap.PosePrior(
+        corr_data_id=image.data_id,
+        position=prior.position,
+        position_covariance=prior.covariance,
+        coordinate_system=pycolmap.PosePriorCoordinateSystem.CARTESIAN,
+    )
+
+
+def _joined_warning(placed: Placement, parts: "list[tuple[pycolmap.Reconstruction, Placement]]") -> QualityWarning:
+    sizes = " + ".join(str(part.num_reg_images()) for part, _ in parts)
+    worst = max((found for _, found in parts), key=lambda found: found.scale_std)
+    return QualityWarning(
+        f"Navigation alone holds {sizes} frames beside the others: they share no ground with them. Their scale is known"
+        f" to {100 * float(np.hypot(worst.scale_std, placed.scale_std)):.1f}% and their attitude to"
+        f" {worst.rotation_std_deg:.1f} degrees.",
+        "Measure lengths within a part rather than across; a line that crosses the others joins them by what is seen.",
+    )

@@ -1,0 +1,127 @@
+"""Navigation in mapping: a path that bends is straightened, and two parts that share no ground become one model."""
+
+from dataclasses import replace
+from pathlib import Path
+
+import cv2
+import numpy as np
+import pytest
+import torch
+from scipy.spatial.transform import Rotation
+from tests.scale.conftest import SCALE, survey_along
+
+from swimm3r.geometry import align_similarity
+from swimm3r.io.colmap.model import from_pycolmap, to_pycolmap
+from swimm3r.progress import silent
+from swimm3r.scale.navigation.navigator import NavigationFile
+from swimm3r.scale.settings import ScaleSettings
+from swimm3r.scene.frames import Frame, Frames
+from swimm3r.sfm.colmap import poses
+from swimm3r.sfm.colmap.adjustment import bundle_adjust
+from swimm3r.sfm.colmap.navigated import Prior, adjust_to_positions
+from swimm3r.sfm.settings import ColmapSettings
+
+WIDTH, HEIGHT, FOCAL = 320, 240, 260.0
+RANGE, EACH, STEP, APART = 4.0, 9, 0.4, 10.0  # metres; frames of a part
+
+
+def path_error(centers: np.ndarray, truth: np.ndarray) -> float:
+    """Root mean square distance after the best similarity, in the unit of `truth`."""
+    fit = align_similarity(torch.from_numpy(centers), torch.from_numpy(truth))
+    moved = fit.scale.item() * centers @ fit.R.numpy().T + fit.t.numpy()
+    return float(np.sqrt(((moved - truth) ** 2).sum(1).mean()))
+
+
+def test_priors_of_positions_straighten_a_strip_that_bends():
+    x = np.arange(60) * 0.4
+    strip = np.stack([x, 0.5 * np.sin(x / 3), 2 + 0.2 * np.cos(x / 2)], -1)
+    survey = survey_along(strip)
+    rng = np.random.default_rng(0)
+    tracks = survey.rec.tracks
+    seen = torch.bincount(tracks.point, minlength=len(survey.rec.points.xyz)) > 1
+    few = (seen & torch.from_numpy(rng.random(len(seen)) < 0.1))[tracks.point]
+    xy = tracks.xy[few] + torch.from_numpy(rng.normal(size=(int(few.sum()), 2))).float()
+    noisy = replace(survey.rec, tracks=replace(tracks, point=tracks.point[few], frame=tracks.frame[few], xy=xy))
+    bent = bundle_adjust(noisy)
+    model = to_pycolmap(bent.colmap_model())
+    std = 0.05  # metres
+    stated = survey.position + std * rng.normal(size=strip.shape)
+    cov = np.eye(3) * (std / SCALE) ** 2
+    priors = {name: Prior(p, cov) for name, p in zip(survey.rec.names, survey.in_run(stated), strict=True)}
+    held = from_pycolmap(adjust_to_positions(model, priors, silent, lens=False))
+    free = path_error(bent.cameras.centers.double().numpy(), survey.position)
+    assert path_error(held.cam2world[:, :3, 3], survey.position) < 0.5 * min(free, std * np.sqrt(3))
+
+
+@pytest.fixture(scope="module")
+def two_parts(tmp_path_factory) -> tuple[Frames, np.ndarray]:
+    """Frames over two stretches of ground with a gap, and the places of the cameras."""
+    folder = tmp_path_factory.mktemp("frames")
+    rng = np.random.default_rng(0)
+    ground = texture(rng, 2400, 800)
+    boxes = [(texture(rng, 256, 256), x, rng.uniform(-1.2, 0.4)) for x in np.arange(-2, 17, 0.9)]
+    along = np.concatenate([np.arange(EACH) * STEP, APART + np.arange(EACH) * STEP])
+    places = np.stack([along, 0.3 * np.sin(along), 0.2 * np.cos(2 * along)], -1)
+    frames = []
+    for i, place in enumerate(places):
+        R = Rotation.from_rotvec([0.05 * np.sin(i), 0.06 * np.cos(1.7 * i), 0.1 * np.sin(0.5 * i)]).as_matrix().T
+        P = np.array([[FOCAL, 0, WIDTH / 2], [0, FOCAL, HEIGHT / 2], [0, 0, 1]]) @ np.c_[R, -R @ place]
+        image = np.zeros((HEIGHT, WIDTH), np.uint8)
+        for picture, corner, u, v in [
+            (ground, (-5.0, -4.0, RANGE), (24 / 2400, 0, 0), (0, 8 / 800, 0)),
+            *((box, (x, y, RANGE - 0.9), (0.8 / 256, 0, 0.5 / 256), (0, 0.8 / 256, 0.2 / 256)) for box, x, y in boxes),
+        ]:
+            H = P @ np.stack([[*u, 0], [*v, 0], [*corner, 1]], 1)
+            cover = cv2.warpPerspective(np.full_like(picture, 255), H, (WIDTH, HEIGHT)) > 127
+            image = np.where(cover, cv2.warpPerspective(picture, H, (WIDTH, HEIGHT)), image)
+        file = folder / f"{i:02d}.png"
+        cv2.imwrite(str(file), np.repeat(image[..., None], 3, 2))
+        frames.append(Frame(file.name, file, float(i), 1.0, "train"))
+    return Frames(tuple(frames), WIDTH, HEIGHT, True), places
+
+
+def texture(rng: np.random.Generator, width: int, height: int) -> np.ndarray:
+    total = np.zeros((height, width), np.float32)
+    for cells in (8, 16, 32, 64, 128):
+        small = rng.random((max(2, cells * height // width), cells), np.float32)
+        total += cv2.resize(small, (width, height), interpolation=cv2.INTER_CUBIC)
+    return (255 * (total - total.min()) / np.ptp(total)).astype(np.uint8)
+
+
+def write_navigation(file: Path, frames: Frames, places: np.ndarray, noise: float, rows: slice = slice(None)) -> Path:
+    """Easting, northing and height of the cameras, which look down."""
+    metres = places * [1, -1, -1] + noise * np.random.default_rng(1).normal(size=places.shape) + [1000, 2000, -10]
+    lines = [f"{n},{e},{m},{h}" for n, (e, m, h) in list(zip(frames.names, metres, strict=True))[rows]]
+    file.write_text("\n".join(["image,easting,northing,height", *lines]) + "\n")
+    return file
+
+
+SETTINGS = ColmapSettings(threads=2, focal=FOCAL, k1=0.0, intrinsics="fixed")
+
+
+def test_navigation_joins_two_parts_that_share_no_ground(two_parts, tmp_path):
+    frames, places = two_parts
+    alone = poses.reconstruct(frames, SETTINGS, tmp_path / "alone")
+    assert len(alone.names) == EACH
+    nav = write_navigation(tmp_path / "nav.csv", frames, places, 0.02)
+    navigator = NavigationFile(ScaleSettings(nav=nav, crs="local"))
+    rec = poses.reconstruct(frames, SETTINGS, tmp_path / "joined", navigator=navigator)
+    assert set(rec.names) == set(frames.names)
+    order = [frames.names.index(name) for name in rec.names]
+    assert path_error(rec.cameras.centers.double().numpy(), places[order]) < 0.03
+    told = [warning.what for warning in rec.warnings]
+    assert any("Navigation alone holds 9 frames" in what for what in told)
+    assert not any("fall into parts" in what for what in told)
+    assert not (tmp_path / "joined" / "parts").exists()
+
+
+def test_a_part_without_positions_stays_a_model_of_its_own(two_parts, tmp_path):
+    frames, places = two_parts
+    alone = poses.reconstruct(frames, SETTINGS, tmp_path / "alone")
+    first = alone.names[0] == frames.names[0]
+    rows = slice(0, EACH + 2) if first else slice(EACH - 2, None)
+    nav = write_navigation(tmp_path / "nav.csv", frames, places, 0.02, rows)
+    navigator = NavigationFile(ScaleSettings(nav=nav, crs="local"))
+    rec = poses.reconstruct(frames, SETTINGS, tmp_path / "out", navigator=navigator)
+    assert set(rec.names) == set(alone.names)
+    assert any("fall into parts" in warning.what for warning in rec.warnings)
