@@ -27,8 +27,8 @@ from swimm3r.pipeline.stage_start import StageStart, ignore_stages
 from swimm3r.prepare import check_source, load_frames, read_frames
 from swimm3r.progress import Progress, silent, watched
 from swimm3r.report import write_report
-from swimm3r.scale.rig import has_known_baseline
 from swimm3r.scale.navigation.navigator import NavigationFile
+from swimm3r.scale.rig import has_known_baseline
 from swimm3r.scale.run import read_record, scale_folder, scale_sections, source_key
 from swimm3r.scene.frames import Frames
 from swimm3r.scene.ground_truth import GroundTruth
