@@ -242,8 +242,8 @@ def test_an_empty_folder_is_refused(tmp_path, prepared):
 def test_a_folder_of_other_things_says_what_is_there(tmp_path, prepared):
     (tmp_path / "dive").mkdir()
     for i in range(3):
-        (tmp_path / "dive" / f"{i}.dng").write_bytes(b"raw")
-    fails(r"only 3 \.dng", tmp_path / "dive", prepared)
+        (tmp_path / "dive" / f"{i}.heic").write_bytes(b"none that is read")
+    fails(r"only 3 \.heic", tmp_path / "dive", prepared)
 
 
 def test_no_such_file_is_refused(tmp_path, prepared):

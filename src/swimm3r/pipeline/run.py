@@ -124,6 +124,7 @@ def _make_stages(
         "width": frames.width,
         "height": frames.height,
         "gray": frames.gray,
+        "development": frames.development,
         "masks": {"used": sum(frame.mask is not None for frame in frames), "unused": frames.unused_masks},
     }
     record.add({"warnings": [{"what": what, "advice": ""} for what in frames.warnings]})

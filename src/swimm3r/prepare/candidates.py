@@ -57,6 +57,7 @@ class SelectedImages:
     start_ns: int | None = None  # nanoseconds since 1970 at second 0, where the source stamps its images
     calibration: Path | None = None  # a calibration file in the draft folder
     rig: Rig | None = None
+    development: str | None = None  # how values were brought to sRGB's curve; None where they are as stored
 
 
 def sharpness(gray: UInt8[np.ndarray, "h w"]) -> float:

@@ -25,6 +25,7 @@ from swimm3r.prepare.candidates import (
     sharpness,
     thinned,
 )
+from swimm3r.prepare.development import developed, development_of
 from swimm3r.progress import Progress
 from swimm3r.scene.settings import FrameSettings
 
@@ -42,6 +43,7 @@ def open_clip(source: Path, settings: FrameSettings) -> Clip:
 def prepare_clip(source: Path, draft: Path, settings: FrameSettings, progress: Progress) -> SelectedImages:
     """Write the frames of a clip into `draft`, in one pass. Raises InputError."""
     video = open_clip(source, settings)
+    development = development_of(settings)
     end = settings.end if settings.end is not None else inf
     last = min(end, video.seconds if video.seconds is not None else inf)
     rate = settings.fps or inf
@@ -70,7 +72,7 @@ def prepare_clip(source: Path, draft: Path, settings: FrameSettings, progress: P
             continue
         frame, sharp = best
         name = f"frame_{len(found):06d}.png"
-        rgb = scaled_down(frame.rgb(), settings.long_side)
+        rgb = scaled_down(developed(frame.rgb(), development), settings.long_side)
         images.write_rgb(draft / name, rgb)
         found.append(SourceImage(name, Path(name), (video.width, video.height), frame.time, sharp, is_gray(rgb)))
     progress(STEP, max(seen, 1), max(seen, 1))
@@ -86,7 +88,8 @@ def prepare_clip(source: Path, draft: Path, settings: FrameSettings, progress: P
     mask_folders = [settings.masks] if settings.masks is not None else []
     kept = thinned(found, settings.max_frames)
     originals = [image.original for image in found]
-    chosen = SelectedImages(kept, True, warnings, mask_folders, originals, recorded=video.recorded)
+    told = str(development) if development.changes else None
+    chosen = SelectedImages(kept, True, warnings, mask_folders, originals, recorded=video.recorded, development=told)
     if not isinstance(video, BagClip):
         return chosen
     lens = draft / LENS if video.lens is not None and settings.camera_info else None

@@ -2,7 +2,7 @@
 
 The folder appears when it is complete, and not before. frames.json holds name, time, split, sharpness and mask of each
 frame, and width, height, ordered, gray, masks (how many are used and unused), source, date of the recording, stamp of
-second 0, lens and warnings of them all.
+second 0, lens, development of raw or log images, and warnings of them all.
 """
 
 import logging
@@ -104,6 +104,7 @@ class _Document:
     start_ns: int | None = None
     calibration: str | None = None
     rig: Rig | None = None
+    development: str | None = None
 
     def __post_init__(self) -> None:
         if min(self.width, self.height) < 1:
@@ -149,6 +150,7 @@ def load_frames(folder: Path) -> Frames:
         start_ns=document.start_ns,
         calibration=calibration,
         rig=document.rig,
+        development=document.development,
     )
 
 
@@ -252,6 +254,7 @@ def _write_frames(dive: SelectedImages, draft: Path, source: Path, settings: Fra
         start_ns=dive.start_ns,
         calibration=dive.calibration,
         rig=dive.rig,
+        development=dive.development,
     )
     write_index(draft, frames, str(source.resolve()))
 

@@ -16,7 +16,8 @@ from swimm3r.errors import InputError
 from swimm3r.io import image_folder, images
 from swimm3r.io.files.cache_key import files_below
 from swimm3r.io.files.safe_names import safe_name, shown_name
-from swimm3r.io.image_header import ImageHeader, ImageSizeError, capture_time, read_header
+from swimm3r.io.image_header import ImageHeader, ImageSizeError, capture_time
+from swimm3r.io.raw import RAW_SUFFIXES
 from swimm3r.io.video import VIDEO_SUFFIXES
 from swimm3r.prepare.candidates import (
     BLANK,
@@ -32,6 +33,7 @@ from swimm3r.prepare.candidates import (
     some_names,
     thinned,
 )
+from swimm3r.prepare.development import Development, development_of, header_of, read_developed
 from swimm3r.prepare.rig import cameras_of_folder, pair_images
 from swimm3r.progress import Progress
 from swimm3r.scene.rig import Rig, RigCamera
@@ -58,6 +60,7 @@ class ImageFolder:
     root: Path  # names are relative to it
     paths: list[Path]
     unreadable: list[Path]  # folders that could not be searched
+    raw_beside: int = 0  # camera raw files that were passed over, as there are images
 
 
 def prepare_stills(
@@ -68,16 +71,22 @@ def prepare_stills(
     cameras = cameras_of_folder(folder.root, settings)
     if cameras:
         folder = replace(folder, paths=[p for p in folder.paths if p.relative_to(folder.root).parts[0] in cameras])
+    development = development_of(settings, folder.paths)
     root, originals = folder.root, [path.relative_to(folder.root) for path in folder.paths]
     headers: dict[Path, ImageHeader] = {}
     refused: dict[Path, InputError] = {}
     for path in folder.paths:
         try:
-            headers[path] = read_header(path)
+            headers[path] = header_of(path, development)
         except InputError as error:
             refused[path] = error
     sizes = {path: header.size for path, header in headers.items()}
     paths, warnings = _one_size(list(headers), sizes, root, settings)
+    if folder.raw_beside:
+        warnings.append(
+            f"{folder.raw_beside} camera raw files lie beside the images and were left out. "
+            "A folder that holds them alone is developed."
+        )
     if cameras:
         of_rig = pair_images(root, paths, cameras, settings)
         chosen, ordered, recorded = list(of_rig.images), of_rig.ordered, of_rig.recorded
@@ -88,7 +97,8 @@ def prepare_stills(
         chosen = thinned(taken, settings.max_frames)
     work = _named(chosen, root, settings.long_side, headers)
     most = max((headers[path].decoding_bytes for path in paths), default=0)
-    results = _in_threads(partial(_prepare_still, draft=draft, long_side=settings.long_side), work, most, progress)
+    prepare = partial(_prepare_still, draft=draft, long_side=settings.long_side, development=development)
+    results = _in_threads(prepare, work, most, progress)
     images, blank, of_path = [], 0, {taken.path: taken for taken in chosen}
     for still, result in zip(work, results, strict=True):
         match result:
@@ -113,22 +123,31 @@ def prepare_stills(
         )
     files = frozenset(root.resolve() / original for original in originals)
     rig = Rig(tuple(RigCamera(name) for name in cameras)) if cameras else None
-    return SelectedImages(images, ordered, warnings, mask_folders, originals, files, recorded, rig=rig)
+    told = str(development) if development.changes or development.balance is not None else None
+    return SelectedImages(
+        images, ordered, warnings, mask_folders, originals, files, recorded, rig=rig, development=told
+    )
 
 
 def images_of(source: Path, leave_out: Sequence[Path] = ()) -> ImageFolder:
-    """The images of a folder: those in images/ where there is one and no image beside it. Raises InputError."""
+    """The images of a folder: those in images/ where there is one and no image beside it; without any, raw files.
+
+    Raises InputError where there are neither.
+    """
     root = _root_of(source)
     outer = [path for path in leave_out if path.resolve() != root.resolve()]
     found = image_folder.find_images(root, [*outer, root / MASKS])
+    raw = image_folder.find_files(root, RAW_SUFFIXES, [*outer, root / MASKS])
     if found.paths:
-        return ImageFolder(root, found.paths, found.unreadable)
+        return ImageFolder(root, found.paths, found.unreadable, len(raw.paths))
+    if raw.paths:
+        return ImageFolder(root, raw.paths, raw.unreadable)
     kinds = Counter(path.suffix.lower() for path in files_below(root))
     instead = ", ".join(f"{count} {kind or 'nameless'}" for kind, count in kinds.most_common(4))
     raise InputError(
         f"{source} holds no images" + (f", only {instead}" if instead else ": it is empty"),
-        cause="another folder was meant, or the images are raw files or HEIC",
-        hint=f"a folder with {', '.join(images.SUFFIXES)}; a video is given by its own path; develop raw files first",
+        cause="another folder was meant, or the images are HEIC",
+        hint=f"a folder with {', '.join(images.SUFFIXES)}, or camera raw files; a video is given by its own path",
     )
 
 
@@ -138,7 +157,7 @@ def only_video(source: Path) -> Path | None:
     Raises InputError where there are several.
     """
     root = _root_of(source)
-    if image_folder.find_images(root, [root / MASKS]).paths:
+    if image_folder.find_images(root, [root / MASKS]).paths or image_folder.find_files(root, RAW_SUFFIXES).paths:
         return None
     videos = image_folder.find_files(source, VIDEO_SUFFIXES).paths
     if len(videos) > 1:
@@ -152,7 +171,9 @@ def only_video(source: Path) -> Path | None:
 
 def _root_of(source: Path) -> Path:
     inner = source / "images"
-    beside = any(path.suffix.lower() in images.SUFFIXES for path in source.iterdir() if path.is_file())
+    beside = any(
+        path.suffix.lower() in (*images.SUFFIXES, *RAW_SUFFIXES) for path in source.iterdir() if path.is_file()
+    )
     return inner if inner.is_dir() and not beside else source
 
 
@@ -232,11 +253,13 @@ def _named(chosen: list[Taken], root: Path, long_side: int, headers: dict[Path, 
     return work
 
 
-def _prepare_still(still: _Still, draft: Path, long_side: int) -> tuple[float, bool] | InputError | None:
+def _prepare_still(
+    still: _Still, draft: Path, long_side: int, development: Development
+) -> tuple[float, bool] | InputError | None:
     """Put one image in its place: its sharpness and grayness, None where it shows nothing, or what is wrong."""
     target = draft / still.name
     try:
-        image = images.read_rgb(still.source)
+        image = read_developed(still.source, development)
     except InputError as error:
         return error
     gray = small_gray(image)

@@ -64,6 +64,7 @@ class Frames:
     start_ns: int | None = None  # nanoseconds since 1970 at second 0, where every image is stamped: those of a bag
     calibration: Path | None = None  # the lens as the source states it, a file beside the frames
     rig: Rig | None = None  # cameras that are fixed to each other; frames of one instant are neighbors in the list
+    development: str | None = None  # how raw, linear or log values became sRGB's; None where frames are as stored
 
     def __len__(self) -> int:
         return len(self.frames)
@@ -150,7 +151,7 @@ class Frames:
         return tuple(times[name] for name in names)
 
     def image(self, i: int) -> Float[Tensor, "h w 3"]:
-        """Image i as stored (sRGB-encoded unless the input was linear), 0..1. Raises InputError on a damaged one."""
+        """Image i as stored (sRGB-encoded, raw and log inputs too), 0..1. Raises InputError on a damaged one."""
         return _unit(self._stored(i))
 
     def colors(self, i: int, pixels: Int[Tensor, " n"]) -> Float[Tensor, "n 3"]:
@@ -224,6 +225,7 @@ def write_index(folder: Path, frames: Frames, source: str = "") -> None:
         "start_ns": frames.start_ns,
         "calibration": None if frames.calibration is None else frames.calibration.relative_to(folder).as_posix(),
         "rig": None if frames.rig is None else asdict(frames.rig),
+        "development": frames.development,
         "frames": [
             {
                 "name": frame.name,

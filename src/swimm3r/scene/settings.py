@@ -7,6 +7,8 @@ from typing import Annotated, Literal
 from swimm3r.errors import UsageError
 from swimm3r.settings import ClipSecond, CountOrZero, LongSideOrOwn, Range, Settings, Share
 
+Transfer = Literal["srgb", "linear", "gopro-log", "s-log3", "v-log"]
+
 
 @dataclass(frozen=True)
 class FrameSettings(Settings):
@@ -51,6 +53,13 @@ class FrameSettings(Settings):
     """Largest difference of the times of one instant in seconds."""
     rig_missing: Share = 0.1
     """Largest share of instants at which a camera of the rig may have no image."""
+    transfer: Transfer = "srgb"
+    """Curve of the values in images and videos; those of linear light or a log curve are developed to sRGB's."""
+    raw_balance: Literal["daylight", "camera", "none"] = "daylight"
+    """White balance of camera raw files: that of the camera for daylight, that the first file was taken with, or none.
+    """
+    stops: Annotated[float, Range(-10, 10)] = 0.0
+    """Exposure added to raw files and to linear or log images, in stops; light above 1 is clipped."""
     odd_sizes: Literal["refuse", "skip"] = "refuse"
     """Handling of images whose size differs from most others: refuse the input, or skip them."""
 
