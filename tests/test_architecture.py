@@ -27,7 +27,7 @@ ROWS = {  # by package: a room or module imports only rooms of rows before its o
     "swimm3r.io": [
         {"files", "view_names"},
         {"cameras_json", "depth", "medium_json", "colmap", "image_header", "ply", "trajectory", "video"},
-        {"images"},
+        {"images", "raw"},
         {"image_folder", "imports"},
         {"calibration"},
         {"bags"},

@@ -90,6 +90,60 @@ def test_positions_without_height_are_enough(survey):
     assert found.scale == pytest.approx(SCALE, rel=1e-4)
 
 
+def heaving(count: int = 3) -> Survey:
+    """A survey that rises and sinks by more than a meter."""
+    path = lines(count)
+    return survey_along(path + np.stack([0 * path[:, 0], 0 * path[:, 0], 0.7 * np.sin(np.arange(len(path)) / 4)], -1))
+
+
+def depths_of(survey: Survey, noise: float = 0.0) -> dict:
+    rng = np.random.default_rng(0)
+    return {
+        "position": survey.position * [0, 0, 1] + noise * rng.normal(size=survey.position.shape) * [0, 0, 1],
+        "std": np.tile([np.inf, np.inf, 0.1], (len(survey.position), 1)),
+        "attitude": None,
+    }
+
+
+def test_depths_alone_give_scale_and_up():
+    survey = heaving()
+    found = aligned(survey, **depths_of(survey))
+    assert found.scale == pytest.approx(SCALE, rel=1e-3)
+    assert (found.R @ TURN[:, 2])[2] > np.cos(np.radians(0.5))
+    noisy = aligned(survey, **depths_of(survey, 0.1))
+    assert abs(np.log(noisy.scale / SCALE)) < 3 * noisy.scale_std < 0.3
+
+
+def test_depths_alone_say_nothing_of_heading_east_and_north():
+    survey = heaving()
+    found = aligned(survey, **depths_of(survey))
+    assert found.rotation_std_deg[2] >= 90
+    assert found.rotation_std_deg[:2].max() < 10
+    assert found.center_std[:2].min() > 1e3
+    assert found.center_std[2] < 0.1
+
+
+@pytest.mark.parametrize("shift", [-1.1, 0.6])
+def test_depths_alone_show_the_offset_between_clocks(shift: float):
+    survey = heaving()
+    log = dense(survey, step=1.0)
+    log = replace(log, std=np.tile([np.inf, np.inf, 0.1], (len(log), 1)))
+    log = replace(log, position=log.position * [0, 0, 1])
+    found = find_offset(log, times_of(survey, -shift), survey.rec.cameras.centers.numpy(), (-3.0, 3.0), 5.0)
+    assert found is not None
+    assert found.seconds == pytest.approx(shift, abs=0.1)
+
+
+def test_the_log_of_a_dive_computer_gives_a_run_its_scale(tmp_path):
+    survey = heaving()
+    seconds, depths = survey.seconds, -survey.position[:, 2] + 12
+    path = tmp_path / "log.csv"
+    rows = "".join(f"{t!r},{d!r}\n" for t, d in zip(seconds.tolist(), depths.round(1).tolist(), strict=True))
+    path.write_text("time,depth [m]\n" + rows)
+    found = fit_navigation(survey.rec, survey.frames, ScaleSettings(nav=path))
+    assert found.alignment.scale == pytest.approx(SCALE, rel=0.03)
+
+
 def test_along_a_straight_line_the_ground_lies_below_the_cameras():
     line = np.stack([np.arange(20) * 0.3, np.zeros(20), np.full(20, 2.0)], -1)
     survey = survey_along(line)

@@ -75,6 +75,7 @@ def _placed(found: Alignment, place: Place, center: Float[np.ndarray, "3"], solu
     origin = np.array(place.base) + grid * (place.to_grid @ local_origin)
     away = np.linalg.norm(solution.scale * center)
     sides = np.radians(np.abs(found.rotation_std_deg)).max() * away
+    origin_std = np.hypot(found.center_std, np.hypot(sides, solution.std * away))
     geodetic = None
     if place.origin is not None:
         latitude, longitude, _ = geodetic_from_local(local_origin[None], place.origin)[0]
@@ -85,7 +86,7 @@ def _placed(found: Alignment, place: Place, center: Float[np.ndarray, "3"], solu
         rotation=(_vector(R[0]), _vector(R[1]), _vector(R[2])),
         scale=solution.scale,
         scale_std=solution.std,
-        origin_std=_vector(np.hypot(found.center_std, np.hypot(sides, solution.std * away))),
+        origin_std=_vector(origin_std) if np.isfinite(origin_std).all() else None,
         rotation_std_deg=_vector(found.rotation_std_deg),
         grid_scale=float(place.grid_scale),
         geodetic=geodetic,

@@ -8,14 +8,15 @@ from swimm3r.io.bags.bag import is_bag
 from swimm3r.io.files.damage import Remedy, guard
 from swimm3r.io.image_folder import find_images
 from swimm3r.io.navigation.bag import read_bag
+from swimm3r.io.navigation.dive_log import is_dive_log, read_dive_log
 from swimm3r.io.navigation.exif import read_exif
 from swimm3r.io.navigation.formats import read_dim2, read_nmea, read_srt, read_tum
 from swimm3r.io.navigation.record import Navigation, in_time_order
 from swimm3r.io.navigation.table import read_table
 
 _REMEDY = Remedy(
-    "a CSV with named columns, NMEA, Matisse .dim2, TUM, .srt, a ROS bag, or a folder of images with GPS in EXIF; see"
-    " docs/guides/metric-scale.md",
+    "a CSV with named columns, NMEA, Matisse .dim2, TUM, .srt, Subsurface's XML, a ROS bag, or a folder of images with"
+    " GPS in EXIF; see docs/guides/metric-scale.md",
     cause="a slip in the name, or it is cut off or of another format",
     fault="cannot be read as navigation",
 )
@@ -50,6 +51,8 @@ def _read(path: Path, begin: str) -> Navigation:
     lines = [line for line in begin.splitlines() if line.strip()]
     if not lines:
         raise InputError(f"{path} is empty", cause="the recording did not start", hint="another file")
+    if is_dive_log(begin):
+        return read_dive_log(path)
     if _DIM2.match(lines[0]):
         return read_dim2(path)
     if "-->" in begin:

@@ -42,6 +42,11 @@ class Navigation:
     def __len__(self) -> int:
         return len(self.position)
 
+    @property
+    def has_heights_alone(self) -> bool:
+        """Return whether east and north are known in no row, as of dive computers."""
+        return self.std is not None and bool(np.isinf(self.std[:, :2]).all())
+
     def rows(self, which: Int[np.ndarray, " k"] | Bool[np.ndarray, " n"]) -> "Navigation":
         """Some of the rows."""
         index = np.flatnonzero(which) if which.dtype == bool else which

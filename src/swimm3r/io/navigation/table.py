@@ -9,6 +9,7 @@ import numpy as np
 from swimm3r.errors import InputError
 from swimm3r.io.navigation.clock import is_date, seconds_of, seconds_of_date, seconds_of_day
 from swimm3r.io.navigation.columns import Column, column
+from swimm3r.io.navigation.dive_log import depths_alone
 from swimm3r.io.navigation.pressure import depth_of_pressure
 from swimm3r.io.navigation.record import Clock, Frame, Navigation, vehicle_attitude
 
@@ -18,6 +19,7 @@ _HINT = (
 )
 _TURN = 2 * np.pi + 1e-6
 _TEXTS = ("name", "date", "time", "role")
+_POSITIONS = ("latitude", "longitude", "easting", "northing")
 _BESIDE = {"latitude": "longitude", "easting": "northing"}
 
 
@@ -25,6 +27,8 @@ def read_table(path: Path) -> Navigation:
     """The navigation in a table whose first line names the columns. Raises InputError that names line and column."""
     cells, columns = read_cells(path)
     values = _values(path, cells, columns)
+    if not any(kind in values for kind in _POSITIONS) and any(kind in values for kind in ("depth", "pressure")):
+        return _depths_alone(path, cells, columns, values)
     frame, position, std = read_positions(path, cells, columns)
     count = len(position)
     names = tuple(cells["name"]) if "name" in cells else None
@@ -46,6 +50,21 @@ def read_table(path: Path) -> Navigation:
         attitude_std=_columns_of(values, ("std_heading", "std_pitch", "std_roll")),
         altitude=values.get("altitude"),
     )
+
+
+def _depths_alone(
+    path: Path, cells: dict[str, list[str]], columns: dict[str, Column], values: dict[str, np.ndarray]
+) -> Navigation:
+    """A table of times and depths, as dive computers and loggers write it; rows without a depth are left out."""
+    count = len(cells["time"]) if "time" in cells else 0
+    if not count:
+        _refuse(path, "it has depths and no times")
+    height, _ = _heights(path, values, count)
+    _, time = _times(path, cells, columns, count, None)
+    known = np.isfinite(height)
+    if not known.any():
+        _refuse(path, "none of its rows has a depth")
+    return depths_alone(path, time[known], -height[known])
 
 
 def read_positions(

@@ -23,6 +23,7 @@ MOUNTS = {  # camera axes (right, down, ahead of the image) in those of the vehi
     "forward": np.array([[0.0, 0, 1], [1, 0, 0], [0, 1, 0]]),
 }
 _UP_STD = np.radians(20.0)
+_HALF_TURN = np.pi  # standard deviation of a heading that is not known
 _REFINED = 2  # of the beginnings, the best ones
 _ROUNDS = 12
 _SETTLED = 1e-6  # of the sizes of the unknowns, between rounds
@@ -135,7 +136,17 @@ def _starts(path: Path, settings: ScaleSettings) -> list[tuple[float, np.ndarray
         scale = float((b * (a @ R.T) * known).sum() / ((a @ R.T * known) ** 2).sum())
         if scale > 0:
             starts.append((scale, R, target.mean(0) - scale * R @ path.centers.mean(0)))
+    if not known[:2].any():
+        starts.append(_by_heights(path, target[:, 2]))
     return [start for start in starts if start[0] > 0]
+
+
+def _by_heights(path: Path, height: Float[np.ndarray, " k"]) -> tuple[float, np.ndarray, np.ndarray]:
+    """The beginning of heights alone: up as the scene shows it, the scale of heights above and below."""
+    turn = Rotation.align_vectors([[0.0, 0.0, 1.0]], [path.up])[0].as_matrix()
+    rise, stated = (path.centers - path.centers.mean(0)) @ path.up, height - height.mean()
+    scale = float(rise @ stated / max(float(rise @ rise), 1e-18))
+    return scale, turn, np.array([0.0, 0.0, height.mean()]) - scale * turn @ path.centers.mean(0)
 
 
 def _camera_positions(path: Path, settings: ScaleSettings) -> Float[np.ndarray, "k 3"]:
@@ -273,7 +284,9 @@ def _result(problem: _Problem, fitted: OptimizeResult, std: np.ndarray, weight: 
     spread = float((rows**2).sum()) / max(1, used - 7) * correlation
     free = fitted.jac.T @ fitted.jac
     covariance = np.linalg.pinv(free, rcond=1e-12) * max(1.0, spread)
-    errors = np.sqrt(np.diag(covariance))
+    errors = np.sqrt(np.diag(covariance).clip(0))
+    undetermined = ~(np.diag(free) > 0)  # heights alone say nothing of heading, east and north
+    errors[undetermined] = np.where(np.arange(len(errors)) < 4, _HALF_TURN, np.inf)[undetermined]
     attitudes = problem.attitudes(fitted.x)
     shown = float(np.degrees(np.sqrt((attitudes**2).sum(1).mean()))) if len(attitudes) else None
     return Alignment(

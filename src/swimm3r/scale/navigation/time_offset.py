@@ -97,13 +97,27 @@ def _misfit(navigation: Navigation, path: _CameraPath, offset: float) -> tuple[i
     if rows.sum() < FEWEST:
         return int(rows.sum()), np.inf
     source, target = source[rows], navigation.position[rows]
+    fit = _heights if navigation.has_heights_alone else _similar
     weight = np.ones(len(source))
     squared = np.zeros(len(source))
     for _ in range(3):
-        scale, R, t = umeyama(source, target, weight)
-        squared = ((scale * source @ R.T + t - target) ** 2).sum(1)
+        squared = fit(source, target, weight)
         weight = 1 / (1 + squared / (4 * np.median(squared) + 1e-12))
     return len(source), float(weight @ squared / weight.sum())
+
+
+def _similar(source: np.ndarray, target: np.ndarray, weight: np.ndarray) -> np.ndarray:
+    """Squared distances under the best similarity."""
+    scale, R, t = umeyama(source, target, weight)
+    return ((scale * source @ R.T + t - target) ** 2).sum(1)
+
+
+def _heights(source: np.ndarray, target: np.ndarray, weight: np.ndarray) -> np.ndarray:
+    """Squared differences of heights under the best scale and direction up."""
+    rows = np.column_stack([source - source.mean(0), np.ones(len(source))])
+    root = np.sqrt(weight)
+    found = np.linalg.lstsq(rows * root[:, None], target[:, 2] * root, rcond=1e-6)[0]
+    return (rows @ found - target[:, 2]) ** 2
 
 
 def _least(fit: Callable[[float], float], low: float, high: float) -> float:
