@@ -119,7 +119,7 @@ def umeyama(
 def _starts(path: Path, settings: ScaleSettings) -> list[tuple[float, np.ndarray, np.ndarray]]:
     """Beginnings: the centers alone, and turned half about the path, and the attitude where the mounting is known."""
     target = _camera_positions(path, settings)
-    known = np.ones(3) if path.std is None else (~np.isinf(path.std)).any(0)
+    known = np.ones(3) if path.std is None else np.array([not np.isinf(column).all() for column in path.std.T])
     target = target * known
     scale, R, t = umeyama(path.centers, target)
     along = np.linalg.svd(target - target.mean(0), full_matrices=False)[2][0]
