@@ -90,7 +90,7 @@ def test_positions_without_height_are_enough(survey):
     assert found.scale == pytest.approx(SCALE, rel=1e-4)
 
 
-def heaving(count: int = 3) -> Survey:
+def rising_and_sinking(count: int = 3) -> Survey:
     """A survey that rises and sinks by more than a meter."""
     path = lines(count)
     return survey_along(path + np.stack([0 * path[:, 0], 0 * path[:, 0], 0.7 * np.sin(np.arange(len(path)) / 4)], -1))
@@ -106,7 +106,7 @@ def depths_of(survey: Survey, noise: float = 0.0) -> dict:
 
 
 def test_depths_alone_give_scale_and_up():
-    survey = heaving()
+    survey = rising_and_sinking()
     found = aligned(survey, **depths_of(survey))
     assert found.scale == pytest.approx(SCALE, rel=1e-3)
     assert (found.R @ TURN[:, 2])[2] > np.cos(np.radians(0.5))
@@ -115,7 +115,7 @@ def test_depths_alone_give_scale_and_up():
 
 
 def test_depths_alone_say_nothing_of_heading_east_and_north():
-    survey = heaving()
+    survey = rising_and_sinking()
     found = aligned(survey, **depths_of(survey))
     assert found.rotation_std_deg[2] >= 90
     assert found.rotation_std_deg[:2].max() < 10
@@ -125,7 +125,7 @@ def test_depths_alone_say_nothing_of_heading_east_and_north():
 
 @pytest.mark.parametrize("shift", [-1.1, 0.6])
 def test_depths_alone_show_the_offset_between_clocks(shift: float):
-    survey = heaving()
+    survey = rising_and_sinking()
     log = dense(survey, step=1.0)
     log = replace(log, std=np.tile([np.inf, np.inf, 0.1], (len(log), 1)))
     log = replace(log, position=log.position * [0, 0, 1])
@@ -135,7 +135,7 @@ def test_depths_alone_show_the_offset_between_clocks(shift: float):
 
 
 def test_the_log_of_a_dive_computer_gives_a_run_its_scale(tmp_path):
-    survey = heaving()
+    survey = rising_and_sinking()
     seconds, depths = survey.seconds, -survey.position[:, 2] + 12
     path = tmp_path / "log.csv"
     rows = "".join(f"{t!r},{d!r}\n" for t, d in zip(seconds.tolist(), depths.round(1).tolist(), strict=True))

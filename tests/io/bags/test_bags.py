@@ -98,6 +98,32 @@ def test_a_bag_is_sampled_like_a_video(tmp_path: Path):
     assert later.stamps_of(later.names) == tuple(START + round(t * SECOND) for t in (0.5, 0.6, 0.7, 0.8, 0.9, 1.0))
 
 
+@pytest.mark.parametrize("stamps", ["header", "received"])
+@pytest.mark.parametrize("version", VERSIONS)
+def test_a_late_start_passes_over_what_was_recorded_long_before(version: str, stamps, tmp_path: Path, monkeypatch):
+    path = write_bag(tmp_path, version, camera(count=40, step=10.0))
+    clip, stated = BagClip(path, stamps=stamps), []
+    whole = [frame.time for frame in clip.frames()]
+    messages = Bag.messages
+
+    def counted(bag: Bag, *topics: str, since: int | None = None):
+        for message in messages(bag, *topics, since=since):
+            stated.append(message.stamp)
+            yield message
+
+    monkeypatch.setattr(Bag, "messages", counted)
+    assert [frame.time for frame in clip.frames(start=200.0)] == [time for time in whole if time >= 200]
+    assert 20 <= len(stated) <= 27
+
+
+def test_a_driver_that_is_calibrated_later_gives_its_lens(tmp_path: Path):
+    unset = [replace(lens(K=(0.0,) * 9), stamp=START + i * SECOND // 10) for i in range(3)]
+    path = write_bag(tmp_path, "bag", [*camera(), *unset, replace(lens(), stamp=START + SECOND)])
+    frames = read_frames(path, folder=tmp_path / "prepare")
+    assert frames.calibration is not None
+    assert not any("lens" in warning for warning in frames.warnings)
+
+
 def test_the_lens_is_that_of_camera_info_in_pixels_of_the_frames(tmp_path: Path):
     path = write_bag(tmp_path, "sqlite3", [*camera(), lens()])
     frames = read_frames(path, folder=tmp_path / "prepare", long_side=32)

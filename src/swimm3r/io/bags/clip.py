@@ -9,6 +9,7 @@ from collections.abc import Iterator
 from dataclasses import dataclass
 from datetime import UTC, datetime
 from functools import cached_property
+from itertools import islice
 from pathlib import Path
 from typing import Any, Literal
 
@@ -27,6 +28,7 @@ from swimm3r.io.images import Rgb
 
 Stamps = Literal["header", "received"]
 
+_TRIED = 100  # messages of a lens, of which the first that is calibrated counts
 _LEAP = 60.0  # seconds that a header may be ahead of the recording between two images: buffers hold less
 _FIRST_YEAR = 631_152_000  # 1990 in seconds since 1970: earlier stamps are of a clock that was never set
 
@@ -88,6 +90,7 @@ class BagClip:
             image = self._first_decoded(bag)
             self.height, self.width = image.shape[:2]
             self.lens = self._lens(bag, lens_topic(topics, self.topic))
+        self._first_received = first.received
         self.start_ns, end = self._stamp(first), self._stamp(last)
         self.seconds = (end - self.start_ns) * 1e-9 if end > self.start_ns else None
         self.rate = (self.topic.count - 1) / self.seconds if self.seconds else 1.0
@@ -97,10 +100,13 @@ class BagClip:
 
     def frames(self, start: float = 0.0, end: float = math.inf) -> Iterator[BagImage]:
         """The images from second `start` up to before second `end`. Raises InputError where the clock is no clock."""
+        skipped = max(0.0, start - _LEAP)  # recorders write a message within that time of its header
+        since = self._first_received + int(skipped * 1e9) if skipped else None
         with open_bag(self.path) as bag:
             before: Message | None = None
-            for number, message in enumerate(bag.messages(self.topic.name), 1):
-                self._check_clock(message, before, number)
+            for number, message in enumerate(bag.messages(self.topic.name, since=since), 1):
+                place = f"image {number}" if since is None else f"image {number} from {skipped:.0f} s on"
+                self._check_clock(message, before, place)
                 if before is not None and self._stamp(message) == self._stamp(before):
                     continue  # the same image twice
                 before = message
@@ -164,30 +170,32 @@ class BagClip:
                 f"There is no camera_info beside {space}: the lens is estimated unless --calibration tells it."
             )
             return None
-        message = bag.first(topic.name)
-        assert message is not None  # or it would be no topic
-        try:
-            text = lens_text(bag.content(message), topic.name, rectified="rect" in space.rpartition("/")[2])
-            lens_at(read_document(from_yaml(text))[0], self.width, self.height)
-        except (ValueError, Swimm3rError) as error:
-            self._notes.append(f"The lens in {topic.name} is not used: {first_line(error)}.")
-            return None
-        return text
+        why: object = "it holds no message that can be read"
+        for message in islice(bag.messages(topic.name), _TRIED):  # drivers send empty ones until they are set up
+            try:
+                text = lens_text(bag.content(message), topic.name, rectified="rect" in space.rpartition("/")[2])
+                lens_at(read_document(from_yaml(text))[0], self.width, self.height)
+            except (ValueError, Swimm3rError) as error:
+                why = first_line(error)
+            else:
+                return text
+        self._notes.append(f"The lens in {topic.name} is not used: {why}.")
+        return None
 
     def _stamp(self, message: Message) -> int:
         return message.stamp if self.stamps == "header" else message.received
 
-    def _check_clock(self, message: Message, before: Message | None, number: int) -> None:
+    def _check_clock(self, message: Message, before: Message | None, place: str) -> None:
         """Raise InputError for a stamp that is zero, earlier than the one before, or far ahead of the recording."""
         fault = None
         if self._stamp(message) == 0:
-            fault = f"image {number} has a stamp of zero"
+            fault = f"{place} has a stamp of zero"
         elif before is not None:
             step = (self._stamp(message) - self._stamp(before)) * 1e-9
             if step < 0:
-                fault = f"the clock runs back by {-step:.3g} s at image {number}"
+                fault = f"the clock runs back by {-step:.3g} s at {place}"
             elif step - (message.received - before.received) * 1e-9 > _LEAP:
-                fault = f"the clock leaps ahead by {step:.3g} s at image {number}"
+                fault = f"the clock leaps ahead by {step:.3g} s at {place}"
         if fault is not None:
             raise InputError(
                 f"the headers of {self.topic.name} in {self.path} are no times: {fault}",
