@@ -1,5 +1,6 @@
 """Maps of an analytic seabed: heights, colors, place, holes, and how they are made in tiles."""
 
+import json
 import shutil
 from dataclasses import replace
 from pathlib import Path
@@ -131,6 +132,10 @@ def test_holes_stay_holes(seabed: Seabed, tmp_path: Path):
     inside = np.hypot(x - 0.5, y - 0.5) < 0.13
     assert np.isnan(found[inside]).all()
     assert not alpha[inside].any()
+    told = json.loads((run / "summary.json").read_text())["products"]
+    assert told["area"] == pytest.approx(np.isfinite(found).sum() * told["gsd"] ** 2)
+    assert told["area_std"] == pytest.approx(2 * SCALE_STD * told["area"])
+    assert (told["unit"], "elevation.tif" in told["files"]) == ("m", True)
 
 
 def test_without_georeference_up_is_from_the_scene_and_the_unit_stays_unknown(seabed: Seabed, tmp_path: Path):

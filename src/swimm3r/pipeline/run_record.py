@@ -24,6 +24,7 @@ from swimm3r.pipeline.estimate import Estimate, check_disk, duration, size
 from swimm3r.pipeline.presets import RunSettings, from_yaml
 from swimm3r.pipeline.run_settings import differences, settings_by_stage, with_stages_of
 from swimm3r.pipeline.stage_start import StageStart, ignore_stages
+from swimm3r.products.record import summary_section
 from swimm3r.scale.rescale import finish_rescale
 from swimm3r.scene.run_folder import MARKERS, SCHEMA, STAGES, RunFolder, StageRecord, check_vacant, is_run, read_run
 
@@ -241,6 +242,7 @@ class RunRecord:
 
     def write(self) -> dict:
         """Bring summary.json up to date and return it."""
+        self.summary |= summary_section(self.folder)
         write_text(self.folder / "summary.json", json.dumps(self.summary, indent=2) + "\n")
         return self.summary
 

@@ -4,6 +4,7 @@ import json
 import math
 from dataclasses import asdict, dataclass
 from pathlib import Path
+from typing import Any
 
 from swimm3r.io.files.atomic import write_text
 from swimm3r.io.files.damage import Remedy
@@ -82,6 +83,17 @@ class ProductsRecord:
             f"Surface: rugosity {found.rugosity:.3f}, mean slope {found.mean_slope_deg:.1f} degrees, from heights every"
             f" {found.resolution:.3g} {self.unit}; figures of {found.squares} squares in habitat.csv"
         ]
+
+
+def summary_section(run: Path) -> dict[str, dict[str, Any]]:
+    """The section "products" of the run's summary.json; none where RUN/products holds none."""
+    record = read_record(run / FOLDER)
+    if record is None:
+        return {}
+    figures = asdict(record)
+    del figures["schema"], figures["place"]
+    area_std = None if record.scale_std is None else 2 * record.scale_std * record.area
+    return {"products": {**figures, "area_std": area_std}}
 
 
 def read_record(folder: Path) -> ProductsRecord | None:

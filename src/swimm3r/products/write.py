@@ -1,15 +1,18 @@
 """All map products of a run, in one pass over the tiles of its grid, then what is made of the finished maps."""
 
+import json
 from collections.abc import Iterator
-from contextlib import ExitStack, contextmanager
+from contextlib import ExitStack, contextmanager, suppress
 from dataclasses import dataclass, field
 from importlib.metadata import version
 from pathlib import Path
 
 import numpy as np
 
-from swimm3r.errors import InputError
+from swimm3r.errors import InputError, UsageError
+from swimm3r.io.files.atomic import write_text
 from swimm3r.io.files.cache_key import cache_key
+from swimm3r.io.files.folder_lock import folder_lock
 from swimm3r.io.files.outputs import output_folder
 from swimm3r.products.elevation import elevation, frames_over, hill_shade
 from swimm3r.products.frame_colors import Points, blended
@@ -19,7 +22,7 @@ from swimm3r.products.habitat.areas import Area, Line, read_areas
 from swimm3r.products.habitat.tables import Lattice, lattice, write_areas, write_profiles, write_squares
 from swimm3r.products.packages import require_packages
 from swimm3r.products.preview import write_previews
-from swimm3r.products.record import FOLDER, HabitatRecord, ProductsRecord
+from swimm3r.products.record import FOLDER, HabitatRecord, ProductsRecord, summary_section
 from swimm3r.products.settings import ProductSettings
 from swimm3r.products.solids.write import write_solids
 from swimm3r.products.survey import Colors, Survey, open_survey
@@ -49,7 +52,17 @@ def write_products(
         record = _record(survey, grid, totals, notes, habitat)
         write_previews(folder, record.unit)
         record.save(folder)
+    if out is None:
+        _add_to_summary(run)
     return record
+
+
+def _add_to_summary(run: Path) -> None:
+    """Bring the section "products" of summary.json up to date."""
+    with suppress(UsageError), folder_lock(run):  # a run in progress adds it when it writes next
+        path = run / "summary.json"
+        summary = json.loads(path.read_text(encoding="utf-8"))
+        write_text(path, json.dumps(summary | summary_section(run), indent=2) + "\n")
 
 
 @dataclass

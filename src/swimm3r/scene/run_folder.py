@@ -75,6 +75,7 @@ class _Summary:
     other_protocols: dict[str, dict[str, Any]] | None = None
     scale: dict[str, Any] | None = None
     water: dict[str, Any] | None = None
+    products: dict[str, Any] | None = None
     warnings: tuple[dict[str, str], ...] = ()
 
 
