@@ -144,7 +144,7 @@ def test_positions_in_the_images_themselves(tmp_path):
         ("time,lat [rad],lon [rad]\n1,38.1,12.2\n2,38.2,12.3\n", "degrees in a column that states radians"),
         ("time,x,y,z,heading,pitch,roll\n1,0,0,0,0.1,0,0\n2,1,0,0,3.1,0,0\n", "radians in columns"),
         ("time,lat,lon,depth\n1,50,8,-12\n2,50,8.1,-13\n", "a depth grows downwards"),
-        ("time,depth\n1,5\n2,5\n", "no two give a position"),
+        ("time,heading\n1,5\n2,5\n", "no two give a position"),
         ("lat,lon\n50,8\n51,8\n", "neither times nor names"),
         ("time,lat,lon\n10:00:01,50,8\n10:00:02,51,8\n", "no date"),
         ("time,lat,lon\n1,50,8\n2,fifty,8\n", "line 3: the latitude is 'fifty'"),
