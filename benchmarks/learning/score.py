@@ -38,7 +38,7 @@ from swimm3r.io.depth import read_depth
 from swimm3r.medium import Medium, MediumFit
 from swimm3r.scene.frames import Frame, Frames
 from swimm3r.scene.reconstruction import DepthMap, DepthMaps, Matches, Points, Reconstruction, Tracks
-from swimm3r.sfm.colmap.poses import absolute_pose
+from swimm3r.sfm.colmap.absolute_pose import absolute_pose
 from swimm3r.sfm.distillation.pairs import depth_to_network
 from swimm3r.sfm.distillation.validation import absolute_relative
 from swimm3r.sfm.mast3r import checkpoint

@@ -8,7 +8,7 @@ import torch
 from swimm3r.cameras import Cameras, project
 from swimm3r.geometry import pose_from, so3_exp, so3_log
 from swimm3r.localization.pose_covariance import pose_covariance
-from swimm3r.sfm.colmap.poses import absolute_pose
+from swimm3r.sfm.colmap.absolute_pose import absolute_pose
 
 POSE = pose_from(
     so3_exp(torch.tensor([0.4, -0.9, 0.3], dtype=torch.float64)), torch.tensor([3.0, -2.0, 5.0], dtype=torch.float64)

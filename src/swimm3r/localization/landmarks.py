@@ -17,7 +17,7 @@ from swimm3r.cameras import Cameras
 from swimm3r.io.colmap.model import silence_log
 from swimm3r.scene.frames import Frames
 from swimm3r.scene.reconstruction import Reconstruction
-from swimm3r.sfm.colmap.poses import absolute_pose
+from swimm3r.sfm.colmap.absolute_pose import absolute_pose
 from swimm3r.sfm.features.sift import extract_features, match_descriptors, unit_descriptors
 from swimm3r.sfm.settings import FeatureSettings
 

@@ -33,7 +33,7 @@ from swimm3r.localization.settings import LocalizationSettings
 from swimm3r.progress import Progress, silent
 from swimm3r.scene.frames import Frames
 from swimm3r.scene.reconstruction import Reconstruction
-from swimm3r.sfm.colmap.poses import absolute_pose
+from swimm3r.sfm.colmap.absolute_pose import absolute_pose
 from swimm3r.splat.rendering import SplatMap
 from swimm3r.splat.training_poses import as_mapped, axes_of_map
 

@@ -23,7 +23,7 @@ from swimm3r.prepare.keyframes import tracked
 from swimm3r.progress import Progress, silent
 from swimm3r.scene.frames import Frames
 from swimm3r.scene.reconstruction import Reconstruction
-from swimm3r.sfm.colmap.poses import absolute_pose
+from swimm3r.sfm.colmap.absolute_pose import absolute_pose
 from swimm3r.tasks.threads import thread_count
 
 BETWEEN = "cameras_between.json"

@@ -16,7 +16,9 @@ from swimm3r.scene.frames import Frame, Frames
 from swimm3r.scene.reconstruction import Points, Reconstruction
 from swimm3r.sfm.colmap import calibration, plausibility
 from swimm3r.sfm.colmap import poses as colmap
+from swimm3r.sfm.colmap.absolute_pose import absolute_pose
 from swimm3r.sfm.colmap.adjustment import bundle_adjust
+from swimm3r.sfm.colmap.pairs import choose_pairs
 from swimm3r.sfm.features import database as feature_database
 from swimm3r.sfm.settings import ColmapSettings, MappingSettings
 
@@ -273,10 +275,10 @@ def test_video_is_matched_with_neighbors_and_lookalikes_only(rec, frames: Frames
     camera = calibration.first_camera(WIDTH, HEIGHT, SETTINGS)
     store = feature_database.start_database(folder, frames, camera, SETTINGS.features)
     sparse = replace(SETTINGS, exhaustive_to=4, overlap=1, loops=1)
-    pairs = colmap.choose_pairs(store, frames, sparse)
+    pairs = choose_pairs(store, frames, sparse)
     assert {(i, i + 1) for i in range(COUNT - 1)} <= set(pairs)
     assert len(pairs) < COUNT * (COUNT - 1) // 2
-    assert len(colmap.choose_pairs(store, frames, SETTINGS)) == COUNT * (COUNT - 1) // 2
+    assert len(choose_pairs(store, frames, SETTINGS)) == COUNT * (COUNT - 1) // 2
 
 
 @pytest.mark.parametrize(
@@ -312,7 +314,7 @@ def test_pnp_finds_the_pose_among_outliers() -> None:
     pixels, _ = project(truth, points[None])
     pixels = pixels[0].clone()
     pixels[:30] += 50 * torch.rand(30, 2, generator=generator, dtype=torch.float64) + 20
-    found = colmap.absolute_pose(pixels, points, truth)
+    found = absolute_pose(pixels, points, truth)
     assert found is not None
     pose, inliers = found
     torch.testing.assert_close(pose, truth.cam2world[0], atol=1e-4, rtol=0)
@@ -322,7 +324,7 @@ def test_pnp_finds_the_pose_among_outliers() -> None:
 def test_pnp_without_a_consistent_pose_finds_none() -> None:
     generator = torch.Generator().manual_seed(0)
     pixels = torch.rand(3, 2, generator=generator) * 200
-    assert colmap.absolute_pose(pixels, torch.zeros(3, 3), _cameras()[0]) is None
+    assert absolute_pose(pixels, torch.zeros(3, 3), _cameras()[0]) is None
 
 
 def test_bundle_adjustment_mends_shaken_poses(rec: Reconstruction) -> None:
@@ -381,7 +383,7 @@ def test_a_model_without_one_scale_is_refused(frames: Frames, folder: Path, rec,
     shrunk.cameras.cam2world[0, :3, 3] -= 2000 * depth[0] * rec.cameras.cam2world[0, :3, 2]
     assert plausibility.depth_change(rec) < 3
     assert plausibility.depth_change(shrunk) > 1000
-    monkeypatch.setattr(colmap, "_record", lambda *_: shrunk)
+    monkeypatch.setattr(colmap, "record_of", lambda *_: shrunk)
     with pytest.raises(RegistrationError, match="not in one scale"):
         colmap.reconstruct(frames, SETTINGS, tmp_path)
 

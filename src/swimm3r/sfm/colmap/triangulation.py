@@ -16,7 +16,8 @@ from swimm3r.io.files.atomic import DRAFT
 from swimm3r.progress import Progress, silent
 from swimm3r.scene.frames import Frames
 from swimm3r.scene.reconstruction import Points, Reconstruction, Tracks
-from swimm3r.sfm.colmap import poses
+from swimm3r.sfm.colmap.pairs import choose_pairs
+from swimm3r.sfm.colmap.record import verified_matches
 from swimm3r.sfm.features.database import fill_features, match_pairs, start_database
 from swimm3r.sfm.settings import ColmapSettings, FeatureSettings
 from swimm3r.sfm.tracks import MatchTracks, as_points
@@ -46,7 +47,7 @@ def triangulate(
     camera.has_prior_focal_length = True
     store = start_database(folder, placed, camera, settings)
     fill_features(store, placed, settings, threads, progress)
-    match_pairs(store, poses.choose_pairs(store, placed, ColmapSettings()), settings, threads, progress)
+    match_pairs(store, choose_pairs(store, placed, ColmapSettings()), settings, threads, progress)
     options = pycolmap.IncrementalPipelineOptions()
     options.extract_colors = False
     options.num_threads = 1  # the same sums in the same order
@@ -69,5 +70,5 @@ def triangulate(
         rec,
         points=Points(*(torch.cat([getattr(p, n) for p in (old, points)]) for n in ("xyz", "rgb", "error"))),
         tracks=Tracks(observations.point + len(old.xyz), observations.frame, observations.xy),
-        matches=poses.verified_matches(store, list(range(len(rec.names)))),
+        matches=verified_matches(store, list(range(len(rec.names)))),
     )
