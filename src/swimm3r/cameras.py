@@ -99,6 +99,16 @@ class Cameras:
         small = resized(self, max(2, round(self.width * scale)), max(2, round(self.height * scale)))
         return replace(small, distortion=small.distortion[:, :0], model="PINHOLE")
 
+    def drawn(self, long_side: int = 0) -> "Cameras":
+        """The cameras that maps draw, images of at most `long_side` pixels: pinholes, and fisheyes as they are.
+
+        A pinhole image of what a fisheye shows would leave out its border, or be of many times the pixels.
+        """
+        pinholes = self.pinhole(long_side)
+        if self.model != "OPENCV_FISHEYE":
+            return pinholes
+        return replace(pinholes, distortion=self.distortion, model=self.model)
+
     def save(
         self,
         path: str | Path,

@@ -3,7 +3,8 @@
     u_lens = K_lens distort(K_pinhole^-1 u_pinhole)
 
 Depth along the optical axis is the same number in both images. Each function takes the camera of a frame and the
-pinhole camera (`Cameras.pinhole` of the same field's middle, `covering_pinholes` of all of it) that stands for it.
+pinhole camera (`Cameras.pinhole` of the same field's middle, `covering_pinholes` of all of it) that stands for it, or
+where maps are drawn the camera of `Cameras.drawn`, which is a smaller fisheye for a fisheye.
 """
 
 from functools import lru_cache
@@ -24,13 +25,21 @@ from swimm3r.cameras import (
     rows_of_frames,
 )
 
+_ASIDE = 1e-3  # cosine of the angle from the axis beyond which a ray has no place in the image
 _WIDEST = 2.5  # tangent of the half angle that covering pinhole images show at most: 136 degrees
 
 
 def undistorted(
-    image: Float[Tensor, "h w *c"], mask: Bool[Tensor, "h w"], camera: Cameras, pinhole: Cameras
+    image: Float[Tensor, "h w *c"],
+    mask: Bool[Tensor, "h w"],
+    camera: Cameras,
+    pinhole: Cameras,
+    turn: Float[Tensor, "3 3"] | None = None,
 ) -> tuple[Float[Tensor, "ph pw *c"], Bool[Tensor, "ph pw"]]:
-    """A frame's image as its pinhole camera sees it, and which of its pixels the frame shows and its mask admits."""
+    """A frame's image as its pinhole camera sees it, and which of its pixels the frame shows and its mask admits.
+
+    `turn` are the pinhole camera's axes in those of the frame, where they differ.
+    """
     import cv2
 
     focal, wanted = (K[0, [0, 1], [0, 1]].double() for K in (camera.K, pinhole.K))
@@ -41,8 +50,8 @@ def undistorted(
         values = cv2.resize(values, size, interpolation=cv2.INTER_AREA)
         usable = cv2.resize(usable, size, interpolation=cv2.INTER_AREA)
         camera = resized(camera, *size)
-    if not _same_image(camera, pinhole):
-        column, row, inside = _grid(_key(camera), _key(pinhole))
+    if turn is not None or not _same_image(camera, pinhole):
+        column, row, inside = _grid(_key(camera), _key(pinhole), _turn_key(turn))
         values = cv2.remap(values, column, row, cv2.INTER_LINEAR, borderMode=cv2.BORDER_REPLICATE)
         usable = cv2.remap(usable, column, row, cv2.INTER_LINEAR) * inside
     return torch.from_numpy(values), torch.from_numpy(usable > 0.999)
@@ -59,9 +68,11 @@ def nearest_pixels(camera: Cameras, pinhole: Cameras) -> tuple[Int[Tensor, "ph p
     return row.round().long().clamp(0, camera.height - 1), column.round().long().clamp(0, camera.width - 1)
 
 
-def pinhole_grid(camera: Cameras, pinhole: Cameras) -> tuple[np.ndarray, np.ndarray]:
+def pinhole_grid(
+    camera: Cameras, pinhole: Cameras, turn: Float[Tensor, "3 3"] | None = None
+) -> tuple[np.ndarray, np.ndarray]:
     """Column and row (index coordinates) of every pixel of the frame in the pinhole image, -9 where it has none."""
-    return _pinhole_grid(_key(camera), _key(pinhole))
+    return _pinhole_grid(_key(camera), _key(pinhole), _turn_key(turn))
 
 
 def frame_rays(camera: Cameras) -> Float[Tensor, "h w 3"]:
@@ -119,15 +130,21 @@ def covering_pinholes(cameras: Cameras, long_side: int) -> Cameras:
     return Cameras(K[which], cameras.distortion[:, :0], cameras.cam2world, width, height)
 
 
-def distorted_grid(camera: Cameras, pinhole: Cameras) -> tuple[Float[Tensor, "h w 2"], Bool[Tensor, "h w"]]:
+def distorted_grid(
+    camera: Cameras, pinhole: Cameras, turn: Float[Tensor, "3 3"] | None = None
+) -> tuple[Float[Tensor, "h w 2"], Bool[Tensor, "h w"]]:
     """The pixel of the lens's image for every pixel of the pinhole camera, and whether the image shows it."""
-    rays = image_directions(pinhole).double()[..., :2]
+    rays, ahead = image_directions(pinhole).double(), torch.tensor(True)
+    if turn is not None:
+        rays = rays @ turn.mT
+        ahead = rays[..., 2] > _ASIDE * torch.linalg.vector_norm(rays, dim=-1)
+    rays = rays[..., :2] / torch.where(ahead, rays[..., 2], 1.0)[..., None]
     pixels = _through_lens(camera, rays)
     edge = directions(camera, _outline(camera.width, camera.height)[None])[0, :, :2]
     reach = torch.linalg.vector_norm(edge[edge.isfinite().all(-1)], dim=-1).max()
     shown = inside_image(pixels, camera.width, camera.height)
     # beyond the farthest ray of the outline the lens model may fold back into the image
-    return pixels, shown & (torch.linalg.vector_norm(rays, dim=-1) <= reach * 1.001)
+    return pixels, shown & ahead & (torch.linalg.vector_norm(rays, dim=-1) <= reach * 1.001)
 
 
 def _through_lens(camera: Cameras, rays: Float[Tensor, "*m 2"]) -> Float[Tensor, "*m 2"]:
@@ -137,8 +154,11 @@ def _through_lens(camera: Cameras, rays: Float[Tensor, "*m 2"]) -> Float[Tensor,
 
 
 def _same_image(camera: Cameras, pinhole: Cameras) -> bool:
-    """Return whether a pinhole camera's image is the frame's own: a fisheye without parameters is no pinhole camera."""
-    straight = camera.model != "OPENCV_FISHEYE" and not bool(camera.distortion.any())
+    """Return whether the image is the frame's own: a fisheye without parameters is no pinhole camera."""
+    if camera.model == pinhole.model == "OPENCV_FISHEYE":
+        straight = torch.allclose(camera.distortion.double(), pinhole.distortion.double(), rtol=0, atol=1e-9)
+    else:
+        straight = camera.model != "OPENCV_FISHEYE" and not bool(camera.distortion.any())
     same_size = (camera.width, camera.height) == (pinhole.width, pinhole.height)
     return straight and same_size and torch.allclose(camera.K.double(), pinhole.K.double(), rtol=0, atol=1e-6)
 
@@ -149,6 +169,17 @@ _Key = tuple[tuple[float, ...], tuple[float, ...], int, int, str]
 def _key(camera: Cameras) -> _Key:
     K, distortion = camera.K[0].flatten().tolist(), camera.distortion[0].tolist()
     return tuple(K), tuple(distortion), camera.width, camera.height, camera.model
+
+
+_Turn = tuple[float, ...] | None
+
+
+def _turn_key(turn: Float[Tensor, "3 3"] | None) -> _Turn:
+    return None if turn is None else tuple(turn.flatten().tolist())
+
+
+def _turn(key: _Turn) -> Float[Tensor, "3 3"] | None:
+    return None if key is None else torch.tensor(key, dtype=torch.float64).reshape(3, 3)
 
 
 def _camera(key: _Key) -> Cameras:
@@ -164,18 +195,21 @@ def _camera(key: _Key) -> Cameras:
 
 
 @lru_cache(maxsize=8)  # one lens per clip as a rule, at a few sizes
-def _grid(camera: _Key, pinhole: _Key) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+def _grid(camera: _Key, pinhole: _Key, turn: _Turn = None) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     """`distorted_grid` as columns and rows (index coordinates) and the pixels shown, for OpenCV."""
-    pixels, shown = distorted_grid(_camera(camera), _camera(pinhole))
+    pixels, shown = distorted_grid(_camera(camera), _camera(pinhole), _turn(turn))
     column, row = (pixels - 0.5).float().unbind(-1)
     return column.contiguous().numpy(), row.contiguous().numpy(), shown.numpy()
 
 
 @lru_cache(maxsize=4)
-def _pinhole_grid(camera: _Key, pinhole: _Key) -> tuple[np.ndarray, np.ndarray]:
-    lens, K = _camera(camera), _camera(pinhole).K[0]
-    at = undistorted_pixels(lens, pixel_grid(lens.height, lens.width).reshape(-1, 2), K) - 0.5
-    column, row = torch.where(at.isfinite().all(-1, keepdim=True), at, -9.0).numpy().T
+def _pinhole_grid(camera: _Key, pinhole: _Key, turn: _Turn) -> tuple[np.ndarray, np.ndarray]:
+    lens, K, axes = _camera(camera), _camera(pinhole).K[0], _turn(turn)
+    rays = directions(lens, pixel_grid(lens.height, lens.width).double().reshape(1, -1, 2))[0]
+    rays = rays if axes is None else rays @ axes
+    ahead = rays[:, 2:] > _ASIDE * torch.linalg.vector_norm(rays, dim=-1, keepdim=True)
+    at = (rays @ K.mT)[:, :2] / torch.where(ahead, rays[:, 2:], 1.0) - 0.5
+    column, row = torch.where(ahead & at.isfinite().all(-1, keepdim=True), at, -9.0).numpy().T
     return np.ascontiguousarray(column), np.ascontiguousarray(row)
 
 

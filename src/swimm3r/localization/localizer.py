@@ -237,7 +237,7 @@ class Localizer:
         with _timed(seconds, "render"):
             reference = rendered(self.scene, lens, self.long_side, s.min_alpha, time)
         with _timed(seconds, "match"):
-            canvas = lens.pinhole(self.long_side)
+            canvas = lens.drawn(self.long_side)
             shown, usable = undistorted(image, mask, lens, canvas)
             xy_query, xy_rendering = self.matcher.match(
                 self.matcher.describe(shown, usable), self.matcher.describe(reference.rgb, reference.usable)

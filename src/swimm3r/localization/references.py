@@ -70,7 +70,7 @@ def rendered(scene: SplatMap, lens: Cameras, long_side: int, min_alpha: float, t
 
     A dynamic map is shown at `time`, seconds of its clip, or half way through where nobody knows it.
     """
-    canvas = lens.pinhole(long_side)
+    canvas = lens.drawn(long_side)
     out = scene.render(canvas, sum(scene.span) / 2 if time is None else time)
     covered = out.alpha > min_alpha
     camera = replace(canvas, cam2world=canvas.cam2world.double())

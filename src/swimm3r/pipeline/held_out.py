@@ -175,7 +175,7 @@ def score_views(
         lens = replace(lens, cam2world=first.cam2world[None].to(lens.cam2world))
         time = frames.frames[f].time
         lens = refine_pose(scene, lens, frames.image(f), frames.mask(f), settings, time=time).camera
-        canvas = lens.pinhole(scene.settings.long_side)
+        canvas = lens.drawn(scene.settings.long_side)
         window = visible_window(lens, canvas)
         target, seen = (
             part[window.rows, window.columns] for part in undistorted(frames.image(f), frames.mask(f), lens, canvas)

@@ -104,7 +104,7 @@ def film_flight(run: MappedRun, progress: Progress = silent) -> None:
     first = None if run.frames.rig is None else run.frames.rig.names[0]
     rows = [i for i, name in enumerate(path.names) if run.frames.frames[run.frames.index(name)].camera == first]
     lens = path.cameras[0]
-    canvas = lens.pinhole(scene.settings.long_side)
+    canvas = lens.drawn(scene.settings.long_side)
     write_flythrough(
         run.folder / "renders" / "flythrough.mp4",
         scene,

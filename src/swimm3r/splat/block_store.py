@@ -61,6 +61,8 @@ class BlockEntry:
         """Return whether the box may reach into a view."""
         corners = torch.cartesian_prod(*(torch.tensor(pair) for pair in zip(self.low, self.high, strict=True)))
         x, y, z = (corners.to(view.R) @ view.R.mT + view.t).unbind(-1)
+        if view.fisheye is not None:  # of all that lies ahead; what is beside the image is culled by primitive
+            return bool((z > 0).any())
         view = view.widened(_SLACK)
         before_edges = (
             z,

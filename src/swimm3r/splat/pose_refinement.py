@@ -60,7 +60,7 @@ def refine_pose(
     """
     settings = settings or PoseRefinementSettings()
     delta = torch.zeros(9, requires_grad=True)
-    whole = camera.pinhole(scene.settings.long_side)
+    whole = camera.drawn(scene.settings.long_side)
     sides = sizes(settings, max(whole.width, whole.height))
     looks = [_Look(scene, camera, image, mask, settings, side, time) for side in sides]
     with torch.no_grad():
@@ -96,7 +96,7 @@ class _Look:
         time: float | None,
     ) -> None:
         self._scene, self._now = scene, scene.normalized_time(time)
-        self._canvas = camera.pinhole(long_side)
+        self._canvas = camera.drawn(long_side)
         target, seen = undistorted(image, mask, camera, self._canvas)
         self._target, self._wanted = target.to(scene.device), edges(target, seen, settings).to(scene.device)
         self._seen = seen.to(scene.device)

@@ -153,11 +153,11 @@ class SplatMap:
         return replace(self, primitives=self.primitives.to(device), field=field, blocks=blocks)
 
     def render(self, camera: Cameras, time: float | None = None) -> RenderOutput:
-        """The view of one pinhole camera at a time of the clip (seconds; static maps need none), without gradient.
+        """The view of a pinhole or fisheye at a time of the clip (seconds; static maps need none), without gradient.
 
         The images are where the camera is, on the processor as a rule, wherever the map may be.
 
-        Raises ValueError where the camera has distortion, or where a dynamic map is given no time.
+        Raises ValueError where the camera has other distortion, or where a dynamic map is given no time.
         """
         with torch.no_grad():
             return render(self, camera, time)

@@ -113,11 +113,11 @@ def seen_in_training(scene: SplatMap, rec: Reconstruction, frames: Frames, names
     chosen, canvases, views, admitted = names[:: -(-len(names) // MOST)], [], [], []
     for name in chosen:
         lens, f = cameras[rec.index(name)], frames.index(name)
-        canvases.append(lens.pinhole(SIDE))
+        canvases.append(lens.drawn(SIDE))
         views.append(scene.render(canvases[-1], frames.frames[f].time))
         row, column = nearest_pixels(lens, canvases[-1])
         admitted.append(shown_pixels(lens, canvases[-1]) & frames.mask(f)[row, column])
-    small = cameras[[rec.index(name) for name in chosen]].pinhole(SIDE)
+    small = cameras[[rec.index(name) for name in chosen]].drawn(SIDE)
     return coverage_of(small, [view.z_depth for view in views], [view.alpha for view in views], admitted)
 
 

@@ -87,13 +87,13 @@ class TrainingViews:
     def cameras(self) -> Cameras:
         """The views' pinhole cameras, working units."""
         lenses = self.rec.cameras[[self.rec.index(name) for name in self.names]]
-        return _in_working_units(lenses.pinhole(self.settings.long_side), self.scale)
+        return _in_working_units(lenses.drawn(self.settings.long_side), self.scale)
 
     def __getitem__(self, k: int) -> TrainingView:
         name = self.names[k]
         i = self.rec.index(name)
         lens = self.rec.cameras[i]
-        canvas = lens.pinhole(self.settings.long_side)
+        canvas = lens.drawn(self.settings.long_side)
 
         def make() -> tuple[np.ndarray, ...]:
             f = self.frames.index(name)

@@ -22,7 +22,7 @@ from torch import Tensor
 
 from swimm3r.cameras import Cameras
 from swimm3r.devices import CPU, for_depth
-from swimm3r.imaging.undistortion import covering_pinholes
+from swimm3r.imaging.undistortion import frame_rays
 from swimm3r.io.files.array_file import Layout, read_arrays
 from swimm3r.io.files.atomic import atomic_path, write_text
 from swimm3r.io.files.cache import ArrayCache
@@ -33,6 +33,7 @@ from swimm3r.scene.frames import Frames
 from swimm3r.scene.reconstruction import DepthMap, DepthMaps, Reconstruction
 from swimm3r.scene.reconstruction_io import load_reconstruction
 from swimm3r.sfm.plane_sweep import consistency, kernels
+from swimm3r.sfm.plane_sweep.facets import facets_of, in_facets, merged
 from swimm3r.sfm.plane_sweep.level import Level, Round, SweepNumbers
 from swimm3r.sfm.plane_sweep.refinement import refine, window
 from swimm3r.sfm.plane_sweep.views import (
@@ -88,7 +89,7 @@ def estimate_depth(
     _claim(folder, _stamp(rec, frames, settings))
     passes = _Passes(rec, frames, settings)
     todo = [i for i, name in enumerate(rec.names) if name not in rec.depth]
-    wanted = sorted({j for i in todo for j in (i, *passes.sources[i])})
+    wanted = sorted({j for i in todo for view in passes.facets.of_frame(i) for j in (view, *passes.sources[view])})
     missing = [i for i in wanted if not passes.raw_path(i).is_file()]
     steps: tuple[tuple[Step, list[int], int], ...] = (
         ("depth", missing, len(wanted)),
@@ -138,14 +139,15 @@ class _Passes:
     def __init__(self, rec: Reconstruction, frames: Frames, settings: PlaneSweepSettings) -> None:
         self._rec, self._frames, self._settings = rec, frames, settings
         self._device = for_depth(settings.device)
-        self._canvas = covering_pinholes(rec.cameras, settings.long_side)
-        self.sources = choose_sources(rec, max(settings.sources, _NEIGHBORS), settings.angle_deg)
-        self._points, self._pose_error = points_by_frame(rec), _pose_error(rec, self._canvas)
+        self.facets = facets_of(rec.cameras, settings.long_side)
+        self._canvas, self._views_of = self.facets.cameras, in_facets(rec, self.facets)
+        self.sources = choose_sources(self._views_of, max(settings.sources, _NEIGHBORS), settings.angle_deg)
+        self._points, self._pose_error = points_by_frame(self._views_of), _pose_error(rec, self._canvas)
         self._position = {name: k for k, name in enumerate(frames.names)}
         self._views, self._raws = ArrayCache(max_bytes=256 << 20), ArrayCache(max_bytes=256 << 20)
 
     def raw_path(self, i: int) -> Path:
-        return self._rec.depth.folder / _RAW / f"{self._rec.names[i]}.npz"
+        return self._rec.depth.folder / _RAW / f"{self._views_of.names[i]}.npz"
 
     def step(self, name: Step) -> Callable[[int], None]:
         return self._sweep_one if name == "depth" else self._agree_one
@@ -155,9 +157,10 @@ class _Passes:
 
     def _view(self, i: int) -> SweepView:
         def load() -> tuple[np.ndarray, ...]:
-            k = self._position[self._rec.names[i]]
+            frame = self.facets.frame_of(i)
+            k = self._position[self._rec.names[frame]]
             image, mask = self._frames.image(k), self._frames.mask(k)
-            made = make_view(image, mask, self._rec.cameras[i], self._canvas[i])
+            made = make_view(image, mask, self._rec.cameras[frame], self._canvas[i], self.facets.turn_of(i))
             return made.gray.numpy(), made.detail.numpy(), made.seen.numpy()
 
         gray, detail, seen = (torch.from_numpy(a.copy()) for a in self._views.get(i, load))
@@ -172,7 +175,7 @@ class _Passes:
 
     def _sweep_one(self, i: int) -> None:
         canvas, settings = self._canvas, self._settings
-        span, compared = depth_range(self._rec, i, self._points[i]), self.sources[i][: settings.sources]
+        span, compared = depth_range(self._views_of, i, self._points[i]), self.sources[i][: settings.sources]
         raw = RawDepth(torch.zeros(canvas.height, canvas.width), torch.zeros(canvas.height, canvas.width))
         if span is not None and compared:
             raw = sweep(self._view(i), [self._view(j) for j in compared], span, settings, self._device)
@@ -180,16 +183,24 @@ class _Passes:
             np.savez(draft, inverse_depth=raw.inverse_depth.numpy(), correlation=raw.correlation.numpy())
 
     def _agree_one(self, i: int) -> None:
-        rec, frames, canvas, others = self._rec, self._frames, self._canvas, self.sources[i]
-        raws = [self._raw_of(j) for j in others]
-        fused = consistent(self._raw_of(i), raws, canvas[[i, *others]], self._pose_error, self._settings)
+        rec, frames = self._rec, self._frames
         k = self._position[rec.names[i]]
-        q, confidence = on_frame_grid(
-            fused.inverse_depth, fused.correlation, self._view(i).gray, frames.image(k), rec.cameras[i], canvas[i]
-        )
+        on_grid = [self._agreed(view, frames.image(k), rec.cameras[i]) for view in self.facets.of_frame(i)]
+        rays = frame_rays(rec.cameras[i])
+        q, confidence = merged([q for q, _ in on_grid], [share for _, share in on_grid], rays, self.facets)
         usable = (q > 0) & frames.mask(k)
         z_depth = torch.where(usable, 1 / q.clamp(min=1e-12), 0.0)
         rec.depth.write(rec.names[i], DepthMap(z_depth, torch.where(usable, confidence, 0.0)))
+
+    def _agreed(
+        self, view: int, image: Float[Tensor, "h w 3"], lens: Cameras
+    ) -> tuple[Float[Tensor, "h w"], Float[Tensor, "h w"]]:
+        """Inverse depth along a view's axis that others share, and its confidence, on the grid of the view's frame."""
+        others, canvas = self.sources[view], self._canvas
+        raws = [self._raw_of(j) for j in others]
+        fused = consistent(self._raw_of(view), raws, canvas[[view, *others]], self._pose_error, self._settings)
+        gray, turn = self._view(view).gray, self.facets.turn_of(view)
+        return on_frame_grid(fused.inverse_depth, fused.correlation, gray, image, lens, canvas[view], turn)
 
 
 def sweep(

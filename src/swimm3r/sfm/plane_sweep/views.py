@@ -20,6 +20,7 @@ from swimm3r.sfm.plane_sweep import consistency
 
 _FEWEST_POINTS = 8  # in a frame, to know its depth range
 _CANDIDATES = 40  # frames sharing most points that are considered as sources
+_NO_ANGLE = 0.01  # degrees
 _SLOW = 12.0  # pixels at working size: what varies slower is no surface texture
 _FAST = 0.7  # pixels: what varies faster is noise, or the lines of interlaced video
 
@@ -63,6 +64,7 @@ def choose_sources(rec: Reconstruction, count: int, angle_deg: float) -> list[li
         _, _, inside = project_visible(rec.cameras[near_by], P.expand(len(near_by), -1, -1))
         both = torch.from_numpy(np.stack([_contains(points[j], mine) for j in near_by]))
         weight = torch.exp(-0.5 * ((angle - angle_deg) / width) ** 2)
+        weight[angle.amax(-1) < _NO_ANGLE] = 0  # from the same place, as facets of one frame
         weight = weight * torch.where(both, 1.0, torch.where(inside, 0.25, 0.0))
         covered = torch.zeros(len(mine), dtype=torch.float64)
         for _ in range(min(count, len(near_by))):
@@ -103,11 +105,17 @@ def depth_range(rec: Reconstruction, i: int, points: np.ndarray) -> tuple[float,
     return float(low) / 1.4, float(high) * 2.5
 
 
-def make_view(image: Float[Tensor, "h w 3"], mask: Bool[Tensor, "h w"], lens: Cameras, canvas: Cameras) -> SweepView:
-    """A frame undistorted onto the canvas; `lens` and `canvas` are its own camera and its pinhole one."""
+def make_view(
+    image: Float[Tensor, "h w 3"],
+    mask: Bool[Tensor, "h w"],
+    lens: Cameras,
+    canvas: Cameras,
+    turn: Float[Tensor, "3 3"] | None = None,
+) -> SweepView:
+    """A frame undistorted onto the canvas; `lens` is its own camera, `canvas` the pinhole one and `turn` its axes."""
     import cv2
 
-    values, shown = undistorted(image @ LUMA, mask, lens, canvas)
+    values, shown = undistorted(image @ LUMA, mask, lens, canvas, turn)
     gray, seen = values.numpy(), shown.numpy()
     share = cv2.GaussianBlur(seen.astype(np.float32), (0, 0), _SLOW, borderType=cv2.BORDER_REFLECT)
     slow = cv2.GaussianBlur(np.where(seen, gray, 0), (0, 0), _SLOW, borderType=cv2.BORDER_REFLECT)
@@ -140,9 +148,10 @@ def on_frame_grid(
     image: Float[Tensor, "fh fw 3"],
     lens: Cameras,
     canvas: Cameras,
+    turn: Float[Tensor, "3 3"] | None = None,
 ) -> tuple[Float[Tensor, "fh fw"], Float[Tensor, "fh fw"]]:
     """`values` and `also` of the canvas at the pixels of the frame, along the edges of the image; 0 = unknown."""
-    u, v = pinhole_grid(lens, canvas)
+    u, v = pinhole_grid(lens, canvas, turn)
     wanted = (image @ LUMA).numpy().ravel()
     out, read = consistency.look_up(values.numpy(), also.numpy(), guide.numpy(), u, v, wanted, likely_edge(guide), 0.03)
     shape = image.shape[:2]

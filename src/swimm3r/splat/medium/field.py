@@ -134,14 +134,7 @@ def grid_of(field: MediumField, view: Pinhole, stride: int, time: Float[Tensor, 
     rows, columns = (max(2, math.ceil((size - 1) / stride) + 1) for size in (view.height, view.width))
     y = torch.linspace(0.5, view.height - 0.5, rows, device=view.R.device)
     x = torch.linspace(0.5, view.width - 0.5, columns, device=view.R.device)
-    rays = torch.stack(
-        [
-            ((x - view.cx) / view.fx).expand(rows, columns),
-            ((y - view.cy) / view.fy)[:, None].expand(rows, columns),
-            torch.ones(rows, columns, device=view.R.device),
-        ],
-        -1,
-    )
+    rays = view.rays(x, y)
     rays = rays if field.lamp else rays @ view.R  # R^T to the world
     directions = torch.nn.functional.normalize(rays, dim=-1).to(field.length)
     step = ((view.height - 1) / (rows - 1), (view.width - 1) / (columns - 1))
@@ -170,9 +163,8 @@ def _hats(few: int, many: int, like: Tensor) -> Float[Tensor, "many few"]:
 
 def ray_lengths(view: Pinhole) -> Float[Tensor, "h w"]:
     """Lengths of the pixels' rays at z = 1."""
-    x = (torch.arange(view.width, device=view.R.device) + 0.5 - view.cx) / view.fx
-    y = (torch.arange(view.height, device=view.R.device) + 0.5 - view.cy) / view.fy
-    return (1 + x * x + (y * y)[:, None]).sqrt()
+    x, y = (torch.arange(size, device=view.R.device) + 0.5 for size in (view.width, view.height))
+    return torch.linalg.vector_norm(view.rays(x, y), dim=-1)
 
 
 def per_z_depth(maps: MediumMaps, view: Pinhole) -> MediumMaps:

@@ -24,7 +24,7 @@ def project(
     if isinstance(p, GaussianPrimitives):
         return project_gaussians(p, view, settings.near)
     assert isinstance(settings, RenderSettings)
-    if _has_fast_form(p, settings):
+    if _has_fast_form(p, view, settings):
         return cpu_project.project(p, view, settings, time)
     return project_plainly(p, view, settings, time)
 
@@ -40,7 +40,7 @@ def center_gradients(
 
     The direction that primitives are conditioned on follows xyz, as in `project`.
     """
-    if _has_fast_form(p, settings):
+    if _has_fast_form(p, view, settings):
         return cpu_project.center_gradients(p, view, settings, on_plane, time)
     with torch.enable_grad():
         xyz = p.xyz.detach().requires_grad_()
@@ -50,5 +50,6 @@ def center_gradients(
     return torch.stack(parts, 1)
 
 
-def _has_fast_form(p: BetaPrimitives, settings: RenderSettings) -> bool:
-    return p.xyz.device.type == "cpu" and p.xyz.dtype == torch.float32 and settings.rotation == "first_order"
+def _has_fast_form(p: BetaPrimitives, view: Pinhole, settings: RenderSettings) -> bool:
+    on_cpu = p.xyz.device.type == "cpu" and p.xyz.dtype == torch.float32
+    return on_cpu and settings.rotation == "first_order" and view.fisheye is None

@@ -30,7 +30,7 @@ _STRIDE = 4  # pixels between the rays that are asked
 class TrainingCoverage:
     """Training frames as small depth images."""
 
-    cameras: Cameras  # pinholes, scene units
+    cameras: Cameras  # as drawn, scene units
     z_depth: Float[Tensor, "n h w"]  # scene units; infinite in open water, 0 where the mask excludes
 
     def sees(self, points: Float[Tensor, "p 3"], viewed_from: Float[Tensor, "3"] | None = None) -> Bool[Tensor, " p"]:
@@ -70,7 +70,7 @@ class TrainingCoverage:
     def of_view(
         self, camera: Cameras, z_depth: Float[Tensor, "h w"], alpha: Float[Tensor, "h w"]
     ) -> Bool[Tensor, "h w"]:
-        """Mask of the pixels of a pinhole view whose surface, or open water, some frame saw."""
+        """Mask of the pixels of a view whose surface, or open water, some frame saw."""
         height, width = z_depth.shape
         few = slice(_STRIDE // 2, None, _STRIDE) if min(height, width) > 4 * _STRIDE else slice(None)
         near = z_depth.cpu()[few, few]
@@ -87,7 +87,9 @@ class TrainingCoverage:
     def tensors(self) -> dict[str, Tensor]:
         """The record as a map's file keeps it: -1 in open water, as files hold finite numbers only."""
         depth = torch.where(self.z_depth.isinf(), -1.0, self.z_depth).half()
-        return {"seen.K": self.cameras.K, "seen.cam2world": self.cameras.cam2world, "seen.z_depth": depth}
+        kept = {"seen.K": self.cameras.K, "seen.cam2world": self.cameras.cam2world, "seen.z_depth": depth}
+        lens = {} if self.cameras.model == "PINHOLE" else {"seen.fisheye": self.cameras.distortion}
+        return kept | lens
 
 
 def coverage_from(tensors: Mapping[str, Tensor]) -> TrainingCoverage | None:
@@ -98,7 +100,11 @@ def coverage_from(tensors: Mapping[str, Tensor]) -> TrainingCoverage | None:
     n = len(z_depth)
     if z_depth.dim() != 3 or K.shape != (n, 3, 3) or cam2world.shape != (n, 4, 4) or not bool((z_depth >= -1).all()):
         raise ValueError(f"its small depth images have the shapes {tuple(z_depth.shape)} and {tuple(cam2world.shape)}")
-    cameras = Cameras(K, K.new_zeros(n, 0), cam2world, z_depth.shape[2], z_depth.shape[1])
+    fisheye = tensors.get("seen.fisheye")
+    if fisheye is not None and fisheye.shape != (n, 4):
+        raise ValueError(f"its fisheye lenses have the shape {tuple(fisheye.shape)}")
+    model, distortion = ("PINHOLE", K.new_zeros(n, 0)) if fisheye is None else ("OPENCV_FISHEYE", fisheye)
+    cameras = Cameras(K, distortion, cam2world, z_depth.shape[2], z_depth.shape[1], model)
     check_cameras(cameras)
     return TrainingCoverage(cameras, torch.where(z_depth < 0, torch.inf, z_depth))
 

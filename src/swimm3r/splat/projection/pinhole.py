@@ -1,4 +1,4 @@
-"""One pinhole camera that primitives are projected into, and their record on its image plane."""
+"""The one camera that primitives are projected into, a pinhole or a fisheye, and their record on its image plane."""
 
 from dataclasses import dataclass, replace
 
@@ -6,7 +6,7 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
-from swimm3r.cameras import Cameras
+from swimm3r.cameras import Cameras, undistort
 from swimm3r.raster import Kernel, Primitives2D
 
 BLUR = 0.3
@@ -16,7 +16,7 @@ _MARGIN = 0.3  # field tangents beyond the image at which J is held
 
 @dataclass(frozen=True)
 class Pinhole:
-    """One undistorted camera, world to camera; its pose may carry a gradient."""
+    """One camera, world to camera; its pose may carry a gradient."""
 
     R: Float[Tensor, "3 3"]
     t: Float[Tensor, "3"]
@@ -27,6 +27,15 @@ class Pinhole:
     cy: float
     width: int
     height: int
+    fisheye: tuple[float, float, float, float] | None = None  # k1 to k4 of an OPENCV_FISHEYE lens; None of a pinhole
+
+    def rays(self, x: Float[Tensor, " w"], y: Float[Tensor, " h"]) -> Float[Tensor, "h w 3"]:
+        """Rays with z = 1 of a grid of pixels, by its columns and rows, in camera axes."""
+        plane = torch.stack(torch.meshgrid((x - self.cx) / self.fx, (y - self.cy) / self.fy, indexing="xy"), -1)
+        if self.fisheye is not None:
+            plane = undistort(plane, plane.new_tensor(self.fisheye), "OPENCV_FISHEYE")
+            plane = torch.nan_to_num(plane, nan=0.0)  # no ray of the lens: such a pixel is masked
+        return torch.cat([plane, torch.ones_like(plane[..., :1])], -1)
 
     def to(self, device: torch.device) -> "Pinhole":
         """The same camera for primitives on a device."""
@@ -49,12 +58,16 @@ class Projection:
 
 
 def pinhole(camera: Cameras, dtype: torch.dtype = torch.float32) -> Pinhole:
-    """The one camera of a `Cameras`. Raises ValueError for several, or for one with distortion."""
+    """The one camera of a `Cameras`. Raises ValueError for several, or for one with distortion that is no fisheye."""
     if len(camera) != 1:
         raise ValueError(f"a map is rendered for one camera at a time, got {len(camera)}")
-    if camera.distortion.numel() and bool(camera.distortion.any()):
+    fisheye = None
+    if camera.model == "OPENCV_FISHEYE":
+        k1, k2, k3, k4 = camera.distortion[0].tolist()
+        fisheye = (k1, k2, k3, k4)
+    elif camera.distortion.numel() and bool(camera.distortion.any()):
         raise ValueError(
-            f"a map is rendered for pinhole cameras, got {camera.model} with distortion; camera.pinhole() leaves it out"
+            f"maps are drawn for pinholes and fisheyes, got {camera.model} with distortion; use camera.drawn()"
         )
     R = camera.cam2world[0, :3, :3].mT
     center = camera.cam2world[0, :3, 3]
@@ -69,6 +82,7 @@ def pinhole(camera: Cameras, dtype: torch.dtype = torch.float32) -> Pinhole:
         K[1][2],
         camera.width,
         camera.height,
+        fisheye,
     )
 
 
