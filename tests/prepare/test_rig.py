@@ -4,6 +4,8 @@ import logging
 import shutil
 
 import pytest
+import torch
+import yaml
 from tests.prepare.test_image_folder import image, write
 
 from swimm3r.errors import InputError, UsageError
@@ -139,3 +141,41 @@ def test_a_limit_of_frames_keeps_whole_instants(stereo, prepared):
     frames = read_frames(stereo, folder=prepared, max_frames=5)
     assert len(frames) == 10
     assert len({frame.instant for frame in frames}) == 5
+
+
+def camchain(path, baseline):
+    lens = {
+        "camera_model": "pinhole",
+        "distortion_model": "none",
+        "distortion_coeffs": [],
+        "intrinsics": [60.0, 60.0, 31.5, 23.5],
+        "resolution": [64, 48],
+    }
+    pose = [[1.0, 0, 0, -baseline], [0, 1.0, 0, 0], [0, 0, 1.0, 0], [0, 0, 0, 1.0]]
+    path.write_text(yaml.safe_dump({"cam0": lens, "cam1": {**lens, "T_cn_cnm1": pose}}))
+    return path
+
+
+def test_a_calibration_gives_the_poses_and_the_first_lens(stereo, tmp_path, prepared):
+    frames = read_frames(stereo, folder=prepared, rig_calibration=camchain(tmp_path / "chain.yaml", 0.12))
+    assert frames.rig is not None
+    assert frames.rig.cameras[1].baseline == pytest.approx(0.12)
+    assert frames.calibration is not None
+    assert frames.calibration.read_text() == "1 OPENCV 64 48 60 60 32 24 0 0 0 0\n"
+    assert load_frames(prepared) == frames
+
+
+def test_a_video_that_shows_two_views_is_a_stereo_pair(write_video, tmp_path, prepared):
+    video = write_video(tmp_path / "pair.mp4", [image(i) for i in range(8)])
+    whole = read_frames(video, folder=tmp_path / "whole" / "prepare", fps=0)
+    frames = read_frames(video, folder=prepared, fps=0, rig=("side-by-side",))
+    assert len(frames) == 2 * len(whole)
+    assert frames.names[:2] == ("left/frame_000000.png", "right/frame_000000.png")
+    assert (frames.width, frames.height) == (whole.width // 2, whole.height)
+    both = torch.cat([frames.image(2), frames.image(3)], 1)
+    assert torch.equal(both, whole.image(1))
+
+
+def test_names_of_folders_are_no_views_of_a_video(write_video, tmp_path, prepared):
+    with pytest.raises(UsageError, match="names sub-folders"):
+        read_frames(write_video(tmp_path / "pair.mp4", [image(0)] * 4), folder=prepared, rig=("left", "right"))

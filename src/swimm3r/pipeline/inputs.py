@@ -7,6 +7,7 @@ from swimm3r.pipeline.presets import RunSettings
 from swimm3r.prepare import check_source
 from swimm3r.prepare.clip import open_clip
 from swimm3r.prepare.masks import check_masks
+from swimm3r.prepare.rig import check_rig
 from swimm3r.scale.sources import check_sources
 from swimm3r.scene.ground_truth import FOLDER, GroundTruth, read_ground_truth
 from swimm3r.sfm import check_files
@@ -20,6 +21,7 @@ def check_inputs(source: Path, settings: RunSettings, reference: Path | None = N
     if is_bag(check_source(source)):
         open_clip(source, settings.frames)  # its camera is chosen
     check_masks(settings.frames)
+    check_rig(source, settings.frames)
     truth_of(source, reference)
     check_files(settings.sfm)
     check_sources(settings.scale)

@@ -7,11 +7,15 @@ from math import ceil, inf
 from pathlib import Path
 from typing import Literal
 
-from swimm3r.errors import InputError
+import numpy as np
+from jaxtyping import UInt8, UInt16
+
+from swimm3r.errors import InputError, UsageError
 from swimm3r.io import images
 from swimm3r.io.bags.bag import is_bag
 from swimm3r.io.bags.clip import BagClip, BagImage
 from swimm3r.io.files.atomic import write_text
+from swimm3r.io.images import Rgb
 from swimm3r.io.video import Video, VideoFrame
 from swimm3r.prepare.candidates import (
     BLANK,
@@ -26,17 +30,26 @@ from swimm3r.prepare.candidates import (
     thinned,
 )
 from swimm3r.prepare.development import developed, development_of
+from swimm3r.prepare.rig import NONE, SIDE_BY_SIDE, STEREO, rig_of, write_lens
 from swimm3r.progress import Progress
 from swimm3r.scene.settings import FrameSettings
 
 Clip = Video | BagClip
 ClipFrame = VideoFrame | BagImage
 
+View = UInt8[np.ndarray, "rows columns 3"] | UInt16[np.ndarray, "rows columns 3"]
+
 LENS = "camera_info.yaml"  # the lens that a bag states, beside the frames
 
 
 def open_clip(source: Path, settings: FrameSettings) -> Clip:
     """A video, or the camera of a bag. Raises InputError, and UsageError where a bag holds several cameras."""
+    if settings.rig not in ((), (NONE,), (SIDE_BY_SIDE,)):
+        raise UsageError(
+            f"--rig {' '.join(settings.rig)} names sub-folders, and {source.name} is a video or a bag",
+            cause="only videos that show two views side by side, and folders of images are rigs",
+            hint="--rig side-by-side; or write the images of each camera into a folder of its name",
+        )
     return BagClip(source, settings.topic, settings.stamps) if is_bag(source) else Video(source)
 
 
@@ -63,7 +76,8 @@ def prepare_clip(source: Path, draft: Path, settings: FrameSettings, progress: P
     def bin_of(frame: ClipFrame) -> int:
         return int((frame.time - settings.start) * rate + 1e-6) if rate < inf else seen
 
-    found: list[SourceImage] = []
+    cameras = STEREO if settings.rig == (SIDE_BY_SIDE,) else ()
+    instants: list[list[SourceImage]] = []
     blank = 0
     for _, bin_frames in groupby(watched(), bin_of):
         best = _best(bin_frames, settings.pick)
@@ -71,10 +85,15 @@ def prepare_clip(source: Path, draft: Path, settings: FrameSettings, progress: P
             blank += 1
             continue
         frame, sharp = best
-        name = f"frame_{len(found):06d}.png"
-        rgb = scaled_down(developed(frame.rgb(), development), settings.long_side)
-        images.write_rgb(draft / name, rgb)
-        found.append(SourceImage(name, Path(name), (video.width, video.height), frame.time, sharp, is_gray(rgb)))
+        number = f"frame_{len(instants):06d}.png"
+        views = []
+        for camera, view in (halves(frame.rgb()) if cameras else {None: frame.rgb()}).items():
+            name = number if camera is None else f"{camera}/{number}"
+            rgb = scaled_down(developed(view, development), settings.long_side)
+            images.write_rgb(draft / name, rgb)
+            size, instant = (view.shape[1], view.shape[0]), len(instants) if cameras else None
+            views.append(SourceImage(name, Path(name), size, frame.time, sharp, is_gray(rgb), camera, instant))
+        instants.append(views)
     progress(STEP, max(seen, 1), max(seen, 1))
 
     if not seen:
@@ -86,16 +105,26 @@ def prepare_clip(source: Path, draft: Path, settings: FrameSettings, progress: P
     warnings = [blank_warning(blank, "times of the video")] if blank else []
     warnings += _warnings(video, last, reached)
     mask_folders = [settings.masks] if settings.masks is not None else []
-    kept = thinned(found, settings.max_frames)
-    originals = [image.original for image in found]
+    kept = [image for views in thinned(instants, settings.max_frames) for image in views]
+    originals = [image.original for views in instants for image in views]
     told = str(development) if development.changes else None
     chosen = SelectedImages(kept, True, warnings, mask_folders, originals, recorded=video.recorded, development=told)
-    if not isinstance(video, BagClip):
+    if cameras and kept:
+        lens = write_lens(draft, cameras, kept[0].size, settings)
+        chosen = replace(chosen, rig=rig_of(cameras, settings), calibration=lens)
+    if not isinstance(video, BagClip) or cameras:
         return chosen
     lens = draft / LENS if video.lens is not None and settings.camera_info else None
     if lens is not None and video.lens is not None:
         write_text(lens, video.lens)
     return replace(chosen, start_ns=video.start_ns, calibration=lens)
+
+
+def halves(image: Rgb) -> dict[str, View]:
+    """The left and the right half of an image that shows two views side by side."""
+    width = image.shape[1] // 2
+    left, right = STEREO
+    return {left: image[:, :width], right: image[:, image.shape[1] - width :]}
 
 
 def _warnings(video: Clip, last: float, reached: float) -> list[str]:

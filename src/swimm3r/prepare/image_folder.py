@@ -34,9 +34,8 @@ from swimm3r.prepare.candidates import (
     thinned,
 )
 from swimm3r.prepare.development import Development, development_of, header_of, read_developed
-from swimm3r.prepare.rig import cameras_of_folder, pair_images
+from swimm3r.prepare.rig import cameras_of_folder, pair_images, rig_of, write_lens
 from swimm3r.progress import Progress
-from swimm3r.scene.rig import Rig, RigCamera
 from swimm3r.scene.settings import FrameSettings
 
 MASKS = "masks"  # a folder of this name in the input is not searched for frames
@@ -122,11 +121,11 @@ def prepare_stills(
             dict.fromkeys([root, root / MASKS, source / MASKS, *([root.parent / MASKS] * (root.name == "images"))])
         )
     files = frozenset(root.resolve() / original for original in originals)
-    rig = Rig(tuple(RigCamera(name) for name in cameras)) if cameras else None
+    rig = rig_of(cameras, settings) if cameras else None
+    lens = write_lens(draft, cameras, images[0].size, settings) if cameras and images else None
     told = str(development) if development.changes or development.balance is not None else None
-    return SelectedImages(
-        images, ordered, warnings, mask_folders, originals, files, recorded, rig=rig, development=told
-    )
+    chosen = SelectedImages(images, ordered, warnings, mask_folders, originals, files, recorded)
+    return replace(chosen, calibration=lens, rig=rig, development=told)
 
 
 def images_of(source: Path, leave_out: Sequence[Path] = ()) -> ImageFolder:

@@ -10,16 +10,21 @@ from pathlib import Path
 import numpy as np
 
 from swimm3r.errors import InputError, UsageError
+from swimm3r.io.calibration.record import REMEDY, lens_at
+from swimm3r.io.calibration.rig import read_rig
+from swimm3r.io.files.atomic import write_text
+from swimm3r.io.files.damage import guard
 from swimm3r.io.image_folder import find_images, natural_key, numbered
 from swimm3r.io.image_header import capture_time
-from swimm3r.io.video import VIDEO_SUFFIXES
 from swimm3r.prepare.candidates import Taken, thinned
+from swimm3r.scene.rig import Rig, RigCamera, pose_of
 from swimm3r.scene.settings import FrameSettings
 
 log = logging.getLogger(__name__)
 
 NONE, SIDE_BY_SIDE = "none", "side-by-side"
 STEREO = ("left", "right")
+LENS = "rig_lens.txt"  # of the first camera of a calibrated rig, beside the frames
 _UNITS = {19: 1e-9, 16: 1e-6, 13: 1e-3}  # seconds, by the number of digits of a stamp since 1970
 _STAMP = re.compile(r"(?<!\d)(?:(\d{10})[._](\d{1,9})|(\d{19}|\d{16}|\d{13}))(?!\d)")
 _SAME_NAMES = 0.5  # share of the instants with all cameras, from which equal names are no chance
@@ -55,7 +60,7 @@ def cameras_of_folder(root: Path, settings: FrameSettings) -> tuple[str, ...]:
             there = sorted(path.name for path in root.iterdir() if path.is_dir())
             raise InputError(
                 f"{root} has no camera {missing[0]}" + (f", only {', '.join(there[:8])}" if there else ""),
-                cause="a slip in --rig, whose names are those of sub-folders or videos in the folder",
+                cause="a slip in --rig, whose names are those of sub-folders",
                 hint="--rig with the names of the cameras, the first of which gives the axes",
             )
         return settings.rig
@@ -70,10 +75,41 @@ def cameras_of_folder(root: Path, settings: FrameSettings) -> tuple[str, ...]:
     return found
 
 
-def videos_of(root: Path, cameras: Sequence[str]) -> list[Path]:
-    """The videos of a rig's cameras; empty where these are folders."""
-    paths = [root / name for name in cameras]
-    return paths if paths and all(path.suffix.lower() in VIDEO_SUFFIXES and path.is_file() for path in paths) else []
+def check_rig(source: Path, settings: FrameSettings) -> None:
+    """Read the calibration of a rig before any work is done. Raises InputError and UsageError where it cannot be used.
+
+    The cameras of a folder of images must be there.
+    """
+    if settings.rig == (SIDE_BY_SIDE,):
+        rig_of(STEREO, settings)
+    elif source.is_dir() and settings.rig:
+        inner = source / "images"
+        cameras = cameras_of_folder(inner if inner.is_dir() else source, settings)
+        if cameras:
+            rig_of(cameras, settings)
+
+
+def rig_of(cameras: Sequence[str], settings: FrameSettings) -> Rig:
+    """The cameras, with their poses where a calibration gives them. Raises InputError where that cannot be used."""
+    if settings.rig_calibration is None:
+        return Rig(tuple(RigCamera(name) for name in cameras))
+    found = read_rig(settings.rig_calibration, cameras).camera_from_rig
+    return Rig(tuple(RigCamera(name, pose_of(pose)) for name, pose in zip(cameras, found, strict=True)))
+
+
+def write_lens(draft: Path, cameras: Sequence[str], size: tuple[int, int], settings: FrameSettings) -> Path | None:
+    """Write the calibrated lens of the first camera beside the frames, as a line of COLMAP; None without one."""
+    if settings.rig_calibration is None:
+        return None
+    lens = read_rig(settings.rig_calibration, cameras).lenses[0]
+    with guard(settings.rig_calibration, REMEDY):
+        camera = lens_at(lens, *size, None if lens.size else size).camera
+    (fx, _, cx), (_, fy, cy), _ = camera.K[0].tolist()
+    bent = [*camera.distortion[0].tolist(), 0.0, 0.0, 0.0, 0.0][:4]
+    model = camera.model if camera.model == "OPENCV_FISHEYE" else "OPENCV"
+    numbers = " ".join(f"{value:.12g}" for value in (fx, fy, cx, cy, *bent))
+    write_text(draft / LENS, f"1 {model} {size[0]} {size[1]} {numbers}\n")
+    return draft / LENS
 
 
 @dataclass(frozen=True)

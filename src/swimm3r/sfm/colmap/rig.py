@@ -15,7 +15,7 @@ from jaxtyping import Float
 from torch import Tensor
 
 from swimm3r.cameras import cameras_of, project
-from swimm3r.geometry import invert_poses
+from swimm3r.geometry import invert_poses, rotation_angle
 from swimm3r.io.colmap.model import from_pycolmap, silence_log
 from swimm3r.io.colmap.rigs import RigLayout, rigged, sensor_poses
 from swimm3r.progress import Progress, silent
@@ -34,6 +34,7 @@ log = logging.getLogger(__name__)
 _MAX_ERROR = 4.0  # pixels, as in mapping
 _MIN_ANGLE = 1.5  # degrees between rays, as in mapping
 _WORSE, _WORSE_PX = 1.3, 0.15  # median reprojection error of a rig by that of free poses, and beyond it in pixels
+_CALIBRATED = np.radians(3.0)  # between the calibrated pose of a camera and the one found
 _STEP = "adjusting the rig"
 
 
@@ -71,7 +72,7 @@ def as_rig(
     fit = RigFit(_placed(rig, rec, rows, sensors), rigid, free_px, rig_px)
     log.info("rig: %s", said(fit))
     if rigid:
-        return replace(_record(rec, model), rig=fit)
+        return replace(_record(rec, model), rig=fit, warnings=(*rec.warnings, *_miscalibrated(rig, fit)))
     return replace(rec, rig=fit, warnings=(*rec.warnings, _not_rigid(rec, rows, fit)))
 
 
@@ -199,3 +200,26 @@ def _not_rigid(rec: Reconstruction, rows: RigRows, fit: RigFit) -> QualityWarnin
         "The images are not synchronized, or pairs are off by some: pair them by time (--rig-pairs time), or shift one"
         " of the two; a rig that bends is none (--rig none).",
     )
+
+
+def _miscalibrated(rig: Rig, fit: RigFit) -> list[QualityWarning]:
+    """Doubts where the images turn a camera, or its place, another way than the calibration of the rig."""
+    found = []
+    for camera, placed in zip(rig.cameras[1:], fit.cameras[1:], strict=True):
+        if camera.camera_from_rig is None:
+            continue
+        known, seen = np.array(camera.camera_from_rig), np.array(placed.camera_from_rig)
+        turn = rotation_angle(torch.from_numpy(seen[:3, :3] @ known[:3, :3].T)).item()
+        centers = [-pose[:3, :3].T @ pose[:3, 3] for pose in (known, seen)]
+        cosine = float(centers[0] @ centers[1] / np.linalg.norm(centers[0]) / np.linalg.norm(centers[1]))
+        away = float(np.arccos(np.clip(cosine, -1, 1)))
+        if max(turn, away) > _CALIBRATED:
+            found.append(
+                QualityWarning(
+                    f"The calibration of the rig does not fit the images: {camera.name} is turned by"
+                    f" {np.degrees(turn):.1f} degrees, and its place seen from {rig.names[0]} by"
+                    f" {np.degrees(away):.1f} degrees. The rig is as the images show it, its scale by the calibration.",
+                    "Check the order of the cameras under --rig, and whether the calibration was made in water.",
+                )
+            )
+    return found
