@@ -140,7 +140,11 @@ def _adjusted(model: "pycolmap.Reconstruction", *, lens: bool = False) -> "pycol
     options.ceres.loss_function_type = pycolmap.LossFunctionType.SOFT_L1
     options.ceres.solver_options.num_threads = THREADS
     options.ceres.solver_options.function_tolerance = STILL
-    pycolmap.bundle_adjustment(out, options)
+    images = pycolmap.BundleAdjustmentConfig()  # `pycolmap.bundle_adjustment` is the same, and prints
+    for image_id in out.reg_image_ids():
+        images.add_image(image_id)
+    images.fix_gauge(pycolmap.BundleAdjustmentGauge.TWO_CAMS_FROM_WORLD)
+    pycolmap.create_default_bundle_adjuster(options, images, out).solve()
     out.update_point_3d_errors()
     return out
 
