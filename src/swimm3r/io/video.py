@@ -89,6 +89,11 @@ class Video:
         self.width, self.height = self._sensor_size[:: -1 if self._quarter_turns % 2 else 1]
 
     @property
+    def quarter_turns(self) -> int:
+        """Quarter turns counter-clockwise that bring the stored images upright."""
+        return self._quarter_turns
+
+    @property
     def begin(self) -> float:
         """Time of the first frame in the container, seconds; times of frames count from it."""
         return float(self._origin * self._tick)

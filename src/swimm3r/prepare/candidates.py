@@ -41,6 +41,7 @@ class SourceImage:
     gray: bool  # three equal channels
     camera: str | None = None  # of a rig
     instant: int | None = None  # of a rig
+    up: tuple[float, float, float] | None = None  # away from the earth, x right, y down, z forward
 
 
 @dataclass(frozen=True)

@@ -29,7 +29,8 @@ from swimm3r.prepare.candidates import (
     sharpness,
     thinned,
 )
-from swimm3r.prepare.development import developed, development_of
+from swimm3r.prepare.development import Development, developed, development_of
+from swimm3r.prepare.measured_up import with_up
 from swimm3r.prepare.rig import NONE, SIDE_BY_SIDE, STEREO, rig_of, write_lens
 from swimm3r.progress import Progress
 from swimm3r.scene.settings import FrameSettings
@@ -84,16 +85,7 @@ def prepare_clip(source: Path, draft: Path, settings: FrameSettings, progress: P
         if best is None:
             blank += 1
             continue
-        frame, sharp = best
-        number = f"frame_{len(instants):06d}.png"
-        views = []
-        for camera, view in (halves(frame.rgb()) if cameras else {None: frame.rgb()}).items():
-            name = number if camera is None else f"{camera}/{number}"
-            rgb = scaled_down(developed(view, development), settings.long_side)
-            images.write_rgb(draft / name, rgb)
-            size, instant = (view.shape[1], view.shape[0]), len(instants) if cameras else None
-            views.append(SourceImage(name, Path(name), size, frame.time, sharp, is_gray(rgb), camera, instant))
-        instants.append(views)
+        instants.append(_written(*best, len(instants), draft, settings, development, split=bool(cameras)))
     progress(STEP, max(seen, 1), max(seen, 1))
 
     if not seen:
@@ -106,6 +98,8 @@ def prepare_clip(source: Path, draft: Path, settings: FrameSettings, progress: P
     warnings += _warnings(video, last, reached)
     mask_folders = [settings.masks] if settings.masks is not None else []
     kept = [image for views in thinned(instants, settings.max_frames) for image in views]
+    if isinstance(video, Video):
+        kept = with_up(kept, source)
     originals = [image.original for views in instants for image in views]
     told = str(development) if development.changes else None
     chosen = SelectedImages(kept, True, warnings, mask_folders, originals, recorded=video.recorded, development=told)
@@ -118,6 +112,27 @@ def prepare_clip(source: Path, draft: Path, settings: FrameSettings, progress: P
     if lens is not None and video.lens is not None:
         write_text(lens, video.lens)
     return replace(chosen, start_ns=video.start_ns, calibration=lens)
+
+
+def _written(
+    frame: ClipFrame,
+    sharp: float,
+    number: int,
+    draft: Path,
+    settings: FrameSettings,
+    development: Development,
+    *,
+    split: bool,
+) -> list[SourceImage]:
+    """The image of a moment on disk, or its two halves where it is `split` into the views of a rig."""
+    views = []
+    for camera, view in (halves(frame.rgb()) if split else {None: frame.rgb()}).items():
+        name = f"frame_{number:06d}.png" if camera is None else f"{camera}/frame_{number:06d}.png"
+        rgb = scaled_down(developed(view, development), settings.long_side)
+        images.write_rgb(draft / name, rgb)
+        size, instant = (view.shape[1], view.shape[0]), number if split else None
+        views.append(SourceImage(name, Path(name), size, frame.time, sharp, is_gray(rgb), camera, instant))
+    return views
 
 
 def halves(image: Rgb) -> dict[str, View]:

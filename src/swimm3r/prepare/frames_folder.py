@@ -82,6 +82,7 @@ class _Entry:
     mask: str | None = None
     camera: str | None = None
     instant: int | None = None
+    up: tuple[float, float, float] | None = None
 
 
 @dataclass(frozen=True)
@@ -134,6 +135,7 @@ def load_frames(folder: Path) -> Frames:
                 mask=_inside(folder, entry.mask) if entry.mask else None,
                 camera=entry.camera,
                 instant=entry.instant,
+                up=entry.up,
             )
             for entry in document.frames
         )
@@ -239,6 +241,7 @@ def _write_frames(dive: SelectedImages, draft: Path, source: Path, settings: Fra
             mask=draft / masks.places[image.name] if image.name in masks.places else None,
             camera=image.camera,
             instant=image.instant,
+            up=image.up,
         )
         for image, part in zip(kept, parts, strict=True)
     )

@@ -18,7 +18,7 @@ from swimm3r.errors import InputError
 from swimm3r.io.files.damage import Remedy, guard
 from swimm3r.io.navigation.record import Navigation, check_coordinates
 from swimm3r.io.navigation.table import read_cells, read_positions
-from swimm3r.scale.navigation.alignment import Alignment, Path, align
+from swimm3r.scale.navigation.alignment import GROUND_STD, Alignment, Path, align
 from swimm3r.scale.navigation.place import LocalNavigation, Place, localized
 from swimm3r.scale.settings import ScaleSettings
 from swimm3r.scale.triangulation import ScenePoint
@@ -151,7 +151,7 @@ class _Pairs:
 
     def _align(self, std: Float[np.ndarray, "n 3"]) -> Alignment:
         eye = np.tile(np.eye(3), (len(self.xyz), 1, 1))
-        path = Path(self.xyz, eye, self.coordinates, std, None, np.zeros((len(self.xyz), 3)), self.up)
+        path = Path(self.xyz, eye, self.coordinates, std, None, np.zeros((len(self.xyz), 3)), self.up, GROUND_STD)
         return align(path, ScaleSettings(outlier=self.outlier))
 
     def without(self, k: int) -> "_Pairs":

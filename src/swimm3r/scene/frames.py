@@ -47,6 +47,7 @@ class Frame:
     mask: Path | None = None  # image of the same size, 0 where the frame is not to be used
     camera: str | None = None  # of a rig
     instant: int | None = None  # of a rig: frames of one instant were taken together
+    up: tuple[float, float, float] | None = None  # away from the earth in image axes, where the camera measured it
 
 
 @dataclass(frozen=True)
@@ -230,6 +231,7 @@ def write_index(folder: Path, frames: Frames, source: str = "") -> None:
             {
                 "name": frame.name,
                 **({} if frame.camera is None else {"camera": frame.camera, "instant": frame.instant}),
+                **({} if frame.up is None else {"up": [round(value, 6) for value in frame.up]}),
                 "time": frame.time,
                 "split": frame.split,
                 "sharpness": frame.sharpness,

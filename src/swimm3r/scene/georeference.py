@@ -122,13 +122,14 @@ def local_georeference(rec: Reconstruction) -> Georeference:
 def up_from_scene(rec: Reconstruction) -> Float[np.ndarray, "3 3"]:
     """The rotation from the axes of a run to local ones with z up, from its points and cameras alone.
 
-    Up is the normal of the ground, a robust plane through the sparse points, on the side of the cameras. Where the
-    points are no plane, as around a wreck, it is opposite to the mean camera's y axis. The x axis is the mean camera's,
+    Up is against the gravity that the camera measured, where it did; else the normal of the ground, a robust plane
+    through the sparse points, on the side of the cameras. Where the points are no plane, as around a wreck, it is
+    opposite to the mean camera's y axis. The x axis is the mean camera's,
     turned level, so that a view from above lies as the frames do. Raises DegenerateAlignmentError where neither shows
     a direction.
     """
     poses = rec.cameras.cam2world.double().numpy()
-    up = _ground_normal(rec.points.xyz.double().numpy(), poses)
+    up = _ground_normal(rec.points.xyz.double().numpy(), poses) if rec.up is None else _unit(np.array(rec.up))
     if up is None:
         up = _unit(-poses[:, :3, 1].mean(0))
     level = [axis - up * (axis @ up) for axis in (*poses[:, :3, :2].mean(0).T, *np.eye(3))]

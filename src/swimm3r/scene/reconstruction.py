@@ -169,6 +169,7 @@ class Reconstruction:
     warnings: tuple[QualityWarning, ...] = ()
     white_balance: WhiteBalance = UNBALANCED  # of everything that is shown
     points_found: int | None = None  # sparse ones, before the settings' cap; None: nothing was left out
+    up: tuple[float, float, float] | None = None  # away from the earth, where the camera measured it; world axes
     rig: RigFit | None = None  # of a clip of several cameras that are fixed to each other
 
     def __repr__(self) -> str:
@@ -264,6 +265,7 @@ class Reconstruction:
         self.white_balance.save(folder / WHITE_BALANCE)
         about = {"backend": self.backend, "metric": self.metric, "warnings": [vars(each) for each in self.warnings]}
         about["points_found"] = self.points_found
+        about["up"] = self.up
         about["rig"] = None if self.rig is None else asdict(self.rig)
         write_text(folder / "reconstruction.json", json.dumps(about, indent=2) + "\n")
 

@@ -39,6 +39,7 @@ class _About:
     metric: bool
     warnings: tuple[QualityWarning, ...]
     points_found: int | None = None  # earlier versions did not count
+    up: tuple[float, float, float] | None = None
     rig: RigFit | None = None
 
 
@@ -76,6 +77,7 @@ def load_reconstruction(folder: str | Path, frames: Frames | None = None) -> Rec
         warnings=about.warnings,
         white_balance=read_run_balance(folder),
         points_found=about.points_found,
+        up=about.up,
         rig=about.rig,
     )
 

@@ -22,7 +22,7 @@ _BEGIN = b"DEVC"  # of every GPMF payload
 def read_telemetry(path: Path) -> Telemetry:
     """All streams of a video. Raises InputError where it is no video, or holds no telemetry that can be read."""
     video = Video(path)
-    payloads, stated = _payloads(video)
+    payloads, stated = gpmf_payloads(video)
     if not payloads:
         raise InputError(
             f"{path} holds no telemetry",
@@ -70,7 +70,7 @@ def _columns(stream: Stream) -> Iterator[str]:
         yield f"{channel} [{unit}]" if unit else channel
 
 
-def _payloads(video: Video) -> tuple[list[Payload], int]:
+def gpmf_payloads(video: Video) -> tuple[list[Payload], int]:
     """The packets of the first GPMF track with times of the clip, and how many the file states."""
     import av
     from av.error import FFmpegError

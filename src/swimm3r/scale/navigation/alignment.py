@@ -2,7 +2,8 @@
 
     p_i + A_i l = s R c_i + t + noise          positions of the vehicle; l lever arm, A_i attitude
     A_i M = R R_i exp(noise)                   attitude, where given; M mounting of the camera, the same in all frames
-    R up_scene = z + noise of 20 degrees       the ground below the cameras: holds what a straight path leaves open
+    R up_scene = z + noise                     gravity, else the ground below the cameras: holds what a straight path
+                                               leaves open
 
 Solved by weighted least squares over log s, R, t and M; rows far off count less (Cauchy), and the standard deviation of
 positions is that of the residuals where none is given. Errors of navigation last for many rows: the covariance grows by
@@ -22,8 +23,8 @@ MOUNTS = {  # camera axes (right, down, ahead of the image) in those of the vehi
     "down": np.array([[0.0, -1, 0], [1, 0, 0], [0, 0, 1]]),
     "forward": np.array([[0.0, 0, 1], [1, 0, 0], [0, 1, 0]]),
 }
-_UP_STD = np.radians(20.0)
 _HALF_TURN = np.pi  # standard deviation of a heading that is not known
+GROUND_STD = np.radians(20.0)  # of up by the normal of the ground, which slopes
 _REFINED = 2  # of the beginnings, the best ones
 _ROUNDS = 12
 _SETTLED = 1e-6  # of the sizes of the unknowns, between rounds
@@ -43,6 +44,7 @@ class Path:
     attitude: Float[np.ndarray, "k 3 3"] | None
     attitude_std: Float[np.ndarray, "k 3"]  # about the vehicle's forward, starboard and down axes, radians
     up: Float[np.ndarray, "3"]  # of the scene, in the run
+    up_std: float  # radians
 
     def rows(self, marked: Bool[np.ndarray, " k"]) -> "Path":
         """The marked rows alone."""
@@ -257,7 +259,7 @@ class _Problem:
         _, R, _ = self.similarity(x)
         up = R @ self.path.up
         tilt = np.arctan2(np.linalg.norm(up[:2]), up[2]) * up[:2] / max(float(np.linalg.norm(up[:2])), 1e-12)
-        parts = [tilt / _UP_STD]
+        parts = [tilt / self.path.up_std]
         if self.whole is not None:
             parts.append((self.attitudes(x) / self.path.attitude_std[self.whole]).ravel())
             if self.settings.camera_mount != "free":

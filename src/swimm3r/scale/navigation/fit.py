@@ -15,7 +15,7 @@ from jaxtyping import Float
 from swimm3r.errors import InputError
 from swimm3r.io.navigation.read import read_navigation
 from swimm3r.io.navigation.record import Navigation, vehicle_attitude
-from swimm3r.scale.navigation.alignment import Alignment, Path, align, realign, without_attitude
+from swimm3r.scale.navigation.alignment import GROUND_STD, Alignment, Path, align, realign, without_attitude
 from swimm3r.scale.navigation.latency import at_offset, find_latency, within_path
 from swimm3r.scale.navigation.matching import (
     FEWEST,
@@ -37,6 +37,7 @@ from swimm3r.scene.reconstruction import Reconstruction
 
 _MISFIT = 0.2  # of the extent of the path: more than any navigation errs, less than any slip makes
 _MUCH_BETTER = 0.4  # a slip is named where its correction leaves this share of the misfit
+_GRAVITY_STD = np.radians(1.0)  # of up as the camera measured it
 _BELOW = 60.0  # degrees between up and the scene's up: cameras that film from below
 _TURNED = 15.0  # degrees, root mean square, between stated attitude and the cameras
 
@@ -105,8 +106,10 @@ def path_of(rec: Reconstruction, matched: Matched, settings: ScaleSettings) -> P
     if stated is not None:
         heading, pitch, roll = np.where(np.isfinite(stated), stated, np.stack([heading, pitch, roll], -1)).T
     attitude_std = np.radians(np.stack([roll, pitch, heading], -1))  # about forward, starboard and down
-    up = up_from_scene(rec)[2]
-    return Path(poses[:, :3, 3], poses[:, :3, :3], navigation.position, std, navigation.attitude, attitude_std, up)
+    up, up_std = up_from_scene(rec)[2], GROUND_STD if rec.up is None else _GRAVITY_STD
+    return Path(
+        poses[:, :3, 3], poses[:, :3, :3], navigation.position, std, navigation.attitude, attitude_std, up, up_std
+    )
 
 
 def _match(

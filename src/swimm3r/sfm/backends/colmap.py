@@ -4,6 +4,7 @@ from pathlib import Path
 
 from swimm3r.progress import Progress, silent
 from swimm3r.scene.frames import Frames
+from swimm3r.scene.gravity import with_measured_up
 from swimm3r.scene.placement import Navigator
 from swimm3r.scene.reconstruction import Reconstruction
 from swimm3r.scene.reconstruction_io import load_reconstruction
@@ -33,7 +34,7 @@ def reconstruct(
     if not (folder / "reconstruction.json").is_file():
         rec = poses.reconstruct(frames, settings, folder, progress, engine=engine, navigator=navigator)
         rec = rec if frames.rig is None else as_rig(rec, frames, settings, progress)
-        rec.save(folder, frames)
+        with_measured_up(rec, frames).save(folder, frames)
     rec = load_reconstruction(folder, frames)  # also where it was just made: the same bits as after an interruption
     estimate_depth(rec, frames, settings.depth, progress, engine)
     rec = with_water(rec, frames, settings, folder, progress)

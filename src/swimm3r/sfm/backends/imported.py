@@ -21,6 +21,7 @@ from swimm3r.io.imports.read import read_foreign
 from swimm3r.io.imports.record import ForeignModel
 from swimm3r.progress import Progress, silent
 from swimm3r.scene.frames import Frames
+from swimm3r.scene.gravity import with_measured_up
 from swimm3r.scene.placement import Navigator
 from swimm3r.scene.reconstruction import DepthMap, DepthMaps, Matches, Points, QualityWarning, Reconstruction, Tracks
 from swimm3r.sfm.colmap.triangulation import triangulate
@@ -48,7 +49,7 @@ def reconstruct(
 ) -> Reconstruction:
     """The reconstruction of the frames that the model names. Raises InputError where fewer than 2 of them are in it."""
     foreign = read_foreign(settings.model)
-    rec = from_foreign(frames, foreign, folder)
+    rec = with_measured_up(from_foreign(frames, foreign, folder), frames)
     if len(rec.tracks.point) == 0 and foreign.depth is None:
         rec = _with_points(rec, frames, foreign, settings, folder, progress)
     rec.save(folder, frames)

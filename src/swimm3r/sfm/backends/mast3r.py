@@ -19,6 +19,7 @@ from swimm3r.errors import RegistrationError
 from swimm3r.imaging.filters import LUMA
 from swimm3r.progress import Progress, silent
 from swimm3r.scene.frames import Frames
+from swimm3r.scene.gravity import with_measured_up
 from swimm3r.scene.placement import Navigator
 from swimm3r.scene.reconstruction import DepthMap, DepthMaps, Matches, QualityWarning, Reconstruction
 from swimm3r.scene.reconstruction_io import load_reconstruction, write_unfiltered_matches
@@ -86,7 +87,7 @@ def reconstruct(
             encodings = EncodingStore(network, images, cache / "encodings")
             read_water = _WaterReader(head, encodings, folder / _WATER)
         rec = _place(said, images, settings, folder, progress, read_water)
-        rec.save(folder, frames)
+        with_measured_up(rec, frames).save(folder, frames)
     rec = load_reconstruction(folder, frames)  # also where it was just made: the same bits as after an interruption
     if settings.adapter is None:
         rec = with_water(rec, frames, settings, folder, progress)
