@@ -26,7 +26,9 @@ def rig_estimates(rec: Reconstruction, settings: ScaleSettings) -> list[ScaleEst
             return []
         raise InputError(
             "a baseline is given, and the run has no rigid rig" + ("" if rig is None else ": its cameras moved apart"),
-            cause="the frames are of one camera" if rig is None else "the images of the cameras are not synchronized",
+            cause="the frames are of one camera, or poses are not of COLMAP's mapping, which alone fits rigs"
+            if rig is None
+            else "the images of the cameras are not synchronized",
             hint="images in left/ and right/, or --rig with the names of the cameras; without --baseline the run is"
             " as it was",
         )
