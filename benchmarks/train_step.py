@@ -26,7 +26,7 @@ from swimm3r.splat.medium.field import grid_of, initial_field, medium_at_pixels,
 from swimm3r.splat.optimizer import adam_step
 from swimm3r.splat.primitives.beta import BetaPrimitives, inverse_softplus
 from swimm3r.splat.projection.dispatch import project
-from swimm3r.splat.projection.pinhole import pinhole
+from swimm3r.splat.projection.view_camera import view_camera
 from swimm3r.splat.recipes import uwbs
 from swimm3r.splat.rendering import Drawing
 from swimm3r.splat.settings import UwbsSettings
@@ -127,7 +127,7 @@ def measure(size: Size, repeats: int, device: torch.device) -> dict[str, float]:
         z_depth=prior,
         open_water=prior < 0,
     ).to(device)
-    sight = pinhole(view.camera).to(device)
+    sight = view_camera(view.camera).to(device)
     leaves = BetaPrimitives(*(t.clone().requires_grad_() for t in p))
 
     seen = project(leaves, sight, settings.render)

@@ -14,7 +14,7 @@ import torch
 import swimm3r
 from swimm3r.io.images import read_rgb
 from swimm3r.sfm.settings import PlaneSweepSettings
-from swimm3r.splat.projection.pinhole import pinhole
+from swimm3r.splat.projection.view_camera import view_camera
 from swimm3r.splat.settings import DensifySettings, InitialSettings, MediumFieldSettings, UwbsSettings
 
 README = Path(__file__).parents[1] / "README.md"
@@ -82,9 +82,9 @@ def test_every_public_name_loads():
 def test_a_camera_with_distortion_is_refused_with_what_to_do():
     K, pose = torch.tensor([[[9.0, 0, 4], [0, 9, 3], [0, 0, 1]]]), torch.eye(4)[None].double()
     lens = swimm3r.Cameras(K, torch.tensor([[0.1]]), pose, 8, 6, "SIMPLE_RADIAL")
-    with pytest.raises(ValueError, match=r"camera\.pinhole\(\)"):
-        pinhole(lens)
-    pinhole(lens.pinhole())
+    with pytest.raises(ValueError, match=r"camera\.drawn\(\)"):
+        view_camera(lens)
+    view_camera(lens.drawn())
 
 
 def test_the_version_is_that_of_the_distribution():

@@ -24,7 +24,7 @@ from swimm3r.splat.medium.field import initial_field
 from swimm3r.splat.primitives.beta import BetaPrimitives, inverse_softplus
 from swimm3r.splat.primitives.gaussian import GaussianPrimitives, seen_color
 from swimm3r.splat.projection.dispatch import project
-from swimm3r.splat.projection.pinhole import pinhole
+from swimm3r.splat.projection.view_camera import view_camera
 from swimm3r.splat.rendering import SplatMap
 from swimm3r.splat.settings import MediumFieldSettings, UwbsSettings, mcmc_gs
 
@@ -140,7 +140,7 @@ def test_negative_colors_do_not_brighten_the_gaussians_as_a_whole():
     dark = replace(scene, primitives=p)
     assert (p.rgb < 0).float().mean() > 0.15
     plain = moment_matched(dark, view)
-    own = rasterize(project(p, pinhole(view), dark.settings.render).primitives, None, 56, 80).clear.mean((1, 2))
+    own = rasterize(project(p, view_camera(view), dark.settings.render).primitives, None, 56, 80).clear.mean((1, 2))
     brighter = draw_gaussians(plain, view, 0.01).clear.mean((1, 2)) / own
     assert brighter.min() > 1.05
     kept = draw_gaussians(with_mean_color(dark, plain, view), view, 0.01).clear.mean((1, 2))

@@ -12,7 +12,7 @@ from swimm3r.export.gaussians import clear_difference, clear_gaussians
 from swimm3r.splat.block_store import BlockEntry, PartCache, nbytes, no_primitives, write_block
 from swimm3r.splat.map_file import load_map
 from swimm3r.splat.pose_refinement import in_sight
-from swimm3r.splat.projection.pinhole import pinhole
+from swimm3r.splat.projection.view_camera import view_camera
 from swimm3r.splat.rendering import SplatMap
 
 
@@ -40,7 +40,7 @@ def test_views_of_blocks_are_those_of_the_whole_map(turned_wall, tmp_path):
             whole, found = turned_wall.render(camera), cut.render(camera)
             for name in ("rgb", "clear", "backscatter", "z_depth", "alpha"):
                 torch.testing.assert_close(getattr(found, name), getattr(whole, name), atol=1e-3, rtol=1e-3)
-            drawn += len(cut.blocks.seen_by(pinhole(camera)))
+            drawn += len(cut.blocks.seen_by(view_camera(camera)))
     assert drawn < 0.8 * 18 * 6  # some were left out
 
 
@@ -53,7 +53,7 @@ def test_a_view_of_no_block_shows_the_water(turned_wall, tmp_path):
 def test_far_blocks_are_drawn_from_few_primitives_that_look_alike(wall, tmp_path):
     scene = wall(6000)
     cut = in_blocks(scene, tmp_path)
-    near, far = pinhole(looking(0.0)), pinhole(looking(0.0, -60.0))
+    near, far = view_camera(looking(0.0)), view_camera(looking(0.0, -60.0))
     assert not any(entry.is_far(near) for entry in cut.blocks.entries)
     assert all(entry.is_far(far) for entry in cut.blocks.entries)
     assert sum(len(p.xyz) for p in cut.blocks.seen_by(far)) < 6000 / 5

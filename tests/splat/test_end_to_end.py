@@ -10,7 +10,7 @@ from swimm3r.cameras import Cameras
 from swimm3r.raster import Backend, MediumMaps, RasterOutput, rasterize
 from swimm3r.splat.primitives.beta import BetaPrimitives
 from swimm3r.splat.projection.dispatch import project
-from swimm3r.splat.projection.pinhole import Pinhole, pinhole
+from swimm3r.splat.projection.view_camera import ViewCamera, view_camera
 from swimm3r.splat.settings import RenderSettings
 
 Make = Callable[..., BetaPrimitives]
@@ -24,7 +24,7 @@ def water() -> MediumMaps:
     return MediumMaps(Binf, 0.4 * beta_D, 0.4 * beta_B)
 
 
-def turned(view: Pinhole, world2cam: torch.Tensor) -> Pinhole:
+def turned(view: ViewCamera, world2cam: torch.Tensor) -> ViewCamera:
     """The camera with another pose; its center follows."""
     R, t = world2cam[:3, :3], world2cam[:3, 3]
     return replace(view, R=R, t=t, center=-R.mT @ t)
@@ -36,7 +36,7 @@ def loss(out: RasterOutput) -> torch.Tensor:
     return sum(((w * image).sum() for w, image in zip(weights, out, strict=True)), torch.zeros(()))
 
 
-def image(p: BetaPrimitives, view: Pinhole, backend: Backend) -> RasterOutput:
+def image(p: BetaPrimitives, view: ViewCamera, backend: Backend) -> RasterOutput:
     dtype = p.xyz.dtype
     time = TIME.to(dtype) if p.query_mean.shape[1] == 4 else None
     drawn = project(p, view, RenderSettings(), time).primitives
@@ -44,9 +44,9 @@ def image(p: BetaPrimitives, view: Pinhole, backend: Backend) -> RasterOutput:
     return rasterize(drawn, maps, HEIGHT, WIDTH, alpha_min=0.0, backend=backend)
 
 
-def scene(primitives: Make, camera: Callable[..., Cameras], c: int) -> tuple[BetaPrimitives, Pinhole, torch.Tensor]:
+def scene(primitives: Make, camera: Callable[..., Cameras], c: int) -> tuple[BetaPrimitives, ViewCamera, torch.Tensor]:
     """36 primitives that a 32 x 24 camera sees, and its pose, world to camera."""
-    p, view = primitives(36, c, seed=2), pinhole(camera(WIDTH, HEIGHT), torch.float64)
+    p, view = primitives(36, c, seed=2), view_camera(camera(WIDTH, HEIGHT), torch.float64)
     p = p._replace(
         beta=torch.cat([p.beta[:, :1], p.beta[:, 1:] - 1], -1),  # most of them show
         scale=torch.cat([p.scale[:, :3] + 0.8, p.scale[:, 3:]], -1),

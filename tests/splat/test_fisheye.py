@@ -11,8 +11,8 @@ from swimm3r.imaging.undistortion import undistorted
 from swimm3r.splat.medium.field import ray_lengths
 from swimm3r.splat.projection.conditioning import Conditioned
 from swimm3r.splat.projection.observed import coverage_from, coverage_of
-from swimm3r.splat.projection.pinhole import BLUR, pinhole
 from swimm3r.splat.projection.plain import project_conditioned
+from swimm3r.splat.projection.view_camera import BLUR, view_camera
 
 LENS = (0.02, -0.01, 0.004, -0.001)
 
@@ -43,7 +43,7 @@ def drawn(xyz: torch.Tensor, spread: float, cam: Cameras):
     covariance = spread**2 * torch.eye(3, dtype=torch.float64).expand(len(xyz), 3, 3)
     ones = torch.ones(len(xyz), dtype=torch.float64)
     seen = Conditioned(xyz, covariance, ones)
-    return project_conditioned(seen, ones, xyz, pinhole(cam, torch.float64), 0.01).primitives
+    return project_conditioned(seen, ones, xyz, view_camera(cam, torch.float64), 0.01).primitives
 
 
 def test_primitives_stand_where_the_camera_has_their_points():
@@ -88,7 +88,7 @@ def test_near_the_axis_a_fisheye_is_a_pinhole():
 
 def test_the_water_s_rays_are_those_of_the_camera():
     lengths = torch.linalg.vector_norm(image_directions(camera()), dim=-1)
-    torch.testing.assert_close(ray_lengths(pinhole(camera())), lengths.float(), rtol=1e-4, atol=0)
+    torch.testing.assert_close(ray_lengths(view_camera(camera())), lengths.float(), rtol=1e-4, atol=0)
 
 
 def test_a_fisheye_s_frame_is_drawn_whole_and_unchanged():
@@ -109,7 +109,7 @@ def test_a_smaller_canvas_shows_the_same_field():
 def test_other_distortion_is_not_drawn():
     assert camera((0.1, 0.0, 0.0, 0.0), "OPENCV").drawn().model == "PINHOLE"
     with pytest.raises(ValueError, match=r"camera\.drawn\(\)"):
-        pinhole(camera((0.1, 0.0, 0.0, 0.0), "OPENCV"))
+        view_camera(camera((0.1, 0.0, 0.0, 0.0), "OPENCV"))
 
 
 def test_the_record_of_seen_parts_keeps_the_lens():

@@ -27,8 +27,8 @@ from swimm3r.splat.primitives.gaussian import colored, covariance
 from swimm3r.splat.primitives.spherical_harmonics import Y_00
 from swimm3r.splat.projection.conditioning import Conditioned, condition, queries, symmetric
 from swimm3r.splat.projection.dispatch import project
-from swimm3r.splat.projection.pinhole import pinhole
 from swimm3r.splat.projection.plain import project_conditioned
+from swimm3r.splat.projection.view_camera import view_camera
 from swimm3r.splat.rendering import SplatMap, settings_in_scene_units
 from swimm3r.splat.settings import RenderSettings
 
@@ -74,7 +74,7 @@ def clear_gaussians(scene: SplatMap, cameras: Cameras, time: float | None = None
 
 
 def _of_block(scene: SplatMap, blocks: StoredBlocks, entry: BlockEntry, cameras: Cameras) -> Gaussians:
-    views = [k for k in range(len(cameras)) if entry.is_in(pinhole(cameras[k]))]
+    views = [k for k in range(len(cameras)) if entry.is_in(view_camera(cameras[k]))]
     asked = [views[k] for k in spread(len(views), ASKED).tolist()] if views else []
     alone = replace(scene, primitives=blocks.read(entry), blocks=None)
     return moment_matched(alone, cameras[asked])
@@ -101,7 +101,7 @@ def moment_matched(scene: SplatMap, cameras: Cameras, time: float | None = None)
     direction, share, seen = (torch.zeros(len(p.xyz), k) for k in (3, 1, 1))
     with torch.no_grad():
         for i in range(len(cameras)):
-            view = pinhole(cameras[i])
+            view = view_camera(cameras[i])
             drawn = project(p, view, settings, now)
             at, reach = drawn.primitives.mean2d, drawn.radius[:, None]
             size = torch.tensor([view.width, view.height])
@@ -125,7 +125,7 @@ def moment_matched(scene: SplatMap, cameras: Cameras, time: float | None = None)
 
 def draw_gaussians(g: Gaussians, camera: Cameras, near: float) -> RasterOutput:
     """The image of a 3DGS viewer: exp(-r2 / 2) under the image plane's covariance with its 0.3 px^2 of blur."""
-    view = pinhole(camera)
+    view = view_camera(camera)
     half = torch.full_like(g.opacity, 0.5)
     rgb = colored(g.rgb, g.harmonics, g.xyz - view.center)
     p = project_conditioned(Conditioned(g.xyz, g.covariance, g.opacity), half, rgb, view, near).primitives
@@ -166,7 +166,7 @@ def _both(scene: SplatMap, g: Gaussians, camera: Cameras, time: float | None) ->
     """One view of the Gaussians as a 3DGS viewer draws them, and of the map without its water."""
     settings, now = settings_in_scene_units(scene.settings, scene.length).render, scene.normalized_time(time)
     with torch.no_grad():
-        view = pinhole(camera)
+        view = view_camera(camera)
         seen = project(scene.seen_by(view), view, settings, now)
         own = rasterize(seen.primitives, None, view.height, view.width, kernel=seen.kernel)
         return draw_gaussians(g, camera, settings.near), own

@@ -26,8 +26,8 @@ from swimm3r.sfm.plane_sweep.views import make_view
 from swimm3r.sfm.settings import PlaneSweepSettings
 from swimm3r.splat.primitives.beta import BetaPrimitives
 from swimm3r.splat.projection.dispatch import project
-from swimm3r.splat.projection.pinhole import pinhole
 from swimm3r.splat.projection.plain import project_plainly
+from swimm3r.splat.projection.view_camera import view_camera
 from swimm3r.splat.settings import RenderSettings
 from swimm3r.splat.training.losses import mean_ssim, photometric
 
@@ -93,7 +93,7 @@ def _rasterized(
 
 
 def _projection(device: str, c: int) -> Iterator[Check]:
-    p, view, time = beta_primitives(700, c), pinhole(turned_camera(), torch.float64), torch.tensor(0.4)
+    p, view, time = beta_primitives(700, c), view_camera(turned_camera(), torch.float64), torch.tensor(0.4)
     exact = BetaPrimitives(*(t.requires_grad_() for t in p))
     fast = BetaPrimitives(*(t.detach().to(device, torch.float32).requires_grad_() for t in p))
     moment = time if c == 4 else None

@@ -23,7 +23,7 @@ from swimm3r.io.files.safe_names import check_name
 from swimm3r.io.files.tensor_file import TensorFile, read_tensors, write_tensors
 from swimm3r.splat.primitives.beta import BetaPrimitives, select
 from swimm3r.splat.primitives.kinds import primitives_from
-from swimm3r.splat.projection.pinhole import Pinhole
+from swimm3r.splat.projection.view_camera import ViewCamera
 
 SCHEMA = 1  # of a block's files
 FOLDER = "blocks"  # beside the map's own file
@@ -57,7 +57,7 @@ class BlockEntry:
         """The file of the few primitives."""
         return self.file.removesuffix(".safetensors") + "_coarse.safetensors"
 
-    def is_in(self, view: Pinhole) -> bool:
+    def is_in(self, view: ViewCamera) -> bool:
         """Return whether the box may reach into a view."""
         corners = torch.cartesian_prod(*(torch.tensor(pair) for pair in zip(self.low, self.high, strict=True)))
         x, y, z = (corners.to(view.R) @ view.R.mT + view.t).unbind(-1)
@@ -73,7 +73,7 @@ class BlockEntry:
         )
         return all(bool((side > 0).any()) for side in before_edges)
 
-    def is_far(self, view: Pinhole) -> bool:
+    def is_far(self, view: ViewCamera) -> bool:
         """Return whether a view cannot tell the few primitives from all."""
         low, high = torch.tensor(self.low).to(view.center), torch.tensor(self.high).to(view.center)
         away = float((view.center - view.center.clamp(low, high)).norm())
@@ -142,7 +142,7 @@ class StoredBlocks:
         """The same without the primitives whose centers `kept` denies."""
         return replace(self, kept=kept, cache=PartCache(self.cache.max_bytes))
 
-    def seen_by(self, view: Pinhole) -> list[BetaPrimitives]:
+    def seen_by(self, view: ViewCamera) -> list[BetaPrimitives]:
         """Primitives of the blocks that reach into a view, of far ones the few."""
         seen = [entry for entry in self.entries if entry.primitives and entry.is_in(view)]
         return [self.read(entry, coarse=entry.is_far(view)) for entry in seen]

@@ -25,7 +25,7 @@ from swimm3r.splat.primitives.beta import select
 from swimm3r.splat.primitives.kinds import Primitives
 from swimm3r.splat.projection.dispatch import project
 from swimm3r.splat.projection.observed import TrainingCoverage
-from swimm3r.splat.projection.pinhole import pinhole
+from swimm3r.splat.projection.view_camera import view_camera
 from swimm3r.splat.rendering import SplatMap, expected_z_depth, images, memory_for_views, settings_in_scene_units
 from swimm3r.splat.settings import PoseRefinementSettings
 
@@ -108,7 +108,7 @@ class _Look:
     def _observed(self, coverage: TrainingCoverage) -> Bool[Tensor, "h w"]:
         """Mask of what training frames saw of the first pose's view."""
         with torch.no_grad():
-            view = pinhole(self._canvas).to(self._scene.device)
+            view = view_camera(self._canvas).to(self._scene.device)
             shown = images(self._primitives, self._scene.field, view, self._units, self._now)
         return coverage.of_view(self._canvas, expected_z_depth(shown), shown.alpha).to(self._scene.device)
 
@@ -124,7 +124,7 @@ class _Look:
 
     def loss(self, delta: Float[Tensor, "9"]) -> Float[Tensor, ""]:
         """Mean absolute difference over the edges."""
-        view = pinhole(replace(self._canvas, cam2world=self.pose(delta)[None])).to(self._scene.device)
+        view = view_camera(replace(self._canvas, cam2world=self.pose(delta)[None])).to(self._scene.device)
         rgb = images(self._primitives, self._scene.field, view, self._units, self._now).rgb
         rgb = rgb.permute(1, 2, 0)
         if self._scene.colors is not None:  # the frame has colors of its own: they say nothing about the pose
@@ -160,7 +160,7 @@ def edges(
 def in_sight(scene: SplatMap, canvas: Cameras, now: Float[Tensor, ""] | None = None) -> Primitives:
     """The primitives that a camera sees, or would after a small motion."""
     with torch.no_grad():
-        view = pinhole(canvas).to(scene.device)
+        view = view_camera(canvas).to(scene.device)
         p = scene.seen_by(view.widened(_MARGIN))
         seen = project(p, view, settings_in_scene_units(scene.settings, scene.length).render, now)
     size = torch.tensor([canvas.width, canvas.height]).to(seen.radius)

@@ -36,7 +36,7 @@ from swimm3r.splat.primitives.beta import BetaPrimitives, select
 from swimm3r.splat.primitives.kinds import Primitives
 from swimm3r.splat.projection.dispatch import project
 from swimm3r.splat.projection.observed import TrainingCoverage
-from swimm3r.splat.projection.pinhole import Pinhole, Projection, pinhole
+from swimm3r.splat.projection.view_camera import Projection, ViewCamera, view_camera
 from swimm3r.splat.settings import SplatSettings, UwbsSettings
 from swimm3r.splat.training_poses import RefinedPoses
 from swimm3r.splat.views import normalized_time
@@ -118,7 +118,7 @@ class SplatMap:
         """Number of primitives, of all blocks."""
         return len(self.primitives.xyz) if self.blocks is None else self.blocks.count
 
-    def seen_by(self, view: Pinhole) -> Primitives:
+    def seen_by(self, view: ViewCamera) -> Primitives:
         """The primitives that a view is drawn from: all, or those of the blocks that it sees."""
         if self.blocks is None:
             return self.primitives
@@ -219,7 +219,7 @@ class Drawing:
 def draw(
     p: Primitives,
     field: MediumField,
-    view: Pinhole,
+    view: ViewCamera,
     settings: UwbsSettings | GaussianSettings,
     time: Float[Tensor, ""] | None = None,
     sgg: bool = False,
@@ -244,7 +244,7 @@ def draw(
     return Drawing(images, projection, grid, maps, buffers, time, light)
 
 
-def evenly_lit(drawing: Drawing, view: Pinhole, settings: UwbsSettings | GaussianSettings) -> RasterOutput:
+def evenly_lit(drawing: Drawing, view: ViewCamera, settings: UwbsSettings | GaussianSettings) -> RasterOutput:
     """The images of a drawing, with a clear one without the light of a lamp."""
     if drawing.light is None:
         return drawing.images
@@ -257,7 +257,7 @@ def evenly_lit(drawing: Drawing, view: Pinhole, settings: UwbsSettings | Gaussia
 
 
 def images(
-    p: Primitives, field: Water, view: Pinhole, settings: SplatSettings, time: Float[Tensor, ""] | None = None
+    p: Primitives, field: Water, view: ViewCamera, settings: SplatSettings, time: Float[Tensor, ""] | None = None
 ) -> RasterOutput:
     """The images of any map; differentiable as `draw` is."""
     match field:
@@ -304,7 +304,7 @@ memory_for_views = devices.memory_for(
 def render(scene: SplatMap, camera: Cameras, time: float | None = None) -> RenderOutput:
     """One view of a map at a time of its clip. Raises ValueError as `SplatMap.render` does."""
     settings = settings_in_scene_units(scene.settings, scene.length)
-    view, now = pinhole(camera).to(scene.device), scene.normalized_time(time)
+    view, now = view_camera(camera).to(scene.device), scene.normalized_time(time)
     match scene.field:
         case MediumField():
             drawing = draw(scene.seen_by(view), scene.field, view, settings, now)
@@ -346,7 +346,7 @@ def mean_water(scene: SplatMap, camera: Cameras, time: float | None = None) -> M
     """The map's water averaged over one view, per scene unit of ray depth."""
     match scene.field:
         case MediumField():
-            view = pinhole(camera).to(scene.device)
+            view = view_camera(camera).to(scene.device)
             grid = grid_of(scene.field, view, scene.field.stride, scene.normalized_time(time))
             mean = grid.values.flatten(1).mean(1).to(camera.cam2world.device)
             return Medium(mean[:3], beta_B=mean[3:6], beta_D=mean[6:])
@@ -355,7 +355,7 @@ def mean_water(scene: SplatMap, camera: Cameras, time: float | None = None) -> M
             return Medium(**{name: values.flatten(0, 1).mean(0) for name, values in vars(medium).items()})
 
 
-def _as_coefficients(water: SceneWater, over: WaterLayer, images: RasterOutput, view: Pinhole) -> MediumMaps:
+def _as_coefficients(water: SceneWater, over: WaterLayer, images: RasterOutput, view: ViewCamera) -> MediumMaps:
     """Betas per unit of ray depth that take, over each pixel's own, the light that the scene's coefficients take."""
     z = expected_z_depth(images)
     ray = (torch.where(z > 0, z, z.max()) * ray_lengths(view)).clamp(min=1e-6)

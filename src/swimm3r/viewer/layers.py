@@ -16,7 +16,7 @@ from swimm3r.cameras import Cameras, image_directions, pixel_grid, project_visib
 from swimm3r.imaging.depth_colors import depth_image
 from swimm3r.medium import Medium, linear_from_srgb, srgb_from_linear
 from swimm3r.pipeline.renders import shown_clear
-from swimm3r.splat.projection.pinhole import pinhole
+from swimm3r.splat.projection.view_camera import view_camera
 from swimm3r.splat.rendering import (
     RenderOutput,
     SplatMap,
@@ -248,7 +248,7 @@ def wiped(
 def _render_surface(scene: SplatMap, camera: Cameras, time: float | None) -> RenderOutput:
     """`SplatMap.render` without the coefficients of the water and its own light, which take as long again."""
     settings = settings_in_scene_units(scene.settings, scene.length)
-    view = pinhole(camera).to(scene.device)
+    view = view_camera(camera).to(scene.device)
     with torch.no_grad():
         drawn = images(scene.seen_by(view), scene.field, view, settings, scene.normalized_time(time))
     rgb, clear = (image.permute(1, 2, 0).cpu() for image in (drawn.rgb, surface_color(drawn)))

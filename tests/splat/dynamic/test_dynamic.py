@@ -21,7 +21,7 @@ from swimm3r.splat import train
 from swimm3r.splat.map_file import load_map
 from swimm3r.splat.medium.field import grid_of, initial_field
 from swimm3r.splat.primitives.beta import initial_primitives, with_time
-from swimm3r.splat.projection.pinhole import pinhole
+from swimm3r.splat.projection.view_camera import view_camera
 from swimm3r.splat.settings import (
     DensifySettings,
     InitialSettings,
@@ -113,7 +113,7 @@ def test_an_interrupted_dynamic_training_ends_with_the_bits_of_one_that_was_not(
 
 
 def test_the_water_of_a_dynamic_map_begins_the_same_at_all_times_and_learns_to_change(camera):
-    view, settings = pinhole(camera()), MediumFieldSettings(hidden=16)
+    view, settings = view_camera(camera()), MediumFieldSettings(hidden=16)
     field = initial_field(None, settings, rng(), dynamic=True)
     times = torch.tensor([0.0, 0.37, 1.0])
     first = [grid_of(field, view, 8, t).values for t in times]

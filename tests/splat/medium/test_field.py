@@ -18,7 +18,7 @@ from swimm3r.splat.medium.field import (
     spherical_harmonics,
 )
 from swimm3r.splat.medium.prior import deviation, water_prior, with_binf_prior
-from swimm3r.splat.projection.pinhole import pinhole
+from swimm3r.splat.projection.view_camera import view_camera
 from swimm3r.splat.settings import MediumFieldSettings
 
 WATER = Medium(torch.tensor([0.1, 0.4, 0.5]), torch.tensor([0.4, 0.15, 0.1]), torch.tensor([0.3, 0.2, 0.25]))
@@ -44,7 +44,7 @@ def test_the_harmonics_are_orthonormal_on_the_sphere():
 
 
 def test_the_first_field_is_the_given_water_in_every_direction(camera):
-    view = pinhole(camera())
+    view = view_camera(camera())
     field = initial_field(WATER, MediumFieldSettings(), torch.Generator().manual_seed(0))
     maps = medium_at_pixels(grid_of(field, view, 8), view.height, view.width)
     for got, expected in zip(maps, (WATER.Binf, WATER.beta_D, WATER.beta_B), strict=True):
@@ -52,7 +52,7 @@ def test_the_first_field_is_the_given_water_in_every_direction(camera):
 
 
 def test_a_change_of_unit_divides_the_betas_only(camera):
-    view, field = pinhole(camera()), rough_field()
+    view, field = view_camera(camera()), rough_field()
     before = grid_of(field, view, 8).values.detach()
     field.length.fill_(4.0)
     after = grid_of(field, view, 8).values.detach()
@@ -61,7 +61,7 @@ def test_a_change_of_unit_divides_the_betas_only(camera):
 
 
 def test_interpolating_between_grid_points_changes_a_rough_field_little(camera):
-    view, field = pinhole(camera(160, 112)), rough_field()
+    view, field = view_camera(camera(160, 112)), rough_field()
     exact = medium_at_pixels(grid_of(field, view, 1), view.height, view.width)
     coarse = medium_at_pixels(grid_of(field, view, 8), view.height, view.width)
     for a, b in zip(coarse, exact, strict=True):
@@ -81,7 +81,7 @@ def test_the_field_is_interpolated_as_torch_interpolates_and_so_are_its_gradient
 
 
 def test_the_field_is_seen_at_pixel_centers_of_the_turned_camera(camera):
-    view, field = pinhole(camera()), rough_field()
+    view, field = view_camera(camera()), rough_field()
     maps = medium_at_pixels(grid_of(field, view, 1), view.height, view.width)
     ray = torch.tensor([(11.5 - view.cx) / view.fx, (7.5 - view.cy) / view.fy, 1.0])
     direction = torch.nn.functional.normalize(view.R.T @ ray, dim=-1)
@@ -91,7 +91,7 @@ def test_the_field_is_seen_at_pixel_centers_of_the_turned_camera(camera):
 
 
 def test_smoothness_on_the_grid_is_that_of_the_interpolated_pixels(camera):
-    view = pinhole(camera(129, 97))
+    view = view_camera(camera(129, 97))
     grid = grid_of(rough_field(), view, 8)
     pixels = torch.cat(medium_at_pixels(grid, view.height, view.width))
     on_pixels = pixels.diff(dim=1).abs().mean() + pixels.diff(dim=2).abs().mean()
@@ -100,11 +100,11 @@ def test_smoothness_on_the_grid_is_that_of_the_interpolated_pixels(camera):
 
 def test_uniform_water_is_perfectly_smooth(camera):
     field = initial_field(WATER, MediumFieldSettings(), torch.Generator().manual_seed(0))
-    assert smoothness(grid_of(field, pinhole(camera()), 8)) < 1e-7
+    assert smoothness(grid_of(field, view_camera(camera()), 8)) < 1e-7
 
 
 def test_betas_for_z_depth_attenuate_as_much_as_betas_along_the_ray(camera):
-    view, field = pinhole(camera()), rough_field()
+    view, field = view_camera(camera()), rough_field()
     maps = medium_at_pixels(grid_of(field, view, 4), view.height, view.width)
     scaled = per_z_depth(maps, view)
     ray = torch.tensor([(3.5 - view.cx) / view.fx, (50.5 - view.cy) / view.fy, 1.0])
@@ -114,7 +114,7 @@ def test_betas_for_z_depth_attenuate_as_much_as_betas_along_the_ray(camera):
 
 
 def test_the_pose_reaches_the_field(camera):
-    view = pinhole(camera())
+    view = view_camera(camera())
     R = view.R.clone().requires_grad_()
     value = grid_of(rough_field(), replace(view, R=R), 8).values.square().sum()
     assert torch.autograd.grad(value, R)[0].abs().max() > 1e-3
@@ -125,7 +125,7 @@ def test_the_prior_is_what_the_first_field_says_in_the_fields_own_unit(camera, t
     settings = MediumFieldSettings(hidden=16)
     water = Medium(fit.Binf, fit.beta_D * length, fit.beta_B * length)
     prior = water_prior(fit, length, settings)
-    grid = grid_of(initial_field(water, settings, torch.Generator().manual_seed(0)), pinhole(camera()), 8)
+    grid = grid_of(initial_field(water, settings, torch.Generator().manual_seed(0)), view_camera(camera()), 8)
     assert deviation(grid, prior) < 1e-8
     one_off = replace(grid, values=grid.values * torch.cat([torch.ones(8), torch.tensor([1.1])])[:, None, None])
     d = torch.tensor(1.1).log() / settings.least_std

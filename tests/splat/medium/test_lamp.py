@@ -9,7 +9,7 @@ from swimm3r.lamp import Lamp, log_light, veil_pattern
 from swimm3r.splat.map_file import load_map
 from swimm3r.splat.medium.field import MediumField, grid_of, in_unit, initial_field, medium_at_pixels
 from swimm3r.splat.medium.lamp import CameraLamp
-from swimm3r.splat.projection.pinhole import pinhole
+from swimm3r.splat.projection.view_camera import view_camera
 from swimm3r.splat.rendering import draw
 from swimm3r.splat.settings import UwbsSettings
 
@@ -36,7 +36,7 @@ def lit(scene):
 
 
 def test_light_on_the_world_is_that_of_the_camera_it_is_seen_from(camera):
-    view = pinhole(camera)
+    view = view_camera(camera)
     in_camera = torch.tensor([[0.3, 0.2, 2.0], [-0.5, 0.1, 4.0]])
     world = (in_camera - view.t) @ view.R
     found = CameraLamp(LAMP).light(world, view, BETA, torch.ones(()))
@@ -45,7 +45,7 @@ def test_light_on_the_world_is_that_of_the_camera_it_is_seen_from(camera):
 
 
 def test_light_is_the_same_in_any_unit(camera):
-    view, world = pinhole(camera), torch.tensor([[0.1, 0.2, 0.3]])
+    view, world = view_camera(camera), torch.tensor([[0.1, 0.2, 0.3]])
     stretched = replace(view, t=4 * view.t, center=4 * view.center)
     near = CameraLamp(LAMP).light(world, view, BETA, torch.ones(()))
     far = CameraLamp(LAMP).light(4 * world, stretched, BETA / 4, torch.tensor(4.0))
@@ -54,7 +54,7 @@ def test_light_is_the_same_in_any_unit(camera):
 
 def test_backscatter_stays_with_the_camera_and_has_the_lamps_pattern(camera):
     field = initial_field(None, UwbsSettings().medium, torch.Generator().manual_seed(0), lamp=LAMP)
-    view = pinhole(camera)
+    view = view_camera(camera)
     turned = replace(view, R=view.R @ torch.tensor([[0.0, -1, 0], [1, 0, 0], [0, 0, 1]]))
     here, there = (medium_at_pixels(grid_of(field, v, 1), view.height, view.width).Binf for v in (view, turned))
     torch.testing.assert_close(here, there)
@@ -72,7 +72,7 @@ def test_clear_images_are_evenly_lit(scene, lit, camera):
 
 def test_beam_and_pattern_of_the_backscatter_are_trained(lit, camera):
     field = lit.field.requires_grad_(True)
-    drawing = draw(lit.primitives, field, pinhole(camera), lit.settings)
+    drawing = draw(lit.primitives, field, view_camera(camera), lit.settings)
     drawing.images.rgb.square().sum().backward()
     assert field.lamp.beam.grad.abs().sum() > 0
     assert field.lamp.veil.grad.abs().sum() > 0

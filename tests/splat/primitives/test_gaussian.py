@@ -28,7 +28,7 @@ from swimm3r.splat.primitives.gaussian import (
 )
 from swimm3r.splat.primitives.spherical_harmonics import Y_00, spherical_harmonics
 from swimm3r.splat.projection.dispatch import project
-from swimm3r.splat.projection.pinhole import Pinhole, pinhole
+from swimm3r.splat.projection.view_camera import ViewCamera, view_camera
 
 VECTORS = np.load(Path(__file__).parents[2] / "data" / "uwbs_vectors.npz")
 
@@ -46,7 +46,7 @@ def gaussians(n: int, seed: int = 0) -> GaussianPrimitives:
     )
 
 
-def turned(view: Pinhole, world2cam: torch.Tensor) -> Pinhole:
+def turned(view: ViewCamera, world2cam: torch.Tensor) -> ViewCamera:
     R, t = world2cam[:3, :3], world2cam[:3, 3]
     return replace(view, R=R, t=t, center=-R.mT @ t)
 
@@ -93,7 +93,7 @@ def test_a_change_of_unit_changes_lengths_alone():
 
 
 def test_gradients_of_the_image_agree_with_finite_differences(camera: Callable[..., Cameras]):
-    view = pinhole(camera(32, 24), torch.float64)
+    view = view_camera(camera(32, 24), torch.float64)
     p, pose = gaussians(12), torch.cat([view.R, view.t[:, None]], -1)
     rng = torch.Generator().manual_seed(3)
     weight = torch.randn(5, 24, 32, generator=rng, dtype=torch.float64)
@@ -119,7 +119,7 @@ def test_gradients_of_the_image_agree_with_finite_differences(camera: Callable[.
 
 
 def test_a_gaussian_reaches_as_far_as_its_radius(camera: Callable[..., Cameras]):
-    view = pinhole(camera(), torch.float64)
+    view = view_camera(camera(), torch.float64)
     p = to_degree(gaussians(1), 0)._replace(
         xyz=torch.tensor([[0.1, -0.05, 3.5]], dtype=torch.float64), opacity=torch.tensor([9.0], dtype=torch.float64)
     )
@@ -253,7 +253,7 @@ def test_culled_rows_leave_and_the_others_keep_their_place():
 
 
 def test_pulls_are_counted_while_a_gaussian_is_in_the_image(camera: Callable[..., Cameras]):
-    view = pinhole(camera())
+    view = view_camera(camera())
     p = GaussianPrimitives(*(t.float() for t in to_degree(gaussians(30), 0)))
     p.xyz[10:20, 2] = -3.0
     seen = project(p, view, GaussianRenderSettings())

@@ -11,14 +11,14 @@ from swimm3r.cameras import Cameras
 from swimm3r.cameras import project as project_points
 from swimm3r.splat.primitives.beta import BetaPrimitives
 from swimm3r.splat.projection.dispatch import project
-from swimm3r.splat.projection.pinhole import BLUR, Pinhole, Projection, pinhole
 from swimm3r.splat.projection.plain import project_plainly
+from swimm3r.splat.projection.view_camera import BLUR, Projection, ViewCamera, view_camera
 from swimm3r.splat.settings import RenderSettings
 
 Make = Callable[..., BetaPrimitives]
 
 
-def leaves(p: BetaPrimitives, view: Pinhole) -> tuple[BetaPrimitives, Pinhole, list[torch.Tensor]]:
+def leaves(p: BetaPrimitives, view: ViewCamera) -> tuple[BetaPrimitives, ViewCamera, list[torch.Tensor]]:
     p = BetaPrimitives(*(t.detach().clone().requires_grad_() for t in p))
     pose = [t.detach().clone().requires_grad_() for t in (view.R, view.t, view.center)]
     return p, replace(view, R=pose[0], t=pose[1], center=pose[2]), [*p, *pose]
@@ -39,7 +39,7 @@ def test_a_center_lands_where_its_camera_sees_it(primitives: Make, camera: Calla
     p = primitives(50)
     seen = project_plainly(
         p._replace(query_mean=torch.nn.functional.normalize(p.xyz - camera().centers[0], dim=-1)),
-        pinhole(camera(), torch.float64),
+        view_camera(camera(), torch.float64),
         RenderSettings(),
     )
     pixels, z = project_points(camera(), p.xyz[None])
@@ -57,7 +57,7 @@ def test_a_primitive_is_drawn_out_to_the_ellipse_of_its_covariance(primitives: M
         lower=torch.zeros_like(p.lower),
     )
     view = replace(
-        pinhole(camera(), torch.float64),
+        view_camera(camera(), torch.float64),
         R=torch.eye(3, dtype=torch.float64), t=torch.zeros(3, dtype=torch.float64),
         center=torch.zeros(3, dtype=torch.float64), fx=80.0, fy=80.0,
     )  # fmt: skip
@@ -74,7 +74,7 @@ def test_what_is_behind_the_camera_is_not_drawn(primitives: Make, camera: Callab
     p = primitives(20)
     for form in (project, project_plainly):
         behind = BetaPrimitives(*(t.float() for t in p._replace(xyz=-p.xyz, lower=0 * p.lower)))
-        assert (form(behind, pinhole(camera()), RenderSettings()).primitives.depth == 0).all()
+        assert (form(behind, view_camera(camera()), RenderSettings()).primitives.depth == 0).all()
 
 
 @pytest.mark.parametrize("c", [3, 4])
@@ -84,7 +84,7 @@ def test_the_fast_form_agrees_with_the_plain_one(
 ):
     settings = RenderSettings(covariance=covariance)
     time = torch.tensor(0.4) if c == 4 else None
-    p, view = primitives(700, c), pinhole(camera(), torch.float64)
+    p, view = primitives(700, c), view_camera(camera(), torch.float64)
     exact_p, exact_view, exact = leaves(p, view)
     oracle = project_plainly(exact_p, exact_view, settings, None if time is None else time.double())
     fast_p, fast_view, fast = leaves(
@@ -116,7 +116,7 @@ def test_threads_change_no_bit(primitives: Make, camera: Callable[..., Cameras])
     try:
         for threads in (1, 2, 3):
             torch.set_num_threads(threads)
-            q, view, everything = leaves(p, pinhole(camera()))
+            q, view, everything = leaves(p, view_camera(camera()))
             seen = project(q, view, RenderSettings())
             results.append([*seen.primitives, *torch.autograd.grad(weighted_sum(seen), everything)])
     finally:
@@ -128,4 +128,4 @@ def test_threads_change_no_bit(primitives: Make, camera: Callable[..., Cameras])
 def test_a_distorted_camera_is_refused(camera: Callable[..., Cameras]):
     bent = replace(camera(), distortion=torch.tensor([[0.1]], dtype=torch.float64), model="SIMPLE_RADIAL")
     with pytest.raises(ValueError, match=r"camera\.pinhole\(\)"):
-        pinhole(bent)
+        view_camera(bent)

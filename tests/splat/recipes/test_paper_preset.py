@@ -10,7 +10,7 @@ from swimm3r.cameras import image_directions
 from swimm3r.cli.main import main
 from swimm3r.evaluate.images import ssim
 from swimm3r.pipeline.presets import MAST3R_PRESETS, PRESETS
-from swimm3r.splat.projection.pinhole import pinhole
+from swimm3r.splat.projection.view_camera import view_camera
 from swimm3r.splat.recipes import uwbs
 from swimm3r.splat.rendering import draw
 from swimm3r.splat.settings import SplatSettings, UwbsSettings, WaterSplattingSettings, with_recipe
@@ -51,7 +51,7 @@ def test_the_objective_is_the_literal_sum_of_eq_18(tiny_dive):
     field = varied_field(tiny_dive, MAP)
     scene = TrainingScene(tiny_dive.rec, 1.0, 1.0, TrainingViews(tiny_dive.rec, tiny_dive.frames, MAP, 1.0))
     prior = uwbs.known_water(scene, MAP)
-    drawing = draw(p, field, pinhole(view.camera), MAP)
+    drawing = draw(p, field, view_camera(view.camera), MAP)
     loss = uwbs.objective(p, drawing, view, MAP, prior, True)
 
     I, rendered = view.rgb.double(), drawing.images.rgb.double()

@@ -8,7 +8,7 @@ import torch
 from swimm3r.splat.medium.field import grid_of, initial_field
 from swimm3r.splat.optimizer import Moments
 from swimm3r.splat.primitives.gaussian import GaussianPrimitives
-from swimm3r.splat.projection.pinhole import pinhole
+from swimm3r.splat.projection.view_camera import view_camera
 from swimm3r.splat.recipes.watersplatting import WaterSplatting, relative_photometric
 from swimm3r.splat.rendering import draw
 from swimm3r.splat.settings import UwbsSettings, WaterSplattingSettings, watersplatting, with_recipe
@@ -33,7 +33,7 @@ def test_the_image_is_the_one_that_its_kernel_adds_up(tiny_dive):
     """The published sums, pair by pair in depth order: with z_{i-1}, and the medium behind the last."""
     start = recipe(tiny_dive)
     state, view = start.start(), view_of(tiny_dive)
-    sight = pinhole(view.camera)
+    sight = view_camera(view.camera)
     drawing = draw(state.primitives, state.field, sight, SETTINGS)
     p, maps = drawing.projection.primitives, drawing.maps
     y, x = 20, 31
@@ -62,7 +62,7 @@ def test_the_image_is_the_one_that_its_kernel_adds_up(tiny_dive):
 def test_its_network_has_one_hidden_layer_of_sigmoids_and_no_biases(tiny_dive):
     field = initial_field(None, SETTINGS.medium, torch.Generator().manual_seed(0))
     assert [tuple(w.shape[:2]) for w in field.parameters()] == [(128, 16), (9, 128)]
-    values = grid_of(field, pinhole(view_of(tiny_dive).camera), 8).values
+    values = grid_of(field, view_camera(view_of(tiny_dive).camera), 8).values
     assert (values > 0).all()
     assert (values[:3] < 1).all()
 

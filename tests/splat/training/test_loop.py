@@ -12,7 +12,7 @@ from swimm3r.errors import UsageError
 from swimm3r.evaluate.images import psnr
 from swimm3r.splat import train
 from swimm3r.splat.map_file import load_map
-from swimm3r.splat.projection.pinhole import pinhole
+from swimm3r.splat.projection.view_camera import view_camera
 from swimm3r.splat.recipes import uwbs
 from swimm3r.splat.rendering import SplatMap, draw
 from swimm3r.splat.settings import (
@@ -140,7 +140,7 @@ def test_the_objective_is_the_papers_sum_with_the_papers_weights(tiny_dive):
     p = tiny_dive.truth.primitives
     p = p._replace(xyz=p.xyz + 0.05, scale=p.scale.clone())
     p.scale[0] = 3.0  # larger than 100 px of a 1280 px wide image
-    drawing = draw(p, tiny_dive.truth.field, pinhole(view.camera), paper)
+    drawing = draw(p, tiny_dive.truth.field, view_camera(view.camera), paper)
     found = uwbs.objective(p, drawing, view, paper, None, regularized=True)
     n = {name: float(torch.as_tensor(value).detach()) for name, value in found.numbers.items()}
     expected = 0.8 * n["l1"] + 0.2 * (1 - n["ssim"]) + 0.01 * n["opacity"] + 0.01 * n["scale"]

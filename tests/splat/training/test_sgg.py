@@ -12,8 +12,8 @@ from swimm3r.raster import MediumMaps, Primitives2D, SggBuffers, rasterize
 from swimm3r.splat.medium.field import initial_field
 from swimm3r.splat.primitives.beta import BetaPrimitives
 from swimm3r.splat.projection.dispatch import center_gradients, project
-from swimm3r.splat.projection.pinhole import pinhole
 from swimm3r.splat.projection.plain import project_plainly
+from swimm3r.splat.projection.view_camera import view_camera
 from swimm3r.splat.recipes import uwbs
 from swimm3r.splat.rendering import draw
 from swimm3r.splat.settings import InitialSettings, RenderSettings, SggSettings, UwbsSettings
@@ -67,16 +67,16 @@ def test_the_multiplier_is_bounded_and_protects_depth_that_is_right():
 @pytest.mark.parametrize("time", [None, torch.tensor(0.4)], ids=["static", "dynamic"])
 def test_center_gradients_are_the_projections_own(time, primitives: Make, camera: Callable[..., Cameras]):
     """Fast against autograd of the plain form, several at once; both against the whole adjoint."""
-    p, view = primitives(500, 3 if time is None else 4), pinhole(camera(), torch.float64)
+    p, view = primitives(500, 3 if time is None else 4), view_camera(camera(), torch.float64)
     rng = torch.Generator().manual_seed(1)
     pulls = torch.randn(500, 2, 3, generator=rng, dtype=torch.float64)
     expected = center_gradients(p, view, RenderSettings(), pulls, time)
     single = BetaPrimitives(*(t.float() for t in p))
-    found = center_gradients(single, pinhole(camera()), RenderSettings(), pulls.float(), time)
+    found = center_gradients(single, view_camera(camera()), RenderSettings(), pulls.float(), time)
     tame = (p.xyz @ view.R.mT + view.t)[:, 2] > 0.5
     torch.testing.assert_close(found[tame], expected[tame].float(), rtol=1e-3, atol=1e-3)
     xyz = single.xyz.clone().requires_grad_()
-    seen_from = pinhole(camera())
+    seen_from = view_camera(camera())
     seen = project(single._replace(xyz=xyz), seen_from, RenderSettings(), time).primitives
     (whole,) = torch.autograd.grad((seen.mean2d, seen.depth), xyz, (pulls[:, 0, :2].float(), pulls[:, 0, 2].float()))
     torch.testing.assert_close(found[:, 0], whole, rtol=1e-4, atol=1e-4)
@@ -98,7 +98,7 @@ def scene(dive):
 
 def differentiated(dive, settings: UwbsSettings):
     p, view = scene(dive)
-    seen_from = pinhole(view.camera)
+    seen_from = view_camera(view.camera)
     drawing = draw(p, dive.truth.field, seen_from, settings, sgg=True)
     loss = uwbs.objective(p, drawing, view, settings, None, True)
     result = gradients.differentiate(loss.total, loss.depth, [*p], p, drawing, seen_from, settings)
@@ -107,7 +107,7 @@ def differentiated(dive, settings: UwbsSettings):
 
 def test_geometry_and_medium_add_up_to_the_exact_gradient_and_all_but_the_centers_keep_it(tiny_dive):
     result, drawing, p, view = differentiated(tiny_dive, UwbsSettings())
-    plain = draw(p, tiny_dive.truth.field, pinhole(view.camera), UwbsSettings())
+    plain = draw(p, tiny_dive.truth.field, view_camera(view.camera), UwbsSettings())
     loss = uwbs.objective(p, plain, view, UwbsSettings(), None, True)
     exact = torch.autograd.grad(loss.total, [*p, plain.projection.primitives.mean2d], materialize_grads=True)
     for name, a, b in zip(p._fields, result.gradients, exact, strict=False):
@@ -123,7 +123,7 @@ def test_no_water_no_cancellation_no_change(tiny_dive):
         last: Any = clear.network[-1]
         last.bias.copy_(torch.tensor([-30.0] * 9))  # black, and neither attenuating nor scattering
     p, view = scene(tiny_dive)
-    seen_from = pinhole(view.camera)
+    seen_from = view_camera(view.camera)
     drawing = draw(p, clear, seen_from, UwbsSettings(), sgg=True)
     loss = uwbs.objective(p, drawing, view, UwbsSettings(), None, True)
     result = gradients.differentiate(loss.total, loss.depth, [*p], p, drawing, seen_from, UwbsSettings())
@@ -153,7 +153,7 @@ def test_the_step_of_the_centers_is_that_of_the_float64_oracle(tiny_dive, sgg: S
 def oracle(drawing, p: BetaPrimitives, view: TrainingView, settings: UwbsSettings) -> dict[str, torch.Tensor]:
     """Corrections and multipliers of the plain form: black water shows the geometry's branch by itself."""
     exact = BetaPrimitives(*(t.detach().double().requires_grad_() for t in p))
-    seen_from = pinhole(view.camera, torch.float64)
+    seen_from = view_camera(view.camera, torch.float64)
     seen = project_plainly(exact, seen_from, settings.render).primitives
     maps = MediumMaps(*(t.detach().double() for t in drawing.maps))
     images = [t.detach().requires_grad_() for t in drawing.images]

@@ -15,7 +15,7 @@ from swimm3r.splat.densify.rows import Round
 from swimm3r.splat.optimizer import Moments
 from swimm3r.splat.primitives.beta import select
 from swimm3r.splat.primitives.gaussian import GaussianPrimitives, shape_factor
-from swimm3r.splat.projection.pinhole import Pinhole, Projection
+from swimm3r.splat.projection.view_camera import Projection, ViewCamera
 
 _SHRINK = math.log(1.6)
 
@@ -26,7 +26,7 @@ def nothing_seen(n: int, device: torch.device = CPU) -> dict[str, Tensor]:
 
 
 def remembered(
-    memory: dict[str, Tensor], gradient: Float[Tensor, "n 2"], projection: Projection, view: Pinhole
+    memory: dict[str, Tensor], gradient: Float[Tensor, "n 2"], projection: Projection, view: ViewCamera
 ) -> dict[str, Tensor]:
     """The memory after one more step, whose centers' gradient (per pixel) and projection are given."""
     size = torch.tensor([view.width, view.height]).to(gradient)

@@ -17,7 +17,7 @@ from torch.nn.functional import avg_pool2d, grid_sample, interpolate
 from swimm3r.cameras import Cameras, pixel_grid, project, resized, unproject
 from swimm3r.splat.medium.field import MediumField
 from swimm3r.splat.primitives.beta import BetaPrimitives
-from swimm3r.splat.projection.pinhole import pinhole
+from swimm3r.splat.projection.view_camera import view_camera
 from swimm3r.splat.rendering import draw, expected_z_depth
 from swimm3r.splat.settings import UwbsSettings
 from swimm3r.splat.views import TrainingView, TrainingViews
@@ -63,7 +63,7 @@ def motion_view(p: BetaPrimitives, field: MediumField, view: TrainingView, setti
     width, height = max(8, round(scale * view.camera.width)), max(8, round(scale * view.camera.height))
     camera = resized(view.camera, width, height)
     with torch.no_grad():
-        images = draw(p, field, pinhole(camera), settings, view.time).images
+        images = draw(p, field, view_camera(camera), settings, view.time).images
     target = interpolate(view.rgb[None], (height, width), mode="area")[0]
     seen = interpolate(view.seen[None, None].float(), (height, width), mode="area")[0, 0] > 0.999
     off = _blurred(torch.where(seen, images.rgb - target, 0.0)).abs().mean(0)

@@ -26,7 +26,7 @@ from swimm3r.raster import MediumMaps
 from swimm3r.splat.medium.lamp import CameraLamp
 from swimm3r.splat.primitives.beta import inverse_softplus
 from swimm3r.splat.primitives.spherical_harmonics import HARMONICS, spherical_harmonics
-from swimm3r.splat.projection.pinhole import Pinhole
+from swimm3r.splat.projection.view_camera import ViewCamera
 from swimm3r.splat.shared_settings import MediumFieldSettings
 
 
@@ -129,7 +129,7 @@ def in_unit(field: MediumField, length: float) -> MediumField:
     return field
 
 
-def grid_of(field: MediumField, view: Pinhole, stride: int, time: Float[Tensor, ""] | None = None) -> FieldGrid:
+def grid_of(field: MediumField, view: ViewCamera, stride: int, time: Float[Tensor, ""] | None = None) -> FieldGrid:
     """The field on about every stride-th pixel of a view, at a time in 0..1; the pose may carry a gradient."""
     rows, columns = (max(2, math.ceil((size - 1) / stride) + 1) for size in (view.height, view.width))
     y = torch.linspace(0.5, view.height - 0.5, rows, device=view.R.device)
@@ -161,13 +161,13 @@ def _hats(few: int, many: int, like: Tensor) -> Float[Tensor, "many few"]:
     return (1 - (at[:, None] - torch.arange(few, device=like.device)).abs()).clamp(min=0).to(like)
 
 
-def ray_lengths(view: Pinhole) -> Float[Tensor, "h w"]:
+def ray_lengths(view: ViewCamera) -> Float[Tensor, "h w"]:
     """Lengths of the pixels' rays at z = 1."""
     x, y = (torch.arange(size, device=view.R.device) + 0.5 for size in (view.width, view.height))
     return torch.linalg.vector_norm(view.rays(x, y), dim=-1)
 
 
-def per_z_depth(maps: MediumMaps, view: Pinhole) -> MediumMaps:
+def per_z_depth(maps: MediumMaps, view: ViewCamera) -> MediumMaps:
     """Betas for a rasterizer that blends z depth: times the length of the pixel's ray at z = 1, which is exact."""
     length = ray_lengths(view).to(maps.Binf)
     return MediumMaps(maps.Binf, maps.beta_D * length, maps.beta_B * length)

@@ -10,7 +10,7 @@ from jaxtyping import Float
 from torch import Tensor, nn
 
 from swimm3r.lamp import TERMS, Lamp, lamp_distance, log_light
-from swimm3r.splat.projection.pinhole import Pinhole
+from swimm3r.splat.projection.view_camera import ViewCamera
 
 NO_LIGHT = Lamp(torch.zeros(3), 1.0, 0.0, 1.0, torch.zeros(TERMS), torch.zeros(TERMS))
 """A lamp whose values are read from a file."""
@@ -38,7 +38,7 @@ class CameraLamp(nn.Module):
         return Lamp(self.position, *numbers, self.beam, self.veil)
 
     def light(
-        self, xyz: Float[Tensor, "n 3"], view: Pinhole, beta_D: Float[Tensor, "3"], length: Tensor
+        self, xyz: Float[Tensor, "n 3"], view: ViewCamera, beta_D: Float[Tensor, "3"], length: Tensor
     ) -> Float[Tensor, "n 3"]:
         """Light on points of the world in scene units, `length` of which are a working unit; beta_D per scene unit."""
         points = (xyz @ view.R.mT + view.t) / length

@@ -38,7 +38,7 @@ from swimm3r.splat.projection.cpu_matrices import (
     product_bt,
     zero,
 )
-from swimm3r.splat.projection.pinhole import BLUR
+from swimm3r.splat.projection.view_camera import BLUR
 
 LEAST_SPREAD = np.float32(0.01)
 PX2 = np.float32(BLUR)

@@ -52,7 +52,7 @@ from swimm3r.splat.projection.cpu_plane import (  # fmt: skip
     store_gradients,
     store_on_plane,
 )
-from swimm3r.splat.projection.pinhole import Pinhole, Projection, ray_limits
+from swimm3r.splat.projection.view_camera import Projection, ViewCamera, ray_limits
 from swimm3r.splat.settings import RenderSettings
 
 # enters the kernels' signatures, so that Numba's cache notices when what is inlined into them changes
@@ -117,7 +117,9 @@ class _Project(torch.autograd.Function):
     """Saves its inputs only; the block is computed again on the way back, which costs less than its memory."""
 
     @staticmethod
-    def forward(ctx: Any, view: Pinhole, settings: RenderSettings, time: float, *tensors: Tensor) -> tuple[Tensor, ...]:
+    def forward(
+        ctx: Any, view: ViewCamera, settings: RenderSettings, time: float, *tensors: Tensor
+    ) -> tuple[Tensor, ...]:
         stored = Stored(*(tensor.detach().contiguous() for tensor in tensors[:-3]))
         camera = _camera(view, settings)
         n = len(stored.xyz)
@@ -143,7 +145,7 @@ class _Project(torch.autograd.Function):
         return None, None, None, *results, pose[:9].reshape(3, 3), pose[9:12], pose[12:]
 
 
-def _camera(view: Pinhole, settings: RenderSettings) -> np.ndarray:
+def _camera(view: ViewCamera, settings: RenderSettings) -> np.ndarray:
     """The camera as the kernels read it."""
     pose = np.concatenate([t.detach().numpy().ravel() for t in (view.R, view.t, view.center)])
     rest = (view.fx, view.fy, view.cx, view.cy, *ray_limits(view), settings.near, settings.covariance == "upper")
@@ -180,7 +182,7 @@ def _arrays(tensors: Arrays) -> Arrays:
 
 
 def project(
-    p: BetaPrimitives, view: Pinhole, settings: RenderSettings, time: Float[Tensor, ""] | None = None
+    p: BetaPrimitives, view: ViewCamera, settings: RenderSettings, time: Float[Tensor, ""] | None = None
 ) -> Projection:
     """`dispatch.project` for float32 on the CPU; no gradient reaches `time`."""
     moment = 0.0 if time is None else float(time)
@@ -193,7 +195,7 @@ def project(
 
 def center_gradients(
     p: BetaPrimitives,
-    view: Pinhole,
+    view: ViewCamera,
     settings: RenderSettings,
     on_plane: Float[Tensor, "n k 3"],
     time: Float[Tensor, ""] | None = None,

@@ -9,14 +9,14 @@ from swimm3r.splat.primitives.beta import BetaPrimitives
 from swimm3r.splat.primitives.gaussian import GaussianPrimitives
 from swimm3r.splat.primitives.kinds import Primitives
 from swimm3r.splat.projection import cpu_project
-from swimm3r.splat.projection.pinhole import Pinhole, Projection
 from swimm3r.splat.projection.plain import project_gaussians, project_plainly
+from swimm3r.splat.projection.view_camera import Projection, ViewCamera
 from swimm3r.splat.settings import RenderSettings
 
 
 def project(
     p: Primitives,
-    view: Pinhole,
+    view: ViewCamera,
     settings: RenderSettings | GaussianRenderSettings,
     time: Float[Tensor, ""] | None = None,
 ) -> Projection:
@@ -31,7 +31,7 @@ def project(
 
 def center_gradients(
     p: BetaPrimitives,
-    view: Pinhole,
+    view: ViewCamera,
     settings: RenderSettings,
     on_plane: Float[Tensor, "n k 3"],
     time: Float[Tensor, ""] | None = None,
@@ -50,6 +50,6 @@ def center_gradients(
     return torch.stack(parts, 1)
 
 
-def _has_fast_form(p: BetaPrimitives, view: Pinhole, settings: RenderSettings) -> bool:
+def _has_fast_form(p: BetaPrimitives, view: ViewCamera, settings: RenderSettings) -> bool:
     on_cpu = p.xyz.device.type == "cpu" and p.xyz.dtype == torch.float32
     return on_cpu and settings.rotation == "first_order" and view.fisheye is None

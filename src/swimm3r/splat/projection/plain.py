@@ -22,14 +22,14 @@ from swimm3r.raster import Primitives2D
 from swimm3r.splat.primitives.beta import BetaPrimitives
 from swimm3r.splat.primitives.gaussian import GaussianPrimitives, covariance, seen_color
 from swimm3r.splat.projection.conditioning import Conditioned, conditioned_in_view
-from swimm3r.splat.projection.pinhole import BLUR, Pinhole, Projection, ray_limits
+from swimm3r.splat.projection.view_camera import BLUR, Projection, ViewCamera, ray_limits
 from swimm3r.splat.settings import RenderSettings
 
 _GAUSSIAN_REACH = math.sqrt(2 * math.log(255))
 
 
 def project_conditioned(
-    seen: Conditioned, exponent: Float[Tensor, " n"], rgb: Float[Tensor, "n 3"], view: Pinhole, near: float
+    seen: Conditioned, exponent: Float[Tensor, " n"], rgb: Float[Tensor, "n 3"], view: ViewCamera, near: float
 ) -> Projection:
     """Symmetric conditioned primitives in one camera, plain form; depth 0 where one cannot be drawn."""
     p = seen.mean @ view.R.mT + view.t
@@ -57,7 +57,7 @@ def project_conditioned(
     )
 
 
-def _through_pinhole(p: Float[Tensor, "n 3"], view: Pinhole) -> tuple[Float[Tensor, "n 2"], Float[Tensor, "n 2 3"]]:
+def _through_pinhole(p: Float[Tensor, "n 3"], view: ViewCamera) -> tuple[Float[Tensor, "n 2"], Float[Tensor, "n 2 3"]]:
     """Pixels of points in camera axes, and the Jacobian."""
     x, y, z = p.unbind(-1)
     x_low, x_high, y_low, y_high = ray_limits(view)
@@ -68,7 +68,7 @@ def _through_pinhole(p: Float[Tensor, "n 3"], view: Pinhole) -> tuple[Float[Tens
 
 
 def _through_fisheye(
-    p: Float[Tensor, "n 3"], view: Pinhole, k: tuple[float, float, float, float]
+    p: Float[Tensor, "n 3"], view: ViewCamera, k: tuple[float, float, float, float]
 ) -> tuple[Float[Tensor, "n 2"], Float[Tensor, "n 2 3"], Bool[Tensor, " n"]]:
     """Pixels of points in camera axes, the Jacobian, and where the image grows with the angle, as a lens's does."""
     x, y, z = p.unbind(-1)
@@ -89,14 +89,14 @@ def _through_fisheye(
 
 
 def project_plainly(
-    p: BetaPrimitives, view: Pinhole, settings: RenderSettings, time: Float[Tensor, ""] | None = None
+    p: BetaPrimitives, view: ViewCamera, settings: RenderSettings, time: Float[Tensor, ""] | None = None
 ) -> Projection:
     """`project` in torch operations: any D, any dtype, every setting; the oracle of the fast form."""
     seen = conditioned_in_view(p, view.center, settings, time)
     return project_conditioned(seen, 4 * torch.exp(p.beta[:, 0]), p.rgb, view, settings.near)
 
 
-def project_gaussians(p: GaussianPrimitives, view: Pinhole, near: float) -> Projection:
+def project_gaussians(p: GaussianPrimitives, view: ViewCamera, near: float) -> Projection:
     """Gaussians in one camera."""
     seen = Conditioned(p.xyz, covariance(p), torch.sigmoid(p.opacity))
     half = torch.full_like(seen.opacity, 0.5)

@@ -12,7 +12,7 @@ from swimm3r.splat.medium.field import NO_WATER, MediumField
 from swimm3r.splat.optimizer import log_linear
 from swimm3r.splat.pose_mlp import pose_rate
 from swimm3r.splat.primitives.gaussian import GaussianPrimitives, initial_gaussians, rescaled, to_degree
-from swimm3r.splat.projection.pinhole import Pinhole
+from swimm3r.splat.projection.view_camera import ViewCamera
 from swimm3r.splat.rendering import Drawing, draw
 from swimm3r.splat.training import loop
 from swimm3r.splat.training.scene import TrainingScene
@@ -32,7 +32,7 @@ class TrainingRender:
 
     p: GaussianPrimitives  # leaves
     drawing: Drawing
-    pinhole_view: Pinhole
+    pinhole_view: ViewCamera
     parameters: dict[str, Tensor]  # the leaves by name, water and poses too
 
     def gradients(self, loss: Float[Tensor, ""]) -> dict[str, Tensor]:

@@ -12,7 +12,7 @@ from swimm3r.scene.reconstruction import Reconstruction
 from swimm3r.splat.medium.field import MediumField
 from swimm3r.splat.pose_mlp import PoseMlp
 from swimm3r.splat.primitives.beta import BetaPrimitives
-from swimm3r.splat.projection.pinhole import Pinhole, pinhole
+from swimm3r.splat.projection.view_camera import ViewCamera, view_camera
 from swimm3r.splat.shared_settings import TrainingPoseSettings
 from swimm3r.splat.training_poses import TrainingPoses
 from swimm3r.splat.views import TrainingView, TrainingViews
@@ -58,9 +58,9 @@ class TrainingScene:
         place = torch.tensor([self.poses.names.index(view.name)])
         return replace(view.camera, cam2world=self.poses.moved(codes, place))
 
-    def pinhole_view(self, view: TrainingView, codes: PoseMlp | None) -> Pinhole:
+    def pinhole_view(self, view: TrainingView, codes: PoseMlp | None) -> ViewCamera:
         """That camera for drawing."""
-        return pinhole(self.camera(view, codes)).to(self.device)
+        return view_camera(self.camera(view, codes)).to(self.device)
 
     def epipolar_error(
         self, codes: PoseMlp | None, settings: TrainingPoseSettings, share: float, rng: torch.Generator

@@ -20,7 +20,7 @@ from torch import Tensor
 from swimm3r.raster import SggBuffers, rasterize
 from swimm3r.splat.primitives.beta import BetaPrimitives
 from swimm3r.splat.projection.dispatch import center_gradients
-from swimm3r.splat.projection.pinhole import Pinhole
+from swimm3r.splat.projection.view_camera import ViewCamera
 from swimm3r.splat.rendering import Drawing
 from swimm3r.splat.settings import UwbsSettings
 
@@ -85,7 +85,7 @@ def differentiate(
     leaves: list[Tensor],
     p: BetaPrimitives,
     drawing: Drawing,
-    view: Pinhole,
+    view: ViewCamera,
     settings: UwbsSettings,
 ) -> Differentiated:
     """Gradients of `total` in the leaves, and Alg. 1's for the centers of `p`, which was drawn with SggBuffers.

@@ -15,7 +15,7 @@ _MARGIN = 0.3  # field tangents beyond the image at which J is held
 
 
 @dataclass(frozen=True)
-class Pinhole:
+class ViewCamera:
     """One camera, world to camera; its pose may carry a gradient."""
 
     R: Float[Tensor, "3 3"]
@@ -37,11 +37,11 @@ class Pinhole:
             plane = torch.nan_to_num(plane, nan=0.0)  # no ray of the lens: such a pixel is masked
         return torch.cat([plane, torch.ones_like(plane[..., :1])], -1)
 
-    def to(self, device: torch.device) -> "Pinhole":
+    def to(self, device: torch.device) -> "ViewCamera":
         """The same camera for primitives on a device."""
         return replace(self, R=self.R.to(device), t=self.t.to(device), center=self.center.to(device))
 
-    def widened(self, share: float) -> "Pinhole":
+    def widened(self, share: float) -> "ViewCamera":
         """The same camera with this share of the image more on every side."""
         right, down = round(share * self.width), round(share * self.height)
         width, height = self.width + 2 * right, self.height + 2 * down
@@ -57,7 +57,7 @@ class Projection:
     kernel: Kernel = "beta"
 
 
-def pinhole(camera: Cameras, dtype: torch.dtype = torch.float32) -> Pinhole:
+def view_camera(camera: Cameras, dtype: torch.dtype = torch.float32) -> ViewCamera:
     """The one camera of a `Cameras`. Raises ValueError for several, or for one with distortion that is no fisheye."""
     if len(camera) != 1:
         raise ValueError(f"a map is rendered for one camera at a time, got {len(camera)}")
@@ -72,7 +72,7 @@ def pinhole(camera: Cameras, dtype: torch.dtype = torch.float32) -> Pinhole:
     R = camera.cam2world[0, :3, :3].mT
     center = camera.cam2world[0, :3, 3]
     K = camera.K[0].tolist()
-    return Pinhole(
+    return ViewCamera(
         R.to(dtype),
         -(R @ center).to(dtype),
         center.to(dtype),
@@ -86,7 +86,7 @@ def pinhole(camera: Cameras, dtype: torch.dtype = torch.float32) -> Pinhole:
     )
 
 
-def ray_limits(view: Pinhole) -> tuple[float, float, float, float]:
+def ray_limits(view: ViewCamera) -> tuple[float, float, float, float]:
     """Lowest and highest x / z, then y / z, at which J is taken."""
     x, y = _MARGIN * 0.5 * view.width / view.fx, _MARGIN * 0.5 * view.height / view.fy
     return (
