@@ -127,5 +127,5 @@ def test_threads_change_no_bit(primitives: Make, camera: Callable[..., Cameras])
 
 def test_a_distorted_camera_is_refused(camera: Callable[..., Cameras]):
     bent = replace(camera(), distortion=torch.tensor([[0.1]], dtype=torch.float64), model="SIMPLE_RADIAL")
-    with pytest.raises(ValueError, match=r"camera\.pinhole\(\)"):
+    with pytest.raises(ValueError, match=r"camera\.drawn\(\)"):
         view_camera(bent)
