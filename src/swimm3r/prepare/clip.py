@@ -105,9 +105,12 @@ def prepare_clip(source: Path, draft: Path, settings: FrameSettings, progress: P
     chosen = SelectedImages(kept, True, warnings, mask_folders, originals, recorded=video.recorded, development=told)
     if cameras and kept:
         lens = write_lens(draft, cameras, kept[0].size, settings)
-        chosen = replace(chosen, rig=rig_of(cameras, settings), calibration=lens)
-    if not isinstance(video, BagClip) or cameras:
-        return chosen
+        return replace(chosen, rig=rig_of(cameras, settings), calibration=lens)
+    return _of_bag(chosen, video, draft, settings) if isinstance(video, BagClip) else chosen
+
+
+def _of_bag(chosen: SelectedImages, video: BagClip, draft: Path, settings: FrameSettings) -> SelectedImages:
+    """The images with the clock of their headers, and the lens that the bag states."""
     lens = draft / LENS if video.lens is not None and settings.camera_info else None
     if lens is not None and video.lens is not None:
         write_text(lens, video.lens)
