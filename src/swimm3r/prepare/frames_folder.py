@@ -8,7 +8,7 @@ second 0, lens, development of raw or log images, and warnings of them all.
 import logging
 import os
 import shutil
-from collections.abc import Iterator
+from collections.abc import Container, Iterator
 from contextlib import contextmanager, suppress
 from dataclasses import dataclass, replace
 from datetime import datetime
@@ -28,7 +28,7 @@ from swimm3r.io.files.damage import guard, remake
 from swimm3r.io.files.json_file import read_json
 from swimm3r.io.files.safe_names import check_name, check_names, shown_name
 from swimm3r.io.video import Video
-from swimm3r.prepare.candidates import SelectedImages, small_gray, target_size
+from swimm3r.prepare.candidates import SelectedImages, SourceImage, small_gray, target_size
 from swimm3r.prepare.clip import prepare_clip
 from swimm3r.prepare.image_folder import images_of, only_video, prepare_stills
 from swimm3r.prepare.keyframes import SIDE as MOTION_SIDE
@@ -199,15 +199,7 @@ def _write_frames(dive: SelectedImages, draft: Path, source: Path, settings: Fra
     warnings = list(dive.warnings)
     size = target_size(dive.images[0].size, settings.long_side) if dive.images else (0, 0)
     masks = prepare_masks(dive, draft, size, settings, warnings)
-    kept = [image for image in dive.images if image.name not in masks.covered]
-    if masks.covered:
-        if not kept:
-            raise InputError(
-                f"the masks leave nothing: every one of {len(masks.covered)} frames is wholly masked out",
-                cause="the masks are the wrong way round; here 0 means leave out, anything else means use",
-                hint="invert the masks, or run without them",
-            )
-        warnings.append(f"{len(masks.covered)} frames were left out because their masks cover them wholly.")
+    kept = _unmasked(dive, masks.covered, warnings)
     if len(kept) < LEAST:
         raise InputError(
             f"{source} gives {len(kept)} usable frame{'s' * (len(kept) != 1)}, and at least {LEAST} are needed",
@@ -220,17 +212,7 @@ def _write_frames(dive: SelectedImages, draft: Path, source: Path, settings: Fra
             "The frames are gray: their three channels are equal. The water's coefficients are those of one channel, "
             "and removing the water restores contrast, not color."
         )
-
-    starts = first_of_instants([image.instant for image in kept])
-
-    @lru_cache(maxsize=_HELD)
-    def gray_of(i: int) -> UInt8[np.ndarray, "h w"]:
-        return small_gray(images.read_rgb(draft / kept[starts[i]].name), MOTION_SIDE)
-
-    sharpness = [kept[start].sharpness for start in starts]
-    of_instant = split_frames(gray_of, sharpness, settings, progress, ordered=dive.ordered)
-    counts = np.diff([*starts, len(kept)])
-    parts: list[Part] = [part for part, count in zip(of_instant, counts, strict=True) for _ in range(count)]
+    parts = _parts(kept, draft, settings, progress, ordered=dive.ordered)
     listed = tuple(
         Frame(
             name=image.name,
@@ -260,6 +242,37 @@ def _write_frames(dive: SelectedImages, draft: Path, source: Path, settings: Fra
         development=dive.development,
     )
     write_index(draft, frames, str(source.resolve()))
+
+
+def _unmasked(dive: SelectedImages, covered: Container[str], warnings: list[str]) -> list[SourceImage]:
+    """The images that are not masked out wholly. Raises InputError where all are."""
+    kept = [image for image in dive.images if image.name not in covered]
+    if dive.images and not kept:
+        raise InputError(
+            f"the masks leave nothing: every one of {len(dive.images)} frames is wholly masked out",
+            cause="the masks are the wrong way round; here 0 means leave out, anything else means use",
+            hint="invert the masks, or run without them",
+        )
+    if len(kept) < len(dive.images):
+        left_out = len(dive.images) - len(kept)
+        warnings.append(f"{left_out} frames were left out because their masks cover them wholly.")
+    return kept
+
+
+def _parts(
+    kept: list[SourceImage], draft: Path, settings: FrameSettings, progress: Progress, *, ordered: bool
+) -> list[Part]:
+    """The part of each image; those of one instant of a rig are of one part."""
+    starts = first_of_instants([image.instant for image in kept])
+
+    @lru_cache(maxsize=_HELD)
+    def gray_of(i: int) -> UInt8[np.ndarray, "h w"]:
+        return small_gray(images.read_rgb(draft / kept[starts[i]].name), MOTION_SIDE)
+
+    sharpness = [kept[start].sharpness for start in starts]
+    of_instant = split_frames(gray_of, sharpness, settings, progress, ordered=ordered)
+    counts = np.diff([*starts, len(kept)])
+    return [part for part, count in zip(of_instant, counts, strict=True) for _ in range(count)]
 
 
 def _inside(folder: Path, name: str) -> Path:

@@ -46,10 +46,20 @@ Result = TypeVar("Result")
 
 @dataclass(frozen=True)
 class _Still:
-    source: Path
+    """An image to be prepared."""
+
+    taken: Taken
     original: Path  # relative name
     name: str  # of the prepared image
     linked: bool  # the original serves as it is
+
+
+@dataclass(frozen=True)
+class _Seen:
+    """An image that shows something."""
+
+    sharpness: float
+    gray: bool
 
 
 @dataclass(frozen=True)
@@ -71,61 +81,80 @@ def prepare_stills(
     if cameras:
         folder = replace(folder, paths=[p for p in folder.paths if p.relative_to(folder.root).parts[0] in cameras])
     development = development_of(settings, folder.paths)
-    root, originals = folder.root, [path.relative_to(folder.root) for path in folder.paths]
-    headers: dict[Path, ImageHeader] = {}
-    refused: dict[Path, InputError] = {}
-    for path in folder.paths:
-        try:
-            headers[path] = header_of(path, development)
-        except InputError as error:
-            refused[path] = error
+    headers, refused = _headers(folder.paths, development)
+    choice = _choose(folder, headers, cameras, settings)
+    work = _named(choice.taken, folder.root, settings.long_side, headers)
+    most = max((headers[still.taken.path].decoding_bytes for still in work), default=0)
+    prepare = partial(_prepare_still, draft=draft, long_side=settings.long_side, development=development)
+    results = list(zip(work, _in_threads(prepare, work, most, progress), strict=True))
+    refused |= {still.taken.path: result for still, result in results if isinstance(result, InputError)}
+    images = [
+        _source_image(still, headers[still.taken.path].size, result)
+        for still, result in results
+        if isinstance(result, _Seen)
+    ]
+    blank = sum(result is None for _, result in results)
+    return SelectedImages(
+        images,
+        choice.ordered,
+        [*choice.warnings, *_left_out(refused, folder), *([blank_warning(blank, "images")] if blank else [])],
+        _mask_folders(source, folder.root, settings),
+        originals=[path.relative_to(folder.root) for path in folder.paths],
+        files=frozenset(folder.root.resolve() / path.relative_to(folder.root) for path in folder.paths),
+        recorded=choice.recorded,
+        calibration=write_lens(draft, cameras, images[0].size, settings) if cameras and images else None,
+        rig=rig_of(cameras, settings) if cameras else None,
+        development=str(development) if development.changes or development.balance is not None else None,
+    )
+
+
+@dataclass(frozen=True)
+class _Choice:
+    """The images of a folder that are used."""
+
+    taken: list[Taken]
+    ordered: bool  # neighbors were taken in turn
+    recorded: str | None  # date of the earliest image that has one, ISO 8601
+    warnings: list[str]
+
+
+def _choose(
+    folder: ImageFolder, headers: dict[Path, ImageHeader], cameras: tuple[str, ...], settings: FrameSettings
+) -> _Choice:
+    """The readable images of one size, in order: those of a rig by instants, others by time, thinned."""
     sizes = {path: header.size for path, header in headers.items()}
-    paths, warnings = _one_size(list(headers), sizes, root, settings)
+    paths, warnings = _one_size(list(headers), sizes, folder.root, settings)
     if folder.raw_beside:
         warnings.append(
             f"{folder.raw_beside} camera raw files lie beside the images and were left out. "
             "A folder that holds them alone is developed."
         )
     if cameras:
-        of_rig = pair_images(root, paths, cameras, settings)
-        chosen, ordered, recorded = list(of_rig.images), of_rig.ordered, of_rig.recorded
-        warnings += of_rig.warnings
-    else:
-        paths, times, ordered, recorded = _in_time_order(paths, warnings)
-        taken = [Taken(path, time) for path, time in zip(paths, times, strict=True)]
-        chosen = thinned(taken, settings.max_frames)
-    work = _named(chosen, root, settings.long_side, headers)
-    most = max((headers[path].decoding_bytes for path in paths), default=0)
-    prepare = partial(_prepare_still, draft=draft, long_side=settings.long_side, development=development)
-    results = _in_threads(prepare, work, most, progress)
-    images, blank, of_path = [], 0, {taken.path: taken for taken in chosen}
-    for still, result in zip(work, results, strict=True):
-        match result:
-            case InputError():
-                refused[still.source] = result
-            case None:
-                blank += 1
-            case (sharp, gray):
-                one = of_path[still.source]
-                size = sizes[still.source]
-                images.append(
-                    SourceImage(still.name, still.original, size, one.time, sharp, gray, one.camera, one.instant)
-                )
-    warnings += _left_out(refused, folder)
-    if blank:
-        warnings.append(blank_warning(blank, "images"))
+        paired = pair_images(folder.root, paths, cameras, settings)
+        return _Choice(list(paired.images), paired.ordered, paired.recorded, [*warnings, *paired.warnings])
+    paths, times, ordered, recorded = _in_time_order(paths, warnings)
+    taken = thinned([Taken(path, time) for path, time in zip(paths, times, strict=True)], settings.max_frames)
+    return _Choice(taken, ordered, recorded, warnings)
+
+
+def _headers(paths: Sequence[Path], development: Development) -> tuple[dict[Path, ImageHeader], dict[Path, InputError]]:
+    """The headers of the images that can be read, and the errors of the others."""
+    headers: dict[Path, ImageHeader] = {}
+    refused: dict[Path, InputError] = {}
+    for path in paths:
+        try:
+            headers[path] = header_of(path, development)
+        except InputError as error:
+            refused[path] = error
+    return headers, refused
+
+
+def _mask_folders(source: Path, root: Path, settings: FrameSettings) -> list[Path]:
+    """The folders that may hold masks: the one that the settings name, else those beside the images, each once."""
     if settings.masks is not None:
-        mask_folders = [settings.masks]
-    else:
-        mask_folders = list(
-            dict.fromkeys([root, root / MASKS, source / MASKS, *([root.parent / MASKS] * (root.name == "images"))])
-        )
-    files = frozenset(root.resolve() / original for original in originals)
-    rig = rig_of(cameras, settings) if cameras else None
-    lens = write_lens(draft, cameras, images[0].size, settings) if cameras and images else None
-    told = str(development) if development.changes or development.balance is not None else None
-    chosen = SelectedImages(images, ordered, warnings, mask_folders, originals, files, recorded)
-    return replace(chosen, calibration=lens, rig=rig, development=told)
+        return [settings.masks]
+    outer = [root.parent / MASKS] if root.name == "images" else []
+    return list(dict.fromkeys([root, root / MASKS, source / MASKS, *outer]))
 
 
 def images_of(source: Path, leave_out: Sequence[Path] = ()) -> ImageFolder:
@@ -246,19 +275,17 @@ def _named(chosen: list[Taken], root: Path, long_side: int, headers: dict[Path, 
             while stem.lower() in given:
                 stem += "_"
             given.add(stem.lower())
-        path = taken.path
-        linked = headers[path].plain and (not long_side or max(headers[path].size) <= long_side)
-        work.append(_Still(path, relative, f"{stem}{path.suffix if linked else '.png'}", linked))
+        header = headers[taken.path]
+        linked = header.plain and (not long_side or max(header.size) <= long_side)
+        work.append(_Still(taken, relative, f"{stem}{taken.path.suffix if linked else '.png'}", linked))
     return work
 
 
-def _prepare_still(
-    still: _Still, draft: Path, long_side: int, development: Development
-) -> tuple[float, bool] | InputError | None:
-    """Put one image in its place: its sharpness and grayness, None where it shows nothing, or what is wrong."""
-    target = draft / still.name
+def _prepare_still(still: _Still, draft: Path, long_side: int, development: Development) -> _Seen | InputError | None:
+    """Put one image in its place; None where it shows nothing, the error where it cannot be read."""
+    target, source = draft / still.name, still.taken.path
     try:
-        image = read_developed(still.source, development)
+        image = read_developed(source, development)
     except InputError as error:
         return error
     gray = small_gray(image)
@@ -266,13 +293,20 @@ def _prepare_still(
         return None
     if not still.linked:
         images.write_rgb(target, scaled_down(image, long_side))
-        return sharpness(gray), is_gray(image)
+        return _Seen(sharpness(gray), is_gray(image))
     target.parent.mkdir(parents=True, exist_ok=True)
     try:
-        os.link(still.source.resolve(), target)
+        os.link(source.resolve(), target)
     except OSError:  # another disk, or a file system without links
-        shutil.copyfile(still.source, target)
-    return sharpness(gray), is_gray(image)
+        shutil.copyfile(source, target)
+    return _Seen(sharpness(gray), is_gray(image))
+
+
+def _source_image(still: _Still, size: tuple[int, int], seen: _Seen) -> SourceImage:
+    taken = still.taken
+    return SourceImage(
+        still.name, still.original, size, taken.time, seen.sharpness, seen.gray, taken.camera, taken.instant
+    )
 
 
 def _in_threads(
