@@ -21,7 +21,6 @@ if TYPE_CHECKING:
     import pycolmap
 
 PARTS = "parts"  # folder of the models that did not join the largest
-_NONE, _NOWHERE = np.zeros(0), np.zeros((0, 2))  # what is joined where no pair matches
 
 
 def record_of(model: "pycolmap.Reconstruction", store: FeatureDatabase, frames: Frames, folder: Path) -> Reconstruction:
@@ -55,27 +54,29 @@ def verified_matches(store: FeatureDatabase, index: list[int]) -> Matches:
     import pycolmap
 
     row_of = {i: row for row, i in enumerate(index)}
-    i, j, xy_i, xy_j = [], [], [], []
     with store.open() as database:
-        xy = {k: database.read_keypoints(k + 1)[:, :2].astype(np.float64) for k in index}
-        pairs, counts = database.read_two_view_geometry_num_inliers()
-        for pair in sorted(pair for pair, count in zip(pairs, counts, strict=True) if count):
-            a, b = (k - 1 for k in pycolmap.pair_id_to_image_pair(pair))
-            if a not in row_of or b not in row_of:
-                continue
-            rows = np.asarray(database.read_two_view_geometry(a + 1, b + 1).inlier_matches, np.int64).reshape(-1, 2)
-            i.append(np.full(len(rows), row_of[a]))
-            j.append(np.full(len(rows), row_of[b]))
-            xy_i.append(xy[a][rows[:, 0]])
-            xy_j.append(xy[b][rows[:, 1]])
-    first, second = (torch.from_numpy(np.concatenate([_NONE, *side]).astype(np.int64)) for side in (i, j))
-    return Matches(
-        i=first,
-        j=second,
-        xy_i=torch.from_numpy(np.concatenate([_NOWHERE, *xy_i])).float(),
-        xy_j=torch.from_numpy(np.concatenate([_NOWHERE, *xy_j])).float(),
-        confidence=torch.ones(len(first)),
-    )
+        pixels = {i: torch.from_numpy(database.read_keypoints(i + 1)[:, :2].astype(np.float32)) for i in index}
+        found = [
+            (*(image - 1 for image in pycolmap.pair_id_to_image_pair(pair)), count)
+            for pair, count in sorted(zip(*database.read_two_view_geometry_num_inliers(), strict=True))
+        ]
+        pairs = [(a, b, count) for a, b, count in found if count and a in row_of and b in row_of]
+        total = sum(count for *_, count in pairs)  # millions: each array is allocated once
+        matches = Matches(
+            i=torch.empty(total, dtype=torch.int64),
+            j=torch.empty(total, dtype=torch.int64),
+            xy_i=torch.empty(total, 2),
+            xy_j=torch.empty(total, 2),
+            confidence=torch.ones(total),
+        )
+        end = 0
+        for a, b, count in pairs:
+            inliers = database.read_two_view_geometry(a + 1, b + 1).inlier_matches.astype(np.int64)
+            rows, end = slice(end, end + count), end + count
+            matches.i[rows], matches.j[rows] = row_of[a], row_of[b]
+            matches.xy_i[rows] = pixels[a][inliers[:, 0]]
+            matches.xy_j[rows] = pixels[b][inliers[:, 1]]
+    return matches
 
 
 def write_parts(
