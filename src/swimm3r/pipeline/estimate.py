@@ -15,6 +15,7 @@ from swimm3r.io.bags.bag import is_bag
 from swimm3r.io.images import image_size
 from swimm3r.pipeline.presets import RunSettings
 from swimm3r.prepare import check_source
+from swimm3r.prepare.bag_rig import BagRig
 from swimm3r.prepare.clip import open_clip
 from swimm3r.prepare.image_folder import images_of
 from swimm3r.scene.run_folder import STAGES
@@ -161,6 +162,7 @@ def _frames_to_come(source: Path, folder: Path, settings: FrameSettings) -> tupl
         if whole is None:
             return None
         count = decoded = len(paths)
+        views = 1
     else:
         video = open_clip(source, settings)
         if video.seconds is None:
@@ -169,11 +171,12 @@ def _frames_to_come(source: Path, folder: Path, settings: FrameSettings) -> tupl
         decoded = seconds * video.rate
         count = max(1, round(min(decoded, seconds * settings.fps if settings.fps else decoded)))
         whole = video.width, video.height
+        views = len(video.rig.names) if isinstance(video, BagRig) else 1
     if settings.max_frames:
         count = min(count, settings.max_frames)
     scale = _scale(settings.long_side, max(whole))
     width, height = (max(1, round(side * scale)) for side in whole)
-    return count, (width, height), float(decoded * whole[0] * whole[1])
+    return views * count, (width, height), float(views * decoded * whole[0] * whole[1])
 
 
 def _size_of(path: Path) -> tuple[int, int] | None:

@@ -1,7 +1,7 @@
 """A video or the camera of a bag -> one frame of each bin of 1/fps seconds, of which the best alone is in memory."""
 
 from collections.abc import Iterator
-from dataclasses import replace
+from dataclasses import dataclass, replace
 from itertools import groupby
 from math import ceil, inf
 from pathlib import Path
@@ -17,6 +17,7 @@ from swimm3r.io.bags.clip import BagClip, BagImage
 from swimm3r.io.files.atomic import write_text
 from swimm3r.io.images import Rgb
 from swimm3r.io.video import Video, VideoFrame
+from swimm3r.prepare.bag_rig import BagRig, RigInstant
 from swimm3r.prepare.candidates import (
     BLANK,
     GRAY_SIDE,
@@ -35,23 +36,40 @@ from swimm3r.prepare.rig import NONE, SIDE_BY_SIDE, STEREO, rig_of, write_lens
 from swimm3r.progress import Progress
 from swimm3r.scene.settings import FrameSettings
 
-Clip = Video | BagClip
-ClipFrame = VideoFrame | BagImage
+Camera = Video | BagClip
+Clip = Camera | BagRig
+ClipFrame = VideoFrame | BagImage | RigInstant
 
-View = UInt8[np.ndarray, "rows columns 3"] | UInt16[np.ndarray, "rows columns 3"]
+Half = UInt8[np.ndarray, "rows columns 3"] | UInt16[np.ndarray, "rows columns 3"]
 
 LENS = "camera_info.yaml"  # the lens that a bag states, beside the frames
 
 
-def open_clip(source: Path, settings: FrameSettings) -> Clip:
-    """A video, or the camera of a bag. Raises InputError, and UsageError where a bag holds several cameras."""
-    if settings.rig not in ((), (NONE,), (SIDE_BY_SIDE,)):
-        raise UsageError(
-            f"--rig {' '.join(settings.rig)} names sub-folders, and {source.name} is a video or a bag",
-            cause="only videos that show two views side by side, and folders of images are rigs",
-            hint="--rig side-by-side; or write the images of each camera into a folder of its name",
-        )
+@dataclass(frozen=True)
+class _View:
+    """An image of one camera at a moment of a clip."""
+
+    camera: str | None  # of a rig
+    time: float
+    pixels: Rgb
+
+
+def open_camera(source: Path, settings: FrameSettings) -> Camera:
+    """A video, or one camera of a bag. Raises InputError, and UsageError where a bag holds several."""
     return BagClip(source, settings.topic, settings.stamps) if is_bag(source) else Video(source)
+
+
+def open_clip(source: Path, settings: FrameSettings) -> Clip:
+    """A video, a camera of a bag, or the rig whose topics are named. Raises InputError and UsageError."""
+    if settings.rig in ((), (NONE,), (SIDE_BY_SIDE,)):
+        return open_camera(source, settings)
+    if is_bag(source):
+        return BagRig(source, settings)
+    raise UsageError(
+        f"--rig {' '.join(settings.rig)} names sub-folders or topics, and {source.name} is a video",
+        cause="of videos, only those that show two views side by side are rigs",
+        hint="--rig side-by-side; or write the images of each camera into a folder of its name",
+    )
 
 
 def prepare_clip(source: Path, draft: Path, settings: FrameSettings, progress: Progress) -> SelectedImages:
@@ -77,7 +95,6 @@ def prepare_clip(source: Path, draft: Path, settings: FrameSettings, progress: P
     def bin_of(frame: ClipFrame) -> int:
         return int((frame.time - settings.start) * rate + 1e-6) if rate < inf else seen
 
-    cameras = STEREO if settings.rig == (SIDE_BY_SIDE,) else ()
     instants: list[list[SourceImage]] = []
     blank = 0
     for _, bin_frames in groupby(watched(), bin_of):
@@ -85,7 +102,8 @@ def prepare_clip(source: Path, draft: Path, settings: FrameSettings, progress: P
         if best is None:
             blank += 1
             continue
-        instants.append(_written(*best, len(instants), draft, settings, development, split=bool(cameras)))
+        views = _views(best[0], split=settings.rig == (SIDE_BY_SIDE,))
+        instants.append([_written(view, best[1], len(instants), draft, settings, development) for view in views])
     progress(STEP, max(seen, 1), max(seen, 1))
 
     if not seen:
@@ -103,42 +121,52 @@ def prepare_clip(source: Path, draft: Path, settings: FrameSettings, progress: P
     originals = [image.original for views in instants for image in views]
     told = str(development) if development.changes else None
     chosen = SelectedImages(kept, True, warnings, mask_folders, originals, recorded=video.recorded, development=told)
-    if cameras and kept:
-        lens = write_lens(draft, cameras, kept[0].size, settings)
-        return replace(chosen, rig=rig_of(cameras, settings), calibration=lens)
-    return _of_bag(chosen, video, draft, settings) if isinstance(video, BagClip) else chosen
+    if not kept:
+        return chosen
+    if not isinstance(video, Video):
+        chosen = _of_bag(chosen, video, draft, settings)
+    rig = video.rig if isinstance(video, BagRig) else rig_of(STEREO, settings) if kept[0].camera is not None else None
+    if rig is None:
+        return chosen
+    lens = write_lens(draft, rig.names, kept[0].size, settings)
+    return replace(chosen, rig=rig, calibration=lens or chosen.calibration)
 
 
-def _of_bag(chosen: SelectedImages, video: BagClip, draft: Path, settings: FrameSettings) -> SelectedImages:
+def _of_bag(chosen: SelectedImages, clip: BagClip | BagRig, draft: Path, settings: FrameSettings) -> SelectedImages:
     """The images with the clock of their headers, and the lens that the bag states."""
-    lens = draft / LENS if video.lens is not None and settings.camera_info else None
-    if lens is not None and video.lens is not None:
-        write_text(lens, video.lens)
-    return replace(chosen, start_ns=video.start_ns, calibration=lens)
+    lens = draft / LENS if clip.lens is not None and settings.camera_info else None
+    if lens is not None and clip.lens is not None:
+        write_text(lens, clip.lens)
+    return replace(chosen, start_ns=clip.start_ns, calibration=lens)
+
+
+def _views(frame: ClipFrame, *, split: bool) -> list[_View]:
+    """The image of a moment: its two halves where it is `split`, and of a rig one for each camera."""
+    if isinstance(frame, RigInstant):
+        return [_View(camera, image.time, image.rgb()) for camera, image in frame.images.items()]
+    if not split:
+        return [_View(None, frame.time, frame.rgb())]
+    return [_View(camera, frame.time, half) for camera, half in halves(frame.rgb()).items()]
 
 
 def _written(
-    frame: ClipFrame,
+    view: _View,
     sharp: float,
-    number: int,
+    instant: int,
     draft: Path,
     settings: FrameSettings,
     development: Development,
-    *,
-    split: bool,
-) -> list[SourceImage]:
-    """The image of a moment on disk, or its two halves where it is `split` into the views of a rig."""
-    views = []
-    for camera, view in (halves(frame.rgb()) if split else {None: frame.rgb()}).items():
-        name = f"frame_{number:06d}.png" if camera is None else f"{camera}/frame_{number:06d}.png"
-        rgb = scaled_down(developed(view, development), settings.long_side)
-        images.write_rgb(draft / name, rgb)
-        size, instant = (view.shape[1], view.shape[0]), number if split else None
-        views.append(SourceImage(name, Path(name), size, frame.time, sharp, is_gray(rgb), camera, instant))
-    return views
+) -> SourceImage:
+    """A view on disk."""
+    name = f"frame_{instant:06d}.png" if view.camera is None else f"{view.camera}/frame_{instant:06d}.png"
+    rgb = scaled_down(developed(view.pixels, development), settings.long_side)
+    images.write_rgb(draft / name, rgb)
+    size = view.pixels.shape[1], view.pixels.shape[0]
+    of_rig = None if view.camera is None else instant
+    return SourceImage(name, Path(name), size, view.time, sharp, is_gray(rgb), view.camera, of_rig)
 
 
-def halves(image: Rgb) -> dict[str, View]:
+def halves(image: Rgb) -> dict[str, Half]:
     """The left and the right half of an image that shows two views side by side."""
     width = image.shape[1] // 2
     left, right = STEREO

@@ -7,8 +7,6 @@ from dataclasses import dataclass
 from datetime import UTC, datetime
 from pathlib import Path
 
-import numpy as np
-
 from swimm3r.errors import InputError, UsageError
 from swimm3r.io.calibration.record import REMEDY, lens_at
 from swimm3r.io.calibration.rig import read_rig
@@ -17,6 +15,7 @@ from swimm3r.io.files.damage import guard
 from swimm3r.io.image_folder import find_images, natural_key, numbered
 from swimm3r.io.image_header import capture_time
 from swimm3r.prepare.candidates import Taken, thinned
+from swimm3r.prepare.instants import CameraImages, instants_of, missing
 from swimm3r.scene.rig import Rig, RigCamera, pose_of
 from swimm3r.scene.settings import FrameSettings
 
@@ -27,8 +26,6 @@ STEREO = ("left", "right")
 LENS = "rig_lens.txt"  # of the first camera of a calibrated rig, beside the frames
 _UNITS = {19: 1e-9, 16: 1e-6, 13: 1e-3}  # seconds, by the number of digits of a stamp since 1970
 _STAMP = re.compile(r"(?<!\d)(?:(\d{10})[._](\d{1,9})|(\d{19}|\d{16}|\d{13}))(?!\d)")
-_SAME_NAMES = 0.5  # share of the instants with all cameras, from which equal names are no chance
-_NAMED = 3  # images without partner that a message names
 
 
 @dataclass(frozen=True)
@@ -112,31 +109,22 @@ def write_lens(draft: Path, cameras: Sequence[str], size: tuple[int, int], setti
     return draft / LENS
 
 
-@dataclass(frozen=True)
-class _Camera:
-    """The images of one camera."""
-
-    name: str
-    paths: list[Path]
-    times: list[float] | None  # seconds since 1970 or of the camera's clock; None where one image has none
-
-
 def pair_images(root: Path, paths: Sequence[Path], cameras: Sequence[str], settings: FrameSettings) -> RigImages:
     """The images of the cameras by instants. Raises InputError where too many have no partner."""
-    found = []
-    for name in cameras:
-        own = [path for path in paths if path.is_relative_to(root / name)]
-        if not own:
+    own = {name: [path for path in paths if path.is_relative_to(root / name)] for name in cameras}
+    for name, files in own.items():
+        if not files:
             raise InputError(
                 f"{root / name} holds no images",
                 cause="the folder of that camera is empty, or holds another kind of files",
                 hint="--rig with the names of the sub-folders that hold images",
             )
-        found.append(_Camera(name, own, _times(own)))
+    found = [_images_of(root, name, files) for name, files in own.items()]
     clocked = all(camera.times is not None for camera in found)
-    instants = _instants(found, root, settings)
-    warnings = _check_missing(instants, found, settings)
-    moment = {path: t for camera in found for path, t in zip(camera.paths, camera.times or (), strict=False)}
+    together = instants_of(found, settings)
+    told = missing(together, found, settings)
+    instants = [{name: own[name][i] for name, i in instant.items()} for instant in together]
+    moment = {path: t for camera in found for path, t in zip(own[camera.name], camera.times or (), strict=False)}
     if clocked:
         instants.sort(key=lambda instant: min(moment[path] for path in instant.values()))
     else:
@@ -150,90 +138,14 @@ def pair_images(root: Path, paths: Sequence[Path], cameras: Sequence[str], setti
         if name in instant
     ]
     recorded = datetime.fromtimestamp(begin, UTC).strftime("%Y-%m-%dT%H:%M:%S") if clocked else None
-    return RigImages(tuple(images), clocked or numbered(found[0].paths), recorded, tuple(warnings))
+    warnings = () if told is None else (f"{told} They are used as they are.",)
+    return RigImages(tuple(images), clocked or numbered(own[cameras[0]]), recorded, warnings)
 
 
-def _instants(cameras: Sequence[_Camera], root: Path, settings: FrameSettings) -> list[dict[str, Path]]:
-    """The images of each instant by their camera, in no order."""
-    named = [[_key(path, root, camera.name) for path in camera.paths] for camera in cameras]
-    unique = all(len(set(keys)) == len(keys) for keys in named)
-    shared = len(set.intersection(*map(set, named))) / max(map(len, named))
-    clocked = all(camera.times is not None for camera in cameras)
-    how = settings.rig_pairs
-    if how == "auto":
-        how = "name" if (unique and shared >= _SAME_NAMES) or not clocked else "time"
-    if how == "time" and clocked:
-        return _by_time(cameras, settings.rig_tolerance)
-    if how == "order" and len({len(camera.paths) for camera in cameras}) == 1:
-        rows = zip(*(camera.paths for camera in cameras), strict=True)
-        return [dict(zip((camera.name for camera in cameras), row, strict=True)) for row in rows]
-    if how != "name" or not unique or not shared:
-        raise InputError(
-            f"the images of the rig cannot be paired by {how}: {_counts(cameras)}",
-            cause={
-                "time": "an image carries no time, neither in its name nor in EXIF",
-                "order": "the cameras have different numbers of images",
-                "name": "no names agree, and the images carry no times",
-            }[how],
-            hint="the same name for images of one instant (left/0001.png, right/0001.png); or --rig-pairs order where"
-            " the first image of each camera is of the first instant, and so on",
-        )
-    found: dict[str, dict[str, Path]] = {}
-    for camera, keys in zip(cameras, named, strict=True):
-        for path, key in zip(camera.paths, keys, strict=True):
-            found.setdefault(key, {})[camera.name] = path
-    return list(found.values())
-
-
-def _by_time(cameras: Sequence[_Camera], tolerance: float) -> list[dict[str, Path]]:
-    """Images that are each other's nearest in time, within the tolerance; the others are instants of their own."""
-    first = cameras[0]
-    instants = [{first.name: path} for path in first.paths]
-    for camera in cameras[1:]:
-        gap = np.abs(np.subtract.outer(np.array(camera.times), np.array(first.times)))
-        nearest, back = gap.argmin(1), gap.argmin(0)
-        for row, path in enumerate(camera.paths):
-            column = int(nearest[row])
-            if gap[row, column] <= tolerance and back[column] == row:
-                instants[column][camera.name] = path
-            else:
-                instants.append({camera.name: path})
-    return instants
-
-
-def _check_missing(instants: list[dict[str, Path]], cameras: Sequence[_Camera], settings: FrameSettings) -> list[str]:
-    """The warning about images without partners. Raises InputError where they are too many."""
-    alone = [path for instant in instants if len(instant) < len(cameras) for path in instant.values()]
-    lacking = sum(len(instant) < len(cameras) for instant in instants)
-    if not lacking:
-        return []
-    names = ", ".join(f"{path.parent.name}/{path.name}" for path in alone[:_NAMED])
-    told = (
-        f"{lacking} of {len(instants)} instants lack the image of a camera ({names}{' ...' * (len(alone) > _NAMED)});"
-        f" there are {_counts(cameras)}"
-    )
-    if lacking <= settings.rig_missing * len(instants):
-        return [f"{told}. They are used as they are."]
-    apart = _apart(cameras)
-    raise InputError(
-        told + ("" if apart is None else f", {apart:.3g} s apart in the median"),
-        cause="the cameras were not triggered together, or images of one of them were lost or left out",
-        hint=f"--rig-tolerance (now {settings.rig_tolerance:g} s) where the times differ by little, --rig-missing (now"
-        f" {settings.rig_missing:g}) to go on without the partners, or --rig none: one camera after the other",
-    )
-
-
-def _apart(cameras: Sequence[_Camera]) -> float | None:
-    """Median difference of the images' times from the nearest of the first camera; None without times."""
-    if any(camera.times is None for camera in cameras):
-        return None
-    first = np.array(cameras[0].times)
-    gaps = [np.abs(np.subtract.outer(np.array(camera.times), first)).min(1) for camera in cameras[1:]]
-    return float(np.median(np.concatenate(gaps)))
-
-
-def _counts(cameras: Sequence[_Camera]) -> str:
-    return ", ".join(f"{len(camera.paths)} images of {camera.name}" for camera in cameras)
+def _images_of(root: Path, name: str, paths: Sequence[Path]) -> CameraImages:
+    """The images of a camera's folder."""
+    labels = [f"{path.parent.name}/{path.name}" for path in paths]
+    return CameraImages(name, labels, _times(paths), [_key(path, root, name) for path in paths])
 
 
 def _key(path: Path, root: Path, camera: str) -> str:

@@ -41,14 +41,14 @@ class FrameSettings(Settings):
     camera_info: bool = True
     """Start from the lens that a bag's camera_info states, where neither --calibration nor --focal gives another."""
     rig: tuple[str, ...] = ()
-    """Cameras of a rig: names of sub-folders of SOURCE, `side-by-side` for a video that shows two views, or `none`. By
-    default sub-folders left and right are a stereo pair."""
+    """Cameras of a rig: names of sub-folders of SOURCE, topics of images of a ROS bag, `side-by-side` for a video that
+    shows two views, or `none`. By default sub-folders left and right are a stereo pair."""
     rig_calibration: Path | None = None
     """Calibration of the rig, its cameras in their order: Kalibr camchain, stereo calibration of OpenCV (YAML), or a
     folder with a ROS camera_info per camera. It gives the scale, too."""
     rig_pairs: Literal["auto", "name", "time", "order"] = "auto"
-    """Images of one instant: those of the same name, of the same time (in names or EXIF), or of the same place in
-    their folders; auto takes names, and where they differ times."""
+    """Images of one instant: those of the same name, of the same time (in names, EXIF, or headers of a bag), or of the
+    same place in their lists; auto takes names, and where they differ times."""
     rig_tolerance: Annotated[float, Range(above=0, most=10)] = 0.01
     """Largest difference of the times of one instant in seconds."""
     rig_missing: Share = 0.1

@@ -13,7 +13,13 @@ if TYPE_CHECKING:
 Bag = Positional[Annotated[Path, arg(metavar="BAG")]]
 
 _TITLES = ("topic", "type", "messages", "rate [Hz]", "first", "last", "used for")
-_OPTIONS = {"images": "images: run", "positions": "positions: --nav", "depth": "depth: --nav", "lens": "lens of images"}
+_OPTIONS = {
+    "images": "images: run, --rig",
+    "positions": "positions: --nav",
+    "depth": "depth: --nav",
+    "lens": "lens of images",
+    "transforms": "poses of cameras: --rig",
+}
 _DATES_FROM = 10**17  # nanoseconds; smaller stamps count from the begin of a simulation
 
 

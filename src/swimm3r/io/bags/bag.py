@@ -1,7 +1,8 @@
 """A ROS bag that is open for reading: version 1 (.bag), version 2 (a folder with metadata.yaml, a .db3 or an .mcap).
 
-rosbags (Apache-2.0) reads and writes them without ROS. All messages used here begin with a std_msgs/Header, whose stamp
-lies four bytes into the message in both versions, so that images that are not taken are never decoded.
+rosbags (Apache-2.0) reads and writes them without ROS. All messages used here but those of tf begin with a
+std_msgs/Header, whose stamp lies four bytes into the message in both versions, so that images that are not taken are
+never decoded.
 """
 
 import struct
@@ -18,6 +19,7 @@ from swimm3r.errors import DeviceError, InputError
 from swimm3r.io.files.damage import first_line
 
 BAG_SUFFIXES = (".bag", ".mcap", ".db3")
+TRANSFORMS = "tf2_msgs/msg/TFMessage"
 _STORAGES = (".mcap", ".db3")  # the files of a bag of version 2
 _MARK = b"rosbag2_bagfile_information"  # in its metadata.yaml
 _BEGIN = 4096  # bytes that hold the mark
@@ -34,7 +36,7 @@ class Message:
 
     topic: str
     type: str  # "sensor_msgs/msg/Image", for version 1 too
-    stamp: int  # of its header, nanoseconds
+    stamp: int  # of its header, nanoseconds; of a message without one as `received`
     received: int  # by the recorder, nanoseconds since 1970
     data: bytes
 
@@ -100,7 +102,7 @@ class Bag:
                 if one is None:
                     return
                 connection, received, data = one
-                stamp = self._stamp(data)
+                stamp = received if connection.msgtype == TRANSFORMS else self._stamp(data)
             except self._faults as error:
                 self.cut = first_line(error)
                 return

@@ -72,10 +72,11 @@ class BagClip:
     seconds: float | None  # from the first header to the last
     rate: float  # images per second on average
     recorded: str | None  # date of the first header, ISO 8601; None of a clock that was not set
-    start_ns: int  # stamp of the first image
+    start_ns: int  # stamp of second 0, by default that of the first image
     lens: str | None  # ROS camera_info of the images, as YAML; None where the bag has none that can be used
     damaged: int  # messages that did not decode so far
     interlaced: bool
+    frame_id: str  # of the images' axes, as the first one states them
 
     def __init__(self, path: Path, topic: str | None = None, stamps: Stamps = "header") -> None:
         """Raises InputError where the bag cannot be read or has no images, UsageError where a topic is to be chosen."""
@@ -87,37 +88,36 @@ class BagClip:
             first, last = bag.first(self.topic.name), bag.last(self.topic.name)
             assert first is not None  # or it would be no topic
             assert last is not None
-            image = self._first_decoded(bag)
+            self.frame_id, image = self._first_decoded(bag)
             self.height, self.width = image.shape[:2]
             self.lens = self._lens(bag, lens_topic(topics, self.topic))
         self._first_received = first.received
         self.start_ns, end = self._stamp(first), self._stamp(last)
         self.seconds = (end - self.start_ns) * 1e-9 if end > self.start_ns else None
         self.rate = (self.topic.count - 1) / self.seconds if self.seconds else 1.0
-        known = self.start_ns > _FIRST_YEAR * 10**9
-        begin = datetime.fromtimestamp(self.start_ns // 1000 * 1e-6, UTC) if known else None
-        self.recorded = None if begin is None else begin.strftime("%Y-%m-%dT%H:%M:%S.%f")
+        self.recorded = recorded_at(self.start_ns)
+
+    def count_from(self, stamp: int) -> None:
+        """Move second 0 to a stamp."""
+        self._first_received += stamp - self.start_ns
+        self.start_ns, self.recorded = stamp, recorded_at(stamp)
 
     def frames(self, start: float = 0.0, end: float = math.inf) -> Iterator[BagImage]:
         """The images from second `start` up to before second `end`. Raises InputError where the clock is no clock."""
-        skipped = max(0.0, start - _LEAP)  # recorders write a message within that time of its header
-        since = self._first_received + int(skipped * 1e9) if skipped else None
         with open_bag(self.path) as bag:
-            before: Message | None = None
-            for number, message in enumerate(bag.messages(self.topic.name, since=since), 1):
-                place = f"image {number}" if since is None else f"image {number} from {skipped:.0f} s on"
-                self._check_clock(message, before, place)
-                if before is not None and self._stamp(message) == self._stamp(before):
-                    continue  # the same image twice
-                before = message
-                time = (self._stamp(message) - self.start_ns) * 1e-9
-                if time >= end:
-                    break
-                if time >= start - 1e-6:
-                    image = BagImage(time, message, self, bag)
-                    if self._decodes(image):
-                        yield image
+            for time, message in self._messages(bag, start, end):
+                image = BagImage(time, message, self, bag)
+                if self._decodes(image):
+                    yield image
             self._cut = bag.cut
+
+    def times(self, start: float = 0.0, end: float = math.inf) -> list[float]:
+        """Times of the images from second `start` up to before second `end`, of damaged ones too: none is decoded.
+
+        Raises InputError where the clock is no clock.
+        """
+        with open_bag(self.path) as bag:
+            return [time for time, _ in self._messages(bag, start, end)]
 
     def warnings(self) -> list[str]:
         """Faults that were met so far, in plain words."""
@@ -132,6 +132,23 @@ class BagClip:
         """The pixels of a message. Raises ValueError or InputError where they are damaged."""
         place = Path(f"{self.path}:{message.topic}")
         return image_of(content) if message.type == IMAGE else compressed_image_of(content, place)
+
+    def _messages(self, bag: Bag, start: float, end: float) -> Iterator[tuple[float, Message]]:
+        """The images from second `start` up to before second `end`, with their times."""
+        skipped = max(0.0, start - _LEAP)  # recorders write a message within that time of its header
+        since = self._first_received + int(skipped * 1e9) if skipped else None
+        before: Message | None = None
+        for number, message in enumerate(bag.messages(self.topic.name, since=since), 1):
+            place = f"image {number}" if since is None else f"image {number} from {skipped:.0f} s on"
+            self._check_clock(message, before, place)
+            if before is not None and self._stamp(message) == self._stamp(before):
+                continue  # the same image twice
+            before = message
+            time = (self._stamp(message) - self.start_ns) * 1e-9
+            if time >= end:
+                return
+            if time >= start - 1e-6:
+                yield time, message
 
     def _decodes(self, image: BagImage) -> bool:
         """Return whether an image decodes in the size of the clip; damaged ones are counted."""
@@ -149,11 +166,13 @@ class BagClip:
             hint=f"--end {image.time:.1f}, or --start {image.time:.1f} for the images after",
         )
 
-    def _first_decoded(self, bag: Bag) -> Rgb:
+    def _first_decoded(self, bag: Bag) -> tuple[str, Rgb]:
+        """The first image that decodes, with the name of its axes."""
         why: object = "the bag is cut off before it"
         for message in bag.messages(self.topic.name):
             try:
-                return self.decoded(bag.content(message), message)
+                content = bag.content(message)
+                return str(content.header.frame_id), self.decoded(content, message)
             except (ValueError, InputError) as error:
                 why = error.what if isinstance(error, InputError) else error
         raise InputError(
@@ -202,3 +221,10 @@ class BagClip:
                 cause="the driver does not stamp its images, or its clock was set while they were recorded",
                 hint="--stamps received, which takes the times at which they were recorded",
             )
+
+
+def recorded_at(stamp: int) -> str | None:
+    """The date of a stamp, ISO 8601; None of a clock that was not set."""
+    if stamp <= _FIRST_YEAR * 10**9:
+        return None
+    return datetime.fromtimestamp(stamp // 1000 * 1e-6, UTC).strftime("%Y-%m-%dT%H:%M:%S.%f")

@@ -12,10 +12,10 @@ def lens_text(info: Any, name: str, *, rectified: bool = False) -> str:
     Images of a part of the sensor (roi) have a lens and a size of their own. `rectified` images are those of the
     projection matrix, without distortion. Raises ValueError where the camera is not calibrated.
     """
-    K, D = (np.asarray(_either(info, letter), np.float64) for letter in ("k", "d"))
+    K, D, R, P = (np.asarray(_either(info, letter), np.float64) for letter in ("k", "d", "r", "p"))
     model = str(info.distortion_model)
     if rectified:
-        K, D, model = np.asarray(_either(info, "p"), np.float64).reshape(3, 4)[:, :3].ravel(), np.zeros(0), ""
+        K, D, model, R = P.reshape(3, 4)[:, :3].ravel(), np.zeros(0), "", np.eye(3).ravel()
     if not K[0]:
         raise ValueError("it is not calibrated (its matrix is zero)")
     width, height, roi = int(info.width), int(info.height), info.roi
@@ -30,6 +30,8 @@ def lens_text(info: Any, name: str, *, rectified: bool = False) -> str:
             "camera_matrix": {"rows": 3, "cols": 3, "data": K.tolist()},
             "distortion_model": model,
             "distortion_coefficients": {"rows": 1, "cols": len(D), "data": D.tolist()},
+            "rectification_matrix": {"rows": 3, "cols": 3, "data": R.tolist()},
+            "projection_matrix": {"rows": 3, "cols": 4, "data": P.tolist()},
         },
         sort_keys=False,
     )

@@ -10,7 +10,7 @@ from pathlib import Path
 from typing import Literal, NoReturn
 
 from swimm3r.errors import InputError, UsageError
-from swimm3r.io.bags.bag import Bag, open_bag, unreadable
+from swimm3r.io.bags.bag import TRANSFORMS, Bag, open_bag, unreadable
 from swimm3r.io.bags.pixels import is_camera_encoding, is_camera_format
 
 IMAGE, COMPRESSED = "sensor_msgs/msg/Image", "sensor_msgs/msg/CompressedImage"
@@ -18,7 +18,7 @@ CAMERA_INFO, IMU, PRESSURE = "sensor_msgs/msg/CameraInfo", "sensor_msgs/msg/Imu"
 FIX, ODOMETRY = "sensor_msgs/msg/NavSatFix", "nav_msgs/msg/Odometry"
 POSE, POSE_COVARIANCE = "geometry_msgs/msg/PoseStamped", "geometry_msgs/msg/PoseWithCovarianceStamped"
 
-Use = Literal["images", "lens", "positions", "orientation", "depth"]
+Use = Literal["images", "lens", "positions", "orientation", "depth", "transforms"]
 USES: dict[str, Use] = {
     IMAGE: "images",
     COMPRESSED: "images",
@@ -29,13 +29,15 @@ USES: dict[str, Use] = {
     POSE_COVARIANCE: "positions",
     IMU: "orientation",
     PRESSURE: "depth",
+    TRANSFORMS: "transforms",
 }
-_COMPRESSED = "/compressed"  # the last part of the names of compressed images
+STATIC = "/tf_static"  # the topic of transforms that hold for the whole bag
+COMPRESSED_END = "/compressed"  # the last part of the names of compressed images
 
 
 @dataclass(frozen=True)
 class Topic:
-    """A topic of messages with headers; times are those of the headers, nanoseconds."""
+    """A topic; times are those of the messages' headers, nanoseconds, of transforms those of recording."""
 
     name: str
     type: str
@@ -105,8 +107,8 @@ def choose_images(topics: Topics, asked: str | None) -> Topic:
             hint=f"swimm3r topics {topics.path} lists what the bag holds",
         )
     if asked is None:
-        raw = {topic.name for topic in cameras if not topic.name.endswith(_COMPRESSED)}
-        cameras = [topic for topic in cameras if topic.name not in {name + _COMPRESSED for name in raw}]
+        raw = {topic.name for topic in cameras if not topic.name.endswith(COMPRESSED_END)}
+        cameras = [topic for topic in cameras if topic.name not in {name + COMPRESSED_END for name in raw}]
     return _chosen(topics.path, cameras, asked, "--topic", "images")
 
 
@@ -120,7 +122,7 @@ def choose_positions(topics: Topics, asked: str | None) -> Topic | None:
 
 def lens_topic(topics: Topics, images: Topic) -> Topic | None:
     """The camera_info of a topic of images."""
-    space = images.name.removesuffix(_COMPRESSED).rpartition("/")[0]
+    space = images.name.removesuffix(COMPRESSED_END).rpartition("/")[0]
     return next((topic for topic in topics.used_for("lens") if topic.name == f"{space}/camera_info"), None)
 
 
@@ -129,6 +131,8 @@ def _topic(bag: Bag, name: str, type_: str) -> Topic | None:
     if first is None or last is None:
         return None
     use, detail = USES[type_], ""
+    if type_ == TRANSFORMS and name != STATIC:
+        return Topic(name, type_, bag.count(name), first.stamp, last.stamp, None, "of what moves")
     if type_ in (IMAGE, COMPRESSED):
         try:
             content = bag.content(first)
@@ -161,5 +165,12 @@ def _refuse(path: Path, found: Sequence[Topic], asked: str | None, option: str, 
         if asked is None
         else f"{path} has no topic of {what} {asked}, but {listed or 'none'}",
         cause="one of them is used" if asked is None else "a slip in the name",
-        hint=f"{option} {found[0].name}, or another of these names" if found else f"leave out {option}",
+        hint=_which(found, option) if found else f"leave out {option}",
     )
+
+
+def _which(found: Sequence[Topic], option: str) -> str:
+    told = f"{option} {found[0].name}, or another of these names"
+    if option == "--topic" and len(found) > 1:
+        told += f"; --rig {found[0].name} {found[1].name} where cameras are fixed to each other"
+    return told

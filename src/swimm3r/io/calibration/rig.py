@@ -50,13 +50,18 @@ def read_rig(path: Path, cameras: Sequence[str]) -> RigCalibration:
             found = _chained(document, list(chain.values())) if chain else _stereo(document)
         if len(found.lenses) != len(cameras):
             raise ValueError(f"it has {len(found.lenses)} cameras, and the rig {len(cameras)} ({', '.join(cameras)})")
-        for pose in found.camera_from_rig:
-            R = pose[:3, :3]
-            if not np.isfinite(pose).all() or np.abs(R @ R.T - np.eye(3)).max() > _ORTHONORMAL or np.linalg.det(R) < 0:
-                raise ValueError("a pose in it is no rotation and translation")
-        if not np.linalg.norm(found.camera_from_rig[1:, :3, 3], axis=1).all():
-            raise ValueError("two of its cameras are in one place")
+        check_rig_poses(found.camera_from_rig)
         return found
+
+
+def check_rig_poses(camera_from_rig: Float[np.ndarray, "s 4 4"]) -> None:
+    """Raise ValueError for poses that are no rotations and translations, and for a camera where the first one is."""
+    for pose in camera_from_rig:
+        R = pose[:3, :3]
+        if not np.isfinite(pose).all() or np.abs(R @ R.T - np.eye(3)).max() > _ORTHONORMAL or np.linalg.det(R) < 0:
+            raise ValueError("a pose in it is no rotation and translation")
+    if not np.linalg.norm(camera_from_rig[1:, :3, 3], axis=1).all():
+        raise ValueError("two of its cameras are in one place")
 
 
 def _kalibr(camera: Mapping[str, Any]) -> bool:
@@ -82,22 +87,30 @@ def _stereo(document: Mapping[str, Any]) -> RigCalibration:
 
 
 def _rectified(folder: Path, cameras: Sequence[str]) -> RigCalibration:
-    lenses, rectified, offsets = [], [], []
+    documents = []
     for name in cameras:
         file = next((folder / f"{name}{end}" for end in (".yaml", ".yml") if (folder / f"{name}{end}").is_file()), None)
         if file is None:
             raise ValueError(f"it has no {name}.yaml")
-        document = from_yaml(file.read_text(encoding="utf-8-sig"))
-        lenses.append(read_document(document)[0])
-        R = _numbers(document.get("rectification_matrix", document.get("R")), (3, 3))
+        documents.append(from_yaml(file.read_text(encoding="utf-8-sig")))
+    lenses = tuple(read_document(document)[0] for document in documents)
+    return RigCalibration(lenses, rectified_poses(documents))
+
+
+def rectified_poses(documents: Sequence[Mapping[str, Any]]) -> Float[np.ndarray, "s 4 4"]:
+    """camera_from_rig of cameras whose camera_info is given. Raises ValueError where one has no R or P."""
+    rectified, offsets = [], []
+    for document in documents:
         P = _numbers(document.get("projection_matrix", document.get("P")), (3, 4))
-        rectified.append(R)
+        if not P[0, 0] * P[1, 1]:
+            raise ValueError("a projection_matrix in it is zero")
+        rectified.append(_numbers(document.get("rectification_matrix", document.get("R")), (3, 3)))
         offsets.append(np.array([-P[0, 3] / P[0, 0], -P[1, 3] / P[1, 1], 0.0]))
-    poses = np.tile(np.eye(4), (len(cameras), 1, 1))
-    for k in range(1, len(cameras)):
+    poses = np.tile(np.eye(4), (len(documents), 1, 1))
+    for k in range(1, len(documents)):
         poses[k, :3, :3] = rectified[k].T @ rectified[0]
         poses[k, :3, 3] = -rectified[k].T @ (offsets[k] - offsets[0])
-    return RigCalibration(tuple(lenses), poses)
+    return poses
 
 
 def _numbers(value: Any, shape: tuple[int, ...]) -> np.ndarray:

@@ -12,7 +12,7 @@ from swimm3r.io.bags.clip import BagClip
 from swimm3r.io.image_folder import find_images
 from swimm3r.io.images import Rgb
 from swimm3r.localization.settings import StreamSettings
-from swimm3r.prepare.clip import open_clip
+from swimm3r.prepare.clip import open_camera
 from swimm3r.scene.settings import FrameSettings
 
 _POLL_S = 0.1  # between two looks into a folder
@@ -57,7 +57,7 @@ def _thinned(found: Iterator[StreamImage], fps: float) -> Iterator[StreamImage]:
 
 
 def _of_clip(source: Path, settings: StreamSettings) -> Iterator[StreamImage]:
-    clip = open_clip(source, FrameSettings(topic=settings.topic, stamps=settings.stamps))
+    clip = open_camera(source, FrameSettings(topic=settings.topic, stamps=settings.stamps))
     start = clip.start_ns if isinstance(clip, BagClip) else None
     for number, frame in enumerate(clip.frames()):
         stamp = None if start is None else start + round(frame.time * 1e9)
