@@ -96,3 +96,70 @@ def test_maps_about_the_identity_relate_frames_as_before():
         return m[-1, :, :3] @ S + m[-1, :, 3]
 
     torch.testing.assert_close(from_first_to_last(centered), from_first_to_last(maps))
+
+
+def recorded(stops: float = 0.6) -> torch.Tensor:
+    """Gains on linear light of a camera that exposes and balances anew all the time."""
+    rng = torch.Generator().manual_seed(3)
+    exposure = stops * (2 * torch.rand(FRAMES, 1, generator=rng) - 1)
+    return 0.02 * 2 ** (exposure + 0.3 * stops * torch.randn(FRAMES, 3, generator=rng))
+
+
+def as_stored(gains: torch.Tensor, slope: float = 0.45) -> torch.Tensor:
+    factors = gains**slope
+    return factors / factors.mean(0)
+
+
+def test_recorded_gains_explain_the_frames_through_the_slope_of_the_tone_curve():
+    found = fit_frame_colors(replace(dive(as_stored(recorded()), rise=1.5), gains=recorded()))
+    assert found is not None
+    e = found.evidence
+    assert e.by_record is not None
+    assert e.slope is not None
+    assert abs(e.slope - 0.45) < 0.03
+    assert e.by_record > 0.9 * e.by_frames > 0.5
+
+
+def test_small_changes_of_exposure_are_told_by_the_record_alone():
+    small = recorded(0.05)
+    with_record = fit_frame_colors(replace(dive(as_stored(small), noise=0.012), gains=small))
+    assert with_record is not None
+    assert with_record.evidence.by_record is not None
+    assert 0.05 < with_record.evidence.by_record < 0.5
+    assert with_record.evidence.slope == pytest.approx(0.45, abs=0.1)
+
+
+def test_a_record_holds_frames_that_see_little():
+    tracks = replace(dive(as_stored(recorded())), gains=recorded())
+    poor = tracks.frame == 7
+    kept = ~poor | (torch.cumsum(poor, 0) <= 2)
+    few = {name: getattr(tracks, name)[kept] for name in ("color", "ray_depth", "point", "frame", "T_D", "backscatter")}
+    S = torch.tensor([0.2, 0.4, 0.4])
+
+    def error(gains: torch.Tensor | None) -> float:
+        found = fit_frame_colors(replace(tracks, **few, gains=gains))
+        assert found is not None
+        shown = (found.maps[7, :, :3] @ S + found.maps[7, :, 3]) / S
+        return float((shown / as_stored(recorded())[7] - 1).abs().max())
+
+    assert error(recorded()) < 0.03 < error(None)
+
+
+def test_a_camera_that_held_its_settings_changes_nothing():
+    tracks = dive(jitter())
+    without = fit_frame_colors(tracks)
+    held = fit_frame_colors(replace(tracks, gains=0.02 * torch.tensor([3.6, 1.0, 1.6]).expand(FRAMES, 3)))
+    assert held is not None
+    assert without is not None
+    assert torch.equal(held.maps, without.maps)
+    assert held.evidence == without.evidence
+
+
+def test_a_record_of_something_else_explains_nothing_and_leaves_the_maps_as_they_are():
+    tracks = dive(jitter())
+    without, other = fit_frame_colors(tracks), fit_frame_colors(replace(tracks, gains=recorded()))
+    assert without is not None
+    assert other is not None
+    assert other.evidence.by_record is not None
+    assert other.evidence.by_record < 0.3 < without.evidence.by_frames
+    assert (other.maps - without.maps).abs().max() < 0.02

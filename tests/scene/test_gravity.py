@@ -8,7 +8,7 @@ import pytest
 from scipy.spatial.transform import Rotation
 from tests.scale.conftest import TURN, Survey, lines, survey_along
 
-from swimm3r.io.telemetry.gravity import up_of_images
+from swimm3r.io.telemetry.of_images import telemetry_of_images
 from swimm3r.prepare import load_frames, read_frames
 from swimm3r.scene.frames import Frames
 from swimm3r.scene.georeference import up_from_scene
@@ -61,7 +61,7 @@ def test_up_is_kept_on_disk_with_frames_and_reconstruction(survey, tmp_path):
 @pytest.mark.shared
 def test_a_gopro_holds_up_in_the_axes_of_its_images(shared: Path, tmp_path):
     reef = shared / "data" / "gopro_reef" / "reef.mp4"
-    found = up_of_images(reef, [0.5, 3.0, 6.0])
+    found = telemetry_of_images(reef, [0.5, 3.0, 6.0]).up
     assert found is not None
     np.testing.assert_allclose(np.linalg.norm(found, axis=1), 1, atol=1e-9)
     assert (found[:, 1] < -0.8).all()  # filmed ahead and some 20 degrees down
@@ -73,4 +73,6 @@ def test_a_gopro_holds_up_in_the_axes_of_its_images(shared: Path, tmp_path):
 
 @pytest.mark.shared
 def test_a_clip_whose_telemetry_was_cut_off_by_an_editor_has_no_up(shared: Path):
-    assert up_of_images(shared / "data" / "gopro_transect" / "transect.mp4", [0.5]) is None
+    found = telemetry_of_images(shared / "data" / "gopro_transect" / "transect.mp4", [0.5])
+    assert found.up is None
+    assert found.gains is None

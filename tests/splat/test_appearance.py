@@ -75,6 +75,26 @@ def test_steady_frames_need_no_colors_of_their_own(tiny_dive, tracked):
     assert decided.decision.by_frames < 0.1
 
 
+def test_a_record_of_small_changes_decides_where_the_images_alone_do_not(tiny_dive, tracked, tmp_path):
+    gains = [(2.0 ** (0.06 * (i % 5 - 2)),) * 3 for i in range(len(tiny_dive.frames))]
+    rng, listed = torch.Generator().manual_seed(0), []
+    for i, frame in enumerate(tiny_dive.frames):
+        path = tmp_path / frame.name
+        stored = tiny_dive.frames.image(i) * torch.tensor(gains[i]) ** 0.45
+        write_rgb(path, (stored + 0.03 * torch.randn(stored.shape, generator=rng)).clamp(0, 1).numpy())
+        listed.append(replace(frame, path=path, gains=gains[i]))
+    told = replace(tiny_dive.frames, frames=tuple(listed))
+    silent = replace(told, frames=tuple(replace(frame, gains=None) for frame in listed))
+    settings = AppearanceSettings(least_explained=0.9)
+    assert not decide_appearance(tracked, silent, tracked.names, settings).decision.on
+    decision = decide_appearance(tracked, told, tracked.names, settings).decision
+    assert decision.on
+    assert decision.by_record is not None
+    assert decision.by_record >= settings.least_recorded
+    assert decision.record_stops == pytest.approx((0.24,) * 3, abs=1e-6)
+    assert "that the camera recorded" in decision.reason
+
+
 def test_frames_of_changing_exposure_get_colors_that_undo_it(tiny_dive, tracked, relit):
     decided = decide_appearance(tracked, relit, tracked.names, AppearanceSettings())
     assert decided.decision.on

@@ -14,9 +14,13 @@ The maps themselves are fitted in the water that structure from motion measured,
 and free maps would share out between them what both can explain. Diagonal entries are nearly free, for that is what
 exposure and white balance are; the others, and offsets, are held closer to 0, as frames that look farther than others
 resemble frames with an offset.
+
+Where the camera recorded its gains g_f on linear light, they make a model of their own, whose one free number is the
+slope of the tone curve: M_f = diag(g_f^slope), about the identity. Maps of frames are then held to these, not to 1.
 """
 
-from dataclasses import dataclass
+from collections.abc import Callable
+from dataclasses import dataclass, replace
 
 import numpy as np
 import torch
@@ -30,6 +34,8 @@ _REDUNDANCY = 100.0  # observations that share an error: what is common to a fra
 _LEAST_SCALE = 2e-3  # pixel value, the least spread that residuals are weighed by
 _BRIGHTEST = 1.2  # clear color of a point
 _TERMS = 4  # of the water, per channel
+_HELD = 0.01  # range of the logarithms of recorded gains up to which a camera held them
+_SLOPES = 0.0, 1.5  # of a tone curve in logarithms; sRGB's is 0.42 to 1
 _DARK, _FULL = 0.02, 0.97  # pixel values beyond which nothing can be told about a color
 
 
@@ -44,6 +50,7 @@ class ColorTracks:
     frames: int
     T_D: Float[Tensor, "o 3"] | None = None  # of the measured water; None where none was
     backscatter: Float[Tensor, "o 3"] | None = None
+    gains: Float[Tensor, "f 3"] | None = None  # of linear light, by the camera's record
 
 
 @dataclass(frozen=True)
@@ -55,6 +62,8 @@ class ColorEvidence:
     water: float  # about that and the water
     frames: float  # about that and the frames' maps
     both: float
+    recorded: float | None = None  # about the water and the gains that the camera recorded; None without any
+    slope: float | None = None  # of the tone curve that they act through
 
     @property
     def by_water(self) -> float:
@@ -65,6 +74,11 @@ class ColorEvidence:
     def by_frames(self) -> float:
         """Share that the frames explain of what the water leaves."""
         return _explained(self.water, self.both)
+
+    @property
+    def by_record(self) -> float | None:
+        """Share that the recorded gains explain of what the water leaves; None without any."""
+        return None if self.recorded is None else _explained(self.water, self.recorded)
 
 
 @dataclass(frozen=True)
@@ -82,13 +96,13 @@ def fit_frame_colors(tracks: ColorTracks) -> FrameColorFit | None:
     if len(points) < 40:
         return None
     half = np.searchsorted(points, seen.point) % 2 == 0
-    spreads = np.zeros((2, 4))
-    for k, (fitted, held) in enumerate(((half, ~half), (~half, half))):
-        for m, (water, frames) in enumerate(((False, False), (True, False), (False, True), (True, True))):
-            spreads[k, m] = _spread(seen.rows(held), _fitted(seen.rows(fitted), water, frames))
-    alone, water, frames, both = np.sqrt((spreads**2).mean(0)).tolist()
-    maps = _fitted(seen, True, True).maps if seen.T_D is None else _fitted_in_water(seen)
-    return FrameColorFit(torch.from_numpy(maps).float(), ColorEvidence(len(points), alone, water, frames, both))
+    spreads = np.array([_spreads(seen.rows(half), seen.rows(~half)), _spreads(seen.rows(~half), seen.rows(half))])
+    alone, water, frames, both, recorded = np.sqrt((spreads**2).mean(0)).tolist()
+    of_record = (None, None) if seen.log_gains is None else (recorded, _recorded(seen).slope)
+    center = _recorded(seen).maps
+    maps = _fitted(seen, True, _own_maps(center)).maps if seen.T_D is None else _fitted_in_water(seen, center)
+    evidence = ColorEvidence(len(points), alone, water, frames, both, *of_record)
+    return FrameColorFit(torch.from_numpy(maps).float(), evidence)
 
 
 def identity_maps(count: int) -> Float[Tensor, "f 3 4"]:
@@ -113,16 +127,23 @@ class _Seen:
     frames: int
     T_D: np.ndarray | None
     backscatter: np.ndarray | None
+    log_gains: np.ndarray | None  # [f, 3], 0 on average; None where the camera recorded none, or held them
 
     def rows(self, which: np.ndarray) -> "_Seen":
-        of_water = (None if values is None else values[which] for values in (self.T_D, self.backscatter))
-        return _Seen(self.color[which], self.z[which], self.point[which], self.frame[which], self.frames, *of_water)
+        T_D, backscatter = (None if values is None else values[which] for values in (self.T_D, self.backscatter))
+        own = self.color[which], self.z[which], self.point[which], self.frame[which], self.frames
+        return _Seen(*own, T_D, backscatter, self.log_gains)
 
 
 @dataclass(frozen=True)
 class _Fit:
     water: np.ndarray  # [terms, 3]
     maps: np.ndarray  # [f, 3, 4]
+    slope: float = 0.0  # of the tone curve through which recorded gains act
+
+
+# the maps of all frames from observations, common colors, weights, their scale, and the maps of before
+MapFit = Callable[[_Seen, np.ndarray, np.ndarray, float, np.ndarray], np.ndarray]
 
 
 def _usable(tracks: ColorTracks) -> _Seen:
@@ -132,9 +153,18 @@ def _usable(tracks: ColorTracks) -> _Seen:
     good = (color > _DARK).all(1) & (color < _FULL).all(1) & (z > 0) & np.isfinite(z)
     count = np.bincount(point[good], minlength=int(point.max(initial=0)) + 1)
     good &= count[point] >= 3
-    of_water = (None if values is None else values.double().numpy() for values in (tracks.T_D, tracks.backscatter))
+    T_D, backscatter = (None if each is None else each.double().numpy() for each in (tracks.T_D, tracks.backscatter))
     unit = np.median(z[good]) if good.any() else 1.0
-    return _Seen(color, z / unit, point, frame, tracks.frames, *of_water).rows(good)
+    seen = _Seen(color, z / unit, point, frame, tracks.frames, T_D, backscatter, _log_gains(tracks))
+    return seen.rows(good)
+
+
+def _log_gains(tracks: ColorTracks) -> np.ndarray | None:
+    if tracks.gains is None or not tracks.frames:
+        return None
+    logs = np.log(tracks.gains.double().numpy())
+    logs = logs - logs.mean(0)
+    return logs if np.ptp(logs, axis=0).max() > _HELD else None
 
 
 class _Means:
@@ -163,12 +193,20 @@ def _basis(seen: _Seen, mean: _Means, a: np.ndarray) -> np.ndarray:
     return np.concatenate([np.repeat(phi[..., None], 3, -1), phi[..., None] * a[:, None]], 1)
 
 
-def _fitted(seen: _Seen, with_water: bool, with_frames: bool) -> _Fit:
+def _spreads(fitted: _Seen, held: _Seen) -> list[float]:
+    """Spreads of held-out points: alone, with water, with frames' maps, with both, with water and recorded gains."""
+    recorded = _recorded(fitted)
+    own = _own_maps(recorded.maps)
+    models = (_fitted(fitted, False), _fitted(fitted, True), _fitted(fitted, False, own), _fitted(fitted, True, own))
+    return [_spread(held, model) for model in (*models, recorded)]
+
+
+def _fitted(seen: _Seen, with_water: bool, map_fit: MapFit | None = None) -> _Fit:
     """Robust alternating least squares."""
     maps = np.tile(np.eye(3, 4), (seen.frames, 1, 1))
     water = np.zeros((_TERMS, 3))
     mean = _Means(seen.point)
-    for _ in range(_ROUNDS if with_water or with_frames else 0):
+    for _ in range(_ROUNDS if with_water or map_fit is not None else 0):
         S = _common(seen, maps)
         a = mean(S)
         basis = _basis(seen, mean, a)
@@ -177,22 +215,54 @@ def _fitted(seen: _Seen, with_water: bool, with_frames: bool) -> _Fit:
         of_water = np.einsum("otc,tc->oc", basis, water)
         predicted = mean(S - of_water) + of_water
         scale = mean.reweigh(seen.color - _filmed(seen, maps, predicted))
-        if with_frames:
-            maps = _frame_maps(seen, predicted, mean.weight, scale, maps)
+        if map_fit is not None:
+            maps = map_fit(seen, predicted, mean.weight, scale, maps)
     return _Fit(water, maps)
 
 
-def _fitted_in_water(seen: _Seen) -> np.ndarray:
-    """The maps [f, 3, 4] in known water."""
+def _recorded(seen: _Seen) -> _Fit:
+    """Water, and the maps of the recorded gains through a tone curve of one slope; those of no gains without any."""
+    if seen.log_gains is None:
+        return _fitted(seen, True)
+    fit = _fitted(seen, True, _record_maps)
+    logs = np.log(np.diagonal(fit.maps[..., :3], axis1=1, axis2=2))
+    slope = float((logs - logs.mean(0)).ravel() @ seen.log_gains.ravel() / (seen.log_gains**2).sum())
+    return replace(fit, slope=slope)
+
+
+def _record_maps(seen: _Seen, S: np.ndarray, weight: np.ndarray, scale: float, maps: np.ndarray) -> np.ndarray:
+    """The maps of the recorded gains, with the slope of the tone curve that fits the colors of points best."""
+    assert seen.log_gains is not None
+    mean = _Means(seen.point)
+    mean.weight = weight * (S.clip(_DARK) ** 2).mean(1)  # of logarithms
+    x, y = seen.log_gains[seen.frame], np.log(seen.color / S.clip(_DARK))
+    x, y = x - mean(x), y - mean(y)
+    slope = (mean.weight @ (x * y).sum(1)) / max(float(mean.weight @ (x * x).sum(1)), 1e-12)
+    out = np.tile(np.eye(3, 4), (seen.frames, 1, 1))
+    out[:, range(3), range(3)] = np.exp(np.clip(slope, *_SLOPES) * seen.log_gains)
+    return about_identity(torch.from_numpy(out)).numpy()
+
+
+def _own_maps(center: np.ndarray) -> MapFit:
+    """The fit of a free map per frame, held to `center` [f, 3, 4]."""
+
+    def fit(seen: _Seen, S: np.ndarray, weight: np.ndarray, scale: float, maps: np.ndarray) -> np.ndarray:
+        return _frame_maps(seen, S, weight, scale, maps, center)
+
+    return fit
+
+
+def _fitted_in_water(seen: _Seen, center: np.ndarray) -> np.ndarray:
+    """The maps [f, 3, 4] in known water, held to `center`."""
     assert seen.T_D is not None
     assert seen.backscatter is not None
-    maps, mean = np.tile(np.eye(3, 4), (seen.frames, 1, 1)), _Means(seen.point)
+    maps, mean = center, _Means(seen.point)
     for _ in range(_ROUNDS):
         direct = _common(seen, maps) - seen.backscatter
         J = (mean(seen.T_D * direct) / mean(seen.T_D**2).clip(1e-9)).clip(0.0, _BRIGHTEST)
         predicted = J * seen.T_D + seen.backscatter
         scale = mean.reweigh(seen.color - _filmed(seen, maps, predicted))
-        maps = _frame_maps(seen, predicted, mean.weight, scale, maps)
+        maps = _frame_maps(seen, predicted, mean.weight, scale, maps, center)
     return maps
 
 
@@ -222,8 +292,10 @@ def _least_squares(x: np.ndarray, y: np.ndarray, weight: np.ndarray) -> np.ndarr
     return np.linalg.solve(information + 1e-6 * len(x) * np.eye(x.shape[1]), x.T @ (weight * y))
 
 
-def _frame_maps(seen: _Seen, S: np.ndarray, weight: np.ndarray, scale: float, maps: np.ndarray) -> np.ndarray:
-    """Every frame's map from the dive's colors to its own, held to the identity where little is seen.
+def _frame_maps(
+    seen: _Seen, S: np.ndarray, weight: np.ndarray, scale: float, maps: np.ndarray, center: np.ndarray
+) -> np.ndarray:
+    """Every frame's map from the dive's colors to its own, held to `center` where little is seen.
 
     By turns with the points' colors alone, frames that share no point would take long to agree. So the points are
     moved first by what gains of all frames, found at once, would change them by.
@@ -231,7 +303,7 @@ def _frame_maps(seen: _Seen, S: np.ndarray, weight: np.ndarray, scale: float, ma
     filmed = _filmed(seen, maps, S).clip(_DARK)
     delta = np.log(seen.color / filmed)
     of_points = _point_changes(seen, delta, weight * (filmed**2).mean(1), scale)
-    return _affine_maps(seen, S * np.exp(of_points), weight, scale)
+    return _affine_maps(seen, S * np.exp(of_points), weight, scale, center)
 
 
 def _point_changes(seen: _Seen, delta: np.ndarray, weight: np.ndarray, scale: float) -> np.ndarray:
@@ -251,7 +323,7 @@ def _point_changes(seen: _Seen, delta: np.ndarray, weight: np.ndarray, scale: fl
     return changes
 
 
-def _affine_maps(seen: _Seen, S: np.ndarray, weight: np.ndarray, scale: float) -> np.ndarray:
+def _affine_maps(seen: _Seen, S: np.ndarray, weight: np.ndarray, scale: float, center: np.ndarray) -> np.ndarray:
     x = np.concatenate([S, np.ones((len(S), 1))], 1)
     information, products = np.zeros((seen.frames, 4, 4)), np.zeros((seen.frames, 4, 3))
     for i in range(4):
@@ -264,7 +336,8 @@ def _affine_maps(seen: _Seen, S: np.ndarray, weight: np.ndarray, scale: float) -
     for c in range(3):
         std = np.array([_GAIN_STD if i == c else _MIX_STD for i in range(3)] + [_OFFSET_STD])
         stay = np.diag(_REDUNDANCY * scale**2 / std**2)
-        found[:, c] = np.linalg.solve(information + stay, (products[..., c] + stay[c])[..., None])[..., 0]
+        held = center[:, c] @ stay
+        found[:, c] = np.linalg.solve(information + stay, (products[..., c] + held)[..., None])[..., 0]
     return about_identity(torch.from_numpy(found)).numpy()
 
 

@@ -10,6 +10,7 @@ from jaxtyping import UInt8, UInt16
 
 from swimm3r.io.files.safe_names import shown_name
 from swimm3r.io.images import Rgb
+from swimm3r.io.telemetry.gyroscope import Gyroscope
 from swimm3r.scene.rig import Rig
 
 STEP = "preparing frames"  # what progress calls it
@@ -42,6 +43,7 @@ class SourceImage:
     camera: str | None = None  # of a rig
     instant: int | None = None  # of a rig
     up: tuple[float, float, float] | None = None  # away from the earth, x right, y down, z forward
+    gains: tuple[float, float, float] | None = None  # of linear light, by the camera's record
 
 
 @dataclass(frozen=True)
@@ -59,6 +61,7 @@ class SelectedImages:
     calibration: Path | None = None  # a calibration file in the draft folder
     rig: Rig | None = None
     development: str | None = None  # how values were brought to sRGB's curve; None where they are as stored
+    gyroscope: Gyroscope | None = None
 
 
 def sharpness(gray: UInt8[np.ndarray, "h w"]) -> float:

@@ -16,6 +16,7 @@ from swimm3r.io.bags.bag import is_bag
 from swimm3r.io.bags.clip import BagClip, BagImage
 from swimm3r.io.files.atomic import write_text
 from swimm3r.io.images import Rgb
+from swimm3r.io.telemetry.gyroscope import gyroscope_of
 from swimm3r.io.video import Video, VideoFrame
 from swimm3r.prepare.bag_rig import BagRig, RigInstant
 from swimm3r.prepare.candidates import (
@@ -31,8 +32,8 @@ from swimm3r.prepare.candidates import (
     thinned,
 )
 from swimm3r.prepare.development import Development, developed, development_of
-from swimm3r.prepare.measured_up import with_up
 from swimm3r.prepare.rig import NONE, SIDE_BY_SIDE, STEREO, rig_of, write_lens
+from swimm3r.prepare.telemetry import with_telemetry
 from swimm3r.progress import Progress
 from swimm3r.scene.settings import FrameSettings
 
@@ -116,19 +117,26 @@ def prepare_clip(source: Path, draft: Path, settings: FrameSettings, progress: P
     warnings += _warnings(video, last, reached)
     mask_folders = [settings.masks] if settings.masks is not None else []
     kept = [image for views in thinned(instants, settings.max_frames) for image in views]
-    if isinstance(video, Video):
-        kept = with_up(kept, source)
     originals = [image.original for views in instants for image in views]
     told = str(development) if development.changes else None
     chosen = SelectedImages(kept, True, warnings, mask_folders, originals, recorded=video.recorded, development=told)
-    if not kept:
+    return _completed(chosen, video, draft, settings) if kept else chosen
+
+
+def _completed(chosen: SelectedImages, clip: Clip, draft: Path, settings: FrameSettings) -> SelectedImages:
+    """The images with all that their clip tells about them: telemetry, clock, lens and rig."""
+    if isinstance(clip, Video):
+        images = with_telemetry(chosen.images, clip.path)
+        chosen = replace(chosen, images=images, gyroscope=gyroscope_of(clip.path))
+    else:
+        chosen = _of_bag(chosen, clip, draft, settings)
+    if isinstance(clip, BagRig):
+        rig = clip.rig
+    elif settings.rig == (SIDE_BY_SIDE,):
+        rig = rig_of(STEREO, settings)
+    else:
         return chosen
-    if not isinstance(video, Video):
-        chosen = _of_bag(chosen, video, draft, settings)
-    rig = video.rig if isinstance(video, BagRig) else rig_of(STEREO, settings) if kept[0].camera is not None else None
-    if rig is None:
-        return chosen
-    lens = write_lens(draft, rig.names, kept[0].size, settings)
+    lens = write_lens(draft, rig.names, chosen.images[0].size, settings)
     return replace(chosen, rig=rig, calibration=lens or chosen.calibration)
 
 

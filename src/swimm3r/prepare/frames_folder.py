@@ -12,7 +12,7 @@ from collections.abc import Container, Iterator
 from contextlib import contextmanager, suppress
 from dataclasses import dataclass, replace
 from datetime import datetime
-from functools import lru_cache
+from functools import lru_cache, partial
 from pathlib import Path
 from typing import Any
 
@@ -33,6 +33,7 @@ from swimm3r.prepare.clip import prepare_clip
 from swimm3r.prepare.image_folder import images_of, only_video, prepare_stills
 from swimm3r.prepare.keyframes import SIDE as MOTION_SIDE
 from swimm3r.prepare.masks import check_masks, prepare_masks
+from swimm3r.prepare.rotation import rotation_motion
 from swimm3r.prepare.split import split_frames
 from swimm3r.progress import Progress, silent
 from swimm3r.scene.frames import Frame, Frames, Part, write_index
@@ -83,6 +84,11 @@ class _Entry:
     camera: str | None = None
     instant: int | None = None
     up: tuple[float, float, float] | None = None
+    gains: tuple[float, float, float] | None = None
+
+    def __post_init__(self) -> None:
+        if self.gains is not None and not min(self.gains) > 0:
+            raise ValueError(f"gains of an exposure are above 0, got {list(self.gains)} of {self.name}")
 
 
 @dataclass(frozen=True)
@@ -136,6 +142,7 @@ def load_frames(folder: Path) -> Frames:
                 camera=entry.camera,
                 instant=entry.instant,
                 up=entry.up,
+                gains=entry.gains,
             )
             for entry in document.frames
         )
@@ -212,7 +219,7 @@ def _write_frames(dive: SelectedImages, draft: Path, source: Path, settings: Fra
             "The frames are gray: their three channels are equal. The water's coefficients are those of one channel, "
             "and removing the water restores contrast, not color."
         )
-    parts = _parts(kept, draft, settings, progress, ordered=dive.ordered)
+    parts = _parts(replace(dive, images=kept), draft, settings, progress)
     listed = tuple(
         Frame(
             name=image.name,
@@ -224,6 +231,7 @@ def _write_frames(dive: SelectedImages, draft: Path, source: Path, settings: Fra
             camera=image.camera,
             instant=image.instant,
             up=image.up,
+            gains=image.gains,
         )
         for image, part in zip(kept, parts, strict=True)
     )
@@ -259,19 +267,21 @@ def _unmasked(dive: SelectedImages, covered: Container[str], warnings: list[str]
     return kept
 
 
-def _parts(
-    kept: list[SourceImage], draft: Path, settings: FrameSettings, progress: Progress, *, ordered: bool
-) -> list[Part]:
+def _parts(dive: SelectedImages, draft: Path, settings: FrameSettings, progress: Progress) -> list[Part]:
     """The part of each image; those of one instant of a rig are of one part."""
-    starts = first_of_instants([image.instant for image in kept])
+    starts = first_of_instants([image.instant for image in dive.images])
+    first = [dive.images[start] for start in starts]
 
     @lru_cache(maxsize=_HELD)
     def gray_of(i: int) -> UInt8[np.ndarray, "h w"]:
-        return small_gray(images.read_rgb(draft / kept[starts[i]].name), MOTION_SIDE)
+        return small_gray(images.read_rgb(draft / first[i].name), MOTION_SIDE)
 
-    sharpness = [kept[start].sharpness for start in starts]
-    of_instant = split_frames(gray_of, sharpness, settings, progress, ordered=ordered)
-    counts = np.diff([*starts, len(kept)])
+    rotation = None
+    if dive.gyroscope is not None:
+        rotation = partial(rotation_motion, dive.gyroscope, [image.time for image in first])
+    sharpness = [image.sharpness for image in first]
+    of_instant = split_frames(gray_of, sharpness, settings, progress, ordered=dive.ordered, rotation=rotation)
+    counts = np.diff([*starts, len(dive.images)])
     return [part for part, count in zip(of_instant, counts, strict=True) for _ in range(count)]
 
 

@@ -1,10 +1,13 @@
 """Keyframes of a long, dense clip: frames that the camera's motion sets apart, the sharpest of those that would do.
 
 Motion is the median displacement of corners tracked from the last keyframe (Lucas-Kanade), as a share of the longer
-side. So the number of keyframes follows the ground that a dive covers, not the rate of its frames.
+side. So the number of keyframes follows the ground that a dive covers, not the rate of its frames. Rotation adds no
+parallax: where it is known (`prepare.rotation`), displacement is that from where rotation alone takes a corner, and a
+camera that only turns makes a new keyframe when the view of the last one is lost.
 """
 
 from collections.abc import Callable, Sequence
+from functools import partial
 
 import numpy as np
 from jaxtyping import Bool, Float, UInt8
@@ -20,18 +23,23 @@ _CONSISTENT = 1.0  # pixels between a corner and where it returns to when tracke
 _WINDOW, _LEVELS = (15, 15), 4  # pixels of Lucas-Kanade's window, and halvings
 _FROM = 0.7  # share of the wanted motion from which a sharper frame is taken instead
 
+Gray = UInt8[np.ndarray, "h w"]
+Points = Float[np.ndarray, "n 2"]
+
 
 def choose_keyframes(
     count: int,
-    gray_of: Callable[[int], UInt8[np.ndarray, "h w"]],
+    gray_of: Callable[[int], Gray],
     sharpness: Sequence[float],
     motion: float,
     progress: Progress = silent,
+    rotated: Callable[[int, int, Points], Points] | None = None,
 ) -> list[int]:
     """Indices of the keyframes among frames 0..count-1, the first and the last among them.
 
     `gray_of` gives a small gray copy; `motion` is the share of its longer side that a camera moves the image between
-    keyframes, at most where a single step is not larger.
+    keyframes, at most where a single step is not larger. `rotated` gives places in the second of two frames of points
+    in the first, had the camera only turned.
     """
     chosen = [0]
     last = gray_of(0)
@@ -39,7 +47,7 @@ def choose_keyframes(
     i = 1
     while i < count:
         progress(_STEP, i, count)
-        moved = displacement(last, gray_of(i))
+        moved = displacement(last, gray_of(i), None if rotated is None else partial(rotated, chosen[-1], i))
         if moved is not None and moved < motion:
             if moved >= _FROM * motion:
                 candidates.append(i)
@@ -56,8 +64,27 @@ def choose_keyframes(
     return chosen
 
 
-def displacement(before: UInt8[np.ndarray, "h w"], after: UInt8[np.ndarray, "h w"]) -> float | None:
-    """Median displacement of tracked corners, as a share of the longer side; None where too few are found again."""
+def displacement(before: Gray, after: Gray, rotated: Callable[[Points], Points] | None = None) -> float | None:
+    """Median displacement of tracked corners, as a share of the longer side; None where too few are found again.
+
+    It is that from their places in the first image, or from where rotation alone takes them.
+    """
+    corners = _tracked_corners(before, after)
+    if corners is None:
+        return None
+    here, there = corners
+    expected = here if rotated is None else rotated(here)
+    return float(np.median(np.linalg.norm(there - expected, axis=1)) / max(before.shape))
+
+
+def median_flow(before: Gray, after: Gray) -> Float[np.ndarray, "2"] | None:
+    """Median displacement of tracked corners in x and y, pixels; None where too few are found again."""
+    corners = _tracked_corners(before, after)
+    return None if corners is None else np.median(corners[1] - corners[0], axis=0)
+
+
+def _tracked_corners(before: Gray, after: Gray) -> tuple[Points, Points] | None:
+    """Corners in two images; None where too few are found again."""
     import cv2
 
     corners = cv2.goodFeaturesToTrack(before, _CORNERS, 0.005, 5)
@@ -66,12 +93,10 @@ def displacement(before: UInt8[np.ndarray, "h w"], after: UInt8[np.ndarray, "h w
     there, found = tracked(before, after, corners[:, 0])
     if found.sum() < max(_FEW, _LOST * len(corners)):
         return None
-    return float(np.median(np.linalg.norm((there - corners[:, 0])[found], axis=1)) / max(before.shape))
+    return corners[found, 0], there[found]
 
 
-def tracked(
-    before: UInt8[np.ndarray, "h w"], after: UInt8[np.ndarray, "h w"], xy: Float[np.ndarray, "n 2"]
-) -> tuple[Float[np.ndarray, "n 2"], Bool[np.ndarray, " n"]]:
+def tracked(before: Gray, after: Gray, xy: Points) -> tuple[Points, Bool[np.ndarray, " n"]]:
     """Positions of points in another image, and whether each is found: tracked back, it returns to where it was."""
     import cv2
 

@@ -9,9 +9,10 @@ clear.
 from collections.abc import Callable, Sequence
 
 import numpy as np
-from jaxtyping import Float, UInt8
+from jaxtyping import Float
 
-from swimm3r.prepare.keyframes import choose_keyframes
+from swimm3r.prepare.keyframes import Gray, choose_keyframes
+from swimm3r.prepare.rotation import RotationMotion
 from swimm3r.progress import Progress
 from swimm3r.scene.frames import Part
 from swimm3r.scene.settings import FrameSettings
@@ -23,18 +24,24 @@ _DETAIL = 12.0  # pixels of the small copy: light that varies more slowly is tak
 
 
 def split_frames(
-    gray_of: Callable[[int], UInt8[np.ndarray, "h w"]],
+    gray_of: Callable[[int], Gray],
     sharpness: Sequence[float],
     settings: FrameSettings,
     progress: Progress,
     *,
     ordered: bool,
+    rotation: Callable[[Callable[[int], Gray]], RotationMotion | None] | None = None,
 ) -> list[Part]:
-    """The part of each of the frames that have these sharpnesses; `gray_of` gives a small gray copy of one."""
+    """The part of each of the frames that have these sharpnesses; `gray_of` gives a small gray copy of one.
+
+    `rotation` finds the motion of these copies by the camera's rotation, where it was measured.
+    """
     count = len(sharpness)
     keyframes = list(range(count))
     if ordered and settings.keyframe_motion and count > settings.every_frame_to:
-        keyframes = choose_keyframes(count, gray_of, sharpness, settings.keyframe_motion, progress)
+        turning = None if rotation is None else rotation(gray_of)
+        rotated = None if turning is None else turning.moved
+        keyframes = choose_keyframes(count, gray_of, sharpness, settings.keyframe_motion, progress, rotated)
     parts: list[Part] = ["between"] * count
     for k, i in enumerate(keyframes):
         if k % TEST_EVERY:
@@ -48,7 +55,7 @@ def split_frames(
     return parts
 
 
-def _holds_a_chain(gray_of: Callable[[int], UInt8[np.ndarray, "h w"]], before: int, this: int, after: int) -> bool:
+def _holds_a_chain(gray_of: Callable[[int], Gray], before: int, this: int, after: int) -> bool:
     """Return whether the frames before and after are known to overlap too little to do without the one between.
 
     Where one of the two shifts is not clear, it is taken to be like the other.
@@ -62,7 +69,7 @@ def _holds_a_chain(gray_of: Callable[[int], UInt8[np.ndarray, "h w"]], before: i
     return float(np.prod(np.clip(1 - moved, 0, 1))) < _LEAST_OVERLAP
 
 
-def shift(before: UInt8[np.ndarray, "h w"], after: UInt8[np.ndarray, "h w"]) -> Float[np.ndarray, "2"] | None:
+def shift(before: Gray, after: Gray) -> Float[np.ndarray, "2"] | None:
     """Translation between two images in pixels (x, y), None without a clear one."""
     import cv2
 
@@ -71,7 +78,7 @@ def shift(before: UInt8[np.ndarray, "h w"], after: UInt8[np.ndarray, "h w"]) -> 
     return np.array(found) if response >= _CLEAR_PEAK else None
 
 
-def _detail(gray: UInt8[np.ndarray, "h w"]) -> Float[np.ndarray, "h w"]:
+def _detail(gray: Gray) -> Float[np.ndarray, "h w"]:
     """Local contrast, evenly strong: neither a lamp's cone nor the shade at the border moves with the ground."""
     import cv2
 

@@ -48,6 +48,7 @@ class Frame:
     camera: str | None = None  # of a rig
     instant: int | None = None  # of a rig: frames of one instant were taken together
     up: tuple[float, float, float] | None = None  # away from the earth in image axes, where the camera measured it
+    gains: tuple[float, float, float] | None = None  # exposure x ISO x white balance, where the camera recorded them
 
 
 @dataclass(frozen=True)
@@ -232,6 +233,7 @@ def write_index(folder: Path, frames: Frames, source: str = "") -> None:
                 "name": frame.name,
                 **({} if frame.camera is None else {"camera": frame.camera, "instant": frame.instant}),
                 **({} if frame.up is None else {"up": [round(value, 6) for value in frame.up]}),
+                **({} if frame.gains is None else {"gains": [float(f"{value:.6g}") for value in frame.gains]}),
                 "time": frame.time,
                 "split": frame.split,
                 "sharpness": frame.sharpness,

@@ -69,6 +69,9 @@ class AppearanceDecision:
     spread: float | None = None  # of a point's color between frames, pixel values; no outliers
     spread_left: float | None = None  # after water and frames
     points: int = 0
+    by_record: float | None = None  # share of the rest that the exposures and white balances explain which are recorded
+    record_stops: tuple[float, float, float] | None = None  # range of the recorded gains of red, green, blue, in EV
+    record_slope: float | None = None  # of the tone curve: the power of the recorded gains that the images show
 
 
 @dataclass(frozen=True)
@@ -85,13 +88,15 @@ def decide_appearance(
     """Judge the colors of the frames `names` by their sparse tracks."""
     if settings.mode == "off":
         return Appearance(AppearanceDecision(False, "switched off"), None)
-    fit = fit_frame_colors(color_tracks(rec, frames, names)) if len(names) > 2 else None
+    tracks = color_tracks(rec, frames, names)
+    fit = fit_frame_colors(tracks) if len(names) > 2 else None
     if fit is None:
         colors = FrameColors(tuple(names), identity_maps(len(names))) if settings.mode == "on" else None
         return Appearance(AppearanceDecision(colors is not None, "too few points are seen by three frames"), colors)
     on, reason = _judged(fit.evidence, settings)
     e = fit.evidence
     decision = AppearanceDecision(on, reason, e.by_water, e.by_frames, e.alone, e.both, e.points)
+    decision = replace(decision, by_record=e.by_record, record_stops=_stops(tracks), record_slope=e.slope)
     log.info("colors of single frames %s: %s", "fitted" if on else "not fitted", reason)
     return Appearance(decision, FrameColors(tuple(names), fit.maps) if on else None)
 
@@ -101,10 +106,23 @@ def _judged(e: ColorEvidence, settings: AppearanceSettings) -> tuple[bool, str]:
         f"of the variation of {e.points:,} points' colors between frames the water explains {e.by_water:.0%}, and"
         f" exposure and white balance of the frames {max(0.0, e.by_frames):.0%} of the rest"
     )
+    by_record = e.by_record
+    if by_record is not None:
+        told += f"; those that the camera recorded explain {max(0.0, by_record):.0%} of it by themselves"
     if settings.mode == "on":
         return True, f"switched on; {told}"
     moved = max(0.0, e.water**2 - e.both**2) ** 0.5
-    return e.by_frames >= settings.least_explained and moved >= settings.least_change, told
+    explained = e.by_frames >= settings.least_explained or (by_record or 0.0) >= settings.least_recorded
+    return explained and moved >= settings.least_change, told
+
+
+def _stops(tracks: ColorTracks) -> tuple[float, float, float] | None:
+    """Range of the recorded gains per channel in EV; None without any."""
+    if tracks.gains is None or not len(tracks.gains):
+        return None
+    logs = tracks.gains.log2()
+    red, green, blue = (logs.amax(0) - logs.amin(0)).tolist()
+    return red, green, blue
 
 
 def color_tracks(rec: Reconstruction, frames: Frames, names: Sequence[str]) -> ColorTracks:
@@ -129,11 +147,17 @@ def color_tracks(rec: Reconstruction, frames: Frames, names: Sequence[str]) -> C
         nothing = torch.zeros(0, dtype=torch.int64)
         return ColorTracks(torch.zeros(0, 3), torch.zeros(0), nothing, nothing, 0)
     color, ray_depth, point, frame, toward = (torch.cat(part) for part in zip(*parts, strict=True))
-    tracks = ColorTracks(color, ray_depth, point, frame, len(names))
+    tracks = ColorTracks(color, ray_depth, point, frame, len(names), gains=_recorded_gains(frames, names))
     if rec.medium is None or rec.medium.encoding != "srgb":
         return tracks
     medium = rec.medium.at(ray_depth, toward)
     return replace(tracks, T_D=transmittances(ray_depth, medium)[0], backscatter=backscatter(ray_depth, medium))
+
+
+def _recorded_gains(frames: Frames, names: Sequence[str]) -> Float[Tensor, "f 3"] | None:
+    """The gains that the camera recorded; None where it did not for all of the frames."""
+    gains = [gain for name in names if (gain := frames.frames[frames.index(name)].gains) is not None]
+    return torch.tensor(gains, dtype=torch.float64) if len(gains) == len(names) else None
 
 
 def fit_to_view(

@@ -66,6 +66,9 @@ class AppearanceSettings(Settings):
     points say that frames differ in more than their distances (auto)."""
     least_explained: Share = 0.2
     """Smallest share that frames must explain of the variation that the water leaves, with `auto`."""
+    least_recorded: Share = 0.05
+    """Share of that variation from which the exposure and white balance that the camera recorded are enough, with
+    `auto`: but for one slope of the tone curve, nothing is fitted to them."""
     least_change: Share = 0.006
     """Smallest change of colors, in pixel values, that frames must explain, with `auto`."""
     refits: Annotated[int, Range(0, 100)] = 3

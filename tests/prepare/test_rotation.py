@@ -1,0 +1,121 @@
+"""Keyframes of a camera that turns: the gyroscope takes rotation out of the motion, if it is that of the images."""
+
+from collections.abc import Callable
+from functools import partial
+from pathlib import Path
+
+import cv2
+import numpy as np
+import pytest
+from scipy.spatial.transform import Rotation
+
+from swimm3r.io.telemetry.gyroscope import Gyroscope, gyroscope_of
+from swimm3r.prepare.keyframes import choose_keyframes
+from swimm3r.prepare.rotation import RotationMotion, rotation_motion
+from swimm3r.prepare.split import split_frames
+from swimm3r.progress import silent
+from swimm3r.scene.settings import FrameSettings
+
+WIDTH, HEIGHT, FOCAL = 320, 200, 260.0
+FPS, COUNT, RATE = 10.0, 120, 200.0
+HALF = COUNT // 2  # the camera only turns in the first half, and moves along, too, in the second
+DISTANCE = 2.0
+K = np.array([[FOCAL, 0, WIDTH / 2], [0, FOCAL, HEIGHT / 2], [0, 0, 1]])
+TIMES = (np.arange(COUNT) / FPS).tolist()
+
+
+@pytest.fixture(scope="module")
+def wall() -> np.ndarray:
+    """A wall at `DISTANCE`, a hundred pixels per unit."""
+    rng = np.random.default_rng(0)
+    total = np.zeros((700, 1100), np.float32)
+    for cells in (20, 60, 150, 300):
+        total += cv2.resize(rng.random((cells, 2 * cells), np.float32), (1100, 700), interpolation=cv2.INTER_CUBIC)
+    return (255 * (total - total.min()) / np.ptp(total)).astype(np.uint8)
+
+
+def attitude(t: float) -> Rotation:
+    """Rotation from the camera's axes to the world's: unsteady hands."""
+    yaw = 0.16 * np.sin(2.1 * t) + 0.03 * np.sin(9 * t)
+    return Rotation.from_euler("YXZ", [yaw, 0.05 * np.sin(3.3 * t) + 0.02 * np.sin(11 * t), 0.04 * np.sin(1.7 * t)])
+
+
+def view(wall: np.ndarray, i: int) -> np.ndarray:
+    center = np.array([0.03 * max(0, i - HALF), 0, 0])
+    R = attitude(TIMES[i]).as_matrix().T
+    onto = np.stack([R[:, 0] / 100, R[:, 1] / 100, R @ (np.array([-4.0, -3.5, DISTANCE]) - center)], 1)
+    return cv2.warpPerspective(wall, K @ onto, (WIDTH, HEIGHT))
+
+
+def gyroscope(late: float = 0.0) -> Gyroscope:
+    """Exact rates between samples; those of a sensor that is late stand later in the file."""
+    at = np.arange(-0.5, COUNT / FPS + 0.5, 1 / RATE)
+    steps = [(attitude(t).inv() * attitude(t + 1 / RATE)).as_rotvec() for t in at]
+    return Gyroscope(at + late, RATE * np.array(steps))
+
+
+@pytest.fixture(scope="module")
+def views(wall: np.ndarray) -> Callable[[int], np.ndarray]:
+    return [view(wall, i) for i in range(COUNT)].__getitem__
+
+
+def test_rates_add_up_to_the_rotation_between_two_times():
+    found = gyroscope().turn(1.2, 7.83)
+    np.testing.assert_allclose(found, (attitude(1.2).inv() * attitude(7.83)).as_matrix(), atol=2e-4)
+
+
+@pytest.mark.parametrize("late", [0.0, 0.1])
+def test_the_focal_length_and_the_delay_follow_from_the_images(views: Callable[[int], np.ndarray], late: float):
+    motion = rotation_motion(gyroscope(late), TIMES, views)
+    assert motion is not None
+    assert motion.focal == pytest.approx(FOCAL, rel=0.03)
+    assert motion.delay == pytest.approx(late, abs=0.026)
+
+
+def test_points_move_as_those_far_away_do():
+    motion = RotationMotion(gyroscope(), tuple(TIMES), FOCAL, 0.0, (WIDTH / 2, HEIGHT / 2))
+    far = attitude(TIMES[3]).apply([[0.3, -0.2, 1.0]])
+    seen = [(K @ attitude(TIMES[i]).inv().apply(far)[0]) for i in (3, 9)]
+    here, there = (xyz[:2] / xyz[2] for xyz in seen)
+    np.testing.assert_allclose(motion.moved(3, 9, here[None])[0], there, atol=0.2)
+
+
+def test_a_camera_that_only_turns_needs_few_keyframes_and_one_that_moves_as_many_as_before(
+    views: Callable[[int], np.ndarray],
+):
+    motion = rotation_motion(gyroscope(), TIMES, views)
+    assert motion is not None
+    sharp = [1.0] * COUNT
+    plain = choose_keyframes(COUNT, views, sharp, 0.04)
+    chosen = choose_keyframes(COUNT, views, sharp, 0.04, rotated=motion.moved)
+    assert sum(i < HALF for i in plain) > 25
+    assert sum(i < HALF for i in chosen) <= 8
+    steps = np.diff([i for i in chosen if i >= HALF])
+    travel = 0.04 * WIDTH / FOCAL * DISTANCE / 0.03  # frames in which parallax makes up the wanted motion
+    assert steps.max() <= travel + 1
+    assert np.median(steps) >= 0.6 * travel
+
+
+def test_a_gyroscope_of_something_else_is_not_used(views: Callable[[int], np.ndarray]):
+    rng = np.random.default_rng(0)
+    true = gyroscope()
+    other = Gyroscope(true.time, np.roll(true.rate, len(true.time) // 3, axis=0)[:, [2, 0, 1]])
+    noise = Gyroscope(true.time, rng.normal(size=true.rate.shape))
+    assert rotation_motion(other, TIMES, views) is None
+    assert rotation_motion(noise, TIMES, views) is None
+
+
+def test_keyframes_of_a_dive_are_chosen_by_the_gyroscope(views: Callable[[int], np.ndarray]):
+    settings = FrameSettings(every_frame_to=20)
+    turned = partial(rotation_motion, gyroscope(), TIMES)
+    parts = split_frames(views, [1.0] * COUNT, settings, silent, ordered=True, rotation=turned)
+    plain = split_frames(views, [1.0] * COUNT, settings, silent, ordered=True)
+    assert parts[:HALF].count("between") > 50 > plain[:HALF].count("between")
+
+
+@pytest.mark.shared
+def test_the_gyroscope_of_a_gopro_is_that_of_its_images(shared: Path):
+    found = gyroscope_of(shared / "data" / "gopro_reef" / "reef.mp4")
+    assert found is not None
+    assert len(found.time) == 1397
+    assert gyroscope_of(shared / "data" / "gopro_transect" / "transect.mp4") is None
