@@ -18,6 +18,7 @@ from swimm3r.report import frames as shown_frames
 from swimm3r.report import head, outputs, scale, scores, verdict, water
 from swimm3r.report.maps import map_section
 from swimm3r.report.plan_view import path_overlay, plan_view
+from swimm3r.report.rig import rig_section
 from swimm3r.report.scene import pack_scene, shown_points
 from swimm3r.report.style import style_sheet
 from swimm3r.scene.frames import Frames
@@ -50,7 +51,7 @@ def write(folder: Path) -> Path:
         autoescape=True, undefined=jinja2.StrictUndefined, trim_blocks=True, lstrip_blocks=True
     )
     try:
-        fields |= _of_summary(summary, folder)
+        fields |= _of_summary(summary, folder) | {"rig": rig_section(summary, frames)}
         page = template.from_string(_part("page.html.j2")).render(fields)
     except (jinja2.UndefinedError, TypeError, ValueError, KeyError, AttributeError) as error:
         raise damaged(folder / "summary.json", first_line(error), remedy) from error

@@ -60,6 +60,8 @@ class PlacedCamera:
     baseline: float  # distance from the first camera, in the unit of the reconstruction; 0 of the first
     baseline_std: float  # relative
     known_baseline: float | None = None  # calibrated, metres
+    delay: float | None = None  # by which its images are later than the first's, by the path before; None where untold
+    delay_std: float | None = None  # in the unit of the frames' times, as the delay
 
 
 @dataclass(frozen=True)

@@ -73,7 +73,7 @@ def as_rig(
     log.info("rig: %s", said(fit))
     if rigid:
         return replace(_record(rec, model), rig=fit, warnings=(*rec.warnings, *_miscalibrated(rig, fit)))
-    return replace(rec, rig=fit, warnings=(*rec.warnings, _not_rigid(rec, rows, fit)))
+    return replace(rec, rig=fit, warnings=(*rec.warnings, _not_rigid(rows, fit)))
 
 
 def said(fit: RigFit) -> str:
@@ -182,20 +182,20 @@ def _placed(
         lengths = torch.linalg.vector_norm(single[:, :3, 3], dim=1).numpy()
         std = relative_scatter(lengths) if k else 0.0
         baseline = float(np.linalg.norm(pose[:3, 3]))
-        out.append(PlacedCamera(camera.name, pose_of(pose), len(single), baseline, std, camera.baseline if k else None))
+        placed = PlacedCamera(camera.name, pose_of(pose), len(single), baseline, std, camera.baseline if k else None)
+        delay = delay_of(rec.cameras.cam2world, rows, k) if k else None
+        out.append(placed if delay is None else replace(placed, delay=delay.seconds, delay_std=delay.std))
     return tuple(out)
 
 
-def _not_rigid(rec: Reconstruction, rows: RigRows, fit: RigFit) -> QualityWarning:
-    late = []
-    for k, camera in enumerate(fit.cameras[1:], 1):
-        delay = delay_of(rec.cameras.cam2world, rows, k)
-        if delay is not None and abs(delay.seconds) > 3 * delay.std:
-            step = float(np.median(np.diff(rows.time)))
-            late.append(
-                f"{camera.name} seems to be later by {delay.seconds / step:.2f} \u00b1 {delay.std / step:.2f} of the"
-                " time between two images"
-            )
+def _not_rigid(rows: RigRows, fit: RigFit) -> QualityWarning:
+    step = float(np.median(np.diff(rows.time)))
+    late = [
+        f"{camera.name} seems to be later by {camera.delay / step:.2f} \u00b1 {camera.delay_std / step:.2f} of the time"
+        " between two images"
+        for camera in fit.cameras
+        if camera.delay is not None and camera.delay_std is not None and abs(camera.delay) > 3 * camera.delay_std
+    ]
     why = f": {', '.join(late)}" if late else ""
     return QualityWarning(
         f"The cameras of the rig were not at one place of it at each instant{why}. Reprojection errors are"
