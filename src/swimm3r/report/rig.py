@@ -65,7 +65,7 @@ def _row(camera: dict[str, Any], metric: bool) -> RigRow:
 
 
 def _together(camera: dict[str, Any], first: str, frames: Frames) -> str:
-    """How well the images of a camera were taken together with those of the first, by their times and by the path."""
+    """Times by which the images of a camera are later than those of the first, by their stamps and by the path."""
     name, delay, std = camera["name"], camera["delay"], camera["delay_std"]
     times = {side: {one.instant: one.time for one in frames if one.camera == side} for side in (first, name)}
     gaps = [1000 * (time - times[first][i]) for i, time in times[name].items() if i in times[first]]
