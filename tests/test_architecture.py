@@ -39,7 +39,7 @@ ROWS = {  # by package: a room or module imports only rooms of rows before its o
         {"features", "lens", "plane_sweep"},
         {"alignment", "student", "colmap"},
         {"mast3r_sfm"},
-        {"medium", "between"},
+        {"medium", "moving", "between"},
         {"backends", "distillation"},
     ],
     "swimm3r.splat": [

@@ -78,7 +78,7 @@ def localize_run(
     scene = load_map(folder / "splat" / "map.safetensors").to(devices.for_maps(map_device))
     frames = load_frames(folder / "prepare")
     rec = load_reconstruction(folder / "sfm", frames)
-    localizer = Localizer(scene, rec, frames, settings, progress=progress)
+    localizer = Localizer(scene, rec, rec.still(frames), settings, progress=progress)
     out = out or folder / "localization"
     answers = []
     names = [path.name for path in image_files] or list(frames.test.names)

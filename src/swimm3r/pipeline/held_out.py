@@ -32,11 +32,12 @@ from swimm3r.progress import Progress, silent
 from swimm3r.scene.frames import Frames
 from swimm3r.scene.ground_truth import GroundTruth
 from swimm3r.scene.reconstruction import Reconstruction
+from swimm3r.sfm.moving.find import still_scene
 from swimm3r.sfm.settings import FeatureSettings, RestoreSettings
 from swimm3r.splat.pose_refinement import refine_pose
 from swimm3r.splat.rendering import SplatMap
 from swimm3r.splat.settings import PoseRefinementSettings
-from swimm3r.splat.training_poses import axes_of_map
+from swimm3r.splat.training_poses import as_mapped, axes_of_map
 
 Source = Literal["reference", "2D-3D matches", "neighbors"]
 _GAP = 0.03  # of the image's width: gaps in the cloud up to this size are closed where coverage is asked
@@ -64,6 +65,7 @@ class HeldOutView:
     scores: ViewScores
     covered: "CoveredScores"
     observed: "ObservedScores"
+    still: "StillScores"
 
 
 @dataclass(frozen=True)
@@ -92,6 +94,18 @@ class CoveredScores:
 
 
 @dataclass(frozen=True)
+class StillScores:
+    """The scores where nothing moves, by the surfaces that training frames measured (`sfm.moving`)."""
+
+    share: float | NotComputed  # of the pixels
+    psnr: float | NotComputed  # dB
+
+    def summary(self) -> dict[str, object]:
+        """The scores by the names of summary.json."""
+        return {"still": self.share, "psnr_still": self.psnr}
+
+
+@dataclass(frozen=True)
 class ObservedScores:
     """The scores on what some training frame saw by the map's own depth, measured or guessed."""
 
@@ -112,7 +126,7 @@ def first_poses(
 ) -> dict[str, FirstPose]:
     """A pose of every test frame in the axes and unit of the reconstruction."""
     known = {} if reference is None else reference_poses(rec, reference)
-    landmarks = landmarks_of(rec, frames, features)
+    landmarks = landmarks_of(rec, rec.still(frames), features)
     poses = {}
     for done, frame in enumerate(frames.test):
         progress("placing test frames", done, len(frames.test))
@@ -167,6 +181,7 @@ def score_views(
     """
     perceptual = published_lpips()
     views, stems = [], view_stems(frames.names)
+    surfaces = None if rec.moving is None else still_scene(as_mapped(rec, scene.poses), frames)
     style = display_style(scene, rec, restore)
     for done, (name, first) in enumerate(poses.items()):
         progress("scoring test frames", done, len(poses))
@@ -188,7 +203,12 @@ def score_views(
         scores = view_scores(shown, target, perceptual, seen)
         covered = covered_scores(shown, target, seen, known)
         observed = observed_scores(shown, target, seen, out.observed)
-        views.append(HeldOutView(name, time, lens, canvas, window, first.source, scores, covered, observed))
+        quiet = None
+        if surfaces is not None:
+            unmoved = frames.mask(f) & ~surfaces.moving_in(lens, frames.image(f))
+            quiet = undistorted(frames.image(f), unmoved, lens, canvas)[1][window.rows, window.columns]
+        still = still_scores(shown, target, seen, quiet)
+        views.append(HeldOutView(name, time, lens, canvas, window, first.source, scores, covered, observed, still))
     progress("scoring test frames", len(poses), len(poses))
     return views
 
@@ -268,7 +288,23 @@ def observed_scores(
     return ObservedScores(share, psnr(as_8_bit(render)[counted], as_8_bit(target)[counted]))
 
 
-Part = TypeVar("Part", CoveredScores, ObservedScores)
+def still_scores(
+    render: Float[Tensor, "h w 3"],
+    target: Float[Tensor, "h w 3"],
+    seen: Bool[Tensor, "h w"],
+    quiet: Bool[Tensor, "h w"] | None,
+) -> StillScores:
+    """Share and PSNR of the pixels without moving objects; both images as their 8-bit files show them."""
+    if quiet is None:
+        unknown = NotComputed("moving objects were not looked for (--moving none)")
+        return StillScores(unknown, unknown)
+    share = float(quiet.sum() / seen.sum())
+    if not bool(quiet.any()):
+        return StillScores(share, NotComputed("moving objects cover the test frames wholly"))
+    return StillScores(share, psnr(as_8_bit(render)[quiet], as_8_bit(target)[quiet]))
+
+
+Part = TypeVar("Part", CoveredScores, ObservedScores, StillScores)
 
 
 def mean_part(parts: Sequence[Part]) -> Part:

@@ -37,7 +37,7 @@ _ASKED = 16  # training views that the map's mean water is taken over
 def sfm_sections(
     rec: Reconstruction, frames: Frames, matches: Matches | None = None, placed_between: int = 0
 ) -> dict[str, object]:
-    """ "sfm", "rig", "medium" and "warnings": what structure from motion found.
+    """ "sfm", "rig", "moving", "medium" and "warnings": what structure from motion found.
 
     Epipolar scores are of `matches`, by default those that the reconstruction keeps. `placed_between` is the number of
     frames between keyframes that have a pose.
@@ -63,6 +63,10 @@ def sfm_sections(
     sections: dict[str, object] = {"sfm": summary_entries(sfm)}
     if rec.rig is not None:
         sections["rig"] = asdict(rec.rig)
+    if rec.moving is not None:
+        shares = [share for _, share in rec.moving.shares(frames)]
+        covered = {"share": sum(shares) / len(rec.names), "largest_share": max(shares, default=0.0)}
+        sections["moving"] = {"frames": len(shares), **covered}
     if rec.medium is not None:
         sections["medium"] = {"sfm": _medium_section(rec.medium, rec.metric)}
         if rec.medium_linear is not None:
@@ -117,6 +121,7 @@ def test_section(views: Sequence[HeldOutView], settings: PoseRefinementSettings,
         **vars(mean_scores(views)),
         **mean_part([view.observed for view in views]).summary(),
         **mean_part([view.covered for view in views]).summary(),
+        **mean_part([view.still for view in views]).summary(),
         "protocol": protocol(views, settings, recolored),
     }
     return summary_entries(means) | {"frames": [frame_entry(view) for view in views]}
@@ -125,7 +130,9 @@ def test_section(views: Sequence[HeldOutView], settings: PoseRefinementSettings,
 def frame_entry(view: HeldOutView) -> dict[str, object]:
     """The scores of one test frame."""
     of_frame = {name: getattr(view.scores, name) for name in ("psnr", "ssim", "lpips", "blur4_psnr", "sharpness")}
-    return {"name": view.name} | summary_entries({**of_frame, **view.observed.summary(), **view.covered.summary()})
+    return {"name": view.name} | summary_entries(
+        {**of_frame, **view.observed.summary(), **view.covered.summary(), **view.still.summary()}
+    )
 
 
 def mean_medium(scene: SplatMap, rec: Reconstruction, frames: Frames) -> Medium:

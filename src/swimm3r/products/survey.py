@@ -153,7 +153,7 @@ def open_survey(folder: Path) -> Survey:
     open_run(folder, "sfm")
     frames = load_frames(folder / "prepare")
     rec = load_reconstruction(folder / "sfm", frames)
-    return Survey(folder, rec, frames, load_georeference(folder) or local_georeference(rec))
+    return Survey(folder, rec, rec.still(frames), load_georeference(folder) or local_georeference(rec))
 
 
 def _resized_mask(usable: Bool[np.ndarray, "h w"], width: int, height: int) -> Bool[np.ndarray, "*n"]:

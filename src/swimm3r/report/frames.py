@@ -14,6 +14,8 @@ from swimm3r.scene.reconstruction import Reconstruction
 
 _SHOWN_FRAMES = 8
 _SHOWN_TESTS = 4
+_SHOWN_MOVING = 6
+_MOVING = np.array([255.0, 40.0, 40.0])  # color of moving objects
 _LONG_SIDE = 720  # pixels
 _QUALITY = 82
 _STEPS = 17  # colors of the bar
@@ -78,6 +80,21 @@ def dive_frames(
             colors = depth_image(rec.depth[name].z_depth.numpy(), *near_far)
             views.append(View("depth", _uri(colors), f"depth of {name} in colors"))
         found.append(ShownFrame(caption(frames, name), tuple(views)))
+    return found
+
+
+def moving_objects(rec: Reconstruction, frames: Frames) -> list[ShownFrame]:
+    """A few of the frames with moving objects, evenly spread over the dive, and these in color."""
+    if rec.moving is None:
+        return []
+    shares = dict(rec.moving.shares(frames))
+    masked, found = rec.moving.on(frames), []
+    for name in _spread(tuple(shares), _SHOWN_MOVING):
+        f = frames.index(name)
+        image, moving = filmed(frames, name), (frames.mask(f) & ~masked.mask(f)).numpy()
+        image[moving] = (0.5 * image[moving] + 0.5 * _MOVING).round().astype(np.uint8)
+        view = View("raw", _uri(image), f"moving objects in {name}")
+        found.append(ShownFrame(f"{caption(frames, name)}: {shares[name]:.1%}", (view,)))
     return found
 
 

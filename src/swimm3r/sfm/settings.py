@@ -109,6 +109,7 @@ class RestoreSettings(Settings):
 
 
 LightChoice = Literal["auto", "sun", "lamp"]
+MovingChoice = Literal["auto", "none"]
 
 
 @dataclass(frozen=True)
@@ -313,6 +314,8 @@ class ColmapSettings(LensSettings):
     features: FeatureSettings = field(default_factory=FeatureSettings)
     mapping: MappingSettings = field(default_factory=MappingSettings)
     depth: PlaneSweepSettings = field(default_factory=PlaneSweepSettings)
+    moving: MovingChoice = "auto"
+    """Masks of moving objects: found where they hide surfaces that other frames measured (auto), or none."""
     light: LightChoice = "sun"
     """Light of the dive: the sun, a lamp on the camera, or the one of them that the frames tell (auto)."""
     water: SeathruSettings = field(default_factory=SeathruSettings)
@@ -373,6 +376,8 @@ class Mast3rSettings(LensSettings):
     alignment: AlignmentSettings = field(default_factory=lambda: AlignmentSettings(intrinsics="shared"))
     features: FeatureSettings = field(default_factory=FeatureSettings)
     """By which held-out frames find their place beside a finished reconstruction."""
+    moving: MovingChoice = "auto"
+    """Masks of moving objects: found where they hide surfaces that other frames measured (auto), or none."""
     light: LightChoice = "sun"
     """Light of the dive: the sun, a lamp on the camera, or the one of them that the frames tell (auto)."""
     water: SeathruSettings = field(default_factory=SeathruSettings)
@@ -393,6 +398,8 @@ class ColmapModelSettings(Settings):
     (`swimm3r.io.imports.read.read_foreign`)."""
     features: FeatureSettings = field(default_factory=FeatureSettings)
     depth: PlaneSweepSettings = field(default_factory=PlaneSweepSettings)
+    moving: MovingChoice = "auto"
+    """Masks of moving objects: found where they hide surfaces that other frames measured (auto), or none."""
     light: LightChoice = "sun"
     """Light of the dive: the sun, a lamp on the camera, or the one of them that the frames tell (auto)."""
     water: SeathruSettings = field(default_factory=SeathruSettings)

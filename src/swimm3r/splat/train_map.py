@@ -51,6 +51,8 @@ def train(
     All are in the scene's own unit; cameras.json and trajectory.tum are not written where poses are held. A static map
     of more ground than one block holds is trained in several, in blocks/ (`splat.blocks`).
     """
+    if settings.recipe != "uwbs-dynamic":  # a dynamic map is trained on what moves
+        frames = rec.still(frames)
     scale = working_scale(rec, settings)
     _check_near(settings, scale * median_z_depth(rec))
     if plan := _plan(rec, settings):

@@ -30,7 +30,7 @@ def landmarks_of_run(folder: Path, settings: FeatureSettings, progress: Progress
     key = cache_key(settings, code_version(), *made_from)
     found = _read(path, key, rec) if path.is_file() else None
     if found is None:
-        found = landmark_map(rec, frames, settings, progress)
+        found = landmark_map(rec, rec.still(frames), settings, progress)
         with atomic_path(path) as draft:
             arrays = {name: getattr(found, name).numpy() for name in _ARRAYS}
             np.savez(draft, key=np.array(key), distance=np.array(found.distance), **arrays)

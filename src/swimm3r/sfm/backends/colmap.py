@@ -1,20 +1,28 @@
-"""Structure from motion without weights: COLMAP poses -> plane-sweep depth -> Sea-Thru water -> restored cloud."""
+"""Structure from motion without weights: COLMAP poses -> plane-sweep depth -> Sea-Thru water -> restored cloud.
+
+Moving objects, which depth makes known, are masked before the water. Where they hold a notable share of the
+observations, poses and depth are found anew without them.
+"""
 
 from pathlib import Path
 
 from swimm3r.progress import Progress, silent
-from swimm3r.scene.frames import Frames
+from swimm3r.scene.frames import MASKS, Frames
 from swimm3r.scene.gravity import with_measured_up
 from swimm3r.scene.placement import Navigator
 from swimm3r.scene.reconstruction import Reconstruction
 from swimm3r.scene.reconstruction_io import load_reconstruction
 from swimm3r.sfm.colmap import poses
+from swimm3r.sfm.colmap.adjustment import bundle_adjust
 from swimm3r.sfm.colmap.rig import as_rig
 from swimm3r.sfm.lens import check_calibration
 from swimm3r.sfm.medium.apply import with_water
+from swimm3r.sfm.moving.find import mask_depth, with_moving, without_moving_observations
 from swimm3r.sfm.plane_sweep.estimate import estimate_depth
 from swimm3r.sfm.settings import ColmapSettings
 from swimm3r.tasks.settings import EngineSettings
+
+_NOTABLE = 0.02  # share of the observations on moving objects from which they pull on the poses
 
 
 def check_files(settings: ColmapSettings) -> None:
@@ -37,6 +45,30 @@ def reconstruct(
         with_measured_up(rec, frames).save(folder, frames)
     rec = load_reconstruction(folder, frames)  # also where it was just made: the same bits as after an interruption
     estimate_depth(rec, frames, settings.depth, progress, engine)
-    rec = with_water(rec, frames, settings, folder, progress)
+    if settings.moving == "auto":
+        rec = with_moving(rec, frames, folder / MASKS, progress)
+        if rec.rig is None and navigator is None and settings.housing == "none":  # which hold poses in their own ways
+            rec = _of_still_scene(rec, frames, settings, folder, progress, engine)
+    rec = with_water(rec, rec.still(frames), settings, folder, progress)
     rec.save(folder, frames)
     return rec
+
+
+def _of_still_scene(
+    rec: Reconstruction,
+    frames: Frames,
+    settings: ColmapSettings,
+    folder: Path,
+    progress: Progress,
+    engine: EngineSettings,
+) -> Reconstruction:
+    """The reconstruction adjusted and with new depth without moving objects, if these have a share in its poses."""
+    still = without_moving_observations(rec, frames)
+    dropped = len(rec.tracks.point) - len(still.tracks.point)
+    if dropped <= _NOTABLE * len(rec.tracks.point):
+        return rec
+    still = bundle_adjust(still)
+    still.save(folder, frames)  # tasks and interrupted runs go on from there
+    estimate_depth(still, frames, settings.depth, progress, engine)
+    mask_depth(still, frames)
+    return still

@@ -20,13 +20,14 @@ from swimm3r.io.colmap.model import ColmapModel
 from swimm3r.io.imports.read import read_foreign
 from swimm3r.io.imports.record import ForeignModel
 from swimm3r.progress import Progress, silent
-from swimm3r.scene.frames import Frames
+from swimm3r.scene.frames import MASKS, Frames
 from swimm3r.scene.gravity import with_measured_up
 from swimm3r.scene.placement import Navigator
 from swimm3r.scene.reconstruction import DepthMap, DepthMaps, Matches, Points, QualityWarning, Reconstruction, Tracks
 from swimm3r.sfm.colmap.triangulation import triangulate
 from swimm3r.sfm.imported.match_frames import at_frame_size, named_frames
 from swimm3r.sfm.medium.apply import with_water
+from swimm3r.sfm.moving.find import with_moving
 from swimm3r.sfm.plane_sweep.estimate import estimate_depth
 from swimm3r.sfm.plane_sweep.views import on_frame_grid
 from swimm3r.sfm.settings import ColmapModelSettings
@@ -57,7 +58,9 @@ def reconstruct(
         estimate_depth(rec, frames, settings.depth, progress, engine)
     else:
         write_depth(rec, frames, foreign, progress)
-    rec = with_water(rec, frames, settings, folder, progress)
+    if settings.moving == "auto":
+        rec = with_moving(rec, frames, folder / MASKS, progress)
+    rec = with_water(rec, rec.still(frames), settings, folder, progress)
     rec.save(folder, frames)
     return rec
 

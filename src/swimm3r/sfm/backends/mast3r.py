@@ -18,7 +18,7 @@ from swimm3r.cameras import Cameras, project_visible
 from swimm3r.errors import RegistrationError
 from swimm3r.imaging.filters import LUMA
 from swimm3r.progress import Progress, silent
-from swimm3r.scene.frames import Frames
+from swimm3r.scene.frames import MASKS, Frames
 from swimm3r.scene.gravity import with_measured_up
 from swimm3r.scene.placement import Navigator
 from swimm3r.scene.reconstruction import DepthMap, DepthMaps, Matches, QualityWarning, Reconstruction
@@ -38,6 +38,7 @@ from swimm3r.sfm.mast3r_sfm.pair_store import PairRecord
 from swimm3r.sfm.mast3r_sfm.run_pairs import PairResults, apply_adapter, load_network, run_pairs
 from swimm3r.sfm.medium import from_head
 from swimm3r.sfm.medium.apply import with_water
+from swimm3r.sfm.moving.find import with_moving
 from swimm3r.sfm.plane_sweep.views import on_frame_grid
 from swimm3r.sfm.settings import Mast3rSettings
 from swimm3r.sfm.student import adapter_file
@@ -89,12 +90,15 @@ def reconstruct(
         rec = _place(said, images, settings, folder, progress, read_water)
         with_measured_up(rec, frames).save(folder, frames)
     rec = load_reconstruction(folder, frames)  # also where it was just made: the same bits as after an interruption
+    if settings.moving == "auto":
+        rec = with_moving(rec, frames, folder / MASKS, progress)
+    still = rec.still(frames)
     if settings.adapter is None:
-        rec = with_water(rec, frames, settings, folder, progress)
+        rec = with_water(rec, still, settings, folder, progress)
     else:
         facts = adapter_file.head_facts(settings.adapter)
         predicted = from_head.read(folder / _WATER, network_images(frames, settings), facts)
-        rec = with_water(rec, frames, settings, folder, progress, predicted)
+        rec = with_water(rec, still, settings, folder, progress, predicted)
     rec.save(folder, frames)
     if settings.cache is None:
         shutil.rmtree(cache, ignore_errors=True)

@@ -1,0 +1,223 @@
+"""Masks of moving objects from a reconstruction with depth: in the training frames, and in any other posed image.
+
+Frames are compared at 320 pixels, each with up to 16 others that see the same surfaces, spread over the time in which
+they do: an object that moves with the camera stands before the same ground in neighboring frames.
+"""
+
+from collections.abc import Sequence
+from concurrent.futures import ThreadPoolExecutor
+from dataclasses import dataclass, replace
+from functools import cached_property
+from pathlib import Path
+
+import numpy as np
+import torch
+from jaxtyping import Bool, Float, Int
+from torch import Tensor
+
+from swimm3r.cameras import Cameras, pixel_grid, project_visible, resized, unproject
+from swimm3r.imaging.filters import blur
+from swimm3r.io import images
+from swimm3r.io.files.atomic import atomic_folder
+from swimm3r.progress import Progress, silent
+from swimm3r.scene.frames import Frames
+from swimm3r.scene.moving_masks import MovingMasks
+from swimm3r.scene.reconstruction import DepthMap, QualityWarning, Reconstruction, Tracks
+from swimm3r.sfm.moving.occluders import Layer, SmallView, moving_pixels
+from swimm3r.tasks.threads import thread_count
+
+_LONG_SIDE = 320  # of the images that are compared, pixels
+_BLUR = 1.0  # pixel, of these images: noise and compression
+_OTHERS = 16  # frames that a frame is compared with
+_NOTABLE = 0.01  # of the pixels of all frames, from which a user should look at the masks
+_SHARED = 0.05  # of a frame's surface that another one must show to be compared with it
+_SAMPLES = 200  # points of a frame's surface that decide this
+_CORNERS = ((0, 0), (0, 1), (1, 0), (1, 1))  # pixels around a point, which together leave no cracks
+
+
+@dataclass(frozen=True)
+class _Surface:
+    """The points that one frame measured, with their colors there."""
+
+    xyz: Float[Tensor, "n 3"]  # world
+    rgb: Float[np.ndarray, "n 3"]
+
+
+@dataclass(frozen=True)
+class StillScene:
+    """The frames of a reconstruction with the surfaces that they measured."""
+
+    rec: Reconstruction
+    cameras: Cameras  # of the small images
+    views: tuple[SmallView, ...]
+
+    @cached_property
+    def _surfaces(self) -> tuple[_Surface, ...]:
+        return tuple(_surface(self.cameras[i], view) for i, view in enumerate(self.views))
+
+    @cached_property
+    def _samples(self) -> tuple[Float[Tensor, "n 3"], Int[Tensor, " n"]]:
+        """A few points of each frame's surface, and the frames they are of."""
+        few = [surface.xyz[:: max(1, len(surface.xyz) // _SAMPLES)] for surface in self._surfaces]
+        of = torch.repeat_interleave(torch.arange(len(few)), torch.tensor([len(points) for points in few]))
+        return torch.cat(few), of
+
+    def moving_in_frame(self, i: int) -> Bool[np.ndarray, "h w"]:
+        """The pixels of the small image of frame `i` that show moving objects."""
+        camera = self.cameras[i]
+        return moving_pixels(self.views[i], self._layers(camera, [j for j in self._overlapping(camera) if j != i]))
+
+    def moving_in(self, lens: Cameras, image: Float[Tensor, "h w 3"]) -> Bool[Tensor, "h w"]:
+        """The pixels of another image of the scene, of known pose, that show moving objects.
+
+        Its depth is the nearest that the frames measured on each pixel's ray.
+        """
+        camera = resized(lens, self.cameras.width, self.cameras.height)
+        layers = self._layers(camera, self._overlapping(camera))
+        nearest = np.full(camera.height * camera.width, np.inf, np.float32)
+        for layer in layers:
+            nearest[layer.pixel] = np.minimum(nearest[layer.pixel], layer.z_depth)
+        z_depth = np.where(np.isfinite(nearest), nearest, 0).reshape(camera.height, camera.width)
+        view = SmallView(_small(image, camera), z_depth, np.ones_like(z_depth, dtype=bool))
+        return _enlarged(moving_pixels(view, layers), lens.height, lens.width)
+
+    def _overlapping(self, camera: Cameras) -> list[int]:
+        """The frames whose surfaces a camera sees."""
+        points, of = self._samples
+        visible = project_visible(camera, points[None])[2][0]
+        seen, total = (torch.bincount(rows, minlength=len(self.views)) for rows in (of[visible], of))
+        return ((total > 0) & (seen >= _SHARED * total)).nonzero()[:, 0].tolist()
+
+    def _layers(self, camera: Cameras, others: Sequence[int]) -> list[Layer]:
+        return [_layer(camera, self._surfaces[j]) for j in _spread(others)]
+
+
+def still_scene(rec: Reconstruction, frames: Frames, progress: Progress = silent) -> StillScene:
+    """The registered frames with their depth, at a small size."""
+    scale = min(1.0, _LONG_SIDE / max(frames.width, frames.height))
+    width, height = max(8, round(scale * frames.width)), max(8, round(scale * frames.height))
+    cameras, views = resized(rec.cameras, width, height), []
+    rows, columns = (
+        ((np.arange(small) + 0.5) * full / small).astype(int)
+        for small, full in ((height, frames.height), (width, frames.width))
+    )
+    for i, name in enumerate(rec.names):
+        progress("reading frames", i, len(rec.names))
+        f = frames.index(name)
+        z_depth = rec.depth[name].z_depth.numpy()[np.ix_(rows, columns)]
+        usable = frames.mask(f).numpy()[np.ix_(rows, columns)]
+        views.append(SmallView(_small(frames.image(f), cameras[i]), z_depth, usable))
+    progress("reading frames", len(rec.names), len(rec.names))
+    return StillScene(rec, cameras, tuple(views))
+
+
+def with_moving(rec: Reconstruction, frames: Frames, folder: Path, progress: Progress = silent) -> Reconstruction:
+    """The reconstruction with the masks of `find_moving`, and a warning where objects cover much of the frames.
+
+    Depth on the objects is removed from the maps on disk.
+    """
+    masks = find_moving(rec, frames, folder, progress)
+    covered = sum(share for _, share in masks.shares(frames)) / len(rec.names)
+    rec = replace(rec, moving=masks)
+    mask_depth(rec, frames)
+    if covered < _NOTABLE:
+        return rec
+    warning = QualityWarning(
+        f"Moving objects cover {covered:.1%} of the frames; they are left out of depth, water and static maps.",
+        f"Check the masks in sfm/{folder.name}. A map that shows the objects: --recipe uwbs-dynamic.",
+    )
+    return rec if warning in rec.warnings else replace(rec, warnings=(*rec.warnings, warning))
+
+
+def find_moving(rec: Reconstruction, frames: Frames, folder: Path, progress: Progress = silent) -> MovingMasks:
+    """Masks of moving objects in the registered frames, in a new folder; those of an earlier call are kept."""
+    if folder.is_dir():
+        return MovingMasks(folder)
+    scene = still_scene(rec, frames, progress)
+    with atomic_folder(folder) as draft, ThreadPoolExecutor(thread_count()) as pool:
+        found = pool.map(scene.moving_in_frame, range(len(rec.names)))
+        for i, (name, moving) in enumerate(zip(rec.names, found, strict=True)):
+            progress("moving objects", i, len(rec.names))
+            if moving.any():
+                still = ~_enlarged(moving, frames.height, frames.width)
+                images.write_mask(draft / f"{name}.png", (still & frames.mask(frames.index(name))).numpy())
+    progress("moving objects", len(rec.names), len(rec.names))
+    return MovingMasks(folder)
+
+
+def mask_depth(rec: Reconstruction, frames: Frames) -> None:
+    """Remove depth on moving objects from the maps on disk."""
+    still = rec.still(frames)
+    for name in rec.names:
+        if rec.moving is not None and name in rec.moving:
+            usable, depth = still.mask(frames.index(name)), rec.depth[name]
+            kept = (torch.where(usable, values, 0.0) for values in (depth.z_depth, depth.confidence))
+            rec.depth.write(name, DepthMap(*kept))
+
+
+def without_moving_observations(rec: Reconstruction, frames: Frames) -> Reconstruction:
+    """The reconstruction without observations on moving objects, and without points that fewer than two are left of."""
+    still, kept = rec.still(frames), torch.ones(len(rec.tracks.point), dtype=torch.bool)
+    for i, name in enumerate(rec.names):
+        if rec.moving is not None and name in rec.moving:
+            mine = (rec.tracks.frame == i).nonzero()[:, 0]
+            column, row = rec.tracks.xy[mine].long().unbind(-1)
+            usable = still.mask(frames.index(name))
+            kept[mine] = usable[row.clamp(0, frames.height - 1), column.clamp(0, frames.width - 1)]
+    return rec if bool(kept.all()) else _with_observations(rec, kept)
+
+
+def _with_observations(rec: Reconstruction, kept: Bool[Tensor, " o"]) -> Reconstruction:
+    """The reconstruction with some of its observations, and the points that two or more of them see."""
+    tracks = rec.tracks
+    seen = torch.bincount(tracks.point[kept], minlength=len(rec.points.xyz)) >= 2
+    number, kept = seen.cumsum(0) - 1, kept & seen[tracks.point]
+    points = type(rec.points)(**{name: values[seen] for name, values in vars(rec.points).items()})
+    return replace(rec, points=points, tracks=Tracks(number[tracks.point[kept]], tracks.frame[kept], tracks.xy[kept]))
+
+
+def _small(image: Float[Tensor, "h w 3"], camera: Cameras) -> Float[np.ndarray, "sh sw 3"]:
+    import cv2
+
+    size = (camera.width, camera.height)
+    return blur(torch.from_numpy(cv2.resize(image.numpy(), size, interpolation=cv2.INTER_AREA)), _BLUR).numpy()
+
+
+def _enlarged(mask: Bool[np.ndarray, "sh sw"], height: int, width: int) -> Bool[Tensor, "h w"]:
+    """A mask at the size of the frames, its border halfway between the small image's pixels."""
+    import cv2
+
+    return torch.from_numpy(cv2.resize(mask.astype(np.float32), (width, height), interpolation=cv2.INTER_LINEAR) > 0.5)
+
+
+def _surface(camera: Cameras, view: SmallView) -> _Surface:
+    known = view.z_depth.reshape(-1) > 0
+    pixels = pixel_grid(camera.height, camera.width).reshape(-1, 2)[torch.from_numpy(known)]
+    z_depth = torch.from_numpy(view.z_depth.reshape(-1)[known])
+    return _Surface(unproject(camera, pixels[None].double(), z_depth[None].double())[0], view.rgb.reshape(-1, 3)[known])
+
+
+def _layer(camera: Cameras, surface: _Surface) -> Layer:
+    """A frame's surface in another image: the nearest point at each pixel."""
+    uv, z, visible = (part[0].numpy() for part in project_visible(camera, surface.xyz[None]))
+    uv, z, rgb = uv[visible], z[visible].astype(np.float32), surface.rgb[visible]
+    first, far_to_near = np.floor(uv - 0.5).astype(np.int64), np.argsort(-z)
+    nearest = np.full(camera.height * camera.width, -1)
+    for corner in _CORNERS:
+        column, row = (first[far_to_near] + corner).T
+        inside = (column >= 0) & (column < camera.width) & (row >= 0) & (row < camera.height)
+        pixel, point = (row * camera.width + column)[inside], far_to_near[inside]
+        there = np.full_like(nearest, -1)
+        there[pixel] = point  # of several points the last, which is the nearest
+        closer = (there >= 0) & ((nearest < 0) | (z[there] < z[nearest]))
+        nearest[closer] = there[closer]
+    pixel = np.flatnonzero(nearest >= 0)
+    return Layer(pixel, z[nearest[pixel]], rgb[nearest[pixel]])
+
+
+def _spread(frames: Sequence[int]) -> list[int]:
+    """A few of the frames, evenly spread."""
+    if not frames:
+        return []
+    at = np.unique(np.linspace(0, len(frames) - 1, min(_OTHERS, len(frames))).round().astype(int))
+    return [frames[k] for k in at]

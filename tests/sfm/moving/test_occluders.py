@@ -1,0 +1,82 @@
+"""Votes of other frames on the pixels of a frame, and the objects that they show."""
+
+import numpy as np
+import pytest
+
+from swimm3r.sfm.moving.occluders import Layer, SmallView, moving_pixels, votes_on
+
+HEIGHT, WIDTH = 60, 80
+OBJECT = (slice(20, 40), slice(30, 55))
+GROUND = 3.0
+
+
+def ground() -> np.ndarray:
+    """Sand: patches of a few pixels, without sharp edges."""
+    y, x = np.mgrid[:HEIGHT, :WIDTH] / 4
+    waves = np.stack([np.sin(x + 2 * y), np.sin(2 * x - y + 1), np.sin(x - y)], -1)
+    return (0.5 + 0.08 * waves).astype(np.float32)
+
+
+def layer(rgb: np.ndarray, z_depth: float = GROUND, rows: slice = slice(None)) -> Layer:
+    """A surface that another frame measured at every pixel of some rows."""
+    pixel = np.arange(HEIGHT * WIDTH).reshape(HEIGHT, WIDTH)[rows].reshape(-1)
+    return Layer(pixel, np.full(len(pixel), z_depth, np.float32), rgb.reshape(-1, 3)[pixel])
+
+
+def view(rgb: np.ndarray, z_depth: float = 0.0) -> SmallView:
+    """A frame, all of it usable; without depth unless it is given."""
+    return SmallView(rgb, np.full(rgb.shape[:2], z_depth, np.float32), np.ones(rgb.shape[:2], bool))
+
+
+@pytest.fixture
+def with_object() -> np.ndarray:
+    rgb = ground()
+    rgb[OBJECT] = (0.1, 0.05, 0.05)
+    return rgb
+
+
+@pytest.fixture
+def truth() -> np.ndarray:
+    found = np.zeros((HEIGHT, WIDTH), bool)
+    found[OBJECT] = True
+    return found
+
+
+def test_an_object_before_measured_ground_is_found_to_its_edges(with_object: np.ndarray, truth: np.ndarray) -> None:
+    moving = moving_pixels(view(with_object), [layer(ground())] * 4)
+    assert (moving & truth).sum() > 0.95 * truth.sum()
+    assert (moving & ~truth).sum() < 0.1 * truth.sum()
+
+
+def test_an_object_reaches_beyond_the_ground_that_others_measured(with_object: np.ndarray, truth: np.ndarray) -> None:
+    moving = moving_pixels(view(with_object), [layer(ground(), rows=slice(0, 32))] * 4)
+    assert (moving & truth).sum() > 0.9 * truth.sum()
+    assert (moving & ~truth).sum() < 0.2 * truth.sum()
+
+
+def test_nothing_moves_where_frames_show_the_same() -> None:
+    assert not moving_pixels(view(ground()), [layer(ground())] * 4).any()
+
+
+def test_exposure_and_white_balance_are_no_movement() -> None:
+    brighter = ground() * np.array([1.3, 1.1, 0.9], np.float32)
+    assert not moving_pixels(view(brighter), [layer(ground())] * 4).any()
+
+
+def test_a_measured_surface_hides_what_lies_behind_it(with_object: np.ndarray) -> None:
+    near = view(with_object, GROUND / 2)
+    assert not votes_on(near, [layer(ground())] * 4).different.any()
+    assert not moving_pixels(near, [layer(ground())] * 4).any()
+
+
+def test_an_object_that_a_minority_saw_elsewhere_is_no_reason_to_doubt_the_frame(with_object: np.ndarray) -> None:
+    assert not moving_pixels(view(ground()), [layer(ground())] * 3 + [layer(with_object)]).any()
+
+
+def test_one_frame_alone_decides_nothing(with_object: np.ndarray) -> None:
+    assert not moving_pixels(view(with_object), [layer(ground())]).any()
+
+
+def test_pixels_that_are_not_to_be_used_are_no_objects(with_object: np.ndarray, truth: np.ndarray) -> None:
+    unusable = SmallView(with_object, np.zeros((HEIGHT, WIDTH), np.float32), ~truth)
+    assert not moving_pixels(unusable, [layer(ground())] * 4).any()
