@@ -1,6 +1,6 @@
 """Masks of moving objects from a reconstruction with depth: in the training frames, and in any other posed image.
 
-Frames are compared at 320 pixels, each with up to 16 others that see the same surfaces, spread over the time in which
+Frames are compared at 256 pixels, each with up to 16 others that see the same surfaces, spread over the time in which
 they do: an object that moves with the camera stands before the same ground in neighboring frames.
 """
 
@@ -26,7 +26,7 @@ from swimm3r.scene.reconstruction import DepthMap, QualityWarning, Reconstructio
 from swimm3r.sfm.moving.occluders import Layer, SmallView, moving_pixels
 from swimm3r.tasks.threads import thread_count
 
-_LONG_SIDE = 320  # of the images that are compared, pixels
+_LONG_SIDE = 256  # of the images that are compared, pixels
 _BLUR = 1.0  # pixel, of these images: noise and compression
 _OTHERS = 16  # frames that a frame is compared with
 _NOTABLE = 0.01  # of the pixels of all frames, from which a user should look at the masks
@@ -201,16 +201,12 @@ def _layer(camera: Cameras, surface: _Surface) -> Layer:
     """A frame's surface in another image: the nearest point at each pixel."""
     uv, z, visible = (part[0].numpy() for part in project_visible(camera, surface.xyz[None]))
     uv, z, rgb = uv[visible], z[visible].astype(np.float32), surface.rgb[visible]
-    first, far_to_near = np.floor(uv - 0.5).astype(np.int64), np.argsort(-z)
+    far_to_near = np.argsort(-z)
+    around = np.floor(uv[far_to_near, None] - 0.5).astype(np.int64) + np.array(_CORNERS)
+    point, (column, row) = far_to_near.repeat(len(_CORNERS)), around.reshape(-1, 2).T
+    inside = (column >= 0) & (column < camera.width) & (row >= 0) & (row < camera.height)
     nearest = np.full(camera.height * camera.width, -1)
-    for corner in _CORNERS:
-        column, row = (first[far_to_near] + corner).T
-        inside = (column >= 0) & (column < camera.width) & (row >= 0) & (row < camera.height)
-        pixel, point = (row * camera.width + column)[inside], far_to_near[inside]
-        there = np.full_like(nearest, -1)
-        there[pixel] = point  # of several points the last, which is the nearest
-        closer = (there >= 0) & ((nearest < 0) | (z[there] < z[nearest]))
-        nearest[closer] = there[closer]
+    nearest[(row * camera.width + column)[inside]] = point[inside]  # of several points the last, which is the nearest
     pixel = np.flatnonzero(nearest >= 0)
     return Layer(pixel, z[nearest[pixel]], rgb[nearest[pixel]])
 

@@ -3,12 +3,12 @@
 A point X of frame s, at a depth that other frames confirmed, lies at pixel x of frame t. Unless t has a measured
 surface nearer than X, it must show X there, so that
 
-    d = |g I_s(X) - I_t(x)| <= max(0.06, 4 sigma)
+    d = |g I_s(X) - I_t(x)| <= max(0.06, 4 q)
 
-with g the gains between the frames' channels, and sigma the spread of d over all points of the pair. I_t(x) is the
-range of colors in 3 x 3 pixels, as x is known to a pixel. Where most of the frames that measured a surface disagree, t
-shows something that was elsewhere when they were taken. These pixels, and those where frames agree, say by their
-colors (GrabCut; Rother et al. 2004) where the object ends in between.
+with g the gains between the frames' channels, d that of the worst channel, and q the d that three quarters of the
+pair's points keep. I_t(x) is the range of colors in 3 x 3 pixels, as x is known to a pixel. Where most of the frames
+that measured a surface disagree, t shows something that was elsewhere when they were taken. These pixels, and those
+where frames agree, say by their colors (GrabCut; Rother et al. 2004) where the object ends in between.
 """
 
 from collections.abc import Sequence
@@ -17,7 +17,8 @@ from dataclasses import dataclass
 import numpy as np
 from jaxtyping import Bool, Float, Int, UInt8
 
-_OFF = 4.0  # standard deviations of a pair's colors beyond which they differ
+_USUAL = 0.75  # share of a pair's points, fewer than which move, whose differences are usual
+_OFF = 4.0  # such differences beyond which colors differ
 _LEAST = 0.06  # pixel value, differences that exposure, water and caustics may make
 _DARK = 0.02  # pixel value below which ratios of colors are noise
 _NEARER = 0.05  # share of a depth by which one surface is before another
@@ -27,8 +28,7 @@ _STILL = 0.5  # share from which a pixel is surely what they measured
 _REACH = 0.15  # of the longer side, how far an object may extend beyond pixels that other frames decide
 _ROUNDS = 3  # of GrabCut
 _SPECK = 0.001  # of the image; smaller objects are noise
-_DECIDED = 0.1  # share of an object's pixels that other frames must decide
-_MAD = 1.4826
+_DECIDED = 0.25  # share of an object's pixels that other frames must decide; else it is only these
 
 
 @dataclass(frozen=True)
@@ -74,7 +74,7 @@ def moving_pixels(view: SmallView, layers: Sequence[Layer]) -> Bool[np.ndarray, 
 
 
 def votes_on(view: SmallView, layers: Sequence[Layer]) -> Votes:
-    """What other frames say about the pixels of a frame."""
+    """Comparison of every pixel of a frame with the surfaces that other frames measured there."""
     import cv2
 
     around = np.ones((3, 3), np.uint8)
@@ -84,9 +84,8 @@ def votes_on(view: SmallView, layers: Sequence[Layer]) -> Votes:
     for layer in layers:
         at = layer.pixel
         rgb = layer.rgb * _gains(layer.rgb, mine[at])
-        spread = _MAD * np.median(np.abs(rgb - mine[at]).mean(1)) if len(at) else 0.0
-        limit = max(_LEAST, _OFF * spread)
-        off = np.maximum(0, np.maximum(low[at] - rgb, rgb - high[at])).mean(1)
+        off = np.maximum(0, np.maximum(low[at] - rgb, rgb - high[at])).max(1, initial=0)
+        limit = max(_LEAST, _OFF * np.quantile(off, _USUAL)) if len(at) else _LEAST
         hidden = (own_depth[at] > 0) & (layer.z_depth > (1 + _NEARER) * own_depth[at])
         same[at[~hidden & (off < limit / 2)]] += 1
         different[at[~hidden & (off > limit)]] += 1
@@ -115,16 +114,18 @@ def _objects(
     if (cut == cv2.GC_BGD).any():  # else there is nothing that the object could end at
         model = [np.zeros((1, 65)), np.zeros((1, 65))]
         cv2.setRNGSeed(0)
-        cv2.grabCut(_eight_bits(rgb[rows, columns]), cut, None, *model, _ROUNDS, cv2.GC_INIT_WITH_MASK)
+        cv2.grabCut(_eight_bits(rgb[rows, columns]), cut, (0, 0, 0, 0), *model, _ROUNDS, cv2.GC_INIT_WITH_MASK)
     region = np.zeros(decided.shape, np.uint8)
     region[rows, columns] = (cut == cv2.GC_FGD) | (cut == cv2.GC_PR_FGD)
     region = cv2.morphologyEx(region, cv2.MORPH_CLOSE, np.ones((5, 5), np.uint8))
-    count, part_of = cv2.connectedComponents(region)
+    count, labels = cv2.connectedComponents(region)
+    part_of = labels.astype(np.int64)
     sizes = np.bincount(part_of.reshape(-1), minlength=count)
     by_votes = np.bincount(part_of[decided], minlength=count)
-    kept = (sizes >= _SPECK * decided.size) & (by_votes >= _DECIDED * sizes)
+    whole = by_votes >= _DECIDED * sizes
+    kept = np.where(whole, sizes, by_votes) >= _SPECK * decided.size
     kept[0] = False
-    return kept[part_of]
+    return kept[part_of] & (whole[part_of] | decided)
 
 
 def _box(mask: Bool[np.ndarray, "h w"]) -> tuple[slice, slice]:
