@@ -4,10 +4,10 @@ Frames are compared at 256 pixels, each with up to 16 others that see the same s
 they do: an object that moves with the camera stands before the same ground in neighboring frames.
 """
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass, replace
-from functools import cached_property
+from functools import cached_property, lru_cache
 from pathlib import Path
 
 import numpy as np
@@ -31,7 +31,8 @@ _BLUR = 1.0  # pixel, of these images: noise and compression
 _OTHERS = 16  # frames that a frame is compared with
 _NOTABLE = 0.01  # of the pixels of all frames, from which a user should look at the masks
 _SHARED = 0.05  # of a frame's surface that another one must show to be compared with it
-_SAMPLES = 200  # points of a frame's surface that decide this
+_SAMPLES = 64  # points of a frame's surface that decide this
+_KEPT = 128  # frames in memory, 3 MB each at most
 _CORNERS = ((0, 0), (0, 1), (1, 0), (1, 1))  # pixels around a point, which together leave no cracks
 
 
@@ -45,27 +46,36 @@ class _Surface:
 
 @dataclass(frozen=True)
 class StillScene:
-    """The frames of a reconstruction with the surfaces that they measured."""
+    """The frames of a reconstruction with the surfaces that they measured, read when asked for; a few are kept."""
 
     rec: Reconstruction
+    frames: Frames
     cameras: Cameras  # of the small images
-    views: tuple[SmallView, ...]
 
     @cached_property
-    def _surfaces(self) -> tuple[_Surface, ...]:
-        return tuple(_surface(self.cameras[i], view) for i, view in enumerate(self.views))
+    def _view(self) -> Callable[[int], SmallView]:
+        return lru_cache(maxsize=_KEPT)(self._read_view)
+
+    @cached_property
+    def _surface(self) -> Callable[[int], _Surface]:
+        return lru_cache(maxsize=_KEPT)(self._read_surface)
 
     @cached_property
     def _samples(self) -> tuple[Float[Tensor, "n 3"], Int[Tensor, " n"]]:
         """A few points of each frame's surface, and the frames they are of."""
-        few = [surface.xyz[:: max(1, len(surface.xyz) // _SAMPLES)] for surface in self._surfaces]
-        of = torch.repeat_interleave(torch.arange(len(few)), torch.tensor([len(points) for points in few]))
-        return torch.cat(few), of
+        points = []
+        for i in range(len(self.rec.names)):
+            z_depth = self._z_depth(i)
+            at = np.flatnonzero(z_depth)
+            points.append(self._points(i, z_depth, at[:: max(1, len(at) // _SAMPLES)]))
+        of = torch.repeat_interleave(torch.arange(len(points)), torch.tensor([len(few) for few in points]))
+        return torch.cat(points), of
 
     def moving_in_frame(self, i: int) -> Bool[np.ndarray, "h w"]:
         """The pixels of the small image of frame `i` that show moving objects."""
         camera = self.cameras[i]
-        return moving_pixels(self.views[i], self._layers(camera, [j for j in self._overlapping(camera) if j != i]))
+        others = [j for j in self._overlapping(camera) if j != i]
+        return moving_pixels(self._view(i), self._layers(camera, others))
 
     def moving_in(self, lens: Cameras, image: Float[Tensor, "h w 3"]) -> Bool[Tensor, "h w"]:
         """The pixels of another image of the scene, of known pose, that show moving objects.
@@ -79,36 +89,49 @@ class StillScene:
             nearest[layer.pixel] = np.minimum(nearest[layer.pixel], layer.z_depth)
         z_depth = np.where(np.isfinite(nearest), nearest, 0).reshape(camera.height, camera.width)
         view = SmallView(_small(image, camera), z_depth, np.ones_like(z_depth, dtype=bool))
-        return _enlarged(moving_pixels(view, layers), lens.height, lens.width)
+        return enlarged(moving_pixels(view, layers), lens.height, lens.width)
 
     def _overlapping(self, camera: Cameras) -> list[int]:
         """The frames whose surfaces a camera sees."""
         points, of = self._samples
         visible = project_visible(camera, points[None])[2][0]
-        seen, total = (torch.bincount(rows, minlength=len(self.views)) for rows in (of[visible], of))
+        seen, total = (torch.bincount(rows, minlength=len(self.rec.names)) for rows in (of[visible], of))
         return ((total > 0) & (seen >= _SHARED * total)).nonzero()[:, 0].tolist()
 
     def _layers(self, camera: Cameras, others: Sequence[int]) -> list[Layer]:
-        return [_layer(camera, self._surfaces[j]) for j in _spread(others)]
+        return [_layer(camera, self._surface(j)) for j in _spread(others)]
+
+    def _read_view(self, i: int) -> SmallView:
+        f = self.frames.index(self.rec.names[i])
+        usable = self._small_grid(self.frames.mask(f).numpy())
+        return SmallView(_small(self.frames.image(f), self.cameras[i]), self._z_depth(i), usable)
+
+    def _read_surface(self, i: int) -> _Surface:
+        view = self._view(i)
+        known = np.flatnonzero(view.z_depth)
+        return _Surface(self._points(i, view.z_depth, known), view.rgb.reshape(-1, 3)[known])
+
+    def _z_depth(self, i: int) -> Float[np.ndarray, "h w"]:
+        return self._small_grid(self.rec.depth[self.rec.names[i]].z_depth.numpy())
+
+    def _points(self, i: int, z_depth: Float[np.ndarray, "h w"], at: Int[np.ndarray, " n"]) -> Float[Tensor, "n 3"]:
+        """World points of some pixels, by their row-major index."""
+        camera = self.cameras[i]
+        pixels = pixel_grid(camera.height, camera.width).reshape(-1, 2)[at]
+        return unproject(camera, pixels[None].double(), torch.from_numpy(z_depth.reshape(-1)[at])[None].double())[0]
+
+    def _small_grid(self, values: np.ndarray) -> np.ndarray:
+        """The values of a frame's pixels nearest to those of its small image."""
+        sizes = zip((self.cameras.height, self.cameras.width), values.shape, strict=True)
+        rows, columns = (((np.arange(small) + 0.5) * full / small).astype(int) for small, full in sizes)
+        return values[np.ix_(rows, columns)]
 
 
-def still_scene(rec: Reconstruction, frames: Frames, progress: Progress = silent) -> StillScene:
-    """The registered frames with their depth, at a small size."""
+def still_scene(rec: Reconstruction, frames: Frames) -> StillScene:
+    """The registered frames at a small size."""
     scale = min(1.0, _LONG_SIDE / max(frames.width, frames.height))
     width, height = max(8, round(scale * frames.width)), max(8, round(scale * frames.height))
-    cameras, views = resized(rec.cameras, width, height), []
-    rows, columns = (
-        ((np.arange(small) + 0.5) * full / small).astype(int)
-        for small, full in ((height, frames.height), (width, frames.width))
-    )
-    for i, name in enumerate(rec.names):
-        progress("reading frames", i, len(rec.names))
-        f = frames.index(name)
-        z_depth = rec.depth[name].z_depth.numpy()[np.ix_(rows, columns)]
-        usable = frames.mask(f).numpy()[np.ix_(rows, columns)]
-        views.append(SmallView(_small(frames.image(f), cameras[i]), z_depth, usable))
-    progress("reading frames", len(rec.names), len(rec.names))
-    return StillScene(rec, cameras, tuple(views))
+    return StillScene(rec, frames, resized(rec.cameras, width, height))
 
 
 def with_moving(rec: Reconstruction, frames: Frames, folder: Path, progress: Progress = silent) -> Reconstruction:
@@ -133,13 +156,13 @@ def find_moving(rec: Reconstruction, frames: Frames, folder: Path, progress: Pro
     """Masks of moving objects in the registered frames, in a new folder; those of an earlier call are kept."""
     if folder.is_dir():
         return MovingMasks(folder)
-    scene = still_scene(rec, frames, progress)
+    scene = still_scene(rec, frames)
     with atomic_folder(folder) as draft, ThreadPoolExecutor(thread_count()) as pool:
         found = pool.map(scene.moving_in_frame, range(len(rec.names)))
         for i, (name, moving) in enumerate(zip(rec.names, found, strict=True)):
             progress("moving objects", i, len(rec.names))
             if moving.any():
-                still = ~_enlarged(moving, frames.height, frames.width)
+                still = ~enlarged(moving, frames.height, frames.width)
                 images.write_mask(draft / f"{name}.png", (still & frames.mask(frames.index(name))).numpy())
     progress("moving objects", len(rec.names), len(rec.names))
     return MovingMasks(folder)
@@ -183,18 +206,11 @@ def _small(image: Float[Tensor, "h w 3"], camera: Cameras) -> Float[np.ndarray, 
     return blur(torch.from_numpy(cv2.resize(image.numpy(), size, interpolation=cv2.INTER_AREA)), _BLUR).numpy()
 
 
-def _enlarged(mask: Bool[np.ndarray, "sh sw"], height: int, width: int) -> Bool[Tensor, "h w"]:
+def enlarged(mask: Bool[np.ndarray, "sh sw"], height: int, width: int) -> Bool[Tensor, "h w"]:
     """A mask at the size of the frames, its border halfway between the small image's pixels."""
     import cv2
 
     return torch.from_numpy(cv2.resize(mask.astype(np.float32), (width, height), interpolation=cv2.INTER_LINEAR) > 0.5)
-
-
-def _surface(camera: Cameras, view: SmallView) -> _Surface:
-    known = view.z_depth.reshape(-1) > 0
-    pixels = pixel_grid(camera.height, camera.width).reshape(-1, 2)[torch.from_numpy(known)]
-    z_depth = torch.from_numpy(view.z_depth.reshape(-1)[known])
-    return _Surface(unproject(camera, pixels[None].double(), z_depth[None].double())[0], view.rgb.reshape(-1, 3)[known])
 
 
 def _layer(camera: Cameras, surface: _Surface) -> Layer:
