@@ -2,15 +2,16 @@
 
 from pathlib import Path
 
+from swimm3r.errors import UsageError
 from swimm3r.io.bags.bag import is_bag
 from swimm3r.pipeline.presets import RunSettings
 from swimm3r.prepare import check_source
 from swimm3r.prepare.clip import open_clip
 from swimm3r.prepare.masks import check_masks
-from swimm3r.prepare.rig import check_rig
+from swimm3r.prepare.rig import NONE, check_rig
 from swimm3r.scale.sources import check_sources
 from swimm3r.scene.ground_truth import FOLDER, GroundTruth, read_ground_truth
-from swimm3r.sfm import check_files
+from swimm3r.sfm import ColmapSettings, check_files
 
 
 def check_inputs(source: Path, settings: RunSettings, reference: Path | None = None) -> None:
@@ -22,9 +23,29 @@ def check_inputs(source: Path, settings: RunSettings, reference: Path | None = N
         open_clip(source, settings.frames)  # its camera is chosen
     check_masks(settings.frames)
     check_rig(source, settings.frames)
+    _check_adjusted(settings)
     truth_of(source, reference)
     check_files(settings.sfm)
     check_sources(settings.scale)
+
+
+def _check_adjusted(settings: RunSettings) -> None:
+    """Raise UsageError where a rig is asked for and its cameras would not be adjusted as one."""
+    if settings.frames.rig in ((), (NONE,)) and settings.frames.rig_calibration is None:
+        return
+    if not isinstance(settings.sfm, ColmapSettings):
+        raise UsageError(
+            "a rig is asked for, and poses by MASt3R or of another program's model are those of single frames",
+            cause="only COLMAP's mapping adjusts a rig with one pose per instant",
+            hint="--backend colmap; or --rig none, which takes the images of one camera after the other",
+        )
+    if settings.sfm.housing != "none":
+        raise UsageError(
+            f"a rig is asked for, and its cameras are not adjusted under refraction (--housing {settings.sfm.housing})",
+            cause="a port is taken into account for poses of single frames only",
+            hint="leave out --housing: a lens that was calibrated or is refined in water takes most of a port; or"
+            " --rig none",
+        )
 
 
 def truth_of(source: Path, reference: Path | None) -> GroundTruth | None:

@@ -9,7 +9,7 @@ so that b and dt follow from all instants by least squares, as long as the veloc
 """
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 import torch
@@ -18,6 +18,7 @@ from torch import Tensor
 
 from swimm3r.geometry import mean_rotation, pose_from, relative_poses, rotation_angle
 from swimm3r.scene.frames import Frames
+from swimm3r.scene.reconstruction import QualityWarning, Reconstruction
 
 LEAST = 3  # instants that tell the pose of one camera from another
 _ROUNDS = 10
@@ -57,6 +58,17 @@ def rig_rows(names: Sequence[str], frames: Frames) -> RigRows:
         np.array([numbers.index(frame.instant or 0) for frame in own]),
         np.array([times[number] for number in numbers]),
     )
+
+
+def with_loose_rig(rec: Reconstruction) -> Reconstruction:
+    """The reconstruction, with a warning that its cameras are those of a rig and were placed one by one."""
+    warning = QualityWarning(
+        "The images are of a rig, whose cameras were placed one by one: they are not adjusted with one pose per"
+        " instant, and no baseline gives their scale.",
+        "Only COLMAP's mapping adjusts a rig, and not behind a port: --backend colmap, without --housing. --rig none"
+        " takes the images of one camera after the other.",
+    )
+    return replace(rec, warnings=(*rec.warnings, warning))
 
 
 def relative_to_first(cam2world: Float[Tensor, "c 4 4"], rows: RigRows, camera: int) -> Float[Tensor, "n 4 4"]:

@@ -19,6 +19,7 @@ from swimm3r.sfm.lens import check_calibration
 from swimm3r.sfm.medium.apply import with_water
 from swimm3r.sfm.moving.find import mask_depth, with_moving, without_moving_observations
 from swimm3r.sfm.plane_sweep.estimate import estimate_depth
+from swimm3r.sfm.rig_poses import with_loose_rig
 from swimm3r.sfm.settings import ColmapSettings
 from swimm3r.tasks.settings import EngineSettings
 
@@ -41,7 +42,9 @@ def reconstruct(
     """Poses first, and saved at once: what comes after reads them from there when an interrupted run goes on."""
     if not (folder / "reconstruction.json").is_file():
         rec = poses.reconstruct(frames, settings, folder, progress, engine=engine, navigator=navigator)
-        rec = rec if frames.rig is None else as_rig(rec, frames, settings, progress)
+        if frames.rig is not None:
+            under_port = settings.housing != "none"
+            rec = with_loose_rig(rec) if under_port else as_rig(rec, frames, settings, progress)
         with_measured_up(rec, frames).save(folder, frames)
     rec = load_reconstruction(folder, frames)  # also where it was just made: the same bits as after an interruption
     estimate_depth(rec, frames, settings.depth, progress, engine)

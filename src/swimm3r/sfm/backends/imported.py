@@ -30,6 +30,7 @@ from swimm3r.sfm.medium.apply import with_water
 from swimm3r.sfm.moving.find import with_moving
 from swimm3r.sfm.plane_sweep.estimate import estimate_depth
 from swimm3r.sfm.plane_sweep.views import on_frame_grid
+from swimm3r.sfm.rig_poses import with_loose_rig
 from swimm3r.sfm.settings import ColmapModelSettings
 from swimm3r.sfm.tracks import MatchTracks, as_points
 from swimm3r.tasks.settings import EngineSettings
@@ -51,6 +52,7 @@ def reconstruct(
     """The reconstruction of the frames that the model names. Raises InputError where fewer than 2 of them are in it."""
     foreign = read_foreign(settings.model)
     rec = with_measured_up(from_foreign(frames, foreign, folder), frames)
+    rec = rec if frames.rig is None else with_loose_rig(rec)
     if len(rec.tracks.point) == 0 and foreign.depth is None:
         rec = _with_points(rec, frames, foreign, settings, folder, progress)
     rec.save(folder, frames)

@@ -40,6 +40,7 @@ from swimm3r.sfm.medium import from_head
 from swimm3r.sfm.medium.apply import with_water
 from swimm3r.sfm.moving.find import with_moving
 from swimm3r.sfm.plane_sweep.views import on_frame_grid
+from swimm3r.sfm.rig_poses import with_loose_rig
 from swimm3r.sfm.settings import Mast3rSettings
 from swimm3r.sfm.student import adapter_file
 from swimm3r.sfm.student.physics_head import PhysicsHead
@@ -88,6 +89,7 @@ def reconstruct(
             encodings = EncodingStore(network, images, cache / "encodings")
             read_water = _WaterReader(head, encodings, folder / _WATER)
         rec = _place(said, images, settings, folder, progress, read_water)
+        rec = rec if frames.rig is None else with_loose_rig(rec)
         with_measured_up(rec, frames).save(folder, frames)
     rec = load_reconstruction(folder, frames)  # also where it was just made: the same bits as after an interruption
     if settings.moving == "auto":

@@ -155,7 +155,7 @@ def _settled(model: "pycolmap.Reconstruction", settings: ColmapSettings) -> "pyc
 
     pycolmap.ObservationManager(model).filter_all_points3D(_MAX_ERROR, _MIN_ANGLE)
     model = _adjusted(model)
-    if settings.intrinsics == "fixed" or settings.housing != "none":  # the lens of a port is that of its rays
+    if settings.intrinsics == "fixed":
         return model
     own = _adjusted(model, lens=True)
     gain = 1 - own.compute_mean_reprojection_error() / model.compute_mean_reprojection_error()
