@@ -1,16 +1,19 @@
 """The dives of a batch: found in folders, by patterns and in tables; names, and errors that name the place."""
 
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
 import pytest
 
 from swimm3r.batch.dives import find_dives
-from swimm3r.batch.sheet import read_sheet, with_setting
+from swimm3r.batch.sheet import read_sheet, with_settings
 from swimm3r.errors import InputError, UsageError
 from swimm3r.io.images import write_rgb
 from swimm3r.pipeline.presets import PRESETS, RunSettings, from_yaml, to_yaml
-from swimm3r.settings import SettingError
+from swimm3r.scale.settings import ScaleSettings
+from swimm3r.scene.settings import FrameSettings
+from swimm3r.settings import SettingError, declarations
 from swimm3r.sfm.settings import ColmapSettings, Mast3rSettings
 from swimm3r.splat.settings import GaussianSettings
 
@@ -130,6 +133,9 @@ def test_back_ends_and_recipes_have_columns_and_spreadsheets_may_use_semicolons(
         ("dive,start,end\nwall,5,2\n", "line 2: end .* is not after start"),
         ("dive,fps,fps\nwall,1,2\n", "two columns of one name"),
         ("dive,name\nwall,a/b\n", "cannot be called 'a/b'"),
+        ("dive,markers\nwall,\nreef,aruco-4x4-50\n", "line 3: markers of aruco-4x4-50 .* size is not given"),
+        ("dive,nav_std\nwall,0.1 0.1\n", "line 2: scale.nav_std must be 3 values"),
+        ("dive,scale\nwall,markers\n", "line 2: there is no setting scale"),
         ("dive\nwall\nwall\n", "two dives are called wall"),
     ],
 )
@@ -155,16 +161,50 @@ def test_a_table_that_is_none_is_refused(tapes: Path):
         read_sheet(path, FAST)
 
 
+def changed(name: str, text: str, settings: RunSettings = FAST) -> RunSettings:
+    return with_settings(settings, {name: text}, Path())
+
+
 def test_texts_that_look_like_numbers_stay_texts_where_a_text_is_expected():
-    assert with_setting(RunSettings(), "frames.masks", "2024").frames.masks == Path("2024")
-    assert with_setting(RunSettings(), "frames.end", "12").frames.end == 12
+    assert changed("frames.masks", "2024").frames.masks == Path("2024")
+    assert changed("frames.end", "12").frames.end == 12
     with pytest.raises(SettingError, match=r"frames\.fps"):
-        with_setting(RunSettings(), "frames.fps", "-1")
+        changed("frames.fps", "-1")
 
 
 def test_what_a_dive_of_a_table_runs_with_is_what_settings_yaml_says(tmp_path: Path):
-    changed = with_setting(FAST, "splat.densify.cap_max", "1234")
+    settings = changed("splat.densify.cap_max", "1234")
     path = tmp_path / "settings.yaml"
-    path.write_text(to_yaml(changed))
-    assert from_yaml(path) == changed
-    assert changed != FAST
+    path.write_text(to_yaml(settings))
+    assert from_yaml(path) == settings
+    assert settings != FAST
+
+
+def test_a_table_gives_each_dive_its_sources_of_scale(tapes: Path):
+    bar = "0.png:10,20 0.png:30,22 1.png:14,25 1.png:35,28 0.5"
+    path = sheet(
+        tapes,
+        "dive,preset,nav,nav_offset,nav_std,markers,marker_size,scale_bar,scale.baseline\n"
+        "reef,best,logs/reef.csv,0.3,0.1 0.1 0.02,aruco-4x4-50,0.2,,\n"
+        f'wall,,,,,,,"{bar}",0.1\n',
+    )
+    everywhere = replace(FAST, scale=ScaleSettings(camera_height=1.5))
+    first, second = (dive.settings.scale for dive in read_sheet(path, everywhere))
+    assert first == ScaleSettings(
+        camera_height=1.5, nav=tapes / "logs" / "reef.csv", nav_offset=0.3, nav_std=(0.1, 0.1, 0.02),
+        markers="aruco-4x4-50", marker_size=0.2,
+    )  # fmt: skip
+    assert second == ScaleSettings(camera_height=1.5, scale_bar=tuple(bar.split()), baseline=0.1)
+
+
+def test_paths_of_a_table_hold_wherever_the_command_is_repeated(tapes: Path, monkeypatch: pytest.MonkeyPatch):
+    monkeypatch.chdir(tapes)
+    sheet(tapes, "dive,nav\nreef,reef.csv\n")
+    (dive,) = read_sheet(Path("dives.csv"), FAST)
+    assert dive.settings.scale.nav == tapes / "reef.csv"
+
+
+def test_columns_without_a_dot_name_one_setting():
+    short = [*declarations(FrameSettings), *declarations(ScaleSettings)]
+    own = ["dive", "name", "preset", "backend", "recipe", "reference"]
+    assert len(set(short + own)) == len(short + own)

@@ -1,6 +1,8 @@
 """A batch over tiny dives: failures stay with their dive, finished ones are not touched, page and table show all."""
 
 import csv
+import json
+import os
 from collections.abc import Callable
 from dataclasses import replace
 from importlib.util import find_spec
@@ -9,16 +11,23 @@ from pathlib import Path
 import numpy as np
 import pytest
 from tests.batch.tasks import finish_or_fail
+from tests.scale.conftest import lines, survey_along, write_csv
+from tests.scale.test_rescale import write_run
 
 from swimm3r.batch import run as batch_run
 from swimm3r.batch.dive import Dive
 from swimm3r.batch.dives import FoundDives, Skipped, find_dives
-from swimm3r.batch.results import Row
+from swimm3r.batch.results import Row, is_finished
 from swimm3r.batch.run import BatchError, check_outcome, run_batch
 from swimm3r.cli.main import main
 from swimm3r.errors import UsageError
+from swimm3r.io.files.cache_key import stat_digest
 from swimm3r.io.images import write_rgb
-from swimm3r.pipeline.presets import PRESETS
+from swimm3r.pipeline.presets import PRESETS, to_yaml
+from swimm3r.pipeline.run_record import stage_keys
+from swimm3r.scale.run import scale_run
+from swimm3r.scale.settings import ScaleSettings
+from swimm3r.sfm.settings import ColmapSettings
 from swimm3r.synthetic import write_dive
 from swimm3r.synthetic.settings import DiveSettings
 from swimm3r.tasks import EngineSettings
@@ -153,3 +162,29 @@ def test_what_is_left_out_is_on_the_page(tapes: Path, tmp_path: Path):
     skipped = (Skipped(Path("papers"), "it holds <neither> images nor a video"),)
     run_batch(replace(found, skipped=skipped), tmp_path, last_stage="prepare")
     assert "it holds &lt;neither&gt; images nor a video" in (tmp_path / "results.html").read_text()
+
+
+def test_a_dive_is_finished_where_it_has_the_scale_of_its_sources(tapes: Path, tmp_path: Path):
+    survey = survey_along(lines(count=2, each=4))
+    file = write_csv(tmp_path / "nav.csv", survey)
+    assert isinstance(TINY.sfm, ColmapSettings)
+    without = replace(TINY.sfm, mapping=replace(TINY.sfm.mapping, navigation=False))
+    plain = Dive("reef", tapes / "reef", replace(TINY, sfm=without))
+    given = replace(plain, settings=replace(plain.settings, scale=ScaleSettings(nav=file, nav_offset=0.0)))
+    run = write_run(tmp_path / "reef", survey)
+    digest = stat_digest(plain.source, leave_out=run)
+    keys = stage_keys(digest, plain.settings, None)
+    stages = {stage: {"status": "done", "key": keys[stage]} for stage in ("prepare", "sfm")}
+    summary = json.loads((run / "summary.json").read_text())
+    summary |= {"input": {"path": str(plain.source), "fingerprint": digest}, "stages": stages}
+    (run / "summary.json").write_text(json.dumps(summary))
+    (run / "settings.yaml").write_text(to_yaml(plain.settings))
+
+    assert is_finished(plain, tmp_path, "sfm")
+    assert not is_finished(given, tmp_path, "sfm")
+    assert is_finished(given, tmp_path, "prepare")
+    scale_run(run, given.settings.scale)
+    assert is_finished(given, tmp_path, "sfm")
+    assert is_finished(plain, tmp_path, "sfm")
+    os.utime(file, (1, 1))
+    assert not is_finished(given, tmp_path, "sfm")

@@ -17,6 +17,7 @@ from swimm3r.pipeline.presets import from_yaml
 from swimm3r.pipeline.run_record import stage_keys
 from swimm3r.pipeline.run_settings import with_stages_of
 from swimm3r.report.verdict import water_verdict
+from swimm3r.scale.run import is_scaled
 from swimm3r.scene.run_folder import STAGES, is_run, read_run
 from swimm3r.tasks import Failure
 
@@ -65,7 +66,8 @@ def is_finished(dive: Dive, out: Path, last_stage: str) -> bool:
     scored = run.stages.get("eval")
     known = dive.reference or (Path(scored.reference) if scored is not None and scored.reference else None)
     keys = stage_keys(run.input.fingerprint, settings, known)
-    return all(run.stages[stage].key == keys[stage] for stage in stages)
+    made = all(run.stages[stage].key == keys[stage] for stage in stages)
+    return made and ("sfm" not in stages or not settings.scale.has_sources or is_scaled(folder, run, settings.scale))
 
 
 def row_of(dive: Dive, out: Path, status: Status, failure: Failure | None = None) -> Row:

@@ -4,14 +4,15 @@
     tapes/reef.mp4,reef,fast,2,
     stills/wall,,,,8000
 
-`dive` is a video or a folder of images, relative to the table. Settings stand under their names in settings.yaml, those
-of frames also alone; an empty cell leaves the command's value.
+`dive` is a video or a folder of images. Settings stand under their names in settings.yaml, those of frames and of scale
+also alone; an empty cell leaves the command's value. Paths are relative to the table.
 """
 
 import csv
 import difflib
 from collections.abc import Iterator, Mapping
 from contextlib import contextmanager
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -20,14 +21,15 @@ from swimm3r.errors import Swimm3rError, UsageError
 from swimm3r.io.files.damage import Remedy, first_line, guard
 from swimm3r.pipeline.presets import Preset, RunSettings
 from swimm3r.pipeline.run_settings import starting_settings
+from swimm3r.scale.settings import ScaleSettings, resolved
 from swimm3r.scene.settings import FrameSettings
-from swimm3r.settings import SettingError, accepted, declarations
+from swimm3r.settings import SettingError, Settings, accepted, declarations
 from swimm3r.settings_document import from_document, to_document
 from swimm3r.sfm.settings import BackendName
 from swimm3r.splat.settings import RecipeName
 
 _OWN = ("dive", "name", "preset", "backend", "recipe", "reference")
-_PLACES = ("dive", "reference", "frames.masks")  # paths that are relative to the table
+_SHORT: Mapping[str, type[Settings]] = {"frames": FrameSettings, "scale": ScaleSettings}  # whose names may stand alone
 _KINDS: Mapping[str, Any] = {"preset": Preset, "backend": BackendName, "recipe": RecipeName}
 _REMEDY = Remedy(
     cause="it is no table, or not saved as UTF-8",
@@ -76,7 +78,7 @@ def _check_columns(path: Path, columns: list[str]) -> None:
         )
     if len(set(columns)) < len(columns):
         raise UsageError(f"{path} has two columns of one name", cause=", ".join(columns), hint="one column for each")
-    known = [*_OWN, *declarations(FrameSettings)]
+    known = [*_OWN, *(name for kind in _SHORT.values() for name in declarations(kind))]
     unknown = [name for name in columns if name not in known and name.split(".")[0] not in declarations(RunSettings)]
     if unknown:
         near = [match for name in unknown for match in difflib.get_close_matches(name, known, 1)]
@@ -89,18 +91,15 @@ def _check_columns(path: Path, columns: list[str]) -> None:
 
 
 def _dive(path: Path, line: int, cells: dict[str, str], settings: RunSettings, reference: Path | None) -> Dive:
-    given = {(f"frames.{name}" if name in declarations(FrameSettings) else name): v for name, v in cells.items() if v}
-    for name in _PLACES:
-        if name in given:
-            given[name] = str(path.parent / Path(given[name]).expanduser())
+    given = {name: text for name, text in cells.items() if text}
     try:
         if "dive" not in given:
             raise ValueError("it names no dive")
         chosen = {name: accepted(name, given.get(name), kind | None) for name, kind in _KINDS.items()}
         own = starting_settings(chosen["preset"], chosen["backend"], chosen["recipe"], settings)
-        for name, value in given.items():
-            if name not in _OWN:
-                own = with_setting(own, name, value)
+        own = replace(own, scale=settings.scale)  # presets say nothing of it
+        texts = {_dotted(name): text for name, text in given.items() if name not in _OWN}
+        own = with_settings(own, texts, path.parent)
     except SettingError as error:
         raise SettingError(f"{path}, line {line}: {error.name}", error.expected, error.got) from error
     except Swimm3rError as error:
@@ -111,38 +110,57 @@ def _dive(path: Path, line: int, cells: dict[str, str], settings: RunSettings, r
             cause="a slip in the table",
             hint="correct it there; the settings.yaml of any run folder shows every setting",
         ) from error
-    source = Path(given["dive"])
+    source = path.parent / Path(given["dive"]).expanduser()
     stem = source.stem if source.suffix and not source.is_dir() else source.resolve().name
-    known = Path(given["reference"]) if "reference" in given else reference
+    known = path.parent / Path(given["reference"]).expanduser() if "reference" in given else reference
     return Dive(given.get("name", stem), source, own, known)
 
 
-def with_setting(settings: RunSettings, name: str, text: str) -> RunSettings:
-    """The settings with one of them, by its dotted name, as a text says; a text that is no other value stays a text.
+def _dotted(name: str) -> str:
+    """The name in settings.yaml of a column."""
+    return next((f"{part}.{name}" for part, kind in _SHORT.items() if name in declarations(kind)), name)
+
+
+def with_settings(settings: RunSettings, texts: Mapping[str, str], folder: Path) -> RunSettings:
+    """The settings with some of them, by their dotted names, as texts say; paths are relative to a folder.
 
     Raises ValueError where there is no such setting, and SettingError where it cannot have that value.
     """
+    document = to_document(settings)
+    for name, text in texts.items():
+        *above, last = name.split(".")
+        record: Any = settings
+        place: Any = document
+        for part in above:
+            record, place = getattr(record, part, None), place.get(part)
+            if not isinstance(record, Settings):
+                raise ValueError(f"there is no setting {name}")
+        if last not in place or isinstance(place[last], dict):
+            raise ValueError(f"there is no setting {name}")
+        value = _value(name, text, declarations(type(record))[last])
+        place[last] = folder / value.expanduser() if isinstance(value, Path) else value
+    changed = from_document(document, RunSettings)
+    return replace(changed, scale=resolved(changed.scale))
+
+
+def _value(name: str, text: str, hint: Any) -> Any:
+    """The first reading of a text that a setting can have: a value of YAML, several side by side, texts, one text."""
+    words = text.split()
+    readings: tuple[Any, ...] = (_plain(text), [_plain(word) for word in words], words, text)
+    refused = None
+    for reading in readings:
+        try:
+            return accepted(name, reading, hint)
+        except SettingError as error:
+            refused = refused or error
+    assert refused is not None
+    raise refused
+
+
+def _plain(text: str) -> Any:
     import yaml
 
     try:
-        value = yaml.safe_load(text)
+        return yaml.safe_load(text)
     except yaml.YAMLError:
-        value = text
-    try:
-        return _replaced(settings, name, value)
-    except SettingError:
-        if isinstance(value, str):
-            raise
-        return _replaced(settings, name, text)
-
-
-def _replaced(settings: RunSettings, name: str, value: object) -> RunSettings:
-    document = to_document(settings)
-    *above, last = name.split(".")
-    place: Any = document
-    for part in above:
-        if not isinstance(place.get(part), dict):
-            raise ValueError(f"there is no setting {name}")
-        place = place[part]
-    place[last] = value
-    return from_document(document, RunSettings)
+        return text

@@ -11,6 +11,7 @@ from swimm3r.cli.pipeline.stages import require_adapter
 from swimm3r.cli.terminal.console import drawn_progress, outcome_console, print_line, print_results
 from swimm3r.cli.terminal.options import FLAT, Out
 from swimm3r.pipeline.presets import RunSettings
+from swimm3r.scale.settings import ScaleSettings, resolved
 from swimm3r.scene.settings import FrameSettings
 from swimm3r.splat.settings import PoseRefinementSettings
 
@@ -39,6 +40,7 @@ def batch_command(defaults: RunSettings) -> Callable:
         sfm: Annotated[type(defaults.sfm), FLAT] = defaults.sfm,
         splat: type(defaults.splat) = defaults.splat,
         test: PoseRefinementSettings = defaults.test,
+        scale: Annotated[ScaleSettings, FLAT] = defaults.scale,
     ) -> None:
         """Many dives, each with all stages in OUT/NAME. Re-run the same command to resume and to retry what failed.
 
@@ -52,7 +54,7 @@ def batch_command(defaults: RunSettings) -> Callable:
         from swimm3r.batch.dives import find_dives
         from swimm3r.batch.run import check_outcome, run_batch
 
-        found = find_dives(dives, RunSettings(frames, sfm, splat, test), out, poses.reference)
+        found = find_dives(dives, RunSettings(frames, sfm, splat, test, resolved(scale)), out, poses.reference)
         for one in found.skipped:
             print_line(f"left out: {one.path} ({one.reason})")
         with drawn_progress() as progress:

@@ -29,7 +29,7 @@ from swimm3r.progress import Progress, silent, watched
 from swimm3r.report import write_report
 from swimm3r.scale.navigation.navigator import NavigationFile
 from swimm3r.scale.rig import has_known_baseline
-from swimm3r.scale.run import read_record, scale_folder, scale_sections, source_key
+from swimm3r.scale.run import is_scaled, scale_folder, scale_sections
 from swimm3r.scene.frames import Frames
 from swimm3r.scene.ground_truth import GroundTruth
 from swimm3r.scene.reconstruction import Reconstruction
@@ -171,8 +171,7 @@ def _scaled(record: RunRecord, rec: Reconstruction, settings: RunSettings, progr
         return False
     record.write()
     run = open_run(record.folder, "sfm")
-    before = read_record(record.folder)
-    if before is not None and before.key == source_key(run, settings.scale):
+    if is_scaled(record.folder, run, settings.scale):
         return False
     scale_folder(record.folder, run, settings.scale, progress)
     return True

@@ -103,6 +103,12 @@ def read_record(folder: Path) -> ScaleRecord | None:
     return read_json(path, ScaleRecord, _REMEDY) if path.is_file() else None
 
 
+def is_scaled(folder: Path, run: RunFolder, settings: ScaleSettings) -> bool:
+    """Return whether a run has the unit and the place that these sources give, whose files are as they were."""
+    record = read_record(folder)
+    return record is not None and record.key == source_key(run, settings)
+
+
 def source_key(run: RunFolder, settings: ScaleSettings) -> str:
     """A digest of settings, of the files they name, and of what they are about."""
     files = [getattr(settings, name) for name in ("points", "distances", "marker_file", "laser_dots", "nav", "control")]
