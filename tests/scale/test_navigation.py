@@ -55,16 +55,18 @@ def test_the_attitude_shows_the_mounting_of_the_camera(survey):
     assert found.attitude_residual_deg == pytest.approx(0, abs=1e-5)
 
 
-def test_the_standard_deviation_of_the_scale_is_that_of_repeated_dives():
+@pytest.mark.parametrize("step", [1.0, 0.4])
+def test_the_standard_deviation_of_the_scale_is_that_of_repeated_dives(step):
+    """By positions at the frames' times, and by ones between which positions are interpolated."""
     survey = survey_along(lines(each=12))
-    errors, stds = [], []
-    for seed in range(16):
-        noise = 0.1 * np.random.default_rng(seed).normal(size=survey.position.shape)
-        found = aligned(survey, survey.position + noise, attitude=None)
-        errors.append(np.log(found.scale / SCALE))
-        stds.append(found.scale_std)
-    assert np.std(errors) == pytest.approx(np.mean(stds), rel=0.4)
-    assert abs(np.mean(errors)) < 3 * np.std(errors) / np.sqrt(len(errors))
+    errors = []
+    for seed in range(40):
+        log = dense(survey, step=step, noise=0.1, seed=seed)
+        settings = ScaleSettings()
+        found = align(path_of(survey.rec, match_times(log, times_of(survey), 0.0, 5.0), settings), settings)
+        errors.append(np.log(found.scale / SCALE) / found.scale_std)
+    assert np.sqrt(np.mean(np.square(errors))) == pytest.approx(1, abs=0.25)
+    assert abs(np.mean(errors)) < 3 / np.sqrt(len(errors))
 
 
 def test_a_few_wild_positions_do_not_pull_the_scale(survey):
@@ -165,6 +167,32 @@ def test_the_offset_between_clocks_is_found(survey, shift):
     assert found is not None
     assert found.seconds == pytest.approx(shift, abs=0.05)
     assert abs(found.seconds - shift) < 4 * found.std
+
+
+def test_the_standard_deviation_of_the_offset_is_that_of_repeated_dives(survey):
+    centers = survey.rec.cameras.centers.numpy()
+    log = dense(survey, step=0.5)
+    path = CubicSpline(survey.seconds, survey.position)(log.time)
+    draws = [path + 0.1 * np.random.default_rng(seed).normal(size=path.shape) for seed in range(80)]
+    logs = [replace(log, position=position) for position in draws]
+    found = [find_offset(log, times_of(survey, -0.3), centers, (-0.5, 1.0), 5.0) for log in logs]
+    errors = [(each.seconds - 0.3) / each.std for each in found if each is not None]
+    assert len(errors) == 80
+    assert np.sqrt(np.mean(np.square(errors))) == pytest.approx(1, abs=0.2)
+
+
+def test_the_scale_is_as_uncertain_as_the_offset_of_the_clocks(tmp_path):
+    """Along a straight path that gains speed, an offset changes the scale."""
+    along = np.cumsum(np.linspace(0.1, 0.6, 30))
+    survey = survey_along(np.stack([along, np.zeros(30), np.full(30, 2.0)], -1))
+    noise = 0.05 * np.random.default_rng(0).normal(size=survey.position.shape)
+    stated = survey.geodetic(survey.position + noise)
+    columns = {"latitude": stated[:, 0], "longitude": stated[:, 1], "depth": -stated[:, 2], "heading": None}
+    file = write_csv(tmp_path / "nav.csv", survey, **columns)
+    found, given = (fit_navigation(survey.rec, survey.frames, ScaleSettings(nav=file, nav_offset=o)) for o in (None, 0))
+    assert found.offset is not None
+    assert found.offset.std > 0.05
+    assert found.alignment.scale_std > 1.2 * given.alignment.scale_std
 
 
 def test_the_offset_of_a_clip_without_a_date_is_found_anywhere(survey):

@@ -4,7 +4,7 @@ Navigation that does not fit the path of the cameras is refused. Where a common 
 zone, another unit of angles) would make it fit, the message names it; nothing is corrected silently.
 """
 
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path as FilePath
 from typing import Literal
@@ -69,6 +69,8 @@ def fit_navigation(rec: Reconstruction, frames: Frames, settings: ScaleSettings)
     _check_fit(rec, path, alignment, local.navigation, raw, times, matched, settings)
     if matched.by == "name" and times.clock == "utc":
         matched, alignment, offset = _at_latency(path, matched, alignment, times, settings)
+    elif offset is not None and settings.nav_offset is None:
+        alignment = _as_uncertain(alignment, _beside(rec, local.navigation, times, offset, settings))
     return NavigationFit(
         settings.nav, matched, alignment, local.place, matched.by, offset, settings.nav_offset is None, tuple(notes)
     )
@@ -86,11 +88,24 @@ def _at_latency(
     matched = Matched(matched.frame[rows], matched.navigation.rows(np.flatnonzero(rows)), matched.by)
     found = align(at_offset(path, seconds, offset.seconds).rows(rows), settings)
     sides = [
-        realign(at_offset(path, seconds, offset.seconds + side).rows(rows), settings, found).scale
+        realign(at_offset(path, seconds, offset.seconds + side).rows(rows), settings, found)
         for side in (-offset.std, offset.std)
     ]
-    by_offset = abs(np.log(sides[1] / sides[0])) / 2
-    return matched, replace(found, scale_std=float(np.hypot(found.scale_std, by_offset))), offset
+    return matched, _as_uncertain(found, sides), offset
+
+
+def _beside(
+    rec: Reconstruction, local: Navigation, times: FrameTimes, offset: Offset, settings: ScaleSettings
+) -> list[Alignment]:
+    """The alignments a standard deviation of the offset before and after it, where enough positions are left."""
+    sides = (match_times(local, times, offset.seconds + side, settings.nav_gap) for side in (-offset.std, offset.std))
+    return [align(path_of(rec, side, settings), settings) for side in sides if len(side.frame) >= FEWEST]
+
+
+def _as_uncertain(found: Alignment, sides: Sequence[Alignment]) -> Alignment:
+    """The alignment whose scale is also as uncertain as those under other offsets differ."""
+    by_offset = np.ptp(np.log([each.scale for each in (found, *sides)])) / 2
+    return replace(found, scale_std=float(np.hypot(found.scale_std, by_offset)))
 
 
 def path_of(rec: Reconstruction, matched: Matched, settings: ScaleSettings) -> Path:

@@ -1,11 +1,13 @@
 """The offset between two clocks: that under which the path of the cameras fits the navigation best.
 
 The fit of a straight path at constant speed is the same under every offset; the standard deviation, from the curvature
-of the sum of squares at its least, tells.
+of the sum of squares at its least, tells. The weights of the least are held for it, and the variance of positions is
+that of their median: rows far off count less, so that a weighted mean of squares is a fifth below the variance.
 """
 
 from collections.abc import Callable
 from dataclasses import dataclass
+from typing import TypeAlias
 
 import numpy as np
 from jaxtyping import Float
@@ -17,6 +19,11 @@ from swimm3r.scale.navigation.matching import FEWEST, FrameTimes
 _STEPS = 4000  # of a coarse search, at most
 _FINEST = 1e-3  # seconds
 _LEAST_STD = 2e-3  # metres, of any position
+_Fit: TypeAlias = Callable[[np.ndarray, np.ndarray, np.ndarray], np.ndarray]
+_REACH = 0.02  # seconds on either side of the best offset, over which the curvature is taken
+_ROUNDS = 3  # of reweighting
+_UNKNOWNS = 8  # a similarity and the offset
+_MEDIAN_1, _MEDIAN_3 = 0.455, 2.366  # of the chi-squared distribution of 1 and of 3 degrees of freedom
 _ENOUGH = 0.6  # of the positions that overlap at best: offsets with fewer are not compared
 
 
@@ -53,18 +60,22 @@ def find_offset(
         return _misfit(navigation, path, offset)[1]
 
     best = _least(fit, max(low, grid[at] - step), min(high, grid[at] + step))
-    count, variance = _misfit(navigation, path, best)
-    # the sum of squares is count * misfit / variance; half of its second derivative is 1 / std^2
-    reach = max(2 * step, 4 * _FINEST)
-    sides = [fit(best - reach), fit(best + reach)]
-    curvature = (sum(sides) - 2 * variance) / reach**2
-    freedom = max(1, 3 * count - 8)
-    std = (
-        np.sqrt(2 * (variance + _LEAST_STD**2) / (curvature * freedom))
-        if curvature > 0 and np.isfinite(curvature)
-        else np.inf
-    )
-    return Offset(best, float(std))
+    return Offset(best, _std(navigation, path, best))
+
+
+def _std(navigation: Navigation, path: "_CameraPath", best: float) -> float:
+    """The standard deviation of the best offset; infinite where the fit is no worse on either side."""
+    inside, source = path.at(navigation.time - best)
+    rows = inside > 0
+    target, fit = navigation.position[rows], _fit_of(navigation)
+    squared, weight = _residuals(source[rows], target, fit)
+    axes, middle = (1, _MEDIAN_1) if navigation.has_heights_alone else (3, _MEDIAN_3)
+    freedom = max(1, axes * len(target) - _UNKNOWNS) / (axes * len(target))
+    variance = float(np.median(squared)) / middle / freedom + _LEAST_STD**2
+    sides = [fit(path.at(navigation.time - best + side)[1][rows], target, weight) for side in (-_REACH, _REACH)]
+    # the weighted sum of squares over the variance is chi^2; half of its second derivative is the information
+    curvature = float(weight @ (sides[0] + sides[1] - 2 * squared)) / _REACH**2
+    return float(np.sqrt(2 * variance / curvature)) if curvature > 0 and np.isfinite(curvature) else np.inf
 
 
 @dataclass(frozen=True)
@@ -96,14 +107,23 @@ def _misfit(navigation: Navigation, path: _CameraPath, offset: float) -> tuple[i
     rows = inside > 0
     if rows.sum() < FEWEST:
         return int(rows.sum()), np.inf
-    source, target = source[rows], navigation.position[rows]
-    fit = _heights if navigation.has_heights_alone else _similar
-    weight = np.ones(len(source))
-    squared = np.zeros(len(source))
-    for _ in range(3):
+    squared, weight = _residuals(source[rows], navigation.position[rows], _fit_of(navigation))
+    return int(rows.sum()), float(weight @ squared / weight.sum())
+
+
+def _fit_of(navigation: Navigation) -> _Fit:
+    return _heights if navigation.has_heights_alone else _similar
+
+
+def _residuals(
+    source: Float[np.ndarray, "n 3"], target: Float[np.ndarray, "n 3"], fit: _Fit
+) -> tuple[Float[np.ndarray, " n"], Float[np.ndarray, " n"]]:
+    """Squared distances under the best similarity, and the weights of the rows in it."""
+    weight, squared = np.ones(len(source)), np.zeros(len(source))
+    for _ in range(_ROUNDS):
         squared = fit(source, target, weight)
         weight = 1 / (1 + squared / (4 * np.median(squared) + 1e-12))
-    return len(source), float(weight @ squared / weight.sum())
+    return squared, weight
 
 
 def _similar(source: np.ndarray, target: np.ndarray, weight: np.ndarray) -> np.ndarray:
