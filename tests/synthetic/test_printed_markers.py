@@ -11,7 +11,7 @@ from swimm3r.cameras import project
 from swimm3r.medium import srgb_from_linear
 from swimm3r.scale.markers import MarkerSizes, detect
 from swimm3r.synthetic import DiveSettings, make_dive
-from swimm3r.synthetic.printed_markers import Plate, with_plates
+from swimm3r.synthetic.printed_markers import Plate, plates_from_above, with_plates
 from swimm3r.synthetic.seafloor import height_at
 
 DIVE = DiveSettings(frames=6, width=320, height=240, noise=0.0, printed_markers=3, printed_marker_size=0.3)
@@ -66,3 +66,26 @@ def test_a_square_has_its_size_and_turn():
     sides = np.linalg.norm(plate.corners - np.roll(plate.corners, 1, 0), axis=1)
     np.testing.assert_allclose(sides, 0.3)
     np.testing.assert_allclose(plate.corners.mean(0), [1, 2, 0.1])
+
+
+def test_the_view_from_above_shows_the_plate_that_a_camera_above_it_sees(dive):
+    camera, plate = below(dive)
+    radiance, z = with_plates(np.full((240, 320, 3), 0.2), np.full((240, 320), 9.0), camera, [plate])
+    height, place = float(camera.cam2world[0, 2, 3]), camera.cam2world[0, :2, 3].numpy()
+    cell = (height - plate.center[2]) / float(camera.K[0, 0, 0])  # of a pixel on the plate
+    x = place[0] + (np.arange(320) + 0.5 - float(camera.K[0, 0, 2])) * cell
+    y = place[1] - (np.arange(240) + 0.5 - float(camera.K[0, 1, 2])) * cell
+    above, ground = plates_from_above(np.full((240, 320, 3), 0.2), np.full((240, 320), height - 9.0), x, y, [plate])
+    np.testing.assert_allclose(above, radiance, atol=1e-6)
+    np.testing.assert_allclose(height - ground, z, atol=1e-6)
+
+
+def test_ground_above_a_plate_hides_it_from_above(dive):
+    plate = dive.plates[1]
+    x, y = (plate.center[k] + np.linspace(-0.05, 0.05, 11) for k in range(2))
+    height = np.where(np.arange(11) < 5, plate.center[2] + 0.1, plate.center[2] - 0.1) + np.zeros((11, 11))
+    above, found = plates_from_above(np.full((11, 11, 3), 0.2), height, x, y, [plate])
+    np.testing.assert_allclose(above[:, :5], 0.2)
+    np.testing.assert_allclose(found[:, :5], height[:, :5])
+    np.testing.assert_allclose(found[:, 5:], plate.center[2])
+    assert np.abs(above[:, 5:] - 0.2).mean() > 0.1

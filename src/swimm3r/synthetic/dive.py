@@ -105,7 +105,7 @@ class Dive:
         rays, sample_rays = centers.direction, samples.direction
         radiance, z = render(floor, camera.cam2world[0].numpy(), centers, samples, seconds, settings.caustics)
         if self.plates:
-            radiance, z = with_plates(radiance, z, camera, list(self.plates))
+            radiance, z = with_plates(radiance, z, camera, self.plates)
         radiance = radiance * np.array(settings.daylight)
         clear = srgb_from_linear(torch.from_numpy(radiance)).clamp(0, 1).float()
         z_depth = torch.from_numpy(z).float()

@@ -3,11 +3,12 @@
 A plate lies just above the highest ground below it, and is rendered exactly where the rays of a frame meet its plane.
 """
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
 import torch
-from jaxtyping import Float
+from jaxtyping import Float, Int
 
 from swimm3r.cameras import Cameras, directions, project
 from swimm3r.synthetic.plain import Plain
@@ -63,7 +64,7 @@ def plates_along(
 
 
 def with_plates(
-    radiance: Float[np.ndarray, "h w 3"], z_depth: Float[np.ndarray, "h w"], camera: Cameras, plates: list[Plate]
+    radiance: Float[np.ndarray, "h w 3"], z_depth: Float[np.ndarray, "h w"], camera: Cameras, plates: Sequence[Plate]
 ) -> tuple[Float[np.ndarray, "h w 3"], Float[np.ndarray, "h w"]]:
     """Linear radiance and z depth of a frame with the plates that it shows."""
     radiance, z_depth = radiance.copy(), z_depth.copy()
@@ -72,20 +73,53 @@ def with_plates(
         if window is None:
             continue
         rows, columns = window
-        grid = (np.arange(_SAMPLES) + 0.5) / _SAMPLES
-        y = (rows[:, None] + grid).ravel()
-        x = (columns[:, None] + grid).ravel()
-        shape = (len(rows), _SAMPLES, len(columns), _SAMPLES)
-        albedo, _ = _seen(camera, plate, x, y)
-        cover = np.isfinite(albedo).reshape(shape).mean((1, 3))
-        light = _LIGHT * np.nansum(albedo.reshape(shape), (1, 3)) / _SAMPLES**2
+        albedo, _ = _seen(camera, plate, _samples(columns), _samples(rows))
         middle, z = _seen(camera, plate, columns + 0.5, rows + 0.5)
         at = np.ix_(rows, columns)
         visible = (z_depth[at] == 0) | (z < z_depth[at]) | ~np.isfinite(middle)
-        mixed = (1 - cover)[..., None] * radiance[at] + light[..., None]
-        radiance[at] = np.where(visible[..., None], mixed, radiance[at])
+        radiance[at] = np.where(visible[..., None], _over(radiance[at], albedo), radiance[at])
         z_depth[at] = np.where(visible & np.isfinite(middle), z, z_depth[at])
     return radiance, z_depth
+
+
+def plates_from_above(
+    radiance: Float[np.ndarray, "rows columns 3"],
+    height: Float[np.ndarray, "rows columns"],
+    x: Float[np.ndarray, " columns"],
+    y: Float[np.ndarray, " rows"],
+    plates: Sequence[Plate],
+) -> tuple[Float[np.ndarray, "rows columns 3"], Float[np.ndarray, "rows columns"]]:
+    """Linear radiance and heights of cells with these middles, evenly spaced, with the plates that lie there."""
+    radiance, height = radiance.copy(), height.copy()
+    steps = x[1] - x[0], y[1] - y[0]
+    for plate in plates:
+        reach = _BORDER * plate.size / np.sqrt(2) + abs(steps[0])
+        columns = np.flatnonzero(np.abs(x - plate.center[0]) < reach)
+        rows = np.flatnonzero(np.abs(y - plate.center[1]) < reach)
+        if not len(columns) or not len(rows):
+            continue
+        at = np.ix_(rows, columns)
+        middles = x[columns] - plate.center[0], y[rows] - plate.center[1]
+        fine = (m[0] + (_samples(np.arange(len(m))) - 0.5) * step for m, step in zip(middles, steps, strict=True))
+        albedo, middle = _albedo(plate, *np.meshgrid(*fine)), _albedo(plate, *np.meshgrid(*middles))
+        visible = (height[at] < plate.center[2]) | ~np.isfinite(middle)
+        radiance[at] = np.where(visible[..., None], _over(radiance[at], albedo), radiance[at])
+        height[at] = np.where(visible & np.isfinite(middle), plate.center[2], height[at])
+    return radiance, height
+
+
+def _samples(pixels: Int[np.ndarray, " n"]) -> Float[np.ndarray, " m"]:
+    """The places of samples along one side of pixels, evenly spread in each."""
+    return (pixels[:, None] + (np.arange(_SAMPLES) + 0.5) / _SAMPLES).ravel()
+
+
+def _over(radiance: Float[np.ndarray, "h w 3"], albedo: Float[np.ndarray, "m n"]) -> Float[np.ndarray, "h w 3"]:
+    """Radiance of pixels behind a plate whose albedo their samples have; NaN beside it."""
+    rows, columns = radiance.shape[:2]
+    shape = (rows, _SAMPLES, columns, _SAMPLES)
+    cover = np.isfinite(albedo).reshape(shape).mean((1, 3))
+    light = _LIGHT * np.nansum(albedo.reshape(shape), (1, 3)) / _SAMPLES**2
+    return (1 - cover)[..., None] * radiance + light[..., None]
 
 
 def _window(camera: Cameras, plate: Plate) -> tuple[np.ndarray, np.ndarray] | None:
@@ -110,15 +144,20 @@ def _seen(
     down = np.where(np.abs(rays[:, 2]) < 1e-9, 1e-9, rays[:, 2])
     z = (plate.center[2] - pose[2, 3]) / down
     east, north = (pose[:3, 3] + z[:, None] * rays)[:, :2].T - np.array(plate.center[:2])[:, None]
+    shape = (len(y), len(x))
+    albedo = np.where(z > 0, _albedo(plate, east, north), np.nan)
+    return albedo.reshape(shape), z.reshape(shape)
+
+
+def _albedo(plate: Plate, east: Float[np.ndarray, "*n"], north: Float[np.ndarray, "*n"]) -> Float[np.ndarray, "*n"]:
+    """Albedo of a plate at distances from its center, metres; NaN beside it."""
     cos, sin = np.cos(plate.turn), np.sin(plate.turn)
     u, v = (cos * east + sin * north) / plate.size, (cos * north - sin * east) / plate.size
-    on_plate = (np.maximum(np.abs(u), np.abs(v)) <= _BORDER / 2) & (z > 0)
+    on_plate = np.maximum(np.abs(u), np.abs(v)) <= _BORDER / 2
     column, row = (np.floor((value + 0.5) * _CELLS).astype(int) for value in (u, -v))
     inside = (column >= 0) & (column < _CELLS) & (row >= 0) & (row < _CELLS)
     cells = _cells(plate.marker)[row.clip(0, _CELLS - 1), column.clip(0, _CELLS - 1)]
-    albedo = np.where(inside, np.where(cells, _WHITE, _BLACK), _WHITE)
-    shape = (len(y), len(x))
-    return np.where(on_plate, albedo, np.nan).reshape(shape), z.reshape(shape)
+    return np.where(on_plate, np.where(inside & ~cells, _BLACK, _WHITE), np.nan)
 
 
 def _cells(marker: int) -> np.ndarray:

@@ -10,6 +10,7 @@ from jaxtyping import Float
 from swimm3r.medium import srgb_from_linear
 from swimm3r.synthetic.appearance import radiance
 from swimm3r.synthetic.dive import Dive
+from swimm3r.synthetic.printed_markers import plates_from_above
 from swimm3r.synthetic.raycast import bilinear
 from swimm3r.synthetic.render_frame import SAMPLES
 
@@ -31,6 +32,7 @@ def top_view(
                 y[rows], cell, floor.seed * 1000 + 17,
             )  # fmt: skip
             color[np.ix_(rows, columns)], height[np.ix_(rows, columns)] = colors, heights
+    color, height = plates_from_above(color, height, x, y, dive.plates)
     return srgb_from_linear(torch.from_numpy(color)).clamp(0, 1).numpy(), height
 
 
