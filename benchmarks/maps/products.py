@@ -1,7 +1,7 @@
 """Map products of a synthetic survey against the true view from above.
 
-    python benchmarks/map_products.py DIVE RUN            the run as it was reconstructed, placed by its camera centers
-    python benchmarks/map_products.py DIVE RUN --truth    the true cameras, depth and clear images in its place
+    python benchmarks/maps/products.py DIVE RUN            the run as it was reconstructed, placed by its camera centers
+    python benchmarks/maps/products.py DIVE RUN --truth    the true cameras, depth and clear images in its place
 
 DIVE is a folder of `swimm3r.synthetic.dive.write_dive`, RUN a run of its images. Printed: errors of height over the
 cells, PSNR of the orthophoto without water, and shifts of patches of 48 cells by phase correlation.
@@ -18,6 +18,7 @@ from typing import Any
 import cv2
 import numpy as np
 import torch
+from jaxtyping import Float, Int
 
 from swimm3r.evaluate.images import psnr
 from swimm3r.geometry import align_similarity
@@ -49,14 +50,17 @@ class TrueImages(Survey):
         return super().image(colors, i) if colors == "filmed" or clear is None else clear.numpy()
 
 
-def placed(survey: Survey, truth: GroundTruth) -> Survey:
-    """The run in the truth's frame, by a similarity of the camera centers."""
+def placed(survey: Survey, truth: GroundTruth, scale: float | None = None) -> Survey:
+    """The run in the truth's frame, by a similarity of the camera centers; of a given scale, by a motion."""
     reference = truth.cameras[[truth.names.index(name) for name in survey.rec.names]]
-    fit = align_similarity(survey.rec.cameras.centers.double(), reference.centers.double())
-    away = fit.points(survey.rec.cameras.centers.double()) - reference.centers
-    print(f"camera centers: {1e3 * float(away.norm(dim=1).pow(2).mean().sqrt()):.2f} mm rms")
+    own, true = survey.rec.cameras.centers.double(), reference.centers.double()
+    fit = align_similarity(own, true)
+    scale = float(fit.scale) if scale is None else scale
+    shift = true.mean(0) - scale * fit.R @ own.mean(0)
+    away = (scale * own @ fit.R.T + shift - true).norm(dim=1)
+    print(f"camera centers: {1e3 * float(away.pow(2).mean().sqrt()):.2f} mm rms")
     rows = [tuple(row) for row in fit.R.tolist()]
-    place = Georeference(None, tuple(fit.t.tolist()), (rows[0], rows[1], rows[2]), float(fit.scale))
+    place = Georeference(None, tuple(shift.tolist()), (rows[0], rows[1], rows[2]), scale)
     return replace(survey, place=place)
 
 
@@ -73,8 +77,49 @@ def with_truth(survey: Survey, truth: GroundTruth, folder: Path) -> Survey:
     return TrueImages(survey.folder, rec, survey.frames, place, truth)
 
 
-def compare(survey: Survey, dive: Dive) -> None:
-    """Print the errors of height, color and place."""
+@dataclass(frozen=True)
+class MapErrors:
+    """Errors of the maps of a survey against the true view from above; lengths in metres."""
+
+    grid: Grid
+    seconds: float  # of the processor
+    distance: float  # median z depth
+    height: Float[np.ndarray, "rows columns"]  # found less true; NaN in holes
+    views: Int[np.ndarray, "rows columns"]
+    rugosity: dict[float, tuple[float, float]]  # distance of the heights: of the map, and of the truth
+    psnr: float
+    shifts: Float[np.ndarray, " patches"]  # cells
+
+    def rms(self, views: int = 1) -> float:
+        """Root mean square error of the heights that at least so many depth maps show."""
+        return float(np.sqrt((self._shown_by(views) ** 2).mean()))
+
+    def _shown_by(self, views: int) -> Float[np.ndarray, " n"]:
+        return self.height[~np.isnan(self.height) & (self.views >= views)]
+
+    def show(self) -> None:
+        """Print all of them."""
+        grid = self.grid
+        print(f"{grid.columns} x {grid.rows} cells of {1e3 * grid.gsd:g} mm, {self.seconds:.1f} CPU-s")
+        for views in (1, 2, 3, 5):
+            kept, rms = self._shown_by(views), self.rms(views)
+            print(
+                f"heights, at least {views} views: {len(kept) / self.height.size:.0%} of the cells, {1e3 * rms:.2f} mm"
+                f" rms = {rms / self.distance:.2%} of the range, median {1e3 * np.median(np.abs(kept)):.2f} mm"
+            )
+        for spacing, (found, true) in self.rugosity.items():
+            print(
+                f"rugosity of heights every {1e3 * spacing:g} mm: {found:.3f}, {found / true - 1:+.1%} from the truth"
+            )
+        print(f"orthophoto: {self.psnr:.1f} dB")
+        print(
+            f"place: median {np.median(self.shifts):.2f} cells of {len(self.shifts)} patches,"
+            f" 90 % {np.quantile(self.shifts, 0.9):.2f}"
+        )
+
+
+def compare(survey: Survey, dive: Dive) -> MapErrors:
+    """The errors of height, color and place of a survey in the frame of the truth."""
     grid = grid_of(survey)
     window = Window(0, 0, grid.rows, grid.columns)
     started = time.process_time()
@@ -84,37 +129,34 @@ def compare(survey: Survey, dive: Dive) -> None:
     rows, columns = np.nonzero(~np.isnan(found.height))
     points = Points(np.stack([x[columns], y[rows], found.height[rows, columns]], -1), size=grid.gsd)
     colors = blended(survey, points, frames, ["physical"])["physical"]
-    cost = time.process_time() - started
+    seconds = time.process_time() - started
     image = np.full((grid.rows, grid.columns, 3), np.nan)
     image[rows, columns] = colors
     origin = np.array(survey.place.origin)
     clear, height = top_view(dive, x + origin[0], y + origin[1])
-    print(f"{grid.columns} x {grid.rows} cells of {1e3 * grid.gsd:g} mm, {cost:.1f} CPU-s")
-    distance = np.median([np.median(survey.points(i).z_depth[survey.points(i).usable]) for i in survey.indices])
     error = found.height + origin[2] - height
-    for views in (1, 2, 3, 5):
-        kept = error[~np.isnan(error) & (found.views >= views)]
-        rms = float(np.sqrt((kept**2).mean()))
-        print(
-            f"heights, at least {views} views: {len(kept) / error.size:.0%} of the cells, {1e3 * rms:.2f} mm rms"
-            f" = {rms / distance:.2%} of the range, median {1e3 * np.median(np.abs(kept)):.2f} mm"
-        )
-    print_rugosity(found.height, np.where(np.isnan(error), np.nan, height), grid.gsd)
     shown = np.logical_not(np.isnan(image).any(-1))
-    print(f"orthophoto: {psnr(torch.from_numpy(image[shown]), torch.from_numpy(clear[shown])):.1f} dB")
-    shifts = patch_shifts(image, clear, shown, grid)
-    print(f"place: median {np.median(shifts):.2f} cells of {len(shifts)} patches, 90 % {np.quantile(shifts, 0.9):.2f}")
+    medians = [np.median(one.z_depth[one.usable]) for one in map(survey.points, survey.overview)]
+    return MapErrors(
+        grid=grid,
+        seconds=seconds,
+        distance=float(np.median(medians)),
+        height=error,
+        views=found.views,
+        rugosity=rugosities(found.height, np.where(np.isnan(error), np.nan, height), grid.gsd),
+        psnr=float(psnr(torch.from_numpy(image[shown]), torch.from_numpy(clear[shown]))),
+        shifts=patch_shifts(image, clear, shown, grid),
+    )
 
 
-def print_rugosity(height: np.ndarray, truth: np.ndarray, gsd: float) -> None:
-    """Rugosity by heights at several distances, relative to that of the true ones."""
+def rugosities(height: np.ndarray, truth: np.ndarray, gsd: float) -> dict[float, tuple[float, float]]:
+    """Rugosity of heights and of the true ones, by the distance of the heights."""
+    found = {}
     for block in (1, 2, 5, 10):
         one, other = (figures(means(values, block), block * gsd) for values in (height, truth))
         if one is not None and other is not None:
-            error = one.rugosity / other.rugosity - 1
-            print(
-                f"rugosity of heights every {1e3 * block * gsd:g} mm: {one.rugosity:.3f}, {error:+.1%} from the truth"
-            )
+            found[block * gsd] = (one.rugosity, other.rugosity)
+    return found
 
 
 def means(values: np.ndarray, block: int) -> np.ndarray:
@@ -158,7 +200,7 @@ def main() -> None:
     survey, truth = open_survey(given.run), read_ground_truth(given.dive / "truth")
     with TemporaryDirectory() as folder:
         survey = with_truth(survey, truth, Path(folder)) if given.truth else placed(survey, truth)
-        compare(survey, dive_of(given.dive))
+        compare(survey, dive_of(given.dive)).show()
 
 
 if __name__ == "__main__":

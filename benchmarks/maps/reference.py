@@ -1,6 +1,6 @@
 """The elevation map of a run against depth maps of another program.
 
-    python benchmarks/map_reference.py RUN REFERENCE
+    python benchmarks/maps/reference.py RUN REFERENCE
 
 RUN has products. REFERENCE holds reference_cameras.json (openMVG's pinhole with k1, k2, p1, p2, k3; c2w in metres) and
 depth_mm/NAME.png, millimetres along the optical axis. The reference is laid over the run by its camera centers, with
