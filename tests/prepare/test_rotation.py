@@ -34,14 +34,21 @@ def wall() -> np.ndarray:
     return (255 * (total - total.min()) / np.ptp(total)).astype(np.uint8)
 
 
-def attitude(t: float) -> Rotation:
-    """Rotation from the camera's axes to the world's: unsteady hands."""
+def angles(t: float) -> tuple[float, float, float]:
+    """Yaw, pitch and roll of unsteady hands."""
     yaw = 0.16 * np.sin(2.1 * t) + 0.03 * np.sin(9 * t)
-    return Rotation.from_euler("YXZ", [yaw, 0.05 * np.sin(3.3 * t) + 0.02 * np.sin(11 * t), 0.04 * np.sin(1.7 * t)])
+    return yaw, 0.05 * np.sin(3.3 * t) + 0.02 * np.sin(11 * t), 0.04 * np.sin(1.7 * t)
 
 
-def view(wall: np.ndarray, i: int) -> np.ndarray:
-    center = np.array([0.03 * max(0, i - HALF), 0, 0])
+def attitude(t: float) -> Rotation:
+    """Rotation from the camera's axes to the world's."""
+    return Rotation.from_euler("YXZ", angles(t))
+
+
+def view(wall: np.ndarray, i: int, sway: float = 0.0) -> np.ndarray:
+    """The image of a frame; a share `sway` of the motion by rotation is undone by moving aside."""
+    yaw, pitch, _ = angles(TIMES[i])
+    center = np.array([0.03 * max(0, i - HALF) - sway * DISTANCE * yaw, sway * DISTANCE * pitch, 0])
     R = attitude(TIMES[i]).as_matrix().T
     onto = np.stack([R[:, 0] / 100, R[:, 1] / 100, R @ (np.array([-4.0, -3.5, DISTANCE]) - center)], 1)
     return cv2.warpPerspective(wall, K @ onto, (WIDTH, HEIGHT))
@@ -103,6 +110,11 @@ def test_a_gyroscope_of_something_else_is_not_used(views: Callable[[int], np.nda
     noise = Gyroscope(true.time, rng.normal(size=true.rate.shape))
     assert rotation_motion(other, TIMES, views) is None
     assert rotation_motion(noise, TIMES, views) is None
+
+
+def test_a_camera_that_sways_as_it_turns_does_not_tell_its_focal_length(wall: np.ndarray):
+    swaying = [view(wall, i, sway=0.7) for i in range(COUNT)]
+    assert rotation_motion(gyroscope(), TIMES, swaying.__getitem__) is None
 
 
 def test_keyframes_of_a_dive_are_chosen_by_the_gyroscope(views: Callable[[int], np.ndarray]):

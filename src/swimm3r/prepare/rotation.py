@@ -6,7 +6,8 @@ frame i is then seen (in units of the focal length): translation is smooth, hand
 
     u_i+1 - u_i = f (p_i+1 - p_i) + ...
 
-by least squares, at the delay at which the two go together best.
+by least squares, at the delay at which the two go together best. A camera that sways as it turns moves the image by
+both: where that makes a focal length which no lens has, the motion by rotation is not known.
 """
 
 from collections.abc import Callable, Sequence
@@ -23,6 +24,7 @@ _CORRELATED = 0.7  # between changes of displacement and of rotation, from which
 _FEWEST = 10  # changes that tell the focal length
 _MOST = 200  # pairs of frames that are looked at
 _ROUNDS = 3  # of the focal length
+_FOCALS = 0.4, 4.0  # by the longer side: fields of view of 103 and 14 degrees
 
 
 @dataclass(frozen=True)
@@ -72,7 +74,8 @@ def rotation_motion(
     for _ in range(_ROUNDS):  # off its middle an image moves more: the whole of it tells the focal length
         expected = np.diff([_median_flow(motion, i) for i in starts], axis=0)[known].ravel()
         motion = replace(motion, focal=motion.focal * float(u @ expected) / float(expected @ expected))
-    return motion
+    low, high = (share * max(height, width) for share in _FOCALS)
+    return motion if low <= motion.focal <= high else None
 
 
 def _ahead(turn: Float[np.ndarray, "3 3"]) -> Float[np.ndarray, "2"]:
