@@ -112,9 +112,9 @@ def _objects(
     rows, columns = _box(near)
     cut = np.ascontiguousarray(label[rows, columns])
     if (cut == cv2.GC_BGD).any():  # else there is nothing that the object could end at
-        model = [np.zeros((1, 65)), np.zeros((1, 65))]
+        ground, moving = np.zeros((1, 65)), np.zeros((1, 65))  # GrabCut's models of their colors
         cv2.setRNGSeed(0)
-        cv2.grabCut(_eight_bits(rgb[rows, columns]), cut, (0, 0, 0, 0), *model, _ROUNDS, cv2.GC_INIT_WITH_MASK)
+        cv2.grabCut(_eight_bits(rgb[rows, columns]), cut, (0, 0, 0, 0), ground, moving, _ROUNDS, cv2.GC_INIT_WITH_MASK)
     region = np.zeros(decided.shape, np.uint8)
     region[rows, columns] = (cut == cv2.GC_FGD) | (cut == cv2.GC_PR_FGD)
     region = cv2.morphologyEx(region, cv2.MORPH_CLOSE, np.ones((5, 5), np.uint8))
