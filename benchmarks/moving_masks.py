@@ -48,13 +48,13 @@ def row(folder: Path) -> str:
 def true_mask(truth: GroundTruth, name: str) -> np.ndarray:
     """The pixels of a frame of known truth at which something moves."""
     moving = truth.moving(name)
-    return np.False_ if moving is None else moving.numpy()
+    return np.zeros((truth.cameras.height, truth.cameras.width), bool) if moving is None else moving.numpy()
 
 
 def compared(found: list[np.ndarray], true: list[np.ndarray]) -> str:
     """Recall, precision, and the share of all pixels that are found and do not move."""
     hits = sum(int((a & b).sum()) for a, b in zip(found, true, strict=True))
-    claimed, moving = sum(int(a.sum()) for a in found), sum(int(np.sum(b)) for b in true)
+    claimed, moving = sum(int(a.sum()) for a in found), sum(int(b.sum()) for b in true)
     recall = f"{hits / moving:.2f}" if moving else "-"
     precision = f"{hits / claimed:.2f}" if claimed and moving else "-"
     return f"{recall} | {precision} | {(claimed - hits) / sum(a.size for a in found):.2%}"
