@@ -62,6 +62,7 @@ def lifted(size: Size) -> BetaPrimitives:
         beta=torch.cat([(p.beta / 4).log()[:, None], 0.1 * torch.randn(n, 3, generator=rng)], -1),
         scale=inverse_softplus(torch.cat([spatial, torch.ones(n, 3)], -1)),
         lower=0.05 * torch.randn(n, 15, generator=rng),
+        footprint=torch.zeros(n),
     )
 
 

@@ -133,6 +133,7 @@ def scene() -> swimm3r.SplatMap:
         torch.zeros(5000, 4),
         torch.cat([torch.full((5000, 3), -3.0), torch.ones(5000, 3)], -1),
         torch.zeros(5000, 15),
+        torch.zeros(5000),
     )
     field = initial_field(WATER, MediumFieldSettings(), rng).requires_grad_(False)
     scene = swimm3r.SplatMap(p, field, swimm3r.UwbsSettings(), True, viewpoint=camera())

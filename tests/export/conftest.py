@@ -55,6 +55,7 @@ def harmonic_map() -> SplatMap:
     gaussians = GaussianPrimitives(
         p.xyz, torch.randn(n, 4, generator=rng), torch.full((n, 3), -2.5) + 0.3 * torch.randn(n, 3, generator=rng),
         p.opacity, (p.rgb - 0.5) / 0.28209479, 0.05 * torch.randn(n, 15, 3, generator=rng),
+        torch.zeros(n),
     )  # fmt: skip
     settings = with_recipe(UwbsSettings(), "watersplatting")
     assert isinstance(settings, WaterSplattingSettings)

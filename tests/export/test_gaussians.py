@@ -48,7 +48,7 @@ def wall(n: int = 1500) -> SplatMap:
     spread = torch.cat([torch.full((n, 3), 0.25), torch.ones(n, 3)], -1)
     p = BetaPrimitives(
         xyz, torch.nn.functional.normalize(xyz, dim=-1), 0.5 + 0.35 * waves, torch.full((n,), 3.0),
-        torch.zeros(n, 4), inverse_softplus(spread), torch.zeros(n, 15),
+        torch.zeros(n, 4), inverse_softplus(spread), torch.zeros(n, 15), torch.full((n,), 0.02),
     )  # fmt: skip
     return SplatMap(p, initial_field(None, MediumFieldSettings(), rng), UwbsSettings(), True)
 
@@ -154,7 +154,7 @@ def gaussian_wall() -> SplatMap:
     assert isinstance(of.primitives, BetaPrimitives)
     p = GaussianPrimitives(
         of.primitives.xyz, torch.randn(n, 4, generator=rng), torch.full((n, 3), -2.5), of.primitives.opacity,
-        torch.randn(n, 3, generator=rng), 0.2 * torch.randn(n, 15, 3, generator=rng),
+        torch.randn(n, 3, generator=rng), 0.2 * torch.randn(n, 15, 3, generator=rng), torch.zeros(n),
     )  # fmt: skip
     field = initial_field(None, MediumFieldSettings(model="none"), rng)
     return SplatMap(p, field, mcmc_gs(), True)

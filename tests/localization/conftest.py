@@ -84,6 +84,7 @@ def _blotchy_wall() -> SplatMap:
         torch.zeros(n, 4),
         inverse_softplus(torch.cat([torch.full((n, 3), 0.04), torch.ones(n, 3)], -1)),
         torch.zeros(n, 15),
+        torch.zeros(n),
     )
     field = initial_field(WATER, MediumFieldSettings(), torch.Generator().manual_seed(0)).requires_grad_(False)
     return SplatMap(p, field, replace(UwbsSettings(), long_side=240), True)

@@ -56,6 +56,7 @@ def small_map() -> SplatMap:
         beta=torch.zeros(n, 4),
         scale=torch.cat([torch.full((n, 3), -1.0), torch.ones(n, 3)], -1),
         lower=0.1 * torch.randn(n, 15, generator=rng),
+        footprint=0.02 * torch.rand(n, generator=rng),
     )
     field = MediumField(MediumFieldSettings()).requires_grad_(False)
     return SplatMap(p, field, UwbsSettings(), False, length=1.3)

@@ -56,6 +56,7 @@ def make_wall(n: int = 1500) -> SplatMap:
         torch.zeros(n, 4),
         inverse_softplus(spread),
         torch.zeros(n, 15),
+        torch.full((n,), 0.02),
     )
     field = initial_field(WATER, MediumFieldSettings(), torch.Generator().manual_seed(0)).requires_grad_(False)
     return SplatMap(p, field, UwbsSettings(), True)

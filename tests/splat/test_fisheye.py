@@ -11,8 +11,10 @@ from swimm3r.imaging.undistortion import undistorted
 from swimm3r.splat.medium.field import ray_lengths
 from swimm3r.splat.projection.conditioning import Conditioned
 from swimm3r.splat.projection.observed import coverage_from, coverage_of
+from swimm3r.splat.projection.pixel_filter import DILATION
 from swimm3r.splat.projection.plain import project_conditioned
-from swimm3r.splat.projection.view_camera import BLUR, view_camera
+from swimm3r.splat.projection.view_camera import view_camera
+from swimm3r.splat.settings import RenderSettings
 
 LENS = (0.02, -0.01, 0.004, -0.001)
 
@@ -43,7 +45,9 @@ def drawn(xyz: torch.Tensor, spread: float, cam: Cameras):
     covariance = spread**2 * torch.eye(3, dtype=torch.float64).expand(len(xyz), 3, 3)
     ones = torch.ones(len(xyz), dtype=torch.float64)
     seen = Conditioned(xyz, covariance, ones)
-    return project_conditioned(seen, ones, xyz, view_camera(cam, torch.float64), 0.01).primitives
+    return project_conditioned(
+        seen, ones, xyz, view_camera(cam, torch.float64), RenderSettings(antialiasing="dilation")
+    ).primitives
 
 
 def test_primitives_stand_where_the_camera_has_their_points():
@@ -61,7 +65,7 @@ def test_their_extent_is_that_of_points_around_them():
         for e in moves
     ]
     J = torch.stack(columns, -1)
-    expected = 0.05**2 * J @ J.mT + BLUR * torch.eye(2, dtype=torch.float64)
+    expected = 0.05**2 * J @ J.mT + DILATION * torch.eye(2, dtype=torch.float64)
     a, b, c = drawn(xyz, 0.05, camera()).conic.unbind(-1)
     found = torch.linalg.inv(torch.stack([a, b, b, c], -1).unflatten(-1, (2, 2)))
     torch.testing.assert_close(found, expected, rtol=1e-5, atol=1e-6)

@@ -1,5 +1,6 @@
 """Files that are not maps are refused in plain words."""
 
+from collections.abc import Mapping
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
@@ -73,22 +74,34 @@ def test_a_map_comes_back_with_the_same_bits(tmp_path, wall, camera):
     assert (again.viewpoint.width, again.viewpoint.height) == (camera().width, camera().height)
 
 
-def rewritten(path: Path, tensors: dict[str, Tensor], about: dict[str, Any]) -> None:
+def rewritten(path: Path, tensors: Mapping[str, Tensor | None], about: dict[str, Any]) -> None:
     """The same map with some tensors and header entries replaced, or left out where they are None."""
     stored = read_tensors(path, dict[str, Any], remake(path.parent), None)
 
-    def merged(old: dict, new: dict) -> dict:
+    def merged(old: dict, new: Mapping) -> dict:
         return {k: v for k, v in {**old, **new}.items() if v is not None}
 
     write_tensors(path, merged(stored.tensors, tensors), merged(stored.about, about))
 
 
+def test_a_map_from_before_the_filters_is_drawn_as_it_was_trained(tmp_path, wall, camera):
+    path, dilated = tmp_path / "map.safetensors", RenderSettings(antialiasing="dilation")
+    scene = replace(wall(50), settings=UwbsSettings(render=dilated))
+    scene.save(path)
+    old = to_document(scene.settings)
+    del old["render"]["antialiasing"]
+    rewritten(path, {"primitives.footprint": None}, {"schema": 2, "settings": old})
+    again = load_map(path)
+    assert again.settings == scene.settings
+    assert torch.equal(again.render(camera()).rgb, scene.render(camera()).rgb)
+
+
 @pytest.mark.parametrize(
     ("tensors", "about", "said"),
     [
-        ({}, {"schema": 4}, "newer Swimm3R: its schema is 4, this version reads 2 and 3"),
+        ({}, {"schema": 6}, "newer Swimm3R: its schema is 6, this version reads 2 and 3 and 4 and 5"),
         ({}, {"schema": 3}, "schema 3 lists 0 blocks"),
-        ({}, {"schema": 1}, "an older Swimm3R: its schema is 1, this version reads 2 and 3"),
+        ({}, {"schema": 1}, "an older Swimm3R: its schema is 1, this version reads 2 and 3 and 4 and 5"),
         ({}, {"schema": None}, "its schema is None"),
         ({}, {"recipe": "splatfacto"}, "splatfacto"),
         ({}, {"recipe": []}, "recipe: a text is expected"),

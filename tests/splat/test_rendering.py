@@ -39,7 +39,7 @@ def test_a_surface_looks_as_the_water_makes_it_look_along_the_ray(wall, camera):
     medium = type(out.medium)(*(values[50, 6] for values in vars(out.medium).values()))
     expected = add_water(p.rgb[0], ray_depth, medium)
     share = out.alpha[50, 6]
-    assert share > 0.99
+    assert share > 0.9  # its light is averaged over the pixel
     torch.testing.assert_close(out.rgb[50, 6], share * expected + (1 - share) * medium.Binf, atol=1e-4, rtol=0)
     assert out.z_depth[50, 6] == pytest.approx(4.0, abs=1e-3)
 

@@ -22,11 +22,13 @@ from swimm3r.cameras import Cameras
 from swimm3r.evaluate.images import psnr_from_errors
 from swimm3r.raster import ALPHA_MAX, ALPHA_MIN, RasterOutput, rasterize
 from swimm3r.splat.block_store import BlockEntry, StoredBlocks
-from swimm3r.splat.primitives.beta import BetaPrimitives, select
+from swimm3r.splat.gaussian_settings import GaussianRenderSettings
+from swimm3r.splat.primitives.beta import BetaPrimitives, kernel_exponent, select
 from swimm3r.splat.primitives.gaussian import colored, covariance
 from swimm3r.splat.primitives.spherical_harmonics import Y_00
-from swimm3r.splat.projection.conditioning import Conditioned, condition, queries, symmetric
+from swimm3r.splat.projection.conditioning import Conditioned, queries, shown
 from swimm3r.splat.projection.dispatch import project
+from swimm3r.splat.projection.pixel_filter import smoothed
 from swimm3r.splat.projection.plain import project_conditioned
 from swimm3r.splat.projection.view_camera import view_camera
 from swimm3r.splat.rendering import SplatMap, settings_in_scene_units
@@ -70,7 +72,8 @@ def clear_gaussians(scene: SplatMap, cameras: Cameras, time: float | None = None
         return moment_matched(scene, cameras, time)
     p = select(p, torch.sigmoid(p.opacity) >= ALPHA_MIN)
     peak = torch.sigmoid(p.opacity).clamp(max=ALPHA_MAX)
-    return Gaussians(p.xyz, 0.5 + Y_00 * p.color, peak, covariance(p), p.harmonics)
+    shape = smoothed(covariance(p), torch.full_like(peak, 0.5), p.footprint, scene.settings.render)
+    return Gaussians(p.xyz, 0.5 + Y_00 * p.color, peak, shape, p.harmonics)
 
 
 def _of_block(scene: SplatMap, blocks: StoredBlocks, entry: BlockEntry, cameras: Cameras) -> Gaussians:
@@ -114,10 +117,9 @@ def moment_matched(scene: SplatMap, cameras: Cameras, time: float | None = None)
         query = normalize(direction[found], dim=-1)
         if now is not None:
             query = torch.cat([query, now.expand(len(query), 1)], -1)
-        state = condition(p, query, settings.rotation)
-        B = 4 * torch.exp(p.beta[:, 0])
+        state, B = shown(p, query, settings), kernel_exponent(p)
         peak = ((share / seen.clamp(min=1))[found, 0] * (B + 2) / (B + 1)).clamp(max=ALPHA_MAX)
-        shape = symmetric(state.covariance, settings.covariance) / (2 * (B + 2))[:, None, None]
+        shape = state.covariance / (2 * (B + 2))[:, None, None]
         visible = peak >= ALPHA_MIN
     none = torch.zeros(int(visible.sum()), 0, 3)
     return Gaussians(state.mean[visible], p.rgb[visible], peak[visible], shape[visible], none)
@@ -128,7 +130,8 @@ def draw_gaussians(g: Gaussians, camera: Cameras, near: float) -> RasterOutput:
     view = view_camera(camera)
     half = torch.full_like(g.opacity, 0.5)
     rgb = colored(g.rgb, g.harmonics, g.xyz - view.center)
-    p = project_conditioned(Conditioned(g.xyz, g.covariance, g.opacity), half, rgb, view, near).primitives
+    shapes, settings = Conditioned(g.xyz, g.covariance, g.opacity), GaussianRenderSettings(near=near)
+    p = project_conditioned(shapes, half, rgb, view, settings).primitives
     return rasterize(p, None, view.height, view.width, kernel="gaussian")
 
 

@@ -129,7 +129,7 @@ Preset = Literal["fast", "default", "best", "paper"]
 _PAPER_POINTS = 2_190_000  # of the restored cloud (Tab. sfm_metrics)
 PAPER = UwbsSettings(  # Eq. 18 and nothing else; where the paper is silent UBS's choices, as it says it follows UBS
     initial=InitialSettings(backdrop=0.0, directions="uniform", time_scale=1.0),
-    render=RenderSettings(alpha_min=0.0, covariance="upper"),
+    render=RenderSettings(alpha_min=0.0, antialiasing="dilation", covariance="upper"),
     medium=MediumFieldSettings(stride=1, begin=0.0),  # evaluated at every pixel, trained from the first step
     weights=LossWeights(
         depth_edges=1.0,  # DN-Splatter's edge-aware weight: no scale is printed

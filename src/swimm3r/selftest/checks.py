@@ -24,7 +24,7 @@ from swimm3r.selftest.scenes import (
 from swimm3r.sfm.plane_sweep.estimate import sweep
 from swimm3r.sfm.plane_sweep.views import make_view
 from swimm3r.sfm.settings import PlaneSweepSettings
-from swimm3r.splat.primitives.beta import BetaPrimitives
+from swimm3r.splat.primitives.beta import BetaPrimitives, trained
 from swimm3r.splat.projection.dispatch import project
 from swimm3r.splat.projection.plain import project_plainly
 from swimm3r.splat.projection.view_camera import view_camera
@@ -114,7 +114,7 @@ def _gradients(p: BetaPrimitives, outputs: list[Tensor]) -> list[Tensor]:
     rng = torch.Generator().manual_seed(3)
     weights = [torch.randn(values.shape, generator=rng, dtype=torch.float64) for values in outputs]
     total = torch.stack([(w.to(values) * values).sum() for w, values in zip(weights, outputs, strict=True)]).sum()
-    return list(torch.autograd.grad(total, list(p)))
+    return list(torch.autograd.grad(total, list(trained(p).values())))
 
 
 def _photometric_loss(device: str) -> Iterator[Check]:

@@ -42,7 +42,9 @@ def beta_primitives(n: int, c: int = 3, seed: int = 0) -> BetaPrimitives:
     beta = torch.cat([0.4 * normal(n, 1), -0.5 + 0.8 * normal(n, c)], -1)
     lower = 0.4 * normal(n, (3 + c) * (2 + c) // 2)
     rgb = torch.rand(n, 3, generator=rng, dtype=torch.float64)
-    return BetaPrimitives(xyz, torch.cat([direction, time], -1), rgb, 1 + normal(n), beta, scale, lower)
+    opacity = 1 + normal(n)
+    footprint = 0.08 * torch.rand(n, generator=rng, dtype=torch.float64)
+    return BetaPrimitives(xyz, torch.cat([direction, time], -1), rgb, opacity, beta, scale, lower, footprint)
 
 
 def turned_camera(width: int = 80, height: int = 56) -> Cameras:

@@ -229,7 +229,7 @@ def _remedy(path: Path) -> Remedy:
 
 def no_primitives() -> BetaPrimitives:
     """The primitives of a static map that has none outside its blocks."""
-    return BetaPrimitives(*(torch.zeros(0, *shape) for shape in ((3,), (3,), (3,), (), (4,), (6,), (15,))))
+    return BetaPrimitives(*(torch.zeros(0, *shape) for shape in ((3,), (3,), (3,), (), (4,), (6,), (15,), ())))
 
 
 def joined(parts: list[BetaPrimitives]) -> BetaPrimitives:

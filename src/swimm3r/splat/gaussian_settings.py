@@ -57,6 +57,9 @@ class GaussianRenderSettings(Settings):
     """Smallest opacity of a Gaussian at a pixel that is drawn."""
     near: Annotated[float, Range(above=0, most=1e6)] = 0.01
     """Smallest z depth of a Gaussian that is drawn."""
+    antialiasing: Literal["mip", "dilation"] = "dilation"
+    """Filter of Gaussians: none smaller than a pixel of the training images, and averaged over the pixels of the view
+    (mip, Mip-Splatting), or widened by 0.3 px^2 in every view (dilation), as in 3DGS."""
     medium_depth_grad: Literal["full", "detach"] = "full"
     """Gradient of the medium's terms to the Gaussians' depths: full, or detached."""
 

@@ -1,14 +1,15 @@
 """Maps and training states on disk, as safetensors: tensors under their names, everything else in the header.
 
-map.safetensors (`schema` 2) holds the primitives as stored (before activation), the water, and in its header
+map.safetensors (`schema` 4) holds the primitives as stored (before activation), the water, and in its header
 the recipe, its settings, the metric flag, the working unit and when the clip begins and ends; also the training
 frames' poses where they were refined, their colors where each has its own, small depth images of them, and the camera
-that notebooks show the map from. That of a large map (`schema` 3) holds no primitives but lists the files of its blocks
-(`splat.block_store`), which lie in blocks/ beside it. A checkpoint adds the optimizer's moments and the step.
+that notebooks show the map from. That of a large map (`schema` 5) holds no primitives but lists the files of its blocks
+(`splat.block_store`), which lie in blocks/ beside it. Maps of schema 2 and 3 have no footprints and are drawn dilated,
+as they were trained. A checkpoint adds the optimizer's moments and the step.
 """
 
 from collections.abc import Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any, cast
 
@@ -28,6 +29,9 @@ from swimm3r.splat.recipes import recipe_parts
 from swimm3r.splat.rendering import SCHEMA, SCHEMA_IN_BLOCKS, SplatMap
 from swimm3r.splat.settings import IN_BLOCKS, RECIPES, RecipeName, settings_of
 from swimm3r.splat.training_poses import RefinedPoses
+
+_DILATED = (2, 3)  # schemas of maps before primitives were filtered
+_IN_BLOCKS = (3, SCHEMA_IN_BLOCKS)
 
 
 @dataclass(frozen=True)
@@ -59,7 +63,7 @@ class _MapHeader:
             raise ValueError(f"its clip ends before it begins: {list(self.span)}")
         check_names(self.frames or ())
         check_names(self.colors or ())
-        if bool(self.blocks) != (self.schema == SCHEMA_IN_BLOCKS):
+        if bool(self.blocks) != (self.schema in _IN_BLOCKS):
             raise ValueError(f"a file of schema {self.schema} lists {len(self.blocks)} blocks")
         check_names(entry.file for entry in self.blocks)
         if self.blocks and self.recipe not in IN_BLOCKS:
@@ -74,10 +78,12 @@ def load_map(path: str | Path) -> SplatMap:
         cause="the file is damaged, of another version, or of another program",
         fault="is not a map that can be read",
     )
-    stored = read_tensors(path, _MapHeader, remedy, (SCHEMA, SCHEMA_IN_BLOCKS))
+    stored = read_tensors(path, _MapHeader, remedy, (*_DILATED, SCHEMA, SCHEMA_IN_BLOCKS))
     about = stored.about
     with guard(path, remedy):
         settings = from_document(about.settings, settings_of(cast(RecipeName, about.recipe)))
+        if about.schema in _DILATED:
+            settings = replace(settings, render=replace(settings.render, antialiasing="dilation"))
         lit = any(name.startswith("field.lamp.") for name in stored.tensors)
         parts = recipe_parts(settings, NO_LIGHT if lit else None)
         empty = bool(about.blocks)

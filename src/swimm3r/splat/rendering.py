@@ -41,8 +41,8 @@ from swimm3r.splat.settings import SplatSettings, UwbsSettings
 from swimm3r.splat.training_poses import RefinedPoses
 from swimm3r.splat.views import normalized_time
 
-SCHEMA = 2  # of a map's file; 1: Swimm3R 0.1, whose settings have other names
-SCHEMA_IN_BLOCKS = 3  # of one that lists blocks, which a version that knows none would leave out
+SCHEMA = 4  # of a map's file; 2: without footprints, dilated; 1: Swimm3R 0.1, whose settings have other names
+SCHEMA_IN_BLOCKS = 5  # of one that lists blocks, which a version that knows none would leave out; 3: likewise dilated
 _SHOWN_SIDE = 320  # pixels of a view in a notebook
 _SEEN = 1e-3  # alpha below which a pixel has no depth
 _COVERED = 0.5  # alpha from which on a pixel's clear color is that of a surface

@@ -45,6 +45,9 @@ class RenderSettings(Settings):
     covariance: Literal["symmetric", "upper"] = "symmetric"
     """Reduction of the conditional covariance, which is not symmetric: its mean with its transpose, or its upper
     triangle as in UBS."""
+    antialiasing: Literal["mip", "dilation"] = "mip"
+    """Filter of primitives: none smaller than a pixel of the training images, and averaged over the pixels of the view
+    (mip, Mip-Splatting), or widened by 0.3 px^2 in every view (dilation), as in 3DGS and UBS."""
     rotation: Literal["first_order", "exponential"] = "first_order"
     """Rotation of a primitive from its parameters A: I + A as in UBS, or exp(A)."""
     medium_depth_grad: Literal["full", "detach"] = "full"
@@ -305,7 +308,7 @@ def with_recipe(settings: UwbsSettings, recipe: RecipeName) -> SplatSettings:
             return replace(
                 settings,
                 initial=replace(settings.initial, directions="uniform", colors="raw"),
-                render=replace(settings.render, alpha_min=0.0, covariance="upper"),
+                render=replace(settings.render, alpha_min=0.0, antialiasing="dilation", covariance="upper"),
                 medium=replace(settings.medium, model="none"),
                 weights=replace(settings.weights, **none),
                 sgg=replace(settings.sgg, enabled=False),

@@ -4,6 +4,7 @@ import torch
 
 from swimm3r.splat.densify.rows import appended, in_place, moments_after, only, unchanged
 from swimm3r.splat.optimizer import Moments
+from swimm3r.splat.primitives.beta import trained
 from swimm3r.splat.primitives.gaussian import GaussianPrimitives
 
 
@@ -12,12 +13,13 @@ def gaussians(n: int) -> GaussianPrimitives:
     row = torch.arange(n).float()
     columns = {"xyz": 3, "scale": 3, "quaternion": 4, "color": 3}
     shaped = {name: row[:, None].repeat(1, width) for name, width in columns.items()}
-    return GaussianPrimitives(**shaped, opacity=row.clone(), harmonics=row[:, None, None].repeat(1, 15, 3))
+    harmonics = row[:, None, None].repeat(1, 15, 3)
+    return GaussianPrimitives(**shaped, opacity=row.clone(), harmonics=harmonics, footprint=row.clone())
 
 
 def memory(p: GaussianPrimitives) -> dict[str, Moments]:
     """Moments that say which row they belong to, and one of the water's."""
-    of_rows = {name: Moments(1 + values, 101 + values, torch.tensor(7.0)) for name, values in p._asdict().items()}
+    of_rows = {name: Moments(1 + values, 101 + values, torch.tensor(7.0)) for name, values in trained(p).items()}
     return {**of_rows, "field.weight": Moments(torch.ones(2), torch.ones(2), torch.tensor(7.0))}
 
 

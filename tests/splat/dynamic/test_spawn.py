@@ -17,7 +17,7 @@ from swimm3r.splat.dynamic.linear_motion import traveling
 from swimm3r.splat.dynamic.motion_masks import MotionView, against_others, motion_view, moving_parts, moving_pixels
 from swimm3r.splat.dynamic.spawn import born
 from swimm3r.splat.medium.field import MediumField, initial_field
-from swimm3r.splat.primitives.beta import BetaPrimitives, select, with_time
+from swimm3r.splat.primitives.beta import BetaPrimitives, select, trained, with_time
 from swimm3r.splat.projection.conditioning import condition
 from swimm3r.splat.recipes.uwbs import Uwbs
 from swimm3r.splat.settings import DensifySettings, InitialSettings, MediumFieldSettings, MoverSettings, UwbsSettings
@@ -173,7 +173,7 @@ def test_training_leaves_what_travels_on_its_way(tiny_dive, crossing):
     before = BetaPrimitives(*(values.clone() for values in p))
     after, _ = recipe.step(first_state(p, crossing.field, None), crossing.views[3], 1)
     n = len(crossing.still.xyz)
-    for name in BetaPrimitives._fields:
+    for name in trained(before):
         changed = getattr(after.primitives, name) != getattr(before, name)
         assert changed[:n].any(), name
         assert bool(changed[n:].any()) == (name in ("xyz", "rgb", "opacity")), name

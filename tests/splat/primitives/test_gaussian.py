@@ -42,7 +42,13 @@ def gaussians(n: int, seed: int = 0) -> GaussianPrimitives:
 
     xyz = normal(n, 3) * torch.tensor([0.8, 0.6, 0.6]) + torch.tensor([0.0, 0.0, 3.5])
     return GaussianPrimitives(
-        xyz, normal(n, 4), -2 + 0.5 * normal(n, 3), normal(n), normal(n, 3), 0.3 * normal(n, 15, 3)
+        xyz,
+        normal(n, 4),
+        -2 + 0.5 * normal(n, 3),
+        normal(n),
+        normal(n, 3),
+        0.3 * normal(n, 15, 3),
+        0.03 * normal(n).abs(),
     )
 
 
@@ -99,12 +105,13 @@ def test_gradients_of_the_image_agree_with_finite_differences(camera: Callable[.
     weight = torch.randn(5, 24, 32, generator=rng, dtype=torch.float64)
 
     def value(*t: torch.Tensor) -> torch.Tensor:
-        seen = project(GaussianPrimitives(*t[:-1]), turned(view, t[-1]), GaussianRenderSettings())
+        q = GaussianPrimitives(*t[:-1], footprint=p.footprint)
+        seen = project(q, turned(view, t[-1]), GaussianRenderSettings(antialiasing="mip"))
         assert seen.kernel == "gaussian"
         out = rasterize(seen.primitives, None, 24, 32, kernel="gaussian", alpha_min=1e-12, backend="reference")
         return (torch.cat([out.clear, out.z_depth[None], out.alpha[None]]) * weight).sum()
 
-    leaves = [t.clone().requires_grad_() for t in (*p, pose)]
+    leaves = [t.clone().requires_grad_() for t in (*p[:-1], pose)]
     found = torch.autograd.grad(value(*leaves), leaves)
     for k, gradient in enumerate(found):
         for _ in range(4):

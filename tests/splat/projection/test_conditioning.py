@@ -24,7 +24,7 @@ def stored_primitives(nd6: dict[str, torch.Tensor]) -> BetaPrimitives:
     mean = nd6["in_mean"]
     return BetaPrimitives(
         mean[:, :3], mean[:, 3:], torch.zeros(len(mean), 3, dtype=mean.dtype), nd6["in_raw_opacity"][:, 0],
-        nd6["in_raw_beta"], nd6["in_raw_scale"], nd6["in_ltri"],
+        nd6["in_raw_beta"], nd6["in_raw_scale"], nd6["in_ltri"], torch.zeros(len(mean), dtype=mean.dtype),
     )  # fmt: skip
 
 
@@ -69,7 +69,7 @@ def test_gradients_agree_with_finite_differences(c: int, primitives: Callable[..
     wanted = [p.xyz, p.query_mean, p.opacity, p.beta, p.scale, p.lower, center]
 
     def results(xyz, query_mean, opacity, beta, scale, lower, center):
-        q = BetaPrimitives(xyz, query_mean, p.rgb, opacity, beta, scale, lower)
+        q = BetaPrimitives(xyz, query_mean, p.rgb, opacity, beta, scale, lower, p.footprint)
         seen = conditioned_in_view(q, center, RenderSettings(), time if c == 4 else None)
         return seen.mean, seen.covariance, seen.opacity
 

@@ -11,8 +11,9 @@ from jaxtyping import Float, Int
 from torch import Tensor
 from torch.nn.functional import softplus
 
-from swimm3r.splat.primitives.beta import BetaPrimitives, inverse_softplus, select
+from swimm3r.splat.primitives.beta import BetaPrimitives, inverse_softplus, kernel_exponent, select
 from swimm3r.splat.projection.conditioning import factor
+from swimm3r.splat.projection.pixel_filter import smoothed
 from swimm3r.splat.settings import RenderSettings
 
 _TIMES = 8.0  # fewer primitives, about
@@ -61,7 +62,8 @@ def box_of(p: BetaPrimitives, settings: RenderSettings) -> tuple[Float[Tensor, "
     V = L @ L.mT
     G = torch.linalg.solve(V[:, 3:, 3:], V[:, :3, 3:].mT).mT
     reach = 1 + p.query_mean.norm(dim=-1)
-    half = V[:, [0, 1, 2], [0, 1, 2]].sqrt() + G.norm(dim=-1) * reach[:, None]
+    V11 = smoothed(V[:, :3, :3], kernel_exponent(p), p.footprint, settings)
+    half = V11[:, [0, 1, 2], [0, 1, 2]].sqrt() + G.norm(dim=-1) * reach[:, None]
     return (p.xyz - half).amin(0), (p.xyz + half).amax(0)
 
 

@@ -8,7 +8,7 @@ from jaxtyping import Bool, Int
 from torch import Tensor
 
 from swimm3r.splat.optimizer import Moments
-from swimm3r.splat.primitives.beta import BetaPrimitives, select
+from swimm3r.splat.primitives.beta import BetaPrimitives, select, trained
 from swimm3r.splat.primitives.gaussian import GaussianPrimitives
 
 P = TypeVar("P", BetaPrimitives, GaussianPrimitives)
@@ -73,7 +73,7 @@ def only(done: Round[P], kept: Bool[Tensor, " n"]) -> Round[P]:
 def moments_after(moments: dict[str, Moments], done: Round[P]) -> dict[str, Moments]:
     """The optimizer's memory of the primitives after a round; that of everything else is as it was."""
     kept = dict(moments)
-    for name in done.primitives._fields:
+    for name in trained(done.primitives):
         m = moments[name]
         first, second = m.first[done.memory], m.second[done.memory]
         first[done.restarted], second[done.restarted] = 0, 0

@@ -55,6 +55,7 @@ def traveling(
         beta=xyz.new_zeros(n, 5),
         scale=inverse_softplus(spread),
         lower=torch.cat([skew, xyz.new_zeros(n, 12), lower, xyz.new_zeros(n, 3)], -1),
+        footprint=xyz.new_zeros(n),
     )
     return BetaPrimitives(*(values.float() for values in made))
 

@@ -35,6 +35,7 @@ class BetaPrimitives(NamedTuple):
     beta: Float[Tensor, "n b"]  # 1 + c: spatial, then one per conditioned dimension
     scale: Float[Tensor, "n d"]  # 3 + c
     lower: Float[Tensor, "n l"]  # strict lower triangle: a01 a02 a12, then the rows from 3 on, left to right
+    footprint: Float[Tensor, " n"]  # not trained: finest training pixel there, world units; 0 of maps without filter
 
     @property
     def dynamic(self) -> bool:
@@ -55,6 +56,8 @@ class PrimitiveRows(Protocol):
     @classmethod
     def _make(cls, iterable: Iterable[Tensor]) -> Any: ...
 
+    def _asdict(self) -> dict[str, Any]: ...
+
 
 OfKind = TypeVar("OfKind", bound=PrimitiveRows)
 
@@ -62,6 +65,16 @@ OfKind = TypeVar("OfKind", bound=PrimitiveRows)
 def select(p: OfKind, which: Int[Tensor, " m"] | Bool[Tensor, " n"]) -> OfKind:
     """Some of the primitives."""
     return p._make(values[which] for values in p)
+
+
+def trained(p: PrimitiveRows) -> dict[str, Tensor]:
+    """The tensors of primitives that training moves, by name: all but the footprints, which are measured."""
+    return {name: values for name, values in p._asdict().items() if name != "footprint"}
+
+
+def kernel_exponent(p: BetaPrimitives) -> Float[Tensor, " n"]:
+    """B of the kernel on the image plane."""
+    return 4 * torch.exp(p.beta[:, 0])
 
 
 def inverse_softplus(y: Float[Tensor, "*n"]) -> Float[Tensor, "*n"]:
@@ -73,7 +86,7 @@ def rescaled(p: BetaPrimitives, factor: float) -> BetaPrimitives:
     """The same primitives after every length was multiplied by `factor`; queries have no length."""
     scale = p.scale.clone()
     scale[:, :3] = inverse_softplus(softplus(p.scale[:, :3].double()) * factor).to(scale)
-    return p._replace(xyz=p.xyz * factor, scale=scale)
+    return p._replace(xyz=p.xyz * factor, scale=scale, footprint=p.footprint * factor)
 
 
 def initial_primitives(rec: Reconstruction, settings: InitialSettings, rng: torch.Generator) -> BetaPrimitives:
@@ -96,6 +109,7 @@ def initial_primitives(rec: Reconstruction, settings: InitialSettings, rng: torc
         beta=torch.tensor([0.0, *[settings.view_exponent] * 3]).repeat(n, 1),
         scale=inverse_softplus(scale),
         lower=1e-5 * torch.randn(n, 15, generator=rng),
+        footprint=torch.zeros(n),
     )
 
 

@@ -30,6 +30,7 @@ class GaussianPrimitives(NamedTuple):
     opacity: Float[Tensor, " n"]
     color: Float[Tensor, "n 3"]  # k_00
     harmonics: Float[Tensor, "n h 3"]  # the others, by degree: none, 3, 8 or 15
+    footprint: Float[Tensor, " n"]  # not trained: finest training pixel there, world units; 0 of maps without filter
 
     @property
     def dynamic(self) -> bool:
@@ -43,7 +44,7 @@ class GaussianPrimitives(NamedTuple):
 
 def rescaled(p: GaussianPrimitives, factor: float) -> GaussianPrimitives:
     """The same Gaussians after every length was multiplied by `factor`."""
-    return p._replace(xyz=p.xyz * factor, scale=p.scale + math.log(factor))
+    return p._replace(xyz=p.xyz * factor, scale=p.scale + math.log(factor), footprint=p.footprint * factor)
 
 
 def harmonics_of_degree(degree: int) -> int:
@@ -98,4 +99,5 @@ def initial_gaussians(
         opacity=torch.full((n,), settings.opacity).logit(),
         color=(start.rgb - 0.5) / Y_00,
         harmonics=torch.zeros(n, harmonics_of_degree(settings.harmonics), 3),
+        footprint=torch.zeros(n),
     )

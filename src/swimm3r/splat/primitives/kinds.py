@@ -3,6 +3,7 @@
 from collections.abc import Mapping
 from typing import Any, get_type_hints
 
+import torch
 from torch import Tensor
 
 from swimm3r.splat.primitives.beta import BetaPrimitives
@@ -15,8 +16,12 @@ Primitives = BetaPrimitives | GaussianPrimitives
 def primitives_from(
     tensors: Mapping[str, Tensor], kind: type[Primitives], prefix: str, *, may_be_empty: bool = False
 ) -> Primitives:
-    """The primitives among a file's tensors. Raises KeyError or ValueError where their parts do not fit each other."""
-    p: Any = kind(*(tensors[prefix + name] for name in kind._fields))
+    """The primitives among a file's tensors; without footprints those of a map without filter.
+
+    Raises KeyError or ValueError where their parts do not fit each other.
+    """
+    own = {name: tensors[prefix + name] for name in kind._fields if prefix + name in tensors or name != "footprint"}
+    p: Any = kind(**{"footprint": torch.zeros(len(own["xyz"])), **own})
     for name, hint in get_type_hints(kind, include_extras=True).items():
         if not isinstance(getattr(p, name), hint):
             raise ValueError(f"{prefix}{name} has the shape {tuple(getattr(p, name).shape)}")

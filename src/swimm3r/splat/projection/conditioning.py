@@ -19,7 +19,8 @@ from jaxtyping import Float
 from torch import Tensor
 from torch.nn.functional import softplus
 
-from swimm3r.splat.primitives.beta import BetaPrimitives
+from swimm3r.splat.primitives.beta import BetaPrimitives, kernel_exponent
+from swimm3r.splat.projection.pixel_filter import smoothed
 from swimm3r.splat.settings import RenderSettings
 
 
@@ -94,5 +95,11 @@ def conditioned_in_view(
     p: BetaPrimitives, center: Float[Tensor, "3"], settings: RenderSettings, time: Float[Tensor, ""] | None = None
 ) -> Conditioned:
     """Primitives as a camera at `center` sees them, with symmetric covariances."""
-    seen = condition(p, queries(p.xyz, center, time), settings.rotation)
-    return Conditioned(seen.mean, symmetric(seen.covariance, settings.covariance), seen.opacity)
+    return shown(p, queries(p.xyz, center, time), settings)
+
+
+def shown(p: BetaPrimitives, query: Float[Tensor, "n c"], settings: RenderSettings) -> Conditioned:
+    """Primitives of given queries as they are drawn: with symmetric covariances, no smaller than the filter's."""
+    seen = condition(p, query, settings.rotation)
+    covariance = smoothed(symmetric(seen.covariance, settings.covariance), kernel_exponent(p), p.footprint, settings)
+    return Conditioned(seen.mean, covariance, seen.opacity)

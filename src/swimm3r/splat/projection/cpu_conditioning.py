@@ -41,8 +41,8 @@ NEAREST = np.float32(1e-24)  # squared distance
 # D_S, D_B row 0 is spatial, row 1 one entry per conditioned dimension.
 (XYZ, S, SLOPE, B, O, R, L11, L21, L22, V22, LC, T, U, Q, W, X, DIRECTION, DISTANCE, WX, MEAN, N, A, COV, Y, LOG_SHARE,
  TANH, OC, D_MEAN, D_COV, D_S, D_B, D_L11, D_WX, D_N, D_W, D_Q, D_X, D_Y, D_L21, D_L22, D_V22, D_P, P, PHI, K,
- SCRATCH) = map(np.uintp, range(46))  # fmt: skip
-MATRICES = 46
+ SCRATCH, FOOTPRINT2) = map(np.uintp, range(47))  # fmt: skip
+MATRICES = 47
 
 
 class Stored(NamedTuple):
@@ -54,6 +54,7 @@ class Stored(NamedTuple):
     beta: Any  # [n, 1 + c]
     scale: Any  # [n, 3 + c]
     lower: Any  # [n, (3 + c) (2 + c) / 2]
+    footprint: Any  # [n]; no gradient
 
 
 @no_type_check
@@ -68,6 +69,7 @@ def load(g, ids, first, count, stored, camera, time):
             g[S, 0, k, q] = stored.scale[i, k]
         g[B, 0, 0, q] = stored.beta[i, 0]
         g[O, 0, 0, q] = stored.opacity[i]
+        g[FOOTPRINT2, 0, 0, q] = stored.footprint[i] * stored.footprint[i]
         g[R, 0, 1, q], g[R, 0, 2, q], g[R, 1, 2, q] = stored.lower[i, 0], stored.lower[i, 1], stored.lower[i, 2]
         entry = 3
         for r in range(c):

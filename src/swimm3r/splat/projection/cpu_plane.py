@@ -20,6 +20,7 @@ from swimm3r.splat.projection.cpu_conditioning import (  # fmt: skip
     D_X,
     DIRECTION,
     DISTANCE,
+    FOOTPRINT2,
     MATRICES,
     MEAN,
     OC,
@@ -38,14 +39,16 @@ from swimm3r.splat.projection.cpu_matrices import (
     product_bt,
     zero,
 )
-from swimm3r.splat.projection.view_camera import BLUR
 
 LEAST_SPREAD = np.float32(0.01)
-PX2 = np.float32(BLUR)
 POSE = 15  # gradient of R (9), t (3), center (3)
-(FX, FY, CX, CY, X_LOW, X_HIGH, Y_LOW, Y_HIGH, NEAR, UPPER) = range(15, 25)  # of the camera array, after R, t, center
+# of the camera array, after R, t, center; WORLD and ON_PLANE begin the two numbers each of `pixel_filter.Widening`
+(FX, FY, CX, CY, X_LOW, X_HIGH, Y_LOW, Y_HIGH, NEAR, UPPER, WORLD) = range(15, 26)
+ON_PLANE = WORLD + 2
 # matrices after those of conditioning
-AT, J, RV, COV_SEEN, M, M_COV, PLANE, D_AT, D_M, D_J, D_PLANE, OUTER = map(np.uintp, range(MATRICES, MATRICES + 12))
+(AT, J, RV, COV_SEEN, M, M_COV, PLANE, D_AT, D_M, D_J, D_PLANE, D_WIDTH, OUTER) = map(
+    np.uintp, range(MATRICES, MATRICES + 13)
+)
 
 
 class OnPlane(NamedTuple):
@@ -62,7 +65,7 @@ class OnPlane(NamedTuple):
 @no_type_check
 @inlined
 def onto_plane(g, camera, three, two):
-    """AT in camera axes and PLANE, the covariance on the image plane with its blur."""
+    """AT in camera axes and PLANE, the widened covariance on the image plane of the widened one in the world."""
     for i in range(three):
         at, x, y, z = g[AT, i, 0], g[MEAN, 0, 0], g[MEAN, 1, 0], g[MEAN, 2, 0]
         r0, r1, r2, t = camera[3 * i], camera[3 * i + 1], camera[3 * i + 2], camera[9 + i]
@@ -86,19 +89,27 @@ def onto_plane(g, camera, three, two):
             inverse = ONE / max(z[q], camera[NEAR])
             straight[q] = f * inverse
             slant[q] = -f * inverse * min(max(at[q] * inverse, low), high)
+    exponent, footprint2 = g[B, 0, 0], g[FOOTPRINT2, 0, 0]
+    for k in range(three):
+        seen, u, v = g[COV_SEEN, k, k], camera[WORLD], camera[WORLD + 1]
+        for q in range(g.shape[3]):
+            seen[q] += (u + v * exponent[q]) * footprint2[q]
     product(g, M, J, RV, two, three, three, ONE, SET)
     product(g, M_COV, M, COV_SEEN, two, three, three, ONE, SET)
     product_bt(g, PLANE, M_COV, M, two, three, two, ONE, SET)
     for axis in range(two):
-        variance = g[PLANE, axis, axis]
+        variance, u, v = g[PLANE, axis, axis], camera[ON_PLANE], camera[ON_PLANE + 1]
         for q in range(g.shape[3]):
-            variance[q] += PX2
+            variance[q] += u + v * exponent[q]
 
 
 @no_type_check
 @inlined
 def plane_gradients(g, ids, start, count, camera, three, two, d):
-    """D_AT, D_M, D_COV and D_MEAN of centers, conics and depths (docs/derivations/gradients.md#projection)."""
+    """D_AT, D_M, D_COV and D_MEAN of centers, conics and depths (docs/derivations/gradients.md#projection).
+
+    D_WIDTH is the gradient of the exponents that comes through the widening.
+    """
     zero(g, D_AT, three, 1)
     zero(g, D_PLANE, two, two)
     fx, fy = camera[FX], camera[FY]
@@ -131,6 +142,11 @@ def plane_gradients(g, ids, start, count, camera, three, two, d):
             d_z[q] -= (f * straight[q] - v * (TWO * s if inside else min(max(s, low), high))) * inverse * inverse
     product_at(g, OUTER, M, D_PLANE, three, two, two, ONE, SET)
     product(g, D_COV, OUTER, M, three, two, three, ONE, SET)
+    d_width, footprint2 = g[D_WIDTH, 0, 0], g[FOOTPRINT2, 0, 0]
+    for q in range(g.shape[3]):
+        in_world = g[D_COV, 0, 0, q] + g[D_COV, 1, 1, q] + g[D_COV, 2, 2, q]
+        on_plane = g[D_PLANE, 0, 0, q] + g[D_PLANE, 1, 1, q]
+        d_width[q] = camera[WORLD + 1] * footprint2[q] * in_world + camera[ON_PLANE + 1] * on_plane
     if camera[UPPER] > ZERO:
         for i in range(three):
             for j in range(i):
@@ -196,7 +212,7 @@ def store_gradients(g, ids, start, count, three, c, d_opacity, out, pose):
             pose[12 + k] -= across
             out.scale[i, k] = g[D_S, 0, k, q] * g[SLOPE, 0, k, q]
         out.opacity[i] = d_opacity[i] * g[OC, 0, 0, q] * (ONE - g[O, 0, 0, q])
-        out.beta[i, 0] = g[D_B, 0, 0, q] * g[B, 0, 0, q]
+        out.beta[i, 0] = (g[D_B, 0, 0, q] + g[D_WIDTH, 0, 0, q]) * g[B, 0, 0, q]
         out.lower[i, 0] = g[D_L11, 0, 1, q] - g[D_L11, 1, 0, q]
         out.lower[i, 1] = g[D_L11, 0, 2, q] - g[D_L11, 2, 0, q]
         out.lower[i, 2] = g[D_L11, 1, 2, q] - g[D_L11, 2, 1, q]

@@ -52,6 +52,7 @@ from swimm3r.splat.projection.cpu_plane import (  # fmt: skip
     store_gradients,
     store_on_plane,
 )
+from swimm3r.splat.projection.pixel_filter import widening, with_light_kept
 from swimm3r.splat.projection.view_camera import Projection, ViewCamera, ray_limits
 from swimm3r.splat.settings import RenderSettings
 
@@ -142,13 +143,15 @@ class _Project(torch.autograd.Function):
         d_pose = torch.zeros(-(-len(ids) // LANES), POSE)
         _run(ids, True, stored, ctx.camera, ctx.time, d, results, d_pose)
         pose = d_pose.double().sum(0).float()
-        return None, None, None, *results, pose[:9].reshape(3, 3), pose[9:12], pose[12:]
+        return None, None, None, *results[:-1], None, pose[:9].reshape(3, 3), pose[9:12], pose[12:]
 
 
 def _camera(view: ViewCamera, settings: RenderSettings) -> np.ndarray:
     """The camera as the kernels read it."""
     pose = np.concatenate([t.detach().numpy().ravel() for t in (view.R, view.t, view.center)])
-    rest = (view.fx, view.fy, view.cx, view.cy, *ray_limits(view), settings.near, settings.covariance == "upper")
+    lens = (view.fx, view.fy, view.cx, view.cy, *ray_limits(view))
+    wider = widening(settings)
+    rest = (*lens, settings.near, settings.covariance == "upper", *wider.world, *wider.plane)
     return np.concatenate([pose, np.array(rest)]).astype(np.float32)
 
 
@@ -186,11 +189,14 @@ def project(
 ) -> Projection:
     """`dispatch.project` for float32 on the CPU; no gradient reaches `time`."""
     moment = 0.0 if time is None else float(time)
-    *plane, radius = _Project.apply(
-        view, settings, moment, p.xyz, p.query_mean, p.opacity, p.beta, p.scale, p.lower, view.R, view.t, view.center
-    )
+    *plane, radius = _Project.apply(view, settings, moment, *_stored(p), view.R, view.t, view.center)
     mean2d, conic, opacity, exponent, depth = plane
-    return Projection(Primitives2D(mean2d, conic, p.rgb, opacity, exponent, depth), radius)
+    on_plane = Primitives2D(mean2d, conic, p.rgb, opacity, exponent, depth)
+    return Projection(with_light_kept(on_plane, settings), radius)
+
+
+def _stored(p: BetaPrimitives) -> Stored:
+    return Stored(p.xyz, p.query_mean, p.opacity, p.beta, p.scale, p.lower, p.footprint)
 
 
 def center_gradients(
@@ -203,8 +209,7 @@ def center_gradients(
     """`dispatch.center_gradients` for float32 on the CPU."""
     ids = on_plane.flatten(1).any(-1).nonzero()[:, 0].numpy()
     d_xyz = torch.zeros(*on_plane.shape[:2], 3)
-    values = (p.xyz, p.query_mean, p.opacity, p.beta, p.scale, p.lower)
-    stored = _arrays(Stored(*(tensor.detach().contiguous() for tensor in values)))
+    stored = _arrays(Stored(*(tensor.detach().contiguous() for tensor in _stored(p))))
     given, camera = on_plane.detach().contiguous().numpy(), _camera(view, settings)
     moment, result = np.float32(0.0 if time is None else float(time)), d_xyz.numpy()
 

@@ -22,7 +22,8 @@ def project(
 ) -> Projection:
     """Primitives projected into a camera, Beta ones conditioned on it; differentiable in both."""
     if isinstance(p, GaussianPrimitives):
-        return project_gaussians(p, view, settings.near)
+        assert isinstance(settings, GaussianRenderSettings)
+        return project_gaussians(p, view, settings)
     assert isinstance(settings, RenderSettings)
     if _has_fast_form(p, view, settings):
         return cpu_project.project(p, view, settings, time)

@@ -1,9 +1,9 @@
 """Primitives on the image plane of a real camera (docs/derivations/beta-primitives.md#projection).
 
-    mu = (fx x / z + cx, fy y / z + cy),   Sigma2 = J R S R^T J^T + 0.3 I,   conic = Sigma2^-1
+    mu = (fx x / z + cx, fy y / z + cy),   Sigma2 = J R S R^T J^T + w I,   conic = Sigma2^-1
 
-J is taken at the ray clamped to 0.3 field tangents beyond the image. Of a fisheye, with rho = |(x, y)|, theta the angle
-from the axis and d(theta) = theta (1 + k1 theta^2 + ... + k4 theta^8),
+w is the widening of `pixel_filter`. J is taken at the ray clamped to 0.3 field tangents beyond the image. Of a
+fisheye, with rho = |(x, y)|, theta the angle from the axis and d(theta) = theta (1 + k1 theta^2 + ... + k4 theta^8),
 
     mu = (fx x a + cx, fy y a + cy),   a = d(theta) / rho
 
@@ -19,21 +19,27 @@ from jaxtyping import Bool, Float
 from torch import Tensor
 
 from swimm3r.raster import Primitives2D
-from swimm3r.splat.primitives.beta import BetaPrimitives
+from swimm3r.splat.gaussian_settings import GaussianRenderSettings
+from swimm3r.splat.primitives.beta import BetaPrimitives, kernel_exponent
 from swimm3r.splat.primitives.gaussian import GaussianPrimitives, covariance, seen_color
 from swimm3r.splat.projection.conditioning import Conditioned, conditioned_in_view
-from swimm3r.splat.projection.view_camera import BLUR, Projection, ViewCamera, ray_limits
+from swimm3r.splat.projection.pixel_filter import linear, smoothed, widening, with_light_kept
+from swimm3r.splat.projection.view_camera import Projection, ViewCamera, ray_limits
 from swimm3r.splat.settings import RenderSettings
 
 _GAUSSIAN_REACH = math.sqrt(2 * math.log(255))
 
 
 def project_conditioned(
-    seen: Conditioned, exponent: Float[Tensor, " n"], rgb: Float[Tensor, "n 3"], view: ViewCamera, near: float
+    seen: Conditioned,
+    exponent: Float[Tensor, " n"],
+    rgb: Float[Tensor, "n 3"],
+    view: ViewCamera,
+    settings: RenderSettings | GaussianRenderSettings,
 ) -> Projection:
     """Symmetric conditioned primitives in one camera, plain form; depth 0 where one cannot be drawn."""
     p = seen.mean @ view.R.mT + view.t
-    drawn = p[:, 2] > near
+    drawn = p[:, 2] > settings.near
     p = torch.where(drawn[:, None], p, 1.0)
     z = p[:, 2]
     if view.fisheye is None:
@@ -43,18 +49,17 @@ def project_conditioned(
         drawn = drawn & falls
     M = J @ view.R
     Sigma2 = M @ seen.covariance @ M.mT
-    a, b, c = Sigma2[:, 0, 0] + BLUR, Sigma2[:, 0, 1], Sigma2[:, 1, 1] + BLUR
+    wider = linear(widening(settings).plane, exponent)
+    a, b, c = Sigma2[:, 0, 0] + wider, Sigma2[:, 0, 1], Sigma2[:, 1, 1] + wider
     det = a * c - b * b
     drawn = drawn & (det > 0)
     det = torch.where(drawn, det, 1.0)
     middle = (a + c) / 2
     largest = middle + (middle * middle - det).clamp(min=0.01).sqrt()
-    return Projection(
-        Primitives2D(
-            mean2d, torch.stack([c, -b, a], -1) / det[:, None], rgb, seen.opacity, exponent, torch.where(drawn, z, 0.0)
-        ),
-        torch.where(drawn, largest.clamp(min=0).sqrt(), 0.0).detach(),
-    )
+    conic = torch.stack([c, -b, a], -1) / det[:, None]
+    on_plane = Primitives2D(mean2d, conic, rgb, seen.opacity, exponent, torch.where(drawn, z, 0.0))
+    radius = torch.where(drawn, largest.clamp(min=0).sqrt(), 0.0).detach()
+    return Projection(with_light_kept(on_plane, settings), radius)
 
 
 def _through_pinhole(p: Float[Tensor, "n 3"], view: ViewCamera) -> tuple[Float[Tensor, "n 2"], Float[Tensor, "n 2 3"]]:
@@ -93,12 +98,12 @@ def project_plainly(
 ) -> Projection:
     """`project` in torch operations: any D, any dtype, every setting; the oracle of the fast form."""
     seen = conditioned_in_view(p, view.center, settings, time)
-    return project_conditioned(seen, 4 * torch.exp(p.beta[:, 0]), p.rgb, view, settings.near)
+    return project_conditioned(seen, kernel_exponent(p), p.rgb, view, settings)
 
 
-def project_gaussians(p: GaussianPrimitives, view: ViewCamera, near: float) -> Projection:
+def project_gaussians(p: GaussianPrimitives, view: ViewCamera, settings: GaussianRenderSettings) -> Projection:
     """Gaussians in one camera."""
-    seen = Conditioned(p.xyz, covariance(p), torch.sigmoid(p.opacity))
-    half = torch.full_like(seen.opacity, 0.5)
-    drawn = project_conditioned(seen, half, seen_color(p, view.center), view, near)
+    half = torch.full_like(p.opacity, 0.5)
+    seen = Conditioned(p.xyz, smoothed(covariance(p), half, p.footprint, settings), torch.sigmoid(p.opacity))
+    drawn = project_conditioned(seen, half, seen_color(p, view.center), view, settings)
     return Projection(drawn.primitives, _GAUSSIAN_REACH * drawn.radius, "gaussian")

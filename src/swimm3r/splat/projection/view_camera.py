@@ -9,8 +9,6 @@ from torch import Tensor
 from swimm3r.cameras import Cameras, undistort
 from swimm3r.raster import Kernel, Primitives2D
 
-BLUR = 0.3
-"""px^2, added to every covariance on the image plane."""
 _MARGIN = 0.3  # field tangents beyond the image at which J is held
 
 

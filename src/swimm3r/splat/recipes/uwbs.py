@@ -26,7 +26,7 @@ from swimm3r.splat.medium.field import MediumField, initial_field, smoothness
 from swimm3r.splat.medium.prior import WaterPrior, deviation, water_prior, with_binf_prior
 from swimm3r.splat.optimizer import adam_step, log_linear
 from swimm3r.splat.pose_mlp import pose_rate
-from swimm3r.splat.primitives.beta import BetaPrimitives, initial_primitives, rescaled, with_time
+from swimm3r.splat.primitives.beta import BetaPrimitives, initial_primitives, rescaled, trained, with_time
 from swimm3r.splat.rendering import Drawing, draw
 from swimm3r.splat.settings import UwbsSettings
 from swimm3r.splat.training import loop, losses
@@ -164,7 +164,7 @@ class Uwbs:
         settled = log_linear(
             1.0, r.final_rate_factor, max(0.0, (share - r.rate_decay_start) / (1 - r.rate_decay_start))
         )
-        rates = {name: settled * getattr(r, name) for name in BetaPrimitives._fields}
+        rates = {name: settled * getattr(r, name) for name in BetaPrimitives._fields if name in names}
         rates["xyz"] = self.scene.radius * log_linear(r.xyz, r.xyz_end, share)
         medium = log_linear(r.medium, r.medium_end, share)
         untouched = self.prior is not None and share <= self.settings.medium.begin
@@ -193,7 +193,7 @@ class Uwbs:
         if d.noise_cadence == "round":
             p = p._replace(xyz=p.xyz + self._noise(p, rate, rng))
         gradients, multiplier, stale = dict(adjoint.gradients), adjoint.multiplier, done.changed
-        for name in p._fields:
+        for name in trained(p):
             gradients[name] = gradients[name][done.memory]
             gradients[name][stale] = 0
         if multiplier is not None:

@@ -28,7 +28,7 @@ from swimm3r.splat.settings import SplatSettings
 from swimm3r.splat.shared_settings import AppearanceSettings
 from swimm3r.splat.training.checkpoint import StateHeader, read_state, state_remedy, write_state
 from swimm3r.splat.training.observer import Observer, TrainingStep
-from swimm3r.splat.training.scene import TrainingScene
+from swimm3r.splat.training.scene import TrainingScene, with_footprints
 from swimm3r.splat.training.state import State, restored, stored
 from swimm3r.splat.views import TrainingView, smaller
 
@@ -37,6 +37,7 @@ log = logging.getLogger(__name__)
 _FIRST_REFIT = 0.4  # of the run: every recipe has its water by then
 _REFIT_SIDE = 160  # pixels of the longer side, at least, of the images that colors are fitted on
 _COLORS = "frame_colors"  # of a checkpoint
+_FOOTPRINTS_EVERY = 0.1  # of the run: primitives move little, and those that take another's place take its footprint
 
 Numbers = dict[str, float | Tensor]
 """Scalars logged by one step; tensors stay on their device until the log is written."""
@@ -123,12 +124,15 @@ def run(
     folder.mkdir(parents=True, exist_ok=True)
     state, done = _resume(recipe, parts, path, metrics, schedule)
     state = state.to(recipe.scene.device)
+    measured_every = math.ceil(_FOOTPRINTS_EVERY * schedule.iterations)
     refits = refit_steps(recipe.settings.appearance, schedule.iterations)
     started, cpu_started, first = time.perf_counter(), time.process_time(), done
     sums: dict[str, tuple[float | Tensor, int]] = {}
     for step in range(done + 1, schedule.iterations + 1):
         progress(what, step - 1, schedule.iterations)
         view = recipe.scene.view(view_of_step(step, len(recipe.scene.views), schedule.seed))
+        if (step - 1) % measured_every == 0:
+            state = with_footprints(recipe.scene, state)
         state, numbers = recipe.step(state, view, step)
         for name, value in numbers.items():
             total, count = sums.get(name, (0.0, 0))

@@ -12,8 +12,10 @@ from swimm3r.scene.reconstruction import Reconstruction
 from swimm3r.splat.medium.field import MediumField
 from swimm3r.splat.pose_mlp import PoseMlp
 from swimm3r.splat.primitives.beta import BetaPrimitives
+from swimm3r.splat.projection.footprint import footprints
 from swimm3r.splat.projection.view_camera import ViewCamera, view_camera
 from swimm3r.splat.shared_settings import TrainingPoseSettings
+from swimm3r.splat.training.state import State
 from swimm3r.splat.training_poses import TrainingPoses
 from swimm3r.splat.views import TrainingView, TrainingViews
 
@@ -69,6 +71,14 @@ class TrainingScene:
         if self.poses is None or codes is None or share > settings.epipolar_end:
             return None
         return self.poses.epipolar_error(codes, self.poses.matches.some(settings.matches, rng))
+
+
+def with_footprints(scene: TrainingScene, state: State) -> State:
+    """The state with the footprints of its primitives, where they are filtered by them."""
+    if scene.views.settings.render.antialiasing == "dilation":
+        return state
+    measured = footprints(state.primitives.xyz, scene.views.cameras)
+    return replace(state, primitives=state.primitives._replace(footprint=measured))
 
 
 def path_radius(rec: Reconstruction, scale: float, working_depth: float) -> float:

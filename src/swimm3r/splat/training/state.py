@@ -14,7 +14,7 @@ from swimm3r.splat.medium.seasplat import SceneWater
 from swimm3r.splat.optimizer import Moments, fresh
 from swimm3r.splat.pose_mlp import PoseMlp
 from swimm3r.splat.primitives import beta, gaussian
-from swimm3r.splat.primitives.beta import BetaPrimitives
+from swimm3r.splat.primitives.beta import BetaPrimitives, trained
 from swimm3r.splat.primitives.gaussian import GaussianPrimitives
 from swimm3r.splat.primitives.kinds import Primitives, primitives_from
 
@@ -47,7 +47,7 @@ def parameters_of(p: Primitives, field: Water, poses: PoseMlp | None = None) -> 
     """Everything that is trained, by the names of `State.moments`."""
     of_field: dict[str, Tensor] = {f"{FIELD}{name}": t for name, t in field.named_parameters()}
     of_poses = {} if poses is None else {f"{POSES}{name}": t for name, t in poses.named_parameters()}
-    return {**p._asdict(), **of_field, **of_poses}
+    return {**trained(p), **of_field, **of_poses}
 
 
 def first_state(p: P, field: W, poses: PoseMlp | None, memory: dict[str, Tensor] | None = None) -> State[P, W]:
@@ -60,7 +60,7 @@ def first_state(p: P, field: W, poses: PoseMlp | None, memory: dict[str, Tensor]
 def stored(state: State) -> dict[str, Tensor]:
     """Parameters by name; their moments after .first, .second and .steps; what else is remembered after .memory."""
     parameters = parameters_of(state.primitives, state.field, state.poses)
-    tensors = {f"parameter.{name}": t for name, t in parameters.items()}
+    tensors = {f"parameter.{name}": t for name, t in (state.primitives._asdict() | parameters).items()}
     for name, m in state.moments.items():
         tensors |= {f"first.{name}": m.first, f"second.{name}": m.second, f"steps.{name}": m.steps}
     return tensors | {f"memory.{name}": t for name, t in state.memory.items()}
