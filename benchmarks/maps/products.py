@@ -10,10 +10,9 @@ cells, PSNR of the orthophoto without water, and shifts of patches of 48 cells b
 import argparse
 import json
 import time
-from dataclasses import dataclass, fields, replace
+from dataclasses import dataclass, replace
 from pathlib import Path
 from tempfile import TemporaryDirectory
-from typing import Any
 
 import cv2
 import numpy as np
@@ -30,8 +29,9 @@ from swimm3r.products.survey import Colors, Survey, open_survey
 from swimm3r.scene.georeference import Georeference
 from swimm3r.scene.ground_truth import GroundTruth, read_ground_truth
 from swimm3r.scene.reconstruction import DepthMap, DepthMaps
+from swimm3r.settings_document import from_document
 from swimm3r.synthetic.dive import Dive, make_dive
-from swimm3r.synthetic.settings import Coefficients, DiveSettings
+from swimm3r.synthetic.settings import DiveSettings
 from swimm3r.synthetic.top_view import top_view
 
 PATCH, STEP = 48, 24  # cells
@@ -186,9 +186,7 @@ def patch_shifts(image: np.ndarray, truth: np.ndarray, shown: np.ndarray, grid: 
 def dive_of(folder: Path) -> Dive:
     """The dive that was written into a folder."""
     stored = json.loads((folder / "truth" / "dive.json").read_text(encoding="utf-8"))
-    known = {field.name for field in fields(DiveSettings)} - {"coefficients"}
-    given: dict[str, Any] = {name: value for name, value in stored.items() if name in known}
-    return make_dive(DiveSettings(coefficients=Coefficients(**stored["coefficients"]), **given))
+    return make_dive(from_document({name: value for name, value in stored.items() if name != "whole"}, DiveSettings))
 
 
 def main() -> None:
