@@ -111,7 +111,7 @@ def test_another_family_finds_nothing_and_says_so(dive):
 def test_a_marker_that_moved_is_left_out_with_a_note(dive):
     survey, frames = dive
     sizes = MarkerSizes("aruco-4x4-50", SIDE)
-    found = find_markers(survey.rec, frames, sizes)
+    found = find_markers(survey.rec, frames, sizes.family, sizes.board)
     found[7] = [[replace(s, xy=(s.xy[0] + 40 * (s.frame % 2), s.xy[1])) for s in corner] for corner in found[7]]
     from swimm3r.scale.markers import marker_estimates
 
@@ -136,7 +136,7 @@ def test_corners_are_found_at_their_place_however_blurred(side, blur):
         image = cv2.GaussianBlur(image.reshape(size, finer, size, finer).mean((1, 3)), (0, 0), blur)
         image = (0.6 * image + 40 + rng.normal(0, 1.5, image.shape)).clip(0, 255).astype(np.uint8)
         square = np.array([[-300.0, -300], [300, -300], [300, 300], [-300, 300]]) @ A.T / finer + center
-        off.append(detect(image, MarkerSizes("aruco-4x4-50", SIDE))[7] - square)
+        off.append(detect(image, "aruco-4x4-50")[7] - square)
     off = np.stack(off)
     assert np.abs(off.mean((0, 1))).max() < 0.1  # and 0.5 where the corner of the image was mistaken
     assert off.std() < 0.25

@@ -9,7 +9,7 @@ import torch
 
 from swimm3r.cameras import project
 from swimm3r.medium import srgb_from_linear
-from swimm3r.scale.markers import MarkerSizes, detect
+from swimm3r.scale.markers import detect
 from swimm3r.synthetic import DiveSettings, make_dive
 from swimm3r.synthetic.printed_markers import Plate, plates_from_above, with_plates
 from swimm3r.synthetic.seafloor import height_at
@@ -46,7 +46,7 @@ def test_the_marker_is_found_with_its_corners_at_their_places(dive):
     camera, plate = below(dive)
     radiance, _ = with_plates(np.full((240, 320, 3), 0.2), np.full((240, 320), 9.0), camera, [plate])
     image = (srgb_from_linear(torch.from_numpy(radiance)).clamp(0, 1) * 255).round().byte().numpy()
-    found = detect(cv2.cvtColor(image, cv2.COLOR_RGB2GRAY), MarkerSizes("aruco-4x4-50", plate.size))
+    found = detect(cv2.cvtColor(image, cv2.COLOR_RGB2GRAY), "aruco-4x4-50")
     assert list(found) == [plate.marker]
     pixels, _ = project(camera, torch.from_numpy(plate.corners)[None])
     np.testing.assert_allclose(found[plate.marker], pixels[0].numpy(), atol=0.5)

@@ -10,11 +10,15 @@ from tests.visits.conftest import Visits
 
 from swimm3r.cameras import Cameras, project
 from swimm3r.errors import RegistrationError
-from swimm3r.geometry import pose_from, so3_exp
-from swimm3r.scene.reconstruction import DepthMaps, Matches, Points, Reconstruction, Tracks
-from swimm3r.visits.adjustment import place
-from swimm3r.visits.alignment import Alignment, align
-from swimm3r.visits.matches import VisitMatches, landmarks_of, match_visits
+from swimm3r.geometry import align_similarity, pose_from, so3_exp
+from swimm3r.progress import silent
+from swimm3r.scene.reconstruction import DepthMap, DepthMaps, Matches, Points, Reconstruction, Tracks
+from swimm3r.sfm.colmap.chunks.links import Sim3
+from swimm3r.visits.alignment.depth import with_depth
+from swimm3r.visits.alignment.joint import Joint, Link, map_jointly, moved, shape_similarity
+from swimm3r.visits.alignment.matches import VisitMatches
+from swimm3r.visits.alignment.place import place_visits
+from swimm3r.visits.alignment.similarity import Alignment, Known, align
 from swimm3r.visits.settings import VisitSettings
 
 FRAMES, POINTS = 8, 400
@@ -67,7 +71,13 @@ def matched(a: Reconstruction, b: Reconstruction, wrong: float = 0.0, seed: int 
     at_b[swapped] = np.roll(at_b[swapped], 1)
     of = [(rec.tracks.point.numpy()[at], rec.tracks.frame.numpy()[at], rec.tracks.xy.numpy()[at]) for rec, at in
           ((a, at_a), (b, at_b))]  # fmt: skip
-    return VisitMatches(of[0][0], of[1][0], of[0][1], of[1][1], of[0][2], of[1][2])
+    return VisitMatches(of[0][0], of[1][0], of[0][1], of[1][1], of[0][2], of[1][2], np.zeros(len(at_a), bool))
+
+
+def joined(a: Reconstruction, b: Reconstruction, matches: VisitMatches, found: Alignment) -> Joint:
+    """Both visits after joint mapping."""
+    verified = matches.select(found.verified)
+    return map_jointly((a, moved(b, found.a_from_b)), [Link(0, 1, verified, found.inlier[found.verified])])
 
 
 def apart(a: Reconstruction, b: Reconstruction, found: Alignment) -> float:
@@ -142,23 +152,105 @@ def test_the_joint_adjustment_takes_a_bend_out(tmp_path):
     matches = matched(a, b)
     found = align(a, b, matches, NAMES)
     before = found.a_from_b(b.points.xyz.numpy()) - a.points.xyz.numpy()
-    placed = place(a, b, matches, found)
-    after = placed.rec.points.xyz.numpy() - a.points.xyz.numpy()
+    joint = joined(a, b, matches, found)
+    after = joint.recs[1].points.xyz.numpy() - joint.recs[0].points.xyz.numpy()
     seen = np.unique(matches.point_b)
     misses = [float(np.median(np.linalg.norm(each[seen], axis=1))) for each in (before, after)]
     assert misses[1] < 0.25 * misses[0]
-    assert len(placed.check.xyz_a) > 20
+    assert len(joint.checks[0]) > 20
+
+
+def test_the_frame_and_the_unit_stay_those_of_the_first_visit(tmp_path):
+    a, b = dive(tmp_path, ground(), 1, 0.3), dive(tmp_path, ground(), 2, 0.3)
+    matches = matched(a, b)
+    first = joined(a, b, matches, align(a, b, matches, NAMES)).recs[0]
+    stays = shape_similarity(a, first)
+    assert stays.scale == pytest.approx(1.0, abs=1e-4)
+    assert pytest.approx(np.eye(3), abs=1e-6) == stays.R
+    off = first.cameras.centers - a.cameras.centers
+    size = float((a.cameras.centers[0] - a.cameras.centers[-1]).norm())
+    assert 0 < float(off.norm(dim=1).max()) < 0.01 * size  # it is not held, and does not wander
+
+
+def test_the_bend_of_the_first_visit_is_taken_out_by_a_later_one(tmp_path):
+    """A first visit whose frames share too few points to be stiff, and a later one that spans them."""
+    a, b = dive(tmp_path, ground(), 1, 0.2), dive(tmp_path, ground(), 2, 0.2)
+    size = float((a.cameras.centers[0] - a.cameras.centers[-1]).norm())
+    bent = a.cameras.cam2world.clone()
+    bent[:, :3, 3] += 0.01 * size * torch.linspace(-1, 1, FRAMES)[:, None].double() ** 2 * bent[0, :3, 2]
+    crooked = replace(a, cameras=replace(a.cameras, cam2world=bent))
+    matches = matched(a, b)
+    first = joined(crooked, b, matches, align(a, b, matches, NAMES)).recs[0]
+    before, after = (align_similarity(r.cameras.centers, a.cameras.centers) for r in (crooked, first))
+    misses = [
+        float((by.points(r.cameras.centers) - a.cameras.centers).norm(dim=1).mean())
+        for by, r in ((before, crooked), (after, first))
+    ]
+    assert misses[1] < 0.3 * misses[0]
+
+
+def test_points_on_changed_ground_become_no_common_points(tmp_path):
+    later = ground()
+    raised = later[:, 0] < 0.6
+    later[raised, 2] += 0.05
+    a, b = dive(tmp_path, ground(), 1, 0.1), dive(tmp_path, later, 2, 0.1)
+    matches = matched(a, b)
+    joint = joined(a, b, matches, align(a, b, matches, NAMES))
+    unit = float(np.ptp(a.points.xyz.numpy(), axis=0).max()) / 3
+    off = (joint.recs[1].points.xyz - joint.recs[0].points.xyz).norm(dim=1).numpy() / unit
+    both = np.unique(matches.point_a)
+    assert np.median(off[both][~raised[both]]) < 0.004
+    assert np.median(off[both][raised[both]]) == pytest.approx(0.05, abs=0.02)
+
+
+def test_depth_maps_follow_the_adjusted_poses(tmp_path):
+    a = dive(tmp_path, ground(), 1, 0.0)
+    depth = DepthMaps(tmp_path)
+    for name in a.names:
+        depth.write(name, DepthMap(torch.full((4, 4), 2.0), torch.ones(4, 4)))
+    larger = moved(a, Sim3(3.0, np.eye(3), np.zeros(3)))
+    placed = with_depth(a, larger, 1.0)
+    assert placed.depth[a.names[0]].z_depth == pytest.approx(6.0)
+    nowhere = replace(a, tracks=Tracks(*(values[:0] for values in (a.tracks.point, a.tracks.frame, a.tracks.xy))))
+    assert with_depth(nowhere, larger, 2.5).depth[a.names[0]].z_depth == pytest.approx(5.0)
+
+
+def test_georeferences_add_to_what_few_points_say(tmp_path):
+    a, b = dive(tmp_path, ground(), 1, 0.3), dive(tmp_path, ground(), 2, 0.3)
+    matches = matched(a, b)
+    by_images = align(a, b, matches, NAMES)
+    tight = Known(by_images.a_from_b, np.diag([1e-4, *[1e-4] * 3, *[1e-3] * 3]) ** 2, by_images.pivot)
+    with_both = align(a, b, matches, NAMES, tight)
+    at = a.points.xyz.numpy()[:50]
+    stds = [np.trace(each.covariance_at(at).sum(0)) for each in (by_images, with_both)]
+    assert stds[1] < stds[0]
+    assert with_both.off_georeference == pytest.approx(0.0, abs=0.5)
+    shift = np.array([0.1, 0.0, 0.0])
+    elsewhere = replace(tight, a_from_b=Sim3(tight.a_from_b.scale, tight.a_from_b.R, tight.a_from_b.t + shift))
+    off = align(a, b, matches, NAMES, elsewhere).off_georeference
+    assert off is not None
+    assert off > 3
+
+
+def test_two_markers_align_visits_whose_images_do_not_match(tmp_path):
+    a, b = dive(tmp_path, ground(), 1, 0.2), dive(tmp_path, ground(), 2, 0.2)
+    corners = matched(a, b).select(np.arange(0, 320, 40))
+    coded = replace(corners, coded=np.ones(len(corners), bool))
+    with pytest.raises(RegistrationError):
+        align(a, b, corners, NAMES)
+    found = align(a, b, coded, NAMES)
+    assert found.source == "markers"
+    assert apart(a, b, found) < 0.01
 
 
 def test_real_features_align_visits_in_other_light_over_changed_ground(visits: Visits):
     a, b = visits.surveys()
-    settings = VisitSettings()
-    matches = match_visits(landmarks_of(a, 100), landmarks_of(b, 100), settings)
-    found = align(a.rec, b.rec, matches, NAMES)
-    placed = place(a.rec, b.rec, matches, found)
-    off = a.place.to_local(placed.check.xyz_b - placed.check.xyz_a)
-    assert len(off) > 30
-    assert np.median(np.linalg.norm(off, axis=1)) < 0.003 * 1.3  # of the site's extent
+    first, later = place_visits((a, b), NAMES, VisitSettings(), silent)
+    assert first.fit is None
+    assert later.fit is not None
+    assert later.fit.check_points > 30
+    assert later.fit.level < 0.003 * 1.3  # of the site's extent
+    assert later.fit.up < 0.003 * 1.3
     # depth maps come along, into the unit of the first visit
-    name = placed.rec.names[0]
-    assert float(placed.rec.depth[name].z_depth.median()) * a.scale == pytest.approx(1.0, abs=0.1)
+    rec = later.survey.rec
+    assert float(rec.depth[rec.names[0]].z_depth.median()) * a.scale == pytest.approx(1.0, abs=0.1)

@@ -37,6 +37,7 @@ def ground(
         color=(color * np.broadcast_to(albedo, shape)[..., None] * np.array(light)).astype(np.float32),
         color_std=np.full((*shape, 3), 0.004, np.float32),
         distance=np.full(shape, 2.0, np.float32),
+        slant=np.zeros(shape, np.float32),
     )
 
 
@@ -101,6 +102,33 @@ def test_other_light_is_taken_out_and_bleaching_found():
     assert (paler & bleached).sum() / paler.sum() > 0.8
     assert not (change.color_kind == LESS).any()
     assert (change.height_kind == UNCHANGED).all()
+
+
+def test_colors_of_ground_whose_height_is_uncertain_count_less_where_rays_are_slanted():
+    """Patterned ground that a visit has 3 cm too high, seen at 45 degrees: its colors lie 3 cells beside."""
+    high = np.full((SIDE, SIDE), 0.03)
+    high[:, :70] = 0.0
+    moved = ground(2, high)
+    moved.color[:, 70:] = np.roll(moved.color, 3, axis=1)[:, 70:]
+    nadir = compare(ground(1), moved, NO_MISFIT, GSD, WHITE, VisitSettings())
+    moved.slant[:] = 1.0
+    slanted = compare(ground(1), moved, NO_MISFIT, GSD, WHITE, VisitSettings())
+    assert nadir.color is not None
+    assert slanted.color is not None
+    raised, flat = np.s_[10:-10, 80:-10], np.s_[10:-10, 10:50]
+    assert np.median(slanted.color.std[raised] / nadir.color.std[raised]) > 1.5
+    assert np.median(slanted.color.std[flat] / nadir.color.std[flat]) == pytest.approx(1.0, abs=0.2)
+
+
+def test_cells_beside_a_hole_take_their_doubt_from_the_heights_nearby():
+    a, b = ground(1), ground(2, 0.03 * disc(50, 50, 25))
+    b.slant[:] = a.slant[:] = 1.0
+    b.height[40:60, 40:60] = np.nan
+    change = compare(a, b, Misfit(np.zeros((SIDE, SIDE)), np.full((SIDE, SIDE), 0.1)), GSD, WHITE, VisitSettings())
+    assert change.color is not None
+    assert np.isnan(change.height.value[39, 50])
+    assert change.color.std[39, 50] > 0.5 * np.median(change.color.std[32:38, 45:55])
+    assert change.color.std[39, 50] > 1.3 * np.median(change.color.std[80:, 80:])
 
 
 def test_light_alone_changes_no_color():

@@ -12,6 +12,7 @@ import numpy as np
 from jaxtyping import Float
 
 from swimm3r.errors import InputError, UsageError
+from swimm3r.products.record import MapGrid
 from swimm3r.products.survey import Survey
 from swimm3r.scene.georeference import Georeference
 
@@ -60,6 +61,11 @@ class Grid:
     def cells(self, xy: Float[np.ndarray, "*n 2"]) -> Float[np.ndarray, "*n 2"]:
         """(column, row) of points as fractions: 0.5 is the middle of the first cell."""
         return np.stack([(xy[..., 0] - self.x0) / self.gsd, (self.y1 - xy[..., 1]) / self.gsd], -1)
+
+    def on_map(self, place: Georeference) -> MapGrid:
+        """The grid in map coordinates."""
+        west, step, _, north, _, _ = self.affine(place)
+        return MapGrid(place.unit, step, self.rows, self.columns, place.epsg, west, north)
 
     def affine(self, place: Georeference) -> tuple[float, float, float, float, float, float]:
         """The transform from (column, row) to map coordinates, as GDAL orders it."""

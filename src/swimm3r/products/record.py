@@ -29,16 +29,22 @@ class HabitatRecord:
 
 
 @dataclass(frozen=True)
-class ProductsRecord:
-    """The products of a run."""
+class MapGrid:
+    """The grid of maps in map coordinates, as records state it."""
 
-    unit: str  # of lengths: m, or units where the scale of the run is not known
+    unit: str  # of lengths: m, or units of the run, the first of several, where its scale is not known
     gsd: float
     rows: int
     columns: int
     epsg: int | None
-    west: float  # edges in map coordinates
+    west: float  # edges
     north: float
+
+
+@dataclass(frozen=True)
+class ProductsRecord(MapGrid):
+    """The products of a run."""
+
     scale_std: float | None  # relative; None: not known
     sources: tuple[str, ...]  # of scale and place
     covered: float  # share of the cells with a height

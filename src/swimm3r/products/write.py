@@ -179,16 +179,9 @@ def _write_habitat(
 
 def _record(survey: Survey, grid: Grid, totals: _Totals, notes: list[str], habitat: HabitatRecord) -> ProductsRecord:
     place = survey.place
-    west, step, _, north, _, _ = grid.affine(place)
     std, views = (np.concatenate(parts) if parts else np.zeros(0) for parts in (totals.std, totals.views))
     return ProductsRecord(
-        unit=place.unit,
-        gsd=step,
-        rows=grid.rows,
-        columns=grid.columns,
-        epsg=place.epsg,
-        west=west,
-        north=north,
+        **vars(grid.on_map(place)),
         scale_std=place.scale_std,
         sources=place.sources,
         covered=totals.cells / (grid.rows * grid.columns),

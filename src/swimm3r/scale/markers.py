@@ -110,21 +110,22 @@ def marker_sizes(settings: ScaleSettings) -> MarkerSizes | None:
         return structure(document, MarkerSizes)
 
 
-def detect(image: UInt8[np.ndarray, "h w"], sizes: MarkerSizes) -> dict[int, Float[np.ndarray, "corners 2"]]:
+def detect(
+    image: UInt8[np.ndarray, "h w"], family: MarkerFamily, board: Board | None = None
+) -> dict[int, Float[np.ndarray, "corners 2"]]:
     """Corners of the markers in a gray image by id, clockwise from the first one, pixels from the image's corner.
 
     Of a board, corners of its squares by id, one each.
     """
     from cv2 import aruco
 
-    dictionary = aruco.getPredefinedDictionary(getattr(aruco, _DICTIONARIES[sizes.family]))
+    dictionary = aruco.getPredefinedDictionary(getattr(aruco, _DICTIONARIES[family]))
     parameters = aruco.DetectorParameters()
     # lines through the edges of the square: other ways draw blurred corners inwards by 0.2 to 1 pixel of a side
     parameters.cornerRefinementMethod = aruco.CORNER_REFINE_APRILTAG
-    if sizes.board is not None:
-        b = sizes.board
-        board = aruco.CharucoBoard((b.columns, b.rows), b.square, b.marker, dictionary)
-        corners, ids, _, _ = aruco.CharucoDetector(board, aruco.CharucoParameters(), parameters).detectBoard(image)
+    if board is not None:
+        charuco = aruco.CharucoBoard((board.columns, board.rows), board.square, board.marker, dictionary)
+        corners, ids, _, _ = aruco.CharucoDetector(charuco, aruco.CharucoParameters(), parameters).detectBoard(image)
         if ids is None:
             return {}
         return {int(i): xy.reshape(1, 2).astype(np.float64) + 0.5 for i, xy in zip(ids.ravel(), corners, strict=True)}
@@ -151,14 +152,18 @@ def _light(image: Float[Tensor, "h w 3"]) -> UInt8[np.ndarray, "h w"]:
 
 
 def find_markers(
-    rec: Reconstruction, frames: Frames, sizes: MarkerSizes, progress: Progress = silent
+    rec: Reconstruction,
+    frames: Frames,
+    family: MarkerFamily,
+    board: Board | None = None,
+    progress: Progress = silent,
 ) -> dict[int, list[list[Sighting]]]:
     """Sightings of every corner of every marker, over the registered frames."""
-    found: dict[int, list[list[Sighting]]] = defaultdict(lambda: [[] for _ in range(1 if sizes.board else 4)])
+    found: dict[int, list[list[Sighting]]] = defaultdict(lambda: [[] for _ in range(1 if board else 4)])
     for i, name in enumerate(rec.names):
         progress("looking for markers", i, len(rec.names))
         image = _light(frames.image(frames.index(name)))
-        for marker, corners in detect(image, sizes).items():
+        for marker, corners in detect(image, family, board).items():
             for k, (x, y) in enumerate(corners.tolist()):
                 found[marker][k].append(Sighting(i, (x, y)))
     progress("looking for markers", len(rec.names), len(rec.names))
@@ -182,7 +187,7 @@ def marker_estimates(
             cause="another family was printed, the markers are too small (about 20 pixels are needed), or blurred",
             hint="--markers with the family that was printed; or larger frames (--long-side)",
         )
-    placed, notes = _placed(rec, sightings, np.hypot(_CORNER_PX, sigma_px))
+    placed, notes = placed_markers(rec, sightings, sigma_px)
     if sizes.board is not None:
         return [_board_estimate(placed, sizes.board, settings)], notes
     asked = {int(key) for key in sizes.sizes} | {marker for *both, _ in sizes.distances for marker in both}
@@ -217,13 +222,17 @@ def marker_estimates(
     return estimates, notes
 
 
-def _placed(
+def placed_markers(
     rec: Reconstruction, sightings: Mapping[int, Sequence[Sequence[Sighting]]], sigma_px: float
 ) -> tuple[dict[int, list[ScenePoint]], list[str]]:
-    """Markers whose corners the frames determine, all at one place; and notes on the others."""
+    """Markers whose corners the frames determine, all at one place; and notes on the others.
+
+    `sigma_px` is the standard deviation that poses and lens add to that of a corner.
+    """
     placed, notes = {}, []
+    sigma = float(np.hypot(_CORNER_PX, sigma_px))
     for marker, corners in sightings.items():
-        points, failed = triangulate_all(rec.cameras, {str(k): seen for k, seen in enumerate(corners)}, sigma_px)
+        points, failed = triangulate_all(rec.cameras, {str(k): seen for k, seen in enumerate(corners)}, sigma)
         if failed:
             notes.append(f"Marker {marker} is left out: {next(iter(failed.values()))}.")
         elif max(point.rms_px for point in points.values()) > _OFF_PX:

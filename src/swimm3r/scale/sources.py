@@ -81,7 +81,7 @@ def scale_sources(
             estimates.append(_of_distance(name, points[known.one], points[known.other], known.length, std, settings))
     sizes = marker_sizes(settings)
     if sizes is not None:
-        found = find_markers(rec, frames, sizes, progress)
+        found = find_markers(rec, frames, sizes.family, sizes.board, progress)
         of_markers, told = marker_estimates(rec, found, sizes, settings, noise)
         estimates += of_markers
         notes += told

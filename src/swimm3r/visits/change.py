@@ -3,6 +3,10 @@
     d  = h_b - h_a
     s2 = s_a^2 + s_b^2 + |grad h|^2 (s_xy^2 + s_p^2) + s_z^2 + |grad d|^2 s_r^2
 
+For colors d and h are L*, a* and b*, and s_xy is wider by |d_h| tan(theta), theta the angle of the nearest camera's ray
+from the vertical: where the ground has not changed, a difference of heights d_h is an error, by which the ray meets
+other ground beside the cell; where it has, another surface is seen.
+
 s_p is the place that a height was taken at within its cell; s_xy and s_z are what check points say of the alignment
 (`misfit`), at the cell. s_r is the place of a rim: maps smear a change over the ground beside it. Errors that both
 visits have in common cancel, those of a surface that looks different now do not: there the deviations are larger.
@@ -90,7 +94,8 @@ def compare(
     if not np.isnan(a.color).all() and not np.isnan(b.color).all():
         stable = seen & (np.abs(np.nan_to_num(height.significance)) < settings.threshold / 2)
         gains, _ = light_gains(a.color, b.color, stable)
-        color, by_axis = _color_difference(a, b, gains, white, misfit.level / gsd)
+        aside = np.abs(_filled(height.value.astype(np.float64))) * np.nan_to_num(np.fmax(a.slant, b.slant))
+        color, by_axis = _color_difference(a, b, gains, white, np.hypot(misfit.level, aside) / gsd)
         # on a surface that looks different, errors that both visits had in common no longer cancel
         unlike = np.sqrt(1 + (np.nan_to_num(color.value) / _UNLIKE) ** 2)
         height = replace(height, std=(height.std * unlike).astype(np.float32))
@@ -118,9 +123,9 @@ def _color_difference(
     b: Ground,
     gains: Float[np.ndarray, "3"],
     white: Float[np.ndarray, "3"],
-    level: Float[np.ndarray, "h w"],
+    level: Float[np.ndarray, "h w"],  # cells
 ) -> tuple[Difference, Float32[np.ndarray, "h w 3"]]:
-    """CIELAB distance, and the differences of L*, a*, b*; `level` is the misfit in cells."""
+    """CIELAB distance, and the differences of L*, a*, b*; `level` is how far its color may be beside a cell."""
     lights = [_smoothed(ground.color) * factor for ground, factor in ((a, white), (b, white * gains))]
     stds = [ground.color_std * factor for ground, factor in ((a, white), (b, white * gains))]
     labs = [lab(light) for light in lights]

@@ -29,6 +29,7 @@ _PIXELS = 2.0  # of a frame along a cell, by default: depth is not known for eac
 _MEDIAN = 1.2533  # standard deviation of a median by that of a mean, for normal errors
 _LEAST_PIXELS = 0.25  # of a frame on the ground: no height is surer, however well its views agree
 _POOR = 0.9  # quantile of a view's spread that single views have: they are where matching was hard
+_LEVEL = 0.05  # sine of the angle from the horizontal below which a ray counts as no flatter
 _LEAST_COLOR_STD = 0.02  # of the color itself: what interpolation leaves
 
 
@@ -42,6 +43,7 @@ class Ground:
     color: Float32[np.ndarray, "h w 3"]  # without the water, linear light
     color_std: Float32[np.ndarray, "h w 3"]
     distance: Float32[np.ndarray, "h w"]  # from the nearest camera, local units
+    slant: Float32[np.ndarray, "h w"]  # tangent of the angle between that camera's ray and the vertical
 
     @property
     def seen(self) -> Bool[np.ndarray, "h w"]:
@@ -75,7 +77,7 @@ def observe(survey: Survey, grid: Grid, progress: Progress = silent) -> Ground:
     ground = Ground(
         np.full(shape, np.nan, np.float32), np.full(shape, np.nan, np.float32), np.zeros(shape, np.uint16),
         np.full((*shape, 3), np.nan, np.float32), np.full((*shape, 3), np.nan, np.float32),
-        np.full(shape, np.nan, np.float32),
+        np.full(shape, np.nan, np.float32), np.full(shape, np.nan, np.float32),
     )  # fmt: skip
     tiles = list(grid.tiles(_TILE))
     for done, window in enumerate(tiles):
@@ -100,8 +102,12 @@ def _fill(ground: Ground, survey: Survey, grid: Grid, window: Window) -> None:
         return
     x, y = grid.centers(window)
     points = Points(np.stack([x[columns], y[rows], found.height[rows, columns]], -1), size=grid.gsd)
-    nearest: Any = KDTree(survey.centers[list(survey.indices)]).query(points.xyz)
+    centers = survey.centers[list(survey.indices)]
+    nearest: Any = KDTree(centers).query(points.xyz)
+    ray = centers[nearest[1]] - points.xyz
     ground.distance[own][rows, columns] = nearest[0]
+    above = np.maximum(np.abs(ray[:, 2]), _LEVEL * nearest[0])
+    ground.slant[own][rows, columns] = np.hypot(ray[:, 0], ray[:, 1]) / above
     if not survey.has("physical"):
         return
     mean, std = _colors(survey, points, frames)

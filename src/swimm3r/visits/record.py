@@ -7,9 +7,10 @@ from pathlib import Path
 from swimm3r.io.files.atomic import write_text
 from swimm3r.io.files.damage import Remedy
 from swimm3r.io.files.json_file import read_json
+from swimm3r.products.record import MapGrid
 
 RECORD = "visits.json"
-SCHEMA = 1
+SCHEMA = 2
 _REMEDY = Remedy("swimm3r visits RUN_A RUN_B --out DIR, which writes it again")
 
 
@@ -18,14 +19,15 @@ class AlignmentRecord:
     """The way a visit came into the frame of an earlier one."""
 
     onto: str  # name of the other visit
-    source: str  # images, or georeference
+    source: str  # images, markers or georeference
     matches: int
-    agreeing: int  # matches that agree on the alignment
+    agreeing: int  # matches that agree on one similarity
+    merged: int  # matches that joint mapping took for one point of both visits
     error_px: float | None  # median reprojection error of these
     scale: float  # units of the first visit's files per unit of this one's
     rotation: tuple[tuple[float, float, float], ...]  # from this visit's axes to the first one's
     shift: tuple[float, float, float]  # in the unit of the first visit's files
-    check_points: int  # shared points that were left out of the joint adjustment
+    check_points: int  # shared points that joint mapping left out
     level_std: float  # of the place of this visit on the other one's ground, horizontal, per axis
     up_std: float
 
@@ -69,16 +71,9 @@ class ChangeRecord:
 
 
 @dataclass(frozen=True)
-class VisitsRecord:
+class VisitsRecord(MapGrid):
     """All visits and changes."""
 
-    unit: str  # of lengths: m, or units of the first run where its scale is not known
-    gsd: float
-    rows: int
-    columns: int
-    epsg: int | None
-    west: float  # edges in map coordinates
-    north: float
     threshold: float  # standard deviations from which a change is significant
     visits: tuple[VisitRecord, ...]
     changes: tuple[ChangeRecord, ...]
@@ -97,7 +92,7 @@ class VisitsRecord:
                 by = visit.alignment
                 text += f"; onto {by.onto} by {by.source}"
                 if by.error_px is not None:
-                    text += f", {by.agreeing} of {by.matches} shared points agree to {by.error_px:.2g} px"
+                    text += f", {by.merged} of {by.matches} matched points are one to {by.error_px:.2g} px"
                 text += f"; ± {by.level_std:.2g} {u} level, ± {by.up_std:.2g} {u} up"
             lines.append(text)
         lines += [line for change in self.changes for line in change_lines(change, u, self.threshold)]

@@ -1,7 +1,7 @@
 """Views of two visits' maps by the same camera: frames of the earlier visit at the largest changed places."""
 
 from collections.abc import Sequence
-from dataclasses import replace
+from dataclasses import dataclass, replace
 from pathlib import Path
 
 import numpy as np
@@ -12,28 +12,35 @@ from swimm3r.products.survey import Survey
 from swimm3r.progress import Progress
 from swimm3r.scene.reconstruction import Reconstruction
 from swimm3r.scene.run_folder import MARKERS
+from swimm3r.sfm.colmap.chunks.links import Sim3
 from swimm3r.splat.map_file import load_map
 from swimm3r.splat.training_poses import axes_of_map
-from swimm3r.visits.adjustment import similarity
+from swimm3r.visits.alignment.joint import similarity
 from swimm3r.visits.color import linear, shown
-from swimm3r.visits.misfit import Fit
 from swimm3r.visits.places import Place
 
 _VIEWS = 3
 _LONG_SIDE = 640
 
-Mapped = tuple[Path, Reconstruction, Fit | None, Float[np.ndarray, "3"]]
-"""A run, its reconstruction in its own axes, its fit onto the first visit, and factors on its linear colors."""
+
+@dataclass(frozen=True)
+class Mapped:
+    """A run whose map may be rendered."""
+
+    run: Path
+    own: Reconstruction  # in its own axes
+    first_from_own: Sim3
+    factors: Float[np.ndarray, "3"]  # on its linear colors, into the light of the first visit
 
 
 def rendered_views(
-    survey: Survey, runs: tuple[Mapped, Mapped], places: Sequence[Place], progress: Progress
+    survey: Survey, runs: Sequence[Mapped], places: Sequence[Place], progress: Progress
 ) -> list[tuple[str, UInt8[np.ndarray, "h w 3"], UInt8[np.ndarray, "h w 3"]]]:
     """Captions with what both maps show, without the water, to cameras of the earlier visit (`survey`).
 
     None where a run has no map, or nothing has changed.
     """
-    if not places or not all((run / MARKERS["splat"]).is_file() for run, *_ in runs):
+    if not places or not all((run / MARKERS["splat"]).is_file() for run in (each.run for each in runs)):
         return []
     frames = _frames_at(survey, places)
     cameras = [survey.rec.cameras[i].pinhole(_LONG_SIDE) for i in frames]
@@ -62,17 +69,14 @@ def _frames_at(survey: Survey, places: Sequence[Place]) -> list[int]:
 
 def _rendered(mapped: Mapped, cameras: Sequence[Cameras]) -> list[UInt8[np.ndarray, "h w 3"]]:
     """Views of a map by cameras of the common frame, without the water, in the light of the first visit."""
-    run, own, fit, factors = mapped
-    scene = load_map(run / MARKERS["splat"])
-    to_map = axes_of_map(own, scene.poses)
+    scene = load_map(mapped.run / MARKERS["splat"])
+    to_own, to_map = similarity(mapped.first_from_own.inverse()), axes_of_map(mapped.own, scene.poses)
     views = []
     for camera in cameras:
-        poses = camera.cam2world.double()
-        if fit is not None:
-            poses = similarity(fit.alignment.a_from_b).inverse().poses(poses)
+        poses = to_own.poses(camera.cam2world.double())
         if to_map is not None:
             poses = to_map.poses(poses)
         middle = sum(scene.span) / 2  # of a dynamic map's clip
         clear = scene.render(replace(camera, cam2world=poses.to(camera.cam2world)), middle).clear.clamp(0, 1)
-        views.append((255 * shown(linear(clear.float().numpy()) * factors)).round().astype(np.uint8))
+        views.append((255 * shown(linear(clear.float().numpy()) * mapped.factors)).round().astype(np.uint8))
     return views

@@ -3,6 +3,7 @@
 from dataclasses import dataclass
 from typing import Annotated
 
+from swimm3r.scale.settings import MarkerFamily
 from swimm3r.settings import Count, Positive, Range, Settings
 
 
@@ -22,5 +23,7 @@ class VisitSettings(Settings):
     """Least change of the clear color that is reported, as a CIELAB difference, in addition to the threshold."""
     candidates: Count = 8
     """Number of the most similar frames of the other visit that a frame is matched with."""
+    markers: MarkerFamily | None = None
+    """Family of coded markers that stay on the site: the same ones at two visits are points that both share."""
     matched_frames: Annotated[int, Range(2)] = 400
     """Largest number of frames of a visit that are matched with another one, spread evenly."""

@@ -1,29 +1,30 @@
 """Visits of one site from runs to files: one frame, one grid, each visit's maps, and the layers of each change."""
 
 from collections.abc import Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from itertools import pairwise
 from pathlib import Path
 
 import numpy as np
 
-from swimm3r.errors import RegistrationError, UsageError
+from swimm3r.errors import UsageError
 from swimm3r.io.files.outputs import output_folder
 from swimm3r.products.grid import Grid
 from swimm3r.products.packages import require_packages
 from swimm3r.products.survey import Survey, open_survey
 from swimm3r.progress import Progress, watched
 from swimm3r.scene.reconstruction import Reconstruction
+from swimm3r.sfm.colmap.chunks.links import Sim3
 from swimm3r.visits import color
+from swimm3r.visits.alignment.misfit import Fit, misfit_at
+from swimm3r.visits.alignment.place import Placed, place_visits
 from swimm3r.visits.change import Change, compare
 from swimm3r.visits.ground import Ground, common_grid, observe
 from swimm3r.visits.layers import write_change, write_maps
-from swimm3r.visits.matches import Landmarks, landmarks_of
-from swimm3r.visits.misfit import Fit, align_visit, misfit_at
 from swimm3r.visits.page import Pair, pair, write_page
 from swimm3r.visits.places import Place
 from swimm3r.visits.record import AlignmentRecord, ChangeRecord, VisitRecord, VisitsRecord
-from swimm3r.visits.renders import rendered_views
+from swimm3r.visits.renders import Mapped, rendered_views
 from swimm3r.visits.settings import VisitSettings
 
 
@@ -34,9 +35,18 @@ class Visit:
     name: str
     run: Path
     own: Reconstruction  # in the axes and unit of its own files
-    survey: Survey
-    fit: Fit | None  # None for the first
+    placed: Placed
     ground: Ground
+
+    @property
+    def survey(self) -> Survey:
+        """The run in the frame of the first."""
+        return self.placed.survey
+
+    @property
+    def fit(self) -> Fit | None:
+        """The way it came onto an earlier visit; None for the first."""
+        return self.placed.fit
 
 
 def write_visits(
@@ -47,11 +57,11 @@ def write_visits(
     names = _names(runs)
     surveys = [open_survey(run) for run in runs]
     with watched(progress) as told:
-        placed = _aligned(surveys, names, settings, told)
-        grid = common_grid([survey for survey, _ in placed], settings.gsd)
+        placed = place_visits(surveys, names, settings, told)
+        grid = common_grid([each.survey for each in placed], settings.gsd)
         visits = [
-            Visit(name, run, opened.rec, survey, fit, observe(survey, grid, told))
-            for name, run, opened, (survey, fit) in zip(names, runs, surveys, placed, strict=True)
+            Visit(name, run, opened.rec, each, observe(each.survey, grid, told))
+            for name, run, opened, each in zip(names, runs, surveys, placed, strict=True)
         ]
         with output_folder(out) as folder:
             return _write(visits, grid, folder, settings, told)
@@ -75,32 +85,6 @@ def _names(runs: Sequence[Path]) -> list[str]:
             )
     names = [path.name for path in resolved]
     return [name if names.count(name) == 1 else f"{name} ({k})" for k, name in enumerate(names, 1)]
-
-
-def _aligned(
-    surveys: Sequence[Survey], names: Sequence[str], settings: VisitSettings, progress: Progress
-) -> list[tuple[Survey, Fit | None]]:
-    """The surveys in the frame of the first, each aligned with the earliest one that it can be aligned with."""
-    placed: list[tuple[Survey, Fit | None]] = [(surveys[0], None)]
-    landmarks: list[list[Landmarks]] = [landmarks_of(surveys[0], settings.matched_frames, progress)]
-    for k in range(1, len(surveys)):
-        landmarks.append(landmarks_of(surveys[k], settings.matched_frames, progress))
-        refused: RegistrationError | None = None
-        for j in range(k):
-            try:
-                fit = align_visit(
-                    (names[j], placed[j][0], landmarks[j]), (names[k], surveys[k], landmarks[k]), settings, progress
-                )
-            except RegistrationError as error:
-                refused = refused or error
-                continue
-            moved = replace(surveys[k], rec=fit.rec, place=surveys[0].place)
-            placed.append((moved, fit))
-            break
-        else:
-            assert refused is not None
-            raise refused
-    return placed
 
 
 @dataclass(frozen=True)
@@ -136,19 +120,13 @@ def _write(
         )
         for k, visit in enumerate(visits)
     ]  # fmt: skip
-    west, step, _, north, _, _ = grid.affine(place)
+    notes = [note for visit in visits for note in visit.placed.notes]
     record = VisitsRecord(
-        unit=place.unit,
-        gsd=step,
-        rows=grid.rows,
-        columns=grid.columns,
-        epsg=place.epsg,
-        west=west,
-        north=north,
+        **vars(grid.on_map(place)),
         threshold=settings.threshold,
         visits=tuple(_visit_record(visit, grid.gsd) for visit in visits),
         changes=tuple(each.record for each in compared),
-        notes=tuple(note for each in compared for note in _notes(each)),
+        notes=(*notes, *(note for each in compared for note in _notes(each))),
     )
     pages = [
         _page_of(each, record, (orthophotos[k], orthophotos[k + 1]), (factors[k], factors[k + 1]), progress)
@@ -167,7 +145,10 @@ def _page_of(
     progress: Progress,
 ) -> Pair:
     earlier, later = compared.earlier, compared.later
-    runs = (earlier.run, earlier.own, earlier.fit, factors[0]), (later.run, later.own, later.fit, factors[1])
+    runs = tuple(
+        Mapped(each.run, each.own, each.placed.first_from_own, of)
+        for each, of in zip((earlier, later), factors, strict=True)
+    )
     views = rendered_views(earlier.survey, runs, compared.places, progress)
     return pair(compared.record, compared.places, orthophotos, compared.change, views, record)
 
@@ -189,21 +170,21 @@ def _visit_record(visit: Visit, gsd: float) -> VisitRecord:
         frames=len(visit.survey.rec.names),
         area=float(visit.ground.seen.sum()) * gsd**2,
         clear_colors=visit.survey.has("physical"),
-        alignment=None if fit is None else _alignment_record(fit),
+        alignment=None if fit is None else _alignment_record(fit, visit.placed.first_from_own),
     )
 
 
-def _alignment_record(fit: Fit) -> AlignmentRecord:
-    found = fit.alignment
-    rows = [(float(x), float(y), float(z)) for x, y, z in found.a_from_b.R]
-    x, y, z = (float(value) for value in found.a_from_b.t)
+def _alignment_record(fit: Fit, first_from_own: Sim3) -> AlignmentRecord:
+    rows = [(float(x), float(y), float(z)) for x, y, z in first_from_own.R]
+    x, y, z = (float(value) for value in first_from_own.t)
     return AlignmentRecord(
         onto=fit.onto,
-        source=fit.source,
-        matches=found.matched,
-        agreeing=int(found.inlier.sum()),
-        error_px=found.error_px,
-        scale=float(found.a_from_b.scale),
+        source=fit.alignment.source,
+        matches=fit.alignment.matched,
+        agreeing=int(fit.alignment.inlier.sum()),
+        merged=fit.merged,
+        error_px=fit.error_px,
+        scale=float(first_from_own.scale),
         rotation=tuple(rows),
         shift=(x, y, z),
         check_points=fit.check_points,

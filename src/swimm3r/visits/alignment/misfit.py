@@ -16,18 +16,12 @@ import numpy as np
 from jaxtyping import Float, Int
 from scipy.spatial import KDTree
 
-from swimm3r.errors import RegistrationError
 from swimm3r.products.grid import Grid, Window
-from swimm3r.products.survey import Survey
-from swimm3r.progress import Progress
 from swimm3r.scene.georeference import Georeference
-from swimm3r.scene.reconstruction import Reconstruction
-from swimm3r.visits.adjustment import CheckPoints, place
-from swimm3r.visits.alignment import Alignment, align, by_georeference
+from swimm3r.visits.alignment.joint import CheckPoints
+from swimm3r.visits.alignment.similarity import Alignment
 from swimm3r.visits.change import Misfit
 from swimm3r.visits.ground import Ground
-from swimm3r.visits.matches import Landmarks, match_visits
-from swimm3r.visits.settings import VisitSettings
 
 _NEIGHBORS = 8  # check points of a neighborhood
 _MAD = 1.4826
@@ -68,47 +62,34 @@ class Bends:
 
 @dataclass(frozen=True)
 class Fit:
-    """A visit brought onto another one, in the axes and unit of the first visit's files."""
+    """The way a visit came onto an earlier one, and how well it lies there."""
 
-    onto: str
-    source: str
-    rec: Reconstruction
-    alignment: Alignment
+    onto: str  # name of the earlier visit
+    alignment: Alignment  # of its files with the earlier visit, in the axes and unit of the first visit's files
     check_points: int
+    merged: int  # matches that joint mapping took for one point of both visits
+    error_px: float | None  # median reprojection error of these; None without joint mapping
     level: float  # standard deviation of its place on the other's ground, horizontal per axis, local units
     up: float
-    bends: Bends | None = None  # None with too few check points
+    bends: Bends | None  # None with too few check points
 
 
-def align_visit(
-    onto: tuple[str, Survey, list[Landmarks]],
-    visit: tuple[str, Survey, list[Landmarks]],
-    settings: VisitSettings,
-    progress: Progress,
+def fit_of(
+    onto: str, alignment: Alignment, joint: tuple[CheckPoints, int, float] | None, georeference: Georeference
 ) -> Fit:
-    """The fit of a visit onto a placed one, each with its name and landmarks.
+    """The fit by check points, or by the covariance of the similarity where these are few.
 
-    By images where enough points agree, else by georeferences where both runs have one. Raises RegistrationError
-    where neither tells.
+    `joint` are check points, merged matches and their error after joint mapping; None where there was none.
     """
-    (name_a, a, landmarks_a), (name_b, b, landmarks_b) = onto, visit
-    matches = match_visits(landmarks_a, landmarks_b, settings, progress)
-    try:
-        alignment = align(a.rec, b.rec, matches, (name_a, name_b))
-    except RegistrationError:
-        known = by_georeference(a, b)
-        if known is None:
-            raise
-        alignment, level, up = known
-        moved = place(a.rec, b.rec, matches.select(np.zeros(0, np.int64)), alignment)
-        return Fit(name_a, "georeference", moved.rec, alignment, 0, level, up)
-    placed = place(a.rec, b.rec, matches, alignment)
-    checks = len(placed.check.xyz_a)
-    if checks < _LEAST_CHECKS:
-        size = float(np.sqrt(np.trace(alignment.covariance[4:, 4:]) / 3)) * a.scale
-        return Fit(name_a, "images", placed.rec, alignment, checks, size, size)
-    bends = _bends(placed.check, a.place)
-    return Fit(name_a, "images", placed.rec, alignment, checks, *bends.spread, bends)
+    check, merged, error = joint or (CheckPoints(np.zeros((0, 3)), np.zeros((0, 3))), 0, None)
+    if len(check) >= _LEAST_CHECKS:
+        bends = _bends(check, georeference)
+        level, up = bends.spread
+    else:
+        bends = None
+        levels, ups = _stds_by_covariance(alignment, georeference.to_local(alignment.pivot[None]), georeference)
+        level, up = float(levels[0]), float(ups[0])
+    return Fit(onto, alignment, len(check), merged, error, level, up, bends)
 
 
 def misfit_at(earlier: Fit | None, later: Fit | None, ground: Ground, grid: Grid, georeference: Georeference) -> Misfit:
@@ -135,9 +116,16 @@ def _stds(
     """Horizontal and vertical standard deviation of a fit at local points."""
     if fit.bends is not None:
         return fit.bends.at(points[:, :2])
-    up = georeference.up
-    along = np.einsum("i,nij,j->n", up, fit.alignment.covariance_at(georeference.from_local(points)), up)
-    return np.full(len(points), fit.level), np.sqrt(along * (georeference.scale or 1.0) ** 2 + fit.up**2)
+    return _stds_by_covariance(fit.alignment, points, georeference)
+
+
+def _stds_by_covariance(
+    alignment: Alignment, points: Float[np.ndarray, "n 3"], georeference: Georeference
+) -> tuple[Float[np.ndarray, " n"], Float[np.ndarray, " n"]]:
+    R, scale = georeference.R, georeference.scale or 1.0
+    local = R @ alignment.covariance_at(georeference.from_local(points)) @ R.T
+    x, y, up = scale * np.sqrt(np.diagonal(local, axis1=1, axis2=2)).T
+    return np.hypot(x, y) / np.sqrt(2), up
 
 
 def _bends(check: CheckPoints, georeference: Georeference) -> Bends:

@@ -45,6 +45,7 @@ class VisitMatches:
     frame_b: Int[np.ndarray, " n"]
     xy_a: Float[np.ndarray, "n 2"]  # pixels
     xy_b: Float[np.ndarray, "n 2"]
+    coded: Bool[np.ndarray, " n"]  # corners of coded markers, which cannot be taken for each other
 
     def __len__(self) -> int:
         return len(self.point_a)
@@ -55,7 +56,12 @@ class VisitMatches:
 
     def reversed(self) -> "VisitMatches":
         """The matches with the visits exchanged."""
-        return VisitMatches(self.point_b, self.point_a, self.frame_b, self.frame_a, self.xy_b, self.xy_a)
+        return VisitMatches(self.point_b, self.point_a, self.frame_b, self.frame_a, self.xy_b, self.xy_a, self.coded)
+
+    def and_also(self, others: "VisitMatches") -> "VisitMatches":
+        """These matches, then others of the same visits."""
+        pairs = ((getattr(each, field.name) for each in (self, others)) for field in fields(self))
+        return VisitMatches(*(np.concatenate(list(both)) for both in pairs))
 
     def one_of_each(self, preferred: Bool[np.ndarray, " n"]) -> Bool[np.ndarray, " n"]:
         """True for one match of every two points, a preferred one where there is any."""
@@ -114,8 +120,8 @@ def match_visits(
         rows.append(np.column_stack([*ends, one.xy[found[:, 0]], other.xy[found[:, 1]]]))
     progress("matching the visits", len(pairs), len(pairs))
     table = np.concatenate(rows) if rows else np.zeros((0, 8))
-    whole = table[:, :4].astype(np.int64)
-    return VisitMatches(whole[:, 0], whole[:, 1], whole[:, 2], whole[:, 3], table[:, 4:6], table[:, 6:8])
+    whole, coded = table[:, :4].astype(np.int64), np.zeros(len(table), bool)
+    return VisitMatches(whole[:, 0], whole[:, 1], whole[:, 2], whole[:, 3], table[:, 4:6], table[:, 6:8], coded)
 
 
 def _alike(a: Sequence[Landmarks], b: Sequence[Landmarks], count: int) -> list[tuple[int, int]]:
