@@ -92,6 +92,19 @@ def test_understated_deviations_are_raised_to_the_spread_of_the_ground():
     assert float(np.median(bold.std)) == pytest.approx(spread, rel=0.5)
 
 
+def test_deviations_are_raised_where_shared_points_are_far():
+    """Ground beyond the shared points is bent up and down; no place of it has changed."""
+    bent = np.zeros((SIDE, SIDE))
+    bent[:, 60:] = 0.03 * np.sin(np.arange(60) / 9)
+    far = np.where(np.arange(SIDE) < 60, 1e-4, 2e-4) * np.ones((SIDE, 1))
+    misfit = Misfit(np.zeros((SIDE, SIDE)), far)
+    told = compare(ground(1), ground(2, bent), misfit, GSD, WHITE, VisitSettings())
+    blind = compare(ground(1), ground(2, bent), NO_MISFIT, GSD, WHITE, VisitSettings())
+    assert (blind.height_kind[:, 60:] != UNCHANGED).any()
+    assert (told.height_kind == UNCHANGED).all()
+    assert np.median(told.height.std[:, 70:]) > 3 * np.median(told.height.std[:, :50])
+
+
 def test_other_light_is_taken_out_and_bleaching_found():
     bleached = disc(60, 60, 14)
     later = ground(2, 0.0, (0.5, 0.9, 1.3), albedo=1 + 2 * bleached)

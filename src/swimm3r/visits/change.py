@@ -10,15 +10,17 @@ other ground beside the cell; where it has, another surface is seen.
 s_p is the place that a height was taken at within its cell; s_xy and s_z are what check points say of the alignment
 (`misfit`), at the cell. s_r is the place of a rim: maps smear a change over the ground beside it. Errors that both
 visits have in common cancel, those of a surface that looks different now do not: there the deviations are larger.
-Most of the ground, near and far from the cameras, is taken to be unchanged: where the spread of d / s over the cells at
-like distances, found from its median absolute value, is above 1, it is the factor by which s was too small. Depth and
-water are known the less, the farther away the ground was.
+Most of the ground, near and far from the cameras and from the points that both visits share, is taken to be unchanged:
+where the spread of d / s over cells at like distances, or of like s_z, found from its median absolute value, is above
+1, it is the factor by which s was too small. Depth and water are known the less, the farther away the ground was, and
+bends the less, the farther away the shared points were.
 
 A change is significant from `threshold` s on. From such cells it is followed to neighbors of at least two thirds of it
 in the same direction, so that flanks belong to the place; places smaller than `min_area` are left out. Cells that one
 of the visits did not see are unknown, neither changed nor unchanged.
 """
 
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from typing import Any
 
@@ -39,7 +41,7 @@ _SMOOTH = 1.0  # cells, standard deviation of the filter that both visits pass: 
 _MIN_CELLS = 40  # of a place, by default
 _UNLIKE = 15.0  # CIELAB difference at which deviations of heights are larger by the square root of 2
 _NEAR = 2  # cells around one whose heights tell how steep the ground is
-_CLASSES, _CLASS_CELLS = 8, 400  # of distances: how many at most, and the cells of each at least
+_CLASSES, _CLASS_CELLS = 8, 400  # of cells that are alike: how many at most, and the cells of each at least
 _RIM = 0.5  # cells, standard deviation of the place of a change's rim, which the filter leaves
 _PLACED = 0.25  # cells, standard deviation of where a cell's height was taken: half a pixel of a frame
 
@@ -95,7 +97,7 @@ def compare(
         stable = seen & (np.abs(np.nan_to_num(height.significance)) < settings.threshold / 2)
         gains, _ = light_gains(a.color, b.color, stable)
         aside = np.abs(_filled(height.value.astype(np.float64))) * np.nan_to_num(np.fmax(a.slant, b.slant))
-        color, by_axis = _color_difference(a, b, gains, white, np.hypot(misfit.level, aside) / gsd)
+        color, by_axis = _color_difference(a, b, gains, white, np.hypot(misfit.level, aside) / gsd, misfit)
         # on a surface that looks different, errors that both visits had in common no longer cancel
         unlike = np.sqrt(1 + (np.nan_to_num(color.value) / _UNLIKE) ** 2)
         height = replace(height, std=(height.std * unlike).astype(np.float32))
@@ -115,7 +117,7 @@ def _height_difference(a: Ground, b: Ground, misfit: Misfit, gsd: float) -> tupl
     variance += slope**2 * (misfit.level**2 + (_PLACED * gsd) ** 2) + misfit.up**2
     variance += _smeared(value)
     shifted = float(np.nanmedian(value)) if np.isfinite(value).any() else 0.0
-    return _calibrated(value - shifted, np.sqrt(variance), np.fmax(a.distance, b.distance)), shifted
+    return _calibrated(value - shifted, np.sqrt(variance), (np.fmax(a.distance, b.distance), misfit.up)), shifted
 
 
 def _color_difference(
@@ -124,6 +126,7 @@ def _color_difference(
     gains: Float[np.ndarray, "3"],
     white: Float[np.ndarray, "3"],
     level: Float[np.ndarray, "h w"],  # cells
+    misfit: Misfit,
 ) -> tuple[Difference, Float32[np.ndarray, "h w 3"]]:
     """CIELAB distance, and the differences of L*, a*, b*; `level` is how far its color may be beside a cell."""
     lights = [_smoothed(ground.color) * factor for ground, factor in ((a, white), (b, white * gains))]
@@ -137,8 +140,8 @@ def _color_difference(
         detail = np.maximum(*(_slope(each[..., k]) for each in labs))
         variance[..., k] += detail**2 * (level**2 + _PLACED**2) + _smeared(by_axis[..., k])
     # factors of their own for L*, a*, b*: their errors differ in origin
-    distance = np.fmax(a.distance, b.distance)
-    each = [_calibrated(by_axis[..., k], np.sqrt(variance[..., k]), distance) for k in range(3)]
+    alike = np.fmax(a.distance, b.distance), misfit.up
+    each = [_calibrated(by_axis[..., k], np.sqrt(variance[..., k]), alike) for k in range(3)]
     std = np.stack([one.std for one in each], -1)
     value = np.sqrt((by_axis**2).sum(-1))
     along = np.sqrt((by_axis**2 * std**2).sum(-1)) / np.maximum(value, 1e-9)
@@ -148,23 +151,28 @@ def _color_difference(
 
 
 def _calibrated(
-    value: Float[np.ndarray, "h w"], std: Float[np.ndarray, "h w"], distance: Float32[np.ndarray, "h w"]
+    value: Float[np.ndarray, "h w"], std: Float[np.ndarray, "h w"], alike: Sequence[np.ndarray]
 ) -> Difference:
-    """The difference with its deviations made as large as the spread of most cells at like distances says."""
+    """The difference with its deviations made as large as the spread of most cells that are `alike` says.
+
+    The larger factor of the quantities [h, w] by which cells can be alike counts.
+    """
     known = np.isfinite(value) & np.isfinite(std)
     factor = np.ones(value.shape)
     if known.any():
-        factor[known] = _inflations(np.abs(value[known] / std[known]), distance[known].astype(np.float64))
+        ratio = np.abs(value[known] / std[known])
+        factor[known] = np.max([_inflations(ratio, by[known].astype(np.float64)) for by in alike], axis=0)
     inflation = float(np.median(factor[known])) if known.any() else 1.0
     return Difference(value.astype(np.float32), (factor * std).astype(np.float32), inflation)
 
 
-def _inflations(ratio: Float[np.ndarray, " n"], distance: Float[np.ndarray, " n"]) -> Float[np.ndarray, " n"]:
-    """Factors on deviations by the differences in deviations, found in classes of distance and interpolated."""
-    classes = np.array_split(np.argsort(distance, kind="stable"), max(1, min(_CLASSES, len(ratio) // _CLASS_CELLS)))
-    at = [float(np.median(distance[rows])) for rows in classes]
+def _inflations(ratio: Float[np.ndarray, " n"], by: Float[np.ndarray, " n"]) -> Float[np.ndarray, " n"]:
+    """Factors on deviations by the differences in deviations, found in classes of a quantity and interpolated."""
+    count = max(1, min(_CLASSES, len(ratio) // _CLASS_CELLS, len(np.unique(by))))
+    classes = np.array_split(np.argsort(by, kind="stable"), count)
+    at = [float(np.median(by[rows])) for rows in classes]
     factors = [max(1.0, _MAD * float(np.median(ratio[rows]))) for rows in classes]
-    return np.interp(distance, at, factors)
+    return np.interp(by, at, factors)
 
 
 def _kinds(

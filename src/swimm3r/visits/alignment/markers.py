@@ -53,9 +53,15 @@ def with_markers(survey: Survey, family: MarkerFamily, progress: Progress) -> tu
 def match_markers(a: Corners, b: Corners) -> VisitMatches:
     """The corners that both visits have."""
     both = sorted(set(a.point) & set(b.point))
-    whole = (np.array([of[each] for each in both], np.int64) for of in (a.point, b.point, a.frame, b.frame))
-    pixels = (np.array([of[each] for each in both], np.float64).reshape(-1, 2) for of in (a.xy, b.xy))
-    return VisitMatches(*whole, *pixels, np.ones(len(both), bool))
+    return VisitMatches(
+        np.array([a.point[each] for each in both], np.int64),
+        np.array([b.point[each] for each in both], np.int64),
+        np.array([a.frame[each] for each in both], np.int64),
+        np.array([b.frame[each] for each in both], np.int64),
+        np.array([a.xy[each] for each in both], np.float64).reshape(-1, 2),
+        np.array([b.xy[each] for each in both], np.float64).reshape(-1, 2),
+        np.ones(len(both), bool),
+    )
 
 
 def _extended(rec: Reconstruction, xyz: np.ndarray, tracks: np.ndarray) -> Reconstruction:
