@@ -1,18 +1,14 @@
 """Corners of coded markers as points that visits share."""
 
-from dataclasses import replace
-
 import numpy as np
 import pytest
 import torch
 from tests.visits.conftest import HEIGHT, WIDTH, Visits
 
 from swimm3r.cameras import project
-from swimm3r.errors import UsageError
 from swimm3r.products.survey import Survey
 from swimm3r.progress import silent
 from swimm3r.scale.triangulation import Sighting
-from swimm3r.visits import VisitSettings
 from swimm3r.visits.alignment import markers
 from swimm3r.visits.alignment.markers import Corners, match_markers, with_markers
 
@@ -20,7 +16,7 @@ FAMILY = "aruco-4x4-50"
 
 
 def sightings(survey: Survey, ids: tuple[int, ...]) -> dict[int, list[list[Sighting]]]:
-    """Where every frame sees four corners of markers, 10 cm squares on the ground at places that the id tells."""
+    """Pixels of the corners of markers in every frame: 10 cm squares on the ground at places that the id tells."""
     found = {}
     for marker in ids:
         corner = np.array([0.1 + 0.15 * marker, 0.4])
@@ -59,8 +55,3 @@ def test_markers_of_both_visits_are_matched_by_their_codes():
     assert (found.xy_a.tolist(), found.xy_b.tolist()) == ([[3.0, 4.0]], [[5.0, 6.0]])
     assert found.coded.all()
     assert len(match_markers(one, Corners())) == 0
-
-
-def test_a_family_that_is_not_known_is_refused():
-    with pytest.raises(UsageError):
-        replace(VisitSettings(), markers="aruco-9x9")  # pyright: ignore[reportArgumentType]
