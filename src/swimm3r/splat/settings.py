@@ -45,9 +45,9 @@ class RenderSettings(Settings):
     covariance: Literal["symmetric", "upper"] = "symmetric"
     """Reduction of the conditional covariance, which is not symmetric: its mean with its transpose, or its upper
     triangle as in UBS."""
-    antialiasing: Literal["mip", "dilation"] = "mip"
-    """Filter of primitives: none smaller than a pixel of the training images, and averaged over the pixels of the view
-    (mip, Mip-Splatting), or widened by 0.3 px^2 in every view (dilation), as in 3DGS and UBS."""
+    antialiasing: Literal["mip", "dilation"] = "dilation"
+    """Filter of primitives: widened by 0.3 px^2 in every view (dilation), as in 3DGS and UBS, or none smaller than a
+    pixel of the training images and averaged over the pixels of the view (mip, Mip-Splatting), for other sizes."""
     rotation: Literal["first_order", "exponential"] = "first_order"
     """Rotation of a primitive from its parameters A: I + A as in UBS, or exp(A)."""
     medium_depth_grad: Literal["full", "detach"] = "full"

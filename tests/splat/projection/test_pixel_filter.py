@@ -18,7 +18,8 @@ from swimm3r.splat.projection.view_camera import view_camera
 from swimm3r.splat.settings import RenderSettings
 
 Make = Callable[..., BetaPrimitives]
-SETTINGS = {"beta": RenderSettings(), "gaussian": GaussianRenderSettings(antialiasing="mip")}
+MIP = RenderSettings(antialiasing="mip")
+SETTINGS = {"beta": MIP, "gaussian": GaussianRenderSettings(antialiasing="mip")}
 SHAPE = torch.tensor([[5.0, 1.5], [1.5, 2.0]], dtype=torch.float64)
 
 
@@ -71,10 +72,10 @@ def test_no_primitive_is_smaller_than_the_filter_in_the_views_that_measured_it(
     p = primitives(300)
     p = p._replace(scale=p.scale - 6, footprint=footprints(p.xyz, camera()))
     view = replace(view_camera(camera(), torch.float64))
-    seen = conditioned_in_view(p, view.center, RenderSettings())
+    seen = conditioned_in_view(p, view.center, MIP)
     least = torch.linalg.eigvalsh(seen.covariance)[:, 0] / (2 * (4 * p.beta[:, 0].exp() + 2))
     assert (least >= 0.999 * PIXEL * p.footprint**2).all()
-    conic = project_plainly(p, view, RenderSettings()).primitives.conic
+    conic = project_plainly(p, view, MIP).primitives.conic
     a, b, c = conic.unbind(-1)
     largest = torch.linalg.eigvalsh(torch.stack([a, b, b, c], -1).unflatten(-1, (2, 2)))[:, 1]
     on_image = 1 / largest / (2 * (4 * p.beta[:, 0].exp() + 2))
@@ -85,7 +86,7 @@ def test_the_filters_gradient_is_that_of_differences(primitives: Make, camera: C
     p, view = primitives(6, seed=4), view_camera(camera(), torch.float64)
 
     def drawn(beta: torch.Tensor, scale: torch.Tensor, xyz: torch.Tensor) -> tuple[torch.Tensor, ...]:
-        on_plane = project_plainly(p._replace(beta=beta, scale=scale, xyz=xyz), view, RenderSettings()).primitives
+        on_plane = project_plainly(p._replace(beta=beta, scale=scale, xyz=xyz), view, MIP).primitives
         return on_plane.conic, on_plane.opacity
 
     leaves = [values.clone().requires_grad_() for values in (p.beta, p.scale, p.xyz)]
