@@ -17,7 +17,7 @@ from typing import Any
 
 import numpy as np
 import torch
-from jaxtyping import Float, UInt8
+from jaxtyping import Float
 from torch import Tensor
 
 from swimm3r.errors import InputError
@@ -25,6 +25,7 @@ from swimm3r.io.files.damage import Remedy, guard
 from swimm3r.io.files.json_file import structure
 from swimm3r.medium import linear_from_srgb
 from swimm3r.progress import Progress, silent
+from swimm3r.scale.marker_registration import registered_corners
 from swimm3r.scale.settings import MarkerFamily, ScaleSettings
 from swimm3r.scale.solve import ScaleEstimate
 from swimm3r.scale.triangulation import ScenePoint, Sighting, scale_of_shape, triangulate_all
@@ -45,7 +46,7 @@ _DICTIONARIES: dict[MarkerFamily, str] = {
     "apriltag-36h10": "DICT_APRILTAG_36h10",
     "apriltag-36h11": "DICT_APRILTAG_36h11",
 }
-_CORNER_PX = 0.2  # standard deviation of a corner's place in a sharp frame
+_CORNER_PX = 0.1  # standard deviation of a corner's place; 0.01 in rendered frames, without noise and swell
 _OFF_PX = 3.0  # mean reprojection error of a corner from which a marker is not one thing at one place
 _REMEDY = Remedy(
     "family, size, sizes, distances or board; see docs/guides/metric-scale.md",
@@ -111,44 +112,45 @@ def marker_sizes(settings: ScaleSettings) -> MarkerSizes | None:
 
 
 def detect(
-    image: UInt8[np.ndarray, "h w"], family: MarkerFamily, board: Board | None = None
+    light: Float[np.ndarray, "h w"], family: MarkerFamily, board: Board | None = None
 ) -> dict[int, Float[np.ndarray, "corners 2"]]:
-    """Corners of the markers in a gray image by id, clockwise from the first one, pixels from the image's corner.
+    """Corners of the markers in an image of linear light, 0..1, by id; pixels from the image's corner.
 
-    Of a board, corners of its squares by id, one each.
+    Clockwise from the first corner, by all edges of the pattern. Of a board, corners of its squares by id, one each.
     """
     from cv2 import aruco
 
     dictionary = aruco.getPredefinedDictionary(getattr(aruco, _DICTIONARIES[family]))
-    parameters = aruco.DetectorParameters()
-    # lines through the edges of the square: other ways draw blurred corners inwards by 0.2 to 1 pixel of a side
-    parameters.cornerRefinementMethod = aruco.CORNER_REFINE_APRILTAG
+    image = (light * 255).clip(0, 255).round().astype(np.uint8)
     if board is not None:
         charuco = aruco.CharucoBoard((board.columns, board.rows), board.square, board.marker, dictionary)
-        corners, ids, _, _ = aruco.CharucoDetector(charuco, aruco.CharucoParameters(), parameters).detectBoard(image)
+        corners, ids, _, _ = aruco.CharucoDetector(charuco).detectBoard(image)
         if ids is None:
             return {}
         return {int(i): xy.reshape(1, 2).astype(np.float64) + 0.5 for i, xy in zip(ids.ravel(), corners, strict=True)}
+    parameters = aruco.DetectorParameters()
+    parameters.cornerRefinementMethod = aruco.CORNER_REFINE_APRILTAG  # finds large squares, which thresholds miss
     corners, ids, _ = aruco.ArucoDetector(dictionary, parameters).detectMarkers(image)
     if ids is None:
         return {}
     found: dict[int, Float[np.ndarray, "corners 2"]] = {}
     twice = {int(i) for i in ids.ravel() if (ids == i).sum() > 1}
+    cells = dictionary.markerSize + 2
     for i, xy in zip(ids.ravel().tolist(), corners, strict=True):
-        if i not in twice:  # two markers of one id in a frame: neither is known to be the one
-            found[int(i)] = xy.reshape(4, 2).astype(np.float64)  # this refinement counts from the image's corner
+        if i in twice:  # two markers of one id in a frame: neither is known to be the one
+            continue
+        bright = aruco.generateImageMarker(dictionary, int(i), cells) > 127
+        registered = registered_corners(light, xy.reshape(4, 2).astype(np.float64), bright)
+        if registered is not None:
+            found[int(i)] = registered
     return found
 
 
-def _light(image: Float[Tensor, "h w 3"]) -> UInt8[np.ndarray, "h w"]:
-    """Gray linear light of a frame, to 8 bits.
-
-    A blurred edge on values as stored lies where linear light is a fifth of the white, and squares come out half a
-    pixel too small: 0.6% of a marker of 50 pixels.
-    """
+def _light(image: Float[Tensor, "h w 3"]) -> Float[np.ndarray, "h w"]:
+    """Gray linear light of a frame, relative to its brightest parts."""
     gray = linear_from_srgb(image).mean(-1)
     white = float(torch.quantile(gray[::4, ::4].flatten(), 0.995))
-    return (gray / max(white, 1e-6) * 255).clamp(0, 255).round().byte().numpy()
+    return (gray / max(white, 1e-6)).clamp(0, 1).numpy()
 
 
 def find_markers(
@@ -162,8 +164,8 @@ def find_markers(
     found: dict[int, list[list[Sighting]]] = defaultdict(lambda: [[] for _ in range(1 if board else 4)])
     for i, name in enumerate(rec.names):
         progress("looking for markers", i, len(rec.names))
-        image = _light(frames.image(frames.index(name)))
-        for marker, corners in detect(image, family, board).items():
+        light = _light(frames.image(frames.index(name)))
+        for marker, corners in detect(light, family, board).items():
             for k, (x, y) in enumerate(corners.tolist()):
                 found[marker][k].append(Sighting(i, (x, y)))
     progress("looking for markers", len(rec.names), len(rec.names))

@@ -1,0 +1,130 @@
+"""Corners of a coded marker from all edges of its pattern, outer and inner.
+
+In linear light blur moves no edge, but the response of a camera is not known exactly, and scattered light, sharpening
+and an unknown response move every edge toward its dark or its bright side. Edges of the pattern face both ways, so the
+shift is solved for together with the homography from the marker's plane to the image.
+"""
+
+from dataclasses import dataclass
+
+import cv2
+import numpy as np
+from jaxtyping import Bool, Float
+
+_REACH_PX = 4.0  # greatest distance from an edge to which its profile goes
+_REACH_CELLS = 0.45  # the same by the side of a cell: to the middle of both cells
+_STEPS = 17  # samples of a profile
+_PLACES = np.linspace(0.35, 0.65, 5)  # along the side of a cell, away from its corners, which blur rounds
+_ROUNDS = 6  # profiles are laid again around the edges that were found
+_CONTRAST = 0.4  # of the marker's median, below which an edge is covered or in shadow
+_OUTLIER = 3.0  # robust standard deviations
+_FEWEST = 0.6  # of the edges, below which the marker is not seen well enough
+_FAR_CELLS = 0.25  # robust deviation of the edges from the homography's, above which the square is another thing
+
+
+@dataclass(frozen=True)
+class PatternEdges:
+    """Edges between dark and bright cells; the unit is the side of a cell, the origin the square's first corner."""
+
+    places: Float[np.ndarray, "edges k 2"]
+    to_bright: Float[np.ndarray, "edges 2"]  # unit vectors across the edges
+
+
+def pattern_edges(bright: Bool[np.ndarray, "n n"]) -> PatternEdges:
+    """The edges of a pattern (rows from the first corner on, its dark frame included) on a bright ground."""
+    padded = np.pad(bright, 1, constant_values=True)
+    places, to_bright = [], []
+    for axis in (0, 1):
+        low, high = (padded[:-1], padded[1:]) if axis == 0 else (padded[:, :-1], padded[:, 1:])
+        for row, column in np.argwhere(low != high):
+            along, across = (column, row) if axis == 0 else (row, column)
+            line = np.stack([along - 1 + _PLACES, np.full(len(_PLACES), float(across))], -1)
+            sign = 1.0 if high[row, column] else -1.0
+            places.append(line if axis == 0 else line[:, ::-1])
+            to_bright.append((0.0, sign) if axis == 0 else (sign, 0.0))
+    return PatternEdges(np.array(places), np.array(to_bright))
+
+
+def registered_corners(
+    light: Float[np.ndarray, "h w"], corners: Float[np.ndarray, "4 2"], bright: Bool[np.ndarray, "n n"]
+) -> Float[np.ndarray, "4 2"] | None:
+    """Corners of the dark square of a marker in an image of linear light, pixels from the image's corner.
+
+    `corners` are those corners within half a cell, clockwise from the pattern's first one. None where the pattern does
+    not fit there: covered, or not flat.
+    """
+    edges, n = pattern_edges(bright), len(bright)
+    square = np.array([[0, 0], [n, 0], [n, n], [0, n]], np.float32)
+    plane = cv2.getPerspectiveTransform(square, corners.astype(np.float32)).astype(np.float64)
+    tangent = edges.to_bright[:, None, ::-1] * np.ones_like(edges.places)
+    for _ in range(_ROUNDS):
+        at, slopes = _mapped(plane, edges.places)
+        ahead = np.einsum("ekij,ekj->eki", slopes, tangent)
+        inward = np.einsum("ekij,ej->eki", slopes, edges.to_bright)
+        side = np.linalg.norm(ahead, axis=-1)
+        across = np.stack([-ahead[..., 1], ahead[..., 0]], -1) / side[..., None]
+        across *= np.sign((across * inward).sum(-1, keepdims=True))
+        reach = min(_REACH_PX, _REACH_CELLS * float(np.median(side)))
+        away, seen = _distances(light, at, across, reach)
+        if seen.mean() < _FEWEST:
+            return None
+        rows = np.einsum("eki,ekij->ekj", across, _by_entries(plane, edges.places, at))[seen]
+        rows, away = np.concatenate([rows, np.ones((len(rows), 1))], 1), away[seen]
+        kept = np.ones(len(away), bool)
+        for _ in range(3):
+            found = np.linalg.lstsq(rows[kept], away[kept], rcond=None)[0]
+            left = np.abs(away - rows @ found)
+            spread = 1.4826 * float(np.median(left))
+            kept = left <= max(_OUTLIER * spread, 1e-3)
+        plane = plane + np.append(found[:8], 0).reshape(3, 3)
+        if spread > _FAR_CELLS * float(np.median(side)):
+            return None
+    return _mapped(plane, square[:, None].astype(np.float64))[0][:, 0]
+
+
+def _mapped(
+    plane: Float[np.ndarray, "3 3"], xy: Float[np.ndarray, "m k 2"]
+) -> tuple[Float[np.ndarray, "m k 2"], Float[np.ndarray, "m k 2 2"]]:
+    """Points of the marker's plane in the image, and the derivatives of their places there."""
+    uvw = xy @ plane[:, :2].T + plane[:, 2]
+    at = uvw[..., :2] / uvw[..., 2:]
+    slopes = (plane[:2, :2] - at[..., None] * plane[2, :2]) / uvw[..., 2, None, None]
+    return at, slopes
+
+
+def _by_entries(
+    plane: Float[np.ndarray, "3 3"], xy: Float[np.ndarray, "m k 2"], at: Float[np.ndarray, "m k 2"]
+) -> Float[np.ndarray, "m k 2 8"]:
+    """Derivatives of points' places in the image by the homography's entries but the last, which is 1."""
+    w = xy @ plane[2, :2] + plane[2, 2]
+    x, y = np.moveaxis(xy, -1, 0)
+    none, one = np.zeros_like(x), np.ones_like(x)
+    u, v = np.moveaxis(at, -1, 0)
+    rows = [[x, y, one, none, none, none, -u * x, -u * y], [none, none, none, x, y, one, -v * x, -v * y]]
+    return np.moveaxis(np.array(rows), (0, 1), (-2, -1)) / w[..., None, None]
+
+
+def _distances(
+    light: Float[np.ndarray, "h w"],
+    at: Float[np.ndarray, "m k 2"],
+    across: Float[np.ndarray, "m k 2"],
+    reach: float,
+) -> tuple[Float[np.ndarray, "m k"], Bool[np.ndarray, "m k"]]:
+    """Distances by which edges lie beyond places in the direction of their bright side, and those that are seen.
+
+    The distance is that of a sharp edge with as much light along the profile.
+    """
+    offsets = np.linspace(-reach, reach, _STEPS)
+    xy = at[..., None, :] + offsets[:, None] * across[..., None, :]
+    h, w = light.shape
+    inside = ((xy >= 0.5) & (xy <= (w - 0.5, h - 0.5))).all((-1, -2))
+    x, y = np.moveaxis(xy.reshape(len(xy), -1, 2) - 0.5, -1, 0).astype(np.float32)
+    profiles = cv2.remap(light.astype(np.float32), x, y, cv2.INTER_LINEAR, borderMode=cv2.BORDER_REPLICATE)
+    profiles = profiles.reshape(xy.shape[:-1]).astype(np.float64)
+    dark, bright = (profiles[..., end].mean(1, keepdims=True) for end in (0, -1))
+    contrast = bright - dark
+    seen = inside & (contrast > _CONTRAST * np.median(contrast))
+    if not (contrast > 0).any():
+        return np.zeros(inside.shape), np.zeros_like(inside)
+    lit = np.trapezoid(profiles - dark[..., None], offsets, axis=-1)
+    return reach - lit / np.where(seen, contrast, np.inf), seen
