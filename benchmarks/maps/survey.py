@@ -58,7 +58,7 @@ class Bar:
     name: str
     found: float
     bar: float
-    form: str = ".2%"
+    form: str = ".3%"
     least: bool = False
 
     def show(self) -> None:
@@ -120,7 +120,11 @@ def show_scales(by_markers: ScaleSolution, draws: list[Draw], true: float) -> li
         Bar("scale by markers", abs(by_size), 0.003),
         Bar(f"scale by navigation, rms of {len(draws)} draws", rms[0], 0.01),
         Bar("scale by navigation, worst draw", np.abs(errors[:, 0]).max(), 0.01),
-        Bar("scale by both, rms; the better one", rms[1], min(abs(by_size), rms[0])),
+        Bar(
+            "scale by both, rms; the better one and a tenth of the stated deviation",
+            rms[1],
+            min(abs(by_size), rms[0]) + 0.1 * stds[:, 1].mean(),
+        ),
     ]
 
 

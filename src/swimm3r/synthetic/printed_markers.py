@@ -1,6 +1,7 @@
 """Printed markers on level plates above the seafloor: ArUco 4x4 of 50, ids in the order of the camera's path.
 
-A plate lies just above the highest ground below it, and is rendered exactly where the rays of a frame meet its plane.
+A plate lies where the ground beside the path is flattest, just above its highest point, and is rendered exactly where
+the rays of a frame meet its plane.
 """
 
 from collections.abc import Sequence
@@ -19,6 +20,8 @@ _BORDER = 1.5  # side of the plate by that of the marker's black square
 _CELLS = 6  # of the black square, its frame included
 _ASIDE = 0.35  # metres from the path, left and right in turn
 _ABOVE = 0.005  # metres between plate and ground
+_SEARCH = 0.4  # of a part of the path, before and behind its middle, where flat ground is looked for
+_CANDIDATES = 16  # places there, before and behind
 _WHITE, _BLACK = 0.55, 0.03  # albedo
 _LIGHT = 0.55 + 1.05 * float(SUN[2])
 _SAMPLES = 6  # per pixel and axis
@@ -47,20 +50,36 @@ class Plate:
 def plates_along(
     floor: Seafloor | Plain, path: Float[np.ndarray, "f 3"], count: int, size: float, seed: int
 ) -> list[Plate]:
-    """Markers beside a path of the camera, evenly spread over its frames."""
+    """Markers beside a path of the camera, one for each of `count` parts of its frames, where the ground is flat."""
     rng = np.random.default_rng([seed, 7])
-    plates = []
+    plates: list[Plate] = []
     for marker in range(count):
-        i = min(round((marker + 0.5) * len(path) / count), len(path) - 1)
-        ahead = path[min(i + 1, len(path) - 1), :2] - path[max(i - 1, 0), :2]
-        side = np.array([ahead[1], -ahead[0]]) / max(float(np.linalg.norm(ahead)), 1e-9)
-        x, y = path[i, :2] + _ASIDE * (-1) ** marker * side
-        reach = np.linspace(-_BORDER, _BORDER, 15) * size * 0.75
-        below = height_at(floor.around(float(x), float(y)), *np.meshgrid(x + reach, y + reach))
-        plates.append(
-            Plate(marker, (float(x), float(y), float(below.max()) + _ABOVE), float(rng.uniform(0, 6.28)), size)
-        )
+        turn, last = float(rng.uniform(0, 6.28)), len(path) - 1
+        near = np.linspace(marker + 0.5 - _SEARCH, marker + 0.5 + _SEARCH, 2 * _CANDIDATES + 1)
+        frames = np.unique((near * len(path) / count).round().astype(int).clip(0, last))
+        places = [_beside(path, int(i), side) for i in frames for side in (-1, 1)]
+        free = [place for place in places if _clear_of(place, plates, size)]
+        _, top, (x, y) = min((*_relief(floor, place, size), place) for place in free or places)
+        plates.append(Plate(marker, (x, y, top + _ABOVE), turn, size))
     return plates
+
+
+def _beside(path: Float[np.ndarray, "f 3"], i: int, side: int) -> tuple[float, float]:
+    """The place beside frame i of a path, to its right or its left."""
+    ahead = path[min(i + 1, len(path) - 1), :2] - path[max(i - 1, 0), :2]
+    x, y = path[i, :2] + _ASIDE * side * np.array([ahead[1], -ahead[0]]) / max(float(np.linalg.norm(ahead)), 1e-9)
+    return float(x), float(y)
+
+
+def _clear_of(place: tuple[float, float], plates: Sequence[Plate], size: float) -> bool:
+    return all(np.hypot(place[0] - p.center[0], place[1] - p.center[1]) > 2 * _BORDER * size for p in plates)
+
+
+def _relief(floor: Seafloor | Plain, place: tuple[float, float], size: float) -> tuple[float, float]:
+    """Height by which the ground below a plate varies, and its highest point there; metres."""
+    reach = np.linspace(-_BORDER, _BORDER, 15) * size * 0.75
+    below = height_at(floor.around(*place), *np.meshgrid(place[0] + reach, place[1] + reach))
+    return float(np.ptp(below)), float(below.max())
 
 
 def with_plates(
