@@ -13,7 +13,7 @@ from swimm3r.errors import RegistrationError
 from swimm3r.geometry import align_similarity, pose_from, so3_exp
 from swimm3r.progress import silent
 from swimm3r.scene.reconstruction import DepthMap, DepthMaps, Matches, Points, Reconstruction, Tracks
-from swimm3r.sfm.colmap.chunks.links import Sim3
+from swimm3r.sim3 import Sim3
 from swimm3r.visits.alignment.depth import with_depth
 from swimm3r.visits.alignment.joint import Joint, Link, map_jointly, moved, shape_similarity
 from swimm3r.visits.alignment.matches import VisitMatches

@@ -14,7 +14,7 @@ from swimm3r.geometry import so3_exp
 from swimm3r.products.survey import Survey, open_survey
 from swimm3r.progress import silent
 from swimm3r.scene.run_folder import MARKERS
-from swimm3r.sfm.colmap.chunks.links import Sim3
+from swimm3r.sim3 import Sim3
 from swimm3r.splat.training_poses import RefinedPoses
 from swimm3r.visits import renders
 from swimm3r.visits.alignment.joint import moved

@@ -8,17 +8,14 @@ from jaxtyping import Float
 
 from swimm3r.scene.frames import Frames
 from swimm3r.scene.reconstruction import Reconstruction
+from swimm3r.sim3 import Sim3
 
 
 @dataclass(frozen=True)
 class Placement:
-    """The similarity x -> scale R x + t from a model to the local metres of its navigation, and where that saw the
-    cameras.
-    """
+    """The similarity from a model to the local metres of its navigation, and where that saw the cameras."""
 
-    scale: float
-    R: Float[np.ndarray, "3 3"]
-    t: Float[np.ndarray, "3"]
+    local_from_model: Sim3
     scale_std: float  # relative
     rotation_std_deg: float  # about the axis that is known worst
     names: tuple[str, ...]  # frames with a position

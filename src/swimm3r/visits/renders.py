@@ -12,7 +12,7 @@ from swimm3r.products.survey import Survey
 from swimm3r.progress import Progress
 from swimm3r.scene.reconstruction import Reconstruction
 from swimm3r.scene.run_folder import MARKERS
-from swimm3r.sfm.colmap.chunks.links import Sim3
+from swimm3r.sim3 import Sim3
 from swimm3r.splat.map_file import load_map
 from swimm3r.splat.training_poses import axes_of_map
 from swimm3r.visits.alignment.joint import similarity

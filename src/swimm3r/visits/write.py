@@ -14,7 +14,7 @@ from swimm3r.products.packages import require_packages
 from swimm3r.products.survey import Survey, open_survey
 from swimm3r.progress import Progress, watched
 from swimm3r.scene.reconstruction import Reconstruction
-from swimm3r.sfm.colmap.chunks.links import Sim3
+from swimm3r.sim3 import Sim3
 from swimm3r.visits import color
 from swimm3r.visits.alignment.misfit import Fit, misfit_at
 from swimm3r.visits.alignment.place import Placed, place_visits

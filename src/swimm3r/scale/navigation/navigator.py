@@ -14,6 +14,7 @@ from swimm3r.scale.settings import ScaleSettings
 from swimm3r.scene.frames import Frames
 from swimm3r.scene.placement import Navigator, Placement
 from swimm3r.scene.reconstruction import Reconstruction
+from swimm3r.sim3 import Sim3
 
 _SCALE_STD = 0.05  # of a part that navigation may hold: a tenth of its depth in two of three dives
 _ROTATION_STD = 8.0  # degrees
@@ -49,14 +50,13 @@ def _placement(rec: Reconstruction, fit: NavigationFit) -> Placement:
     used = ~found.outliers
     centers = rec.cameras.centers.double().numpy()[frame[used]]
     widened = found.std[used] * np.sqrt(found.correlation / found.weight[used])[:, None]
+    local_from_model = Sim3(found.scale, found.R, found.t)
     return Placement(
-        scale=found.scale,
-        R=found.R,
-        t=found.t,
+        local_from_model=local_from_model,
         scale_std=found.scale_std,
         rotation_std_deg=float(found.rotation_std_deg.max()),
         names=tuple(rec.names[i] for i in frame[used]),
-        position=found.scale * centers @ found.R.T + found.t - found.residual[used],
+        position=local_from_model(centers) - found.residual[used],
         std=widened,
         offset=None if fit.offset is None else fit.offset.seconds,
     )

@@ -20,9 +20,9 @@ from swimm3r.scene.reconstruction import QualityWarning, Reconstruction
 from swimm3r.sfm.colmap import calibration
 from swimm3r.sfm.colmap.chunks.assemble import assemble
 from swimm3r.sfm.colmap.chunks.join import Joined
-from swimm3r.sfm.colmap.chunks.links import Sim3
 from swimm3r.sfm.colmap.chunks.parts import LEAST_FRAMES, part_of
 from swimm3r.sfm.features.database import FeatureDatabase
+from swimm3r.sim3 import IDENTITY
 
 if TYPE_CHECKING:
     import pycolmap
@@ -124,30 +124,26 @@ def _joined(
     progress: Progress,
 ) -> "pycolmap.Reconstruction":
     """One model of all parts, in the axes of the largest and under its lens, its points triangulated anew."""
-    model_from_local = _similarity(placed).inverse()
-    from_part = {0: Sim3(1.0, np.eye(3), np.zeros(3))}
+    model_from_local = placed.local_from_model.inverse()
+    from_part = {0: IDENTITY}
     for k, (_, found) in enumerate(parts, 1):
-        from_part[k] = model_from_local.after(_similarity(found))
+        from_part[k] = model_from_local.after(found.local_from_model)
     pieces = [part_of(model), *(part_of(part) for part, _ in parts)]
     return assemble(store, pieces, Joined(from_part, ()), model.cameras[1], progress)
-
-
-def _similarity(placed: Placement) -> Sim3:
-    return Sim3(placed.scale, placed.R, placed.t)
 
 
 def _priors(placements: Sequence[Placement], frames: Frames) -> dict[str, Prior]:
     """The positions of all parts in the model of the first, by the names of the database."""
     first = placements[0]
-    model_from_local = _similarity(first).inverse()
+    model_from_local = first.local_from_model.inverse()
     number = {name: f"{i:06d}" for i, name in enumerate(frames.names)}
     priors: dict[str, Prior] = {}
     for placed in placements:
         std = np.where(np.isfinite(placed.std), placed.std, _UNKNOWN * np.ptp(placed.position, axis=0).max())
         for name, position, each in zip(
-            placed.names, model_from_local(placed.position), std / first.scale, strict=True
+            placed.names, model_from_local(placed.position), std * model_from_local.scale, strict=True
         ):
-            covariance = first.R.T @ np.diag(each**2) @ first.R
+            covariance = model_from_local.R @ np.diag(each**2) @ model_from_local.R.T
             priors.setdefault(number[name], Prior(position, covariance))
     return priors
 

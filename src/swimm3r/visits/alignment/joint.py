@@ -23,11 +23,10 @@ from scipy.sparse.csgraph import connected_components
 from swimm3r.cameras import project
 from swimm3r.geometry import Similarity
 from swimm3r.scene.reconstruction import Reconstruction
-from swimm3r.sfm.colmap.chunks.links import Sim3, fit_similarity
+from swimm3r.sim3 import IDENTITY, Sim3, fit_similarity
 from swimm3r.visits.alignment.bundle import Sites, adjusted, with_own_points
 from swimm3r.visits.alignment.matches import VisitMatches
 
-IDENTITY = Sim3(1.0, np.eye(3), np.zeros(3))
 _CHECK_EVERY = 5  # shared places of which one is a check point
 _ROUNDS = 4
 _STABLE = 4.0  # median reprojection errors within which a shared point lies on stable ground

@@ -20,7 +20,7 @@ from torch import Tensor
 from swimm3r.localization.landmarks import MIN_INLIERS
 from swimm3r.scene.reconstruction import Reconstruction
 from swimm3r.sfm.colmap.absolute_pose import absolute_pose
-from swimm3r.sfm.colmap.chunks.links import Sim3
+from swimm3r.sim3 import Sim3
 from swimm3r.visits.alignment.matches import VisitMatches
 
 

@@ -8,9 +8,9 @@ import numpy as np
 from swimm3r.errors import RegistrationError
 from swimm3r.products.survey import Survey
 from swimm3r.progress import Progress
-from swimm3r.sfm.colmap.chunks.links import Sim3
+from swimm3r.sim3 import IDENTITY, Sim3
 from swimm3r.visits.alignment.depth import with_depth
-from swimm3r.visits.alignment.joint import IDENTITY, CheckPoints, Link, map_jointly, moved, shape_similarity
+from swimm3r.visits.alignment.joint import CheckPoints, Link, map_jointly, moved, shape_similarity
 from swimm3r.visits.alignment.markers import Corners, match_markers, with_markers
 from swimm3r.visits.alignment.matches import Landmarks, VisitMatches, landmarks_of, match_visits
 from swimm3r.visits.alignment.misfit import Fit, fit_of

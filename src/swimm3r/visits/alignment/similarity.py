@@ -25,7 +25,7 @@ from swimm3r.cameras import project
 from swimm3r.errors import RegistrationError
 from swimm3r.products.survey import Survey
 from swimm3r.scene.reconstruction import Reconstruction
-from swimm3r.sfm.colmap.chunks.links import Sim3, fit_similarity
+from swimm3r.sim3 import Sim3, fit_similarity
 from swimm3r.visits.alignment.localized import among, localized_frames
 from swimm3r.visits.alignment.matches import VisitMatches
 

@@ -12,9 +12,9 @@ import numpy as np
 from swimm3r.progress import Progress
 from swimm3r.sfm.colmap import calibration
 from swimm3r.sfm.colmap.chunks.join import Joined
-from swimm3r.sfm.colmap.chunks.links import Sim3
 from swimm3r.sfm.colmap.chunks.parts import Part
 from swimm3r.sfm.features.database import MIN_INLIERS, FeatureDatabase
+from swimm3r.sim3 import Sim3
 
 if TYPE_CHECKING:
     import pycolmap

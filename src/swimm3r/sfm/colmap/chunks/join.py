@@ -15,7 +15,8 @@ from scipy.sparse import coo_array
 from scipy.sparse.csgraph import breadth_first_order, connected_components, minimum_spanning_tree
 from scipy.spatial.transform import Rotation
 
-from swimm3r.sfm.colmap.chunks.links import Link, Sim3
+from swimm3r.sfm.colmap.chunks.links import Link
+from swimm3r.sim3 import IDENTITY, Sim3
 
 _BEND = 4.0  # pixels at which a residual begins to count less
 _FALSE = 40.0  # median pixels by which a link may miss under the best similarities
@@ -94,7 +95,7 @@ def _along_tree(members: Sequence[int], links: Sequence[Link]) -> dict[int, Sim3
     tree = minimum_spanning_tree(graph.tocsr())
     order, parent = breadth_first_order(tree, 0, directed=False)
     by_ends = {(each.a, each.b): each for each in links}
-    place = {members[0]: Sim3(1.0, np.eye(3), np.zeros(3))}
+    place = {members[0]: IDENTITY}
     for k in order[1:].tolist():
         child, above = members[k], members[int(parent[k])]
         each = by_ends[min(child, above), max(child, above)]

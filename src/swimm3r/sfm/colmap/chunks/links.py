@@ -11,6 +11,7 @@ import numpy as np
 from jaxtyping import Bool, Float
 
 from swimm3r.sfm.colmap.chunks.parts import Part, SharedPoints
+from swimm3r.sim3 import Sim3, fit_similarity
 
 if TYPE_CHECKING:
     import pycolmap
@@ -21,27 +22,6 @@ _SAMPLE = 600  # shared points that judge a trial
 _LEAST = 25  # shared points that agree
 _LEAST_SHARE = 0.3
 _REFITS = 4
-
-
-@dataclass(frozen=True)
-class Sim3:
-    """x -> scale R x + t."""
-
-    scale: float
-    R: Float[np.ndarray, "3 3"]
-    t: Float[np.ndarray, "3"]
-
-    def __call__(self, xyz: Float[np.ndarray, "*n 3"]) -> Float[np.ndarray, "*n 3"]:
-        """The points in the target's axes."""
-        return self.scale * xyz @ self.R.T + self.t
-
-    def inverse(self) -> "Sim3":
-        """The way back."""
-        return Sim3(1 / self.scale, self.R.T, -(self.R.T @ self.t) / self.scale)
-
-    def after(self, first: "Sim3") -> "Sim3":
-        """`first`, then this one."""
-        return Sim3(self.scale * first.scale, self.R @ first.R, self(first.t))
 
 
 @dataclass(frozen=True)
@@ -96,26 +76,6 @@ def link(
         return None
     kept = rng.permutation(np.flatnonzero(inliers))[:100]
     return Link(a, b, best, view.xyz_a[kept], view.xyz_b[kept], view.depth_b[kept], support)
-
-
-def fit_similarity(
-    source: Float[np.ndarray, "n 3"], target: Float[np.ndarray, "n 3"], weights: Float[np.ndarray, " n"] | None = None
-) -> Sim3 | None:
-    """The similarity with the least squared error (Umeyama 1991); None where the points leave it open."""
-    w = np.ones(len(source)) if weights is None else weights
-    w = w / w.sum()
-    mean_s, mean_t = w @ source, w @ target
-    s, t = source - mean_s, target - mean_t
-    U, spread, Vt = np.linalg.svd((t * w[:, None]).T @ s)
-    variance = w @ (s**2).sum(1)
-    if not spread[1] > 1e-6 * spread[0] or not variance > 0:
-        return None
-    flip = np.array([1.0, 1.0, np.sign(np.linalg.det(U @ Vt))])
-    R = (U * flip) @ Vt
-    scale = float(spread @ flip / variance)
-    if not scale > 0:
-        return None
-    return Sim3(scale, R, mean_t - scale * R @ mean_s)
 
 
 class _View:
