@@ -69,8 +69,9 @@ def main() -> None:
         for _, _, xyz, z in frames:
             points = SurfacePoints(scale * xyz @ R.T + shift, z, np.ones_like(z), z > 0)
             layers.append(seen_from_above(points, grid, Window(0, 0, grid.rows, grid.columns), survey.footprint)[0])
-        error = height - np.nanmedian(np.stack(layers), 0)
-        error = error[~np.isnan(error)]
+        heights = np.stack(layers)
+        common_cells = ~np.isnan(height) & ~np.isnan(heights).all(0)
+        error = height[common_cells] - np.nanmedian(heights[:, common_cells], 0)
         median = float(np.median(np.abs(error)))
         print(
             f"{told}: median {1e3 * median:.1f} mm = {median / distance:.2%} of the range, 90 %"
