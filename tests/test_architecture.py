@@ -10,9 +10,9 @@ import swimm3r
 PACKAGE = Path(swimm3r.__file__).parent
 ROWS = {  # by package: a room or module imports only rooms of rows before its own; "a.b" is a part in a row of its own
     "swimm3r": [
-        {"errors", "progress", "notebook", "sim3"},
+        {"errors", "progress", "notebook"},
         {"io.files", "lamp"},
-        {"medium", "geometry", "cameras"},
+        {"medium", "geometry", "cameras", "sim3"},
         {"settings", "water_types", "devices", "memory", "evaluate", "weights"},
         {"settings_document", "io", "raster", "refraction", "tasks"},
         {"scene"},
