@@ -9,6 +9,7 @@ import pytest
 import torch
 from tests.scale.conftest import SCALE, Survey, lines, survey_along
 
+from swimm3r.cameras import Cameras
 from swimm3r.errors import InputError
 from swimm3r.io.images import write_rgb
 from swimm3r.medium import srgb_from_linear
@@ -124,6 +125,8 @@ def test_a_marker_that_moved_is_left_out_with_a_note(dive):
 def test_corners_are_found_at_their_place_however_blurred(side, blur):
     rng = np.random.default_rng(0)
     finer, size = 8, 160
+    K = torch.tensor([[200.0, 0, size / 2], [0, 200, size / 2], [0, 0, 1]]).double()
+    camera = Cameras(K[None], torch.zeros(1, 0), torch.eye(4).double()[None], size, size)
     dictionary = cv2.aruco.getPredefinedDictionary(cv2.aruco.DICT_4X4_50)
     printed = np.pad(cv2.aruco.generateImageMarker(dictionary, 7, 600), 100, constant_values=255).astype(np.float32)
     off = []
@@ -135,7 +138,7 @@ def test_corners_are_found_at_their_place_however_blurred(side, blur):
         image = cv2.GaussianBlur(image.reshape(size, finer, size, finer).mean((1, 3)), (0, 0), blur)
         image = (0.6 * image + 40 + rng.normal(0, 1.5, image.shape)).clip(0, 255).astype(np.uint8)
         square = np.array([[-300.0, -300], [300, -300], [300, 300], [-300, 300]]) @ A.T / finer + center
-        off.append(detect(image / 255, "aruco-4x4-50")[7] - square)
+        off.append(detect(image / 255, camera, "aruco-4x4-50")[7] - square)
     off = np.stack(off)
     assert np.abs(off.mean((0, 1))).max() < 0.02  # and 0.5 where the corner of the image was mistaken
     assert off.std() < 0.05

@@ -43,7 +43,7 @@ def test_a_plate_covers_the_ground_below_it_and_nothing_else(dive):
 def test_the_marker_is_found_with_its_corners_at_their_places(dive):
     camera, plate = below(dive)
     radiance, _ = with_plates(np.full((240, 320, 3), 0.2), np.full((240, 320), 9.0), camera, [plate])
-    found = detect(radiance.mean(-1).clip(0, 1), "aruco-4x4-50")
+    found = detect(radiance.mean(-1).clip(0, 1), camera, "aruco-4x4-50")
     assert list(found) == [plate.marker]
     pixels, _ = project(camera, torch.from_numpy(plate.corners)[None])
     np.testing.assert_allclose(found[plate.marker], pixels[0].numpy(), atol=0.05)

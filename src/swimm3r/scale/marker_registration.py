@@ -2,14 +2,18 @@
 
 In linear light blur moves no edge, but the response of a camera is not known exactly, and scattered light, sharpening
 and an unknown response move every edge toward its dark or its bright side. Edges of the pattern face both ways, so the
-shift is solved for together with the homography from the marker's plane to the image.
+shift is solved for together with the homography from the marker's plane to the rays of the camera, whose lens bends
+straight edges.
 """
 
 from dataclasses import dataclass
 
 import cv2
 import numpy as np
+import torch
 from jaxtyping import Bool, Float
+
+from swimm3r.cameras import Cameras, directions, distort
 
 _REACH_PX = 4.0  # greatest distance from an edge to which its profile goes
 _REACH_CELLS = 0.45  # the same by the side of a cell: to the middle of both cells
@@ -19,6 +23,7 @@ _ROUNDS = 6  # profiles are laid again around the edges that were found
 _CONTRAST = 0.4  # of the marker's median, below which an edge is covered or in shadow
 _OUTLIER = 3.0  # robust standard deviations
 _FEWEST = 0.6  # of the edges, below which the marker is not seen well enough
+_STEP = 1e-5  # of rays, for derivatives by the lens
 _FAR_CELLS = 0.25  # robust deviation of the edges from the homography's, above which the square is another thing
 
 
@@ -46,62 +51,80 @@ def pattern_edges(bright: Bool[np.ndarray, "n n"]) -> PatternEdges:
 
 
 def registered_corners(
-    light: Float[np.ndarray, "h w"], corners: Float[np.ndarray, "4 2"], bright: Bool[np.ndarray, "n n"]
+    light: Float[np.ndarray, "h w"],
+    camera: Cameras,
+    corners: Float[np.ndarray, "4 2"],
+    bright: Bool[np.ndarray, "n n"],
 ) -> Float[np.ndarray, "4 2"] | None:
-    """Corners of the dark square of a marker in an image of linear light, pixels from the image's corner.
+    """Corners of the dark square of a marker in a camera's image of linear light, pixels from the image's corner.
 
     `corners` are those corners within half a cell, clockwise from the pattern's first one. None where the pattern does
     not fit there: covered, or not flat.
     """
     edges, n = pattern_edges(bright), len(bright)
     square = np.array([[0, 0], [n, 0], [n, n], [0, n]], np.float32)
-    plane = cv2.getPerspectiveTransform(square, corners.astype(np.float32)).astype(np.float64)
+    rays = directions(camera, torch.from_numpy(corners)[None])[0, :, :2].numpy()
+    plane = cv2.getPerspectiveTransform(square, rays.astype(np.float32)).astype(np.float64)
     tangent = edges.to_bright[:, None, ::-1] * np.ones_like(edges.places)
     for _ in range(_ROUNDS):
-        at, slopes = _mapped(plane, edges.places)
+        at, slopes, by_plane = _seen(plane, camera, edges.places)
         ahead = np.einsum("ekij,ekj->eki", slopes, tangent)
         inward = np.einsum("ekij,ej->eki", slopes, edges.to_bright)
         side = np.linalg.norm(ahead, axis=-1)
         across = np.stack([-ahead[..., 1], ahead[..., 0]], -1) / side[..., None]
         across *= np.sign((across * inward).sum(-1, keepdims=True))
-        reach = min(_REACH_PX, _REACH_CELLS * float(np.median(side)))
-        away, seen = _distances(light, at, across, reach)
-        if seen.mean() < _FEWEST:
+        away, clear = _distances(light, at, across, min(_REACH_PX, _REACH_CELLS * float(np.median(side))))
+        if clear.mean() < _FEWEST:
             return None
-        rows = np.einsum("eki,ekij->ekj", across, _by_entries(plane, edges.places, at))[seen]
-        rows, away = np.concatenate([rows, np.ones((len(rows), 1))], 1), away[seen]
-        kept = np.ones(len(away), bool)
-        for _ in range(3):
-            found = np.linalg.lstsq(rows[kept], away[kept], rcond=None)[0]
-            left = np.abs(away - rows @ found)
-            spread = 1.4826 * float(np.median(left))
-            kept = left <= max(_OUTLIER * spread, 1e-3)
-        plane = plane + np.append(found[:8], 0).reshape(3, 3)
+        rows, away = np.einsum("eki,ekij->ekj", across, by_plane)[clear], away[clear]
+        found, spread = _robust_fit(np.concatenate([rows, np.ones((len(rows), 1))], 1), away)
         if spread > _FAR_CELLS * float(np.median(side)):
             return None
-    return _mapped(plane, square[:, None].astype(np.float64))[0][:, 0]
+        plane = plane + np.append(found[:8], 0).reshape(3, 3)
+    return _seen(plane, camera, square[:, None].astype(np.float64))[0][:, 0]
 
 
-def _mapped(
-    plane: Float[np.ndarray, "3 3"], xy: Float[np.ndarray, "m k 2"]
-) -> tuple[Float[np.ndarray, "m k 2"], Float[np.ndarray, "m k 2 2"]]:
-    """Points of the marker's plane in the image, and the derivatives of their places there."""
+def _robust_fit(rows: Float[np.ndarray, "n p"], values: Float[np.ndarray, " n"]) -> tuple[np.ndarray, float]:
+    """The least squares solution without outliers, and the robust deviation from it."""
+    kept, found, spread = np.ones(len(values), bool), np.zeros(rows.shape[1]), 0.0
+    for _ in range(3):
+        found = np.linalg.lstsq(rows[kept], values[kept], rcond=None)[0]
+        left = np.abs(values - rows @ found)
+        spread = 1.4826 * float(np.median(left))
+        kept = left <= max(_OUTLIER * spread, 1e-3)
+    return found, spread
+
+
+def _seen(
+    plane: Float[np.ndarray, "3 3"], camera: Cameras, xy: Float[np.ndarray, "m k 2"]
+) -> tuple[Float[np.ndarray, "m k 2"], Float[np.ndarray, "m k 2 2"], Float[np.ndarray, "m k 2 8"]]:
+    """Pixels of points of the marker's plane, and their derivatives by the points and by the homography's entries.
+
+    The homography takes the plane to rays (x, y, 1) of the camera; its last entry is 1.
+    """
     uvw = xy @ plane[:, :2].T + plane[:, 2]
-    at = uvw[..., :2] / uvw[..., 2:]
-    slopes = (plane[:2, :2] - at[..., None] * plane[2, :2]) / uvw[..., 2, None, None]
-    return at, slopes
-
-
-def _by_entries(
-    plane: Float[np.ndarray, "3 3"], xy: Float[np.ndarray, "m k 2"], at: Float[np.ndarray, "m k 2"]
-) -> Float[np.ndarray, "m k 2 8"]:
-    """Derivatives of points' places in the image by the homography's entries but the last, which is 1."""
-    w = xy @ plane[2, :2] + plane[2, 2]
+    w = uvw[..., 2, None, None]
+    rays = uvw[..., :2] / uvw[..., 2:]
+    by_point = (plane[:2, :2] - rays[..., None] * plane[2, :2]) / w
     x, y = np.moveaxis(xy, -1, 0)
+    u, v = np.moveaxis(rays, -1, 0)
     none, one = np.zeros_like(x), np.ones_like(x)
-    u, v = np.moveaxis(at, -1, 0)
     rows = [[x, y, one, none, none, none, -u * x, -u * y], [none, none, none, x, y, one, -v * x, -v * y]]
-    return np.moveaxis(np.array(rows), (0, 1), (-2, -1)) / w[..., None, None]
+    by_plane = np.moveaxis(np.array(rows), (0, 1), (-2, -1)) / w
+    at, lens = _pixels(camera, rays)
+    return at, lens @ by_point, lens @ by_plane
+
+
+def _pixels(
+    camera: Cameras, rays: Float[np.ndarray, "m k 2"]
+) -> tuple[Float[np.ndarray, "m k 2"], Float[np.ndarray, "m k 2 2"]]:
+    """Pixels of rays (x, y, 1), and their derivatives by x and y as central differences."""
+    beside = _STEP * np.array([[0.0, 0], [1, 0], [-1, 0], [0, 1], [0, -1]])
+    xy = torch.from_numpy(rays[..., None, :] + beside)
+    K = camera.K[0].double()
+    pixels = distort(xy, camera.distortion[0].double(), camera.model) @ K[:2, :2].T + K[:2, 2]
+    at, right, left, below, above = np.moveaxis(pixels.numpy(), -2, 0)
+    return at, np.stack([right - left, below - above], -1) / (2 * _STEP)
 
 
 def _distances(

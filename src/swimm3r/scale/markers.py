@@ -20,6 +20,7 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
+from swimm3r.cameras import Cameras
 from swimm3r.errors import InputError
 from swimm3r.io.files.damage import Remedy, guard
 from swimm3r.io.files.json_file import structure
@@ -112,9 +113,9 @@ def marker_sizes(settings: ScaleSettings) -> MarkerSizes | None:
 
 
 def detect(
-    light: Float[np.ndarray, "h w"], family: MarkerFamily, board: Board | None = None
+    light: Float[np.ndarray, "h w"], camera: Cameras, family: MarkerFamily, board: Board | None = None
 ) -> dict[int, Float[np.ndarray, "corners 2"]]:
-    """Corners of the markers in an image of linear light, 0..1, by id; pixels from the image's corner.
+    """Corners of the markers in a camera's image of linear light, 0..1, by id; pixels from the image's corner.
 
     Clockwise from the first corner, by all edges of the pattern. Of a board, corners of its squares by id, one each.
     """
@@ -140,7 +141,7 @@ def detect(
         if i in twice:  # two markers of one id in a frame: neither is known to be the one
             continue
         bright = aruco.generateImageMarker(dictionary, int(i), cells) > 127
-        registered = registered_corners(light, xy.reshape(4, 2).astype(np.float64), bright)
+        registered = registered_corners(light, camera, xy.reshape(4, 2).astype(np.float64), bright)
         if registered is not None:
             found[int(i)] = registered
     return found
@@ -165,7 +166,7 @@ def find_markers(
     for i, name in enumerate(rec.names):
         progress("looking for markers", i, len(rec.names))
         light = _light(frames.image(frames.index(name)))
-        for marker, corners in detect(light, family, board).items():
+        for marker, corners in detect(light, rec.cameras[i], family, board).items():
             for k, (x, y) in enumerate(corners.tolist()):
                 found[marker][k].append(Sighting(i, (x, y)))
     progress("looking for markers", len(rec.names), len(rec.names))
