@@ -12,6 +12,7 @@ from scipy import ndimage
 from swimm3r.cameras import Cameras, image_directions
 from swimm3r.geometry import so3_exp
 from swimm3r.io.images import write_rgb, write_rgb_16
+from swimm3r.medium import AttenuationCurve, Medium, MediumFit
 from swimm3r.products.survey import Survey, open_survey
 from swimm3r.scene.frames import Frame, Frames
 from swimm3r.scene.georeference import Georeference, save_georeference
@@ -21,6 +22,7 @@ from swimm3r.sfm.settings import FeatureSettings
 
 WIDTH, HEIGHT, FOCAL = 240, 180, 220.0
 ALTITUDE = 1.0
+TRANSMITTED = (0.05, 0.8, 0.8)  # light from the ground straight below
 SIDE, AHEAD = 0.45, 0.3  # metres between lines and frames
 LINES, EACH = 2, 4
 MOUND = (0.25, 0.3, 0.12, 0.05)  # x, y, radius and height of what has grown at the second visit
@@ -80,6 +82,15 @@ def _poses(rng: np.random.Generator, east: float) -> np.ndarray:
     return np.stack(found)
 
 
+def _water(scale: float) -> MediumFit:
+    """Water that leaves 0.05 of red and 0.8 of green and blue at the altitude, in a unit of 1 / `scale` metres."""
+    beta = -torch.tensor(TRANSMITTED, dtype=torch.float64).log() / (ALTITUDE * scale)
+    none = torch.zeros(3, dtype=torch.float64)
+    known = {name: torch.ones(3, dtype=torch.bool) for name in ("Binf", "beta_D", "beta_B")}
+    curve = AttenuationCurve(beta, none, none, none)
+    return MediumFit(0.5 * torch.ones(3), beta, beta, curve, Medium(none, none, none), known, (0.1, 9.0), "srgb")
+
+
 def write_visit(folder: Path, seabed: Seabed, seed: int, *, place: bool, east: float = 0.0) -> None:
     """A run folder of a visit with finished structure from motion, its axes and unit drawn from the seed."""
     rng = np.random.default_rng(seed)
@@ -121,6 +132,7 @@ def write_visit(folder: Path, seabed: Seabed, seed: int, *, place: bool, east: f
         matches=Matches(none, none, torch.zeros(0, 2), torch.zeros(0, 2), torch.zeros(0)),
         depth=depth,
         backend="truth",
+        medium=_water(scale),
     )
     triangulate(bare, frames, FeatureSettings(), folder / "features").save(folder / "sfm", frames)
     if place:

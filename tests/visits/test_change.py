@@ -133,6 +133,20 @@ def test_colors_of_ground_whose_height_is_uncertain_count_less_where_rays_are_sl
     assert np.median(slanted.color.std[flat] / nadir.color.std[flat]) == pytest.approx(1.0, abs=0.2)
 
 
+def test_bleaching_is_found_on_patterned_ground_whose_place_is_uncertain_and_a_shift_is_not_called_bleaching():
+    """Squares of two colors, 6 cells wide, of a place known to 2 cells: the later visit has them 2 cells beside."""
+    rows, columns = np.mgrid[:SIDE, :SIDE] // 6
+    squares = 1 + 0.8 * ((rows + columns) % 2)
+    bleached = disc(60, 60, 14)
+    unsure = Misfit(np.full((SIDE, SIDE), 2 * GSD), np.zeros((SIDE, SIDE)))
+    beside = ground(2, albedo=np.where(bleached, 5.0, np.roll(squares, 2, axis=1)))
+    change = compare(ground(1, albedo=squares), beside, unsure, GSD, WHITE, VisitSettings())
+    paler = change.color_kind == MORE
+    assert (paler & bleached).sum() / bleached.sum() > 0.9
+    assert (paler & bleached).sum() / paler.sum() > 0.9
+    assert not (change.color_kind == LESS).any()
+
+
 def test_cells_beside_a_hole_take_their_doubt_from_the_heights_nearby():
     a, b = ground(1), ground(2, 0.03 * disc(50, 50, 25))
     b.slant[:] = a.slant[:] = 1.0

@@ -111,6 +111,7 @@ COLUMNS = (
     Column("height_recall_pct", "Height recall, %", 1, "high", f"of cells whose true change is above {_STATED}"),
     Column("height_precision_pct", "Height precision, %", 1, "high", _RIGHT),
     Column("volume_error_pct", "Volume, %", 1, "neither", "error of the volume of all reported cells, of the true one"),
+    Column("bleached_cells", "Bleached cells", 0, "neither", "of bleached corals, on ground that both visits saw"),
     Column("bleached_recall_pct", "Bleached recall, %", 1, "high", "cells of bleached corals, reported as paler"),
     Column("paler_precision_pct", "Paler precision, %", 1, "high", _RIGHT),
     Column("false_area_pct", "False area, %", 2, "low", "of unchanged ground, reported as changed in height or color"),

@@ -38,7 +38,8 @@ class RevisitSettings(Settings):
     height: ImageSide = 214
     """Height of the frames in pixels."""
     seed: Seed = 5
-    """Seed of the first pair's seafloor, paths and water; each further pair has the next one."""
+    """First seed that may be the first pair's; each further pair begins at the next one. Taken is the first of every
+    fourth seed whose bleached, grown and moved corals both visits film."""
 
 
 SfmMethod = Literal[

@@ -5,7 +5,9 @@
 
 For colors d and h are L*, a* and b*, and s_xy is wider by |d_h| tan(theta), theta the angle of the nearest camera's ray
 from the vertical: where the ground has not changed, a difference of heights d_h is an error, by which the ray meets
-other ground beside the cell; where it has, another surface is seen.
+other ground beside the cell; where it has, another surface is seen. No shift makes a color that is not there: the part
+of a difference by which a color lies outside the range of those that the other visit has within 2 s_xy counts without
+the term of s_xy, and the more significant of the two is taken.
 
 s_p is the place that a height was taken at within its cell; s_xy and s_z are what check points say of the alignment
 (`misfit`), at the cell. s_r is the place of a rim: maps smear a change over the ground beside it. Errors that both
@@ -43,6 +45,8 @@ _UNLIKE = 15.0  # CIELAB difference at which deviations of heights are larger by
 _NEAR = 2  # cells around one whose heights tell how steep the ground is
 _CLASSES, _CLASS_CELLS = 8, 400  # of cells that are alike: how many at most, and the cells of each at least
 _RIM = 0.5  # cells, standard deviation of the place of a change's rim, which the filter leaves
+_REACH = 2.0  # standard deviations of its place within which a cell's color may come from
+_FARTHEST = 8  # cells of that at most
 _PLACED = 0.25  # cells, standard deviation of where a cell's height was taken: half a pixel of a frame
 
 
@@ -135,19 +139,55 @@ def _color_difference(
     by_axis = labs[1] - labs[0]
     middle = np.nanmedian(by_axis.reshape(-1, 3), axis=0) if np.isfinite(by_axis).any() else np.zeros(3)
     by_axis = by_axis - middle
-    variance = lab_variance(lights[0], stds[0]) + lab_variance(lights[1], stds[1])
+    noise = lab_variance(lights[0], stds[0]) + lab_variance(lights[1], stds[1])
+    noise += np.stack([_smeared(by_axis[..., k]) for k in range(3)], -1)
+    variance, astray = noise.copy(), np.hypot(level, _PLACED)
     for k in range(3):
-        detail = np.maximum(*(_slope(each[..., k]) for each in labs))
-        variance[..., k] += detail**2 * (level**2 + _PLACED**2) + _smeared(by_axis[..., k])
+        variance[..., k] += (np.maximum(*(_slope(each[..., k]) for each in labs)) * astray) ** 2
     # factors of their own for L*, a*, b*: their errors differ in origin
     alike = np.fmax(a.distance, b.distance), misfit.up
     each = [_calibrated(by_axis[..., k], np.sqrt(variance[..., k]), alike) for k in range(3)]
     std = np.stack([one.std for one in each], -1)
     value = np.sqrt((by_axis**2).sum(-1))
-    along = np.sqrt((by_axis**2 * std**2).sum(-1)) / np.maximum(value, 1e-9)
+    along = _along(by_axis, std)
+    beyond = _beyond(labs[0], labs[1] - middle, astray)
+    sure = _along(beyond, std * np.sqrt(noise / variance)) * value / np.maximum(np.sqrt((beyond**2).sum(-1)), 1e-9)
+    along = np.where(beyond.any(-1), np.minimum(along, sure), along)
     inflation = max(one.inflation for one in each)
     found = Difference(value.astype(np.float32), along.astype(np.float32), inflation)
     return found, by_axis.astype(np.float32)
+
+
+def _along(difference: Float[np.ndarray, "h w 3"], std: Float[np.ndarray, "h w 3"]) -> Float[np.ndarray, "h w"]:
+    """Standard deviation along a difference by those along the axes."""
+    return np.sqrt((difference**2 * std**2).sum(-1)) / np.maximum(np.sqrt((difference**2).sum(-1)), 1e-9)
+
+
+def _beyond(
+    a: Float[np.ndarray, "h w 3"], b: Float[np.ndarray, "h w 3"], astray: Float[np.ndarray, "h w"]
+) -> Float[np.ndarray, "h w 3"]:
+    """The part of b - a that no shift explains, of either what has appeared or what has gone, whichever is more.
+
+    `astray` is the standard deviation of a cell's place, cells.
+    """
+    found = np.zeros(a.shape)
+    reach = np.minimum(np.ceil(_REACH * astray), _FARTHEST)
+    for cells in np.unique(reach[np.isfinite(reach)]).astype(int).tolist():
+        rows = reach == cells
+        appeared, gone = _outside(b, a, cells)[rows], -_outside(a, b, cells)[rows]
+        more = (appeared**2).sum(-1) >= (gone**2).sum(-1)
+        found[rows] = np.where(more[:, None], appeared, gone)
+    return found
+
+
+def _outside(
+    values: Float[np.ndarray, "h w 3"], others: Float[np.ndarray, "h w 3"], reach: int
+) -> Float[np.ndarray, "h w 3"]:
+    """How far values are above (below: negative) all others within `reach` cells along either axis."""
+    filled = np.stack([_filled(others[..., k]) for k in range(3)], -1)
+    window = 2 * reach + 1, 2 * reach + 1, 1
+    high, low = ndimage.maximum_filter(filled, window), ndimage.minimum_filter(filled, window)
+    return np.maximum(np.nan_to_num(values - high), 0) + np.minimum(np.nan_to_num(values - low), 0)
 
 
 def _calibrated(

@@ -3,6 +3,9 @@
     height      weighted median over the depth maps, std = 1.2533 s / sqrt(k), s the spread of k views
     color       mean of the frames that see the cell, in linear light, weighted by the square of their rank
 
+The deviation of a color also has the error of the backscatter, which all views of a visit share: it grows as the light
+that arrives gets less (`sfm.medium.restore.color_std`). A red star in water that takes red most is an example.
+
 Cells of a single view have the spread of the visit's poorer cells. Views share errors, so these deviations are too
 small by a factor, which `change` finds from the pair of visits.
 """
@@ -12,16 +15,18 @@ from typing import Any
 
 import numpy as np
 import torch
-from jaxtyping import Bool, Float32, UInt16
+from jaxtyping import Bool, Float, Float32, UInt16
 from scipy.spatial import KDTree
 
 from swimm3r.errors import UsageError
-from swimm3r.medium import linear_from_srgb
+from swimm3r.medium import linear_from_srgb, transmittances
 from swimm3r.products.elevation import elevation, frames_over
 from swimm3r.products.frame_colors import Points, shown_by
 from swimm3r.products.grid import Grid, Window, chosen_gsd, grid_of
 from swimm3r.products.survey import Survey
 from swimm3r.progress import Progress, silent
+from swimm3r.sfm.medium.restore import color_std
+from swimm3r.sfm.settings import RestoreSettings
 
 _TILE = 512  # cells along the side of the windows that are filled one after another
 _MOST_CELLS = 4e7  # of a comparison, whose grids are in memory: about 150 bytes each
@@ -118,23 +123,41 @@ def _colors(survey: Survey, points: Points, frames: list[int]) -> tuple[np.ndarr
     """Weighted means of the colors that frames show of points, and the means' standard deviations."""
     n = len(points.xyz)
     weight, squared = np.zeros(n), np.zeros(n)
-    first, second = np.zeros((n, 3)), np.zeros((n, 3))
+    first, second, shared = np.zeros((n, 3)), np.zeros((n, 3)), np.zeros((n, 3))
     for i in frames:
         shown = shown_by(survey, points, i, "physical")
         if shown is None:
             continue
-        light = linear_from_srgb(torch.from_numpy(np.clip(shown.colors, 0, 1))).double().numpy()
-        w = shown.rank.astype(np.float64) ** 2
+        stored = torch.from_numpy(np.clip(shown.colors, 0, 1)).double()
+        light, w = linear_from_srgb(stored).numpy(), shown.rank.astype(np.float64) ** 2
         weight[shown.which] += w
         squared[shown.which] += w**2
         first[shown.which] += w[:, None] * light
         second[shown.which] += w[:, None] * light**2
+        shared[shown.which] += w[:, None] * _water_std(survey, points.xyz[shown.which], i, stored)
     with np.errstate(invalid="ignore", divide="ignore"):
         mean = first / weight[:, None]
         count = (weight**2 / squared)[:, None]  # views that would weigh as much if all were alike
         spread = np.maximum(second / weight[:, None] - mean**2, 0) * count / np.maximum(count - 1, 1e-3)
         std = np.where(count > 1.2, np.sqrt(spread / count), np.nan)
+        std = np.hypot(std, shared / weight[:, None])
     return mean.astype(np.float32), np.hypot(std, _LEAST_COLOR_STD * mean).astype(np.float32)
+
+
+def _water_std(
+    survey: Survey, xyz: Float[np.ndarray, "n 3"], i: int, stored: Float[torch.Tensor, "n 3"]
+) -> Float[np.ndarray, "n 3"]:
+    """Standard deviations in linear light of points' colors in a frame that errors of the backscatter leave."""
+    medium = survey.rec.medium
+    assert medium is not None  # where images were restored
+    pose = survey.rec.cameras.cam2world[i].double().numpy()
+    ray = (survey.place.from_local(xyz) - pose[:3, 3]) @ pose[:3, :3]
+    z = torch.from_numpy(np.linalg.norm(ray, axis=1))
+    T_D, _ = transmittances(z, medium.at(z, torch.from_numpy(ray) / z[:, None]))
+    std = color_std(T_D, RestoreSettings())
+    if medium.encoding == "linear":
+        return std.numpy()
+    return ((linear_from_srgb(stored + std) - linear_from_srgb(stored - std)) / 2).numpy()
 
 
 def _with_floor(ground: Ground, least: float) -> Ground:
@@ -146,7 +169,9 @@ def _with_floor(ground: Ground, least: float) -> Ground:
         height_std = np.where(ground.seen, np.hypot(np.nan_to_num(height_std, nan=poor), least), np.nan)
     lacking = np.isnan(color_std) & ~np.isnan(ground.color)
     if lacking.any():
-        relative = color_std / np.maximum(ground.color, 1e-4)
-        typical_color = float(np.nanmedian(relative)) if np.isfinite(relative).any() else 0.1
-        color_std[lacking] = 2 * typical_color * np.maximum(ground.color[lacking], 1e-2)
+        relative = (color_std / np.maximum(ground.color, 1e-4)).reshape(-1, 3)
+        told = np.isfinite(relative).any(0)
+        typical = np.full(3, 0.1)  # by channel: water takes one more than another
+        typical[told] = np.nanmedian(relative[:, told], axis=0)
+        color_std[lacking] = (2 * typical * np.maximum(ground.color, 1e-2))[lacking]
     return replace(ground, height_std=height_std.astype(np.float32), color_std=color_std)

@@ -1,21 +1,22 @@
 """Repeat visits against the truth: one synthetic seafloor twice, with another water, light and path, after a season.
 
 Each pair of waters is compared twice: after a season (corals grown, bleached, broken or moved, algae, shifted sand),
-and after none, where only water, light and path differ. Truth is the seafloor from above. A true change of height or
-color counts where it is above three times the deviation that is stated for its cell; a cell that is reported is right
-where the truth has changed by more than one such deviation, in the same direction. The first visit's frame is that of
-the truth, by the camera centers; its own errors are in the scores of the second.
+and after none, where only water, light and path differ (`revisit_dives`). Truth is the seafloor from above. A true
+change of height or color counts where it is above three times the deviation that is stated for its cell; a cell that is
+reported is right where the truth has changed by more than one such deviation, in the same direction. All cells of
+bleached corals that both visits saw count. The first visit's frame is that of the truth, by the camera centers; its own
+errors are in the scores of the second.
 """
 
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Literal
 
 import numpy as np
 import torch
 from jaxtyping import Bool, Float
 
 from swimm3r.bench.cells import ResultKey, Scores, kept_cell
+from swimm3r.bench.revisit_dives import pair_of_dives
 from swimm3r.bench.scores import columns
 from swimm3r.bench.settings import RevisitSettings
 from swimm3r.bench.tables import Table
@@ -30,23 +31,18 @@ from swimm3r.scene.georeference import Georeference, Vector, save_georeference
 from swimm3r.synthetic import DiveSettings, make_dive, write_dive
 from swimm3r.synthetic.seafloor import outline
 from swimm3r.synthetic.season import corals_of
-from swimm3r.synthetic.settings import Season
 from swimm3r.synthetic.top_view import top_view
 from swimm3r.visits import write_visits
 from swimm3r.visits.change import LESS, MORE
 from swimm3r.visits.color import lab, linear, neutral
 from swimm3r.visits.record import VisitsRecord
 
-Family = Literal["cyan", "teal", "green", "warm"]
-WATERS: tuple[tuple[Family, Family], ...] = (("cyan", "green"), ("teal", "cyan"), ("green", "warm"), ("warm", "teal"))
-SEASON = Season(grown=0.25, bleached=0.25, broken=0.15, moved=0.15, algae=0.2, sand=0.12)
-_LIGHT = (0.8, 0.9, 1.0)  # of the later visit
 _THRESHOLD = 3.0
 _NOTHING = 5e-4, 0.5  # m and CIELAB below which the truth has not changed at all
 _COLOR_LAYERS = "color_change", "color_significance", "color_changed"
 COLUMNS = columns(
-    "alignment_pct", "height_recall_pct", "height_precision_pct", "volume_error_pct", "bleached_recall_pct",
-    "paler_precision_pct", "false_area_pct",
+    "alignment_pct", "height_recall_pct", "height_precision_pct", "volume_error_pct", "bleached_cells",
+    "bleached_recall_pct", "paler_precision_pct", "false_area_pct",
 )  # fmt: skip
 
 
@@ -80,21 +76,6 @@ def revisit_table(out: Path, revisits: RevisitSettings, settings: RunSettings, p
             cells.append(kept_cell(out, key, [first, second, settings], make))
     progress("pairs of visits", 2 * revisits.water_pairs, 2 * revisits.water_pairs)
     return Table("revisits", "Changes between repeat visits, against the truth", cells, COLUMNS)
-
-
-def pair_of_dives(number: int, revisits: RevisitSettings) -> tuple[DiveSettings, DiveSettings, DiveSettings]:
-    """A first visit, a visit after a season, and one after none, in the waters of a number."""
-    one, other = WATERS[number % len(WATERS)]
-
-    def dive(family: Family, visit: int, season: Season) -> DiveSettings:
-        return DiveSettings(
-            path="lawnmower", length=revisits.path_length, speed=0.25, fps=1,
-            width=revisits.width, height=revisits.height,
-            seed=revisits.seed + number, corals=0.7, family=family, visit=visit, season=season,
-            daylight=_LIGHT if visit else (1.0, 1.0, 1.0),
-        )  # fmt: skip
-
-    return dive(one, 0, Season()), dive(other, 1, SEASON), dive(other, 2, Season())
 
 
 def scores_of(
@@ -199,6 +180,7 @@ def _found(record: VisitsRecord, layers: Path, truth: Truth) -> dict[str, float 
         "height_recall_pct": _share(true & reported & (sign * truth.height > 0), true, "nothing has changed"),
         "height_precision_pct": _share(right, reported, "nothing was reported"),
         "volume_error_pct": 100 * missed / volume if volume else NotComputed("nothing was reported"),
+        "bleached_cells": float(bleached.sum()),
         "bleached_recall_pct": _share(bleached & paler, bleached, "nothing has bleached"),
         "paler_precision_pct": _share(
             paler & (truth.lab[..., 0] > 0) & (truth.color > color_std), paler, "nothing was reported"

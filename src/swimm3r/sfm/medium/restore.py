@@ -6,7 +6,8 @@ Where T_D is small the quotient is noise, so per channel with s = T_D:
 
     detail    J = S + s^2 / (s^2 + (noise / texture)^2) (J - S)     S: local linear fit of D / s to I's brightness
     color    J = w J + (1 - w) k G,  w = s^2 / (s^2 + (veil_error / color_error)^2)
-              G: the channels weighted by how well they see; k: this channel's share of color where it does see
+              G: the channels weighted by how well they see; k: this channel's share of color where it does see;
+              standard deviation left by errors of B: color_error sqrt(1 - w)
     horizon   in open water, and where no channel sees (max w -> 0), the image's own veil remains
 
 Under a lamp on the camera T_D is the share of its light that arrives (`MediumFit.at`), so that J is evenly lit. Near
@@ -264,11 +265,10 @@ def _without_noise(
     settings: RestoreSettings,
 ) -> Float[Tensor, "h w 3"]:
     """D / T_D with detail and then color held back where T_D does not carry them."""
-    floor = settings.veil_error / settings.color_error
+    floor, sees = settings.veil_error / settings.color_error, _color_weight(T_D, settings)
     J = direct / T_D.clamp(min=floor / 2)
     smooth = local_linear(brightness, J, T_D**2 + 1e-6, settings.window * max(brightness.shape) / 2, settings.noise**2)
     J = smooth + T_D**2 / (T_D**2 + (settings.noise / settings.texture) ** 2) * (J - smooth)
-    sees = T_D**2 / (T_D**2 + floor**2)
     weight = sees**2
     gray = (weight * J).sum(-1, keepdim=True) / weight.sum(-1, keepdim=True).clamp(min=1e-6)
     well = weight.prod(-1, keepdim=True) * ((J > 0) & (J < 1)).all(-1, keepdim=True)
@@ -276,6 +276,19 @@ def _without_noise(
     share = share / share.mean()
     used = (weight * share).sum(-1, keepdim=True) / weight.sum(-1, keepdim=True).clamp(min=1e-6)
     return sees * J + (1 - sees) * share * gray / used.clamp(min=1e-3)
+
+
+def color_std(T_D: Float[Tensor, "*pixels 3"], settings: RestoreSettings) -> Float[Tensor, "*pixels 3"]:
+    """Standard deviation of restored colors, in the encoding of the water, that errors of the backscatter leave.
+
+    All frames of a dive share these errors: a mean over frames does not reduce them.
+    """
+    return settings.color_error * (1 - _color_weight(T_D, settings)).sqrt()
+
+
+def _color_weight(T_D: Float[Tensor, "*pixels 3"], settings: RestoreSettings) -> Float[Tensor, "*pixels 3"]:
+    """Weight of a channel's own color, as an error of the backscatter grows with its amplification."""
+    return T_D**2 / (T_D**2 + (settings.veil_error / settings.color_error) ** 2)
 
 
 def keep_open_water(

@@ -22,6 +22,7 @@ from scipy.sparse.csgraph import connected_components
 
 from swimm3r.cameras import project
 from swimm3r.geometry import Similarity
+from swimm3r.medium import rescale
 from swimm3r.scene.reconstruction import Reconstruction
 from swimm3r.sim3 import IDENTITY, Sim3, fit_similarity
 from swimm3r.visits.alignment.bundle import Sites, adjusted, with_own_points
@@ -90,10 +91,12 @@ def similarity(found: Sim3) -> Similarity:
 
 
 def moved(rec: Reconstruction, onto: Sim3) -> Reconstruction:
-    """Cameras and points of a reconstruction in other axes and another unit; its depth maps stay as stored."""
+    """Cameras, points and water of a reconstruction in other axes and another unit; its depth maps stay as stored."""
     by = similarity(onto)
     cameras = replace(rec.cameras, cam2world=by.poses(rec.cameras.cam2world.double()))
-    return replace(rec, cameras=cameras, points=replace(rec.points, xyz=by.points(rec.points.xyz.double())))
+    points = replace(rec.points, xyz=by.points(rec.points.xyz.double()))
+    medium = None if rec.medium is None else rescale(rec.medium, float(onto.scale))
+    return replace(rec, cameras=cameras, points=points, medium=medium)
 
 
 def shape_similarity(source: Reconstruction, target: Reconstruction) -> Sim3:
