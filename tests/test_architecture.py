@@ -61,7 +61,7 @@ ROWS = {  # by package: a room or module imports only rooms of rows before its o
     "swimm3r.raster": [{"records"}, {"pairmath", "reference"}, {"cpu", "cuda"}],
     "swimm3r.bench": [
         {"inputs", "memory", "images", "reference", "scores", "settings"},
-        {"cells", "sfm_methods"},
+        {"cells", "revisit_dives", "sfm_methods"},
         {"map_scores", "runs", "statistics"},
         {"tables"},
         {"protocols"},

@@ -35,7 +35,7 @@ def test_colors_that_the_water_takes_are_less_certain_at_both_visits(grounds: li
 
 
 def test_an_error_of_the_backscatter_is_the_color_std_of_a_restored_image():
-    """Where a channel arrives well it is the error by the transmittance, where it does not that of a guess."""
+    """The error divided by the transmittance of a channel that arrives well, that of a guess of one that does not."""
     settings = RestoreSettings()
     well, lost = color_std(torch.tensor([[0.9, 0.7, 0.5], [1e-4, 1e-5, 1e-6]]), settings)
     torch.testing.assert_close(well, settings.veil_error / torch.tensor([0.9, 0.7, 0.5]), rtol=0.02, atol=0.0)

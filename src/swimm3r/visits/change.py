@@ -183,7 +183,7 @@ def _beyond(
 def _outside(
     values: Float[np.ndarray, "h w 3"], others: Float[np.ndarray, "h w 3"], reach: int
 ) -> Float[np.ndarray, "h w 3"]:
-    """How far values are above (below: negative) all others within `reach` cells along either axis."""
+    """Excess of values over all others within `reach` cells along either axis; below all of them it is negative."""
     filled = np.stack([_filled(others[..., k]) for k in range(3)], -1)
     window = 2 * reach + 1, 2 * reach + 1, 1
     high, low = ndimage.maximum_filter(filled, window), ndimage.minimum_filter(filled, window)
