@@ -46,6 +46,22 @@ def test_views_know_where_they_look_past_every_surface(tiny_dive, tmp_path):
     assert not open_water[48:].any()
 
 
+def test_what_is_not_open_water_is_a_surface_where_depth_tells_the_two_apart(tiny_dive):
+    view = TrainingViews(tiny_dive.rec, tiny_dive.frames, UwbsSettings(), 1.0)[0]
+    h, w = view.seen.shape
+    rows = torch.arange(h)[:, None].expand(h, w)
+    measured = replace(
+        view,
+        z_depth=torch.where(rows < h // 2, 2.0, 0.0),
+        open_water=rows >= 3 * h // 4,
+        seen=torch.arange(w).expand(h, w) > 0,
+    )
+    surface = (rows < h // 2) | ((rows < 3 * h // 4) & measured.seen)
+    assert torch.equal(measured.surface, surface)
+    hardly = replace(measured, z_depth=torch.where(rows < h // 20, 2.0, 0.0))
+    assert torch.equal(hardly.surface, rows < h // 20)
+
+
 def test_test_frames_are_never_views(tiny_dive):
     rec = replace(tiny_dive.rec, names=("0.png", *tiny_dive.rec.names[1:]))
     assert "0.png" not in TrainingViews(rec, tiny_dive.frames, UwbsSettings(), 1.0).names

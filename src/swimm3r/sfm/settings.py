@@ -61,7 +61,7 @@ class PlaneSweepSettings(Settings):
     tolerance: Share = 0.015
     """Largest relative difference in depth at which two frames agree; the reprojection error may allow more."""
     agreeing: Annotated[int, Range(0, 16)] = 2
-    """Number of other frames that must agree with a depth."""
+    """Number of other frames that must agree with a depth; of ground that fewer of them see, all."""
     speck: CountOrZero = 48
     """Size in working pixels below which connected patches of depth are dropped."""
     threads: Threads = 0

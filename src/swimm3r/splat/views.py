@@ -25,6 +25,8 @@ from swimm3r.splat.appearance import FrameColors
 from swimm3r.splat.ground import Window
 from swimm3r.splat.settings import SplatSettings
 
+_MEASURED = 0.1  # share of an image below which its known depth is too little to tell water from the rest
+
 
 @dataclass(frozen=True)
 class TrainingView:
@@ -37,6 +39,12 @@ class TrainingView:
     z_depth: Float[Tensor, "h w"]  # working units, 0 = unknown or doubtful
     open_water: Bool[Tensor, "h w"]  # looks past every surface; nowhere where depth is not read
     time: Float[Tensor, ""] | None = None  # of the clip, 0..1; static maps do not ask
+
+    @property
+    def surface(self) -> Bool[Tensor, "h w"]:
+        """Pixels that show a surface: of known depth, or, where a tenth of the image has one, not open water."""
+        known = self.z_depth > 0
+        return known | (self.seen & ~self.open_water & (known.float().mean() >= _MEASURED))
 
     def to(self, device: torch.device) -> "TrainingView":
         """The same image on a device; its camera stays with the poses."""

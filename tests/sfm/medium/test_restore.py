@@ -75,6 +75,22 @@ def test_surfaces_of_unknown_depth_in_green_water_look_like_those_of_known_depth
     assert psnr(restored[25:45, 60:], J[25:45, 60:]) > 28
 
 
+def test_bright_sand_has_no_seam_where_its_depth_is_guessed(dive):
+    """Filmed at 0.9 already, it is brighter still without the water: as it is beside, where its depth is known."""
+    blue = Medium(torch.tensor([0.0, 0.13, 0.38]), torch.tensor([0.064, 0.022, 0.023]), torch.tensor([0.03, 0.2, 0.05]))
+    g = torch.Generator().manual_seed(0)
+    J = torch.tensor([0.4, 0.8, 1.0]) * (0.9 + 0.1 * torch.rand(18, 24, 1, generator=g))
+    J[12:] *= 0.5  # darker ground in front
+    J = J.repeat_interleave(4, 0).repeat_interleave(4, 1)
+    z = torch.full((72, 96), 16.0)
+    raw = add_water(J, ray_depth_from_z(z, image_directions(dive.rec.cameras[0]).float()), blue)
+    assert raw[:48].amax(-1).mean() > 0.84
+    z[:40, 56:] = 0
+    restored = restore_image(raw, DepthMap(z, (z > 0).float()), rays_of(dive.rec.cameras[0]), exact(blue)).clear
+    known, guessed = restored[8:32, 36:52].mean((0, 1)), restored[8:32, 64:88].mean((0, 1))
+    torch.testing.assert_close(guessed, known, atol=0.02, rtol=0)
+
+
 def test_a_linear_fit_restores_light_that_was_lost_in_linear_light(dive):
     fit = exact(dive.medium)
     linear = replace(fit, encoding="linear")

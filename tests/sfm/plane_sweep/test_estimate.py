@@ -154,6 +154,40 @@ def test_a_depth_no_other_frame_shares_is_dropped_and_a_shared_one_stays():
     assert (kept.correlation[kept.inverse_depth == 0] == 0).all()
 
 
+def test_ground_in_one_source_alone_is_judged_by_that_source():
+    cameras = dive()
+    cameras.cam2world[:, 0, 3] *= 5  # 1.25 apart at a depth of 4: 34 pixels
+    canvas = covering_pinholes(cameras, 640)
+    everywhere = torch.ones(HEIGHT, WIDTH, dtype=torch.bool)
+    views = [make_view(photograph(cameras[i], FRONTAL), everywhere, cameras[i], canvas[i]) for i in (0, 1, 3, 4)]
+    raw = sweep(views[0], views[1:], (3.0, 5.5), replace(SETTINGS, min_ncc=0.6))  # two of the three sources count
+    q = raw.inverse_depth[12:-12, 45:95]
+    assert (q > 0).double().mean() > 0.8
+    assert ((4 * q[q > 0] - 1).abs() < 0.01).double().mean() > 0.9
+    assert raw.correlation[12:-12, 45:95][q > 0].median() > 0.9
+
+
+def test_a_depth_that_one_other_frame_can_see_needs_that_frame_alone():
+    cameras = dive()
+    cameras.cam2world[:, 0, 3] *= 5  # 1.25 apart at a depth of 4: each image overlaps the next by two thirds
+    canvas = covering_pinholes(cameras, 640)
+    true = [1 / z_of_plane(cameras[i], FRONTAL).float() for i in range(5)]
+    sure = torch.ones(HEIGHT, WIDTH)
+    ends = canvas[[0, 1, 2]]
+    kept = consistent(RawDepth(true[0], sure), [RawDepth(true[1], sure), RawDepth(true[2], sure)], ends, 0.5, SETTINGS)
+    columns = torch.arange(WIDTH)
+    shift = 110 * 1.25 / 4  # pixels from one image to the next
+    in_one = (columns > shift + 2) & (columns < 2 * shift - 2)  # ground in the second image and not in the third
+    rows = slice(16, -16)
+    assert (kept.inverse_depth[rows, in_one] > 0).all()
+    assert (kept.inverse_depth[rows, columns < shift - 2] == 0).all()  # in no other image
+    assert kept.correlation[rows, in_one].max() < kept.correlation[rows, columns > 2 * shift + 2].min()
+    astray = [RawDepth(1.1 * true[1], sure), RawDepth(true[2], sure)]
+    denied = consistent(RawDepth(true[0], sure), astray, ends, 0.5, SETTINGS)
+    assert (denied.inverse_depth[rows, in_one] == 0).all()
+    assert (denied.inverse_depth[rows, columns > 2 * shift + 6] == 0).all()  # two others see it and one agrees
+
+
 def test_frames_with_poor_poses_may_differ_by_what_the_poses_are_worth():
     canvas = covering_pinholes(dive(), 640)
     true = [1 / z_of_plane(dive()[i], FRONTAL).float() for i in range(5)]

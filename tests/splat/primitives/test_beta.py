@@ -2,10 +2,19 @@
 
 from dataclasses import replace
 
+import pytest
 import torch
 
 from swimm3r.cameras import Cameras
-from swimm3r.splat.primitives.beta import initial_primitives, inverse_softplus, mean_directions, rescaled, voxel_sample
+from swimm3r.scene.reconstruction import DenseCloud
+from swimm3r.splat.primitives.beta import (
+    initial_primitives,
+    inverse_softplus,
+    mean_directions,
+    rescaled,
+    starting_points,
+    voxel_sample,
+)
 from swimm3r.splat.rendering import SplatMap
 from swimm3r.splat.settings import InitialSettings
 
@@ -66,6 +75,25 @@ def test_a_bounded_share_of_the_primitives_starts_on_ground_of_guessed_depth(tin
     without = initial_primitives(rec, replace(settings, backdrop=0.0), torch.Generator().manual_seed(0))
     assert len(without.xyz) == len(cloud.xyz)
     assert (without.xyz < behind.xyz.amin(0)).any(-1).all()
+
+
+def test_ground_of_guessed_depth_starts_as_densely_as_measured_ground(tiny_dive):
+    rng = torch.Generator().manual_seed(0)
+    plane = torch.cat([torch.rand(40_000, 2, generator=rng), torch.zeros(40_000, 1)], -1)
+    measured, guessed = (
+        plane[:36_000],
+        plane[36_000:] + torch.tensor([3.0, 0, 0]),
+    )  # as large, with a ninth of the points
+    rec = replace(
+        tiny_dive.rec, cloud=DenseCloud(measured, measured, measured), backdrop=DenseCloud(guessed, guessed, guessed)
+    )
+    start = starting_points(rec, InitialSettings(primitives=2000, backdrop=0.6))
+    share = (start.xyz[:, 0] > 2).double().mean()
+    assert share == pytest.approx(0.5, abs=0.05)
+    spacing = start.spacing
+    assert spacing[start.xyz[:, 0] > 2].median() == pytest.approx(
+        float(spacing[start.xyz[:, 0] < 2].median()), rel=0.15
+    )
 
 
 def test_softplus_undoes_its_inverse():

@@ -101,11 +101,11 @@ def test_the_depth_gradient_agrees_with_finite_differences():
 def test_a_surface_that_is_known_is_to_be_opaque_and_open_water_is_not():
     alpha = torch.tensor([[0.6, 1.0], [0.2, 0.0]], requires_grad=True)
     images = depth_images(torch.ones(2, 2), alpha)
-    share = losses.uncovered(images, torch.tensor([[1.0, 2.0], [0.0, 0.0]]))
+    share = losses.uncovered(images, torch.tensor([[True, True], [False, False]]))
     assert share.item() == pytest.approx(0.2)
     (slope,) = torch.autograd.grad(share, alpha)
     torch.testing.assert_close(slope, torch.tensor([[-0.5, -0.5], [0.0, 0.0]]))
-    assert losses.uncovered(images, torch.zeros(2, 2)) == 0
+    assert losses.uncovered(images, torch.zeros(2, 2) > 0) == 0
 
 
 def test_what_looks_past_every_surface_is_to_show_nothing_but_water():

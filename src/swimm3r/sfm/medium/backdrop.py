@@ -20,7 +20,7 @@ from swimm3r.scene.reconstruction import DenseCloud, Reconstruction
 from swimm3r.sfm.medium.restore import RestoredImage
 
 _CELLS = 48  # cells along the long side of an image in which ground is looked for
-_POINTS = 2  # along each side of a cell
+_POINTS = 3  # along each side of a cell
 _MAX_CLOUD = 500_000  # points of the cloud, at most, that are asked which cells it shows
 _SURFACE = 0.5  # share of open water from which there is no ground
 _MEASURED = 0.1  # share of an image below which its known depth is too little to guess the rest from

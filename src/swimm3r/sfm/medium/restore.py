@@ -48,6 +48,8 @@ from swimm3r.sfm.settings import RestoreSettings
 MediumOfPixels = Callable[[str, Int[Tensor, " n"], Float[Tensor, " n"]], Medium]  # frame, pixels, ray depth
 
 _MAX_TINT = 1.0  # times the other channels, for blurred colors at a guessed distance
+_MAX_BRIGHTNESS = 0.9  # of blurred colors there, in any channel
+_LEVELS, _FEWEST = 20, 20  # levels of brightness from 0 to 1, and surfaces of a level that tell how bright it becomes
 _NEARLY_ALL = 0.95  # of the surfaces at known distance
 _FULL, _TURNS = 0.85, 12  # share of the points wanted, and trials of a voxel size, that end the search for it
 _SAMPLES = 20_000  # of them, which stand for all of an image
@@ -218,8 +220,9 @@ def _not_beyond_white(
 ) -> Float[Tensor, "h w"]:
     """Ray depth, shortened where it is a guess until the blurred J is a color that surfaces have.
 
-    That is below 0.9, and in the channel that the water takes first not far above the others (nor more than nearly all
-    surfaces of known depth are): too long a path shows as a glare of that channel first, mostly red.
+    That is below 0.9, or no more times as bright as filmed than nearly all surfaces of known depth that were filmed as
+    bright, and in the channel that the water takes first not far above the others (nor more than nearly all surfaces of
+    known depth are): too long a path shows as a glare of that channel first, mostly red.
     """
     if not guessed.any():
         return ray_depth
@@ -234,18 +237,43 @@ def _not_beyond_white(
     known = torch.nonzero(~guessed.flatten())[:, 0]
     known = known[:: max(1, len(known) // _SAMPLES)]
     path, toward = ray_depth.flatten()[known], direction.reshape(-1, 3)
-    measured = tint(remove_water(blurred.reshape(-1, 3)[known], path, fit.at(path, toward[known])))
-    measured = measured[measured.isfinite()].numpy()
-    most = max(_MAX_TINT, float(np.quantile(measured, _NEARLY_ALL))) if len(measured) else _MAX_TINT
+    filmed = blurred.reshape(-1, 3)[known]
+    J = remove_water(filmed, path, fit.at(path, toward[known]))
+    most = max(_MAX_TINT, _of_nearly_all(tint(J)))
+    gain = _brightening(filmed.amax(-1), J.amax(-1))
     cell, pixel = _cells(guessed, max(1, round(reach / 3)))  # the blurred image is the same within a cell
     smooth, far = blurred.reshape(-1, 3)[pixel], ray_depth.flatten()[pixel]
     shortened = torch.zeros_like(far)
+    bright = (gain[_level(smooth.amax(-1))] * smooth.amax(-1)).clamp(min=_MAX_BRIGHTNESS)
     for trial in torch.linspace(0.05, 1.0, 20):
         J = remove_water(smooth, trial * far, fit.at(trial * far, toward[pixel]))
-        shortened = torch.where((J.amax(-1) < 0.9) & (tint(J) < most), trial, shortened)
+        shortened = torch.where((J.amax(-1) < bright) & (tint(J) < most), trial, shortened)
     share = torch.ones_like(ray_depth)
     share[guessed] = shortened[cell]
     return torch.where(guessed, ray_depth * blur(share[..., None], reach)[..., 0], ray_depth)
+
+
+def _brightening(filmed: Float[Tensor, " n"], restored: Float[Tensor, " n"]) -> Float[Tensor, " levels"]:
+    """Times that nearly all surfaces are as bright as filmed, at most, by the level of their brightness as filmed.
+
+    Levels that too few surfaces have are those of the nearest that enough have; 1 at least, and where none has.
+    """
+    level = _level(filmed)
+    enough = [k for k in range(_LEVELS) if int((level == k).sum()) >= _FEWEST]
+    if not enough:
+        return torch.ones(_LEVELS)
+    gain = {k: max(1.0, _of_nearly_all((restored / filmed.clamp(min=1e-6))[level == k])) for k in enough}
+    return torch.tensor([gain[min(enough, key=lambda other: abs(other - k))] for k in range(_LEVELS)])
+
+
+def _level(brightness: Float[Tensor, " n"]) -> Int[Tensor, " n"]:
+    return (brightness * _LEVELS).long().clamp(0, _LEVELS - 1)
+
+
+def _of_nearly_all(values: Float[Tensor, " n"]) -> float:
+    """What nearly all finite values do not exceed; 0 of none."""
+    finite = values[values.isfinite()].numpy()
+    return float(np.quantile(finite, _NEARLY_ALL)) if len(finite) else 0.0
 
 
 def _cells(mask: Bool[Tensor, "h w"], edge: int) -> tuple[Int[Tensor, " n"], Int[Tensor, " cells"]]:

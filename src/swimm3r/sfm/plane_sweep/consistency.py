@@ -9,18 +9,21 @@ import numpy as np
 
 from swimm3r.sfm.plane_sweep.kernels import kernel
 
+_BORDER = 4  # pixels
+
 
 @kernel
 @no_type_check
 def agreement(q, others, H, e, H_back, e_back, tolerance, pose_error):
-    """Number of other frames that see the same surface, and the mean depth of all of them.
+    """Mean depth of all frames that see the same surface, the number of others among them, and of those that could.
 
     A point agrees where the other frame's own depth there differs by less than `tolerance` (relative) and its point
     falls back within 1.5 pixels of where it came from; or within `pose_error` pixels, which is all that the poses are
-    worth, unless the depths then differ by more than 6 %.
+    worth, unless the depths then differ by more than 6 %. A frame could see a point that falls into its image,
+    away from the border, where windows do not fit.
     """
     h, w = q.shape
-    count = np.zeros((h, w), np.uint8)
+    count, possible = np.zeros((h, w), np.uint8), np.zeros((h, w), np.uint8)
     fused = q.copy()
     for y in range(h):
         for x in range(w):
@@ -36,6 +39,8 @@ def agreement(q, others, H, e, H_back, e_back, tolerance, pose_error):
                 u, v = X / Z, Y / Z
                 if not (0 <= u < w - 1 and 0 <= v < h - 1):
                     continue
+                if _BORDER <= u < w - _BORDER and _BORDER <= v < h - _BORDER:
+                    possible[y, x] += 1
                 expected = q[y, x] / Z  # inverse depth in the other frame
                 i, j = int(u), int(v)
                 nearest, there = 1e9, 0.0
@@ -57,7 +62,7 @@ def agreement(q, others, H, e, H_back, e_back, tolerance, pose_error):
                 count[y, x] += 1
                 total += there / bz
             fused[y, x] = total / (count[y, x] + 1)
-    return fused, count
+    return fused, count, possible
 
 
 @kernel

@@ -227,9 +227,25 @@ def sweep(
     )
     surface, cost, peak = _backend(device)(coarse, fine, numbers, _rounds(settings.rounds))
     q = np.ascontiguousarray(surface[..., 0])
+    alone = _sighting(fine, q) == 1  # the sweep has counted a second source, which does not see the pixel, as no match
+    cost, peak = np.where(alone, 2 * cost - 1, cost).clip(0), np.where(alone, 2 * peak, peak)
     cost, peak = _with_neighbors(cost), _with_neighbors(peak)
     sure = (1 - cost >= settings.min_ncc) & (peak >= settings.min_peak * (cost + 0.03)) & (q > 0)
     return RawDepth(torch.from_numpy(np.where(sure, q, 0)), torch.from_numpy(np.where(sure, 1 - cost, 0)))
+
+
+def _sighting(level: Level, q: np.ndarray) -> np.ndarray:
+    """Number of sources that see each pixel's point, by its inverse depth."""
+    h, w = q.shape
+    y, x = np.mgrid[:h, :w].astype(np.float32)
+    count = np.zeros((h, w), np.int32)
+    for lens, seen in zip(level.lenses, level.seen, strict=True):
+        H, e = lens[:9].reshape(3, 3), lens[9:]
+        X, Y, Z = (H[k, 0] * x + H[k, 1] * y + H[k, 2] + q * e[k] for k in range(3))
+        u, v = (axis / np.maximum(Z, 1e-9) for axis in (X, Y))
+        inside = (Z > 0) & (u >= 0) & (v >= 0) & (u < w - 1) & (v < h - 1)
+        count[inside] += seen[v[inside].astype(int), u[inside].astype(int)]
+    return count
 
 
 def numba_sweep(
@@ -274,20 +290,22 @@ def consistent(
 ) -> RawDepth:
     """The depths that at least `settings.agreeing` other frames share, averaged with theirs; specks removed.
 
-    `cameras` are the frame's own and then those of the others; `pose_error` is the usual reprojection error, pixels.
-    The confidence, in place of `correlation`, is how far the NCC exceeds its threshold times how many agree (3 = 1).
+    Of a point that fewer others have in their images, all of these must, one at least. `cameras` are the frame's own
+    and then those of the others; `pose_error` is the usual reprojection error, pixels. The confidence, in place of
+    `correlation`, is how far the NCC exceeds its threshold times how many agree (3 = 1).
     """
     if not others:
         return RawDepth(torch.zeros_like(raw.inverse_depth), torch.zeros_like(raw.correlation))
     (K, *Ks), (pose, *poses) = cameras.K.numpy(), cameras.world2cam.numpy()
     there = [_transfer(K, pose, K_other, other) for K_other, other in zip(Ks, poses, strict=True)]
     back = [_transfer(K_other, other, K, pose) for K_other, other in zip(Ks, poses, strict=True)]
-    fused, count = consistency.agreement(
+    fused, count, possible = consistency.agreement(
         raw.inverse_depth.numpy(), np.stack([other.inverse_depth.numpy() for other in others]),
         np.stack([H for H, _ in there]), np.stack([e for _, e in there]),
         np.stack([H for H, _ in back]), np.stack([e for _, e in back]), settings.tolerance, pose_error,
     )  # fmt: skip
-    fused = consistency.without_specks(np.where(count >= settings.agreeing, fused, 0), 0.03, settings.speck)
+    needed = np.minimum(settings.agreeing, np.maximum(possible, 1))
+    fused = consistency.without_specks(np.where(count >= needed, fused, 0), 0.03, settings.speck)
     above = (raw.correlation.numpy() - settings.min_ncc) / (1 - settings.min_ncc)
     confidence = np.where(fused > 0, above.clip(0.05, 1) * np.minimum(count / 3, 1), 0).astype(np.float32)
     return RawDepth(torch.from_numpy(fused), torch.from_numpy(confidence))

@@ -156,9 +156,14 @@ def _sampled(
     if rec.cloud is None:
         chosen = voxel_sample(rec.points.xyz.double(), settings.primitives)
         return rec.points.xyz[chosen].double(), rec.points.rgb[chosen].float()
-    backdrop = DenseCloud(*(torch.zeros(0, 3),) * 3) if rec.backdrop is None else rec.backdrop
-    behind = voxel_sample(backdrop.xyz.double(), round(settings.backdrop * settings.primitives))
-    measured = voxel_sample(rec.cloud.xyz.double(), settings.primitives - len(behind))
+    none = DenseCloud(*(torch.zeros(0, 3),) * 3)
+    backdrop = rec.backdrop if rec.backdrop is not None and settings.backdrop else none
+    n, most = len(rec.cloud.xyz), round(settings.backdrop * settings.primitives)
+    both = voxel_sample(torch.cat([rec.cloud.xyz, backdrop.xyz]).double(), settings.primitives)
+    measured, behind = both[both < n], both[both >= n] - n
+    if len(behind) > most:
+        behind = voxel_sample(backdrop.xyz.double(), most)
+        measured = voxel_sample(rec.cloud.xyz.double(), settings.primitives - len(behind))
     xyz = torch.cat([rec.cloud.xyz[measured], backdrop.xyz[behind]]).double()
     colors = (getattr(cloud, settings.colors)[rows] for cloud, rows in ((rec.cloud, measured), (backdrop, behind)))
     return xyz, torch.cat([*colors]).float()

@@ -231,7 +231,7 @@ def objective(
     edges = losses.edge_weight(view.rgb, w.depth_edges)
     depth_error = losses.depth_error(drawing.images, view.z_depth, edges, w.depth_alpha)
     smooth = smoothness(drawing.grid)
-    open_share = losses.uncovered(drawing.images, view.z_depth)
+    open_share = losses.uncovered(drawing.images, view.surface)
     on_water = losses.drawn_on_water(drawing.images, view.open_water)
     outside = losses.outside_gamut(p, drawing.projection.radius)
     shrunk = view.camera.width / w.max_radius_width if w.max_radius_width else 1.0

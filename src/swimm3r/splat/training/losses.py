@@ -116,10 +116,9 @@ def depth_error(
     return (w * off).sum() / w.sum().clamp(min=_LEAST_WEIGHT)
 
 
-def uncovered(images: RasterOutput, z_depth: Float[Tensor, "h w"]) -> Float[Tensor, ""]:
-    """Mean of 1 - alpha over the pixels where a surface is known to be; 0 where none is known."""
-    known = z_depth > 0
-    return torch.where(known, 1 - images.alpha, 0.0).sum() / known.sum().clamp(min=1)
+def uncovered(images: RasterOutput, surface: Bool[Tensor, "h w"]) -> Float[Tensor, ""]:
+    """Mean of 1 - alpha over the pixels that show a surface; 0 where none does."""
+    return torch.where(surface, 1 - images.alpha, 0.0).sum() / surface.sum().clamp(min=1)
 
 
 def drawn_on_water(images: RasterOutput, open_water: Bool[Tensor, "h w"]) -> Float[Tensor, ""]:
