@@ -271,7 +271,7 @@ def _level(brightness: Float[Tensor, " n"]) -> Int[Tensor, " n"]:
 
 
 def _of_nearly_all(values: Float[Tensor, " n"]) -> float:
-    """What nearly all finite values do not exceed; 0 of none."""
+    """Quantile `_NEARLY_ALL` of the finite values; 0 of none."""
     finite = values[values.isfinite()].numpy()
     return float(np.quantile(finite, _NEARLY_ALL)) if len(finite) else 0.0
 
