@@ -13,7 +13,7 @@ import torch
 from jaxtyping import Float, Int
 
 from swimm3r.bench.settings import RevisitSettings
-from swimm3r.cameras import Cameras
+from swimm3r.cameras import Cameras, project
 from swimm3r.errors import UsageError
 from swimm3r.synthetic import DiveSettings, make_dive
 from swimm3r.synthetic.season import Coral, Fate, corals_of
@@ -85,9 +85,7 @@ def _whole_views(cameras: Cameras, coral: Coral) -> int:
 
 def _images_with(cameras: Cameras, points: Float[np.ndarray, "n 3"]) -> Int[np.ndarray, " c"]:
     """1 for each image that holds all of the points, else 0."""
-    world2cam = cameras.world2cam.double()
-    seen = torch.from_numpy(points) @ world2cam[:, :3, :3].mT + world2cam[:, None, :3, 3]
-    pixels = (seen @ cameras.K.double().mT)[..., :2] / seen[..., 2:]
+    pixels, z = project(cameras, torch.from_numpy(points).expand(len(cameras), -1, -1))
     size = torch.tensor([cameras.width, cameras.height]).double()
-    inside = (pixels > _BORDER * size) & (pixels < (1 - _BORDER) * size) & (seen[..., 2:] > 0)
+    inside = (pixels > _BORDER * size) & (pixels < (1 - _BORDER) * size) & (z[..., None] > 0)
     return inside.all(-1).all(-1).int().numpy()

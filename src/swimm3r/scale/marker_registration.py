@@ -146,8 +146,6 @@ def _distances(
     profiles = profiles.reshape(xy.shape[:-1]).astype(np.float64)
     dark, bright = (profiles[..., end].mean(1, keepdims=True) for end in (0, -1))
     contrast = bright - dark
-    seen = inside & (contrast > _CONTRAST * np.median(contrast))
-    if not (contrast > 0).any():
-        return np.zeros(inside.shape), np.zeros_like(inside)
+    seen = inside & (contrast > max(_CONTRAST * float(np.median(contrast)), 0.0))
     lit = np.trapezoid(profiles - dark[..., None], offsets, axis=-1)
     return reach - lit / np.where(seen, contrast, np.inf), seen
