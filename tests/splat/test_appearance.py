@@ -153,7 +153,7 @@ def test_every_recipe_is_handed_the_same_colors(tracked, relit, tmp_path):
     views.colors = decide_appearance(tracked, relit, views.names, short.appearance).colors
     assert views.colors is not None
     assert (views[2].rgb - filmed).abs().mean() > 0.01
-    for recipe in ("mcmc_gs", "seasplat", "watersplatting", "uwbs-dynamic"):
+    for recipe in ("mcmc_gs", "seasplat", "watersplatting", "oceansplat", "3d-uir", "uwbs-dynamic"):
         peer = with_recipe(short, recipe)
         assert peer.appearance == short.appearance
         scene = train(tracked, relit, peer, tmp_path / recipe)

@@ -45,6 +45,8 @@ RECIPES: list[RecipeName] = [
     "seasplat",
     "threers_gs",
     "mcmc_gs",
+    "oceansplat",
+    "3d-uir",
 ]
 
 on_the_processor = pytest.mark.usefixtures("warp_on_the_processor")

@@ -23,15 +23,15 @@ from swimm3r.evaluate.images import psnr_from_errors
 from swimm3r.raster import ALPHA_MAX, ALPHA_MIN, RasterOutput, rasterize
 from swimm3r.splat.block_store import BlockEntry, StoredBlocks
 from swimm3r.splat.gaussian_settings import GaussianRenderSettings
+from swimm3r.splat.medium.field import MediumField
 from swimm3r.splat.primitives.beta import BetaPrimitives, kernel_exponent, select
-from swimm3r.splat.primitives.gaussian import colored, covariance
-from swimm3r.splat.primitives.spherical_harmonics import Y_00
+from swimm3r.splat.primitives.gaussian import GaussianPrimitives, colored, covariance, mean_color
 from swimm3r.splat.projection.conditioning import Conditioned, queries, shown
 from swimm3r.splat.projection.dispatch import project
 from swimm3r.splat.projection.pixel_filter import smoothed
 from swimm3r.splat.projection.plain import project_conditioned
 from swimm3r.splat.projection.view_camera import view_camera
-from swimm3r.splat.rendering import SplatMap, settings_in_scene_units
+from swimm3r.splat.rendering import SplatMap, projected, settings_in_scene_units
 from swimm3r.splat.settings import RenderSettings
 
 ASKED = 64  # cameras, spread over the dive, that say which way a primitive is looked at
@@ -73,7 +73,22 @@ def clear_gaussians(scene: SplatMap, cameras: Cameras, time: float | None = None
     p = select(p, torch.sigmoid(p.opacity) >= ALPHA_MIN)
     peak = torch.sigmoid(p.opacity).clamp(max=ALPHA_MAX)
     shape = smoothed(covariance(p), torch.full_like(peak, 0.5), p.footprint, scene.settings.render)
-    return Gaussians(p.xyz, 0.5 + Y_00 * p.color, peak, shape, p.harmonics)
+    gain, offset = _mean_affine(scene, p, cameras)
+    return Gaussians(p.xyz, gain * mean_color(p) + offset, peak, shape, gain[:, None] * p.harmonics)
+
+
+def _mean_affine(
+    scene: SplatMap, p: GaussianPrimitives, cameras: Cameras
+) -> tuple[Float[Tensor, "n 3"], Float[Tensor, "n 3"]]:
+    """Gain and offset of colors that change with the camera, averaged over `cameras`; 1 and 0 where they do not."""
+    gain, offset = torch.ones_like(p.color), torch.zeros_like(p.color)
+    field = scene.field
+    if not isinstance(field, MediumField) or field.affine_colors is None or not len(cameras):
+        return gain, offset
+    views = [view_camera(cameras[i]) for i in range(len(cameras))]
+    with torch.no_grad():
+        found = [field.affine_colors.affine(p.xyz, mean_color(p), view, field.length) for view in views]
+    return torch.stack([g for g, _ in found]).mean(0), torch.stack([b for _, b in found]).mean(0)
 
 
 def _of_block(scene: SplatMap, blocks: StoredBlocks, entry: BlockEntry, cameras: Cameras) -> Gaussians:
@@ -167,9 +182,9 @@ def clear_difference(
 
 def _both(scene: SplatMap, g: Gaussians, camera: Cameras, time: float | None) -> tuple[RasterOutput, RasterOutput]:
     """One view of the Gaussians as a 3DGS viewer draws them, and of the map without its water."""
-    settings, now = settings_in_scene_units(scene.settings, scene.length).render, scene.normalized_time(time)
+    settings, now = settings_in_scene_units(scene.settings, scene.length), scene.normalized_time(time)
     with torch.no_grad():
         view = view_camera(camera)
-        seen = project(scene.seen_by(view), view, settings, now)
+        seen = projected(scene.seen_by(view), scene.field, view, settings, now)
         own = rasterize(seen.primitives, None, view.height, view.width, kernel=seen.kernel)
-        return draw_gaussians(g, camera, settings.near), own
+        return draw_gaussians(g, camera, settings.render.near), own

@@ -102,7 +102,7 @@ class GaussianSettings(MapSettings):
 
     @property
     def depth_confidence(self) -> float | None:
-        """No peer reads depth."""
+        """Least confidence of a depth that training reads; None reads no depth."""
         return None
 
 
@@ -217,6 +217,71 @@ class WaterSplattingSettings(GaussianSettings):
 
 
 @dataclass(frozen=True)
+class OceanSplatWeights(RelativeWeights):
+    """Loss weights of the image and of the geometry that the map is to have by itself."""
+
+    trinocular: NotNegative = 0.1
+    """Weight of the agreement of a view with views from beside and below it."""
+    disparity_smoothness: NotNegative = 1e-3  # Monodepth2's; the sources at hand give none
+    """Weight of the edge-aware smoothness of disparity, in units of `trinocular`."""
+    epipolar: NotNegative = 0.4
+    """Weight of the triangulated depth at the start of the run."""
+    epipolar_end: NotNegative = 0.2
+    """Weight of the triangulated depth at the end of the run; linear in between."""
+    residual: NotNegative = 0.01
+    """Weight of the distance of Gaussians from the rendered depth."""
+
+
+@dataclass(frozen=True)
+class VirtualViewSettings(Settings):
+    """Virtual cameras beside and below a training camera; depths are in thirds of the scene's median depth."""
+
+    baseline: Positive = 0.4
+    """Largest vertical translation of a virtual camera, in thirds of the scene's median depth; drawn uniformly."""
+    ratio: Positive = 1.5
+    """Horizontal translation of a virtual camera, in vertical ones."""
+    least_opacity: Share = 0.5  # WaterSplatting culls below it; the sources at hand give none
+    """Opacity from which a Gaussian is triangulated."""
+    least_alpha: Share = 0.5
+    """Smallest rendered alpha of a pixel whose depth is used."""
+
+
+@dataclass(frozen=True)
+class AlphaAdjustmentSettings(Settings):
+    """Opacities adjusted by depth and direction early in training; the sources at hand give no numbers."""
+
+    end: Share = 0.2
+    """Share of the run for which the adjusted opacities are drawn alone."""
+    fade: Share = 0.2
+    """Share of the run after that in which they give way to the Gaussians' own."""
+    hidden: Annotated[int, Range(1, 4096)] = 128  # the width of the medium's network
+    """Width of the hidden layer of the network that adjusts opacities."""
+
+
+@dataclass(frozen=True)
+class OceanSplatSettings(WaterSplattingSettings):
+    """WaterSplatting with geometry that agrees between virtual views."""
+
+    iterations: Count = 10_000
+    """Number of training steps, one image each."""
+    weights: OceanSplatWeights = field(default_factory=OceanSplatWeights)
+    densify: AbsGradSettings = field(
+        default_factory=lambda: AbsGradSettings(  # densified for 7,000 of 10,000, else WaterSplatting's steps
+            refine_start=0.05, refine_stop=0.7, refine_every=0.01, reset_every=0.05
+        )
+    )
+    degree_every: Cadence = 0.1  # 1,000 of 10,000
+    """Share of the run between two degrees of the colors' spherical harmonics."""
+    virtual: VirtualViewSettings = field(default_factory=VirtualViewSettings)
+    alpha: AlphaAdjustmentSettings = field(default_factory=AlphaAdjustmentSettings)
+
+    @property
+    def recipe(self) -> Literal["oceansplat"]:  # pyright: ignore[reportIncompatibleMethodOverride]
+        """The name of the method."""
+        return "oceansplat"
+
+
+@dataclass(frozen=True)
 class GradientSettings(RefineSettings):
     """Multiplication by gradients, culls, and cuts of the opacities (3DGS)."""
 
@@ -299,3 +364,64 @@ class SeaSplatSettings(GaussianSettings):
     def recipe(self) -> Literal["seasplat"]:
         """The name of the method."""
         return "seasplat"
+
+
+@dataclass(frozen=True)
+class UirWeights(Settings):
+    """Loss weights; the sources at hand give none, so each is after another publication."""
+
+    ssim: Share = 0.2  # after 3DGS
+    """Weight of D-SSIM against L1 in the image loss."""
+    depth: NotNegative = 1.0  # after the depth term of 3DGS
+    """Weight of the error of inverse depth at the start of the run, times a third of the scene's median depth."""
+    depth_end: Positive = 0.01  # likewise
+    """Weight of the error of inverse depth at the end of the run; log-linear in between."""
+    flat: NotNegative = 100.0  # after PGSR
+    """Weight of the smallest scale of the Gaussians, in thirds of the scene's median depth."""
+    depth_confidence: NotNegative = 0.3  # that of UWBS
+    """Smallest confidence of a depth that Gaussians are supervised by."""
+    depth_alpha: Share = 0.5
+    """Smallest rendered alpha of a pixel whose depth is supervised."""
+
+
+@dataclass(frozen=True)
+class AffineColorSettings(Settings):
+    """Affine colors of Gaussians by position and camera; widths and rate after WildGaussians."""
+
+    octaves: Annotated[int, Range(1, 16)] = 4
+    """Number of octaves of a Gaussian's position."""
+    pose_octaves: Annotated[int, Range(1, 16)] = 4
+    """Number of octaves of a camera's rotation and position."""
+    embedding: Annotated[int, Range(1, 1024)] = 32
+    """Width of a camera's appearance embedding."""
+    hidden: Annotated[int, Range(1, 4096)] = 128
+    """Width of the two hidden layers of the networks of the appearance."""
+    rate: Rate = 5e-4
+    """Learning rate of the networks of the appearance."""
+
+
+@dataclass(frozen=True)
+class UirSettings(GaussianSettings):
+    """Gaussians whose colors change with the camera, in water whose two effects have networks of their own."""
+
+    initial: GaussianInitialSettings = field(default_factory=lambda: GaussianInitialSettings(colors="restored"))
+    medium: MediumFieldSettings = field(
+        default_factory=lambda: MediumFieldSettings(layers=1, activation="sigmoid", biases=False, begin=0.0)
+    )
+    medium_rate: DecayingRate = 1e-3
+    """Initial learning rate of the medium's networks."""
+    medium_rate_end: DecayingRate = 1.5e-4
+    """Final learning rate of the medium's networks."""
+    affine_colors: AffineColorSettings = field(default_factory=AffineColorSettings)
+    weights: UirWeights = field(default_factory=UirWeights)
+    densify: GradientSettings = field(default_factory=GradientSettings)
+
+    @property
+    def recipe(self) -> Literal["3d-uir"]:
+        """The name of the method."""
+        return "3d-uir"
+
+    @property
+    def depth_confidence(self) -> float | None:
+        """Least confidence of a depth that training reads."""
+        return self.weights.depth_confidence

@@ -33,6 +33,7 @@ from swimm3r.splat.medium.field import (
 from swimm3r.splat.medium.kinds import Water
 from swimm3r.splat.medium.seasplat import SceneWater, WaterLayer, layer, relative_depth, seen_through
 from swimm3r.splat.primitives.beta import BetaPrimitives, select
+from swimm3r.splat.primitives.gaussian import GaussianPrimitives, mean_color
 from swimm3r.splat.primitives.kinds import Primitives
 from swimm3r.splat.projection.dispatch import project
 from swimm3r.splat.projection.observed import TrainingCoverage
@@ -226,7 +227,7 @@ def draw(
 ) -> Drawing:
     """Project, evaluate the water and rasterize; differentiable in everything but time, the pose included."""
     time = time if p.dynamic else None
-    projection = project(p, view, settings.render, time)
+    projection = projected(p, field, view, settings, time)
     grid, light = grid_of(field, view, field.stride, time), None
     if field.lamp is not None:
         light = field.lamp.light(p.xyz, view, grid.values[6:].mean((1, 2)), field.length)
@@ -242,6 +243,23 @@ def draw(
         medium_depth_grad=settings.render.medium_depth_grad == "full", sgg=buffers,
     )  # fmt: skip
     return Drawing(images, projection, grid, maps, buffers, time, light)
+
+
+def projected(
+    p: Primitives,
+    field: Water,
+    view: ViewCamera,
+    settings: UwbsSettings | GaussianSettings,
+    time: Float[Tensor, ""] | None = None,
+) -> Projection:
+    """Primitives in a camera, in the colors that they have before it."""
+    projection = project(p, view, settings.render, time if p.dynamic else None)
+    if not isinstance(field, MediumField) or field.affine_colors is None:
+        return projection
+    assert isinstance(p, GaussianPrimitives)
+    gain, offset = field.affine_colors.affine(p.xyz, mean_color(p), view, field.length)
+    seen = projection.primitives
+    return replace(projection, primitives=seen._replace(color=(gain * seen.color + offset).clamp(min=0)))
 
 
 def evenly_lit(drawing: Drawing, view: ViewCamera, settings: UwbsSettings | GaussianSettings) -> RasterOutput:

@@ -22,7 +22,14 @@ from swimm3r.settings import (
     Settings,
     Share,
 )
-from swimm3r.splat.gaussian_settings import GaussianSettings, McmcGsSettings, SeaSplatSettings, WaterSplattingSettings
+from swimm3r.splat.gaussian_settings import (
+    GaussianSettings,
+    McmcGsSettings,
+    OceanSplatSettings,
+    SeaSplatSettings,
+    UirSettings,
+    WaterSplattingSettings,
+)
 from swimm3r.splat.shared_settings import (
     MapSettings,
     MediumFieldSettings,
@@ -284,13 +291,17 @@ class PoseRefinementSettings(Settings):
     what the frame shows."""
 
 
-SplatSettings = UwbsSettings | WaterSplattingSettings | SeaSplatSettings | McmcGsSettings
+SplatSettings = (
+    UwbsSettings | OceanSplatSettings | WaterSplattingSettings | UirSettings | SeaSplatSettings | McmcGsSettings
+)
 uwbs = UwbsSettings  # as the Python API calls it: swimm3r.train(rec, frames, swimm3r.uwbs(iterations=20_000))
 
 MapDevice = Literal["auto", "cpu", "cuda"]
 """The device that trains and renders maps; no part of the settings, for a map can go from one to the other."""
 
-RecipeName = Literal["uwbs-static", "uwbs-dynamic", "ubs", "watersplatting", "seasplat", "threers_gs", "mcmc_gs"]
+RecipeName = Literal[
+    "uwbs-static", "uwbs-dynamic", "ubs", "watersplatting", "seasplat", "threers_gs", "mcmc_gs", "oceansplat", "3d-uir"
+]
 RECIPES: tuple[RecipeName, ...] = get_args(RecipeName)
 IN_BLOCKS: tuple[RecipeName, ...] = ("uwbs-static",)
 """The recipes that train large maps in blocks; those of the others are one block, however large."""
@@ -314,18 +325,18 @@ def with_recipe(settings: UwbsSettings, recipe: RecipeName) -> SplatSettings:
                 sgg=replace(settings.sgg, enabled=False),
                 poses=replace(settings.poses, enabled=False),
             )
-        case "watersplatting":
-            water = _of_the_same_size(settings, watersplatting())
+        case "watersplatting" | "oceansplat":
+            water = _of_the_same_size(settings, watersplatting() if recipe == "watersplatting" else oceansplat())
             if water.iterations < _SHORT:
                 gentle = replace(water.densify, reset_every=0.0, prune_opacity=water.densify.prune_opacity_late)
                 water = replace(water, densify=gentle, initial=replace(water.initial, opacity=_SHORT_OPACITY))
             return water
-        case "seasplat":
-            sea = _of_the_same_size(settings, seasplat())
-            if sea.iterations < _SHORT:
-                uncut = replace(sea.densify, reset_every=0.0)
-                sea = replace(sea, densify=uncut, initial=replace(sea.initial, opacity=_SHORT_OPACITY))
-            return sea
+        case "seasplat" | "3d-uir":
+            peer = _of_the_same_size(settings, seasplat() if recipe == "seasplat" else uir())
+            if peer.iterations < _SHORT:
+                uncut = replace(peer.densify, reset_every=0.0)
+                peer = replace(peer, densify=uncut, initial=replace(peer.initial, opacity=_SHORT_OPACITY))
+            return peer
         case "threers_gs" | "mcmc_gs":
             peer = _of_the_same_size(settings, threers_gs() if recipe == "threers_gs" else mcmc_gs())
             if peer.iterations < _SHORT:
@@ -340,7 +351,7 @@ opacity of 0.1 and are culled below 0.5: of 4,000 on ruie_green_rock (160 px) 72
 on frames held back; begun at 0.5, culled below 0.1 and not cut they are 7,500 at 30.3 dB. SeaSplat's gain 10 dB by not
 being cut (benchmarks/short_runs.py)."""
 _SHORT_OPACITY = 0.5
-"""Of WaterSplatting's and SeaSplat's Gaussians in short runs, as UWBS begins; SeaSplat gains 0.5 dB by it."""
+"""Of Gaussians that are multiplied by gradients in short runs, as UWBS begins; SeaSplat gains 0.5 dB by it."""
 _SHORT_SCALE = 0.5
 """Of MCMC's Gaussians in short runs, in their spacing: from a tenth of it, as published, they would take 460 steps to
 cover it. The same 400 steps gain 2.3 dB by it."""
@@ -372,6 +383,18 @@ def seasplat(**changes: Any) -> SeaSplatSettings:
     """SeaSplat, as the Python API calls it: on poses as they are."""
     changes.setdefault("poses", TrainingPoseSettings(enabled=False))
     return SeaSplatSettings(**changes)
+
+
+def oceansplat(**changes: Any) -> OceanSplatSettings:
+    """OceanSplat, as the Python API calls it: on poses as they are."""
+    changes.setdefault("poses", TrainingPoseSettings(enabled=False))
+    return OceanSplatSettings(**changes)
+
+
+def uir(**changes: Any) -> UirSettings:
+    """3D-UIR, as the Python API calls it: on poses as they are."""
+    changes.setdefault("poses", TrainingPoseSettings(enabled=False))
+    return UirSettings(**changes)
 
 
 def threers_gs(**changes: Any) -> McmcGsSettings:

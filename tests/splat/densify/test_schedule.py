@@ -85,11 +85,13 @@ def test_maps_are_trained_and_recorded_at_the_ends_of_what_settings_allow(change
     assert math.isfinite(last["loss"])
 
 
-@pytest.mark.parametrize("recipe", ["ubs", "mcmc_gs", "threers_gs", "watersplatting", "seasplat"])
+@pytest.mark.parametrize(
+    "recipe", ["ubs", "mcmc_gs", "threers_gs", "watersplatting", "seasplat", "oceansplat", "3d-uir"]
+)
 def test_every_recipe_takes_one_step_and_rounds_without_pause(recipe, tiny_dive, tmp_path):
     settings = with_recipe(UwbsSettings(iterations=2, initial=InitialSettings(primitives=4)), recipe)
     cadence = {"refine_start": 0.0, "refine_stop": 1.0, "refine_every": 1.0, "min_refine_every": 1}
-    if recipe in ("watersplatting", "seasplat"):
+    if recipe not in ("ubs", "mcmc_gs", "threers_gs"):
         cadence["reset_every"] = 0.1  # more often than there are rounds
     settings = replace(settings, densify=replace(settings.densify, **cadence))
     scene = train(tiny_dive.rec, tiny_dive.frames, settings, tmp_path)

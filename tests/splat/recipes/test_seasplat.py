@@ -11,6 +11,7 @@ from swimm3r.cameras import Cameras
 from swimm3r.raster import RasterOutput
 from swimm3r.splat.gaussian_settings import SeaSplatWeights
 from swimm3r.splat.medium.seasplat import SceneWater, layer, relative_depth, seen_through
+from swimm3r.splat.recipes.gaussian_step import densified_by_gradients
 from swimm3r.splat.recipes.seasplat import SeaSplat, covered_background, dark_channel, depth_steps, objective
 from swimm3r.splat.rendering import SplatMap, mean_water
 from swimm3r.splat.settings import SeaSplatSettings, UwbsSettings, seasplat, with_recipe
@@ -238,7 +239,7 @@ def test_opacities_are_cut_in_long_runs_alone(recipe):
     bright = replace(
         state, primitives=state.primitives._replace(opacity=torch.full_like(state.primitives.opacity, 2.0))
     )
-    cut = of._round(bright, 3000)
+    cut = densified_by_gradients(of.scene, bright, of.settings, of.settings.densify, 3000)
     assert float(torch.sigmoid(cut.primitives.opacity).max()) == pytest.approx(0.01, rel=1e-4)
     short = with_recipe(UwbsSettings(iterations=2000), "seasplat")
     assert isinstance(short, SeaSplatSettings)

@@ -1,1 +1,1 @@
-"""The water of a map: the ambient medium field, and SeaSplat's single water."""
+"""The water of a map: the ambient medium field, SeaSplat's single water, and what light does to colors."""

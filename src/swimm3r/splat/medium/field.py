@@ -14,6 +14,7 @@ is multiplied by the pattern of the lamp's backscatter (`splat.medium.lamp`).
 
 import math
 from dataclasses import dataclass
+from typing import TypeVar
 
 import torch
 from jaxtyping import Float
@@ -23,6 +24,7 @@ from torch.nn.functional import sigmoid, softplus
 from swimm3r.lamp import Lamp, veil_pattern
 from swimm3r.medium import Medium
 from swimm3r.raster import MediumMaps
+from swimm3r.splat.medium.affine_colors import AffineColors
 from swimm3r.splat.medium.lamp import CameraLamp
 from swimm3r.splat.primitives.beta import inverse_softplus
 from swimm3r.splat.primitives.spherical_harmonics import HARMONICS, spherical_harmonics
@@ -39,14 +41,10 @@ class MediumField(nn.Module):
         super().__init__()
         self.lamp = None if lamp is None or settings.model == "none" else CameraLamp(lamp)
         self.stride = settings.stride
+        self.affine_colors: AffineColors | None = None  # of Gaussians by the camera; None where colors are their own
         width = settings.time_features if dynamic else 0
         self.gamma = nn.Linear(2 * settings.frequencies, width) if dynamic else None
-        activation = nn.ReLU if settings.activation == "relu" else nn.Sigmoid
-        layers, inputs = [], HARMONICS + width
-        for _ in range(settings.layers):
-            layers += [nn.Conv2d(inputs, settings.hidden, 1, bias=settings.biases), activation()]
-            inputs = settings.hidden
-        self.network = nn.Sequential(*layers, nn.Conv2d(inputs, 9, 1, bias=settings.biases))
+        self.network = medium_network(settings, 9, HARMONICS + width)
         if settings.model == "none":
             self.gamma, self.network = None, nn.Sequential()
         self.register_buffer("length", torch.ones(()))
@@ -76,6 +74,16 @@ class MediumField(nn.Module):
         return torch.cat([sigmoid(raw[:3]), softplus(raw[3:]) / self.length])
 
 
+def medium_network(settings: MediumFieldSettings, outputs: int, inputs: int = HARMONICS) -> nn.Sequential:
+    """The layers that settings ask for, on maps of features."""
+    activation, layers = nn.ReLU if settings.activation == "relu" else nn.Sigmoid, []
+    for _ in range(settings.layers):
+        layers += [nn.Conv2d(inputs, settings.hidden, 1, bias=settings.biases), activation()]
+        inputs = settings.hidden
+    return nn.Sequential(*layers, nn.Conv2d(inputs, outputs, 1, bias=settings.biases))
+
+
+Field = TypeVar("Field", bound=MediumField)
 NO_WATER = MediumField(MediumFieldSettings(model="none"))
 """Clear water before black."""
 
@@ -100,18 +108,10 @@ def initial_field(
 
     Without biases it cannot be, and begins at random.
     """
-    field = MediumField(settings, dynamic, lamp)
-    if settings.model == "none":
+    field = at_random(MediumField(settings, dynamic, lamp), rng)
+    if settings.model == "none" or not settings.biases:
         return field
     with torch.no_grad():
-        for layer in field.modules():
-            if isinstance(layer, nn.Conv2d | nn.Linear):
-                bound = 1 / math.sqrt(layer.weight.shape[1])  # torch's own default, but from our generator
-                layer.weight.uniform_(-bound, bound, generator=rng)
-                if layer.bias is not None:
-                    layer.bias.uniform_(-bound, bound, generator=rng)
-        if not settings.biases:
-            return field
         gray = torch.full((3,), 0.5)
         start = medium or Medium(gray, torch.full((3,), settings.prior), torch.full((3,), settings.prior))
         last = field.network[-1]
@@ -120,6 +120,18 @@ def initial_field(
         last.weight.zero_()  # the last layer learns first, from the medium as it is
         betas = torch.cat([start.beta_B, start.beta_D]).float().clamp(min=1e-3)
         last.bias.copy_(torch.cat([start.Binf.float().clamp(0.01, 0.99).logit(), inverse_softplus(betas)]))
+    return field
+
+
+def at_random(field: Field, rng: torch.Generator) -> Field:
+    """A field whose layers are drawn anew, in place: torch's own default, but from our generator."""
+    with torch.no_grad():
+        for layer in field.modules():
+            if isinstance(layer, nn.Conv2d | nn.Linear):
+                bound = 1 / math.sqrt(layer.weight.shape[1])
+                layer.weight.uniform_(-bound, bound, generator=rng)
+                if layer.bias is not None:
+                    layer.bias.uniform_(-bound, bound, generator=rng)
     return field
 
 

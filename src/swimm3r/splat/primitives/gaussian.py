@@ -78,9 +78,14 @@ def colored(
     return mean.clamp(min=0)
 
 
+def mean_color(p: GaussianPrimitives) -> Float[Tensor, "n 3"]:
+    """Colors averaged over all directions, before what is negative is cut."""
+    return 0.5 + Y_00 * p.color
+
+
 def seen_color(p: GaussianPrimitives, center: Float[Tensor, "3"]) -> Float[Tensor, "n 3"]:
     """Colors as a camera at `center` sees them."""
-    return colored(0.5 + Y_00 * p.color, p.harmonics, p.xyz - center)
+    return colored(mean_color(p), p.harmonics, p.xyz - center)
 
 
 def initial_gaussians(

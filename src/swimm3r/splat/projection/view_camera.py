@@ -6,7 +6,7 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
-from swimm3r.cameras import Cameras, undistort
+from swimm3r.cameras import Cameras, distort, undistort
 from swimm3r.raster import Kernel, Primitives2D
 
 _MARGIN = 0.3  # field tangents beyond the image at which J is held
@@ -34,6 +34,18 @@ class ViewCamera:
             plane = undistort(plane, plane.new_tensor(self.fisheye), "OPENCV_FISHEYE")
             plane = torch.nan_to_num(plane, nan=0.0)  # no ray of the lens: such a pixel is masked
         return torch.cat([plane, torch.ones_like(plane[..., :1])], -1)
+
+    def pixels(self, points: Float[Tensor, "*n 3"]) -> Float[Tensor, "*n 2"]:
+        """Pixels of points in camera axes with z > 0: the inverse of `rays` up to their distance."""
+        plane = points[..., :2] / points[..., 2:]
+        if self.fisheye is not None:
+            plane = distort(plane, plane.new_tensor(self.fisheye), "OPENCV_FISHEYE")
+        x, y = plane.unbind(-1)
+        return torch.stack([self.fx * x + self.cx, self.fy * y + self.cy], -1)
+
+    def shifted(self, shift: Float[Tensor, "3"]) -> "ViewCamera":
+        """The camera in whose axes every point is farther by `shift`; it looks the same way."""
+        return replace(self, t=self.t + shift, center=self.center - self.R.mT @ shift)
 
     def to(self, device: torch.device) -> "ViewCamera":
         """The same camera for primitives on a device."""

@@ -1,13 +1,16 @@
 """Steps that all recipes with Gaussians share: rendering one view, learning rates, and rows added or removed."""
 
-from collections.abc import Collection
-from dataclasses import dataclass
+from collections.abc import Callable, Collection
+from dataclasses import dataclass, replace
+from typing import Any, TypeVar
 
 import torch
 from jaxtyping import Float
 from torch import Tensor
 
-from swimm3r.splat.gaussian_settings import GaussianSettings
+from swimm3r.splat.densify import adaptive, schedule
+from swimm3r.splat.densify.rows import moments_after, only
+from swimm3r.splat.gaussian_settings import GaussianSettings, GradientSettings
 from swimm3r.splat.medium.field import NO_WATER, MediumField
 from swimm3r.splat.optimizer import log_linear
 from swimm3r.splat.pose_mlp import pose_rate
@@ -24,6 +27,7 @@ _MOST_HASTE = 4.0
 
 
 InField = State[GaussianPrimitives, MediumField]
+S = TypeVar("S", bound=State[GaussianPrimitives, Any])
 
 
 @dataclass(frozen=True)
@@ -31,6 +35,7 @@ class TrainingRender:
     """One view as drawn for training, and what its loss may be differentiated by."""
 
     p: GaussianPrimitives  # leaves
+    shown: GaussianPrimitives  # as drawn: with the harmonics of the step, and what else it changes
     drawing: Drawing
     pinhole_view: ViewCamera
     parameters: dict[str, Tensor]  # the leaves by name, water and poses too
@@ -49,18 +54,27 @@ def first_gaussians(scene: TrainingScene, settings: GaussianSettings) -> Gaussia
 
 
 def render_for_training(
-    scene: TrainingScene, state: State, view: TrainingView, settings: GaussianSettings, step: int, sgg: bool = False
+    scene: TrainingScene,
+    state: State,
+    view: TrainingView,
+    settings: GaussianSettings,
+    step: int,
+    sgg: bool = False,
+    changed: Callable[[GaussianPrimitives, ViewCamera], GaussianPrimitives] | None = None,
 ) -> TrainingRender:
     """Draw a view with the harmonics that this step has come to; `sgg` asks for the gradients' parts.
 
-    Water that lies over finished images is not in this one.
+    `changed` gives the Gaussians that are drawn in their place. Water that lies over finished images is not in this
+    one.
     """
     p = GaussianPrimitives(*(values.detach().requires_grad_() for values in state.primitives))
     degree = int((step - 1) / (settings.degree_every * settings.iterations))
     pinhole_view = scene.pinhole_view(view, state.poses)
     field = state.field if isinstance(state.field, MediumField) else NO_WATER
-    drawing = draw(to_degree(p, min(degree, settings.initial.harmonics)), field, pinhole_view, settings, sgg=sgg)
-    return TrainingRender(p, drawing, pinhole_view, parameters_of(p, state.field, state.poses))
+    shown = to_degree(p, min(degree, settings.initial.harmonics))
+    shown = shown if changed is None else changed(shown, pinhole_view)
+    drawing = draw(shown, field, pinhole_view, settings, sgg=sgg)
+    return TrainingRender(p, shown, drawing, pinhole_view, parameters_of(p, state.field, state.poses))
 
 
 def with_matches(
@@ -92,3 +106,32 @@ def rates_of(scene: TrainingScene, settings: GaussianSettings, step: int, names:
         "opacity": r.opacity,
         **{name: poses for name in names if name.startswith(POSES)},
     }
+
+
+def densified_by_gradients(
+    scene: TrainingScene, state: S, settings: GaussianSettings, d: GradientSettings, step: int
+) -> S:
+    """The state after the step's part in 3DGS's densification: multiply and cull, and cut opacities back.
+
+    Each has its cadence; nothing happens outside of the window.
+    """
+    n = settings.iterations
+    if not schedule.is_open(d, step, n):
+        return state
+    p, moments, memory = state.primitives, state.moments, state.memory
+    cut_every = max(1, round(d.reset_every * n)) if d.reset_every else n
+    if schedule.is_due(d, step, n):
+        rng = loop.generator(settings.seed, step, 4)
+        done = adaptive.multiply(p, memory, d.grow_grad2d, d.grow_scale3d * scene.radius, settings.cap_max, rng)
+        q = done.primitives
+        fit = torch.sigmoid(q.opacity) >= d.prune_opacity
+        if step > cut_every:
+            fit &= q.scale.amax(-1).exp() <= d.prune_scale3d * scene.radius
+            fit &= memory["radius"][done.source] <= d.largest_radius
+        if int(fit.sum()) >= 4:
+            done = only(done, fit)
+        p, moments = done.primitives, moments_after(moments, done)
+        memory = adaptive.nothing_seen(len(p.xyz), p.xyz.device)
+    if d.reset_every and step % cut_every == 0:
+        p, moments = adaptive.dimmed(p, moments, d.reset_opacity)
+    return replace(state, primitives=p, moments=moments, memory=memory)

@@ -24,13 +24,18 @@ from torch import Tensor
 from torch.nn.functional import relu, smooth_l1_loss
 
 from swimm3r.raster import RasterOutput
-from swimm3r.splat.densify import adaptive, schedule
-from swimm3r.splat.densify.rows import moments_after, only
+from swimm3r.splat.densify import adaptive
 from swimm3r.splat.gaussian_settings import SeaSplatSettings, SeaSplatWeights
 from swimm3r.splat.medium.seasplat import SceneWater, initial_scene_water, layer, relative_depth, seen_through
 from swimm3r.splat.optimizer import Moments, adam_step, fresh
 from swimm3r.splat.primitives.gaussian import GaussianPrimitives
-from swimm3r.splat.recipes.gaussian_step import first_gaussians, rates_of, render_for_training, with_matches
+from swimm3r.splat.recipes.gaussian_step import (
+    densified_by_gradients,
+    first_gaussians,
+    rates_of,
+    render_for_training,
+    with_matches,
+)
 from swimm3r.splat.training import loop, losses
 from swimm3r.splat.training.scene import TrainingScene
 from swimm3r.splat.training.state import FIELD, State, first_state, parameters_of
@@ -76,8 +81,7 @@ class SeaSplat:
             adam_step(moving, gradients, state.moments, rates)
             memory = adaptive.remembered(state.memory, gradients["mean2d"], seen.drawing.projection, seen.pinhole_view)
             state = State(state.primitives, state.field, state.poses, state.moments, memory)
-            if schedule.is_open(settings.densify, step, settings.iterations):
-                state = self._round(state, step)
+            state = densified_by_gradients(self.scene, state, settings, settings.densify, step)
         return state, numbers
 
     def _share(self, of: float) -> int:
@@ -127,27 +131,6 @@ class SeaSplat:
         """Some views, drawn anew each time."""
         rng = loop.generator(self.settings.seed, step, purpose)
         return torch.randint(len(self.scene.views), (max(1, round(count)),), generator=rng).tolist()
-
-    def _round(self, state: UnderWater, step: int) -> UnderWater:
-        """Multiply and cull, and cut opacities back, each on its cadence."""
-        d, p, moments, memory = self.settings.densify, state.primitives, state.moments, state.memory
-        cut_every = self._share(d.reset_every) if d.reset_every else self.settings.iterations
-        if schedule.is_due(d, step, self.settings.iterations):
-            rng = loop.generator(self.settings.seed, step, 4)
-            large, most = d.grow_scale3d * self.scene.radius, self.settings.cap_max
-            done = adaptive.multiply(p, memory, d.grow_grad2d, large, most, rng)
-            q = done.primitives
-            fit = torch.sigmoid(q.opacity) >= d.prune_opacity
-            if step > cut_every:
-                fit &= q.scale.amax(-1).exp() <= d.prune_scale3d * self.scene.radius
-                fit &= memory["radius"][done.source] <= d.largest_radius
-            if int(fit.sum()) >= 4:
-                done = only(done, fit)
-            p, moments = done.primitives, moments_after(moments, done)
-            memory = adaptive.nothing_seen(len(p.xyz), p.xyz.device)
-        if d.reset_every and step % cut_every == 0:
-            p, moments = adaptive.dimmed(p, moments, d.reset_opacity)
-        return State(p, state.field, state.poses, moments, memory)
 
 
 @dataclass(frozen=True)

@@ -24,10 +24,11 @@ from torch import Tensor
 from swimm3r.splat.densify import adaptive, schedule
 from swimm3r.splat.densify.rows import moments_after, only, unchanged
 from swimm3r.splat.gaussian_settings import WaterSplattingSettings
-from swimm3r.splat.medium.field import initial_field
+from swimm3r.splat.medium.field import MediumField, initial_field
 from swimm3r.splat.optimizer import adam_step, log_linear
 from swimm3r.splat.recipes.gaussian_step import (
     InField,
+    TrainingRender,
     first_gaussians,
     rates_of,
     render_for_training,
@@ -50,20 +51,22 @@ class WaterSplatting:
         """Faint Gaussians on the cloud, and a network at random."""
         seed = self.settings.seed
         p = first_gaussians(self.scene, self.settings)
-        field = initial_field(None, self.settings.medium, loop.generator(seed, 0, 3))
+        field = self._first_field(loop.generator(seed, 0, 3))
         codes = self.scene.codes(self.settings.poses, loop.generator(seed, 0, 6))
         return first_state(p, field, codes, adaptive.nothing_seen(len(p.xyz)))
+
+    def _first_field(self, rng: torch.Generator) -> MediumField:
+        return initial_field(None, self.settings.medium, rng)
 
     def step(self, state: InField, view: TrainingView, step: int) -> tuple[InField, loop.Numbers]:
         """One view at the resolution this step has come to: forward, adjoint, Adam, densification on its cadence."""
         settings = self.settings
         view = smaller(view, self._divisor(step))
-        seen = render_for_training(self.scene, state, view, settings, step, sgg=True)
-        photo = relative_photometric(seen.drawing.images.rgb, view, settings.weights.floor, settings.weights.ssim)
-        total, numbers = with_matches(self.scene, state, photo.loss, settings, step)
+        seen = self._render(state, view, step)
+        loss, terms = self._objective(seen, view, step)
+        total, numbers = with_matches(self.scene, state, loss, settings, step)
         l1 = (seen.drawing.images.rgb.detach() - view.rgb)[:, view.seen].abs().mean()
-        numbers |= {"loss": total, "l1": l1, "relative_l1": photo.l1, "ssim": photo.ssim}
-        numbers |= {"primitives": float(len(seen.p.xyz))}
+        numbers |= terms | {"loss": total, "l1": l1, "primitives": float(len(seen.p.xyz))}
         gradients = seen.gradients(total)
         clip_field(gradients)
         assert seen.drawing.sgg is not None
@@ -80,6 +83,15 @@ class WaterSplatting:
             if schedule.has_begun(d, step, n) and schedule.is_due(d, step, n):
                 state = self._round(state, step)
         return state, numbers
+
+    def _render(self, state: InField, view: TrainingView, step: int) -> TrainingRender:
+        return render_for_training(self.scene, state, view, self.settings, step, sgg=True)
+
+    def _objective(self, seen: TrainingRender, view: TrainingView, step: int) -> tuple[Float[Tensor, ""], loop.Numbers]:
+        """The loss of one view without that of the poses, and its terms for the record; the same in every step."""
+        w = self.settings.weights
+        photo = relative_photometric(seen.drawing.images.rgb, view, w.floor, w.ssim)
+        return photo.loss, {"relative_l1": photo.l1, "ssim": photo.ssim}
 
     def _divisor(self, step: int) -> int:
         """By how much the training image is smaller."""

@@ -92,13 +92,19 @@ def oversize(p: BetaPrimitives, radius: Float[Tensor, " n"], limit: float) -> Fl
 
 
 def edge_weight(rgb: Float[Tensor, "3 h w"], scale: float) -> Float[Tensor, "h w"]:
-    """w_n of Eq. 13 before it is normalized: mean of e^(-scale |dI/dx|) and e^(-scale |dI/dy|), 1 where I is flat.
+    """w_n of Eq. 13 before it is normalized: mean of e^(-scale |dI/dx|) and e^(-scale |dI/dy|), 1 where I is flat."""
+    right, down = edge_weights(rgb, scale)
+    return (right + down) / 2
+
+
+def edge_weights(rgb: Float[Tensor, "3 h w"], scale: float = 1.0) -> tuple[Float[Tensor, "h w"], Float[Tensor, "h w"]]:
+    """e^(-scale |dI/dx|) and e^(-scale |dI/dy|), 1 in the last column and row.
 
     |dI| is the mean over the channels of the absolute difference to the next pixel.
     """
     right = torch.nn.functional.pad(rgb.diff(dim=2).abs().mean(0), (0, 1))
     down = torch.nn.functional.pad(rgb.diff(dim=1).abs().mean(0), (0, 0, 0, 1))
-    return (torch.exp(-scale * right) + torch.exp(-scale * down)) / 2
+    return torch.exp(-scale * right), torch.exp(-scale * down)
 
 
 def depth_error(

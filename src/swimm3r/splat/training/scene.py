@@ -17,7 +17,7 @@ from swimm3r.splat.projection.view_camera import ViewCamera, view_camera
 from swimm3r.splat.shared_settings import TrainingPoseSettings
 from swimm3r.splat.training.state import State
 from swimm3r.splat.training_poses import TrainingPoses
-from swimm3r.splat.views import TrainingView, TrainingViews
+from swimm3r.splat.views import TrainingView, TrainingViews, median_z_depth
 
 
 @dataclass(frozen=True, eq=False)
@@ -79,6 +79,11 @@ def with_footprints(scene: TrainingScene, state: State) -> State:
         return state
     measured = footprints(state.primitives.xyz, scene.views.cameras)
     return replace(state, primitives=state.primitives._replace(footprint=measured))
+
+
+def third_of_depth(scene: TrainingScene) -> float:
+    """A third of the scene's median depth, working units: 1 where the scene has no scale and is brought to 3."""
+    return median_z_depth(scene.rec) * scene.scale / 3
 
 
 def path_radius(rec: Reconstruction, scale: float, working_depth: float) -> float:

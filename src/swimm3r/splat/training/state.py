@@ -61,9 +61,16 @@ def stored(state: State) -> dict[str, Tensor]:
     """Parameters by name; their moments after .first, .second and .steps; what else is remembered after .memory."""
     parameters = parameters_of(state.primitives, state.field, state.poses)
     tensors = {f"parameter.{name}": t for name, t in (state.primitives._asdict() | parameters).items()}
+    tensors |= {f"buffer.{name}": t for name, t in _measured(state.field).items()}
     for name, m in state.moments.items():
         tensors |= {f"first.{name}": m.first, f"second.{name}": m.second, f"steps.{name}": m.steps}
     return tensors | {f"memory.{name}": t for name, t in state.memory.items()}
+
+
+def _measured(field: Water) -> dict[str, Tensor]:
+    """Numbers of the field that are neither trained nor set by settings or reconstruction: the box of the first step's
+    Gaussians."""
+    return {name: t for name, t in field.named_buffers() if name.startswith("affine_colors.")}
 
 
 def restored(
@@ -82,6 +89,10 @@ def restored(
             if shapes != {parameter.shape} or tensors[f"steps.{name}"].dim():
                 raise ValueError(f"{name} or its moments are not of the shape {tuple(parameter.shape)}")
             parameter.copy_(values)
+        for name, buffer in _measured(field).items():
+            if tensors[f"buffer.{name}"].shape != buffer.shape:
+                raise ValueError(f"{name} is not of the shape {tuple(buffer.shape)}")
+            buffer.copy_(tensors[f"buffer.{name}"])
     moments = {k: Moments(tensors[f"first.{k}"], tensors[f"second.{k}"], tensors[f"steps.{k}"]) for k in parameters}
     memory = {k.removeprefix("memory."): t for k, t in tensors.items() if k.startswith("memory.")}
     filled: Any = field
