@@ -22,8 +22,10 @@ from swimm3r.splat import train
 from swimm3r.splat.settings import (
     LearningRates,
     McmcGsSettings,
+    OceanSplatSettings,
     SeaSplatSettings,
     SplatSettings,
+    UirSettings,
     UwbsSettings,
     WaterSplattingSettings,
     mcmc_gs,
@@ -36,9 +38,12 @@ from swimm3r.splat.settings import (
 def variants(size: UwbsSettings) -> dict[str, SplatSettings]:
     """The recipes as they are trained, and each without one of the changes made for short runs."""
     mcmc, water, sea = (with_recipe(size, name) for name in ("mcmc_gs", "watersplatting", "seasplat"))
+    ocean, uir = (with_recipe(size, name) for name in ("oceansplat", "3d-uir"))
     assert isinstance(mcmc, McmcGsSettings)
     assert isinstance(water, WaterSplattingSettings)
     assert isinstance(sea, SeaSplatSettings)
+    assert isinstance(ocean, OceanSplatSettings)
+    assert isinstance(uir, UirSettings)
     slow = {
         f"{name}, rates as published": replace(of, rates=replace(of.rates, short_run_rate_exponent=0.0))
         for name, of in (("mcmc_gs", mcmc), ("watersplatting", water), ("seasplat", sea))
@@ -61,6 +66,16 @@ def variants(size: UwbsSettings) -> dict[str, SplatSettings]:
         "seasplat": sea,
         "seasplat, first opacity and cuts as published": replace(sea, initial=faint[sea], densify=seasplat().densify),
         "seasplat, first opacity as published": replace(sea, initial=faint[sea]),
+        "oceansplat": ocean,
+        "oceansplat, without virtual views": replace(ocean, weights=replace(ocean.weights, trinocular=0.0)),
+        "oceansplat, without triangulated depth": replace(
+            ocean, weights=replace(ocean.weights, epipolar=0.0, epipolar_end=0.0)
+        ),
+        "oceansplat, opacities as they are": replace(ocean, alpha=replace(ocean.alpha, end=0.0, fade=0.0)),
+        "3d-uir": uir,
+        "3d-uir, not flattened": replace(uir, weights=replace(uir.weights, flat=0.0)),
+        "3d-uir, without depth": replace(uir, weights=replace(uir.weights, depth=0.0)),
+        "3d-uir, colors as they are": replace(uir, affine_colors=replace(uir.affine_colors, rate=0.0)),
         **slow,
     }
 

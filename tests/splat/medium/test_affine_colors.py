@@ -6,7 +6,9 @@ import pytest
 import torch
 from torch.autograd import gradcheck
 
+from swimm3r.evaluate.images import psnr
 from swimm3r.export.gaussians import clear_difference, clear_gaussians
+from swimm3r.scale.rescale import rescaled_map
 from swimm3r.splat.gaussian_settings import AffineColorSettings
 from swimm3r.splat.map_file import load_map
 from swimm3r.splat.medium.affine_colors import AffineColors, fourier
@@ -138,3 +140,15 @@ def test_a_map_is_kept_and_exported_in_the_colors_that_cameras_see(tiny_dive, ga
     assert clear_difference(scene, clear_gaussians(scene, one), one).psnr > 40
     assert clear_difference(scene, clear_gaussians(plain, one), one).psnr < 35
     torch.testing.assert_close(scene.to(torch.device("cpu")).render(camera).clear, scene.render(camera).clear)
+
+
+def test_a_map_brought_to_scale_looks_the_same(tiny_dive, gaussians, tmp_path):
+    scene, camera = SplatMap(gaussians, field_over(gaussians, 0.1), SETTINGS, False), tiny_dive.cameras[4]
+    before = scene.render(camera)
+    scene.save(tmp_path / "map.safetensors")
+    scaled = rescaled_map(load_map(tmp_path / "map.safetensors"), 3.0)
+    cam2world = camera.cam2world.clone()
+    cam2world[:, :3, 3] *= 3
+    after = scaled.render(replace(camera, cam2world=cam2world))
+    assert psnr(after.rgb, before.rgb) > 50
+    torch.testing.assert_close(after.z_depth, 3 * before.z_depth, atol=1e-2, rtol=1e-3)
