@@ -1,4 +1,4 @@
-"""Two visits to a small analytic seabed, with exact depth and colors and real features, each in axes of its own."""
+"""Two visits to a small analytic seabed, with exact depth and water and real features, each in axes of its own."""
 
 import json
 from dataclasses import dataclass
@@ -12,7 +12,7 @@ from scipy import ndimage
 from swimm3r.cameras import Cameras, image_directions
 from swimm3r.geometry import so3_exp
 from swimm3r.io.images import write_rgb, write_rgb_16
-from swimm3r.medium import AttenuationCurve, Medium, MediumFit
+from swimm3r.medium import AttenuationCurve, Medium, MediumFit, add_water
 from swimm3r.products.survey import Survey, open_survey
 from swimm3r.scene.frames import Frame, Frames
 from swimm3r.scene.georeference import Georeference, save_georeference
@@ -27,6 +27,7 @@ SIDE, AHEAD = 0.45, 0.3  # metres between lines and frames
 LINES, EACH = 2, 4
 MOUND = (0.25, 0.3, 0.12, 0.05)  # x, y, radius and height of what has grown at the second visit
 BLEACHED = (0.55, 0.75, 0.1)  # x, y and radius
+LATER_LIGHT = (0.7, 0.9, 1.0)
 ORIGIN = (500_000.0, 5_000_000.0, -30.0)
 
 
@@ -91,6 +92,12 @@ def _water(scale: float) -> MediumFit:
     return MediumFit(0.5 * torch.ones(3), beta, beta, curve, Medium(none, none, none), known, (0.1, 9.0), "srgb")
 
 
+def _filmed(clear: np.ndarray, distance: np.ndarray) -> np.ndarray:
+    """Colors through the water at distances in metres."""
+    z = torch.from_numpy(distance)
+    return add_water(torch.from_numpy(clear), z, _water(1.0).at(z)).numpy()
+
+
 def write_visit(folder: Path, seabed: Seabed, seed: int, *, place: bool, east: float = 0.0) -> None:
     """A run folder of a visit with finished structure from motion, its axes and unit drawn from the seed."""
     rng = np.random.default_rng(seed)
@@ -113,7 +120,7 @@ def write_visit(folder: Path, seabed: Seabed, seed: int, *, place: bool, east: f
             at = world[i, :3, 3] + t[..., None] * rays
             t = (seabed.height(at[..., 0], at[..., 1]) - world[i, 2, 3]) / rays[..., 2]
         clear = np.clip(seabed.color(at[..., 0], at[..., 1]), 0, 1)
-        write_rgb(folder / "given" / name, clear * 0.8 + 0.1)
+        write_rgb(folder / "given" / name, _filmed(clear, t * np.linalg.norm(rays, axis=-1)))
         write_rgb_16(folder / "sfm" / "restored_physical" / f"{name}.png", clear)
         noise = rng.normal(0, 0.001, t.shape)
         z = torch.from_numpy((t + noise) * scale).float()
@@ -168,6 +175,6 @@ def visits(tmp_path_factory: pytest.TempPathFactory) -> Visits:
     folder = tmp_path_factory.mktemp("visits")
     made = Visits(folder / "spring", folder / "autumn", folder / "elsewhere")
     write_visit(made.first, Seabed(), 1, place=True)
-    write_visit(made.later, Seabed(changed=True, light=(0.7, 0.9, 1.0)), 2, place=False)
+    write_visit(made.later, Seabed(changed=True, light=LATER_LIGHT), 2, place=False)
     write_visit(made.elsewhere, Seabed(seed=9), 3, place=False)
     return made

@@ -17,6 +17,7 @@ from swimm3r.sim3 import Sim3
 from swimm3r.visits.alignment.depth import with_depth
 from swimm3r.visits.alignment.joint import Joint, Link, map_jointly, moved, shape_similarity
 from swimm3r.visits.alignment.matches import VisitMatches
+from swimm3r.visits.alignment.misfit import Bends
 from swimm3r.visits.alignment.place import place_visits
 from swimm3r.visits.alignment.similarity import Alignment, Known, align
 from swimm3r.visits.settings import VisitSettings
@@ -254,3 +255,28 @@ def test_real_features_align_visits_in_other_light_over_changed_ground(visits: V
     # depth maps come along, into the unit of the first visit
     rec = later.survey.rec
     assert float(rec.depth[rec.names[0]].z_depth.median()) * a.scale == pytest.approx(1.0, abs=0.1)
+
+
+def test_ground_far_from_shared_points_is_as_uncertain_as_most_of_them():
+    """Bends of 0.02 but for one neighborhood at the rim, which happens to lie right: the ground beyond it need not."""
+    rng = np.random.default_rng(0)
+    xy = rng.uniform(0, 1, (200, 2))
+    off = np.full((200, 3), 0.02)
+    bent = Bends(xy, off)
+    rim = int(xy[:, 0].argmax())
+    off = off.copy()
+    off[rim] = 0.0
+    lucky = Bends(xy, off)
+    beyond, beside = xy[rim][None] + [[0.5, 0.0]], xy[rim][None] + [[1e-6, 0.0]]
+    for k in range(2):
+        assert lucky.at(beyond)[k][0] > 0.95 * bent.at(beyond)[k][0]
+        np.testing.assert_allclose(lucky.at(beside)[k], lucky.spread[k], rtol=1e-3)  # never less than a typical one
+
+
+def test_ground_beside_shared_points_has_their_offset():
+    xy = np.stack(np.meshgrid(np.arange(10.0), np.arange(10.0)), -1).reshape(-1, 2)
+    off = np.full((100, 3), 0.01)
+    off[:10] = 0.09
+    level, up = Bends(xy, off).at(xy)
+    np.testing.assert_allclose(up[:10], 0.09, rtol=1e-6)
+    np.testing.assert_allclose(level[50:], Bends(xy, off).spread[0], rtol=1e-6)

@@ -133,13 +133,16 @@ def test_colors_of_ground_whose_height_is_uncertain_count_less_where_rays_are_sl
     assert np.median(slanted.color.std[flat] / nadir.color.std[flat]) == pytest.approx(1.0, abs=0.2)
 
 
-def test_bleaching_is_found_on_patterned_ground_whose_place_is_uncertain_and_a_shift_is_not_called_bleaching():
-    """Squares of two colors, 6 cells wide, of a place known to 2 cells: the later visit has them 2 cells beside."""
+@pytest.mark.parametrize("cells", [2, 7])
+def test_bleaching_is_found_on_patterned_ground_whose_place_is_uncertain_and_a_shift_is_not_called_bleaching(
+    cells: int,
+):
+    """Squares of two colors, 6 cells wide, of a place known to some cells: the later visit has them so far beside."""
     rows, columns = np.mgrid[:SIDE, :SIDE] // 6
     squares = 1 + 0.8 * ((rows + columns) % 2)
     bleached = disc(60, 60, 14)
-    unsure = Misfit(np.full((SIDE, SIDE), 2 * GSD), np.zeros((SIDE, SIDE)))
-    beside = ground(2, albedo=np.where(bleached, 5.0, np.roll(squares, 2, axis=1)))
+    unsure = Misfit(np.full((SIDE, SIDE), cells * GSD), np.zeros((SIDE, SIDE)))
+    beside = ground(2, albedo=np.where(bleached, 5.0, np.roll(squares, cells, axis=1)))
     change = compare(ground(1, albedo=squares), beside, unsure, GSD, WHITE, VisitSettings())
     paler = change.color_kind == MORE
     assert (paler & bleached).sum() / bleached.sum() > 0.9

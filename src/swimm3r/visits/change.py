@@ -46,7 +46,7 @@ _NEAR = 2  # cells around one whose heights tell how steep the ground is
 _CLASSES, _CLASS_CELLS = 8, 400  # of cells that are alike: how many at most, and the cells of each at least
 _RIM = 0.5  # cells, standard deviation of the place of a change's rim, which the filter leaves
 _REACH = 2.0  # standard deviations of its place within which a cell's color may come from
-_FARTHEST = 8  # cells of that, beyond which any color may have come from anywhere
+_REACHES = (1, 2, 3, 4, 6, 8, 12, 16, 24, 40)  # cells that is rounded up to; beyond the last, colors come from anywhere
 _PLACED = 0.25  # cells, standard deviation of where a cell's height was taken: half a pixel of a frame
 
 
@@ -168,12 +168,14 @@ def _beyond(
 ) -> Float[np.ndarray, "h w 3"]:
     """The part of b - a that no shift explains, of either what has appeared or what has gone, whichever is more.
 
-    `astray` is the standard deviation of a cell's place, cells; none where the reach is beyond `_FARTHEST`.
+    `astray` is the standard deviation of a cell's place, cells; none where its reach is beyond the last of `_REACHES`.
     """
     found = np.zeros(a.shape)
-    reach = np.ceil(_REACH * astray)
-    for cells in np.unique(reach[reach <= _FARTHEST]).astype(int).tolist():
-        rows = reach == cells
+    steps = np.searchsorted(_REACHES, _REACH * astray)
+    for step, cells in enumerate(_REACHES):
+        rows = steps == step
+        if not rows.any():
+            continue
         appeared, gone = _outside(b, a, cells)[rows], -_outside(a, b, cells)[rows]
         more = (appeared**2).sum(-1) >= (gone**2).sum(-1)
         found[rows] = np.where(more[:, None], appeared, gone)

@@ -1,10 +1,11 @@
 """The ground as one visit saw it: height and clear color of the cells of a grid, with their standard deviations.
 
     height      weighted median over the depth maps, std = 1.2533 s / sqrt(k), s the spread of k views
-    color       mean of the frames that see the cell, in linear light, weighted by the square of their rank
+    color       mean of (I - B) / T_D (Eq. 4), in linear light, weighted by the square of the frames' rank
 
 The deviation of a color also has the error of the backscatter, which all views of a visit share: it grows as the light
-that arrives gets less (`sfm.medium.restore.color_std`). A red star in water that takes red most is an example.
+that arrives gets less. Restored images are of no use here: they hold back a color of which little light is left, and
+more of it in one water than in another, which would pass for a change.
 
 Cells of a single view have the spread of the visit's poorer cells. Views share errors, so these deviations are too
 small by a factor, which `change` finds from the pair of visits.
@@ -19,13 +20,12 @@ from jaxtyping import Bool, Float, Float32, UInt16
 from scipy.spatial import KDTree
 
 from swimm3r.errors import UsageError
-from swimm3r.medium import linear_from_srgb, transmittances
+from swimm3r.medium import MediumFit, backscatter, linear_from_srgb, transmittances
 from swimm3r.products.elevation import elevation, frames_over
 from swimm3r.products.frame_colors import Points, shown_by
 from swimm3r.products.grid import Grid, Window, chosen_gsd, grid_of
 from swimm3r.products.survey import Survey
 from swimm3r.progress import Progress, silent
-from swimm3r.sfm.medium.restore import color_std
 from swimm3r.sfm.settings import RestoreSettings
 
 _TILE = 512  # cells along the side of the windows that are filled one after another
@@ -36,6 +36,7 @@ _LEAST_PIXELS = 0.25  # of a frame on the ground: no height is surer, however we
 _POOR = 0.9  # quantile of a view's spread that single views have: they are where matching was hard
 _LEVEL = 0.05  # sine of the angle from the horizontal below which a ray counts as no flatter
 _LEAST_COLOR_STD = 0.02  # of the color itself: what interpolation leaves
+_LEAST_TRANSMITTANCE = 1e-3  # of a channel: with less, its color is unknown by a multiple of white in any case
 
 
 @dataclass(frozen=True)
@@ -113,28 +114,32 @@ def _fill(ground: Ground, survey: Survey, grid: Grid, window: Window) -> None:
     ground.distance[own][rows, columns] = nearest[0]
     above = np.maximum(np.abs(ray[:, 2]), _LEVEL * nearest[0])
     ground.slant[own][rows, columns] = np.hypot(ray[:, 0], ray[:, 1]) / above
-    if not survey.has("physical"):
+    if survey.rec.medium is None:
         return
     mean, std = _colors(survey, points, frames)
     ground.color[own][rows, columns], ground.color_std[own][rows, columns] = mean, std
 
 
 def _colors(survey: Survey, points: Points, frames: list[int]) -> tuple[np.ndarray, np.ndarray]:
-    """Weighted means of the colors that frames show of points, and the means' standard deviations."""
+    """Weighted means of the clear colors that frames show of points, and the means' standard deviations."""
+    fit = survey.rec.medium
+    assert fit is not None
     n = len(points.xyz)
     weight, squared = np.zeros(n), np.zeros(n)
     first, second, shared = np.zeros((n, 3)), np.zeros((n, 3)), np.zeros((n, 3))
     for i in frames:
-        shown = shown_by(survey, points, i, "physical")
+        shown = shown_by(survey, points, i, "filmed")
         if shown is None:
             continue
-        stored = torch.from_numpy(np.clip(shown.colors, 0, 1)).double()
-        light, w = linear_from_srgb(stored).numpy(), shown.rank.astype(np.float64) ** 2
+        pose = survey.rec.cameras.cam2world[i].double().numpy()
+        ray = (survey.place.from_local(points.xyz[shown.which]) - pose[:3, 3]) @ pose[:3, :3]
+        light, veil_std = clear_light(torch.from_numpy(shown.colors), torch.from_numpy(ray), fit)
+        w = shown.rank.astype(np.float64) ** 2
         weight[shown.which] += w
         squared[shown.which] += w**2
         first[shown.which] += w[:, None] * light
         second[shown.which] += w[:, None] * light**2
-        shared[shown.which] += w[:, None] * _water_std(survey, points.xyz[shown.which], i, stored)
+        shared[shown.which] += w[:, None] * veil_std
     with np.errstate(invalid="ignore", divide="ignore"):
         mean = first / weight[:, None]
         count = (weight**2 / squared)[:, None]  # views that would weigh as much if all were alike
@@ -144,20 +149,23 @@ def _colors(survey: Survey, points: Points, frames: list[int]) -> tuple[np.ndarr
     return mean.astype(np.float32), np.hypot(std, _LEAST_COLOR_STD * mean).astype(np.float32)
 
 
-def _water_std(
-    survey: Survey, xyz: Float[np.ndarray, "n 3"], i: int, stored: Float[torch.Tensor, "n 3"]
-) -> Float[np.ndarray, "n 3"]:
-    """Standard deviations in linear light of points' colors in a frame that errors of the backscatter leave."""
-    medium = survey.rec.medium
-    assert medium is not None  # where images were restored
-    pose = survey.rec.cameras.cam2world[i].double().numpy()
-    ray = (survey.place.from_local(xyz) - pose[:3, 3]) @ pose[:3, :3]
-    z = torch.from_numpy(np.linalg.norm(ray, axis=1))
-    T_D, _ = transmittances(z, medium.at(z, torch.from_numpy(ray) / z[:, None]))
-    std = color_std(T_D, RestoreSettings())
-    if medium.encoding == "linear":
-        return std.numpy()
-    return ((linear_from_srgb(stored + std) - linear_from_srgb(stored - std)) / 2).numpy()
+def clear_light(
+    filmed: Float[torch.Tensor, "n 3"], ray: Float[torch.Tensor, "n 3"], fit: MediumFit
+) -> tuple[Float[np.ndarray, "n 3"], Float[np.ndarray, "n 3"]]:
+    """Linear light of filmed colors (stored, 0..1) without the water, and the deviations that errors of B leave.
+
+    Eq. 4 in the encoding of the fit, not clamped. `ray` leads from the camera to the point, in the axes of the camera
+    and in units of the fit.
+    """
+    z = ray.double().norm(dim=1)
+    medium = fit.at(z, ray.double() / z[:, None])
+    T_D = transmittances(z, medium)[0].clamp(min=_LEAST_TRANSMITTANCE)
+    I = filmed.double()
+    direct = (linear_from_srgb(I) if fit.encoding == "linear" else I) - backscatter(z, medium)
+    J, std = direct / T_D, RestoreSettings().veil_error / T_D
+    if fit.encoding == "linear":
+        return J.numpy(), std.numpy()
+    return linear_from_srgb(J).numpy(), ((linear_from_srgb(J + std) - linear_from_srgb(J - std)) / 2).numpy()
 
 
 def _with_floor(ground: Ground, least: float) -> Ground:

@@ -7,7 +7,6 @@ Where T_D is small the quotient is noise, so per channel with s = T_D:
     detail    J = S + s^2 / (s^2 + (noise / texture)^2) (J - S)     S: local linear fit of D / s to I's brightness
     color    J = w J + (1 - w) k G,  w = s^2 / (s^2 + (veil_error / color_error)^2)
               G: the channels weighted by how well they see; k: this channel's share of color where it does see;
-              standard deviation left by errors of B: color_error sqrt(1 - w)
     horizon   in open water, and where no channel sees (max w -> 0), the image's own veil remains
 
 Under a lamp on the camera T_D is the share of its light that arrives (`MediumFit.at`), so that J is evenly lit. Near
@@ -304,14 +303,6 @@ def _without_noise(
     share = share / share.mean()
     used = (weight * share).sum(-1, keepdim=True) / weight.sum(-1, keepdim=True).clamp(min=1e-6)
     return sees * J + (1 - sees) * share * gray / used.clamp(min=1e-3)
-
-
-def color_std(T_D: Float[Tensor, "*pixels 3"], settings: RestoreSettings) -> Float[Tensor, "*pixels 3"]:
-    """Standard deviation of restored colors, in the encoding of the water, that errors of the backscatter leave.
-
-    All frames of a dive share these errors: a mean over frames does not reduce them.
-    """
-    return settings.color_error * (1 - _color_weight(T_D, settings)).sqrt()
 
 
 def _color_weight(T_D: Float[Tensor, "*pixels 3"], settings: RestoreSettings) -> Float[Tensor, "*pixels 3"]:

@@ -1,12 +1,14 @@
 """One visit brought onto another, and the uncertainty of its place on the other's ground.
 
 Check points, averaged over neighborhoods of the site, show the bends that are left: the error of a single point is its
-own and no matter of the ground. m_j is the offset of the neighborhood nearest to a cell, d its distance:
+own and no matter of the ground. m_j are the offsets of neighborhoods at distances d_j from a cell, d the smallest:
 
-    s^2 = max(s_0, |m_j|)^2 + (r d)^2,   s_0 = 1.4826 median |m|,   r = median |m_i - m_j| / |x_i - x_j|
+    s^2 = max(s_0^2, m^2) + (r d)^2,   m^2 = sum d_j^-2 m_j^2 / sum d_j^-2,   s_0 = 1.4826 median |m_j|,
+    r = median |m_i - m_j| / |x_i - x_j|
 
-so that the uncertainty grows away from the points that both visits share. With too few check points, the covariance of
-the similarity takes their place.
+Beside a neighborhood m is its offset, far away the root mean square of many: one of them may be small by chance. The
+uncertainty grows away from the points that both visits share. With too few check points, the covariance of the
+similarity takes their place.
 """
 
 from dataclasses import dataclass
@@ -26,6 +28,7 @@ from swimm3r.visits.ground import Ground
 _NEIGHBORS = 8  # check points of a neighborhood
 _MAD = 1.4826
 _LEAST_CHECKS = 10
+_AROUND = 64  # nearest neighborhoods that tell the offset at a cell
 _PAIRS = 2000  # of neighborhoods, whose offsets tell how fast bends change
 
 
@@ -44,19 +47,24 @@ class Bends:
 
     def at(self, xy: Float[np.ndarray, "k 2"]) -> tuple[Float[np.ndarray, " k"], Float[np.ndarray, " k"]]:
         """Horizontal and vertical standard deviation at places."""
-        nearest: Any = KDTree(self.xy).query(xy)
+        count = min(_AROUND, len(self.xy))
+        nearest: Any = KDTree(self.xy).query(xy, k=np.arange(1, count + 1))
         distance, j = nearest
         rng = np.random.default_rng(0)
         one, other = rng.integers(len(self.xy), size=(2, _PAIRS))
         apart = np.linalg.norm(self.xy[one] - self.xy[other], axis=1)
         told = apart > np.median(apart) / 4  # nearer ones share check points
-        off = np.column_stack([np.hypot(self.off[:, 0], self.off[:, 1]) / np.sqrt(2), np.abs(self.off[:, 2])])
+        squared = np.column_stack([(self.off[:, :2] ** 2).mean(1), self.off[:, 2] ** 2])
+        weight = 1 / np.maximum(distance, 1e-9 * max(float(np.ptp(self.xy)), 1.0)) ** 2
+        off = np.sqrt(np.einsum("kn,knc->ck", weight, squared[j]) / weight.sum(1))
         change = np.column_stack([
             np.linalg.norm(self.off[one, :2] - self.off[other, :2], axis=1) / np.sqrt(2),
             np.abs(self.off[one, 2] - self.off[other, 2]),
         ])  # fmt: skip
         rate = np.median(change[told] / apart[told, None], axis=0) if told.any() else np.zeros(2)
-        level, up = (np.hypot(np.maximum(least, off[j, k]), rate[k] * distance) for k, least in enumerate(self.spread))
+        level, up = (
+            np.hypot(np.maximum(least, off[k]), rate[k] * distance[:, 0]) for k, least in enumerate(self.spread)
+        )
         return level, up
 
 
