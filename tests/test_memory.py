@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 import torch
 
-from swimm3r.memory import MB, available_mb, out_of_memory, peak_mb
+from swimm3r.memory import MB, available_mb, out_of_memory, peak_mb, return_freed
 
 TOO_MANY = 1 << 60  # bytes
 
@@ -18,6 +18,21 @@ def test_the_peak_counts_what_was_taken():
         pytest.skip("this system does not say")
     taken = np.ones(int(before + 100) * MB, np.uint8)  # beyond any peak before
     assert peak_mb() >= taken.nbytes / MB
+
+
+@pytest.mark.skipif(sys.platform != "linux", reason="only glibc keeps freed memory that it can be asked for")
+def test_freed_blocks_between_kept_ones_go_back_to_the_system():
+    def resident_mb() -> float:
+        pages = int(Path("/proc/self/statm").read_text().split()[1])
+        return pages * 4096 / MB
+
+    blocks = [b"x" * 60_000 for _ in range(5_000)]
+    kept = [blocks[::50], b"x" * 1_000]  # scattered over the heap
+    before = resident_mb()
+    del blocks
+    return_freed()
+    assert before - resident_mb() > 0.8 * 5_000 * 60_000 / MB
+    assert len(kept) == 2
 
 
 @pytest.mark.skipif(sys.platform != "linux", reason="other systems are not asked")

@@ -54,7 +54,10 @@ def test_colors_are_those_of_the_ground_without_the_water(grounds: list[tuple[Gr
 def test_clear_light_inverts_the_water_however_little_of_a_channel_is_left(encoding: Encoding, red: float):
     """No color is held back: in any water a surface has one color. The deviation is what errors of B make."""
     beta = torch.tensor([red, 0.3, 0.2]).double()
-    none, sure = torch.zeros(3).double(), dict.fromkeys(("Binf", "beta_D", "beta_B"), torch.ones(3, dtype=torch.bool))
+    none, sure = (
+        torch.zeros(3).double(),
+        {name: torch.ones(3, dtype=torch.bool) for name in ("Binf", "beta_D", "beta_B")},
+    )
     curve = AttenuationCurve(beta, none, none, none)
     fit = MediumFit(0.2 + none, beta, beta, curve, Medium(none, none, none), sure, (0.1, 9.0), encoding)
     colors = torch.tensor([[0.7, 0.1, 0.08], [0.05, 0.5, 0.9]]).double()

@@ -19,7 +19,7 @@ from swimm3r.io.files.atomic import remove_drafts, write_text
 from swimm3r.io.files.cache_key import cache_key
 from swimm3r.io.files.folder_lock import folder_lock
 from swimm3r.io.files.outputs import check_file, output_folder
-from swimm3r.memory import available_mb, peak_mb
+from swimm3r.memory import available_mb, peak_mb, return_freed
 from swimm3r.pipeline.estimate import Estimate, check_disk, duration, size
 from swimm3r.pipeline.presets import RunSettings, from_yaml
 from swimm3r.pipeline.run_settings import differences, settings_by_stage, with_stages_of
@@ -206,6 +206,7 @@ class RunRecord:
             self._log("stopped", stage=name, error=f"{type(error).__name__}: {error}")
             raise
         self._measure_pace(name, time.perf_counter() - wall)
+        return_freed()
         peak = peak_mb()
         self.summary["stages"][name] = {
             "seconds": round(time.perf_counter() - wall, 2),

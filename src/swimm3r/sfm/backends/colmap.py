@@ -6,6 +6,7 @@ observations, poses and depth are found anew without them.
 
 from pathlib import Path
 
+from swimm3r.memory import return_freed
 from swimm3r.progress import Progress, silent
 from swimm3r.scene.frames import MASKS, Frames
 from swimm3r.scene.gravity import with_measured_up
@@ -47,11 +48,13 @@ def reconstruct(
             rec = with_loose_rig(rec) if under_port else as_rig(rec, frames, settings, progress)
         with_measured_up(rec, frames).save(folder, frames)
     rec = load_reconstruction(folder, frames)  # also where it was just made: the same bits as after an interruption
+    return_freed()
     estimate_depth(rec, frames, settings.depth, progress, engine)
     if settings.moving == "auto":
         rec = with_moving(rec, frames, folder / MASKS, progress)
         if rec.rig is None and navigator is None and settings.housing == "none":  # which hold poses in their own ways
             rec = _of_still_scene(rec, frames, settings, folder, progress, engine)
+    return_freed()
     rec = with_water(rec, rec.still(frames), settings, folder, progress)
     rec.save(folder, frames)
     return rec
