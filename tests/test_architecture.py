@@ -10,7 +10,7 @@ import swimm3r
 PACKAGE = Path(swimm3r.__file__).parent
 ROWS = {  # by package: a room or module imports only rooms of rows before its own; "a.b" is a part in a row of its own
     "swimm3r": [
-        {"errors", "progress", "notebook"},
+        {"errors", "progress", "notebook", "rounding"},
         {"io.files", "lamp"},
         {"medium", "geometry", "cameras", "sim3"},
         {"settings", "water_types", "devices", "memory", "evaluate", "weights"},

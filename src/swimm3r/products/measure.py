@@ -25,6 +25,7 @@ from swimm3r.products.habitat.tables import Lattice, squares_inside
 from swimm3r.products.picked_points import PickedPoint, picked
 from swimm3r.products.record import FOLDER, read_record
 from swimm3r.products.survey import Survey, open_survey
+from swimm3r.rounding import rounded
 
 _STEP = 1e-4  # of the points' extent, of numeric gradients
 
@@ -39,9 +40,9 @@ class Measurement:
     unit: str
 
     def __str__(self) -> str:
-        std = " (standard deviation not known)" if self.std is None else f" ± {self.std:.2g}"
+        std = " (standard deviation not known)" if self.std is None else f" ± {rounded(self.std, 2)}"
         digits = 4 if not self.std or self.value == 0 else max(2, int(np.log10(abs(self.value) / self.std)) + 3)
-        return f"{self.name}: {self.value:.{min(digits, 9)}g}{std} {self.unit}"
+        return f"{self.name}: {rounded(self.value, min(digits, 9))}{std} {self.unit}"
 
 
 def measure_run(

@@ -9,6 +9,7 @@ from typing import Any
 from swimm3r.io.files.atomic import write_text
 from swimm3r.io.files.damage import Remedy
 from swimm3r.io.files.json_file import read_json
+from swimm3r.rounding import rounded
 
 FOLDER = "products"
 RECORD = "products.json"
@@ -65,21 +66,25 @@ class ProductsRecord(MapGrid):
 
     def __str__(self) -> str:
         u = self.unit
-        size = f"{self.columns * self.gsd:.4g} x {self.rows * self.gsd:.4g} {u}"
-        area_std = "" if self.scale_std is None else f" ± {2 * self.scale_std * self.area:.2g}"
+        size = f"{rounded(self.columns * self.gsd, 4)} x {rounded(self.rows * self.gsd, 4)} {u}"
+        area_std = "" if self.scale_std is None else f" ± {rounded(2 * self.scale_std * self.area, 2)}"
         lines = [
             f"Map: {self.columns} x {self.rows} cells of {self.gsd:g} {u}, {size}, {self.covered:.0%} of it measured"
-            f" ({self.area:.4g}{area_std} {u}²)"
+            f" ({rounded(self.area, 4)}{area_std} {u}²)"
         ]
         if self.lowest is not None and self.highest is not None:
             digits = max(0, -math.floor(math.log10(self.height_std or self.gsd)))
-            std = "" if self.height_std is None else f" ± {self.height_std:.2g} {u} (median of a cell, one view)"
-            lines.append(f"Heights: {self.lowest:.{digits}f} to {self.highest:.{digits}f} {u}{std}")
+            lines.append(f"Heights: {self.lowest:.{digits}f} to {self.highest:.{digits}f} {u}{self._height_doubt()}")
         scale = "relative standard deviation not known" if self.scale_std is None else f"± {self.scale_std:.2%}"
         if u == "m":
             lines.append(f"Scale: {scale}, from {', '.join(self.sources) or 'the poses that were given'}")
         lines += self._habitat_lines()
         return "\n".join([*lines, *(f"Note: {note}" for note in self.notes)])
+
+    def _height_doubt(self) -> str:
+        if self.height_std is None:
+            return ""
+        return f" ± {rounded(self.height_std, 2)} {self.unit} (median of a cell, one view)"
 
     def _habitat_lines(self) -> list[str]:
         found = self.habitat

@@ -16,6 +16,7 @@ from jaxtyping import Float
 from torch import Tensor
 
 from swimm3r.cameras import Cameras, inside_image, project, unproject
+from swimm3r.rounding import rounded
 from swimm3r.viewer.layers import LayerChoice, Painter, ViewCamera
 
 _VIEWS = 4  # nearest frames that a point is looked at from
@@ -102,7 +103,7 @@ def area(points: Sequence[SurfacePoint]) -> Measured:
 def told(measured: Measured, unit: str) -> str:
     """A number as people write it, with the digits that its spread leaves: 1.243 ± 0.018 m."""
     if not measured.std:
-        return f"{measured.value:.3g} {unit}"
+        return f"{rounded(measured.value, 3)} {unit}"
     digits = max(0, 1 - math.floor(math.log10(measured.std)))
     return f"{measured.value:.{digits}f} ± {measured.std:.{digits}f} {unit}"
 

@@ -16,6 +16,7 @@ from swimm3r.errors import InputError
 from swimm3r.io.files.damage import Remedy, guard
 from swimm3r.products.geotiff import StoredMap
 from swimm3r.products.packages import require_packages
+from swimm3r.rounding import rounded
 from swimm3r.visits.change import COLOR_KINDS, HEIGHT_KINDS
 from swimm3r.visits.page import COLORS
 from swimm3r.visits.record import RECORD, VisitsRecord, change_lines, read_record
@@ -132,7 +133,8 @@ def _labels(
         near = height[max(0, i - 5) : i + 6, max(0, j - 5) : j + 6]
         z = float(np.nanmedian(near)) if np.isfinite(near).any() else 0.0
         middle = record.columns * record.gsd / 2, record.rows * record.gsd / 2
-        told = f"{float(row['volume']):+.2g} {record.unit}³" if row["volume"] else f"L* {float(row['lightness']):+.0f}"
+        volume, lightness = row["volume"], row["lightness"]
+        told = f"{rounded(float(volume), 2, sign=True)} {record.unit}³" if volume else f"L* {float(lightness):+.0f}"
         found.append(((x - middle[0], middle[1] - y, z), f"{row['number']} {row['kind']} {told}"))
     return tuple(found)
 

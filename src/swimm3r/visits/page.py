@@ -19,6 +19,7 @@ from scipy import ndimage
 from swimm3r.io import images
 from swimm3r.io.files.atomic import write_text
 from swimm3r.report.style import style_sheet
+from swimm3r.rounding import rounded
 from swimm3r.visits.change import LESS, MORE, Change
 from swimm3r.visits.places import Place
 from swimm3r.visits.record import ChangeRecord, VisitsRecord, change_lines
@@ -138,12 +139,18 @@ def _enlarged(image: UInt8[np.ndarray, "h w 3"]) -> UInt8[np.ndarray, "h2 w2 3"]
     return image.repeat(times, 0).repeat(times, 1)
 
 
+def _with_std(value: float | None, std: float | None, unit: str) -> str:
+    if value is None or std is None:
+        return ""
+    return f"{rounded(value, 3, sign=True)} ± {rounded(std, 1)} {unit}"
+
+
 def _row(place: Place, unit: str) -> tuple[str, ...]:
-    height = "" if place.height is None else f"{place.height:+.3g} ± {place.height_std:.1g} {unit}"
-    volume = "" if place.volume is None else f"{place.volume:+.3g} ± {place.volume_std:.1g} {unit}³"
+    height = _with_std(place.height, place.height_std, unit)
+    volume = _with_std(place.volume, place.volume_std, f"{unit}³")
     color = "" if place.color is None else f"{place.color:.1f}, L* {place.lightness:+.1f}"
     return (
-        f"{place.number}", place.kind, f"{place.area:.3g} {unit}²", height, volume, color,
+        f"{place.number}", place.kind, f"{rounded(place.area, 3)} {unit}²", height, volume, color,
         f"{place.significance:.1f}",
     )  # fmt: skip
 

@@ -8,6 +8,7 @@ from swimm3r.io.files.atomic import write_text
 from swimm3r.io.files.damage import Remedy
 from swimm3r.io.files.json_file import read_json
 from swimm3r.products.record import MapGrid
+from swimm3r.rounding import rounded
 
 RECORD = "visits.json"
 SCHEMA = 2
@@ -87,13 +88,13 @@ class VisitsRecord(MapGrid):
     def __str__(self) -> str:
         u, lines = self.unit, []
         for visit in self.visits:
-            text = f"{visit.name}: {visit.frames} frames, {visit.area:.4g} {u}² of ground"
+            text = f"{visit.name}: {visit.frames} frames, {rounded(visit.area, 4)} {u}² of ground"
             if visit.alignment is not None:
                 by = visit.alignment
                 text += f"; onto {by.onto} by {by.source}"
                 if by.error_px is not None:
                     text += f", {by.merged} of {by.matches} matched points are one to {by.error_px:.2g} px"
-                text += f"; ± {by.level_std:.2g} {u} level, ± {by.up_std:.2g} {u} up"
+                text += f"; ± {rounded(by.level_std, 2)} {u} level, ± {rounded(by.up_std, 2)} {u} up"
             lines.append(text)
         lines += [line for change in self.changes for line in change_lines(change, u, self.threshold)]
         return "\n".join([*lines, *(f"Note: {note}" for note in self.notes)])
@@ -102,22 +103,21 @@ class VisitsRecord(MapGrid):
 def change_lines(change: ChangeRecord, unit: str, threshold: float) -> list[str]:
     """The figures of a change in words."""
     compared = max(change.compared_area, 1e-12)
-    lines = [
-        f"{change.earlier} to {change.later}: {change.places} changed places on {change.compared_area:.4g} {unit}² that"
-        " both saw"
-    ]
+    both = rounded(change.compared_area, 4)
+    lines = [f"{change.earlier} to {change.later}: {change.places} changed places on {both} {unit}² that both saw"]
     for name, area, volume, std in (
         ("gained", change.gained_area, change.gained_volume, change.gained_volume_std),
         ("lost", change.lost_area, change.lost_volume, change.lost_volume_std),
     ):
-        lines.append(f"  {name}: {area:.3g} {unit}² ({area / compared:.1%}), {volume:.3g} ± {std:.1g} {unit}³")
+        moved = f"{rounded(volume, 3)} ± {rounded(std, 1)} {unit}³"
+        lines.append(f"  {name}: {rounded(area, 3)} {unit}² ({area / compared:.1%}), {moved}")
     if change.color_std is not None:
         for name, area in (("paler", change.paler_area), ("darker", change.darker_area)):
-            lines.append(f"  {name}: {area:.3g} {unit}² ({area / compared:.1%})")
+            lines.append(f"  {name}: {rounded(area, 3)} {unit}² ({area / compared:.1%})")
     if change.height_std is not None:
-        least = f"  a cell's height has changed from {threshold * change.height_std:.2g} {unit} on"
+        least = f"  a cell's height has changed from {rounded(threshold * change.height_std, 2)} {unit} on"
         if change.color_std is not None:
-            least += f", its color from a CIELAB difference of {threshold * change.color_std:.2g} on"
+            least += f", its color from a CIELAB difference of {rounded(threshold * change.color_std, 2)} on"
         lines.append(f"{least} ({threshold:g} standard deviations of a typical cell)")
     return lines
 

@@ -48,8 +48,8 @@ class Bends:
     def at(self, xy: Float[np.ndarray, "k 2"]) -> tuple[Float[np.ndarray, " k"], Float[np.ndarray, " k"]]:
         """Horizontal and vertical standard deviation at places."""
         count = min(_AROUND, len(self.xy))
-        nearest: Any = KDTree(self.xy).query(xy, k=np.arange(1, count + 1))
-        distance, j = nearest
+        tree: Any = KDTree(self.xy)
+        distance, j = tree.query(xy, k=np.arange(1, count + 1))
         rng = np.random.default_rng(0)
         one, other = rng.integers(len(self.xy), size=(2, _PAIRS))
         apart = np.linalg.norm(self.xy[one] - self.xy[other], axis=1)
