@@ -98,6 +98,17 @@ def test_sharpness_is_the_ratio_of_contrasts_and_blind_to_brightness():
     assert sharpness(target, 0.5 * target + 0.2) == pytest.approx(2, rel=1e-5)
 
 
+def test_sharpness_of_a_part_is_that_of_its_pixels():
+    target, left = textured(), torch.zeros(48, 48, dtype=torch.bool)
+    left[:, :20] = True
+    half = torch.cat([target[:, :24], 0.5 * target[:, 24:]], 1)
+    assert sharpness(half, target, left) == pytest.approx(1)
+    whole = sharpness(half, target)
+    assert isinstance(whole, float)
+    assert whole < 0.9
+    assert sharpness(half, target, torch.ones_like(left)) == pytest.approx(whole)
+
+
 def test_the_direction_of_an_edge_does_not_matter_to_sharpness():
     ramp = torch.arange(32).float()[None, :, None].expand(32, 32, 3) / 64
     assert sharpness(ramp, ramp.transpose(0, 1)) == pytest.approx(1, rel=1e-5)

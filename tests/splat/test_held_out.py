@@ -151,6 +151,7 @@ def test_the_observed_score_looks_at_observed_pixels_alone():
     scores = observed_scores(render, target, seen, left)
     assert scores.share == 0.25
     assert scores.psnr == pytest.approx(20.17, abs=0.01)
+    assert scores.sharpness == 0  # the render is flat; half of the edge in the frame is on a pixel that counts
     nothing = observed_scores(render, target, seen, ~seen)
     assert nothing.share == 0
     assert isinstance(nothing.psnr, NotComputed)

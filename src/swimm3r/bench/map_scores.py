@@ -20,7 +20,8 @@ from swimm3r.splat.rendering import SplatMap
 from swimm3r.splat.settings import PoseRefinementSettings, SplatSettings
 
 COLUMNS = columns(
-    "psnr", "psnr_observed", "ssim_3dgs", "lpips_vgg", "sharpness", "blur4_psnr", "psnr_affine", "flow_px",
+    "psnr", "psnr_observed", "ssim_3dgs", "lpips_vgg", "sharpness", "sharpness_observed", "blur4_psnr",
+    "psnr_affine", "flow_px",
     "flow_px_p90", "clear_psnr", "T_D_abs", "B_abs", "from_reference_pct", "train_cpu_seconds",
 )  # fmt: skip
 
@@ -64,6 +65,7 @@ def map_scores(
         "sharpness": mean.sharpness,
         "blur4_psnr": mean.blur4_psnr,
         "psnr_observed": observed.psnr,
+        "sharpness_observed": observed.sharpness,
         **{name: getattr(covered, name) for name in ("psnr_affine", "flow_px", "flow_px_p90")},
         "from_reference_pct": 100 * sum(view.source == "reference" for view in views) / len(views),
         "train_cpu_seconds": _training_seconds(folder, scene.settings),

@@ -40,6 +40,7 @@ COLUMNS = (
     Column("ssim_3dgs", "SSIM", 4, "high", "11 x 11 Gaussian of sigma 1.5, zero padding, as 3DGS"),
     Column("lpips_vgg", "LPIPS", 4, "low", "v0.1, VGG-16, inputs 0..1 as 3DGS feeds them"),
     Column("sharpness", "Sharpness", 3, "neither", "mean gradient magnitude, rendering : test frame; 1 is as sharp"),
+    Column("sharpness_observed", "Sharpness, observed", 3, "neither", "of the pixels that some training frame saw"),
     Column("blur4_psnr", "Blurred by 4 px", 2, "neither", "dB of the test frame against itself blurred, sigma 4 px"),
     Column("psnr_affine", "PSNR, recolored", 2, "high", f"dB on measured ground, {_RECOLORED}"),
     Column("flow_px", "Flow, px", 2, "low", f"median displacement of rendering against test frame, {_FLOW}"),

@@ -134,14 +134,20 @@ def blur4_psnr(target: Float[Tensor, "h w 3"], seen: Bool[Tensor, "h w"] | None 
     return psnr_from_errors(errors if seen is None else errors[seen])
 
 
-def sharpness(render: Float[Tensor, "h w 3"], target: Float[Tensor, "h w 3"]) -> float | NotComputed:
-    """Mean gradient magnitude (central differences of the channel mean) of the render over that of the target."""
-    detail = _mean_gradient(target)
+def sharpness(
+    render: Float[Tensor, "h w 3"], target: Float[Tensor, "h w 3"], counted: Bool[Tensor, "h w"] | None = None
+) -> float | NotComputed:
+    """Mean gradient magnitude (central differences of the channel mean) of the render over that of the target.
+
+    Means are over the `counted` pixels, of which there must be one, or over all.
+    """
+    detail = _mean_gradient(target, counted)
     if detail == 0:
         return NotComputed("the target image is flat")
-    return _mean_gradient(render) / detail
+    return _mean_gradient(render, counted) / detail
 
 
-def _mean_gradient(image: Float[Tensor, "h w 3"]) -> float:
+def _mean_gradient(image: Float[Tensor, "h w 3"], counted: Bool[Tensor, "h w"] | None) -> float:
     down, right = torch.gradient(image.double().mean(-1))
-    return torch.hypot(down, right).mean().item()
+    steps = torch.hypot(down, right)
+    return (steps if counted is None else steps[counted]).mean().item()

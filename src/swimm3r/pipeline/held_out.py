@@ -19,7 +19,7 @@ from torch import Tensor
 from swimm3r import weights
 from swimm3r.cameras import Cameras, project_visible
 from swimm3r.evaluate import NotComputed
-from swimm3r.evaluate.images import ViewScores, as_8_bit, blur4_psnr, mean_view_scores, psnr, view_scores
+from swimm3r.evaluate.images import ViewScores, as_8_bit, blur4_psnr, mean_view_scores, psnr, sharpness, view_scores
 from swimm3r.evaluate.lpips import Lpips, load_lpips
 from swimm3r.evaluate.registration import displacement, psnr_affine, recolored_by_halves
 from swimm3r.geometry import best_similarity
@@ -111,10 +111,11 @@ class ObservedScores:
 
     share: float | NotComputed  # of the pixels
     psnr: float | NotComputed  # dB
+    sharpness: float | NotComputed  # mean gradient magnitude, render : target
 
     def summary(self) -> dict[str, object]:
         """The scores by the names of summary.json."""
-        return {"observed": self.share, "psnr_observed": self.psnr}
+        return {"observed": self.share, "psnr_observed": self.psnr, "sharpness_observed": self.sharpness}
 
 
 def first_poses(
@@ -277,15 +278,17 @@ def observed_scores(
     seen: Bool[Tensor, "h w"],
     observed: Bool[Tensor, "h w"] | None,
 ) -> ObservedScores:
-    """Share and PSNR of the observed pixels; both images as their 8-bit files show them."""
+    """Share, PSNR and sharpness of the observed pixels; both images as their 8-bit files show them."""
     if observed is None:
         unknown = NotComputed("the map was made before it kept what training frames saw")
-        return ObservedScores(unknown, unknown)
+        return ObservedScores(unknown, unknown, unknown)
     counted = seen & observed
     share = float(counted.sum() / seen.sum())
     if not bool(counted.any()):
-        return ObservedScores(share, NotComputed("no training frame saw what the test frames show"))
-    return ObservedScores(share, psnr(as_8_bit(render)[counted], as_8_bit(target)[counted]))
+        nothing = NotComputed("no training frame saw what the test frames show")
+        return ObservedScores(share, nothing, nothing)
+    render, target = as_8_bit(render), as_8_bit(target)
+    return ObservedScores(share, psnr(render[counted], target[counted]), sharpness(render, target, counted))
 
 
 def still_scores(

@@ -59,7 +59,9 @@ def _observed_figures(test: dict[str, Any]) -> list[Figure]:
     """The score of what training frames saw, and how much that is; nothing of maps that do not know."""
     if not isinstance(test.get("observed"), float):
         return []
-    rest = f"{_number(test['observed'], 0, 100)} % of the test frames; the rest is hatched in the pictures"
+    sharp = test.get("sharpness_observed")
+    detail = "" if sharp is None else f", {_number(sharp, 0, 100)} % as sharp as these"
+    rest = f"{_number(test['observed'], 0, 100)} % of the test frames{detail}; the rest is hatched in the pictures"
     return [Figure(f"{_number(test['psnr_observed'], 1)} dB", "PSNR of what training frames saw", rest)]
 
 
