@@ -33,7 +33,13 @@ _PAIR_S = 0.01  # per pair of frames that are matched at 2048 features
 _SWEEP_S = 2.0  # per megapixel of depth and source frame
 _RESTORE_S = 2.5  # per megapixel of a prepared frame
 _STEP_PRIMITIVE_S, _STEP_PIXEL_S = 1.1e-6, 0.6e-6  # of a training step, forward and backward
-_RECIPE_STEP = {"ubs": 0.55, "watersplatting": 1.75, "seasplat": 1.45}  # beside a step of uwbs-static
+_RECIPE_STEP = {  # beside a step of uwbs-static; the last two by way of watersplatting, 3.6 and 2 times it
+    "ubs": 0.55,
+    "watersplatting": 1.75,
+    "seasplat": 1.45,
+    "oceansplat": 6.3,
+    "3d-uir": 3.5,
+}
 _POSE_STEP = 0.7  # a step of pose refinement beside one of training
 _OVERHEAD_S = 5.0  # per stage: imports, kernels from the cache, reading back
 
