@@ -11,10 +11,10 @@ from swimm3r.imaging.undistortion import undistorted
 from swimm3r.splat.medium.field import ray_lengths
 from swimm3r.splat.projection.conditioning import Conditioned
 from swimm3r.splat.projection.observed import coverage_from, coverage_of
-from swimm3r.splat.projection.pixel_filter import DILATION
 from swimm3r.splat.projection.plain import project_conditioned
 from swimm3r.splat.projection.view_camera import view_camera
 from swimm3r.splat.settings import RenderSettings
+from swimm3r.splat.shared_settings import DILATION
 
 LENS = (0.02, -0.01, 0.004, -0.001)
 

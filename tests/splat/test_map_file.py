@@ -96,12 +96,24 @@ def test_a_map_from_before_the_filters_is_drawn_as_it_was_trained(tmp_path, wall
     assert torch.equal(again.render(camera()).rgb, scene.render(camera()).rgb)
 
 
+def test_the_water_of_earlier_maps_had_convolutions_for_layers(tmp_path, wall, camera):
+    path, scene = tmp_path / "map.safetensors", wall(50)
+    scene.save(path)
+    layers = {f"field.{k}": v for k, v in scene.field.state_dict().items() if v.ndim == 2}
+    assert layers
+    rewritten(path, {k: v[:, :, None, None] for k, v in layers.items()}, {"schema": 4})
+    assert torch.equal(load_map(path).render(camera()).rgb, scene.render(camera()).rgb)
+    rewritten(path, {}, {"schema": 6})
+    with pytest.raises(InputError, match="size mismatch"):
+        load_map(path)
+
+
 @pytest.mark.parametrize(
     ("tensors", "about", "said"),
     [
-        ({}, {"schema": 6}, "newer Swimm3R: its schema is 6, this version reads 2 and 3 and 4 and 5"),
+        ({}, {"schema": 8}, "newer Swimm3R: its schema is 8, this version reads 2 and 3 and 4 and 5 and 6 and 7"),
         ({}, {"schema": 3}, "schema 3 lists 0 blocks"),
-        ({}, {"schema": 1}, "an older Swimm3R: its schema is 1, this version reads 2 and 3 and 4 and 5"),
+        ({}, {"schema": 1}, "an older Swimm3R: its schema is 1, this version reads 2 and 3 and 4 and 5 and 6 and 7"),
         ({}, {"schema": None}, "its schema is None"),
         ({}, {"recipe": "splatfacto"}, "splatfacto"),
         ({}, {"recipe": []}, "recipe: a text is expected"),

@@ -22,6 +22,7 @@ from swimm3r.settings import (
     Share,
 )
 from swimm3r.splat.shared_settings import (
+    DILATION,
     MapSettings,
     MediumFieldSettings,
     RefineSettings,
@@ -59,7 +60,9 @@ class GaussianRenderSettings(Settings):
     """Smallest z depth of a Gaussian that is drawn."""
     antialiasing: Literal["mip", "dilation"] = "dilation"
     """Filter of Gaussians: none smaller than a pixel of the training images, and averaged over the pixels of the view
-    (mip, Mip-Splatting), or widened by 0.3 px^2 in every view (dilation), as in 3DGS."""
+    (mip, Mip-Splatting), or widened in every view (dilation), as in 3DGS."""
+    dilation: Annotated[float, Range(0, 10)] = DILATION
+    """Variance added to every Gaussian on the image plane, pixels^2 (dilation)."""
     medium_depth_grad: Literal["full", "detach"] = "full"
     """Gradient of the medium's terms to the Gaussians' depths: full, or detached."""
 

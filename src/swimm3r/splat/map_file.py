@@ -1,11 +1,14 @@
 """Maps and training states on disk, as safetensors: tensors under their names, everything else in the header.
 
-map.safetensors (`schema` 4) holds the primitives as stored (before activation), the water, and in its header
+map.safetensors (`schema` 6) holds the primitives as stored (before activation), the water, and in its header
 the recipe, its settings, the metric flag, the working unit and when the clip begins and ends; also the training
 frames' poses where they were refined, their colors where each has its own, small depth images of them, and the camera
-that notebooks show the map from. That of a large map (`schema` 5) holds no primitives but lists the files of its blocks
-(`splat.block_store`), which lie in blocks/ beside it. Maps of schema 2 and 3 have no footprints and are drawn dilated,
-as they were trained. A checkpoint adds the optimizer's moments and the step.
+that notebooks show the map from. That of a large map (`schema` 7) holds no primitives but lists the files of its blocks
+(`splat.block_store`), which lie in blocks/ beside it.
+
+Earlier maps, of one block and of several: the water's layers are 1 x 1 convolutions (schema 4 and 5); besides, there are
+no footprints, and maps are drawn dilated, as they were trained (2 and 3); settings have other names, and are not read
+(1, Swimm3R 0.1). A checkpoint adds the optimizer's moments and the step.
 """
 
 from collections.abc import Mapping
@@ -31,7 +34,8 @@ from swimm3r.splat.settings import IN_BLOCKS, RECIPES, RecipeName, settings_of
 from swimm3r.splat.training_poses import RefinedPoses
 
 _DILATED = (2, 3)  # schemas of maps before primitives were filtered
-_IN_BLOCKS = (3, SCHEMA_IN_BLOCKS)
+_WITH_CONVOLUTIONS = (*_DILATED, 4, 5)
+_IN_BLOCKS = (3, 5, SCHEMA_IN_BLOCKS)
 
 
 @dataclass(frozen=True)
@@ -78,7 +82,7 @@ def load_map(path: str | Path) -> SplatMap:
         cause="the file is damaged, of another version, or of another program",
         fault="is not a map that can be read",
     )
-    stored = read_tensors(path, _MapHeader, remedy, (*_DILATED, SCHEMA, SCHEMA_IN_BLOCKS))
+    stored = read_tensors(path, _MapHeader, remedy, (*_WITH_CONVOLUTIONS, SCHEMA, SCHEMA_IN_BLOCKS))
     about = stored.about
     with guard(path, remedy):
         settings = from_document(about.settings, settings_of(cast(RecipeName, about.recipe)))
@@ -90,9 +94,7 @@ def load_map(path: str | Path) -> SplatMap:
         primitives = primitives_from(stored.tensors, parts.primitives, "primitives.", may_be_empty=empty)
         field = parts.field
         try:
-            field.load_state_dict(
-                {k.removeprefix("field."): v for k, v in stored.tensors.items() if k.startswith("field.")}
-            )
+            field.load_state_dict(_of_field(stored.tensors, convolutions=about.schema in _WITH_CONVOLUTIONS))
         except RuntimeError as error:  # torch on missing names and other shapes
             raise ValueError(" ".join(str(error).split())) from error
         coverage = coverage_from(stored.tensors)
@@ -119,6 +121,14 @@ def load_map(path: str | Path) -> SplatMap:
         colors,
         coverage,
     )
+
+
+def _of_field(tensors: Mapping[str, Tensor], *, convolutions: bool) -> dict[str, Tensor]:
+    """The stored state of the water; weights of 1 x 1 convolutions are taken as those of linear layers."""
+    state = {k.removeprefix("field."): v for k, v in tensors.items() if k.startswith("field.")}
+    if not convolutions:
+        return state
+    return {k: v.flatten(1) if v.shape[2:] == (1, 1) else v for k, v in state.items()}
 
 
 def _colors(tensors: Mapping[str, Tensor], names: tuple[str, ...]) -> FrameColors:

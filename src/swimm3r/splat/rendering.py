@@ -42,8 +42,8 @@ from swimm3r.splat.settings import SplatSettings, UwbsSettings
 from swimm3r.splat.training_poses import RefinedPoses
 from swimm3r.splat.views import normalized_time
 
-SCHEMA = 4  # of a map's file; 2: without footprints, dilated; 1: Swimm3R 0.1, whose settings have other names
-SCHEMA_IN_BLOCKS = 5  # of one that lists blocks, which a version that knows none would leave out; 3: likewise dilated
+SCHEMA = 6  # of a map's file (earlier ones: `splat.map_file`)
+SCHEMA_IN_BLOCKS = 7  # of one that lists blocks, which a version that knows none would leave out
 _SHOWN_SIDE = 320  # pixels of a view in a notebook
 _SEEN = 1e-3  # alpha below which a pixel has no depth
 _COVERED = 0.5  # alpha from which on a pixel's clear color is that of a surface

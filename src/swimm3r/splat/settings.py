@@ -31,6 +31,7 @@ from swimm3r.splat.gaussian_settings import (
     WaterSplattingSettings,
 )
 from swimm3r.splat.shared_settings import (
+    DILATION,
     MapSettings,
     MediumFieldSettings,
     RefineSettings,
@@ -53,8 +54,10 @@ class RenderSettings(Settings):
     """Reduction of the conditional covariance, which is not symmetric: its mean with its transpose, or its upper
     triangle as in UBS."""
     antialiasing: Literal["mip", "dilation"] = "dilation"
-    """Filter of primitives: widened by 0.3 px^2 in every view (dilation), as in 3DGS and UBS, or none smaller than a
+    """Filter of primitives: widened in every view (dilation), as in 3DGS and UBS, or none smaller than a
     pixel of the training images and averaged over the pixels of the view (mip, Mip-Splatting), for other sizes."""
+    dilation: Annotated[float, Range(0, 10)] = DILATION
+    """Variance added to every primitive on the image plane, pixels^2 (dilation)."""
     rotation: Literal["first_order", "exponential"] = "first_order"
     """Rotation of a primitive from its parameters A: I + A as in UBS, or exp(A)."""
     medium_depth_grad: Literal["full", "detach"] = "full"

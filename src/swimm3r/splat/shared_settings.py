@@ -5,6 +5,9 @@ from typing import Annotated, Literal
 
 from swimm3r.settings import Cadence, Count, LongSideOrOwn, NotNegative, Range, Rate, Seed, Settings, Share
 
+DILATION = 0.3
+"""Variance, pixels^2, that 3DGS and UBS add to every primitive on the image plane."""
+
 
 @dataclass(frozen=True)
 class MediumFieldSettings(Settings):

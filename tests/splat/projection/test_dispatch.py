@@ -11,10 +11,10 @@ from swimm3r.cameras import Cameras
 from swimm3r.cameras import project as project_points
 from swimm3r.splat.primitives.beta import BetaPrimitives
 from swimm3r.splat.projection.dispatch import project
-from swimm3r.splat.projection.pixel_filter import DILATION
 from swimm3r.splat.projection.plain import project_plainly
 from swimm3r.splat.projection.view_camera import Projection, ViewCamera, view_camera
 from swimm3r.splat.settings import RenderSettings
+from swimm3r.splat.shared_settings import DILATION
 
 Make = Callable[..., BetaPrimitives]
 

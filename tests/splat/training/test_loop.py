@@ -205,11 +205,16 @@ def test_an_observer_sees_the_map_grow_and_changes_none_of_its_bits(tiny_dive, t
 
 def test_the_first_steps_train_on_smaller_images_and_the_rest_on_whole_ones(tiny_dive, monkeypatch: pytest.MonkeyPatch):
     widths: list[int] = []
+    dilations: list[float] = []
     real = uwbs.draw
     monkeypatch.setattr(
         uwbs,
         "draw",
-        lambda p, field, view, *rest, **more: widths.append(view.width) or real(p, field, view, *rest, **more),
+        lambda p, field, view, drawn_by, *rest, **more: (
+            widths.append(view.width)
+            or dilations.append(drawn_by.render.dilation)
+            or real(p, field, view, drawn_by, *rest, **more)
+        ),
     )
     settings = replace(SETTINGS, iterations=4, coarse_until=0.5)
     views = TrainingViews(tiny_dive.rec, tiny_dive.frames, settings, 1.0)
@@ -219,3 +224,4 @@ def test_the_first_steps_train_on_smaller_images_and_the_rest_on_whole_ones(tiny
         state, _ = recipe.step(state, views[0], step)
     whole = views[0].rgb.shape[-1]
     assert widths == [whole // 2, whole // 2, whole, whole]
+    assert dilations == [0.075, 0.075, 0.3, 0.3]  # px^2: the same width in the scene

@@ -70,17 +70,17 @@ class MediumField(nn.Module):
             angles = octaves * time.to(features)
             now = self.gamma(torch.cat([angles.sin(), angles.cos()]))
             features = torch.cat([features, now.expand(*features.shape[:2], -1)], -1)
-        raw = self.network(features.permute(2, 0, 1)[None])[0]
-        return torch.cat([sigmoid(raw[:3]), softplus(raw[3:]) / self.length])
+        raw = self.network(features)
+        return torch.cat([sigmoid(raw[..., :3]), softplus(raw[..., 3:]) / self.length], -1).permute(2, 0, 1)
 
 
 def medium_network(settings: MediumFieldSettings, outputs: int, inputs: int = HARMONICS) -> nn.Sequential:
-    """The layers that settings ask for, on maps of features."""
+    """The layers that settings ask for."""
     activation, layers = nn.ReLU if settings.activation == "relu" else nn.Sigmoid, []
     for _ in range(settings.layers):
-        layers += [nn.Conv2d(inputs, settings.hidden, 1, bias=settings.biases), activation()]
+        layers += [nn.Linear(inputs, settings.hidden, bias=settings.biases), activation()]
         inputs = settings.hidden
-    return nn.Sequential(*layers, nn.Conv2d(inputs, outputs, 1, bias=settings.biases))
+    return nn.Sequential(*layers, nn.Linear(inputs, outputs, bias=settings.biases))
 
 
 Field = TypeVar("Field", bound=MediumField)
@@ -115,7 +115,7 @@ def initial_field(
         gray = torch.full((3,), 0.5)
         start = medium or Medium(gray, torch.full((3,), settings.prior), torch.full((3,), settings.prior))
         last = field.network[-1]
-        assert isinstance(last, nn.Conv2d)
+        assert isinstance(last, nn.Linear)
         assert last.bias is not None
         last.weight.zero_()  # the last layer learns first, from the medium as it is
         betas = torch.cat([start.beta_B, start.beta_D]).float().clamp(min=1e-3)
@@ -127,7 +127,7 @@ def at_random(field: Field, rng: torch.Generator) -> Field:
     """A field whose layers are drawn anew, in place: torch's own default, but from our generator."""
     with torch.no_grad():
         for layer in field.modules():
-            if isinstance(layer, nn.Conv2d | nn.Linear):
+            if isinstance(layer, nn.Linear):
                 bound = 1 / math.sqrt(layer.weight.shape[1])
                 layer.weight.uniform_(-bound, bound, generator=rng)
                 if layer.bias is not None:

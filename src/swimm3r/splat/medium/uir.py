@@ -23,8 +23,8 @@ class _SideBySide(nn.Module):
         super().__init__()
         self.backscatter, self.attenuation = backscatter, attenuation
 
-    def forward(self, features: Float[Tensor, "1 f h w"]) -> Float[Tensor, "1 9 h w"]:
-        return torch.cat([self.backscatter(features), self.attenuation(features)], 1)
+    def forward(self, features: Float[Tensor, "h w f"]) -> Float[Tensor, "h w 9"]:
+        return torch.cat([self.backscatter(features), self.attenuation(features)], -1)
 
 
 class UirField(MediumField):

@@ -5,7 +5,7 @@ finest pixel of a training image at its place, Mip-Splatting's filters (Yu et al
 
     S' = S + a h^2 / 12 I        Sigma2' = Sigma2 + a / 12 I        o' = o sqrt(det Sigma2 / det Sigma2')
 
-The dilation of 3DGS and UBS is Sigma2' = Sigma2 + 0.3 I, whatever the kernel, and keeps o.
+The dilation of 3DGS and UBS is Sigma2' = Sigma2 + d I with d = 0.3 px^2, whatever the kernel, and keeps o.
 """
 
 from typing import NamedTuple
@@ -20,8 +20,6 @@ from swimm3r.splat.settings import RenderSettings
 
 PIXEL = 1 / 12
 """Variance of a square pixel, pixels^2: of both filters, in training pixels the one and in the view's the other."""
-DILATION = 0.3
-"""pixels^2 that 3DGS and UBS add to every covariance on the image plane."""
 _LEAST_SHARE = 1e-6  # of a determinant that is left: float32 knows no smaller one
 
 
@@ -35,7 +33,7 @@ class Widening(NamedTuple):
 def widening(settings: RenderSettings | GaussianRenderSettings) -> Widening:
     """The additions that settings ask for. A Beta kernel's a is 2 (B + 2), a Gaussian's is 1."""
     if settings.antialiasing == "dilation":
-        return Widening((0.0, 0.0), (DILATION, 0.0))
+        return Widening((0.0, 0.0), (settings.dilation, 0.0))
     if isinstance(settings, GaussianRenderSettings):
         return Widening((PIXEL, 0.0), (PIXEL, 0.0))
     return Widening((4 * PIXEL, 2 * PIXEL), (4 * PIXEL, 2 * PIXEL))

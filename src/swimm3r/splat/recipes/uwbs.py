@@ -8,7 +8,7 @@ known surfaces opaque (`coverage`), open water empty (`open_water`) and clear co
 
 import copy
 from collections.abc import Collection
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import torch
 from jaxtyping import Float
@@ -36,6 +36,8 @@ from swimm3r.splat.training.state import FIELD, POSES, State, clip_field, first_
 from swimm3r.splat.views import TrainingView, smaller
 
 _HORIZON_STD = 0.2  # of the open water's color around the scene's mean color, as structure from motion assumes
+
+_COARSE = 2  # times the size of a pixel in the first steps
 
 
 @dataclass(frozen=True)
@@ -82,8 +84,8 @@ class Uwbs:
         """One view: forward and adjoint, densification on its cadence, Adam."""
         if self._looks_for_movers(step):
             state = self._with_movers(state, step)
-        if step <= self.settings.coarse_until * self.settings.iterations:
-            view = smaller(view, 2)
+        if self._is_coarse(step):
+            view = smaller(view, _COARSE)
         adjoint = self._adjoint(state, view, step)
         rates = self._rates(step, adjoint.gradients)
         if schedule.has_round(self.settings.densify, step, self.settings.iterations):
@@ -99,6 +101,8 @@ class Uwbs:
         filtered = settings.sgg.enabled and share <= settings.sgg.end
         pinhole_view = self.scene.pinhole_view(view, state.poses)
         drawn = self._with_neighbors(p)
+        if self._is_coarse(step):
+            settings = _on_larger_pixels(settings)
         drawing = draw(drawn, state.field, pinhole_view, settings, view.time, sgg=filtered)
         loss = objective(drawn, drawing, view, settings, self.prior, self._regularized(share))
         numbers, total = loss.numbers | {"primitives": float(len(p.xyz))}, loss.total
@@ -139,6 +143,9 @@ class Uwbs:
         if self.settings.densify.noise_cadence == "step":
             rng = loop.generator(self.settings.seed, step, 8)
             xyz.add_(self._noise(state.primitives, rates["xyz"], rng))
+
+    def _is_coarse(self, step: int) -> bool:
+        return step <= self.settings.coarse_until * self.settings.iterations
 
     def _regularized(self, share: float) -> bool:
         return self.settings.weights.mcmc_begin < share <= self.settings.weights.mcmc_end
@@ -250,6 +257,12 @@ def objective(
         total = total + w.opacity * opacity + w.scale * scale
         numbers |= {"opacity": opacity, "scale": scale}
     return UwbsObjective(total, depth, {"loss": total} | numbers)
+
+
+def _on_larger_pixels(settings: UwbsSettings) -> UwbsSettings:
+    """Settings by which views of 1 / _COARSE the size draw primitives as wide, in the scene, as whole views do."""
+    render = settings.render
+    return replace(settings, render=replace(render, dilation=render.dilation / _COARSE**2))
 
 
 def measured_water(rec: Reconstruction) -> MediumFit | None:

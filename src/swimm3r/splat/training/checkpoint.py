@@ -9,7 +9,7 @@ from torch import Tensor
 from swimm3r.io.files.damage import Remedy
 from swimm3r.io.files.tensor_file import TensorFile, read_tensors, write_tensors
 
-SCHEMA = 2  # 1: Swimm3R 0.1, whose settings have other names
+SCHEMA = 3  # 2: the water's layers are convolutions; 1: Swimm3R 0.1, whose settings have other names
 
 
 @dataclass(frozen=True)
