@@ -6,9 +6,9 @@ frames' poses where they were refined, their colors where each has its own, smal
 that notebooks show the map from. That of a large map (`schema` 7) holds no primitives but lists the files of its blocks
 (`splat.block_store`), which lie in blocks/ beside it.
 
-Earlier maps, of one block and of several: the water's layers are 1 x 1 convolutions (schema 4 and 5); besides, there are
-no footprints, and maps are drawn dilated, as they were trained (2 and 3); settings have other names, and are not read
-(1, Swimm3R 0.1). A checkpoint adds the optimizer's moments and the step.
+Earlier maps, of one block and of several: the water's layers are 1 x 1 convolutions (schema 4 and 5); besides, there
+are no footprints, and maps are drawn dilated, as they were trained (2 and 3); settings have other names, and are not
+read (1, Swimm3R 0.1). A checkpoint adds the optimizer's moments and the step.
 """
 
 from collections.abc import Mapping
