@@ -15,7 +15,14 @@ from swimm3r.scene.frames import Frames
 from swimm3r.scene.reconstruction import DepthMaps, Points, Reconstruction, Tracks
 from swimm3r.scene.reconstruction_io import load_reconstruction
 from swimm3r.scene.settings import FrameSettings
-from swimm3r.sfm.moving.find import find_moving, mask_depth, still_scene, with_moving, without_moving_observations
+from swimm3r.sfm.moving.find import (
+    beside_edges,
+    find_moving,
+    mask_depth,
+    still_scene,
+    with_moving,
+    without_moving_observations,
+)
 
 ROWS, COLUMNS = slice(24, 50), slice(30, 60)
 MOVED = 3  # the frame with the object
@@ -145,3 +152,11 @@ def with_points(rec: Reconstruction) -> Reconstruction:
     frame, point = visible.nonzero().unbind(-1)
     points = Points(xyz, torch.zeros(len(xyz), 3), torch.zeros(len(xyz), dtype=torch.float64))
     return replace(rec, points=points, tracks=Tracks(point, frame, uv[frame, point]))
+
+
+def test_surfaces_end_a_pixel_before_depth_edges_and_slopes_and_gaps_are_none() -> None:
+    z_depth = np.tile(np.linspace(2, 2.5, 12, dtype=np.float32), (8, 1))
+    assert not beside_edges(z_depth).any()
+    z_depth[:, 6:] *= 1.5
+    z_depth[:, 3] = 0
+    assert np.array_equal(np.flatnonzero(beside_edges(z_depth)[4]), [5, 6])

@@ -2,12 +2,23 @@
 
 import numpy as np
 import pytest
+import torch
 
-from swimm3r.sfm.moving.occluders import Layer, SmallView, moving_pixels, votes_on
+from swimm3r.cameras import Cameras
+from swimm3r.sfm.moving.comparison import Pair, SmallView
+from swimm3r.sfm.moving.occluders import Layer, moving_pixels, votes_on
 
 HEIGHT, WIDTH = 60, 80
 OBJECT = (slice(20, 40), slice(30, 55))
 GROUND = 3.0
+CAMERA = Cameras(
+    torch.tensor([[[80.0, 0, WIDTH / 2], [0, 80, HEIGHT / 2], [0, 0, 1]]]),
+    torch.zeros(1, 0),
+    torch.eye(4, dtype=torch.float64)[None],
+    WIDTH,
+    HEIGHT,
+)
+ALIKE = Pair(np.ones(3), 0.06)  # frames of one exposure
 
 
 def ground() -> np.ndarray:
@@ -20,12 +31,12 @@ def ground() -> np.ndarray:
 def layer(rgb: np.ndarray, z_depth: float = GROUND, rows: slice = slice(None)) -> Layer:
     """A surface that another frame measured at every pixel of some rows."""
     pixel = np.arange(HEIGHT * WIDTH).reshape(HEIGHT, WIDTH)[rows].reshape(-1)
-    return Layer(pixel, np.full(len(pixel), z_depth, np.float32), rgb.reshape(-1, 3)[pixel])
+    return Layer(view(rgb), pixel, pixel, np.full(len(pixel), z_depth, np.float32))
 
 
 def view(rgb: np.ndarray, z_depth: float = 0.0) -> SmallView:
     """A frame, all of it usable; without depth unless it is given."""
-    return SmallView(rgb, np.full(rgb.shape[:2], z_depth, np.float32), np.ones(rgb.shape[:2], bool))
+    return SmallView(CAMERA, rgb, np.full(rgb.shape[:2], z_depth, np.float32), np.ones(rgb.shape[:2], bool))
 
 
 @pytest.fixture
@@ -63,9 +74,15 @@ def test_exposure_and_white_balance_are_no_movement() -> None:
     assert not moving_pixels(view(brighter), [layer(ground())] * 4).any()
 
 
+def test_places_are_known_to_a_pixel_in_both_frames(with_object: np.ndarray) -> None:
+    shifted = np.roll(with_object, 2, axis=1)
+    assert not votes_on(view(shifted), [layer(with_object)], [ALIKE]).different.any()
+    assert votes_on(view(np.roll(shifted, 2, axis=1)), [layer(with_object)], [ALIKE]).different.any()
+
+
 def test_a_measured_surface_hides_what_lies_behind_it(with_object: np.ndarray) -> None:
     near = view(with_object, GROUND / 2)
-    assert not votes_on(near, [layer(ground())] * 4).different.any()
+    assert not votes_on(near, [layer(ground())] * 4, [ALIKE] * 4).different.any()
     assert not moving_pixels(near, [layer(ground())] * 4).any()
 
 
@@ -78,5 +95,5 @@ def test_one_frame_alone_decides_nothing(with_object: np.ndarray) -> None:
 
 
 def test_pixels_that_are_not_to_be_used_are_no_objects(with_object: np.ndarray, truth: np.ndarray) -> None:
-    unusable = SmallView(with_object, np.zeros((HEIGHT, WIDTH), np.float32), ~truth)
+    unusable = SmallView(CAMERA, with_object, np.zeros((HEIGHT, WIDTH), np.float32), ~truth)
     assert not moving_pixels(unusable, [layer(ground())] * 4).any()

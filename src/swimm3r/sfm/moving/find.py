@@ -23,7 +23,8 @@ from swimm3r.progress import Progress, silent
 from swimm3r.scene.frames import Frames
 from swimm3r.scene.moving_masks import MovingMasks
 from swimm3r.scene.reconstruction import DepthMap, QualityWarning, Reconstruction, Tracks
-from swimm3r.sfm.moving.occluders import Layer, SmallView, moving_pixels
+from swimm3r.sfm.moving.comparison import SmallView
+from swimm3r.sfm.moving.occluders import Layer, measured_range, moving_pixels
 from swimm3r.tasks.threads import thread_count
 
 _LONG_SIDE = 256  # of the images that are compared, pixels
@@ -32,16 +33,18 @@ _OTHERS = 16  # frames that a frame is compared with
 _NOTABLE = 0.01  # of the pixels of all frames, from which a user should look at the masks
 _SHARED = 0.05  # of a frame's surface that another one must show to be compared with it
 _SAMPLES = 64  # points of a frame's surface that decide this
+_EDGE = 0.1  # share of a depth by which it jumps at an edge
 _KEPT = 128  # frames in memory, 3 MB each at most
 _CORNERS = ((0, 0), (0, 1), (1, 0), (1, 1))  # pixels around a point, which together leave no cracks
 
 
 @dataclass(frozen=True)
 class _Surface:
-    """The points that one frame measured, with their colors there."""
+    """The points that one frame measured, without those beside depth edges."""
 
+    view: SmallView
     xyz: Float[Tensor, "n 3"]  # world
-    rgb: Float[np.ndarray, "n 3"]
+    at: Int[np.ndarray, " n"]  # row-major index of their pixels
 
 
 @dataclass(frozen=True)
@@ -84,11 +87,8 @@ class StillScene:
         """
         camera = resized(lens, self.cameras.width, self.cameras.height)
         layers = self._layers(camera, self._overlapping(camera))
-        nearest = np.full(camera.height * camera.width, np.inf, np.float32)
-        for layer in layers:
-            nearest[layer.pixel] = np.minimum(nearest[layer.pixel], layer.z_depth)
-        z_depth = np.where(np.isfinite(nearest), nearest, 0).reshape(camera.height, camera.width)
-        view = SmallView(_small(image, camera), z_depth, np.ones_like(z_depth, dtype=bool))
+        z_depth = measured_range((camera.height, camera.width), layers).nearest
+        view = SmallView(camera, _small(image, camera), z_depth, np.ones_like(z_depth, dtype=bool))
         return enlarged(moving_pixels(view, layers), lens.height, lens.width)
 
     def _overlapping(self, camera: Cameras) -> list[int]:
@@ -104,12 +104,13 @@ class StillScene:
     def _read_view(self, i: int) -> SmallView:
         f = self.frames.index(self.rec.names[i])
         usable = self._small_grid(self.frames.mask(f).numpy())
-        return SmallView(_small(self.frames.image(f), self.cameras[i]), self._z_depth(i), usable)
+        camera = self.cameras[i]
+        return SmallView(camera, _small(self.frames.image(f), camera), self._z_depth(i), usable)
 
     def _read_surface(self, i: int) -> _Surface:
         view = self._view(i)
-        known = np.flatnonzero(view.z_depth)
-        return _Surface(self._points(i, view.z_depth, known), view.rgb.reshape(-1, 3)[known])
+        known = np.flatnonzero((view.z_depth > 0) & ~beside_edges(view.z_depth))
+        return _Surface(view, self._points(i, view.z_depth, known), known)
 
     def _z_depth(self, i: int) -> Float[np.ndarray, "h w"]:
         return self._small_grid(self.rec.depth[self.rec.names[i]].z_depth.numpy())
@@ -213,10 +214,19 @@ def enlarged(mask: Bool[np.ndarray, "sh sw"], height: int, width: int) -> Bool[T
     return torch.from_numpy(cv2.resize(mask.astype(np.float32), (width, height), interpolation=cv2.INTER_LINEAR) > 0.5)
 
 
+def beside_edges(z_depth: Float[np.ndarray, "h w"]) -> Bool[np.ndarray, "h w"]:
+    """The pixels beside which depth jumps: dense depth puts edges a pixel or two away from where they are."""
+    import cv2
+
+    around = np.ones((3, 3), np.uint8)
+    nearest = cv2.erode(np.where(z_depth > 0, z_depth, np.inf).astype(np.float32), around)
+    return cv2.dilate(z_depth, around) / (1 + _EDGE) > nearest
+
+
 def _layer(camera: Cameras, surface: _Surface) -> Layer:
     """A frame's surface in another image: the nearest point at each pixel."""
     uv, z, visible = (part[0].numpy() for part in project_visible(camera, surface.xyz[None]))
-    uv, z, rgb = uv[visible], z[visible].astype(np.float32), surface.rgb[visible]
+    uv, z, at = uv[visible], z[visible].astype(np.float32), surface.at[visible]
     far_to_near = np.argsort(-z)
     around = np.floor(uv[far_to_near, None] - 0.5).astype(np.int64) + np.array(_CORNERS)
     point, (column, row) = far_to_near.repeat(len(_CORNERS)), around.reshape(-1, 2).T
@@ -224,7 +234,7 @@ def _layer(camera: Cameras, surface: _Surface) -> Layer:
     nearest = np.full(camera.height * camera.width, -1)
     nearest[(row * camera.width + column)[inside]] = point[inside]  # of several points the last, which is the nearest
     pixel = np.flatnonzero(nearest >= 0)
-    return Layer(pixel, z[nearest[pixel]], rgb[nearest[pixel]])
+    return Layer(surface.view, at[nearest[pixel]], pixel, z[nearest[pixel]])
 
 
 def _spread(frames: Sequence[int]) -> list[int]:

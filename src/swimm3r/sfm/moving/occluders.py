@@ -1,14 +1,10 @@
 """Moving objects: pixels that hide surfaces which other frames measured there, and are no measured surface themselves.
 
 A point X of frame s, at a depth that other frames confirmed, lies at pixel x of frame t. Unless t has a measured
-surface nearer than X, it must show X there, so that
-
-    d = |g I_s(X) - I_t(x)| <= max(0.06, 4 q)
-
-with g the gains between the frames' channels, d that of the worst channel, and q the d that three quarters of the
-pair's points keep. I_t(x) is the range of colors in 3 x 3 pixels, as x is known to a pixel. Where most of the frames
-that measured a surface disagree, t shows something that was elsewhere when they were taken. These pixels, and those
-where frames agree, say by their colors (GrabCut; Rother et al. 2004) where the object ends in between.
+surface nearer than X, it must show X there, in the color that it has in s (`comparison`). Where most of the frames that
+measured a surface disagree, t shows something else: an object that was elsewhere when they were taken, or one at rest
+of another depth, which was not measured. The latter is seen along epipolar lines (`parallax`) and left out. The rest,
+and the pixels where frames agree, say by their colors (GrabCut; Rother et al. 2004) where the object ends in between.
 """
 
 from collections.abc import Sequence
@@ -17,10 +13,9 @@ from dataclasses import dataclass
 import numpy as np
 from jaxtyping import Bool, Float, Int, UInt8
 
-_USUAL = 0.75  # share of a pair's points, fewer than which move, whose differences are usual
-_OFF = 4.0  # such differences beyond which colors differ
-_LEAST = 0.06  # pixel value, differences that exposure, water and caustics may make
-_DARK = 0.02  # pixel value below which ratios of colors are noise
+from swimm3r.sfm.moving.comparison import Pair, SmallView, color_range, compared, exactly
+from swimm3r.sfm.moving.parallax import MeasuredRange, explained
+
 _NEARER = 0.05  # share of a depth by which one surface is before another
 _FRAMES = 2  # that must have measured a surface at a pixel
 _SAME = 0.34  # share of these frames from which a pixel is what they measured
@@ -32,21 +27,18 @@ _DECIDED = 0.25  # share of an object's pixels that other frames must decide; el
 
 
 @dataclass(frozen=True)
-class SmallView:
-    """A small image of a frame with what is measured in it."""
-
-    rgb: Float[np.ndarray, "h w 3"]
-    z_depth: Float[np.ndarray, "h w"]  # confirmed by other frames; 0 where unknown
-    usable: Bool[np.ndarray, "h w"]
-
-
-@dataclass(frozen=True)
 class Layer:
     """The surfaces that another frame measured, in the image of a frame: one row per pixel of it."""
 
-    pixel: Int[np.ndarray, " n"]  # row-major index
+    view: SmallView  # the other frame
+    at: Int[np.ndarray, " n"]  # row-major index of the pixel that shows the surface there
+    pixel: Int[np.ndarray, " n"]  # row-major index in the frame
     z_depth: Float[np.ndarray, " n"]  # in the frame
-    rgb: Float[np.ndarray, "n 3"]  # as the other frame shows them
+
+    @property
+    def rgb(self) -> Float[np.ndarray, "n 3"]:
+        """Colors of the surfaces as the other frame shows them."""
+        return self.view.rgb.reshape(-1, 3)[self.at]
 
 
 @dataclass(frozen=True)
@@ -64,39 +56,42 @@ class Votes:
 
 def moving_pixels(view: SmallView, layers: Sequence[Layer]) -> Bool[np.ndarray, "h w"]:
     """The pixels of a frame that show moving objects, by the layers of other frames."""
-    votes = votes_on(view, layers)
+    rgb, colors = view.rgb.reshape(-1, 3), color_range(view.rgb)
+    pairs = [compared(rgb[layer.pixel], colors.at(layer.pixel), layer.rgb) for layer in layers]
+    votes = votes_on(view, layers, pairs)
     decided = (votes.same + votes.different >= _FRAMES) & (votes.share_same < _SAME) & view.usable
     decided = _opened(decided)
+    if decided.any():
+        others = [layer.view for layer in layers]
+        at_rest = explained(view, others, pairs, decided, measured_range(decided.shape, layers))
+        decided = _opened(decided & ~at_rest)
     if not decided.any():
         return decided
     still = _eroded((votes.share_same >= _STILL) & (votes.same >= _FRAMES))
     return _objects(view.rgb, decided, still) & view.usable
 
 
-def votes_on(view: SmallView, layers: Sequence[Layer]) -> Votes:
+def votes_on(view: SmallView, layers: Sequence[Layer], pairs: Sequence[Pair]) -> Votes:
     """Comparison of every pixel of a frame with the surfaces that other frames measured there."""
-    import cv2
-
-    around = np.ones((3, 3), np.uint8)
-    low, high = (change(view.rgb, around).reshape(-1, 3) for change in (cv2.erode, cv2.dilate))
-    mine, own_depth = view.rgb.reshape(-1, 3), view.z_depth.reshape(-1)
+    colors, own_depth = color_range(view.rgb), view.z_depth.reshape(-1)
     same, different = np.zeros((2, own_depth.size), np.int32)
-    for layer in layers:
+    for layer, pair in zip(layers, pairs, strict=True):
         at = layer.pixel
-        rgb = layer.rgb * _gains(layer.rgb, mine[at])
-        off = np.maximum(0, np.maximum(low[at] - rgb, rgb - high[at])).max(1, initial=0)
-        limit = max(_LEAST, _OFF * np.quantile(off, _USUAL)) if len(at) else _LEAST
+        mine, around = colors.at(at), color_range(layer.view.rgb).at(layer.at).times(pair.gains)
         hidden = (own_depth[at] > 0) & (layer.z_depth > (1 + _NEARER) * own_depth[at])
-        same[at[~hidden & (off < limit / 2)]] += 1
-        different[at[~hidden & (off > limit)]] += 1
+        same[at[~hidden & (mine.distance(exactly(layer.rgb * pair.gains)) < pair.limit / 2)]] += 1
+        different[at[~hidden & (mine.distance(around) > pair.limit)]] += 1
     return Votes(same.reshape(view.z_depth.shape), different.reshape(view.z_depth.shape))
 
 
-def _gains(rgb: Float[np.ndarray, "n 3"], target: Float[np.ndarray, "n 3"]) -> Float[np.ndarray, "3"]:
-    """Factors on the channels between two frames; they differ in exposure and white balance."""
-    if not len(rgb):
-        return np.ones(3)
-    return np.exp(np.median(np.log(np.maximum(target, _DARK) / np.maximum(rgb, _DARK)), axis=0))
+def measured_range(shape: tuple[int, ...], layers: Sequence[Layer]) -> MeasuredRange:
+    """The depths of the surfaces that the layers hold at each pixel."""
+    nearest, farthest = np.full(shape, np.inf, np.float32), np.zeros(shape, np.float32)
+    for layer in layers:
+        at = np.unravel_index(layer.pixel, shape)
+        nearest[at] = np.minimum(nearest[at], layer.z_depth)
+        farthest[at] = np.maximum(farthest[at], layer.z_depth)
+    return MeasuredRange(np.where(np.isfinite(nearest), nearest, 0), farthest)
 
 
 def _objects(
