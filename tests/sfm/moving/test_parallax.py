@@ -38,7 +38,7 @@ def camera(frame: int, step: tuple[float, float]) -> Cameras:
 
 
 def points(lens: Cameras, z_depth: float) -> Float[np.ndarray, "h w 3"]:
-    """Where the rays of the pixels meet a plane."""
+    """The points of a plane on the rays of the pixels."""
     pixels = pixel_grid(HEIGHT, WIDTH).reshape(1, -1, 2).double()
     z = torch.full((1, HEIGHT * WIDTH), z_depth, dtype=torch.float64)
     return unproject(lens, pixels, z).reshape(HEIGHT, WIDTH, 3).numpy()
