@@ -30,7 +30,7 @@ from views import Shots, read_shots, true_partners
 
 from swimm3r.cameras import Cameras, cameras_of, pixel_grid
 from swimm3r.datasets import PairSettings
-from swimm3r.evaluate.underwater import water_scores_from_views
+from swimm3r.evaluate.underwater import view_water_errors, water_scores_from_errors
 from swimm3r.geometry import relative_poses, rotation_angle
 from swimm3r.io import images
 from swimm3r.io.colmap.model import read_model
@@ -174,7 +174,8 @@ def sea_thru(shots: Shots, folder: Path, near: bool, chosen: Sequence[int]) -> t
 def water_errors(views: list[tuple[Tensor, Medium]], true: Medium) -> tuple[float, float]:
     """Mean absolute errors of T_D and B over pixels and channels."""
     identifiable = {name: torch.zeros(3, dtype=torch.bool) for name in _COEFFICIENTS}
-    found = water_scores_from_views(views, true, identifiable, true)
+    errors = [view_water_errors(ray_depth, medium, true) for ray_depth, medium in views]
+    found = water_scores_from_errors(errors, true, identifiable, true)
     return float(np.mean(found.T_D_abs)), float(np.mean(found.B_abs))
 
 

@@ -16,8 +16,9 @@ from swimm3r.evaluate.underwater import (
     strength_gain,
     uciqe,
     uiqm,
+    view_water_errors,
     water_scores,
-    water_scores_from_views,
+    water_scores_from_errors,
 )
 from swimm3r.medium import AttenuationCurve, Medium, MediumFit, add_water, backscatter, remove_water
 
@@ -141,7 +142,7 @@ def test_linear_light_is_not_compared_with_stored_values():
 def test_a_medium_that_varies_over_the_image_is_scored_at_its_pixels():
     varying = Medium(*(v.expand(5, 8, 3).clone() for v in (WATER.Binf, WATER.beta_D, WATER.beta_B)))
     varying.Binf[:, :4] += 0.1
-    scores = water_scores_from_views([(Z, varying)], WATER, fit_of(WATER).identifiable, WATER)
+    scores = water_scores_from_errors([view_water_errors(Z, varying, WATER)], WATER, fit_of(WATER).identifiable, WATER)
     expected = 0.1 * (1 - torch.exp(-WATER.beta_B[0] * Z[:, :4])).sum().item() / 40
     assert scores.B_abs[0] == pytest.approx(expected, rel=1e-5)
     assert scores.T_D_abs == pytest.approx([0, 0, 0], abs=1e-6)
@@ -192,7 +193,7 @@ def test_pixels_count_where_enough_of_a_lamps_light_arrives():
 
 def test_backscatter_under_a_lamp_is_compared_with_the_given_one():
     glow = torch.full((5, 8, 3), 0.25)
-    views = [(Z, WATER, backscatter(Z, WATER) + glow)]
-    scores = water_scores_from_views(views, WATER, fit_of(WATER).identifiable, WATER)
+    errors = [view_water_errors(Z, WATER, WATER, backscatter(Z, WATER) + glow)]
+    scores = water_scores_from_errors(errors, WATER, fit_of(WATER).identifiable, WATER)
     assert scores.B_abs == pytest.approx([0.25] * 3, rel=1e-4)
     assert scores.T_D_abs == [0, 0, 0]

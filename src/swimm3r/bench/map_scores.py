@@ -12,7 +12,7 @@ from swimm3r.io.files.metrics_log import read_rows
 from swimm3r.io.view_names import view_stems
 from swimm3r.pipeline import held_out
 from swimm3r.pipeline.run import FinishedSfm
-from swimm3r.pipeline.summary import truth_section
+from swimm3r.pipeline.truth_summary import truth_section
 from swimm3r.progress import Progress, silent
 from swimm3r.splat import train
 from swimm3r.splat.map_file import load_map

@@ -5,7 +5,7 @@
 over the pixels where both are known (finite and > 0), then averaged over frames.
 """
 
-from collections.abc import Sequence
+from collections.abc import Iterable
 from dataclasses import dataclass
 from typing import Literal
 
@@ -31,44 +31,41 @@ class DepthScores:
 
 
 def depth_scores(
-    predicted: Sequence[Float[Tensor, "_ _"]],
-    true: Sequence[Float[Tensor, "_ _"]],
+    pairs: Iterable[tuple[Float[Tensor, "_ _"], Float[Tensor, "_ _"]]],
     align: DepthAlignment = "median",
     max_depth: float | None = None,
 ) -> DepthScores:
-    """Scores of a sequence of depth maps, both of z_depth or both of ray_depth; 0 or not finite means unknown.
+    """Scores of predicted and true depth maps of a sequence, both of z_depth or ray_depth; 0 or not finite is unknown.
 
     `median` scales each frame by median(true) / median(predicted) over its common pixels, `sequence_median` all frames
-    by that of all their pixels together, `none` trusts the unit. Pixels truly at `max_depth` or beyond do not count.
+    by that of all their pixels together, for which it keeps them; `none` trusts the unit. Pixels truly at `max_depth`
+    or beyond do not count.
     """
-    if len(predicted) != len(true):
-        raise ValueError(f"{len(predicted)} predicted depth maps for {len(true)} true ones")
-    pairs, known_pixels = [], 0
-    for p, g in zip(predicted, true, strict=True):
+    frames, kept, known_pixels, scored_pixels = [], [], 0, 0
+    for p, g in pairs:
         if p.shape != g.shape:
             raise ValueError(f"a predicted depth map of {tuple(p.shape)} pixels for a true one of {tuple(g.shape)}")
         known = _known(g) & (g < (torch.inf if max_depth is None else max_depth))
-        known_pixels += int(known.sum())
         scored = known & _known(p)
-        if scored.any():
-            pairs.append((p[scored].double(), g[scored].double()))
-    if not pairs:
+        known_pixels, scored_pixels = known_pixels + int(known.sum()), scored_pixels + int(scored.sum())
+        if not scored.any():
+            continue
+        p, g = p[scored].double(), g[scored].double()
+        match align:
+            case "none":
+                frames.append(_frame_scores(p, g))
+            case "median":
+                frames.append(_frame_scores(_median(g) / _median(p) * p, g))
+            case "sequence_median":
+                kept.append((p, g))
+    if kept:
+        scale = _median(torch.cat([g for _, g in kept])) / _median(torch.cat([p for p, _ in kept]))
+        frames = [_frame_scores(scale * p, g) for p, g in kept]
+    if not frames:
         none = NotComputed("no pixel has both a predicted and a true depth")
         return DepthScores(none, none, none, none, 0, align)
-    match align:
-        case "none":
-            scales = [1.0] * len(pairs)
-        case "median":
-            scales = [_median(g) / _median(p) for p, g in pairs]
-        case "sequence_median":
-            scales = [_median(torch.cat([g for _, g in pairs])) / _median(torch.cat([p for p, _ in pairs]))] * len(
-                pairs
-            )
-    scored = [_frame_scores(s * p, g) for s, (p, g) in zip(scales, pairs, strict=True)]
-    frames = torch.tensor(scored, dtype=torch.float64)
-    absrel, delta, rmse_log = frames.mean(0).tolist()
-    coverage = sum(len(g) for _, g in pairs) / known_pixels
-    return DepthScores(absrel, 100 * delta, rmse_log, coverage, len(pairs), align)
+    absrel, delta, rmse_log = torch.tensor(frames, dtype=torch.float64).mean(0).tolist()
+    return DepthScores(absrel, 100 * delta, rmse_log, scored_pixels / known_pixels, len(frames), align)
 
 
 def _frame_scores(p: Float[Tensor, " n"], g: Float[Tensor, " n"]) -> tuple[float, float, float]:

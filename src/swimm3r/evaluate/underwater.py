@@ -7,7 +7,7 @@ Against a synthetic truth: mean absolute errors of the direct transmittance T_D 
 their true ray depth, and the PSNR of clear colors where enough light is left to tell (true T_D > 0.05).
 """
 
-from collections.abc import Iterable
+from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -43,6 +43,15 @@ class Uiqm:
     uism: float
     uiconm: float
     variant: str
+
+
+@dataclass(frozen=True)
+class WaterErrors:
+    """Absolute errors of an estimated water in one view, per RGB channel, summed over its pixels of known depth."""
+
+    T_D: Float[Tensor, "3"]
+    B: Float[Tensor, "3"]
+    pixels: int
 
 
 @dataclass(frozen=True)
@@ -106,29 +115,36 @@ def water_scores(
     """
     if fit.encoding != encoding:
         raise ValueError(f"the fit explains {fit.encoding} values, the true water {encoding} ones")
-    return water_scores_from_views(((z, fit.at(z)) for z in ray_depths), fit.constant(), fit.identifiable, true)
+    errors = [view_water_errors(z, fit.at(z), true) for z in ray_depths]
+    return water_scores_from_errors(errors, fit.constant(), fit.identifiable, true)
 
 
-def water_scores_from_views(
-    views: Iterable[tuple[Float[Tensor, "_ _"], Medium] | tuple[Float[Tensor, "_ _"], Medium, Float[Tensor, "_ _ 3"]]],
-    coefficients: Medium,
-    identifiable: dict[str, Bool[Tensor, "3"]],
+def view_water_errors(
+    ray_depth: Float[Tensor, "h w"],
+    estimated: Medium,
     true: Medium,
-) -> WaterScores:
-    """The same for a water that varies over the image: per view the true ray depth and the medium at its pixels.
+    true_backscatter: Float[Tensor, "h w 3"] | None = None,
+) -> WaterErrors:
+    """Errors of a water that may vary over the image, at the pixels of one view with their true ray depth.
 
-    A third entry of a view is its true backscatter where that of the true water is not it: under a lamp. `coefficients`
-    are the scene's three numbers per channel that are reported and compared with the truth.
+    `true_backscatter` is given where that of the true water is not it: under a lamp.
     """
-    T_D_error, B_error, pixels = torch.zeros(3).double(), torch.zeros(3).double(), 0
-    for ray_depth, estimated, *given in views:
-        z = ray_depth.double()
-        seen = torch.isfinite(z) & (z > 0)
-        T_D_off = (transmittances(z, estimated)[0] - transmittances(z, true)[0]).abs()
-        B_off = (backscatter(z, estimated) - (given[0] if given else backscatter(z, true))).abs()
-        T_D_error += T_D_off[seen].sum(0)
-        B_error += B_off[seen].sum(0)
-        pixels += int(seen.sum())
+    z = ray_depth.double()
+    seen = torch.isfinite(z) & (z > 0)
+    T_D_off = (transmittances(z, estimated)[0] - transmittances(z, true)[0]).abs()
+    true_B = backscatter(z, true) if true_backscatter is None else true_backscatter
+    B_off = (backscatter(z, estimated) - true_B).abs()
+    return WaterErrors(T_D_off[seen].sum(0), B_off[seen].sum(0), int(seen.sum()))
+
+
+def water_scores_from_errors(
+    errors: Sequence[WaterErrors], coefficients: Medium, identifiable: dict[str, Bool[Tensor, "3"]], true: Medium
+) -> WaterScores:
+    """Scores over the pixels of all views.
+
+    `coefficients` are the scene's three numbers per channel that are reported and compared with the truth.
+    """
+    pixels = sum(each.pixels for each in errors)
     if not pixels:
         raise ValueError("no pixel has a true depth to compare the water at")
 
@@ -138,8 +154,8 @@ def water_scores_from_views(
         return [e.item() if k else None for e, k in zip((estimate - truth).abs() / truth, known, strict=True)]
 
     return WaterScores(
-        T_D_abs=(T_D_error / pixels).tolist(),
-        B_abs=(B_error / pixels).tolist(),
+        T_D_abs=(torch.stack([each.T_D for each in errors]).sum(0) / pixels).tolist(),
+        B_abs=(torch.stack([each.B for each in errors]).sum(0) / pixels).tolist(),
         Binf_abs=(coefficients.Binf.double() - true.Binf.double()).abs().tolist(),
         beta_D_rel=relative("beta_D"),
         beta_B_rel=relative("beta_B"),

@@ -16,6 +16,7 @@ from swimm3r.pipeline import summary as sections
 from swimm3r.pipeline.presets import RunSettings
 from swimm3r.pipeline.renders import display_style, write_flythrough
 from swimm3r.pipeline.restored_scores import restored_section
+from swimm3r.pipeline.truth_summary import truth_section
 from swimm3r.progress import Progress, silent
 from swimm3r.scene.frames import Frames
 from swimm3r.scene.ground_truth import GroundTruth
@@ -85,7 +86,7 @@ def score_map(
     return {
         "test": sections.test_section(views, test, scene.colors is not None),
         "restored": {"splat": restored_section(physical, shown, progress)},
-        "truth": sections.truth_section(rec, frames, truth, scene, views, progress) if truth else None,
+        "truth": truth_section(rec, frames, truth, scene, views, progress) if truth else None,
     }
 
 

@@ -64,6 +64,11 @@ class GroundTruth:
         self._check_size(path, rgb)
         return torch.from_numpy(rgb.astype(np.float32)) / (255.0 if rgb.dtype == np.uint8 else 65535.0)
 
+    @property
+    def lit(self) -> bool:
+        """True for a dive under a lamp."""
+        return self.folder is not None and (self.folder / "lamp").is_dir()
+
     def lamp(self, name: str) -> LampImages | None:
         """Light on the surfaces and backscatter of a dive under a lamp; None in daylight."""
         path = self._path("lamp", f"{name}.npz")

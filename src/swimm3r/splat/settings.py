@@ -215,6 +215,8 @@ class BlockSettings(Settings):
     `initial.primitives` and `densify.cap_max` are those of a block as large as this."""
     margin: NotNegative = 0.25
     """Ground around a block that is trained with it and then left to its neighbors, in median depths."""
+    steps: Annotated[float, Range(above=0, most=10)] = 1.5
+    """Steps of a block, in those that show its ground as often as a map of one block is shown its own."""
     water_steps: PositiveShare = 0.5
     """Length of the training of the water that all blocks share, on a coarse map of the dive, in `iterations`."""
 

@@ -204,7 +204,7 @@ def sequence_depth_scores(
         known += pixels
         if rec is None or name not in rec.names or name not in rec.depth:
             continue
-        frame = depth_scores([rec.depth[name].z_depth], [true])
+        frame = depth_scores([(rec.depth[name].z_depth, true)])
         if not isinstance(frame.absrel, NotComputed):
             totals += torch.tensor([frame.absrel, frame.delta_125, frame.rmse_log], dtype=torch.float64)
             covered += pixels * float(frame.coverage) if not isinstance(frame.coverage, NotComputed) else 0.0

@@ -270,7 +270,7 @@ def of_block(settings: UwbsSettings, block: PlannedBlock, views: BlockViews) -> 
     start = replace(settings.initial, primitives=max(_FEWEST, round(share * settings.initial.primitives)))
     most = replace(settings.densify, cap_max=max(_FEWEST, round(share * settings.densify.cap_max)))
     taking_part = views.images / len(views.names)
-    count = round(steps / taking_part * settings.iterations)
+    count = round(settings.blocks.steps * steps / taking_part * settings.iterations)
     w = settings.weights
     weights = replace(w, opacity=taking_part * w.opacity, scale=taking_part * w.scale)
     return replace(settings, iterations=max(1, count), initial=start, densify=most, weights=weights)
