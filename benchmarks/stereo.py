@@ -1,14 +1,18 @@
 """A stereo dive against the same dive by its left camera alone: errors of the path, and of the scale by the baseline.
 
-    python benchmarks/stereo.py dives [OUT] [--seeds 0 1 2]      from images
-    python benchmarks/stereo.py noise [--draws 10]               from exact tracks with noise of the pixels
+    python benchmarks/stereo.py dives [OUT] [--seeds 0 1 2 3 4 5] [--resamples 6]    from images
+    python benchmarks/stereo.py noise [--draws 10]                                   from exact tracks with noise
 
 Poses are found three times: from the left images alone, from both cameras with a pose per frame, and as a rig. Errors
 are those of the left camera's centers (RMSE) under the similarity that fits them best, which has a free scale for all
 three; those of the rig also under rotation and shift alone, its lengths in metres by the baseline. The latter has one
 number less to fit with than mono, which has no metres to be wrong in. `dives` are rendered and reconstructed with the
-settings of `fast`; `noise` shows how much of the differences between the dives is chance: the same path, points that
-are seen in the same places, and another draw of the noise in every row.
+settings of `fast`; `noise` has the same path and points that are seen in the same places in every row, and another draw
+of the noise of their pixels.
+
+The difference of rig and mono in a dive has a standard deviation by the bootstrap: the points of each are drawn anew
+with replacement, everything is adjusted to their observations, and the errors are compared. Over all rows the logarithm
+of the ratio of the errors has a mean with a standard error.
 """
 
 import argparse
@@ -41,7 +45,10 @@ BASELINE = 0.1  # metres
 NOISE = 0.5  # px, of the exact tracks
 MM = 1000.0
 LEFT, RIGHT = RigCamera("left"), RigCamera("right")
-HEAD = ("seed", "mono", "stereo, free poses", "stereo, rig", "rig, in metres", "error of the scale", "stated")
+HEAD = (
+    *("seed", "mono", "stereo, free poses", "stereo, rig", "rig, in metres", "error of the scale", "stated"),
+    "rig less mono",
+)
 
 
 @dataclass(frozen=True)
@@ -54,6 +61,7 @@ class Errors:
     rig_metric: float
     scale: float  # relative
     scale_std: float  # relative, as stated
+    difference_std: float | None = None  # of rig less mono, by resampled points
 
 
 def dive_of(seed: int) -> DiveSettings:
@@ -61,7 +69,7 @@ def dive_of(seed: int) -> DiveSettings:
     return DiveSettings(frames=20, width=320, height=214, seed=seed, stereo=BASELINE)
 
 
-def errors_of_dive(seed: int, out: Path) -> Errors:
+def errors_of_dive(seed: int, out: Path, resamples: int) -> Errors:
     """Render a dive, find its poses in the three ways, and compare them with the truth."""
     folder = out / f"dive-{seed}"
     write_dive(dive_of(seed), folder)
@@ -71,7 +79,17 @@ def errors_of_dive(seed: int, out: Path) -> Errors:
     assert isinstance(settings, ColmapSettings)
     mono = poses.reconstruct(left_of(both), settings, out / f"mono-sfm-{seed}")
     free = poses.reconstruct(both, settings, out / f"both-sfm-{seed}")
-    return compared(mono, free, as_rig(free, both, settings), truth)
+    rig = as_rig(free, both, settings)
+    found = compared(mono, free, rig, truth)
+    if resamples < 2:
+        return found
+    rng = torch.Generator().manual_seed(seed)
+    differences = []
+    for _ in range(resamples):
+        alone = bundle_adjust(resampled(mono, rng), lens=True)
+        together = as_rig(resampled(rig, rng), both, settings)
+        differences.append(similarity_error(together, truth)[0] - similarity_error(alone, truth)[0])
+    return replace(found, difference_std=float(np.std(differences, ddof=1)))
 
 
 def errors_of_noise(draw: int) -> Errors:
@@ -131,6 +149,18 @@ def part_of(rec: Reconstruction, rows: Sequence[int]) -> Reconstruction:
     return replace(rec, names=names, cameras=rec.cameras[list(rows)], points=points, tracks=tracks)
 
 
+def resampled(rec: Reconstruction, rng: torch.Generator) -> Reconstruction:
+    """As many points with their observations, drawn with replacement."""
+    count = len(rec.points.xyz)
+    drawn = torch.randint(0, count, (count,), generator=rng)
+    seen = torch.bincount(rec.tracks.point, minlength=count)
+    by_point = torch.split(torch.argsort(rec.tracks.point, stable=True), seen.tolist())
+    rows = torch.cat([by_point[point] for point in drawn.tolist()])
+    points = Points(rec.points.xyz[drawn], rec.points.rgb[drawn], rec.points.error[drawn])
+    tracks = Tracks(torch.repeat_interleave(seen[drawn]), rec.tracks.frame[rows], rec.tracks.xy[rows])
+    return replace(rec, points=points, tracks=tracks)
+
+
 def compared(mono: Reconstruction, free: Reconstruction, rig: Reconstruction, truth: GroundTruth) -> Errors:
     """Errors of three reconstructions of one dive."""
     if rig.rig is None or not rig.rig.rigid:
@@ -184,7 +214,27 @@ def row_of(name: str, errors: Errors) -> str:
     """A row of the table."""
     lengths = (errors.mono, errors.free, errors.rig, errors.rig_metric)
     shares = f"{100 * errors.scale:.2f} % | ± {100 * errors.scale_std:.2f} %"
-    return f"| {name} | " + " | ".join(f"{MM * length:.2f}" for length in lengths) + f" | {shares} |"
+    std = errors.difference_std
+    difference = f"{MM * (errors.rig - errors.mono):+.2f}" + ("" if std is None else f" ± {MM * std:.2f}")
+    return f"| {name} | " + " | ".join(f"{MM * length:.2f}" for length in lengths) + f" | {shares} | {difference} |"
+
+
+def verdict(found: Sequence[Errors]) -> str:
+    """How often the rig is nearer to the truth, and by which factor its errors are those of mono."""
+    nearer = sum(one.rig <= one.mono for one in found)
+    told = f"The rig is nearer to the truth than mono in {nearer} of {len(found)}."
+    if all(one.difference_std is not None for one in found):
+        clear = [one for one in found if abs(one.rig - one.mono) > 2 * (one.difference_std or 0.0)]
+        worse = sum(one.rig > one.mono for one in clear)
+        told += f" By more than two standard deviations it is nearer in {len(clear) - worse}, farther in {worse}."
+    if len(found) > 1:
+        logs = np.log([one.rig / one.mono for one in found])
+        error = float(logs.std(ddof=1)) / math.sqrt(len(logs))
+        told += (
+            f" Error of the rig by that of mono: {math.exp(logs.mean()):.2f}, logarithm {logs.mean():.2f} ± {error:.2f}"
+            f" (t = {logs.mean() / error:.1f} with {len(logs) - 1} degrees of freedom)."
+        )
+    return told
 
 
 def main() -> None:
@@ -192,17 +242,19 @@ def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("table", choices=("dives", "noise"))
     parser.add_argument("out", nargs="?", type=Path, default=Path("runs/stereo"))
-    parser.add_argument("--seeds", nargs="+", type=int, default=[0, 1, 2])
+    parser.add_argument("--seeds", nargs="+", type=int, default=[0, 1, 2, 3, 4, 5])
     parser.add_argument("--draws", type=int, default=10)
+    parser.add_argument("--resamples", type=int, default=6, help="of each dive's points; 0 leaves out their scatter")
     given = parser.parse_args()
     print(f"| {' | '.join(HEAD)} |\n|{' --- |' * len(HEAD)}")
     found = []
     for seed in given.seeds if given.table == "dives" else range(given.draws):
-        found.append(errors_of_dive(seed, given.out) if given.table == "dives" else errors_of_noise(seed))
+        dive = given.table == "dives"
+        found.append(errors_of_dive(seed, given.out, given.resamples) if dive else errors_of_noise(seed))
         print(row_of(str(seed), found[-1]), flush=True)
-    columns = np.array([[getattr(one, key) for key in Errors.__dataclass_fields__] for one in found])
+    columns = np.array([(one.mono, one.free, one.rig, one.rig_metric, one.scale, one.scale_std) for one in found])
     print(row_of("root mean square", Errors(*np.sqrt((columns**2).mean(0)))))
-    print(f"The rig is nearer to the truth than mono in {sum(one.rig <= one.mono for one in found)} of {len(found)}.")
+    print(verdict(found))
 
 
 if __name__ == "__main__":

@@ -15,6 +15,7 @@ from swimm3r.cameras import distort
 from swimm3r.errors import UsageError
 from swimm3r.io.colmap.cameras import from_pycolmap_camera, to_pycolmap_camera, under_model
 from swimm3r.progress import Progress
+from swimm3r.sfm.colmap.adjustment import WIDEST, typical_error
 from swimm3r.sfm.colmap.pair_focal import focal_of_pairs
 from swimm3r.sfm.features.database import MIN_INLIERS, FeatureDatabase
 from swimm3r.sfm.lens import check_lens_settings, lens_of, model_of
@@ -127,12 +128,12 @@ def refine(
     """The model after bundle adjustment of everything, its lens included unless the user holds it fixed."""
     camera = model.cameras[1]
     if settings.intrinsics == "fixed":
-        return Calibrated(_adjust(store, model, camera.model.name), refined=False)
+        return Calibrated(_sharpened(store, _adjust(store, model, camera.model.name)), refined=False)
     candidates = [(camera.model.name, True)]
     if settings.camera == "auto" and camera.model.name != "OPENCV":
         candidates.append(("OPENCV", True))
     candidates.append((camera.model.name, False))  # the focal length alone, where distortion runs away
-    kept = None
+    kept, bent = None, True  # the best so far, and whether its distortion was refined
     for done, (name, distortion) in enumerate(candidates):
         progress("refining the lens", done, len(candidates))
         if kept is not None and not distortion:
@@ -143,10 +144,13 @@ def refine(
         gain = 1 - refined.compute_mean_reprojection_error() / before if before else 0.0
         whole = refined.num_reg_images() >= model.num_reg_images()
         if is_lens(refined.cameras[1]) and whole and (kept is None or gain >= settings.mapping.opencv_gain):
-            kept = refined
+            kept, bent = refined, distortion
     progress("refining the lens", len(candidates), len(candidates))
     if kept is None:
-        return Calibrated(_adjust(store, model, camera.model.name), refined=False)
+        return Calibrated(_sharpened(store, _adjust(store, model, camera.model.name)), refined=False)
+    sharp = _sharpened(store, kept, focal=True, distortion=bent)
+    if is_lens(sharp.cameras[1]) and sharp.num_reg_images() >= kept.num_reg_images():
+        kept = sharp
     set_camera(store, kept.cameras[1])
     return Calibrated(kept, refined=True)
 
@@ -196,6 +200,14 @@ def _settled(
     return model
 
 
+def _sharpened(
+    store: FeatureDatabase, model: "pycolmap.Reconstruction", *, focal: bool = False, distortion: bool = False
+) -> "pycolmap.Reconstruction":
+    """An adjusted model after a last adjustment, under a loss as wide as its typical error."""
+    name = model.cameras[1].model.name
+    return _adjust(store, model, name, focal=focal, distortion=distortion, width=typical_error(model))
+
+
 def _adjust(
     store: FeatureDatabase,
     model: "pycolmap.Reconstruction",
@@ -204,6 +216,7 @@ def _adjust(
     focal: bool = False,
     distortion: bool = False,
     is_large: bool = False,
+    width: float = WIDEST,
 ) -> "pycolmap.Reconstruction":
     import pycolmap
 
@@ -231,6 +244,7 @@ def _adjust(
     adjustment.ceres.solver_options.num_threads = THREADS
     adjustment.ceres.solver_options.function_tolerance = STILL
     adjustment.ceres.loss_function_type = pycolmap.LossFunctionType.SOFT_L1
+    adjustment.ceres.loss_function_scale = width
     mapper.iterative_global_refinement(5, 0.0005, mapping, adjustment, triangulation)
     mapper.end_reconstruction(False)
     out.update_point_3d_errors()

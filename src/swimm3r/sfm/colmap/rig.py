@@ -22,6 +22,7 @@ from swimm3r.progress import Progress, silent
 from swimm3r.scene.frames import Frames
 from swimm3r.scene.reconstruction import Points, QualityWarning, Reconstruction, Tracks
 from swimm3r.scene.rig import PlacedCamera, Rig, RigFit, pose_of
+from swimm3r.sfm.colmap.adjustment import WIDEST, typical_error
 from swimm3r.sfm.colmap.calibration import STILL, THREADS, is_lens
 from swimm3r.sfm.rig_poses import LEAST, RigRows, delay_of, relative_scatter, relative_to_first, rig_rows, robust_mean
 from swimm3r.sfm.settings import ColmapSettings
@@ -61,7 +62,7 @@ def as_rig(
     camera2rig = torch.stack([robust_mean(relative_to_first(rec.cameras.cam2world, rows, k)) for k in range(len(seen))])
     model = rigged(_on_rig(rec, rows, camera2rig).colmap_model(), _layout(rec, rows, camera2rig))
     progress(_STEP, 1, 3)
-    model = _adjusted(model)
+    model = _adjusted(model, WIDEST)
     free_px, rig_px = float(_errors(rec).median()), float(_errors(_record(rec, model)).median())
     rigid = rig_px <= max(_WORSE * free_px, free_px + _WORSE_PX)
     if rigid:
@@ -128,8 +129,11 @@ def _errors(rec: Reconstruction, rows: np.ndarray | None = None) -> Float[Tensor
     return torch.cat(found)
 
 
-def _adjusted(model: "pycolmap.Reconstruction", *, lens: bool = False) -> "pycolmap.Reconstruction":
-    """A copy of a model after bundle adjustment of rig, poses and points, and of each camera's lens where asked."""
+def _adjusted(model: "pycolmap.Reconstruction", width: float, *, lens: bool = False) -> "pycolmap.Reconstruction":
+    """A copy of a model after bundle adjustment of rig, poses and points, and of each camera's lens where asked.
+
+    The robust loss is quadratic up to errors of `width` pixels.
+    """
     import pycolmap
 
     out = pycolmap.Reconstruction(model)
@@ -138,6 +142,7 @@ def _adjusted(model: "pycolmap.Reconstruction", *, lens: bool = False) -> "pycol
     options.refine_sensor_from_rig = True
     options.print_summary = False
     options.ceres.loss_function_type = pycolmap.LossFunctionType.SOFT_L1
+    options.ceres.loss_function_scale = width
     options.ceres.solver_options.num_threads = THREADS
     options.ceres.solver_options.function_tolerance = STILL
     images = pycolmap.BundleAdjustmentConfig()  # `pycolmap.bundle_adjustment` is the same, and prints
@@ -154,10 +159,11 @@ def _settled(model: "pycolmap.Reconstruction", settings: ColmapSettings) -> "pyc
     import pycolmap
 
     pycolmap.ObservationManager(model).filter_all_points3D(_MAX_ERROR, _MIN_ANGLE)
-    model = _adjusted(model)
+    width = typical_error(model)
+    model = _adjusted(model, width)
     if settings.intrinsics == "fixed":
         return model
-    own = _adjusted(model, lens=True)
+    own = _adjusted(model, width, lens=True)
     gain = 1 - own.compute_mean_reprojection_error() / model.compute_mean_reprojection_error()
     lenses = all(is_lens(camera) for camera in own.cameras.values())
     return own if lenses and gain >= settings.mapping.opencv_gain else model
