@@ -36,7 +36,7 @@ from swimm3r.scene.reconstruction import DepthMaps, Matches, Points, Reconstruct
 from swimm3r.scene.rig import Rig, RigCamera
 from swimm3r.sfm.colmap import poses
 from swimm3r.sfm.colmap.adjustment import bundle_adjust
-from swimm3r.sfm.colmap.rig import as_rig
+from swimm3r.sfm.colmap.rig.adjustment import as_rig
 from swimm3r.sfm.settings import ColmapSettings
 from swimm3r.synthetic.dive import make_dive, write_dive
 from swimm3r.synthetic.settings import DiveSettings
@@ -220,7 +220,7 @@ def row_of(name: str, errors: Errors) -> str:
 
 
 def verdict(found: Sequence[Errors]) -> str:
-    """How often the rig is nearer to the truth, and by which factor its errors are those of mono."""
+    """Number of dives in which the rig is nearer to the truth, and the factor from the errors of mono to its own."""
     nearer = sum(one.rig <= one.mono for one in found)
     told = f"The rig is nearer to the truth than mono in {nearer} of {len(found)}."
     if all(one.difference_std is not None for one in found):

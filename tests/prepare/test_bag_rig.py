@@ -13,6 +13,7 @@ from tests.bag_files import SECOND, START, VERSIONS, Sent, camera_info, image, t
 from swimm3r.cli.main import main
 from swimm3r.errors import InputError, UsageError
 from swimm3r.geometry import align_similarity
+from swimm3r.io.calibration.colmap_text import read as read_calibration
 from swimm3r.io.images import read_rgb
 from swimm3r.prepare import load_frames, read_frames
 from swimm3r.prepare.bag_rig import camera_names
@@ -21,7 +22,7 @@ from swimm3r.scale.settings import ScaleSettings
 from swimm3r.scene.frames import Frames
 from swimm3r.scene.ground_truth import read_ground_truth
 from swimm3r.sfm.colmap.poses import reconstruct
-from swimm3r.sfm.colmap.rig import as_rig
+from swimm3r.sfm.colmap.rig.adjustment import as_rig
 from swimm3r.sfm.settings import ColmapSettings, FeatureSettings
 from swimm3r.synthetic import DiveSettings, write_dive
 
@@ -78,10 +79,23 @@ def test_two_topics_are_a_stereo_pair_by_the_times_of_their_headers(version: str
     assert load_frames(tmp_path / "prepare") == frames
 
 
-def test_the_lens_is_that_of_the_first_camera(tmp_path: Path):
-    frames = read(write_bag(tmp_path, "mcap", [*pair(), *stereo_info(0.12)]), tmp_path / "prepare")
+def test_each_camera_has_the_lens_of_its_topic_and_frames_begin_with_the_first(tmp_path: Path):
+    left, right = stereo_info(0.12)
+    longer = camera_info(right.topic, size=SIZE, K=(66.0, 0, 31.5, 0, 66, 23.5, 0, 0, 1), D=(-0.1, 0, 0, 0, 0), stamp=START)
+    frames = read(write_bag(tmp_path, "mcap", [*pair(), left, longer]), tmp_path / "prepare")
     assert frames.calibration is not None
     assert "camera_name: stereo_left_camera_info" in frames.calibration.read_text()
+    assert frames.rig is not None
+    lenses = [read_calibration(camera.lens)[0] for camera in frames.rig.cameras if camera.lens is not None]
+    np.testing.assert_allclose([lens.K[0, 0] for lens in lenses], [60, 66])
+    np.testing.assert_allclose([lens.k[0] for lens in lenses], [0, -0.1])
+
+
+def test_without_camera_info_no_camera_has_a_lens(tmp_path: Path):
+    frames = read(write_bag(tmp_path, "mcap", [*pair(), *stereo_info(0.12)]), tmp_path / "prepare", camera_info=False)
+    assert frames.calibration is None
+    assert frames.rig is not None
+    assert [camera.lens for camera in frames.rig.cameras] == [None, None]
 
 
 def test_the_rectification_turns_the_second_camera(tmp_path: Path):

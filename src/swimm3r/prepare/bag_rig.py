@@ -4,7 +4,7 @@ import logging
 import math
 import re
 from collections.abc import Iterator, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from itertools import takewhile
 from pathlib import Path
 
@@ -15,8 +15,9 @@ from swimm3r.errors import InputError, UsageError
 from swimm3r.io.bags.clip import BagClip, BagImage
 from swimm3r.io.bags.rig import stated_poses
 from swimm3r.io.bags.topics import COMPRESSED_END
+from swimm3r.io.calibration.documents import from_yaml, read_document
 from swimm3r.prepare.instants import CameraImages, instants_of, missing
-from swimm3r.prepare.rig import rig_of
+from swimm3r.prepare.rig import lens_line, rig_of
 from swimm3r.scene.rig import Rig, RigCamera, pose_of
 from swimm3r.scene.settings import FrameSettings
 
@@ -115,13 +116,24 @@ class BagRig:
         if settings.rig_calibration is None:
             stated = stated_poses(self._clips, camera_info=settings.camera_info)
         if stated is None:
-            return rig_of(names, settings)
+            rig = rig_of(names, settings, (self.width, self.height))
+            return rig if settings.rig_calibration is not None else self._with_lenses(rig)
         poses, where = stated
-        rig = Rig(tuple(RigCamera(name, pose_of(pose)) for name, pose in zip(names, poses, strict=True)))
+        bare = Rig(tuple(RigCamera(name, pose_of(pose)) for name, pose in zip(names, poses, strict=True)))
+        rig = self._with_lenses(bare)
         first, *others = rig.cameras
         lengths = ", ".join(f"{camera.name} {camera.baseline:.4g} m" for camera in others)
         log.info("%s: from %s by %s: %s.", self.path.name, first.name, where, lengths)
         return rig
+
+    def _with_lenses(self, rig: Rig) -> Rig:
+        """The rig with the lenses that the camera_info of its topics state."""
+        if not self._settings.camera_info:
+            return rig
+        stated = [None if clip.lens is None else read_document(from_yaml(clip.lens))[0] for clip in self._clips]
+        size = self.width, self.height
+        lines = [None if lens is None else lens_line(lens, size) for lens in stated]
+        return Rig(tuple(replace(camera, lens=line) for camera, line in zip(rig.cameras, lines, strict=True)))
 
     def _first_partner(self, begin: int) -> int:
         """The stamp of the first image that may belong to the same instant as one at a stamp."""

@@ -133,10 +133,10 @@ def _completed(chosen: SelectedImages, clip: Clip, draft: Path, settings: FrameS
     if isinstance(clip, BagRig):
         rig = clip.rig
     elif settings.rig == (SIDE_BY_SIDE,):
-        rig = rig_of(STEREO, settings)
+        rig = rig_of(STEREO, settings, chosen.images[0].size)
     else:
         return chosen
-    lens = write_lens(draft, rig.names, chosen.images[0].size, settings)
+    lens = write_lens(draft, rig, settings)
     return replace(chosen, rig=rig, calibration=lens or chosen.calibration)
 
 

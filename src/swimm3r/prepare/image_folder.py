@@ -94,6 +94,7 @@ def prepare_stills(
         if isinstance(result, _Seen)
     ]
     blank = sum(result is None for _, result in results)
+    rig = rig_of(cameras, settings, images[0].size if images else None) if cameras else None
     return SelectedImages(
         images,
         choice.ordered,
@@ -102,8 +103,8 @@ def prepare_stills(
         originals=[path.relative_to(folder.root) for path in folder.paths],
         files=frozenset(folder.root.resolve() / path.relative_to(folder.root) for path in folder.paths),
         recorded=choice.recorded,
-        calibration=write_lens(draft, cameras, images[0].size, settings) if cameras and images else None,
-        rig=rig_of(cameras, settings) if cameras else None,
+        calibration=None if rig is None else write_lens(draft, rig, settings),
+        rig=rig,
         development=str(development) if development.changes or development.balance is not None else None,
     )
 

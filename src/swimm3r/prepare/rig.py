@@ -8,7 +8,7 @@ from datetime import UTC, datetime
 from pathlib import Path
 
 from swimm3r.errors import InputError, UsageError
-from swimm3r.io.calibration.record import REMEDY, lens_at
+from swimm3r.io.calibration.record import REMEDY, Calibration, lens_at
 from swimm3r.io.calibration.rig import read_rig
 from swimm3r.io.files.atomic import write_text
 from swimm3r.io.files.damage import guard
@@ -86,26 +86,37 @@ def check_rig(source: Path, settings: FrameSettings) -> None:
             rig_of(cameras, settings)
 
 
-def rig_of(cameras: Sequence[str], settings: FrameSettings) -> Rig:
-    """The cameras, with their poses where a calibration gives them. Raises InputError where that cannot be used."""
-    if settings.rig_calibration is None:
+def rig_of(cameras: Sequence[str], settings: FrameSettings, size: tuple[int, int] | None = None) -> Rig:
+    """The cameras, with their poses where a calibration gives them, and for images of a known size their lenses.
+
+    Raises InputError where the calibration cannot be used.
+    """
+    path = settings.rig_calibration
+    if path is None:
         return Rig(tuple(RigCamera(name) for name in cameras))
-    found = read_rig(settings.rig_calibration, cameras).camera_from_rig
-    return Rig(tuple(RigCamera(name, pose_of(pose)) for name, pose in zip(cameras, found, strict=True)))
+    found = read_rig(path, cameras)
+    with guard(path, REMEDY):
+        lenses = [None if size is None else lens_line(lens, size) for lens in found.lenses]
+    known = zip(cameras, found.camera_from_rig, lenses, strict=True)
+    return Rig(tuple(RigCamera(name, pose_of(pose), lens) for name, pose, lens in known))
 
 
-def write_lens(draft: Path, cameras: Sequence[str], size: tuple[int, int], settings: FrameSettings) -> Path | None:
-    """Write the calibrated lens of the first camera beside the frames, as a line of COLMAP; None without one."""
-    if settings.rig_calibration is None:
-        return None
-    lens = read_rig(settings.rig_calibration, cameras).lenses[0]
-    with guard(settings.rig_calibration, REMEDY):
-        camera = lens_at(lens, *size, None if lens.size else size).camera
+def lens_line(lens: Calibration, size: tuple[int, int]) -> str:
+    """A lens in images of a size as a line of COLMAP's cameras.txt. Raises as `lens_at` does."""
+    camera = lens_at(lens, *size, None if lens.size else size).camera
     (fx, _, cx), (_, fy, cy), _ = camera.K[0].tolist()
     bent = [*camera.distortion[0].tolist(), 0.0, 0.0, 0.0, 0.0][:4]
     model = camera.model if camera.model == "OPENCV_FISHEYE" else "OPENCV"
     numbers = " ".join(f"{value:.12g}" for value in (fx, fy, cx, cy, *bent))
-    write_text(draft / LENS, f"1 {model} {size[0]} {size[1]} {numbers}\n")
+    return f"1 {model} {size[0]} {size[1]} {numbers}"
+
+
+def write_lens(draft: Path, rig: Rig, settings: FrameSettings) -> Path | None:
+    """Write the lens of the first camera of a calibrated rig beside the frames; None without a calibration."""
+    lens = rig.cameras[0].lens
+    if settings.rig_calibration is None or lens is None:
+        return None
+    write_text(draft / LENS, f"{lens}\n")
     return draft / LENS
 
 

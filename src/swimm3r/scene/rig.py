@@ -12,6 +12,7 @@ import numpy as np
 import torch
 
 from swimm3r.cameras import check_poses
+from swimm3r.io.calibration.colmap_text import read
 
 Row = tuple[float, float, float, float]
 Pose = tuple[Row, Row, Row, Row]
@@ -23,8 +24,11 @@ class RigCamera:
 
     name: str
     camera_from_rig: Pose | None = None  # calibrated, metres; None where it is not known
+    lens: str | None = None  # calibrated, a line of COLMAP's cameras.txt in pixels of the source; None where not known
 
     def __post_init__(self) -> None:
+        if self.lens is not None and len(read(self.lens)) != 1:
+            raise ValueError(f"a camera of a rig has one lens, got {self.lens!r}")
         if self.camera_from_rig is not None:
             check_poses(torch.tensor([self.camera_from_rig], dtype=torch.float64))
 

@@ -50,9 +50,7 @@ def with_calibration(settings: Given, width: int, height: int, stated: Path | No
     cannot be used or is of images of another shape, and UsageError where the settings ask for another camera model.
     """
     _check_whole(settings)
-    path = settings.calibration
-    if path is None and all(getattr(settings, name) is None for name in LENS_NUMBERS):
-        path = stated
+    path = settings.calibration if gives_lens(settings) else stated
     if path is None:
         return settings
     read = read_lens(path, width, height, settings.calibration_camera, settings.calibration_size)
@@ -71,6 +69,11 @@ def with_calibration(settings: Given, width: int, height: int, stated: Path | No
     changed = replace(settings, **blank, focal=fx, fy=fy, cx=cx, cy=cy, **numbers)
     undecided = isinstance(settings, ColmapSettings) and model != "OPENCV_FISHEYE"  # auto goes by the numbers
     return changed if undecided else replace(changed, camera=model)
+
+
+def gives_lens(settings: LensSettings) -> bool:
+    """Return whether the settings themselves say something of the lens."""
+    return settings.calibration is not None or any(getattr(settings, name) is not None for name in LENS_NUMBERS)
 
 
 def behind_port(settings: Given, width: int, height: int) -> tuple[Given, CameraInWater | None]:

@@ -15,7 +15,7 @@ from swimm3r.scene.reconstruction import Reconstruction
 from swimm3r.scene.reconstruction_io import load_reconstruction
 from swimm3r.sfm.colmap import poses
 from swimm3r.sfm.colmap.adjustment import bundle_adjust
-from swimm3r.sfm.colmap.rig import as_rig
+from swimm3r.sfm.colmap.rig.adjustment import as_rig
 from swimm3r.sfm.lens import check_calibration
 from swimm3r.sfm.medium.apply import with_water
 from swimm3r.sfm.moving.find import mask_depth, with_moving, without_moving_observations

@@ -39,6 +39,7 @@ from swimm3r.sfm.colmap.navigated import with_navigation
 from swimm3r.sfm.colmap.pairs import choose_pairs
 from swimm3r.sfm.colmap.plausibility import depth_change, implausible
 from swimm3r.sfm.colmap.record import PARTS, record_of, write_parts
+from swimm3r.sfm.colmap.rig.lenses import RigLenses, lenses_of_rig
 from swimm3r.sfm.features.database import FeatureDatabase, fill_features, match_pairs, start_database
 from swimm3r.sfm.lens import behind_port, with_calibration
 from swimm3r.sfm.settings import ColmapSettings
@@ -70,9 +71,10 @@ def reconstruct(
 ) -> Reconstruction:
     """Cameras, points, tracks and matches of the frames that can be placed; depth maps are for others to fill.
 
-    `lens` (one camera, its pose unused) is held where it is given; else the settings say what is known of it. A
-    `navigator` joins what shares no ground, and holds long paths straight. Raises InputError for fewer than 2 frames or
-    navigation that contradicts them, and RegistrationError where too few can be placed.
+    `lens` (one camera, its pose unused) is held where it is given; else the settings say what is known of it, or the
+    frames' source, which may know another one of each camera of a rig. A `navigator` joins what shares no ground, and
+    holds long paths straight. Raises InputError for fewer than 2 frames or navigation that contradicts them, and
+    RegistrationError where too few can be placed.
     """
 
     if len(frames) < 2:
@@ -83,29 +85,33 @@ def reconstruct(
         )
     silence_log()
     threads = settings.threads or thread_count()
-    housed = None
+    housed = lenses = None
     if lens is None:
+        given = settings
         settings = with_calibration(settings, frames.width, frames.height, frames.calibration)
         settings, housed = behind_port(settings, frames.width, frames.height)
         camera = calibration.first_camera(frames.width, frames.height, settings)
+        lenses = lenses_of_rig(frames, given, camera)
     else:
         camera, settings = to_pycolmap_camera(lens), replace(settings, intrinsics="fixed")
         camera.has_prior_focal_length = True
     with _full_disk_said_plainly(folder):
-        store = start_database(folder, frames, camera, settings.features)
-        fill_features(store, frames, settings.features, threads, progress)
+        numbers, shared = ((), None) if lenses is None else (lenses.numbers, lenses.under_first)
+        store = start_database(folder, frames, camera, settings.features, numbers)
+        fill_features(store, frames, settings.features, threads, progress, shared)
         pairs = choose_pairs(store, frames, settings)
         match_pairs(store, pairs, settings.features, threads, progress)
         with _working_copy(store) as working:
             mapped = _map(working, frames, pairs, settings, progress, engine)
             if navigator is not None:
-                mapped = _navigated(mapped, working, frames, folder, navigator, progress)
+                mapped = _navigated(mapped, working, frames, folder, navigator, progress, lenses)
             _check_placed(mapped.model, len(frames), settings)
-            rec = record_of(mapped.model, working, frames, folder)
+            rec = record_of(mapped.model, working, frames, folder, lenses)
             if housed is not None:
                 free = settings.intrinsics != "fixed"
                 rec = adjust_through_port(rec, housed, settings.port.range, lens=free, progress=progress)
-            sizes = [mapped.model.num_reg_images(), *write_parts(mapped.model, mapped.others, frames, folder / PARTS)]
+            parts = write_parts(mapped.model, mapped.others, frames, folder / PARTS, lenses)
+            sizes = [mapped.model.num_reg_images(), *parts]
             if depth_change(rec) > LOST_SCALE:
                 raise scale_lost(len(rec.names), len(frames))
             found = implausible(rec, working, frames)
@@ -192,6 +198,7 @@ def _navigated(
     folder: Path,
     navigator: Navigator,
     progress: Progress,
+    lenses: RigLenses | None,
 ) -> "_Mapped":
     found = with_navigation(
         store,
@@ -199,7 +206,7 @@ def _navigated(
         mapped.others,
         frames,
         navigator,
-        lambda model: record_of(model, store, frames, folder),
+        lambda model: record_of(model, store, frames, folder, lenses),
         progress,
         lens=mapped.lens_refined,
     )

@@ -15,6 +15,7 @@ from swimm3r.io.colmap.model import ColmapModel, from_pycolmap, write_model
 from swimm3r.scene.frames import Frames
 from swimm3r.scene.reconstruction import DepthMaps, Matches, Points, Reconstruction, Tracks
 from swimm3r.sfm.colmap.chunks.parts import LEAST_FRAMES
+from swimm3r.sfm.colmap.rig.lenses import RigLenses
 from swimm3r.sfm.features.database import FeatureDatabase
 
 if TYPE_CHECKING:
@@ -23,17 +24,29 @@ if TYPE_CHECKING:
 PARTS = "parts"  # folder of the models that did not join the largest
 
 
-def record_of(model: "pycolmap.Reconstruction", store: FeatureDatabase, frames: Frames, folder: Path) -> Reconstruction:
-    """The record of a model whose images are named by their number in the clip; `folder` is the run's sfm."""
+def record_of(
+    model: "pycolmap.Reconstruction",
+    store: FeatureDatabase,
+    frames: Frames,
+    folder: Path,
+    lenses: RigLenses | None = None,
+) -> Reconstruction:
+    """The record of a model whose images are named by their number in the clip; `folder` is the run's sfm.
+
+    With `lenses` keypoints of the database and the model are in pixels of a rig's first lens.
+    """
     table = from_pycolmap(model)
     index = [int(name) for name in table.names]
     table = replace(table, names=tuple(frames.names[i] for i in index))
+    matches = verified_matches(store, index)
+    if lenses is not None:
+        table, matches = lenses.own_model(table, index), lenses.own_matches(matches, index)
     return Reconstruction(
         names=table.names,
         cameras=cameras_of(table),
         points=Points(torch.from_numpy(table.xyz), _colors(table, frames, index), torch.from_numpy(table.error)),
         tracks=Tracks(*(torch.from_numpy(a) for a in (table.track_point, table.track_frame, table.track_xy))),
-        matches=verified_matches(store, index),
+        matches=matches,
         depth=DepthMaps(folder / "z_depth"),
         backend="colmap",
     )
@@ -80,7 +93,11 @@ def verified_matches(store: FeatureDatabase, index: list[int]) -> Matches:
 
 
 def write_parts(
-    model: "pycolmap.Reconstruction", others: "list[pycolmap.Reconstruction]", frames: Frames, folder: Path
+    model: "pycolmap.Reconstruction",
+    others: "list[pycolmap.Reconstruction]",
+    frames: Frames,
+    folder: Path,
+    lenses: RigLenses | None = None,
 ) -> list[int]:
     """Write models that did not join the largest as `folder`/1, 2, ... and return how many frames each has.
 
@@ -96,5 +113,7 @@ def write_parts(
         known |= own
         sizes.append(len(own))
         table = from_pycolmap(other)
+        if lenses is not None:
+            table = lenses.own_model(table, [int(name) for name in table.names])
         write_model(folder / f"{len(sizes)}", replace(table, names=tuple(frames.names[int(n)] for n in table.names)))
     return sizes

@@ -1,7 +1,8 @@
 """COLMAP's database of one dive: keypoints per frame, verified matches per pair; what is in it is not computed again.
 
-Frames stand in it as 000000, 000001, ... in the order of `Frames`, all of one camera. Two-view geometry is verified by
-fundamental matrix and homography as long as nobody knows the focal length, so that matches outlive any guess of it.
+Frames stand in it as 000000, 000001, ... in the order of `Frames`, all of one camera; keypoints of a rig's frames that
+have another lens stand where the one lens has their rays. Two-view geometry is verified by fundamental matrix and
+homography as long as nobody knows the focal length, so that matches outlive any guess of it.
 
 Nothing is written in COLMAP's transactions: one that meets a full disk aborts the process. Instead the last write of a
 frame (keypoints) and of a pair (two-view geometry) says that it is complete.
@@ -11,7 +12,7 @@ import itertools
 import json
 import logging
 import sqlite3
-from collections.abc import Iterator, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from contextlib import closing, contextmanager
 from dataclasses import asdict, dataclass
@@ -60,9 +61,16 @@ class FeatureDatabase:
 
 
 def start_database(
-    folder: Path, frames: Frames, camera: "pycolmap.Camera", settings: FeatureSettings
+    folder: Path,
+    frames: Frames,
+    camera: "pycolmap.Camera",
+    settings: FeatureSettings,
+    lenses: Sequence[Sequence[float]] = (),
 ) -> FeatureDatabase:
-    """The database in `folder`, new unless the one there was made of the same frames with the same settings."""
+    """The database in `folder`, new unless the one there was made of the same frames with the same settings.
+
+    `lenses` are the numbers of those that keypoints are moved from, see `fill_features`.
+    """
     path, about = folder / "database.db", folder / "database.json"
     content = {
         "frames": [[frame.name, round(frame.sharpness, 3), str(frame.mask)] for frame in frames],
@@ -71,6 +79,8 @@ def start_database(
         "camera": camera.model.name if camera.has_prior_focal_length else "unknown",
         "params": camera.params.tolist() if camera.has_prior_focal_length else [],
     }
+    if lenses:
+        content["lenses"] = [list(numbers) for numbers in lenses]
     out = FeatureDatabase(path, len(frames))
     described = json.dumps(content)
     if path.is_file() and about.is_file() and about.read_bytes() == described.encode():
@@ -147,9 +157,17 @@ def _is_whole(path: Path, frames: int) -> bool:
 
 
 def fill_features(
-    store: FeatureDatabase, frames: Frames, settings: FeatureSettings, threads: int, progress: Progress = silent
+    store: FeatureDatabase,
+    frames: Frames,
+    settings: FeatureSettings,
+    threads: int,
+    progress: Progress = silent,
+    under_one_lens: Callable[[int, Features], Features] | None = None,
 ) -> None:
-    """Extract the keypoints of the frames that have none yet."""
+    """Extract the keypoints of the frames that have none yet.
+
+    `under_one_lens` gives those of a frame, by its number, as the lens of the database would have them.
+    """
     import pycolmap
 
     with store.open() as database:
@@ -157,7 +175,8 @@ def fill_features(
     done = store.frames - len(missing)
 
     def extract(i: int) -> tuple[int, Features]:
-        return i, extract_features(frames.image(i), frames.mask(i), settings)
+        found = extract_features(frames.image(i), frames.mask(i), settings)
+        return i, found if under_one_lens is None else under_one_lens(i, found)
 
     progress("finding features", done, store.frames)
     for start in range(0, len(missing), _BATCH):

@@ -67,7 +67,7 @@ def as_rig(
     rigid = rig_px <= max(_WORSE * free_px, free_px + _WORSE_PX)
     if rigid:
         progress(_STEP, 2, 3)
-        model = _settled(model, settings)
+        model = _settled(model, settings, parted=_lenses_differ(rec))
     progress(_STEP, 3, 3)
     sensors = sensor_poses(model) if rigid else invert_poses(camera2rig).numpy()
     fit = RigFit(_placed(rig, rec, rows, sensors), rigid, free_px, rig_px)
@@ -154,8 +154,16 @@ def _adjusted(model: "pycolmap.Reconstruction", width: float, *, lens: bool = Fa
     return out
 
 
-def _settled(model: "pycolmap.Reconstruction", settings: ColmapSettings) -> "pycolmap.Reconstruction":
-    """The model without its outliers, adjusted again, each camera with a lens of its own where that fits better."""
+def _lenses_differ(rec: Reconstruction) -> bool:
+    K, distortion = rec.cameras.K, rec.cameras.distortion
+    return not (torch.equal(K, K[:1].expand_as(K)) and torch.equal(distortion, distortion[:1].expand_as(distortion)))
+
+
+def _settled(model: "pycolmap.Reconstruction", settings: ColmapSettings, *, parted: bool) -> "pycolmap.Reconstruction":
+    """The model without its outliers, adjusted again, each camera's lens by itself where that fits better.
+
+    `parted`: the lenses differ by their calibration, and are refined by themselves in any case.
+    """
     import pycolmap
 
     pycolmap.ObservationManager(model).filter_all_points3D(_MAX_ERROR, _MIN_ANGLE)
@@ -166,7 +174,7 @@ def _settled(model: "pycolmap.Reconstruction", settings: ColmapSettings) -> "pyc
     own = _adjusted(model, width, lens=True)
     gain = 1 - own.compute_mean_reprojection_error() / model.compute_mean_reprojection_error()
     lenses = all(is_lens(camera) for camera in own.cameras.values())
-    return own if lenses and gain >= settings.mapping.opencv_gain else model
+    return own if lenses and (parted or gain >= settings.mapping.opencv_gain) else model
 
 
 def _record(rec: Reconstruction, model: "pycolmap.Reconstruction") -> Reconstruction:

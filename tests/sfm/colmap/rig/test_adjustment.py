@@ -14,7 +14,7 @@ from swimm3r.scene.reconstruction import Reconstruction
 from swimm3r.scene.reconstruction_io import load_reconstruction
 from swimm3r.scene.rig import RigFit
 from swimm3r.sfm.colmap.adjustment import bundle_adjust
-from swimm3r.sfm.colmap.rig import as_rig
+from swimm3r.sfm.colmap.rig.adjustment import as_rig
 from swimm3r.sfm.settings import ColmapSettings
 
 Fixture = tuple[np.ndarray, Reconstruction, Reconstruction]

@@ -1,0 +1,1 @@
+"""Rigs in mapping: one pose per instant for all cameras, each with its own lens."""
