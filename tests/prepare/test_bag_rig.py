@@ -81,7 +81,9 @@ def test_two_topics_are_a_stereo_pair_by_the_times_of_their_headers(version: str
 
 def test_each_camera_has_the_lens_of_its_topic_and_frames_begin_with_the_first(tmp_path: Path):
     left, right = stereo_info(0.12)
-    longer = camera_info(right.topic, size=SIZE, K=(66.0, 0, 31.5, 0, 66, 23.5, 0, 0, 1), D=(-0.1, 0, 0, 0, 0), stamp=START)
+    longer = camera_info(
+        right.topic, size=SIZE, K=(66.0, 0, 31.5, 0, 66, 23.5, 0, 0, 1), D=(-0.1, 0, 0, 0, 0), stamp=START
+    )
     frames = read(write_bag(tmp_path, "mcap", [*pair(), left, longer]), tmp_path / "prepare")
     assert frames.calibration is not None
     assert "camera_name: stereo_left_camera_info" in frames.calibration.read_text()
