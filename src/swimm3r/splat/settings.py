@@ -218,7 +218,7 @@ class BlockSettings(Settings):
     steps: Annotated[float, Range(above=0, most=10)] = 1.5
     """Steps of a block, in those that show its ground as often as a map of one block is shown its own."""
     water_steps: PositiveShare = 0.5
-    """Length of the training of the water that all blocks share, on a coarse map of the dive, in `iterations`."""
+    """Length of the training of the water that all blocks share, on parts of the dive, in `iterations`."""
 
 
 @dataclass(frozen=True)

@@ -5,7 +5,7 @@ import math
 import pytest
 import torch
 
-from swimm3r.splat.blocks.part import BlockViews, part_of, views_of_blocks
+from swimm3r.splat.blocks.part import BlockViews, part_of, stretches_of, views_of_blocks
 from swimm3r.splat.blocks.plan import PlannedBlock, Surface, plan_blocks, surface_of
 from swimm3r.splat.blocks.training import of_block
 from swimm3r.splat.ground import GroundPlane, Window, held_by_any, plane_of
@@ -20,7 +20,7 @@ def l_shaped(n: int = 4000) -> Surface:
     uv = uv[(uv[:, 0] < 4) | (uv[:, 1] < 3)]
     turn = torch.linalg.qr(torch.randn(3, 3, generator=rng, dtype=torch.float64)).Q
     xyz = torch.cat([uv, 0.1 * torch.rand(len(uv), 1, generator=rng, dtype=torch.float64)], -1) @ turn.mT
-    return Surface(xyz, torch.full((len(uv),), 0.01, dtype=torch.float64))
+    return Surface(xyz, torch.full((len(uv),), 0.01, dtype=torch.float64), 0.1)
 
 
 @pytest.mark.parametrize("largest", [3.0, 5.5, 7.0, 1000.0])
@@ -111,6 +111,32 @@ def test_a_block_is_trained_on_the_frames_that_see_it_and_the_points_in_its_wind
     assert torch.equal(part.cameras.cam2world[0], rec.cameras.cam2world[rec.index(part.names[0])])
     assert left.holds(part.cloud.xyz).all()
     assert 0 < len(part.cloud.xyz) < len(rec.cloud.xyz)
+
+
+@pytest.mark.parametrize("images", [0.5, 1.0, 100.0])
+def test_the_stretches_see_as_much_ground_as_asked_for_and_hold_its_points(tiny_dive, images):
+    rec = tiny_dive.rec
+    surface = surface_of(rec, median_z_depth(rec))
+    part = stretches_of(rec, rec.names, surface, images)
+    cells = torch.cat([surface.cells_of(_points(rec, name)) for name in part.names])
+    seen = torch.zeros(len(surface.area), dtype=torch.bool)
+    seen[cells[cells >= 0]] = True
+    assert (float(surface.area[seen].sum()) >= images) == (images < 100)
+    assert (part.names == rec.names) == (images == 100)
+    assert part.names == tuple(name for name in rec.names if name in part.names)
+    assert torch.equal(part.cloud.xyz, rec.cloud.xyz[seen[surface.cells_of(rec.cloud.xyz)]])
+
+
+def test_every_cell_of_a_surface_holds_its_center_and_none_what_lies_elsewhere(tiny_dive):
+    surface = surface_of(tiny_dive.rec, median_z_depth(tiny_dive.rec))
+    assert torch.equal(surface.cells_of(surface.xyz), torch.arange(len(surface.xyz)))
+    above = surface.xyz + torch.tensor([0.0, 0.0, 100.0])
+    assert (surface.cells_of(above) == -1).all()
+    beside = surface.cells_of(surface.xyz + torch.tensor([surface.edge, 0.0, 0.0]))
+    found = beside >= 0
+    assert 0 < found.sum() < len(found)
+    moved = surface.xyz[beside[found]] - surface.xyz[found]
+    assert torch.allclose(moved, torch.tensor([surface.edge, 0.0, 0.0], dtype=torch.float64), atol=1e-9)
 
 
 def test_pixels_whose_surface_lies_outside_the_window_take_no_part(tiny_dive):

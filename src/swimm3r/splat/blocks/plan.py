@@ -10,7 +10,7 @@ from collections.abc import Sequence
 from dataclasses import dataclass, replace
 
 import torch
-from jaxtyping import Float
+from jaxtyping import Float, Int
 from scipy.spatial import KDTree
 from torch import Tensor
 
@@ -25,8 +25,30 @@ _CELLS = 8  # edges of a surface cell in the median depth
 class Surface:
     """The surface of a dive in cells."""
 
-    xyz: Float[Tensor, "n 3"]  # float64, scene units
+    xyz: Float[Tensor, "n 3"]  # of their centers, float64, scene units
     area: Float[Tensor, " n"]  # of each, in images
+    edge: float  # of a cell, scene units
+
+    def cells_of(self, points: Float[Tensor, "m 3"]) -> Int[Tensor, " m"]:
+        """The cell that holds each point; -1 for those in none."""
+        places, low, size = _places(self.xyz, self.edge)
+        asked = (points.double() / self.edge).floor().long() - low
+        inside = ((asked >= 0) & (asked < size)).all(1)
+        keys, order = _keys(places, size).sort()
+        key = _keys(asked.clamp(min=0).minimum(size - 1), size)
+        found = torch.searchsorted(keys, key).clamp(max=len(keys) - 1)
+        return torch.where(inside & (keys[found] == key), order[found], -1)
+
+
+def _places(xyz: Float[Tensor, "n 3"], edge: float) -> tuple[Int[Tensor, "n 3"], Int[Tensor, "3"], Int[Tensor, "3"]]:
+    """The whole-numbered places of cells from the lowest on, the lowest, and how many places there are."""
+    places = (xyz / edge).floor().long()
+    low = places.amin(0)
+    return places - low, low, places.amax(0) - low + 1
+
+
+def _keys(places: Int[Tensor, "n 3"], size: Int[Tensor, "3"]) -> Int[Tensor, " n"]:
+    return (places[:, 0] * size[1] + places[:, 1]) * size[2] + places[:, 2]
 
 
 @dataclass(frozen=True)
@@ -50,7 +72,7 @@ def surface_of(rec: Reconstruction, median_depth: float) -> Surface:
     image = rec.cameras.width / fx * rec.cameras.height / fy * median_depth**2
     nearest, _ = KDTree(rec.cameras.centers.double().numpy()).query(cells.numpy())
     away = torch.from_numpy(nearest).clamp(min=median_depth)
-    return Surface(cells, edge**2 / image * (median_depth / away).square())
+    return Surface(cells, edge**2 / image * (median_depth / away).square(), edge)
 
 
 def plan_blocks(surface: Surface, median_depth: float, settings: BlockSettings) -> tuple[PlannedBlock, ...]:

@@ -1,4 +1,4 @@
-"""A large map trained: first the water on a coarse map of the whole dive, then block after block in that water.
+"""A large map trained: first the water on a map of parts of the dive, then block after block in that water.
 
 A block is trained on the pixels whose surface lies in its window or the margin around it, and leaves the primitives of
 the margin to later blocks. Neighbors take turns: the later one is trained beside the finished primitives of the
@@ -8,7 +8,6 @@ alone, from its checkpoint.
 """
 
 import logging
-import math
 from collections.abc import Sequence
 from dataclasses import asdict, dataclass, replace
 from functools import partial
@@ -34,9 +33,9 @@ from swimm3r.splat.block_store import (
     write_block,
 )
 from swimm3r.splat.blocks.coarse import box_of, coarse_of
-from swimm3r.splat.blocks.part import BlockViews, part_of, views_of_blocks
-from swimm3r.splat.blocks.plan import PlannedBlock
-from swimm3r.splat.ground import Window, held_by_any, plane_of
+from swimm3r.splat.blocks.part import BlockViews, part_of, stretches_of, views_of_blocks
+from swimm3r.splat.blocks.plan import PlannedBlock, surface_of
+from swimm3r.splat.ground import Window, held_by_any
 from swimm3r.splat.medium.field import MediumField
 from swimm3r.splat.primitives.beta import BetaPrimitives, rescaled, select
 from swimm3r.splat.recipes import recipe_parts
@@ -46,13 +45,12 @@ from swimm3r.splat.training import loop
 from swimm3r.splat.training.observer import Observer
 from swimm3r.splat.training.scene import Surroundings, TrainingScene, path_radius
 from swimm3r.splat.training.state import map_in_scene_units
-from swimm3r.splat.views import TrainingViews
+from swimm3r.splat.views import TrainingViews, median_z_depth
 from swimm3r.tasks import run_tasks
 from swimm3r.tasks.settings import EngineSettings
 
 log = logging.getLogger(__name__)
 
-_WATER_VIEWS = 256  # frames that the water is trained on, at most: its images stay in memory
 _STRIP = 0.1  # of the margin: ground of finished neighbors where a block starts with primitives of its own, too
 _FEWEST = 4  # points that a block's training starts from
 
@@ -208,14 +206,14 @@ def _train_water(
     device: torch.device,
     observer: Observer | None,
 ) -> MediumField:
-    """The water of a coarse map of the whole dive, with as many primitives as one block; per working unit.
+    """The water of a map of stretches spread over the dive, with the ground of one block; per working unit.
 
-    It is trained on some of the frames, spread over the dive.
+    A map of all ground would be so coarse, and each primitive drawn so seldom, that the water, which is drawn in every
+    step, would take the primitives' colors.
     """
-    names = views.names[:: math.ceil(len(views) / _WATER_VIEWS)]
-    if len(names) < len(views):
-        everywhere = Window(plane_of(rec.points.xyz))
-        views = TrainingViews(part_of(rec, names, everywhere), views.frames, settings, scale)
+    surface = surface_of(rec, median_z_depth(rec))
+    part = stretches_of(rec, views.names, surface, settings.blocks.largest)
+    views = TrainingViews(part, views.frames, settings, scale)
     short = replace(settings, iterations=max(1, round(settings.blocks.water_steps * settings.iterations)))
     radius = path_radius(rec, scale, settings.working_depth)
     scene = TrainingScene(views.rec, scale, radius, views, None, device)
