@@ -1,5 +1,6 @@
 """Poses without weights: from images of two textured planes whose poses are known, and from a murky real clip."""
 
+import math
 import shutil
 from dataclasses import replace
 from pathlib import Path
@@ -396,6 +397,21 @@ def test_a_leap_of_the_camera_is_said(rec, frames: Frames, folder: Path) -> None
     leap = replace(rec, cameras=replace(rec.cameras, cam2world=poses))
     said = [warning.what for warning in plausibility.implausible(leap, store, frames)]
     assert any(f"jumps 1 time, first at {rec.names[5]}" in what for what in said)
+
+
+@pytest.mark.parametrize("seconds", [1.0, 2.0])
+def test_a_turn_over_a_frame_that_was_held_back_is_no_leap(rec, frames: Frames, folder: Path, seconds: float) -> None:
+    camera = calibration.first_camera(WIDTH, HEIGHT, SETTINGS)
+    store = feature_database.start_database(folder, frames, camera, SETTINGS.features)
+    poses = rec.cameras.cam2world.clone()
+    about = torch.tensor([0.0, math.radians(40.0), 0.0], dtype=torch.float64)
+    back, ahead = poses[4, :3, :3], poses[5, :3, :3].clone()
+    poses[5:, :3, :3] = back @ so3_exp(about) @ ahead.mT @ poses[5:, :3, :3]
+    turned = replace(rec, cameras=replace(rec.cameras, cam2world=poses))
+    late = {name: k + (seconds - 1) * (k >= 5) for k, name in enumerate(rec.names)}
+    timed = replace(frames, frames=tuple(replace(f, time=late.get(f.name, f.time)) for f in frames.frames))
+    said = [warning.what for warning in plausibility.implausible(turned, store, timed)]
+    assert any("path jumps" in what for what in said) == (seconds == 1)
 
 
 @pytest.mark.shared

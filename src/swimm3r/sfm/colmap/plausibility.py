@@ -25,7 +25,7 @@ _SAMPLED_FRAMES = 8
 _WEAK_LINK = 50  # shared points; skerki_wreck's lines hang together by fewer, single clips by 80 and more
 _MIN_ANGLE = 1.5  # degrees between the rays of a typical point; good clips have 6 to 15
 _MAX_DEPTH_CHANGE = 10.0  # of the frames' median depth along a clip; good clips have up to 3.2, the tiled pool 5.6
-_MAX_STEP, _MAX_TURN = 15.0, 30.0  # times the median step, and degrees, between neighboring frames of a video
+_MAX_STEP, _MAX_TURN = 15.0, 30.0  # times the median step, and degrees, in a median time between frames of a video
 _FOCAL_BOUNDS = (0.35, 3.0)  # focal length over image width: 110 degrees to 19 degrees across
 
 
@@ -130,7 +130,9 @@ def _jump(rec: Reconstruction, frames: Frames) -> QualityWarning | None:
     poses = rec.cameras.cam2world[order]
     step = poses[1:, :3, 3].sub(poses[:-1, :3, 3]).norm(dim=1)
     turn = torch.rad2deg(rotation_angle(relative_poses(poses[:-1], poses[1:])[..., :3, :3]))
-    jumps = ((step > _MAX_STEP * step.median()) | (turn > _MAX_TURN)).nonzero().flatten().tolist()
+    elapsed = torch.tensor(frames.times_of([rec.names[i] for i in order]), dtype=torch.float64).diff()
+    longer = (elapsed / elapsed.median()).clamp(min=1)  # where a frame was held back for scores, two
+    jumps = ((step > _MAX_STEP * longer * step.median()) | (turn > _MAX_TURN * longer)).nonzero().flatten().tolist()
     # a gap where frames are missing, or a cut of the film, is no jump
     numbers = [path[rec.names[i]] for i in order]
     jumps = [k for k in jumps if numbers[k + 1] == numbers[k] + 1]
