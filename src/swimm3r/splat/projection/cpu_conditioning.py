@@ -17,9 +17,10 @@ import numpy as np
 from swimm3r.raster.cpu.math import inlined
 from swimm3r.splat.projection.cpu_matrices import (  # fmt: skip
     ADD,
-    HALF,
     ONE,
-    SET,
+    SIZE_1,
+    SIZE_3,
+    SIZE_C,
     TWO,
     ZERO,
     cholesky,
@@ -29,6 +30,8 @@ from swimm3r.splat.projection.cpu_matrices import (  # fmt: skip
     product,
     product_at,
     product_bt,
+    products,
+    run,
     zero,
 )
 
@@ -43,6 +46,56 @@ NEAREST = np.float32(1e-24)  # squared distance
  TANH, OC, D_MEAN, D_COV, D_S, D_B, D_L11, D_WX, D_N, D_W, D_Q, D_X, D_Y, D_L21, D_L22, D_V22, D_P, P, PHI, K,
  SCRATCH, FOOTPRINT2) = map(np.uintp, range(47))  # fmt: skip
 MATRICES = 47
+
+_V22 = products(
+    product_bt(V22, L21, L21, SIZE_C, SIZE_3, SIZE_C),
+    product_bt(V22, L22, L22, SIZE_C, SIZE_C, SIZE_C, ADD),
+)
+_PRECISION = products(
+    product(U, T, L21, SIZE_C, SIZE_C, SIZE_3),
+    product_at(Q, U, T, SIZE_3, SIZE_C, SIZE_C),
+)
+_CONDITIONAL = products(
+    product(WX, W, X, SIZE_3, SIZE_C, SIZE_1),
+    product(MEAN, L11, WX, SIZE_3, SIZE_3, SIZE_1, ADD),
+    product(N, W, L21, SIZE_3, SIZE_C, SIZE_3, ADD, halves=-2),
+    product(A, L11, N, SIZE_3, SIZE_3, SIZE_3),
+    product_bt(COV, A, L11, SIZE_3, SIZE_3, SIZE_3),
+    product(Y, T, X, SIZE_C, SIZE_C, SIZE_1),
+)
+_D_CONDITIONAL = products(
+    product_bt(D_L11, D_MEAN, WX, SIZE_3, SIZE_1, SIZE_3),
+    product(SCRATCH, D_COV, L11, SIZE_3, SIZE_3, SIZE_3),
+    product_bt(D_L11, SCRATCH, N, SIZE_3, SIZE_3, SIZE_3, ADD),
+    product_at(D_L11, D_COV, A, SIZE_3, SIZE_3, SIZE_3, ADD),
+    product_at(D_N, L11, SCRATCH, SIZE_3, SIZE_3, SIZE_3),
+    product_at(D_WX, L11, D_MEAN, SIZE_3, SIZE_3, SIZE_1),
+    product_bt(D_W, D_WX, X, SIZE_3, SIZE_1, SIZE_C),
+    product_bt(D_W, D_N, L21, SIZE_3, SIZE_3, SIZE_C, ADD, halves=-2),
+    product_at(D_X, W, D_WX, SIZE_C, SIZE_3, SIZE_1),
+    product_at(D_L21, W, D_N, SIZE_C, SIZE_3, SIZE_3, halves=-2),
+)
+_D_PRECISION = products(
+    product_at(P, T, T, SIZE_C, SIZE_C, SIZE_C),
+    product_bt(D_L21, P, D_Q, SIZE_C, SIZE_C, SIZE_3, ADD),
+    product(D_P, L21, D_Q, SIZE_C, SIZE_3, SIZE_C),
+    product(SCRATCH, D_P, P, SIZE_C, SIZE_C, SIZE_C),
+    product(D_V22, P, SCRATCH, SIZE_C, SIZE_C, SIZE_C, halves=-2),
+)
+_D_LOG_SHARE = products(
+    product_at(K, T, D_Y, SIZE_C, SIZE_C, SIZE_1),
+)
+_D_FACTOR = products(
+    product_at(PHI, LC, SCRATCH, SIZE_C, SIZE_C, SIZE_C),
+)
+_D_V22 = products(
+    product(SCRATCH, PHI, T, SIZE_C, SIZE_C, SIZE_C, halves=1),
+    product_at(D_V22, T, SCRATCH, SIZE_C, SIZE_C, SIZE_C, ADD),
+)
+_D_LOWER = products(
+    product(D_L21, D_V22, L21, SIZE_C, SIZE_C, SIZE_3, ADD),
+    product(D_L22, D_V22, L22, SIZE_C, SIZE_C, SIZE_C),
+)
 
 
 class Stored(NamedTuple):
@@ -136,29 +189,22 @@ def condition(g, three, c):
         out, s = g[L22, k, k], g[S, 1, k]
         for q in range(g.shape[3]):
             out[q] = s[q]
-    product_bt(g, V22, L21, L21, c, three, c, ONE, SET)
-    product_bt(g, V22, L22, L22, c, c, c, ONE, ADD)
+    run(g, _V22, 0, three, c)
     cholesky(g, LC, V22, c)
     inverse_of_lower(g, T, LC, c)
-    product(g, U, T, L21, c, c, three, ONE, SET)
-    product_at(g, Q, U, T, three, c, c, ONE, SET)
+    run(g, _PRECISION, 0, three, c)
     for i in range(three):
         for j in range(c):
             w, value, b = g[W, i, j], g[Q, i, j], g[B, 1, j]
             for q in range(g.shape[3]):
                 w[q] = value[q] * min(b[q] / FOUR, ONE)
-    product(g, WX, W, X, three, c, 1, ONE, SET)
     zero(g, N, three, three)
     for i in range(three):
         mean, at, one = g[MEAN, i, 0], g[XYZ, i, 0], g[N, i, i]
         for q in range(g.shape[3]):
             mean[q] = at[q]
             one[q] = ONE
-    product(g, MEAN, L11, WX, three, three, 1, ONE, ADD)
-    product(g, N, W, L21, three, c, three, -ONE, ADD)
-    product(g, A, L11, N, three, three, three, ONE, SET)
-    product_bt(g, COV, A, L11, three, three, three, ONE, SET)
-    product(g, Y, T, X, c, c, 1, ONE, SET)
+    run(g, _CONDITIONAL, 0, three, c)
     zero(g, OC, 1, 1)
     oc, o = g[OC, 0, 0], g[O, 0, 0]
     for j in range(c):
@@ -177,16 +223,7 @@ def condition(g, three, c):
 @inlined
 def conditioning_gradients(g, ids, start, count, three, c, d_opacity, d_exponent):
     """D_S, D_L11 (of R in the end), D_L21, D_L22, D_X and D_B from D_MEAN, D_COV and what the rasterizer says."""
-    product_bt(g, D_L11, D_MEAN, WX, three, 1, three, ONE, SET)
-    product(g, SCRATCH, D_COV, L11, three, three, three, ONE, SET)
-    product_bt(g, D_L11, SCRATCH, N, three, three, three, ONE, ADD)
-    product_at(g, D_L11, D_COV, A, three, three, three, ONE, ADD)
-    product_at(g, D_N, L11, SCRATCH, three, three, three, ONE, SET)
-    product_at(g, D_WX, L11, D_MEAN, three, three, 1, ONE, SET)
-    product_bt(g, D_W, D_WX, X, three, 1, c, ONE, SET)
-    product_bt(g, D_W, D_N, L21, three, three, c, -ONE, ADD)
-    product_at(g, D_X, W, D_WX, c, three, 1, ONE, SET)
-    product_at(g, D_L21, W, D_N, c, three, three, -ONE, SET)
+    run(g, _D_CONDITIONAL, 0, three, c)
     zero(g, D_B, 2, c)
     for j in range(c):
         b, d_b = g[B, 1, j], g[D_B, 1, j]
@@ -196,11 +233,7 @@ def conditioning_gradients(g, ids, start, count, three, c, d_opacity, d_exponent
                 d_q[q] = d_w[q] * min(b[q] / FOUR, ONE)
                 d_b[q] += d_w[q] * value[q] / FOUR if b[q] < FOUR else ZERO
     # Q = L21^T P with P = V22^-1 = T^T T, so that D_V22 = -P (L21 D_Q) P
-    product_at(g, P, T, T, c, c, c, ONE, SET)
-    product_bt(g, D_L21, P, D_Q, c, c, three, ONE, ADD)
-    product(g, D_P, L21, D_Q, c, three, c, ONE, SET)
-    product(g, SCRATCH, D_P, P, c, c, c, ONE, SET)
-    product(g, D_V22, P, SCRATCH, c, c, c, -ONE, SET)
+    run(g, _D_PRECISION, 0, three, c)
     # the opacity, through y = T x
     for j in range(c):
         y, d_y, b, d_b, log_share, tanh = (
@@ -219,7 +252,7 @@ def conditioning_gradients(g, ids, start, count, three, c, d_opacity, d_exponent
             d_y[q] = -TWO * weight * b[q] * y[q] * (ONE + tanh[q])
     for q in range(count):
         g[D_B, 0, 0, q] = d_exponent[ids[start + q]]
-    product_at(g, K, T, D_Y, c, c, 1, ONE, SET)
+    run(g, _D_LOG_SHARE, 0, three, c)
     # D_LC = -tril(K y^T); PHI = tril(LC^T D_LC) with its diagonal halved; D_V22 += T^T (PHI + PHI^T) T / 2
     zero(g, SCRATCH, c, c)
     for i in range(c):
@@ -230,14 +263,13 @@ def conditioning_gradients(g, ids, start, count, three, c, d_opacity, d_exponent
             out, y = g[SCRATCH, i, j], g[Y, j, 0]
             for q in range(g.shape[3]):
                 out[q] = -k[q] * y[q]
-    product_at(g, PHI, LC, SCRATCH, c, c, c, ONE, SET)
+    run(g, _D_FACTOR, 0, three, c)
     for i in range(c):  # PHI + PHI^T: the diagonal, halved twice over, is right as it stands
         for j in range(i):
             above, below = g[PHI, j, i], g[PHI, i, j]
             for q in range(g.shape[3]):
                 above[q] = below[q]
-    product(g, SCRATCH, PHI, T, c, c, c, HALF, SET)
-    product_at(g, D_V22, T, SCRATCH, c, c, c, ONE, ADD)
+    run(g, _D_V22, 0, three, c)
     # V22 = L21 L21^T + L22 L22^T
     for i in range(c):
         for j in range(i + 1):
@@ -246,8 +278,7 @@ def conditioning_gradients(g, ids, start, count, three, c, d_opacity, d_exponent
                 both = below[q] + above[q]
                 below[q] = both
                 above[q] = both
-    product(g, D_L21, D_V22, L21, c, c, three, ONE, ADD)
-    product(g, D_L22, D_V22, L22, c, c, c, ONE, SET)
+    run(g, _D_LOWER, 0, three, c)
     zero(g, D_S, 1, three)
     for j in range(three):
         d_s, s = g[D_S, 0, j], g[S, 0, j]

@@ -2,17 +2,20 @@
 
 The workspace `g` is [matrices, 4, 4, LANES]; a matrix is named by its number. The loops over rows and columns are short
 and scalar, the innermost one runs over the lanes and becomes SIMD. It asks the workspace for their number: a loop of
-known length would be unrolled whole, and take minutes to compile.
+known length would be unrolled whole, and take minutes to compile. Products come in lists (`products`), each of which is
+one loop to the compiler: it takes a third of a second for each copy of the arithmetic.
 """
 
 from typing import no_type_check
 
 import numpy as np
+from jaxtyping import Int
 
 from swimm3r.raster.cpu.math import exp2, inlined
 
 LANES = 128
-SET, ADD = False, True
+SET, ADD = 0, 1
+SIZE_1, SIZE_2, SIZE_3, SIZE_C = range(4)  # rows or columns of a matrix: one, two, three, as many as a query has
 ZERO, HALF, ONE, TWO = np.float32(0.0), np.float32(0.5), np.float32(1.0), np.float32(2.0)
 LOG2_E = np.float32(1.4426950408889634)
 # odd powers of the series of artanh: log1p(e) = 2 artanh(e / (2 + e)), which keeps the digits of a small e
@@ -46,41 +49,49 @@ def zero(g, out, rows, columns):
                 o[q] = ZERO
 
 
-@no_type_check
-@inlined
-def _product(g, out, a, b, rows, inner, columns, sign, add, a_turned, b_turned):
-    for i in range(rows):
-        for j in range(columns):
-            o = g[out, i, j]
-            if not add:
-                for q in range(g.shape[3]):
-                    o[q] = ZERO
-            for k in range(inner):
-                u = g[a, k, i] if a_turned else g[a, i, k]
-                v = g[b, j, k] if b_turned else g[b, k, j]
-                for q in range(g.shape[3]):
-                    o[q] += sign * (u[q] * v[q])
+Product = tuple[np.integer | int, ...]
+_PLAIN, _A_TURNED, _B_TURNED = range(3)
+
+
+def products(*listed: Product) -> Int[np.ndarray, "n 9"]:
+    """Products to be run one after another (`run`)."""
+    return np.array([[int(value) for value in each] for each in listed])
+
+
+def product(out, a, b, rows, inner, columns, add=SET, halves=2) -> Product:
+    """out = f a b, or out += with `add`, for a [rows, inner] and b [inner, columns]; f is so many halves."""
+    return out, a, b, rows, inner, columns, _PLAIN, add, halves
+
+
+def product_at(out, a, b, rows, inner, columns, add=SET, halves=2) -> Product:
+    """out = f a^T b, or out += with `add`, for a [inner, rows] and b [inner, columns]."""
+    return out, a, b, rows, inner, columns, _A_TURNED, add, halves
+
+
+def product_bt(out, a, b, rows, inner, columns, add=SET, halves=2) -> Product:
+    """out = f a b^T, or out += with `add`, for a [rows, inner] and b [columns, inner]."""
+    return out, a, b, rows, inner, columns, _B_TURNED, add, halves
 
 
 @no_type_check
 @inlined
-def product(g, out, a, b, rows, inner, columns, sign, add):
-    """out = sign a b, or out += with `add`, for a [rows, inner] and b [inner, columns]."""
-    _product(g, out, a, b, rows, inner, columns, sign, add, False, False)
-
-
-@no_type_check
-@inlined
-def product_at(g, out, a, b, rows, inner, columns, sign, add):
-    """out = sign a^T b, or out += with `add`, for a [inner, rows] and b [inner, columns]."""
-    _product(g, out, a, b, rows, inner, columns, sign, add, True, False)
-
-
-@no_type_check
-@inlined
-def product_bt(g, out, a, b, rows, inner, columns, sign, add):
-    """out = sign a b^T, or out += with `add`, for a [rows, inner] and b [columns, inner]."""
-    _product(g, out, a, b, rows, inner, columns, sign, add, False, True)
+def run(g, listed, two, three, c):
+    """Products of the workspace's matrices, for sizes that are known when it runs."""
+    sizes = (1, two, three, c)
+    for p in range(listed.shape[0]):
+        out, a, b = listed[p, 0], listed[p, 1], listed[p, 2]
+        turned, factor = listed[p, 6], HALF * np.float32(listed[p, 8])
+        for i in range(sizes[listed[p, 3]]):
+            for j in range(sizes[listed[p, 5]]):
+                o = g[out, i, j]
+                if listed[p, 7] == SET:
+                    for q in range(g.shape[3]):
+                        o[q] = ZERO
+                for k in range(sizes[listed[p, 4]]):
+                    u = g[a, k, i] if turned == _A_TURNED else g[a, i, k]
+                    v = g[b, j, k] if turned == _B_TURNED else g[b, k, j]
+                    for q in range(g.shape[3]):
+                        o[q] += (factor * u[q]) * v[q]
 
 
 @no_type_check

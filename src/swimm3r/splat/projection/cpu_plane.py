@@ -31,12 +31,16 @@ from swimm3r.splat.projection.cpu_conditioning import (  # fmt: skip
 from swimm3r.splat.projection.cpu_matrices import (
     HALF,
     ONE,
-    SET,
+    SIZE_1,
+    SIZE_2,
+    SIZE_3,
     TWO,
     ZERO,
     product,
     product_at,
     product_bt,
+    products,
+    run,
     zero,
 )
 
@@ -48,6 +52,21 @@ ON_PLANE = WORLD + 2
 # matrices after those of conditioning
 (AT, J, RV, COV_SEEN, M, M_COV, PLANE, D_AT, D_M, D_J, D_PLANE, D_WIDTH, OUTER) = map(
     np.uintp, range(MATRICES, MATRICES + 13)
+)
+
+_ONTO_PLANE = products(
+    product(M, J, RV, SIZE_2, SIZE_3, SIZE_3),
+    product(M_COV, M, COV_SEEN, SIZE_2, SIZE_3, SIZE_3),
+    product_bt(PLANE, M_COV, M, SIZE_2, SIZE_3, SIZE_2),
+)
+_D_JACOBIAN = products(
+    product(D_M, D_PLANE, M_COV, SIZE_2, SIZE_2, SIZE_3, halves=4),
+    product_bt(D_J, D_M, RV, SIZE_2, SIZE_3, SIZE_3),
+)
+_D_WORLD = products(
+    product_at(OUTER, M, D_PLANE, SIZE_3, SIZE_2, SIZE_2),
+    product(D_COV, OUTER, M, SIZE_3, SIZE_2, SIZE_3),
+    product_at(D_MEAN, RV, D_AT, SIZE_3, SIZE_3, SIZE_1),
 )
 
 
@@ -94,9 +113,7 @@ def onto_plane(g, camera, three, two):
         seen, u, v = g[COV_SEEN, k, k], camera[WORLD], camera[WORLD + 1]
         for q in range(g.shape[3]):
             seen[q] += (u + v * exponent[q]) * footprint2[q]
-    product(g, M, J, RV, two, three, three, ONE, SET)
-    product(g, M_COV, M, COV_SEEN, two, three, three, ONE, SET)
-    product_bt(g, PLANE, M_COV, M, two, three, two, ONE, SET)
+    run(g, _ONTO_PLANE, two, three, 0)
     for axis in range(two):
         variance, u, v = g[PLANE, axis, axis], camera[ON_PLANE], camera[ON_PLANE + 1]
         for q in range(g.shape[3]):
@@ -128,8 +145,7 @@ def plane_gradients(g, ids, start, count, camera, three, two, d):
         r00, r01, r10, r11 = g00 * xx + g01 * xy, g00 * xy + g01 * yy, g01 * xx + g11 * xy, g01 * xy + g11 * yy
         g[D_PLANE, 0, 0, q], g[D_PLANE, 0, 1, q] = -(xx * r00 + xy * r10), -(xx * r01 + xy * r11)
         g[D_PLANE, 1, 0, q], g[D_PLANE, 1, 1, q] = g[D_PLANE, 0, 1, q], -(xy * r01 + yy * r11)
-    product(g, D_M, D_PLANE, M_COV, two, two, three, TWO, SET)
-    product_bt(g, D_J, D_M, RV, two, three, three, ONE, SET)
+    run(g, _D_JACOBIAN, two, three, 0)
     for axis in range(two):
         f, low, high = camera[FX + axis], camera[X_LOW + 2 * axis], camera[X_HIGH + 2 * axis]
         at, z, d_at, d_z = g[AT, axis, 0], g[AT, 2, 0], g[D_AT, axis, 0], g[D_AT, 2, 0]
@@ -140,8 +156,7 @@ def plane_gradients(g, ids, start, count, camera, three, two, d):
             inside = low <= s <= high  # beyond, J follows z alone
             d_at[q] -= v * inverse * inverse if inside else ZERO
             d_z[q] -= (f * straight[q] - v * (TWO * s if inside else min(max(s, low), high))) * inverse * inverse
-    product_at(g, OUTER, M, D_PLANE, three, two, two, ONE, SET)
-    product(g, D_COV, OUTER, M, three, two, three, ONE, SET)
+    run(g, _D_WORLD, two, three, 0)
     d_width, footprint2 = g[D_WIDTH, 0, 0], g[FOOTPRINT2, 0, 0]
     for q in range(g.shape[3]):
         in_world = g[D_COV, 0, 0, q] + g[D_COV, 1, 1, q] + g[D_COV, 2, 2, q]
@@ -153,7 +168,6 @@ def plane_gradients(g, ids, start, count, camera, three, two, d):
                 for q in range(g.shape[3]):
                     g[D_COV, j, i, q] += g[D_COV, i, j, q]
                     g[D_COV, i, j, q] = ZERO
-    product_at(g, D_MEAN, RV, D_AT, three, three, 1, ONE, SET)
 
 
 @no_type_check

@@ -34,7 +34,7 @@ from swimm3r.splat.projection.cpu_conditioning import (  # fmt: skip
     conditioning_gradients,
     load,
 )
-from swimm3r.splat.projection.cpu_matrices import LANES, ONE, SET, product_at, zero
+from swimm3r.splat.projection.cpu_matrices import LANES, SIZE_1, SIZE_3, SIZE_C, product_at, products, run, zero
 from swimm3r.splat.projection.cpu_plane import (  # fmt: skip
     AT,
     D_AT,
@@ -59,6 +59,11 @@ from swimm3r.splat.settings import RenderSettings
 # enters the kernels' signatures, so that Numba's cache notices when what is inlined into them changes
 _INLINED = (cpu_conditioning, cpu_matrices, cpu_plane, math)
 SOURCES = zlib.crc32(b"".join(Path(str(module.__file__)).read_bytes() for module in _INLINED))
+_D_CENTER = products(
+    product_at(D_MEAN, RV, D_AT, SIZE_3, SIZE_3, SIZE_1),
+    product_at(D_WX, L11, D_MEAN, SIZE_3, SIZE_3, SIZE_1),
+    product_at(D_X, W, D_WX, SIZE_C, SIZE_3, SIZE_1),
+)
 kernel = njit(nogil=True, cache=True, error_model="numpy", fastmath=math.FLAGS)
 
 
@@ -104,9 +109,7 @@ def center_blocks(first, beyond, g, ids, on_plane, stored, camera, time, d_xyz, 
                 u, v = on_plane[i, k, 0], on_plane[i, k, 1]
                 g[D_AT, 0, 0, q], g[D_AT, 1, 0, q] = fx / z * u, fy / z * v
                 g[D_AT, 2, 0, q] = on_plane[i, k, 2] - (fx * x * u + fy * y * v) / (z * z)
-            product_at(g, D_MEAN, RV, D_AT, three, three, 1, ONE, SET)
-            product_at(g, D_WX, L11, D_MEAN, three, three, 1, ONE, SET)
-            product_at(g, D_X, W, D_WX, c, three, 1, ONE, SET)
+            run(g, _D_CENTER, two, three, c)
             for q in range(count):
                 i, along = ids[start + q], along_view(g, q, three)
                 for j in range(three):
