@@ -156,6 +156,26 @@ def test_rectified_images_have_the_lens_of_the_projection(tmp_path: Path):
 
 
 @pytest.mark.parametrize(
+    ("later", "told"),
+    [
+        (lens(), None),
+        (lens(K=(33.0, 0, 32, 0, 33, 24, 0, 0, 1)), "fx 33 fy 33"),
+        (lens(D=(0.2, 0, 0, 0, 0)), "distortion 0.2 px at last"),
+        (lens(K=(0,) * 9), None),  # the driver shuts down
+    ],
+)
+@pytest.mark.parametrize("version", VERSIONS)
+def test_a_lens_that_changes_is_told(version: str, later: Sent, told: str | None, tmp_path: Path):
+    path = write_bag(tmp_path, version, [*camera(), lens(), replace(later, stamp=START + SECOND)])
+    frames = read_frames(path, folder=tmp_path / "prepare")
+    assert frames.calibration is not None
+    np.testing.assert_allclose(read_lens(frames.calibration, 64, 48).camera.K[0, 0, 0].numpy(), K[0])
+    changes = [warning for warning in frames.warnings if "changes" in warning]
+    assert len(changes) == (told is not None)
+    assert all(told in warning and "--end" in warning for warning in changes if told)
+
+
+@pytest.mark.parametrize(
     ("info", "told"),
     [
         (None, "no camera_info beside /cam/image_raw"),

@@ -22,7 +22,7 @@ from swimm3r.io.bags.lens import lens_text
 from swimm3r.io.bags.pixels import compressed_image_of, image_of
 from swimm3r.io.bags.topics import IMAGE, Topic, choose_images, lens_topic, topics_of
 from swimm3r.io.calibration.documents import from_yaml, read_document
-from swimm3r.io.calibration.record import lens_at
+from swimm3r.io.calibration.record import Calibration, lens_at
 from swimm3r.io.files.damage import first_line
 from swimm3r.io.images import Rgb
 
@@ -192,14 +192,35 @@ class BagClip:
         why: object = "it holds no message that can be read"
         for message in islice(bag.messages(topic.name), _TRIED):  # drivers send empty ones until they are set up
             try:
-                text = lens_text(bag.content(message), topic.name, rectified="rect" in space.rpartition("/")[2])
-                lens_at(read_document(from_yaml(text))[0], self.width, self.height)
+                text = self._calibrated(bag, message)
             except (ValueError, Swimm3rError) as error:
                 why = first_line(error)
             else:
+                self._note_change(bag, topic, text)
                 return text
         self._notes.append(f"The lens in {topic.name} is not used: {why}.")
         return None
+
+    def _calibrated(self, bag: Bag, message: Message) -> str:
+        """The text of a lens of these images. Raises ValueError and Swimm3rError where it is none."""
+        text = lens_text(bag.content(message), message.topic, rectified="rect" in self.topic.name.rpartition("/")[2])
+        lens_at(read_document(from_yaml(text))[0], self.width, self.height)
+        return text
+
+    def _note_change(self, bag: Bag, topic: Topic, text: str) -> None:
+        """Add a note where the last message of a lens is of another lens than its text."""
+        last = bag.last(topic.name)
+        assert last is not None  # it has a first
+        try:
+            at_last = self._calibrated(bag, last)
+        except (ValueError, Swimm3rError):  # a driver that shuts down
+            return
+        first, second = (read_document(from_yaml(each))[0] for each in (text, at_last))
+        if (told := _numbers(first)) != (then := _numbers(second)):
+            self._notes.append(
+                f"The lens in {topic.name} changes, from {told} px at first to {then} px at last: the first is that of"
+                " all images. Use --end to stop before the change, or --no-camera-info."
+            )
 
     def _stamp(self, message: Message) -> int:
         return message.stamp if self.stamps == "header" else message.received
@@ -221,6 +242,12 @@ class BagClip:
                 cause="the driver does not stamp its images, or its clock was set while they were recorded",
                 hint="--stamps received, which takes the times at which they were recorded",
             )
+
+
+def _numbers(lens: Calibration) -> str:
+    (fx, _, cx), (_, fy, cy), _ = lens.K
+    bent = "".join(f" {value:.4g}" for value in (*lens.k, *lens.p, *lens.divisor) if value)
+    return f"fx {fx:.6g} fy {fy:.6g} cx {cx:.6g} cy {cy:.6g}" + (f" distortion{bent}" if bent else "")
 
 
 def recorded_at(stamp: int) -> str | None:
