@@ -19,6 +19,7 @@ from swimm3r.sfm.colmap import calibration, plausibility
 from swimm3r.sfm.colmap import poses as colmap
 from swimm3r.sfm.colmap.absolute_pose import absolute_pose
 from swimm3r.sfm.colmap.adjustment import bundle_adjust
+from swimm3r.sfm.colmap.messages import too_few
 from swimm3r.sfm.colmap.pairs import choose_pairs
 from swimm3r.sfm.features import database as feature_database
 from swimm3r.sfm.settings import ColmapSettings, MappingSettings
@@ -243,6 +244,15 @@ def test_images_without_common_ground_fail_with_advice(image: str, tmp_path: Pat
     with pytest.raises(RegistrationError, match="of 4 frames") as caught:
         colmap.reconstruct(Frames(tuple(frames), WIDTH, HEIGHT, True), SETTINGS, tmp_path / "sfm")
     assert "--fps" in caught.value.hint
+
+
+@pytest.mark.parametrize(("focal", "doubted"), [(9.8 * WIDTH, True), (1.2 * WIDTH, False), (None, False)])
+def test_a_given_focal_length_of_no_lens_is_named_where_frames_cannot_be_placed(
+    focal: float | None, doubted: bool, frames: Frames
+) -> None:
+    error = too_few(0, frames, replace(SETTINGS, focal=focal))
+    assert (f"{9.8 * WIDTH:.0f} px" in error.cause and "--calibration" in error.hint) == doubted
+    assert ("--fps" in error.hint) != doubted
 
 
 def test_one_frame_is_an_input_error(frames: Frames, tmp_path: Path) -> None:

@@ -3,6 +3,7 @@
 from swimm3r.errors import RegistrationError
 from swimm3r.scene.frames import Frames
 from swimm3r.scene.reconstruction import QualityWarning
+from swimm3r.sfm.colmap.plausibility import FOCAL_BOUNDS
 from swimm3r.sfm.colmap.record import PARTS
 from swimm3r.sfm.settings import ColmapSettings
 
@@ -50,11 +51,19 @@ def unknown_port() -> QualityWarning:
     )
 
 
-def too_few(placed: int, frames: int, settings: ColmapSettings) -> RegistrationError:
+def too_few(placed: int, frames: Frames, settings: ColmapSettings) -> RegistrationError:
     """The error of a model that holds too small a share of the frames."""
-    return _not_placed(
-        f"only {placed} of {frames} frames could be placed relative to each other"
-        + (", and on too few points to be trusted" if placed > settings.mapping.min_share * frames else "")
+    what = f"only {placed} of {len(frames)} frames could be placed relative to each other" + (
+        ", and on too few points to be trusted" if placed > settings.mapping.min_share * len(frames) else ""
+    )
+    low, high = (share * frames.width for share in FOCAL_BOUNDS)
+    if settings.focal is None or settings.camera == "OPENCV_FISHEYE" or low <= settings.focal <= high:
+        return _not_placed(what)
+    return RegistrationError(
+        what,
+        cause=f"the given focal length, {settings.focal:.0f} px in frames {frames.width} px wide, is that of no common"
+        f" lens ({low:.0f} to {high:.0f} px): the calibration failed, or was made at another image size",
+        hint="leave out --calibration or --focal, which estimates the lens; of a bag, --no-camera-info",
     )
 
 

@@ -18,6 +18,7 @@ from swimm3r.scene.reconstruction import QualityWarning, Reconstruction
 from swimm3r.sfm.features.database import FeatureDatabase
 from swimm3r.sfm.features.sift import unit_descriptors
 
+FOCAL_BOUNDS = (0.35, 3.0)  # focal length over image width: 110 degrees to 19 degrees across
 _TWIN_ANGLE = 0.3  # radians between descriptors of things that look the same
 _TWIN_APART = 16.0  # pixels: closer ones are one corner found twice
 _TWIN_SHARE = 0.25  # tiled pool 0.63; reef, rock, wreck, open water with a dolphin 0 to 0.02
@@ -26,7 +27,6 @@ _WEAK_LINK = 50  # shared points; skerki_wreck's lines hang together by fewer, s
 _MIN_ANGLE = 1.5  # degrees between the rays of a typical point; good clips have 6 to 15
 _MAX_DEPTH_CHANGE = 10.0  # of the frames' median depth along a clip; good clips have up to 3.2, the tiled pool 5.6
 _MAX_STEP, _MAX_TURN = 15.0, 30.0  # times the median step, and degrees, in a median time between frames of a video
-_FOCAL_BOUNDS = (0.35, 3.0)  # focal length over image width: 110 degrees to 19 degrees across
 
 
 def implausible(rec: Reconstruction, store: FeatureDatabase, frames: Frames) -> tuple[QualityWarning, ...]:
@@ -69,7 +69,7 @@ def _repeated_texture(store: FeatureDatabase) -> QualityWarning | None:
 
 def _bad_lens(rec: Reconstruction) -> QualityWarning | None:
     ratio = float(rec.cameras.K[0, 0, 0]) / rec.cameras.width
-    if _FOCAL_BOUNDS[0] <= ratio <= _FOCAL_BOUNDS[1]:
+    if FOCAL_BOUNDS[0] <= ratio <= FOCAL_BOUNDS[1]:
         return None
     return QualityWarning(
         f"The reconstruction is implausible: its focal length ({ratio:.2f} image widths) is that of no common lens.",

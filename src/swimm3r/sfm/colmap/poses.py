@@ -105,7 +105,7 @@ def reconstruct(
             mapped = _map(working, frames, pairs, settings, progress, engine)
             if navigator is not None:
                 mapped = _navigated(mapped, working, frames, folder, navigator, progress, lenses)
-            _check_placed(mapped.model, len(frames), settings)
+            _check_placed(mapped.model, frames, settings)
             rec = record_of(mapped.model, working, frames, folder, lenses)
             if housed is not None:
                 free = settings.intrinsics != "fixed"
@@ -168,7 +168,7 @@ def _map(
     else:
         models = mapping.map_frames(store, settings, progress)
     if not models:
-        raise too_few(0, n, settings)
+        raise too_few(0, frames, settings)
     model = without_jumps(models[0])
     if model.num_reg_images() < n:
         placed = {i - 1 for i in model.reg_image_ids()}
@@ -213,10 +213,10 @@ def _navigated(
     return replace(mapped, model=found.model, others=found.others, warnings=[*mapped.warnings, *found.warnings])
 
 
-def _check_placed(model: "pycolmap.Reconstruction", frames: int, settings: ColmapSettings) -> None:
+def _check_placed(model: "pycolmap.Reconstruction", frames: Frames, settings: ColmapSettings) -> None:
     """Raise RegistrationError where a model holds too small a share of the frames."""
     placed = model.num_reg_images()
     thin = model.compute_mean_observations_per_reg_image() < settings.mapping.thin_points
     share = settings.mapping.thin_share if thin else settings.mapping.min_share
-    if placed < max(min(settings.mapping.min_frames, frames), share * frames):
+    if placed < max(min(settings.mapping.min_frames, len(frames)), share * len(frames)):
         raise too_few(placed, frames, settings)
