@@ -1,7 +1,7 @@
 """A stereo dive against the same dive by its left camera alone: errors of the path, and of the scale by the baseline.
 
-    python benchmarks/stereo.py dives [OUT] [--seeds 0 1 2 3 4 5] [--resamples 6]    from images
-    python benchmarks/stereo.py noise [--draws 10]                                   from exact tracks with noise
+    python benchmarks/stereo.py dives [OUT] [--seeds 0 1 2 3 4 5 6 7] [--resamples 6]    from images
+    python benchmarks/stereo.py noise [--draws 10]                                       from exact tracks with noise
 
 Poses are found three times: from the left images alone, from both cameras with a pose per frame, and as a rig. Errors
 are those of the left camera's centers (RMSE) under the similarity that fits them best, which has a free scale for all
@@ -242,7 +242,7 @@ def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("table", choices=("dives", "noise"))
     parser.add_argument("out", nargs="?", type=Path, default=Path("runs/stereo"))
-    parser.add_argument("--seeds", nargs="+", type=int, default=[0, 1, 2, 3, 4, 5])
+    parser.add_argument("--seeds", nargs="+", type=int, default=list(range(8)))
     parser.add_argument("--draws", type=int, default=10)
     parser.add_argument("--resamples", type=int, default=6, help="of each dive's points; 0 leaves out their scatter")
     given = parser.parse_args()
