@@ -16,6 +16,7 @@ from swimm3r.io.files.atomic import DRAFT
 from swimm3r.io.files.folder_lock import folder_lock
 from swimm3r.pipeline.presets import PRESETS, RunSettings, from_yaml
 from swimm3r.pipeline.run import run_pipeline
+from swimm3r.pipeline.run_record import open_record
 from swimm3r.pipeline.run_settings import differences, starting_settings
 from swimm3r.scene.run_folder import open_run, read_run
 from swimm3r.synthetic import write_dive
@@ -124,6 +125,23 @@ def test_a_stage_whose_folder_was_removed_is_made_again(dive: Path, run: Path):
     (run / "prepare").rmdir()
     run_pipeline(dive, run, last_stage="prepare")
     assert contents(run / "prepare") == before
+
+
+@pytest.mark.parametrize(("made", "gone"), [("sfm", ["splat", "eval"]), ("splat", ["eval"]), ("prepare", [])])
+def test_what_was_made_from_a_stage_is_not_done_once_it_is_made_again(
+    dive: Path, run: Path, made: str, gone: list[str]
+):
+    """Not even where the run is killed before it comes to them."""
+    for stage in ("sfm", "splat", "eval"):
+        pretend(run, stage)
+
+    def killed() -> None:
+        raise KeyboardInterrupt
+
+    with open_record(run, dive, read_run(run).input.fingerprint) as record, pytest.raises(KeyboardInterrupt):
+        record.stage(made, "key", killed, lambda: None)
+    kept = {"prepare", "sfm", "splat", "eval"} - set(gone)
+    assert set(json.loads((run / "summary.json").read_text())["stages"]) == kept
 
 
 def test_a_run_of_another_version_keeps_its_stages(dive: Path, run: Path, caplog: pytest.LogCaptureFixture):

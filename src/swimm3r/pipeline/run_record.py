@@ -40,6 +40,7 @@ _CONTENTS = {  # what a stage leaves, and what later commands make of it
     "splat": ("splat", "renders", "localization"),
     "eval": ("renders/test", "renders/protocols", "renders/flythrough.mp4"),
 }
+_MADE_FROM = {"sfm": ("splat", "eval"), "splat": ("eval",)}  # prepared frames are the same every time
 _TITLES = {
     "prepare": "frames",
     "sfm": "structure from motion, depth and water",
@@ -188,13 +189,18 @@ class RunRecord:
     def stage(
         self, name: str, key: str, make: Callable[[], Result], reuse: Callable[[], Result] | None = None, **facts: Any
     ) -> Result:
-        """Do a stage, or reuse it where it is done with the same key and is still there; `facts` go to its record."""
+        """Do a stage, or reuse it where it is done with the same key and is still there; `facts` go to its record.
+
+        Stages made from one that is made again are to be made again, even where this run is killed in between.
+        """
         self._begin(name)
         if reuse and self._is_done(name, key):
             self._log("reused", stage=name)
             return reuse()
         self._check_space()
         self._check_memory(name)
+        for later in _MADE_FROM.get(name, ()):  # their keys tell settings, not what is made now
+            self.summary["stages"].pop(later, None)
         self.summary["stages"][name] = {"status": "running", "key": key, **facts}
         self.write()
         self._log("started", stage=name)
