@@ -23,6 +23,7 @@ from swimm3r.splat.settings import (
     SggSettings,
     UwbsSettings,
 )
+from swimm3r.splat.training import loop
 from swimm3r.splat.training.loop import view_of_step
 from swimm3r.splat.training.observer import TrainingStep
 from swimm3r.splat.training.scene import TrainingScene
@@ -88,6 +89,12 @@ def test_a_checkpoint_of_other_settings_is_not_continued(tiny_dive, tmp_path):
     other = replace(short, seed=1)
     anew = train(tiny_dive.rec, tiny_dive.frames, other, tmp_path / "a")
     assert equal(anew, train(tiny_dive.rec, tiny_dive.frames, other, tmp_path / "b"))
+
+
+def test_a_checkpoint_of_code_that_trained_otherwise_is_not_continued(monkeypatch):
+    before = loop.schedule_of(SETTINGS, "input").fingerprint
+    monkeypatch.setattr(loop, "_TRAINING", loop._TRAINING + 1)
+    assert loop.schedule_of(SETTINGS, "input").fingerprint != before
 
 
 def test_a_map_comes_back_from_disk_as_it_was(tiny_dive, tmp_path):

@@ -34,6 +34,7 @@ from swimm3r.splat.views import TrainingView, smaller
 
 log = logging.getLogger(__name__)
 
+_TRAINING = 2  # raised by every change of the code that trains differently from the same settings
 _FIRST_REFIT = 0.4  # of the run: every recipe has its water by then
 _REFIT_SIDE = 160  # pixels of the longer side, at least, of the images that colors are fitted on
 _COLORS = "frame_colors"  # of a checkpoint
@@ -93,7 +94,7 @@ def schedule_of(settings: SplatSettings, *made_from: object) -> Schedule:
         log_every=max(1, math.ceil(settings.log_every * settings.iterations)),
         checkpoint_every=max(1, math.ceil(settings.checkpoint_every * settings.iterations)),
         seed=settings.seed,
-        fingerprint=cache_key(asdict(settings), *made_from)[:16],
+        fingerprint=cache_key(_TRAINING, asdict(settings), *made_from)[:16],
     )
 
 
