@@ -26,8 +26,9 @@ from swimm3r.io.images import write_rgb
 from swimm3r.pipeline.presets import PRESETS
 from swimm3r.pipeline.run import FinishedSfm, open_finished_sfm
 from swimm3r.scene.frames import Frames
+from swimm3r.scene.surface import surface_of
 from swimm3r.splat import train
-from swimm3r.splat.blocks.plan import PlannedBlock, plan_blocks, surface_of
+from swimm3r.splat.blocks.plan import PlannedBlock, plan_blocks
 from swimm3r.splat.rendering import SplatMap
 from swimm3r.splat.settings import UwbsSettings
 from swimm3r.splat.views import median_z_depth

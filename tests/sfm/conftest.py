@@ -9,7 +9,7 @@ from torch import Tensor
 
 from swimm3r.cameras import Cameras, image_directions, ray_depth_from_z
 from swimm3r.io import images
-from swimm3r.medium import Medium, add_water
+from swimm3r.medium import AttenuationCurve, Medium, MediumFit, add_water
 from swimm3r.scene.frames import Frame, Frames
 from swimm3r.scene.reconstruction import DepthMap, DepthMaps, Matches, Points, Reconstruction, Tracks
 
@@ -82,3 +82,18 @@ def teal() -> Medium:
 def dive(tmp_path_factory: pytest.TempPathFactory, teal: Medium) -> FlatDive:
     """Seven frames from 1 to 4 units above the ground."""
     return flat_dive(tmp_path_factory.mktemp("flat"), teal, (1.0, 1.3, 1.7, 2.2, 2.8, 3.4, 4.0))
+
+
+@pytest.fixture(scope="session")
+def known_water(teal: Medium) -> MediumFit:
+    """The true water as if it had been fitted."""
+    zero, yes = torch.zeros(3), torch.ones(3, dtype=torch.bool)
+    known: dict[str, torch.Tensor] = {name: yes for name in ("Binf", "beta_D", "beta_B")}
+    return MediumFit(
+        **vars(teal),
+        curve=AttenuationCurve(teal.beta_D, zero, zero, zero),
+        std=Medium(zero, zero, zero),
+        identifiable=known,
+        z_range=(0.1, 50.0),
+        encoding="srgb",
+    )

@@ -12,12 +12,13 @@ import torch
 
 from swimm3r.errors import InputError
 from swimm3r.imaging.undistortion import frame_rays
-from swimm3r.medium import AttenuationCurve, Medium, MediumFit
+from swimm3r.medium import MediumFit
 from swimm3r.scene.reconstruction import DepthMaps, Reconstruction
 from swimm3r.settings import Range, Settings, declarations, ranges_of
 from swimm3r.sfm.features.sift import extract_features
+from swimm3r.sfm.medium.dense_cloud import dense_cloud
 from swimm3r.sfm.medium.dense_tracks import fuse_depth
-from swimm3r.sfm.medium.restore import restore_image, restored_cloud
+from swimm3r.sfm.medium.restore import restore_image
 from swimm3r.sfm.medium.seathru import estimate_medium
 from swimm3r.sfm.plane_sweep.estimate import estimate_depth
 from swimm3r.sfm.settings import FeatureSettings, PlaneSweepSettings, RestoreSettings, SeathruSettings, TrackSettings
@@ -51,20 +52,6 @@ def changed(settings: Settings, name: str, number: float) -> Any:
 def finite(fit: MediumFit) -> bool:
     values = [*vars(fit.constant()).values(), *vars(fit.curve).values(), *vars(fit.std).values()]
     return all(bool(value.isfinite().all()) for value in values)
-
-
-@pytest.fixture(scope="module")
-def known_water(teal: Medium) -> MediumFit:
-    zero, yes = torch.zeros(3), torch.ones(3, dtype=torch.bool)
-    known: dict[str, torch.Tensor] = {name: yes for name in ("Binf", "beta_D", "beta_B")}
-    return MediumFit(
-        **vars(teal),
-        curve=AttenuationCurve(teal.beta_D, zero, zero, zero),
-        std=Medium(zero, zero, zero),
-        identifiable=known,
-        z_range=(0.1, 50.0),
-        encoding="srgb",
-    )
 
 
 @pytest.fixture
@@ -101,7 +88,7 @@ def test_tracks_are_found_and_the_water_from_them(name: str, number: float, dive
 def test_images_and_points_are_restored(name: str, number: float, dive, known_water: MediumFit):
     settings = changed(RestoreSettings(), name, number)
     tracks = fuse_depth(dive.rec, dive.frames, TrackSettings(max_tracks=500))
-    cloud = restored_cloud(dive.rec, dive.frames, tracks, known_water, settings)
+    cloud = dense_cloud(dive.rec, dive.frames, tracks, known_water, settings, TrackSettings(max_tracks=500))
     assert 0 < len(cloud.xyz) <= settings.max_points
     depth, rays = dive.rec.depth[dive.rec.names[3]], frame_rays(dive.rec.cameras[3])
     done = restore_image(dive.frames.image(3), depth, rays, known_water, settings)

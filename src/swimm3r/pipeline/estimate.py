@@ -47,6 +47,7 @@ _PARALLEL = 0.75  # of the cores, on average over a run
 
 _FRAME_BYTES = 1.8  # per pixel of a prepared frame, a PNG
 _SFM_BYTES = 15.0  # per pixel of a frame: depth, confidence, the restored image at 8 and 16 bits
+_AREA = 0.15  # of the surface, in images, that a frame adds: surveys of 100 and 1,000 frames
 _POINT_BYTES = 60.0  # of the restored and the raw cloud together
 _PRIMITIVE_BYTES = 600.0  # map, and checkpoint with the optimizer's state
 _VIEW_BYTES = 16.0  # per pixel of a rendered test frame, all its images
@@ -116,7 +117,9 @@ def estimate_run(
         "splat": None if step is None else settings.splat.iterations * step,
         "eval": None if step is None else tests * (settings.test.steps + 20) * step * _POSE_STEP,
     }
-    cloud = settings.sfm.restore.max_points * _POINT_BYTES
+    restore = settings.sfm.restore
+    times = count * _AREA / restore.max_points_area if restore.max_points_area else 1.0
+    cloud = max(1.0, times) * restore.max_points * _POINT_BYTES
     view = frame * _scale(settings.splat.long_side, max(width, height)) ** 2
     disk = {
         "prepare": count * frame * _FRAME_BYTES,

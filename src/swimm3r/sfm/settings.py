@@ -83,7 +83,7 @@ class TrackSettings(Settings):
     min_overlap: Share = 0.1
     """Overlap above which another frame is searched for the points of a frame."""
     max_tracks: Count = 1_000_000
-    """Approximate largest number of surface points; more are thinned on a regular grid."""
+    """Approximate largest number of surface points that the water is fitted to; more are thinned on a regular grid."""
 
 
 @dataclass(frozen=True)
@@ -102,7 +102,9 @@ class RestoreSettings(Settings):
     window: Annotated[float, Range(0.001, 0.25)] = 0.02
     """Standard deviation of the local windows, as a share of the longer side."""
     max_points: Annotated[int, Range(100)] = 500_000
-    """Largest number of points of the restored cloud, thinned by voxels."""
+    """Largest number of points of the restored cloud, thinned by voxels, of a surface of `max_points_area`."""
+    max_points_area: Annotated[float, Range(0, 1e6)] = 12.0
+    """Area in images above which a surface has points in proportion to it; 0 keeps to `max_points`."""
     white_balance: bool = True
     """Apply gray-world gains, one triple per dive, to all that is shown: restored/, points.ply, clear views, exports.
     The colors in restored_physical/ and points_physical.ply, and all scores, stay physical."""

@@ -16,9 +16,10 @@ from swimm3r.imaging.undistortion import nearest_pixels, shown_pixels
 from swimm3r.progress import Progress, silent
 from swimm3r.scene.frames import Frames
 from swimm3r.scene.reconstruction import Reconstruction
+from swimm3r.scene.surface import surface_of
 from swimm3r.splat.appearance import AppearanceDecision, decide_appearance, write_decision
 from swimm3r.splat.block_store import no_primitives
-from swimm3r.splat.blocks.plan import PlannedBlock, plan_blocks, surface_of
+from swimm3r.splat.blocks.plan import PlannedBlock, plan_blocks
 from swimm3r.splat.blocks.training import train_in_blocks
 from swimm3r.splat.medium.field import in_unit
 from swimm3r.splat.projection.observed import MOST, SIDE, TrainingCoverage, coverage_of

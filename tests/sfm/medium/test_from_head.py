@@ -10,9 +10,9 @@ from swimm3r.errors import InputError
 from swimm3r.medium import AttenuationCurve, Medium, remove_water
 from swimm3r.scene.white_balance import WhiteBalance
 from swimm3r.sfm.mast3r_sfm.network_frames import NetworkImages, network_images
+from swimm3r.sfm.medium.dense_cloud import restored_points
 from swimm3r.sfm.medium.dense_tracks import fuse_depth
 from swimm3r.sfm.medium.from_head import PredictedWater, dive_fit, predicted_images, read, write
-from swimm3r.sfm.medium.restore import restored_cloud
 from swimm3r.sfm.settings import Mast3rSettings, SeathruSettings
 from swimm3r.sfm.student.physics_head import HeadFacts, WaterMaps
 from swimm3r.splat.medium.prior import water_prior
@@ -90,12 +90,12 @@ def test_the_maps_prior_trusts_the_water_as_far_as_the_heads_error_goes(dive, wa
 def test_true_water_restores_the_cloud_to_its_clear_colors(dive, water: PredictedWater):
     tracks = fuse_depth(dive.rec, dive.frames, SeathruSettings().tracks)
     fit = dive_fit(water, dive.rec, SeathruSettings())
-    cloud = restored_cloud(dive.rec, dive.frames, tracks, fit, medium_at=water.at)
+    cloud = restored_points(dive.rec, dive.frames, tracks, fit, medium_at=water.at)
     truth = dive.seafloor(cloud.xyz[:, :2])
     by_head = (cloud.restored - truth).abs().mean()
     assert by_head < 0.5 * (cloud.raw - truth).abs().mean()
     torch.testing.assert_close(
-        cloud.restored, restored_cloud(dive.rec, dive.frames, tracks, fit).restored, atol=1e-3, rtol=0
+        cloud.restored, restored_points(dive.rec, dive.frames, tracks, fit).restored, atol=1e-3, rtol=0
     )
 
 
@@ -131,7 +131,7 @@ def test_restoration_divides_by_no_less_than_the_head_was_trained_with(dive, wat
         dive_fit(water, dive.rec, SeathruSettings()),
     )
     clouds = [
-        restored_cloud(dive.rec, dive.frames, tracks, fit, medium_at=water.at, min_transmittance=eps).restored
+        restored_points(dive.rec, dive.frames, tracks, fit, medium_at=water.at, min_transmittance=eps).restored
         for eps in (0.05, 0.5)
     ]
     assert (clouds[1] < clouds[0] - 0.01).any()

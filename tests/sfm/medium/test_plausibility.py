@@ -14,9 +14,10 @@ from swimm3r.scene.frames import Frames
 from swimm3r.scene.reconstruction import DenseCloud
 from swimm3r.scene.white_balance import WhiteBalance
 from swimm3r.sfm.medium import apply, restore
+from swimm3r.sfm.medium.dense_cloud import dense_cloud, restored_points
 from swimm3r.sfm.medium.dense_tracks import fuse_depth
 from swimm3r.sfm.medium.plausibility import attenuation_is_a_guess, optical_depth, water_warnings
-from swimm3r.sfm.medium.restore import RestoredImage, display_gains, restore_image, restored_cloud, white_balance
+from swimm3r.sfm.medium.restore import RestoredImage, display_gains, restore_image, white_balance
 from swimm3r.sfm.settings import ColmapSettings, RestoreSettings, TrackSettings
 
 TINT = torch.tensor([0.6, 1.0, 0.9])
@@ -90,7 +91,7 @@ def test_red_attenuated_least_is_implausible_in_every_natural_water(teal, known:
 def written(dive, fit: MediumFit, folder: Path, monkeypatch: pytest.MonkeyPatch) -> dict[str, np.ndarray]:
     """The dive's frame 2 as filmed, physically restored and as shown, 0..1, where this is the water found."""
     monkeypatch.setattr(apply, "fit_medium", lambda *_: fit)
-    monkeypatch.setattr(apply, "restored_cloud", lambda *given: tinted(restored_cloud(*given)))
+    monkeypatch.setattr(apply, "dense_cloud", lambda *given: tinted(dense_cloud(*given)))
     apply.with_water(dive.rec, dive.frames, ColmapSettings(), folder)
     name = f"{dive.rec.names[2]}.png"
     physical = cv2.imread(str(folder / "restored_physical" / name), cv2.IMREAD_UNCHANGED)
@@ -115,7 +116,7 @@ def test_where_attenuation_is_a_guess_frames_are_shown_as_filmed(dive, tmp_path:
 
 def test_the_cloud_as_shown_has_the_mean_color_of_the_restored_frames(dive, tmp_path: Path, monkeypatch):
     """And of the frames as filmed where those are shown."""
-    monkeypatch.setattr(apply, "restored_cloud", lambda *given: tinted(restored_cloud(*given)))
+    monkeypatch.setattr(apply, "dense_cloud", lambda *given: tinted(dense_cloud(*given)))
     monkeypatch.setattr(restore, "restore_image", lambda *given: tinted_image(restore_image(*given), given[5]))
     for std in (0.1, 0.9):
         monkeypatch.setattr(apply, "fit_medium", lambda *_, std=std: fit_of(dive.medium, std, known=std < 0.5))
@@ -147,7 +148,7 @@ def test_where_nothing_of_the_water_is_determined_frames_are_not_balanced_to_neu
 
 def test_gains_need_water_that_is_determined_and_somebody_who_wants_them(dive):
     fit = fit_of(dive.medium, 0.1, known=True)
-    cloud = restored_cloud(dive.rec, dive.frames, fuse_depth(dive.rec, dive.frames, TrackSettings()), fit)
+    cloud = restored_points(dive.rec, dive.frames, fuse_depth(dive.rec, dive.frames, TrackSettings()), fit)
     rec = replace(dive.rec, medium=fit, cloud=cloud)
     torch.testing.assert_close(white_balance(rec, RestoreSettings()).factors, display_gains(cloud.restored))
     assert white_balance(rec, RestoreSettings(white_balance=False)) == WhiteBalance()

@@ -2,17 +2,14 @@
 
 from dataclasses import replace
 
-import pytest
 import torch
 
 from swimm3r.cameras import Cameras, image_directions, ray_depth_from_z
 from swimm3r.imaging.depth_completion import fill_z_depth
 from swimm3r.imaging.open_water import open_water_mask
 from swimm3r.medium import AttenuationCurve, Medium, MediumFit, add_water, linear_from_srgb, srgb_from_linear
-from swimm3r.scene.reconstruction import DenseCloud, DepthMap
-from swimm3r.sfm.medium.dense_tracks import fuse_depth
-from swimm3r.sfm.medium.restore import _thinned, display_gains, restore_image, restored_cloud
-from swimm3r.sfm.settings import RestoreSettings, TrackSettings
+from swimm3r.scene.reconstruction import DepthMap
+from swimm3r.sfm.medium.restore import display_gains, restore_image
 
 
 def exact(medium: Medium) -> MediumFit:
@@ -144,22 +141,6 @@ def test_noise_is_not_amplified_where_a_channel_no_longer_sees(dive):
     assert J[..., 1].std() < 0.02
 
 
-def test_restored_points_have_the_clear_colors_of_the_seafloor(dive):
-    tracks = fuse_depth(dive.rec, dive.frames, TrackSettings())
-    cloud = restored_cloud(dive.rec, dive.frames, tracks, exact(dive.medium))
-    assert (cloud.restored - dive.seafloor(cloud.xyz[:, :2])).abs().mean() < 0.02
-    assert (cloud.raw - cloud.restored).abs().mean() > 0.05
-
-
-def test_a_cloud_is_thinned_to_the_asked_count_and_keeps_its_extent(dive):
-    tracks = fuse_depth(dive.rec, dive.frames, TrackSettings())
-    full = restored_cloud(dive.rec, dive.frames, tracks, exact(dive.medium))
-    thin = restored_cloud(dive.rec, dive.frames, tracks, exact(dive.medium), RestoreSettings(max_points=800))
-    assert 300 < len(thin.xyz) <= 800 < len(full.xyz)
-    assert (thin.xyz.amax(0)[:2] > 0.85 * full.xyz.amax(0)[:2]).all()
-    torch.testing.assert_close(thin.restored.mean(0), full.restored.mean(0), atol=0.05, rtol=0)
-
-
 def test_a_gray_dive_needs_no_white_balance():
     torch.testing.assert_close(display_gains(torch.rand(500, 1).expand(-1, 3) * 0.9), torch.ones(3))
 
@@ -177,11 +158,3 @@ def test_display_gains_color_surfaces_and_leave_open_water_as_it_was(teal, dive)
     gained = restore_image(image, depth, rays_of(camera), exact(teal), gains=torch.tensor([1.2, 0.9, 0.9])).shown
     torch.testing.assert_close(gained[:20], plain[:20])
     assert (gained[70:, :, 1] < 0.95 * plain[70:, :, 1]).float().mean() > 0.9
-
-
-@pytest.mark.parametrize("length", [1.0, 300.0])
-def test_a_long_dive_keeps_as_many_points_as_a_compact_one(length: float):
-    rng = torch.Generator().manual_seed(0)
-    xyz = torch.rand(20_000, 3, generator=rng) * torch.tensor([length, 1.0, 0.0])
-    thinned = _thinned(DenseCloud(xyz, xyz.clamp(0, 1), xyz.clamp(0, 1)), 4000)
-    assert 0.8 * 4000 < len(thinned.xyz) <= 4000

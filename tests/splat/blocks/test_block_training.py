@@ -9,8 +9,9 @@ from safetensors.torch import load_file
 
 from swimm3r.errors import InputError
 from swimm3r.evaluate.images import psnr
+from swimm3r.scene.surface import surface_of
 from swimm3r.splat import train
-from swimm3r.splat.blocks.plan import plan_blocks, surface_of
+from swimm3r.splat.blocks.plan import plan_blocks
 from swimm3r.splat.ground import held_by_any
 from swimm3r.splat.map_file import load_map
 from swimm3r.splat.settings import BlockSettings, DensifySettings, InitialSettings, UwbsSettings, with_recipe

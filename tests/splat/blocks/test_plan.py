@@ -5,8 +5,9 @@ import math
 import pytest
 import torch
 
+from swimm3r.scene.surface import Surface, surface_of
 from swimm3r.splat.blocks.part import BlockViews, part_of, stretches_of, views_of_blocks
-from swimm3r.splat.blocks.plan import PlannedBlock, Surface, plan_blocks, surface_of
+from swimm3r.splat.blocks.plan import PlannedBlock, plan_blocks
 from swimm3r.splat.blocks.training import of_block
 from swimm3r.splat.ground import GroundPlane, Window, held_by_any, plane_of
 from swimm3r.splat.settings import BlockSettings, DensifySettings, InitialSettings, UwbsSettings

@@ -11,11 +11,12 @@ from swimm3r.progress import Progress, silent
 from swimm3r.scene.frames import Frames
 from swimm3r.scene.reconstruction import QualityWarning, Reconstruction
 from swimm3r.sfm.medium.backdrop import Backdrop
+from swimm3r.sfm.medium.dense_cloud import dense_cloud
 from swimm3r.sfm.medium.dense_tracks import fuse_depth
 from swimm3r.sfm.medium.from_head import PredictedWater, dive_fit, predicted_images
 from swimm3r.sfm.medium.light import judge_light
 from swimm3r.sfm.medium.plausibility import water_warnings
-from swimm3r.sfm.medium.restore import RestoredImage, restored_cloud, restored_images, white_balance
+from swimm3r.sfm.medium.restore import RestoredImage, restored_images, white_balance
 from swimm3r.sfm.medium.samples import WaterSamples, collect_samples
 from swimm3r.sfm.medium.seathru import fit_medium
 from swimm3r.sfm.settings import LightChoice, SeathruSettings, SfmSettings
@@ -61,11 +62,8 @@ def with_water(
     except InputError as failure:
         warning = QualityWarning(f"The water was not estimated: {failure.what}.", f"Try: {failure.hint}")
         return replace(rec, warnings=(*rec.warnings, warning))
-    if predicted is None:
-        cloud = restored_cloud(rec, frames, tracks, stored, settings.restore, progress)
-    else:
-        eps_inv = predicted.head.min_transmittance
-        cloud = restored_cloud(rec, frames, tracks, stored, settings.restore, progress, predicted.at, eps_inv)
+    own = () if predicted is None else (predicted.at, predicted.head.min_transmittance)
+    cloud = dense_cloud(rec, frames, tracks, stored, settings.restore, settings.water.tracks, progress, *own)
     doubts = water_warnings(stored, gray=frames.gray, predicted=predicted is not None, linear=linear)
     rec = replace(rec, medium=stored, medium_linear=linear, cloud=cloud, warnings=(*rec.warnings, *doubts))
     rec = replace(rec, white_balance=white_balance(rec, settings.restore))

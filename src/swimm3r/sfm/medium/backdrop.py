@@ -10,6 +10,7 @@ there.
 import numpy as np
 import torch
 from jaxtyping import Bool, Float, Int
+from scipy.spatial import KDTree
 from torch import Tensor
 
 from swimm3r.cameras import Cameras, directions, project_visible
@@ -21,7 +22,6 @@ from swimm3r.sfm.medium.restore import RestoredImage
 
 _CELLS = 48  # cells along the long side of an image in which ground is looked for
 _POINTS = 3  # along each side of a cell
-_MAX_CLOUD = 500_000  # points of the cloud, at most, that are asked which cells it shows
 _SURFACE = 0.5  # share of open water from which there is no ground
 _MEASURED = 0.1  # share of an image below which its known depth is too little to guess the rest from
 _NEIGHBORS = 8  # frames before and after that may contradict
@@ -36,8 +36,8 @@ class Backdrop:
     def __init__(self, rec: Reconstruction, frames: Frames) -> None:
         assert rec.cloud is not None
         self.rec, self.frames = rec, frames
-        known = rec.cloud.xyz
-        self._known = known[:: -(-len(known) // _MAX_CLOUD)] if len(known) else known
+        self._known = rec.cloud.xyz
+        self._tree = KDTree(self._known.numpy()) if len(self._known) else None
         self._blurs = ArrayCache(max_bytes=0, least_entries=2 * _NEIGHBORS + 2)
         self._pieces: list[DenseCloud] = []
 
@@ -99,8 +99,12 @@ class Backdrop:
     def _nearby(self, camera: Cameras, reach: float) -> Float[Tensor, "n 3"]:
         """The cloud and the ground found so far, without what lies farther than `reach` from the camera."""
         center = camera.centers[0].float()
-        xyz = torch.cat([self._known, *(piece.xyz for piece in self._pieces)])
-        return xyz[(xyz - center).square().sum(-1) < reach**2].double()
+        found = torch.cat([torch.zeros(0, 3), *(piece.xyz for piece in self._pieces)])
+        found = found[(found - center).square().sum(-1) < reach**2]
+        if self._tree is None:
+            return found.double()
+        near = self._tree.query_ball_point(center.numpy(), reach, return_sorted=False)
+        return torch.cat([self._known[torch.tensor(near, dtype=torch.long)], found]).double()
 
     def _blurred(self, i: int, row: Int[Tensor, " n"], column: Int[Tensor, " n"]) -> Float[Tensor, "n 3"]:
         """Pixels of a frame's image without what is smaller than the distance between two points."""

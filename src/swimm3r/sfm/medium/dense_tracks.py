@@ -7,7 +7,7 @@ centers to that one position: errors of single depth maps do not pass for differ
 """
 
 from collections.abc import Iterator
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 import torch
@@ -21,6 +21,7 @@ from swimm3r.scene.frames import Frames
 from swimm3r.scene.reconstruction import Reconstruction
 from swimm3r.sfm.settings import TrackSettings
 
+_ROWS = 1_000_000  # points whose cubes are found at once
 _MOST_ASKED = 96  # frames that are asked whether they see a frame's surface
 
 
@@ -45,14 +46,33 @@ def fuse_depth(
     and the tracks found so far.
     """
     usable = [i for i, name in enumerate(rec.names) if name in rec.depth]
-    pieces: list[DenseTracks] = []
-    count = 0
-    for piece in _by_frame(rec, frames, usable, _seed_stride(rec, usable, settings), settings, progress):
-        pieces.append(DenseTracks(piece.xyz, piece.track + count, *list(vars(piece).values())[2:]))
-        count += len(piece.xyz)
+    stride = _seed_stride(rec, usable, settings.max_tracks)
+    return _joined(list(_by_frame(rec, frames, usable, stride, settings, progress)))
+
+
+def fuse_in_batches(
+    rec: Reconstruction, frames: Frames, settings: TrackSettings, times: float, progress: Progress = silent
+) -> Iterator[DenseTracks]:
+    """About `times` as many tracks as `fuse_depth` finds at most, in batches of about `settings.max_tracks` or less."""
+    usable = [i for i, name in enumerate(rec.names) if name in rec.depth]
+    stride = _seed_stride(rec, usable, times * settings.max_tracks)
+    batch: list[DenseTracks] = []
+    for piece in _by_frame(rec, frames, usable, stride, settings, progress):
+        batch.append(piece)
+        if sum(len(held.xyz) for held in batch) >= settings.max_tracks / 2:
+            yield _joined(batch)
+            batch = []
+    if batch:
+        yield _joined(batch)
+
+
+def _joined(pieces: list[DenseTracks]) -> DenseTracks:
+    """The tracks of all pieces, numbered on."""
     if not pieces:
         none = torch.zeros(0)
         return DenseTracks(none.reshape(0, 3), none.long(), none.long(), none.long(), none, none)
+    first = torch.tensor([0, *(len(piece.xyz) for piece in pieces[:-1])]).cumsum(0).tolist()
+    pieces = [replace(piece, track=piece.track + count) for piece, count in zip(pieces, first, strict=True)]
     return DenseTracks(*(torch.cat(parts) for parts in zip(*(vars(p).values() for p in pieces), strict=True)))
 
 
@@ -146,13 +166,13 @@ def _neighbors(frames: Int[Tensor, " k"], share: Float[Tensor, " k"], settings: 
     return best + rest[::step]
 
 
-def _seed_stride(rec: Reconstruction, usable: list[int], settings: TrackSettings) -> int:
+def _seed_stride(rec: Reconstruction, usable: list[int], most: float) -> int:
     """Grid step of the pixels that start tracks, so that tracks and memory stay bounded."""
     probes = usable[:: max(1, len(usable) // 8)]
     if not probes:
         return 1
     known = sum(int((rec.depth[rec.names[i]].z_depth > 0).sum()) for i in probes) / len(probes) * len(usable)
-    return max(1, round((known / settings.max_tracks) ** 0.5))
+    return max(1, round((known / most) ** 0.5))
 
 
 def _tracks_from(
@@ -225,9 +245,11 @@ def cubes(xyz: Float[Tensor, "n 3"], size: Float[Tensor, "#n"]) -> tuple[Int[Ten
 
     Cubes are told apart by a 64-bit mix of their indices: two of a million collide with a chance of 3e-8.
     """
-    edge = size.double()
-    cell = torch.floor(xyz.double() / edge[:, None]).long()
-    mixed = cell @ torch.tensor([6364136223846793005, 3935559000370003845, 2862933555777941757])
-    mixed = mixed * 2685821657736338717 ^ (mixed >> 29) ^ (edge.log2() * 1024).long()
+    mixed = torch.empty(len(xyz), dtype=torch.long)
+    for rows in torch.arange(len(xyz)).split(_ROWS):
+        edge = size.double() if len(size) == 1 else size[rows].double()
+        cell = torch.floor(xyz[rows].double() / edge[:, None]).long()
+        key = cell @ torch.tensor([6364136223846793005, 3935559000370003845, 2862933555777941757])
+        mixed[rows] = key * 2685821657736338717 ^ (key >> 29) ^ (edge.log2() * 1024).long()
     _, which, count = torch.unique(mixed, return_inverse=True, return_counts=True)
     return which, count

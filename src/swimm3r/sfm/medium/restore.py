@@ -25,9 +25,8 @@ from torch import Tensor
 from swimm3r.imaging.depth_completion import fill_z_depth
 from swimm3r.imaging.filters import LUMA, blur, local_linear
 from swimm3r.imaging.open_water import sea_share, without_fringe
-from swimm3r.imaging.undistortion import frame_directions, frame_rays
+from swimm3r.imaging.undistortion import frame_rays
 from swimm3r.medium import (
-    Medium,
     MediumFit,
     backscatter,
     linear_from_srgb,
@@ -37,20 +36,17 @@ from swimm3r.medium import (
 )
 from swimm3r.progress import Progress, silent
 from swimm3r.scene.frames import Frames
-from swimm3r.scene.reconstruction import DenseCloud, DepthMap, Reconstruction
+from swimm3r.scene.reconstruction import DepthMap, Reconstruction
 from swimm3r.scene.white_balance import WhiteBalance
-from swimm3r.sfm.medium.dense_tracks import DenseTracks, cubes, ray_depth_map
+from swimm3r.sfm.medium.dense_tracks import ray_depth_map
 from swimm3r.sfm.medium.plausibility import any_determined, attenuation_is_a_guess
 from swimm3r.sfm.medium.side_by_side import in_order
 from swimm3r.sfm.settings import RestoreSettings
-
-MediumOfPixels = Callable[[str, Int[Tensor, " n"], Float[Tensor, " n"]], Medium]  # frame, pixels, ray depth
 
 _MAX_TINT = 1.0  # times the other channels, for blurred colors at a guessed distance
 _MAX_BRIGHTNESS = 0.9  # of blurred colors there, in any channel
 _LEVELS, _FEWEST = 20, 20  # levels of brightness from 0 to 1, and surfaces of a level that tell how bright it becomes
 _NEARLY_ALL = 0.95  # of the surfaces at known distance
-_FULL, _TURNS = 0.85, 12  # share of the points wanted, and trials of a voxel size, that end the search for it
 _SAMPLES = 20_000  # of them, which stand for all of an image
 
 
@@ -131,54 +127,6 @@ def restore_image(
     clear = keep_open_water(stored, T_D, image, sea, settings).clamp(0, 1)
     shown = clear if gains is None else keep_open_water(stored * gains, T_D, image, sea, settings).clamp(0, 1)
     return RestoredImage(clear, shown, ray_depth, sea)
-
-
-def restored_cloud(
-    rec: Reconstruction,
-    frames: Frames,
-    tracks: DenseTracks,
-    fit: MediumFit,
-    settings: RestoreSettings | None = None,
-    progress: Progress = silent,
-    medium_at: MediumOfPixels | None = None,
-    min_transmittance: float = 0.05,
-) -> DenseCloud:
-    """The tracks as points: raw and restored colors averaged over the observations, thinned by voxels.
-
-    Restored colors are weighted by confidence and mean T_D squared, the inverse variance of an amplified color.
-    `medium_at` gives each pixel its own water in the place of the dive's, in the encoding of `fit`, and
-    `min_transmittance` bounds what is divided by (eps_inv).
-    """
-    settings = settings or RestoreSettings()
-    n = len(tracks.xyz)
-    raw, restored = torch.zeros(n, 3), torch.zeros(n, 3)
-    raw_weight, restored_weight = torch.zeros(n, 1), torch.zeros(n, 3)
-    order = torch.argsort(tracks.frame, stable=True)
-    bounds = torch.searchsorted(tracks.frame[order], torch.arange(len(rec.names) + 1))
-    for i, name in enumerate(rec.names):
-        progress("restoring points", i, len(rec.names))
-        mine = order[bounds[i] : bounds[i + 1]]
-        if len(mine) == 0:
-            continue
-        I = frames.colors(frames.index(name), tracks.pixel[mine])
-        light = linear_from_srgb(I) if fit.encoding == "linear" else I
-        z, trust = tracks.ray_depth[mine], tracks.confidence[mine, None].clamp(min=0.01)
-        if medium_at is None:
-            medium = fit.at(z, frame_directions(rec.cameras[i]).reshape(-1, 3)[tracks.pixel[mine]])
-        else:
-            medium = medium_at(name, tracks.pixel[mine], z)
-        T_D, _ = transmittances(z, medium)
-        weight = trust * T_D.clamp(min=0.01) ** 2
-        raw.index_add_(0, tracks.track[mine], I * trust)
-        raw_weight.index_add_(0, tracks.track[mine], trust)
-        restored.index_add_(0, tracks.track[mine], remove_water(light, z, medium, min_transmittance) * weight)
-        restored_weight.index_add_(0, tracks.track[mine], weight)
-    progress("restoring points", len(rec.names), len(rec.names))
-    J = restored / restored_weight.clamp(min=1e-12)
-    if fit.encoding == "linear":
-        J = srgb_from_linear(J.clamp(min=0))
-    cloud = DenseCloud(tracks.xyz, (raw / raw_weight.clamp(min=1e-12)).clamp(0, 1), J.clamp(0, 1))
-    return _thinned(cloud, settings.max_points)
 
 
 def white_balance(rec: Reconstruction, settings: RestoreSettings) -> WhiteBalance:
@@ -322,30 +270,3 @@ def keep_open_water(
     best = T_D.amax(-1, keepdim=True)
     sees = best**2 / (best**2 + floor**2) * (1 - sea[..., None])
     return sees * surface + (1 - sees) * image
-
-
-def _thinned(cloud: DenseCloud, count: int) -> DenseCloud:
-    """One averaged point per voxel, with voxels just large enough to leave at most `count`, and hardly fewer.
-
-    The number of voxels of a surface falls with the square of their size, whatever the shape of the dive.
-    """
-    n = len(cloud.xyz)
-    if n <= count:
-        return cloud
-    low, high = (torch.quantile(cloud.xyz[:: max(1, n // 100_000)], q, dim=0) for q in (0.02, 0.98))
-    size = float((high - low).amax()) / max(1.0, count**0.5)
-    which, number = cubes(cloud.xyz, torch.tensor([size]))
-    for turn in range(_TURNS):
-        if _FULL * count <= len(number) <= count or (turn > _TURNS // 2 and len(number) <= count):
-            break
-        size *= min(10.0, max(0.1, (len(number) / (0.95 * count)) ** 0.5))
-        which, number = cubes(cloud.xyz, torch.tensor([size]))
-    while len(number) > count:
-        size *= max(1.05, (len(number) / count) ** 0.4)
-        which, number = cubes(cloud.xyz, torch.tensor([size]))
-
-    def average(x: Tensor) -> Tensor:
-        total = torch.zeros(len(number), 3, dtype=torch.float64).index_add_(0, which, x.double())
-        return (total / number[:, None]).float()
-
-    return DenseCloud(average(cloud.xyz), average(cloud.raw), average(cloud.restored))

@@ -10,7 +10,8 @@ from torch import Tensor
 
 from swimm3r.cameras import unproject
 from swimm3r.scene.reconstruction import DenseCloud, Matches, Points, Reconstruction, Tracks
-from swimm3r.splat.blocks.plan import PlannedBlock, Surface
+from swimm3r.scene.surface import Surface
+from swimm3r.splat.blocks.plan import PlannedBlock
 from swimm3r.splat.ground import Window, held_by_any
 from swimm3r.splat.views import filled
 

@@ -1,8 +1,5 @@
-"""The plan of a map in blocks: the ground cut into windows of equal area, with a margin around each, and their turns.
-
-Area is counted in images: a piece of surface counts by the share of an image that it fills from where it was filmed
-best, but as from the median depth at least. So ground that was only seen from afar counts little, and a number of
-primitives per image's area is one per pixel.
+"""The plan of a map in blocks: the ground cut into windows of equal area (`scene.surface`), with a margin around each,
+and their turns.
 """
 
 import math
@@ -10,45 +7,12 @@ from collections.abc import Sequence
 from dataclasses import dataclass, replace
 
 import torch
-from jaxtyping import Float, Int
-from scipy.spatial import KDTree
+from jaxtyping import Float
 from torch import Tensor
 
-from swimm3r.scene.reconstruction import Reconstruction
+from swimm3r.scene.surface import Surface
 from swimm3r.splat.ground import Window, plane_of
 from swimm3r.splat.settings import BlockSettings
-
-_CELLS = 8  # edges of a surface cell in the median depth
-
-
-@dataclass(frozen=True)
-class Surface:
-    """The surface of a dive in cells."""
-
-    xyz: Float[Tensor, "n 3"]  # of their centers, float64, scene units
-    area: Float[Tensor, " n"]  # of each, in images
-    edge: float  # of a cell, scene units
-
-    def cells_of(self, points: Float[Tensor, "m 3"]) -> Int[Tensor, " m"]:
-        """The cell that holds each point; -1 for those in none."""
-        places, low, size = _places(self.xyz, self.edge)
-        asked = (points.double() / self.edge).floor().long() - low
-        inside = ((asked >= 0) & (asked < size)).all(1)
-        keys, order = _keys(places, size).sort()
-        key = _keys(asked.clamp(min=0).minimum(size - 1), size)
-        found = torch.searchsorted(keys, key).clamp(max=len(keys) - 1)
-        return torch.where(inside & (keys[found] == key), order[found], -1)
-
-
-def _places(xyz: Float[Tensor, "n 3"], edge: float) -> tuple[Int[Tensor, "n 3"], Int[Tensor, "3"], Int[Tensor, "3"]]:
-    """The whole-numbered places of cells from the lowest on, the lowest, and how many places there are."""
-    places = (xyz / edge).floor().long()
-    low = places.amin(0)
-    return places - low, low, places.amax(0) - low + 1
-
-
-def _keys(places: Int[Tensor, "n 3"], size: Int[Tensor, "3"]) -> Int[Tensor, " n"]:
-    return (places[:, 0] * size[1] + places[:, 1]) * size[2] + places[:, 2]
 
 
 @dataclass(frozen=True)
@@ -61,18 +25,6 @@ class PlannedBlock:
     turn: int = 0
     before: tuple[int, ...] = ()  # the neighbors of earlier turns
     open_area: float = 0.0  # in images, that of `before` left out
-
-
-def surface_of(rec: Reconstruction, median_depth: float) -> Surface:
-    """The dense cloud, or the sparse points, as cells of an eighth of the median depth."""
-    points = (rec.points.xyz if rec.cloud is None else rec.cloud.xyz).double()
-    edge = median_depth / _CELLS
-    cells = (torch.unique((points / edge).floor().long(), dim=0).double() + 0.5) * edge
-    fx, fy = rec.cameras.K[:, [0, 1], [0, 1]].double().mean(0).tolist()
-    image = rec.cameras.width / fx * rec.cameras.height / fy * median_depth**2
-    nearest, _ = KDTree(rec.cameras.centers.double().numpy()).query(cells.numpy())
-    away = torch.from_numpy(nearest).clamp(min=median_depth)
-    return Surface(cells, edge**2 / image * (median_depth / away).square(), edge)
 
 
 def plan_blocks(surface: Surface, median_depth: float, settings: BlockSettings) -> tuple[PlannedBlock, ...]:

@@ -22,6 +22,7 @@ from swimm3r.io.files.cache_key import cache_key
 from swimm3r.progress import Progress, silent
 from swimm3r.scene.frames import Frames
 from swimm3r.scene.reconstruction import Reconstruction
+from swimm3r.scene.surface import surface_of
 from swimm3r.splat.block_store import (
     FOLDER,
     BlockEntry,
@@ -34,7 +35,7 @@ from swimm3r.splat.block_store import (
 )
 from swimm3r.splat.blocks.coarse import box_of, coarse_of
 from swimm3r.splat.blocks.part import BlockViews, part_of, stretches_of, views_of_blocks
-from swimm3r.splat.blocks.plan import PlannedBlock, surface_of
+from swimm3r.splat.blocks.plan import PlannedBlock
 from swimm3r.splat.ground import Window, held_by_any
 from swimm3r.splat.medium.field import MediumField
 from swimm3r.splat.primitives.beta import BetaPrimitives, rescaled, select
