@@ -5,12 +5,11 @@ from dataclasses import replace
 import pytest
 import torch
 
-from swimm3r.cameras import Cameras
+from swimm3r.cameras import Cameras, project_visible
 from swimm3r.evaluate import NotComputed
 from swimm3r.geometry import Similarity, align_similarity, best_similarity, pose_from, rotation_angle, so3_exp
 from swimm3r.pipeline.camera_paths import smooth_path
 from swimm3r.pipeline.held_out import (
-    covered_by_training,
     covered_scores,
     cut,
     first_poses,
@@ -18,6 +17,7 @@ from swimm3r.pipeline.held_out import (
     observed_scores,
     visible_window,
 )
+from swimm3r.scene.coverage import TrainingCoverage
 from swimm3r.scene.ground_truth import GroundTruth
 from swimm3r.scene.reconstruction import DenseCloud
 from swimm3r.sfm.settings import FeatureSettings
@@ -80,10 +80,10 @@ def test_what_no_training_frame_saw_is_not_covered(tiny_dive):
     wall = torch.stack([x, y, torch.full_like(x, 3.0)], -1).reshape(-1, 3)
     rec = replace(tiny_dive.rec, cloud=DenseCloud(wall, wall, wall))
     camera = tiny_dive.cameras[4]
-    assert covered_by_training(rec, camera).all()
+    assert TrainingCoverage(rec).of(camera).all()
     away = camera.cam2world.clone()
     away[0, 0, 3] += 3.0  # the wall ends at x = 2.6
-    beyond = covered_by_training(rec, replace(camera, cam2world=away))
+    beyond = TrainingCoverage(rec).of(replace(camera, cam2world=away))
     assert beyond[:, :10].all()
     assert not beyond[:, 50:].any()
 
@@ -95,10 +95,20 @@ def test_ground_at_a_guessed_distance_is_not_covered(tiny_dive):
     cloud, backdrop = (DenseCloud(part, part, part) for part in (measured, guessed))
     camera = tiny_dive.cameras[4]
     shares = [
-        covered_by_training(rec, camera).float().mean()
+        TrainingCoverage(rec).of(camera).float().mean()
         for rec in (replace(tiny_dive.rec, cloud=cloud), replace(tiny_dive.rec, cloud=cloud, backdrop=backdrop))
     ]
     assert shares[0] == shares[1] < 0.9
+
+
+def test_no_point_of_a_view_is_left_out_with_the_groups_beside_it(tiny_dive):
+    cloud = torch.rand(40_000, 3, generator=torch.Generator().manual_seed(1)) * 12 - 6
+    camera = tiny_dive.cameras[4]
+    _, _, visible = project_visible(camera, cloud[None].double())
+    groups = TrainingCoverage(replace(tiny_dive.rec, cloud=DenseCloud(cloud, cloud, cloud)))._before(camera)
+    asked = torch.cat(groups)
+    assert len(asked) < 0.6 * len(cloud)
+    assert int(project_visible(camera, asked[None])[2].sum()) == int(visible.sum()) > 100
 
 
 def test_the_covered_score_looks_at_covered_pixels_alone():

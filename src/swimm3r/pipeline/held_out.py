@@ -12,12 +12,11 @@ from dataclasses import dataclass, fields, replace
 from pathlib import Path
 from typing import Literal, TypeVar
 
-import torch
 from jaxtyping import Bool, Float
 from torch import Tensor
 
 from swimm3r import weights
-from swimm3r.cameras import Cameras, project_visible
+from swimm3r.cameras import Cameras
 from swimm3r.evaluate import NotComputed
 from swimm3r.evaluate.images import ViewScores, as_8_bit, blur4_psnr, mean_view_scores, psnr, sharpness, view_scores
 from swimm3r.evaluate.lpips import Lpips, load_lpips
@@ -29,6 +28,7 @@ from swimm3r.localization.interpolation import neighbors, pose_from_neighbors
 from swimm3r.localization.landmarks import landmarks_of, locate
 from swimm3r.pipeline.renders import display_style, write_view
 from swimm3r.progress import Progress, silent
+from swimm3r.scene.coverage import TrainingCoverage
 from swimm3r.scene.frames import Frames
 from swimm3r.scene.ground_truth import GroundTruth
 from swimm3r.scene.reconstruction import Reconstruction
@@ -40,7 +40,6 @@ from swimm3r.splat.settings import PoseRefinementSettings
 from swimm3r.splat.training_poses import as_mapped, axes_of_map
 
 Source = Literal["reference", "2D-3D matches", "neighbors"]
-_GAP = 0.03  # of the image's width: gaps in the cloud up to this size are closed where coverage is asked
 _REFERENCES = 6  # registered frames, the nearest in time, that a held-out frame is matched with
 
 
@@ -183,7 +182,7 @@ def score_views(
     perceptual = published_lpips()
     views, stems = [], view_stems(frames.names)
     surfaces = None if rec.moving is None else still_scene(as_mapped(rec, scene.poses), frames)
-    style = display_style(scene, rec, restore)
+    style, coverage = display_style(scene, rec, restore), TrainingCoverage(rec)
     for done, (name, first) in enumerate(poses.items()):
         progress("scoring test frames", done, len(poses))
         f = frames.index(name)
@@ -199,7 +198,7 @@ def score_views(
         camera = cut(canvas, window)
         out = scene.render(camera, time)
         write_view(folder, stems[name], out, camera, style)
-        known = covered_by_training(rec, camera)
+        known = coverage.of(camera)
         shown = out.rgb if scene.colors is None else recolored_by_halves(out.rgb, target, seen & known)
         scores = view_scores(shown, target, perceptual, seen)
         covered = covered_scores(shown, target, seen, known)
@@ -225,27 +224,6 @@ def protocol(views: Sequence[HeldOutView], settings: PoseRefinementSettings, rec
 def mean_scores(views: Sequence[HeldOutView]) -> ViewScores:
     """The scores averaged over frames."""
     return mean_view_scores([view.scores for view in views])
-
-
-def covered_by_training(rec: Reconstruction, canvas: Cameras) -> Bool[Tensor, "h w"]:
-    """The pixels of a view into which measured points of the reconstruction fall, small gaps closed.
-
-    It asks the reconstruction, not the map: a map that leaves holes is not excused for them. The backdrop, whose depth
-    is a guess, does not count.
-    """
-    import cv2
-
-    xyz = rec.points.xyz if rec.cloud is None else rec.cloud.xyz
-    pixels, _, visible = project_visible(canvas, xyz[None].double())
-    column, row = pixels[visible].long().unbind(-1)
-    hit = torch.zeros(canvas.height, canvas.width, dtype=torch.uint8)
-    hit[row, column] = 1
-    reach = max(3, round(_GAP * canvas.width)) | 1
-    kernel = cv2.getStructuringElement(cv2.MORPH_ELLIPSE, (reach, reach))
-    border = reach  # closing must not eat into the image's edge
-    padded = cv2.copyMakeBorder(hit.numpy(), border, border, border, border, cv2.BORDER_REFLECT)
-    closed = cv2.morphologyEx(padded, cv2.MORPH_CLOSE, kernel)[border:-border, border:-border]
-    return torch.from_numpy(closed.copy()) > 0
 
 
 def covered_scores(
