@@ -3,7 +3,6 @@
 import numpy as np
 import torch
 from jaxtyping import Bool, Float
-from scipy.spatial import cKDTree
 from torch import Tensor
 
 from swimm3r.cameras import Cameras, directions, project_visible
@@ -22,15 +21,7 @@ class TrainingCoverage:
 
     def __init__(self, rec: Reconstruction) -> None:
         xyz = (rec.points.xyz if rec.cloud is None else rec.cloud.xyz).double()
-        tree = cKDTree(xyz.numpy(), leafsize=_GROUP)
-        nodes, leaves = [tree.tree], []
-        while nodes:
-            node = nodes.pop()
-            if node.lesser is None:
-                leaves.append(xyz[torch.from_numpy(tree.indices[node.start_idx : node.end_idx])])
-            else:
-                nodes += [node.lesser, node.greater]
-        self._groups = [leaf for leaf in leaves if len(leaf)]
+        self._groups = _groups(xyz) if len(xyz) else []
         low = torch.stack([group.amin(0) for group in self._groups]) if self._groups else torch.zeros(0, 3).double()
         high = torch.stack([group.amax(0) for group in self._groups]) if self._groups else torch.zeros(0, 3).double()
         self._middle, self._reach = (low + high) / 2, (high - low).norm(dim=-1) / 2
@@ -64,3 +55,12 @@ class TrainingCoverage:
         spread = torch.arcsin((self._reach / away).clamp(max=1.0))
         near = (angle - spread <= half) | (away <= self._reach)
         return [self._groups[k] for k in np.flatnonzero(near.numpy())]
+
+
+def _groups(xyz: Float[Tensor, "n 3"]) -> list[Float[Tensor, "m 3"]]:
+    """The points in groups of at most `_GROUP`, halved across the longest side until they are."""
+    if len(xyz) <= _GROUP:
+        return [xyz]
+    along = xyz[:, int((xyz.amax(0) - xyz.amin(0)).argmax())].numpy()
+    order = torch.from_numpy(np.argpartition(along, len(xyz) // 2))
+    return _groups(xyz[order[: len(xyz) // 2]]) + _groups(xyz[order[len(xyz) // 2 :]])

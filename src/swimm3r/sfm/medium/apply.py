@@ -11,7 +11,7 @@ from swimm3r.progress import Progress, silent
 from swimm3r.scene.frames import Frames
 from swimm3r.scene.reconstruction import QualityWarning, Reconstruction
 from swimm3r.sfm.medium.backdrop import Backdrop
-from swimm3r.sfm.medium.dense_cloud import dense_cloud
+from swimm3r.sfm.medium.dense_cloud import MIN_TRANSMITTANCE, dense_cloud
 from swimm3r.sfm.medium.dense_tracks import fuse_depth
 from swimm3r.sfm.medium.from_head import PredictedWater, dive_fit, predicted_images
 from swimm3r.sfm.medium.light import judge_light
@@ -62,8 +62,9 @@ def with_water(
     except InputError as failure:
         warning = QualityWarning(f"The water was not estimated: {failure.what}.", f"Try: {failure.hint}")
         return replace(rec, warnings=(*rec.warnings, warning))
-    own = () if predicted is None else (predicted.at, predicted.head.min_transmittance)
-    cloud = dense_cloud(rec, frames, tracks, stored, settings.restore, settings.water.tracks, progress, *own)
+    at, eps_inv = (None, MIN_TRANSMITTANCE) if predicted is None else (predicted.at, predicted.head.min_transmittance)
+    fusion = settings.water.tracks
+    cloud = dense_cloud(rec, frames, tracks, stored, settings.restore, fusion, progress, at, eps_inv)
     doubts = water_warnings(stored, gray=frames.gray, predicted=predicted is not None, linear=linear)
     rec = replace(rec, medium=stored, medium_linear=linear, cloud=cloud, warnings=(*rec.warnings, *doubts))
     rec = replace(rec, white_balance=white_balance(rec, settings.restore))

@@ -22,6 +22,7 @@ from swimm3r.sfm.settings import RestoreSettings, TrackSettings
 
 MediumOfPixels = Callable[[str, Int[Tensor, " n"], Float[Tensor, " n"]], Medium]  # frame, pixels, ray depth
 
+MIN_TRANSMITTANCE = 0.05  # what is divided by at least, of the fitted water
 _FULL, _TURNS = 0.85, 12  # share of the points wanted, and trials of a voxel size, that end the search for it
 _ROWS = 1_000_000  # points averaged at once
 
@@ -35,7 +36,7 @@ def dense_cloud(
     fusion: TrackSettings,
     progress: Progress = silent,
     medium_at: MediumOfPixels | None = None,
-    min_transmittance: float = 0.05,
+    min_transmittance: float = MIN_TRANSMITTANCE,
 ) -> DenseCloud:
     """The cloud of these tracks, or of closer ones where the surface is larger than `settings.max_points_area`.
 
@@ -68,7 +69,7 @@ def restored_points(
     fit: MediumFit,
     progress: Progress = silent,
     medium_at: MediumOfPixels | None = None,
-    min_transmittance: float = 0.05,
+    min_transmittance: float = MIN_TRANSMITTANCE,
 ) -> DenseCloud:
     """The tracks as points: raw and restored colors averaged over the observations.
 
