@@ -5,7 +5,7 @@ from dataclasses import replace
 import pytest
 import torch
 
-from swimm3r.cameras import Cameras, project_visible
+from swimm3r.cameras import Cameras
 from swimm3r.evaluate import NotComputed
 from swimm3r.geometry import Similarity, align_similarity, best_similarity, pose_from, rotation_angle, so3_exp
 from swimm3r.pipeline.camera_paths import smooth_path
@@ -99,16 +99,6 @@ def test_ground_at_a_guessed_distance_is_not_covered(tiny_dive):
         for rec in (replace(tiny_dive.rec, cloud=cloud), replace(tiny_dive.rec, cloud=cloud, backdrop=backdrop))
     ]
     assert shares[0] == shares[1] < 0.9
-
-
-def test_no_point_of_a_view_is_left_out_with_the_groups_beside_it(tiny_dive):
-    cloud = torch.rand(40_000, 3, generator=torch.Generator().manual_seed(1)) * 12 - 6
-    camera = tiny_dive.cameras[4]
-    _, _, visible = project_visible(camera, cloud[None].double())
-    groups = TrainingCoverage(replace(tiny_dive.rec, cloud=DenseCloud(cloud, cloud, cloud)))._before(camera)
-    asked = torch.cat(groups)
-    assert len(asked) < 0.6 * len(cloud)
-    assert int(project_visible(camera, asked[None])[2].sum()) == int(visible.sum()) > 100
 
 
 def test_the_covered_score_looks_at_covered_pixels_alone():

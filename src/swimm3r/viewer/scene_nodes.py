@@ -52,7 +52,8 @@ class SceneNodes:
         at = np.asarray(self._client.camera.position, np.float64)
         away = np.linalg.norm(self._run.cameras.centers.numpy() * self._run.scale - at, axis=1)
         for name, frustum in list(self._frusta.items()):
-            _set_visible(frustum, self._frusta_shown and away[self._run.rec.index(name)] > _NEAR * self._size)
+            apart = bool(away[self._run.rec.index(name)] > _NEAR * self._size)
+            _set_visible(frustum, self._frusta_shown and apart)
         if self._path is not None:
             _set_visible(self._path, self._path_shown and float(away.min()) > self._size / 2)
 

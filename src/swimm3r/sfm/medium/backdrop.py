@@ -10,13 +10,13 @@ there.
 import numpy as np
 import torch
 from jaxtyping import Bool, Float, Int
-from scipy.spatial import KDTree
 from torch import Tensor
 
 from swimm3r.cameras import Cameras, directions, project_visible
 from swimm3r.imaging.filters import blur
 from swimm3r.io.files.cache import ArrayCache
 from swimm3r.scene.frames import Frames
+from swimm3r.scene.point_groups import PointGroups
 from swimm3r.scene.reconstruction import DenseCloud, Reconstruction
 from swimm3r.sfm.medium.restore import RestoredImage
 
@@ -36,8 +36,7 @@ class Backdrop:
     def __init__(self, rec: Reconstruction, frames: Frames) -> None:
         assert rec.cloud is not None
         self.rec, self.frames = rec, frames
-        self._known = rec.cloud.xyz
-        self._tree = KDTree(self._known.numpy()) if len(self._known) else None
+        self._known = PointGroups(rec.cloud.xyz)
         self._blurs = ArrayCache(max_bytes=0, least_entries=2 * _NEIGHBORS + 2)
         self._pieces: list[DenseCloud] = []
 
@@ -101,10 +100,7 @@ class Backdrop:
         center = camera.centers[0].float()
         found = torch.cat([torch.zeros(0, 3), *(piece.xyz for piece in self._pieces)])
         found = found[(found - center).square().sum(-1) < reach**2]
-        if self._tree is None:
-            return found.double()
-        near = self._tree.query_ball_point(center.numpy(), reach, return_sorted=False)
-        return torch.cat([self._known[torch.tensor(near, dtype=torch.long)], found]).double()
+        return torch.cat([self._known.within(center, reach), found]).double()
 
     def _blurred(self, i: int, row: Int[Tensor, " n"], column: Int[Tensor, " n"]) -> Float[Tensor, "n 3"]:
         """Pixels of a frame's image without what is smaller than the distance between two points."""
