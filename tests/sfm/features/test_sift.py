@@ -81,3 +81,14 @@ def test_matching_is_the_same_from_both_sides() -> None:
 def test_stored_descriptors_become_unit_vectors() -> None:
     stored = np.random.default_rng(0).integers(0, 255, (5, 128), dtype=np.uint8)
     torch.testing.assert_close(unit_descriptors(stored).norm(dim=1), torch.ones(5))
+
+
+def test_matches_do_not_depend_on_the_blocks_they_are_looked_for_in() -> None:
+    generator = torch.Generator().manual_seed(2)
+    a = normalize(torch.rand(300, 128, generator=generator) ** 4, dim=1)
+    b = normalize(a[torch.randperm(300, generator=generator)] + 0.1 * torch.rand(300, 128, generator=generator), dim=1)
+    order = torch.randperm(300, generator=generator)  # rows of one block in another
+    expected = {tuple(pair) for pair in match_descriptors(a, b, 0.9).tolist()}
+    shuffled = {(int(order[i]), j) for i, j in match_descriptors(a[order], b, 0.9).tolist()}
+    assert shuffled == expected
+    assert len(expected) > 200

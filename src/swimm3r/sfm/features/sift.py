@@ -6,7 +6,7 @@ than `max_ratio` times the second nearest from both sides (Lowe 2004).
 """
 
 from dataclasses import dataclass
-from typing import TYPE_CHECKING, no_type_check
+from typing import TYPE_CHECKING, NamedTuple, no_type_check
 
 import numba
 import numpy as np
@@ -21,6 +21,7 @@ if TYPE_CHECKING:
     import pycolmap
 
 _MAX_ANGLE = 0.7  # radians between descriptors beyond which the nearest neighbor is no match (COLMAP's limit)
+_ROWS = 128  # whose similarities stay in the processor's cache
 _UPSAMPLE_BELOW = 700  # long side in pixels; small images have their detail at half a pixel's blur, large ones do not
 
 
@@ -78,7 +79,7 @@ def match_descriptors(a: Float[Tensor, "m 128"], b: Float[Tensor, "n 128"], max_
     """Pairs of rows that agree; descriptors have unit length."""
     if len(a) < 2 or len(b) < 2:
         return torch.zeros(0, 2, dtype=torch.int64)
-    return _agreeing(a @ b.mT, max_ratio)
+    return _agreeing(a, b, max_ratio, None)
 
 
 def match_nearby(
@@ -92,12 +93,22 @@ def match_nearby(
     """Pairs of rows that agree among those whose pixels lie within `radius`; descriptors have unit length."""
     if not len(a) or not len(b):
         return torch.zeros(0, 2, dtype=torch.int64)
-    far = torch.cdist(xy_a.float(), xy_b.float()) > radius
-    return _agreeing((a @ b.mT).masked_fill_(far, -1.0), max_ratio)
+    return _agreeing(a, b, max_ratio, torch.cdist(xy_a.float(), xy_b.float()) > radius)
 
 
-def _agreeing(similarity: Float[Tensor, "m n"], max_ratio: float) -> Int[Tensor, "k 2"]:
-    row, column = _mutual(similarity.numpy(), max_ratio, _MAX_ANGLE)
+def _agreeing(
+    a: Float[Tensor, "m 128"], b: Float[Tensor, "n 128"], max_ratio: float, apart: Bool[Tensor, "m n"] | None
+) -> Int[Tensor, "k 2"]:
+    """Pairs of rows that agree; those `apart` count as opposite."""
+    nearest = _Nearest.none(len(a), len(b))
+    block = torch.empty(min(_ROWS, len(a)), len(b))
+    for start in range(0, len(a), _ROWS):
+        rows = a[start : start + _ROWS]
+        similarity = torch.mm(rows, b.mT, out=block[: len(rows)])
+        if apart is not None:
+            similarity.masked_fill_(apart[start : start + _ROWS], -1.0)
+        _look(similarity.numpy(), start, nearest)
+    row, column = _mutual(nearest, max_ratio, _MAX_ANGLE)
     return torch.from_numpy(np.stack([row, column], 1))
 
 
@@ -115,12 +126,31 @@ def _detect(
     return pycolmap.FeatureExtractor.create(options, pycolmap.Device.cpu).extract_from_uint8_array(gray)
 
 
-@numba.njit(cache=True)
+class _Nearest(NamedTuple):
+    """Similarities of the two nearest rows of each column and the reverse, and which is the nearest."""
+
+    row_of: np.ndarray  # [n]
+    first: np.ndarray  # [n]
+    second: np.ndarray  # [n]
+    column_of: np.ndarray  # [m]
+    best: np.ndarray  # [m]
+    next_best: np.ndarray  # [m]
+
+    @classmethod
+    def none(cls, rows: int, columns: int) -> "_Nearest":
+        """As it is before any row was looked at."""
+
+        def side(count: int) -> tuple[np.ndarray, ...]:
+            return np.zeros(count, np.int64), np.full(count, -1, np.float32), np.full(count, -1, np.float32)
+
+        return cls(*side(columns), *side(rows))
+
+
+@numba.njit(cache=True, nogil=True)
 @no_type_check  # the tests' shape checks would wrap what Numba must compile
-def _mutual(similarity, max_ratio, max_angle):  # one pass over memory: four reductions of it take three times as long
+def _look(similarity, start, nearest):  # one pass over memory: four reductions of it take three times as long
     m, n = similarity.shape
-    row_of, first, second = np.zeros(n, np.int64), np.full(n, -1, np.float32), np.full(n, -1, np.float32)
-    column_of, best, next_best = np.zeros(m, np.int64), np.full(m, -1, np.float32), np.full(m, -1, np.float32)
+    row_of, first, second = nearest.row_of, nearest.first, nearest.second
     for i in range(m):
         s1, s2, k = np.float32(-1), np.float32(-1), 0
         for j in range(n):
@@ -132,20 +162,26 @@ def _mutual(similarity, max_ratio, max_angle):  # one pass over memory: four red
                     s2 = s
             if s > second[j]:
                 if s > first[j]:
-                    second[j], first[j], row_of[j] = first[j], s, i
+                    second[j], first[j], row_of[j] = first[j], s, start + i
                 else:
                     second[j] = s
-        column_of[i], best[i], next_best[i] = k, s1, s2
+        nearest.column_of[start + i], nearest.best[start + i], nearest.next_best[start + i] = k, s1, s2
+
+
+@numba.njit(cache=True, nogil=True)
+@no_type_check
+def _mutual(nearest, max_ratio, max_angle):
+    m = len(nearest.column_of)
     rows, columns = np.zeros(m, np.int64), np.zeros(m, np.int64)
     count = 0
     for i in range(m):
-        j = column_of[i]
-        angle = np.arccos(min(best[i], np.float32(1)))
+        j = nearest.column_of[i]
+        angle = np.arccos(min(nearest.best[i], np.float32(1)))
         if (
-            row_of[j] == i
+            nearest.row_of[j] == i
             and angle <= max_angle
-            and angle <= max_ratio * np.arccos(min(next_best[i], np.float32(1)))
-            and angle <= max_ratio * np.arccos(min(second[j], np.float32(1)))
+            and angle <= max_ratio * np.arccos(min(nearest.next_best[i], np.float32(1)))
+            and angle <= max_ratio * np.arccos(min(nearest.second[j], np.float32(1)))
         ):
             rows[count], columns[count] = i, j
             count += 1
