@@ -17,7 +17,7 @@ _REDRAWN_EVERY_S = 0.2  # in a notebook
 
 @runtime_checkable  # so that the suite can check calls against it
 class Progress(Protocol):
-    """Called as `progress("matching", 12, 300)`. Whatever it raises (KeyboardInterrupt) stops the work cleanly."""
+    """Called as `progress("matching", 12, 300)`. An exception of it (KeyboardInterrupt) stops the work cleanly."""
 
     def __call__(self, what: str, done: int, total: int, /) -> None: ...
 

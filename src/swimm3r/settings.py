@@ -7,7 +7,7 @@
 
 The check is the same for the command line, for files and for Python: types (whole numbers stand for floats, lists for
 tuples, strings for paths, and are stored as such), the options of a Literal, and the declared ranges. Numbers are
-finite. What several fields say together is checked by the record's own `__post_init__`, after `super()`'s.
+finite. Combinations of fields are checked by the record's own `__post_init__`, after `super()`'s.
 """
 
 import math

@@ -8,7 +8,7 @@ meaning. Point t, seen in frame f from the ray depth z, has
 
 the water to second order about the point's own mean distance: it moves colors toward its own, the farther the more, by
 amounts that depend on the color. Three models are compared on points that none was fitted to: with water alone, with
-frames alone, and with both. What frames explain beyond the water decides whether they are needed.
+frames alone, and with both. The variation that frames explain beyond the water decides whether they are needed.
 
 The maps themselves are fitted in the water that structure from motion measured, S_tf = J_t T_D(z) + B(z): free water
 and free maps would share out between them what both can explain. Diagonal entries are nearly free, for that is what

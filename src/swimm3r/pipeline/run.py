@@ -104,7 +104,7 @@ def _make_stages(
     observer: Observer | None,
     engine: EngineSettings,
 ) -> None:
-    """Make or reuse the stages one after another. What a stage hands on is read from disk, to the last bit as a resumed
+    """Make or reuse the stages one after another. Results of a stage are read from disk, to the last bit as a resumed
     run finds it.
     """
     folder = record.folder

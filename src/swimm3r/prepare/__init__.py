@@ -22,9 +22,9 @@ def read_frames(
     """The frames of a video, a ROS bag or a folder of stills, prepared into `folder`.
 
     Without a folder they go into the user's cache and are found there the next time. `changes` replace single settings:
-    `read_frames("dive.mp4", fps=2)`. What `folder` held of an earlier preparation is replaced. Raises InputError on
-    what cannot be used, and OSError where the disk refuses; then nothing is left behind. A terminal or a notebook shows
-    how far it is, unless `progress` is given (`swimm3r.silent`: nothing).
+    `read_frames("dive.mp4", fps=2)`. An earlier preparation in `folder` is replaced. Raises InputError on
+    input that cannot be used, and OSError where the disk refuses; then nothing is left behind. A terminal or a notebook
+    shows the progress, unless `progress` is given (`swimm3r.silent`: nothing).
     """
     from swimm3r.prepare import frames_folder
 

@@ -1,8 +1,8 @@
 """The blocks of a large map on disk, of which a view takes those that it sees, far ones with fewer primitives.
 
 blocks/0003.safetensors holds the primitives of a block, blocks/0003_coarse.safetensors about an eighth as many
-(`splat.blocks.coarse`), both in scene units; the map's own file lists them (`splat.map_file`). What was read stays in a
-memory of bounded size, so that a map of any extent is rendered in the memory that its views need.
+(`splat.blocks.coarse`), both in scene units; the map's own file lists them (`splat.map_file`). Blocks that were read
+stay in a memory of bounded size, so that a map of any extent is rendered in the memory that its views need.
 """
 
 import shutil

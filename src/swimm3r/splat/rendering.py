@@ -74,8 +74,8 @@ class RenderOutput:
 class SplatMap:
     """Primitives and water of one scene, in the unit and axes of its reconstruction.
 
-    Those of a large map lie in blocks on disk, of which a view takes what it sees; `primitives` are then none. Whoever
-    needs primitives asks `seen_by` or `parts`.
+    Those of a large map lie in blocks on disk, of which a view takes what it sees; `primitives` are then none. Code
+    that needs primitives asks `seen_by` or `parts`.
     """
 
     primitives: Primitives

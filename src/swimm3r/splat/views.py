@@ -1,8 +1,8 @@
 """Training views of a map: undistorted images of one size, their masks and depth, in working units.
 
 Every frame becomes a pinhole image with its own K at the training size. Depth along the optical axis is the same
-number on both grids. Time runs from 0 at the clip's first frame to 1 at its last, test frames included. What the frame
-does not show, or its mask excludes, is not `seen` and takes no part in any loss.
+number on both grids. Time runs from 0 at the clip's first frame to 1 at its last, test frames included. Pixels
+that the frame does not show, or its mask excludes, are not `seen` and take no part in any loss.
 """
 
 from dataclasses import dataclass, replace

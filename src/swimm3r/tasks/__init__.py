@@ -37,7 +37,7 @@ def run_tasks(
     One local job at a time runs in this process, unless `isolated` asks for a process for every task; more of them run
     in child processes that share the cores. A task whose process is killed, or that fails for no reason that the user
     can mend, is tried again when the others are done, at most `engine.retries` times. An interruption (^C) ends all
-    processes, jobs and tasks before it leaves this function. What tasks print elsewhere goes into `logs`/NAME.log; with
+    processes, jobs and tasks before it leaves this function. Other tasks print into `logs`/NAME.log; with
     Slurm and Ray clusters, `logs` must lie on a disk that every computer sees. `on_end` is told of every task that is
     done, or has failed for good.
 

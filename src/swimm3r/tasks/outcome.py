@@ -29,7 +29,7 @@ class Named(Protocol):
 
 Work = Callable[[Any], object]
 """`work(item)`: a function of a module, or a `partial` of one. It keeps its results in files, and a repeated call makes
-only those that are missing. What it returns is dropped."""
+only those that are missing. Its result is dropped."""
 
 
 class TaskError(Swimm3rError):

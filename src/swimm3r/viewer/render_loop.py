@@ -106,7 +106,7 @@ class RenderLoop(Generic[Request, Result]):
         return True
 
     def run(self) -> None:
-        """Draw until `stop`. What a picture raises ends the loop and is kept in `failure`."""
+        """Draw until `stop`. An exception of a picture ends the loop and is kept in `failure`."""
         while not self._stopping:
             try:
                 drawn = self.turn()

@@ -1,7 +1,8 @@
 """Clear colors of two visits in one light: gains of the later visit, and differences in CIELAB.
 
-What a camera stores of a surface without its water is albedo times the light that reaches it times the exposure. Light
-and exposure differ between visits by a factor per channel, the same for the whole site where its depth varies little:
+The value that a camera stores of a surface without its water is albedo times the light that reaches it times the
+exposure. Light and exposure differ between visits by a factor per channel, the same for the whole site where its depth
+varies little:
 
     g = exp median(log J_a - log J_b)   over ground of unchanged height,   J in linear light
 

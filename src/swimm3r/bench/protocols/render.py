@@ -94,7 +94,7 @@ def compare_on_clips(
 ) -> Table:
     """`compare_renderers` on run folders and on clips, whose structure from motion is made first, in OUT/runs.
 
-    With `given_poses` clips are folders of images with a COLMAP model. What can be refused is refused before the
+    With `given_poses` clips are folders of images with a COLMAP model. Clips that cannot be used are refused before the
     structure from motion.
     """
     check_choice("recipes", recipes, against)

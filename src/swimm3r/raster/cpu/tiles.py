@@ -2,7 +2,7 @@
 
 A tile's 256 pixels live in a workspace, one row per quantity, in the order of its 4 x 4 blocks: a block is one vector
 of 512 bits where the machine has them. Only the blocks that an ellipse may touch, and that have not ended, are gone
-through. What keeps the loops over their pixels vectorized (docs/derivations/raster-kernels.md, asserted by tests): a
+through. Loops over their pixels stay vectorized by (docs/derivations/raster-kernels.md, asserted by tests) a
 one-dimensional workspace, unsigned indices, constant row offsets, float32 constants, and no call that is not inlined.
 Short loops one after the other beat one long loop: fewer values spill, and the long chain of the coverage overlaps with
 itself.

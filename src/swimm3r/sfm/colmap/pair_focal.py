@@ -6,7 +6,7 @@ the right K = diag(f, f, 1) (Mendonca & Cipolla 1999). So each candidate f costs
     c(f) = mean over pairs of min((s1 - s2) / (s1 + s2), _OUTLIER)
 
 Pairs that see a plane, or only turn, have no fundamental matrix; those that move without turning cost the same for
-every f. What is left may be noise: the answer counts where parts of the pairs, each on its own, give it again.
+every f. The rest may be noise: the answer counts where parts of the pairs, each on its own, give it again.
 """
 
 import numpy as np

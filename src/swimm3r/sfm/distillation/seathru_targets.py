@@ -2,7 +2,7 @@
 
 Sea-Thru has linear images and metric depth, but no poses. Of the evidence that `sfm/medium/seathru.py` uses, dark
 pixels and the averages of each range are left; they determine the water only roughly: on made scenes the red channel's
-error halves, green and blue gain little. What is made stays within the training's folder, never beside the data:
+error halves, green and blue gain little. All results stay within the training's folder, never beside the data:
 
     FOLDER/SEQUENCE/NAME.png     the image without water, 16 bits, in the encoding of the scene's own images
     FOLDER/SEQUENCE/made.json    what made it, from which images, and the water: written last

@@ -56,7 +56,7 @@ def estimate_medium(
     encoding: Encoding,
     progress: Progress = silent,
 ) -> MediumFit:
-    """The water of a reconstructed dive. Who wants both encodings gathers once and calls `fit_medium` twice."""
+    """The water of a reconstructed dive in one encoding; for both, collect samples once and call `fit_medium` twice."""
     tracks = fuse_depth(rec, frames, settings.tracks, progress)
     return fit_medium(collect_samples(rec, frames, tracks, settings, progress), settings, encoding)
 

@@ -3,8 +3,8 @@
 A pixel's plane is (q, dq/dx, dq/dy). Each round a pixel compares eight candidates: its own plane, those of four
 neighbors extended to it, its own moved nearer and farther, and its own with the mean slopes of its surroundings.
 
-Nearly all of the time goes into `_patch_cost`. What keeps its loop one of vectors: 16 samples at a time and a count
-that is known; float32 throughout; two pixels in one int32 (`kernels.packed`), so that a sample reads two values and not
+Nearly all of the time goes into `_patch_cost`. Its loop stays vectorized by these means: 16 samples at a time and a
+known count; float32 throughout; two pixels in one int32 (`kernels.packed`), so that a sample reads two values and not
 four; positions clamped to the image instead of tested; no store inside.
 """
 

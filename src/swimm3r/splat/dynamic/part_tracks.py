@@ -79,7 +79,7 @@ def laid_over(a: Part, b: Part) -> Fit | None:
     """The best fit of all shifts and some sizes; None if two parts do not fit each other.
 
     Its cost is a mean over the pixels that either covers: squared difference of color where both do, else a fixed
-    cost. What leaves the image does not count.
+    cost. Parts that leave the image do not count.
     """
     tones = [part.rgb[:, part.mask].mean(1) for part in (a, b)]
     if float((tones[0] - tones[1]).square().mean()) > _ALIKE:
