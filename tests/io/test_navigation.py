@@ -74,6 +74,40 @@ def test_pressures_become_heights(tmp_path):
     np.testing.assert_allclose(found.position[:, 2], [-9712.653, 0], atol=1e-3)
 
 
+TRANSFORMS = "ts,source,target,x,y,z,qx,qy,qz,qw\n"
+TURNED = "0,0,0.7071067811865476,0.7071067811865476"  # by 90 degrees about z: x to y
+
+
+def test_transforms_from_the_world_are_read_as_the_places_of_the_camera(tmp_path):
+    rows = f"1,world,camera,0,-2,-5,{TURNED}\n2,world,camera,0,-3,-5,{TURNED}\n"
+    found = read_navigation(written(tmp_path, TRANSFORMS + rows))
+    np.testing.assert_allclose(found.position, [[2, 0, 5], [3, 0, 5]], atol=1e-12)  # R X + t = 0
+    assert found.frame == "local"
+
+
+def test_transforms_to_the_world_hold_the_places_themselves(tmp_path):
+    rows = f"1,base_link,odom,2,0,5,{TURNED}\n2,base_link,odom,3,0,5,{TURNED}\n"
+    found = read_navigation(written(tmp_path, TRANSFORMS + rows))
+    np.testing.assert_allclose(found.position, [[2, 0, 5], [3, 0, 5]])
+
+
+def test_transforms_that_cannot_be_places_are_refused(tmp_path):
+    row = f"1,{{}},{{}},0,-2,-5,{TURNED}\n"
+    two = row.format("dvl", "camera") + row.format("dvl", "camera").replace("1,", "2,", 1)
+    assert "one end has to be the world" in refused(tmp_path, TRANSFORMS + two)
+    both = row.format("world", "left") + row.format("world", "right").replace("1,", "2,", 1)
+    assert "world to left, world to right" in refused(tmp_path, TRANSFORMS + both)
+    without = "ts,source,target,x,y,z\n1,world,camera,0,0,0\n2,world,camera,1,0,0\n"
+    assert "without qx, qy, qz, qw" in refused(tmp_path, without)
+
+
+def test_a_real_log_of_transforms_is_the_smooth_path_of_a_vehicle(shared):
+    found = read_navigation(shared / "data" / "sparus_nav" / "sparus_snippet.csv")
+    steps = np.linalg.norm(np.diff(found.position, axis=0), axis=1)
+    assert len(found) == 50
+    assert steps.sum() < 1.05 * np.linalg.norm(found.position[-1] - found.position[0])  # translations turn: 3.2 times
+
+
 def test_matisse_files_name_images(shared):
     found = read_navigation(shared / "data" / "rov_vent_a" / "navigation.dim2")
     assert len(found) == 20

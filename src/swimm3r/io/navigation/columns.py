@@ -12,6 +12,8 @@ _ALIASES = {
     "time": ("time", "timestamp", "datetime", "utc", "ts", "t", "date_time", "gps_time", "unix_time", "time_utc"),
     "date": ("date", "day"),
     "role": ("role",),
+    "source": ("source",),
+    "target": ("target",),
     "name": ("name", "image", "file", "filename", "frame", "photo", "label", "point"),
     "latitude": ("latitude", "lat"),
     "longitude": ("longitude", "lon", "long", "lng"),
@@ -80,4 +82,4 @@ def _units(kind: str) -> dict[str, float]:
         return _TIME
     if kind == "pressure":
         return _PRESSURE
-    return {} if kind in ("name", "date", "role", "qx", "qy", "qz", "qw") else _LENGTH
+    return {} if kind in ("name", "date", "role", "source", "target", "qx", "qy", "qz", "qw") else _LENGTH

@@ -1,10 +1,16 @@
-"""CSV and other tables with named columns (`columns`) -> navigation; comma, semicolon or tab between the cells."""
+"""CSV and other tables with named columns (`columns`) -> navigation; comma, semicolon or tab between the cells.
+
+Tables with the columns source, target, x, y, z, qx, qy, qz, qw hold transforms between a world and a camera or vehicle,
+X_target = R X_source + t. Positions are those of the camera's or vehicle's origin in the world, whose z is taken as up:
+-R^T t where the source is the world, t where the target is.
+"""
 
 import csv
 from pathlib import Path
 from typing import NoReturn
 
 import numpy as np
+from jaxtyping import Float
 
 from swimm3r.errors import InputError
 from swimm3r.io.navigation.clock import is_date, seconds_of, seconds_of_date, seconds_of_day
@@ -18,7 +24,9 @@ _HINT = (
     " units in brackets where they are not metres and degrees; see docs/guides/metric-scale.md"
 )
 _TURN = 2 * np.pi + 1e-6
-_TEXTS = ("name", "date", "time", "role")
+_TEXTS = ("name", "date", "time", "role", "source", "target")
+_TRANSFORM = ("easting", "northing", "height", "qx", "qy", "qz", "qw")
+_WORLDS = ("world", "map", "odom", "earth", "enu", "local", "nav", "navigation")
 _POSITIONS = ("latitude", "longitude", "easting", "northing")
 _BESIDE = {"latitude": "longitude", "easting": "northing"}
 
@@ -27,6 +35,10 @@ def read_table(path: Path) -> Navigation:
     """The navigation in a table whose first line names the columns. Raises InputError that names line and column."""
     cells, columns = read_cells(path)
     values = _values(path, cells, columns)
+    if "source" in cells and "target" in cells:
+        count = len(cells["source"])
+        clock, time = _times(path, cells, columns, count, None)
+        return Navigation(path, "local", _origins_in_world(path, cells, values), clock, time)
     if not any(kind in values for kind in _POSITIONS) and any(kind in values for kind in ("depth", "pressure")):
         return _depths_alone(path, cells, columns, values)
     frame, position, std = read_positions(path, cells, columns)
@@ -50,6 +62,31 @@ def read_table(path: Path) -> Navigation:
         attitude_std=_columns_of(values, ("std_heading", "std_pitch", "std_roll")),
         altitude=values.get("altitude"),
     )
+
+
+def _origins_in_world(
+    path: Path, cells: dict[str, list[str]], values: dict[str, np.ndarray]
+) -> Float[np.ndarray, "n 3"]:
+    """Origins of the camera or vehicle in the world, of transforms between both."""
+    from scipy.spatial.transform import Rotation
+
+    missing = [kind for kind in _TRANSFORM if kind not in values]
+    ends = {(source.lower(), target.lower()) for source, target in zip(cells["source"], cells["target"], strict=True)}
+    worlds = [(source in _WORLDS, target in _WORLDS) for source, target in ends]
+    if missing:
+        names = dict(zip(("easting", "northing", "height"), "xyz", strict=True))
+        _refuse(path, f"it has transforms without {', '.join(names.get(kind, kind) for kind in missing)}")
+    if len(ends) != 1 or worlds[0][0] == worlds[0][1]:
+        stated = ", ".join(f"{source} to {target}" for source, target in sorted(ends)[:3])
+        _refuse(path, f"its transforms are {stated}, and one end has to be the world",
+                hint=f"rows of one camera or vehicle, with a source or target named {', '.join(_WORLDS)}")  # fmt: skip
+    t = np.stack([values[kind] for kind in _TRANSFORM[:3]], -1)
+    quaternion = np.stack([values[kind] for kind in _TRANSFORM[3:]], -1)
+    if not (np.linalg.norm(quaternion, axis=1) > 0.1).all():
+        _refuse(path, "a quaternion is zero or missing")
+    if worlds[0][1]:
+        return t
+    return -Rotation.from_quat(quaternion).inv().apply(t)
 
 
 def _depths_alone(
