@@ -1,5 +1,8 @@
 """COLMAP models survive the way to disk and back, and bad ones are refused in the user's words."""
 
+import signal
+import subprocess
+import sys
 from dataclasses import fields, replace
 from pathlib import Path
 
@@ -179,3 +182,15 @@ def test_the_models_of_the_real_clips_project_their_points_where_they_were_seen(
     error = np.linalg.norm(pixels - model.track_xy, axis=1)
     per_point = np.bincount(model.track_point, error) / np.bincount(model.track_point)
     np.testing.assert_allclose(per_point, model.error, atol=1e-3)
+
+
+def test_a_process_that_is_told_to_end_prints_no_stack_trace() -> None:
+    script = (
+        "import os, signal\n"
+        "from swimm3r.io.colmap.model import silence_log\n"
+        "silence_log()\n"
+        "os.kill(os.getpid(), signal.SIGTERM)\n"
+    )
+    ended = subprocess.run([sys.executable, "-c", script], capture_output=True, text=True, timeout=60)
+    assert ended.returncode == -signal.SIGTERM
+    assert ended.stderr == ""

@@ -4,6 +4,8 @@ COLMAP's pixel grid is ours: the center of the first pixel is (0.5, 0.5). It sto
 cam2world.
 """
 
+import signal
+import threading
 from dataclasses import dataclass
 from itertools import pairwise
 from pathlib import Path
@@ -36,11 +38,17 @@ _NOT_FOUND = Remedy(
 
 
 def silence_log() -> None:
-    """Have COLMAP report errors alone, and to stderr rather than into files of the folder for temporary files."""
+    """Have COLMAP report errors alone, and to stderr rather than into files of the folder for temporary files.
+
+    Its import also makes SIGTERM print a stack trace; the process ends by that signal as it did before.
+    """
     import pycolmap
 
     pycolmap.logging.minloglevel = pycolmap.logging.Level.ERROR.value
     pycolmap.logging.logtostderr = True
+    handler = signal.getsignal(signal.SIGTERM)
+    if handler is not None and threading.current_thread() is threading.main_thread():
+        signal.signal(signal.SIGTERM, handler)  # Python does not know of the other one
 
 
 @dataclass(frozen=True)
