@@ -29,14 +29,18 @@ def photometric(
     render: Float[Tensor, "3 h w"], target: Float[Tensor, "3 h w"], seen: Bool[Tensor, "h w"], ssim_weight: float
 ) -> Photometric:
     """(1 - w) L1 + w (1 - SSIM) (Eq. 14), SSIM zero-padded; pixels not `seen` count as matched."""
-    target = torch.where(seen, target, render.detach())
     if render.device.type != "cpu" or render.dtype != torch.float32:
+        target = torch.where(seen, target, render.detach())
         l1, ssim = (render - target).abs().mean(), mean_ssim(render, target)
         loss = (1 - ssim_weight) * l1 + ssim_weight * (1 - ssim)
         return Photometric(loss, l1.detach(), ssim.detach())
+    whole = bool(seen.all())  # most images are, and copies of them would take as long as a third of the loss
+    if not whole:
+        target = torch.where(seen, target, render.detach())
     l1, ssim, gradient = ssim_cpu.photometric(render, target, ssim_weight)
     value = torch.tensor((1 - ssim_weight) * l1 + ssim_weight * (1 - ssim))
-    gradient = torch.where(seen, gradient, 0.0)
+    if not whole:
+        gradient = torch.where(seen, gradient, 0.0)
     return Photometric(_KnownGradient.apply(render, value, gradient), l1, ssim)
 
 
