@@ -71,7 +71,8 @@ def rendered(scene: SplatMap, lens: Cameras, long_side: int, min_alpha: float, t
     A dynamic map is shown at `time`, seconds of its clip, or half way through where nobody knows it.
     """
     canvas = lens.drawn(long_side)
-    out = scene.render(canvas, sum(scene.span) / 2 if time is None else time)
+    moment = sum(scene.span) / 2 if time is None else time
+    out = scene.render(canvas, moment, backscatter=False, observed=False)
     covered = out.alpha > min_alpha
     camera = replace(canvas, cam2world=canvas.cam2world.double())
     return Reference(camera, out.rgb.clamp(0, 1), torch.ones_like(covered), torch.where(covered, out.z_depth, 0.0))

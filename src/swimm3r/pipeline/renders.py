@@ -96,7 +96,8 @@ def marked(image: Float[Tensor, "h w 3"], observed: Bool[Tensor, "h w"] | None) 
 def write_view(folder: Path, stem: str, out: RenderOutput, camera: Cameras, style: DisplayStyle) -> None:
     """The files of one view, as the head of this module lists them."""
     shown = {"rgb": marked(out.rgb, out.observed), "clear": marked(shown_clear(out, camera, style), out.observed)}
-    shown |= {"backscatter": out.backscatter}
+    if out.backscatter is not None:
+        shown["backscatter"] = out.backscatter
     for kind, image in shown.items():
         images.write_rgb(folder / f"{stem}_{kind}.png", image.numpy())
     images.write_rgb_16(folder / f"{stem}_clear_physical.png", physical_clear(out, camera, style).numpy())
@@ -139,7 +140,7 @@ def write_video(
         for i, pose in enumerate(cam2world):
             progress("filming the flight", i, len(times))
             camera = replace(canvas, cam2world=pose[None])
-            out = scene.render(camera, times[i])
+            out = scene.render(camera, times[i], backscatter=False)
             both = torch.cat([marked(image, out.observed) for image in (out.rgb, shown_clear(out, camera, style))], 1)
             yield (both.clamp(0, 1) * 255).round().to(torch.uint8).numpy()
         progress("filming the flight", len(times), len(times))

@@ -176,7 +176,7 @@ def _views_of_map(scene: SplatMap, views: Sequence[HeldOutView], truth: GroundTr
         true_clear, shown = undistorted(clear, everything, view.lens, view.canvas)
         true_z = torch.where(shown, z_depth[nearest_pixels(view.lens, view.canvas)], 0.0)
         ray_depth = ray_depth_from_z(true_z, image_directions(view.canvas).float())[window]
-        out = scene.render(cut(view.canvas, view.window), view.time)
+        out = scene.render(cut(view.canvas, view.window), view.time, backscatter=False, observed=False)
         medium = Medium(out.medium.Binf, out.medium.beta_D / scale, out.medium.beta_B / scale)
         lamp = truth.lamp(view.name)
         if lamp is not None:
@@ -226,7 +226,8 @@ def _moving_section(
         window = (view.window.rows, view.window.columns)
         target, seen = undistorted(frames.image(f), frames.mask(f), view.lens, view.canvas)
         _, quiet = undistorted(frames.image(f), frames.mask(f) & ~moving, view.lens, view.canvas)
-        render = as_8_bit(scene.render(cut(view.canvas, view.window), view.time).rgb)
+        camera = cut(view.canvas, view.window)
+        render = as_8_bit(scene.render(camera, view.time, backscatter=False, observed=False).rgb)
         target, seen, quiet = as_8_bit(target)[window], seen[window], quiet[window]
         for where, found in ((seen & ~quiet, moved), (quiet, still)):
             if bool(where.any()):

@@ -55,11 +55,11 @@ class RenderOutput:
 
     rgb: Float[Tensor, "h w 3"]  # as the camera sees it
     clear: Float[Tensor, "h w 3"]  # J, without the water: the color of what covers a pixel; black where nothing does
-    backscatter: Float[Tensor, "h w 3"]  # Binf V, the light of the water alone (Eq. 11)
+    backscatter: Float[Tensor, "h w 3"] | None  # Binf V, the light of the water alone (Eq. 11); None if not drawn
     z_depth: Float[Tensor, "h w"]  # expected, scene units; 0 where nothing is
     alpha: Float[Tensor, "h w"]
     medium: Medium  # per pixel, [h, w, 3], per scene unit of ray depth
-    observed: Bool[Tensor, "h w"] | None = None  # what some training frame saw; None of maps without that record
+    observed: Bool[Tensor, "h w"] | None = None  # what some training frame saw; None if not asked for or not known
 
     def __repr__(self) -> str:
         height, width = self.alpha.shape
@@ -100,7 +100,8 @@ class SplatMap:
         """A view of the map with its water and without, in the middle of its clip; without a viewpoint, text."""
         if self.viewpoint is None:
             return notebook.table(repr(self), [])
-        seen = self.render(self.viewpoint.pinhole(_SHOWN_SIDE), sum(self.span) / 2)
+        camera = self.viewpoint.pinhole(_SHOWN_SIDE)
+        seen = self.render(camera, sum(self.span) / 2, backscatter=False, observed=False)
         shown = ((seen.rgb, "with the water"), (seen.clear, "without"))
         return notebook.image_row(repr(self), [(_uri(image), caption) for image, caption in shown])
 
@@ -153,15 +154,19 @@ class SplatMap:
         field = copy.deepcopy(self.field).to(device)
         return replace(self, primitives=self.primitives.to(device), field=field, blocks=blocks)
 
-    def render(self, camera: Cameras, time: float | None = None) -> RenderOutput:
+    def render(
+        self, camera: Cameras, time: float | None = None, *, backscatter: bool = True, observed: bool = True
+    ) -> RenderOutput:
         """The view of a pinhole or fisheye at a time of the clip (seconds; static maps need none), without gradient.
 
-        The images are where the camera is, on the processor as a rule, wherever the map may be.
+        The images are where the camera is, on the processor as a rule, wherever the map may be. The water's own light
+        is a second pass of the rasterizer, and finding out what training frames `observed` takes half as long as one:
+        views that need neither are drawn faster without.
 
         Raises ValueError where the camera has other distortion, or where a dynamic map is given no time.
         """
         with torch.no_grad():
-            return render(self, camera, time)
+            return render(self, camera, time, backscatter, observed)
 
     def save(self, path: str | Path) -> None:
         """Write a map.safetensors (layout: `splat.map_file`), whole or not at all; `swimm3r.load_map` reads it.
@@ -319,7 +324,9 @@ memory_for_views = devices.memory_for(
 
 
 @memory_for_views
-def render(scene: SplatMap, camera: Cameras, time: float | None = None) -> RenderOutput:
+def render(
+    scene: SplatMap, camera: Cameras, time: float | None = None, backscatter: bool = True, observed: bool = True
+) -> RenderOutput:
     """One view of a map at a time of its clip. Raises ValueError as `SplatMap.render` does."""
     settings = settings_in_scene_units(scene.settings, scene.length)
     view, now = view_camera(camera).to(scene.device), scene.normalized_time(time)
@@ -330,25 +337,20 @@ def render(scene: SplatMap, camera: Cameras, time: float | None = None) -> Rende
                 evenly_lit(drawing, view, settings),
                 medium_at_pixels(drawing.grid, view.height, view.width),
             )
-            seen = drawing.projection.primitives
-            black = seen._replace(color=torch.zeros_like(seen.color))
-            backscatter = rasterize(
-                black, drawing.maps, view.height, view.width,
-                alpha_min=settings.render.alpha_min, kernel=drawing.projection.kernel,
-            ).rgb  # fmt: skip
+            veil = _water_alone(drawing, view, settings) if backscatter else None
         case SceneWater():
             images = draw(scene.seen_by(view), NO_WATER, view, settings, now).images
             over = layer(scene.field, relative_depth(images))
-            medium, backscatter = _as_coefficients(scene.field, over, images, view), over.backscatter
+            medium, veil = _as_coefficients(scene.field, over, images, view), over.backscatter
             images = images._replace(rgb=seen_through(images.clear, over))
     there = camera.cam2world.device
-    z_depth, observed = expected_z_depth(images).to(there), None
-    if scene.coverage is not None:
-        observed = scene.coverage.of_view(camera, z_depth, images.alpha.to(there)).to(there)
+    z_depth, seen = expected_z_depth(images).to(there), None
+    if observed and scene.coverage is not None:
+        seen = scene.coverage.of_view(camera, z_depth, images.alpha.to(there)).to(there)
     return RenderOutput(
         rgb=images.rgb.permute(1, 2, 0).to(there),
         clear=surface_color(images).permute(1, 2, 0).to(there),
-        backscatter=backscatter.permute(1, 2, 0).to(there),
+        backscatter=None if veil is None else veil.permute(1, 2, 0).to(there),
         z_depth=z_depth,
         alpha=images.alpha.to(there),
         medium=Medium(
@@ -356,8 +358,20 @@ def render(scene: SplatMap, camera: Cameras, time: float | None = None) -> Rende
             beta_D=medium.beta_D.permute(1, 2, 0).to(there),
             beta_B=medium.beta_B.permute(1, 2, 0).to(there),
         ),
-        observed=observed,
+        observed=seen,
     )
+
+
+def _water_alone(
+    drawing: Drawing, view: ViewCamera, settings: UwbsSettings | GaussianSettings
+) -> Float[Tensor, "3 h w"]:
+    """The light of the water in a drawing (Eq. 11): that of its primitives in black."""
+    seen = drawing.projection.primitives
+    black = seen._replace(color=torch.zeros_like(seen.color))
+    return rasterize(
+        black, drawing.maps, view.height, view.width,
+        alpha_min=settings.render.alpha_min, kernel=drawing.projection.kernel,
+    ).rgb  # fmt: skip
 
 
 def mean_water(scene: SplatMap, camera: Cameras, time: float | None = None) -> Medium:
@@ -369,7 +383,7 @@ def mean_water(scene: SplatMap, camera: Cameras, time: float | None = None) -> M
             mean = grid.values.flatten(1).mean(1).to(camera.cam2world.device)
             return Medium(mean[:3], beta_B=mean[3:6], beta_D=mean[6:])
         case SceneWater():
-            medium = scene.render(camera, time).medium
+            medium = scene.render(camera, time, backscatter=False, observed=False).medium
             return Medium(**{name: values.flatten(0, 1).mean(0) for name, values in vars(medium).items()})
 
 

@@ -117,7 +117,7 @@ def seen_in_training(scene: SplatMap, rec: Reconstruction, frames: Frames, names
     for name in chosen:
         lens, f = cameras[rec.index(name)], frames.index(name)
         canvases.append(lens.drawn(SIDE))
-        views.append(scene.render(canvases[-1], frames.frames[f].time))
+        views.append(scene.render(canvases[-1], frames.frames[f].time, backscatter=False, observed=False))
         row, column = nearest_pixels(lens, canvases[-1])
         admitted.append(shown_pixels(lens, canvases[-1]) & frames.mask(f)[row, column])
     small = cameras[[rec.index(name) for name in chosen]].drawn(SIDE)

@@ -16,15 +16,9 @@ from swimm3r.cameras import Cameras, image_directions, pixel_grid, project_visib
 from swimm3r.imaging.depth_colors import depth_image
 from swimm3r.medium import Medium, linear_from_srgb, srgb_from_linear
 from swimm3r.pipeline.renders import shown_clear
-from swimm3r.splat.projection.view_camera import view_camera
 from swimm3r.splat.rendering import (
     RenderOutput,
     SplatMap,
-    expected_z_depth,
-    images,
-    memory_for_views,
-    settings_in_scene_units,
-    surface_color,
 )
 from swimm3r.viewer import water
 from swimm3r.viewer.viewed_run import ViewedRun
@@ -151,14 +145,11 @@ class Painter:
             return self._crops[key]
 
     def _surface(self, scene: SplatMap, camera: Cameras, choice: LayerChoice) -> RenderOutput:
-        """The map's view; without the parts that cost most where the layer does not show them."""
-        time = choice.time if scene.dynamic else None
+        """The map's view, with the water's own light where the layer shows it."""
         if not scene.count:
             return _nothing(camera)
-        changed = choice.layer == "With the water" and (choice.amount != 1 or choice.water is not None)
-        if changed or choice.layer in ("Without the water", "Light of the water alone"):
-            return scene.render(camera, time)
-        return _render_surface(scene, camera, time)
+        veil = choice.layer == "Light of the water alone"
+        return scene.render(camera, choice.time if scene.dynamic else None, backscatter=veil, observed=False)
 
     def _layer(self, out: RenderOutput, camera: Cameras, choice: LayerChoice) -> Float[Tensor, "h w 3"]:
         run = self.run
@@ -242,20 +233,6 @@ def wiped(
     mixed[:, :edge] = left[:, :edge]
     mixed[:, max(0, edge - 1) : edge + 1] = _LINE
     return mixed
-
-
-@memory_for_views
-def _render_surface(scene: SplatMap, camera: Cameras, time: float | None) -> RenderOutput:
-    """`SplatMap.render` without the coefficients of the water and its own light, which take as long again."""
-    settings = settings_in_scene_units(scene.settings, scene.length)
-    view = view_camera(camera).to(scene.device)
-    with torch.no_grad():
-        drawn = images(scene.seen_by(view), scene.field, view, settings, scene.normalized_time(time))
-    rgb, clear = (image.permute(1, 2, 0).cpu() for image in (drawn.rgb, surface_color(drawn)))
-    nothing = torch.zeros_like(rgb)
-    return RenderOutput(
-        rgb, clear, nothing, expected_z_depth(drawn).cpu(), drawn.alpha.cpu(), Medium(nothing, nothing, nothing)
-    )
 
 
 def _nothing(camera: Cameras) -> RenderOutput:

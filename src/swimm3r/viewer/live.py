@@ -197,7 +197,7 @@ class LiveView:
         shown = self._shown_view = self._shown_view or self._placed_view()
         scene = self._viewer.painter.run.scene
         assert scene is not None
-        rendered = scene.render(shown.camera, shown.time).rgb.clamp(0, 1)
+        rendered = scene.render(shown.camera, shown.time, backscatter=False, observed=False).rgb.clamp(0, 1)
         gap = torch.ones(shown.camera.height, 4, 3)
         pixels = (torch.cat([shown.image, gap, rendered], 1).clamp(0, 1) * 255).round().to(torch.uint8).numpy()
         label = f"{shown.label}: as filmed, and by the map ({psnr(rendered, shown.image):.1f} dB)"

@@ -107,6 +107,7 @@ def light_of_water(
 ) -> Float[Tensor, "h w 3"]:
     """The light of the water alone: the map's own, or by the model where amount or water are others."""
     if water is None and amount == 1:
+        assert out.backscatter is not None
         return out.backscatter
     own = water is None
     medium = denser(out.medium if own else water.medium, amount)

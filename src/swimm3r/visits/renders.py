@@ -77,6 +77,8 @@ def _rendered(mapped: Mapped, cameras: Sequence[Cameras]) -> list[UInt8[np.ndarr
         if to_map is not None:
             poses = to_map.poses(poses)
         middle = sum(scene.span) / 2  # of a dynamic map's clip
-        clear = scene.render(replace(camera, cam2world=poses.to(camera.cam2world)), middle).clear.clamp(0, 1)
+        clear = scene.render(
+            replace(camera, cam2world=poses.to(camera.cam2world)), middle, backscatter=False, observed=False
+        ).clear.clamp(0, 1)
         views.append((255 * shown(linear(clear.float().numpy()) * mapped.factors)).round().astype(np.uint8))
     return views

@@ -74,7 +74,7 @@ def _origins_in_world(
     ends = {(source.lower(), target.lower()) for source, target in zip(cells["source"], cells["target"], strict=True)}
     worlds = [(source in _WORLDS, target in _WORLDS) for source, target in ends]
     if missing:
-        names = dict(zip(("easting", "northing", "height"), "xyz", strict=True))
+        names: dict[str, str] = {"easting": "x", "northing": "y", "height": "z"}
         _refuse(path, f"it has transforms without {', '.join(names.get(kind, kind) for kind in missing)}")
     if len(ends) != 1 or worlds[0][0] == worlds[0][1]:
         stated = ", ".join(f"{source} to {target}" for source, target in sorted(ends)[:3])
