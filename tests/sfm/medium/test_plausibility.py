@@ -9,14 +9,19 @@ import pytest
 import torch
 
 from swimm3r.io import images
-from swimm3r.medium import AttenuationCurve, Medium, MediumFit
+from swimm3r.medium import AttenuationCurve, Medium, MediumFit, remove_water
 from swimm3r.scene.frames import Frames
 from swimm3r.scene.reconstruction import DenseCloud
 from swimm3r.scene.white_balance import WhiteBalance
 from swimm3r.sfm.medium import apply, restore
 from swimm3r.sfm.medium.dense_cloud import dense_cloud, restored_points
 from swimm3r.sfm.medium.dense_tracks import fuse_depth
-from swimm3r.sfm.medium.plausibility import attenuation_is_a_guess, optical_depth, water_warnings
+from swimm3r.sfm.medium.plausibility import (
+    attenuation_is_a_guess,
+    optical_depth,
+    water_warnings,
+    with_like_channels,
+)
 from swimm3r.sfm.medium.restore import RestoredImage, display_gains, restore_image, white_balance
 from swimm3r.sfm.settings import ColmapSettings, RestoreSettings, TrackSettings
 
@@ -39,6 +44,54 @@ def said(fit: MediumFit, *, gray: bool = False) -> str:
 
 def test_water_that_is_determined_and_takes_red_first_raises_no_warning(teal):
     assert water_warnings(fit_of(teal, 0.05, known=True), gray=False) == ()
+
+
+def backscatter_share(fit: MediumFit, mean_color: torch.Tensor) -> torch.Tensor:
+    z = (fit.z_range[0] * fit.z_range[1]) ** 0.5
+    return fit.Binf * (1 - torch.exp(-fit.beta_B * z)) / mean_color
+
+
+def test_water_of_which_a_coefficient_is_determined_keeps_its_channels(teal):
+    fit = fit_of(teal, 0.3, known=False)
+    fit.identifiable["Binf"][2] = True
+    assert with_like_channels(fit, TINT / 2) is fit
+
+
+def test_channels_that_nothing_tells_apart_are_drawn_together_around_their_mean(teal):
+    fit, color = fit_of(teal, 0.3, known=False), TINT / 2
+    fit = replace(fit, std=replace(fit.std, Binf=torch.full((3,), 0.1)))
+    alike = with_like_channels(fit, color)
+    for before, after in (
+        (optical_depth(fit)[0], optical_depth(alike)[0]),
+        (backscatter_share(fit, color), backscatter_share(alike, color)),
+    ):
+        torch.testing.assert_close(after.mean(), before.mean())
+        assert after.var() < before.var()
+        assert after.argsort().tolist() == before.argsort().tolist()
+    z = torch.tensor(2.0)
+    torch.testing.assert_close(alike.curve.at(z), alike.beta_D)  # a constant curve follows its number
+
+
+@pytest.mark.parametrize(("std", "factor"), [(1e-6, 1.0), (1e6, 0.0)])
+def test_channels_without_error_stay_and_those_of_any_error_become_alike(teal, std: float, factor: float):
+    fit, color = fit_of(teal, std, known=False), TINT / 2
+    fit = replace(fit, std=replace(fit.std, Binf=torch.full((3,), std)))
+    alike = with_like_channels(fit, color)
+    before, after = optical_depth(fit)[0], optical_depth(alike)[0]
+    torch.testing.assert_close(after - after.mean(), factor * (before - before.mean()), rtol=1e-3, atol=1e-4)
+    share = backscatter_share(fit, color)
+    expected = factor * (share - share.mean())
+    found = backscatter_share(alike, color)
+    torch.testing.assert_close(found - found.mean(), expected, rtol=1e-3, atol=1e-4)
+
+
+def test_a_surface_of_the_mean_color_keeps_its_hue_in_water_that_is_not_determined(teal):
+    color, z = TINT / 2, torch.tensor(2.0)
+    fit = fit_of(teal, 1e6, known=False)
+    fit = replace(fit, std=replace(fit.std, Binf=torch.full((3,), 1e6)))
+    alike = with_like_channels(fit, color)
+    J = remove_water(color, z, alike.at(z))
+    torch.testing.assert_close(J / J.sum(), color / color.sum())
 
 
 def test_the_optical_depth_does_not_depend_on_the_unit_of_length(teal):

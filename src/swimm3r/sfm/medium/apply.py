@@ -15,7 +15,7 @@ from swimm3r.sfm.medium.dense_cloud import MIN_TRANSMITTANCE, dense_cloud
 from swimm3r.sfm.medium.dense_tracks import fuse_depth
 from swimm3r.sfm.medium.from_head import PredictedWater, dive_fit, predicted_images
 from swimm3r.sfm.medium.light import judge_light
-from swimm3r.sfm.medium.plausibility import water_warnings
+from swimm3r.sfm.medium.plausibility import water_warnings, with_like_channels
 from swimm3r.sfm.medium.restore import RestoredImage, restored_images, white_balance
 from swimm3r.sfm.medium.samples import WaterSamples, collect_samples
 from swimm3r.sfm.medium.seathru import fit_medium
@@ -25,7 +25,10 @@ log = logging.getLogger(__name__)
 
 
 def fit_lit(samples: WaterSamples, settings: SeathruSettings, light: LightChoice) -> tuple[MediumFit, MediumFit]:
-    """The water on values as stored and in linear light, under the sun or a lamp as given or as the samples tell."""
+    """The water on values as stored and in linear light, under the sun or a lamp as given or as the samples tell.
+
+    That on values as stored, which images are restored with, has like channels where nothing determines it.
+    """
     evidence = None
     stored = fit_medium(samples, settings, "srgb", "lamp" if light == "lamp" else "sun")
     if light == "auto":
@@ -35,6 +38,7 @@ def fit_lit(samples: WaterSamples, settings: SeathruSettings, light: LightChoice
             stored = fit_medium(samples, settings, "srgb", "lamp")
         log.info("the light is taken for %s", "a lamp's on the camera" if light == "lamp" else "the sun's")
     linear = fit_medium(samples, settings, "linear", light)
+    stored = with_like_channels(stored, samples.I.mean(0))
     return replace(stored, light=evidence), replace(linear, light=evidence)
 
 

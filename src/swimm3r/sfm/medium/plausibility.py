@@ -2,9 +2,13 @@
 
 Coefficients trade against each other where the depths span a short range, while T_D and B within that range may still
 be right. So images are judged by the standard deviation of the optical depth (beta_D z at the middle z of the fit),
-and true colors by whether any coefficient is identifiable at all.
+and true colors by whether any coefficient is identifiable at all. Where none is, the water acts on all channels alike
+as far as nothing tells them apart (`with_like_channels`), so that images keep the hues they were filmed in.
 """
 
+from dataclasses import replace
+
+import torch
 from jaxtyping import Float
 from torch import Tensor
 
@@ -30,6 +34,35 @@ def any_determined(fit: MediumFit) -> bool:
     """Return whether the frames determine a single coefficient; where not, no restored color is a surface's true
     one."""
     return any(bool(flags.any()) for flags in fit.identifiable.values())
+
+
+def with_like_channels(fit: MediumFit, mean_color: Float[Tensor, "3"]) -> MediumFit:
+    """The fit with its channels drawn together where the frames determine no coefficient.
+
+    Of the optical depth tau at the middle depth, and of the backscatter there as a share of the frames' mean color:
+
+        x_c' = m + v / (v + s^2) (x_c - m)     m, v: mean and variance over the channels,   s^2: mean of their variances
+
+    which is the mean of x_c given all three where channels differ by chance (empirical Bayes). Differences between
+    undetermined channels are mostly errors, which restored images would show as a cast. Standard deviations stay, and
+    so does a fit of which any coefficient is determined.
+    """
+    if any_determined(fit):
+        return fit
+    tau, tau_std = optical_depth(fit)
+    thinner = _drawn_together(tau, tau_std) / tau
+    z = (fit.z_range[0] * fit.z_range[1]) ** 0.5
+    left = torch.exp(-fit.beta_B * z)
+    share = fit.Binf * (1 - left) / mean_color
+    share_std = torch.hypot(fit.std.Binf * (1 - left), fit.Binf * left * z * fit.std.beta_B) / mean_color
+    fainter = _drawn_together(share, share_std) / share
+    curve = replace(fit.curve, a=fit.curve.a * thinner, c=fit.curve.c * thinner)
+    return replace(fit, Binf=(fit.Binf * fainter).clamp(max=1), beta_D=fit.beta_D * thinner, curve=curve)
+
+
+def _drawn_together(x: Float[Tensor, "3"], std: Float[Tensor, "3"]) -> Float[Tensor, "3"]:
+    spread, noise = x.var(), std.square().mean()
+    return x.mean() + spread / (spread + noise).clamp(min=1e-12) * (x - x.mean())
 
 
 def water_warnings(
@@ -78,7 +111,8 @@ def _undetermined(fit: MediumFit, predicted: bool, linear: MediumFit | None) -> 
         )
     return QualityWarning(
         f"None of the water's coefficients is determined: restored colors (some {factor - 1:.0%} uncertain at the"
-        " middle distance) are not the true ones, and the restored frames are not white-balanced.",
+        " middle distance) are not the true ones. The restored frames have more contrast, nearly the hues as filmed, and"
+        " no white balance.",
         advice,
     )
 
