@@ -111,8 +111,8 @@ def _undetermined(fit: MediumFit, predicted: bool, linear: MediumFit | None) -> 
         )
     return QualityWarning(
         f"None of the water's coefficients is determined: restored colors (some {factor - 1:.0%} uncertain at the"
-        " middle distance) are not the true ones. The restored frames have more contrast, nearly the hues as filmed, and"
-        " no white balance.",
+        " middle distance) are not the true ones. The restored frames have more contrast and nearly the hues as filmed;"
+        " they are not white-balanced.",
         advice,
     )
 
