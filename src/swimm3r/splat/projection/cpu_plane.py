@@ -152,7 +152,7 @@ def fisheye_jacobian(g, camera, lens):
 @no_type_check
 @inlined
 def hidden(g, q, camera, lens):
-    """Whether the camera cannot have lane q: it is behind, or the image of the lens no longer grows with the angle."""
+    """Return whether lane q is behind the camera, or where the image of its lens no longer grows with the angle."""
     if lens is None:
         return g[AT, 2, 0, q] <= camera[NEAR]
     return g[AT, 2, 0, q] <= camera[NEAR] or g[BENT, 0, 3, q] <= ZERO

@@ -34,7 +34,7 @@ class ViewCamera:
         if self.fisheye is None:
             plane = torch.stack(torch.meshgrid(*at, indexing="xy"), -1)
         else:
-            plane = _fisheye_plane(self.fisheye, *(tuple(values.tolist()) for values in at)).to(x)
+            plane = _fisheye_plane(self.fisheye, *(tuple(values.tolist()) for values in at), x.dtype).to(x.device)
         return torch.cat([plane, torch.ones_like(plane[..., :1])], -1)
 
     def pixels(self, points: Float[Tensor, "*n 3"]) -> Float[Tensor, "*n 2"]:
@@ -102,11 +102,11 @@ def view_camera(camera: Cameras, dtype: torch.dtype = torch.float32) -> ViewCame
     maxsize=8
 )  # one lens as a rule, its pixels and the grid of its water at two sizes: Newton's method takes long
 def _fisheye_plane(
-    k: tuple[float, float, float, float], x: tuple[float, ...], y: tuple[float, ...]
+    k: tuple[float, float, float, float], x: tuple[float, ...], y: tuple[float, ...], dtype: torch.dtype
 ) -> Float[Tensor, "h w 2"]:
     """Points of the plane z = 1 that a lens images at columns x and rows y, in units of its focal lengths."""
-    seen = torch.stack(torch.meshgrid(torch.tensor(x), torch.tensor(y), indexing="xy"), -1)
-    plane = undistort(seen, torch.tensor(k), "OPENCV_FISHEYE")
+    grid = torch.meshgrid(*(torch.tensor(values, dtype=torch.float64) for values in (x, y)), indexing="xy")
+    plane = undistort(torch.stack(grid, -1), torch.tensor(k, dtype=torch.float64), "OPENCV_FISHEYE").to(dtype)
     return torch.nan_to_num(plane, nan=0.0)  # no ray of the lens: such a pixel is masked
 
 
