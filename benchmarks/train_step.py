@@ -1,25 +1,28 @@
 """CPU time of a whole training step beside that of the rasterizer alone, part by part.
 
-    python benchmarks/train_step.py [--sizes XS S M L] [--threads N] [--repeats N]
+    python benchmarks/train_step.py [--sizes XS S M L] [--lenses pinhole fisheye] [--threads N] [--repeats N]
 
 The primitives are those of benchmarks/raster.py, lifted into space so that one camera sees them all, with conditioning
-that does something. CPU-ms are process CPU time summed over threads, medians. The bar is a ratio of 1.5 at M. Where
-there is a GPU, rows follow in wall-clock milliseconds of it, the device waited for after every call, and, where gsplat
-can be built, one of its rasterizer (its projection included, 3D Gaussians of the same place, size and number, no water)
-beside the sum of our projection and rasterizer.
+that does something. A fisheye has 150 degrees across its diagonal, and primitives of about the same ellipses. CPU-ms
+are process CPU time summed over threads, medians. The bar is a ratio of 1.5 at M. Where there is a GPU, rows follow in
+wall-clock milliseconds of it, the device waited for after every call, and, where gsplat can be built, one of its
+rasterizer (its projection included, 3D Gaussians of the same place, size and number, no water) beside the sum of our
+projection and rasterizer.
 """
 
 import argparse
+import math
 import resource
 import statistics
 import time
 from collections.abc import Callable
 from dataclasses import replace
+from itertools import product
 from typing import Any
 
 import torch
 
-from swimm3r.cameras import Cameras
+from swimm3r.cameras import Cameras, directions
 from swimm3r.raster import MediumMaps, rasterize
 from swimm3r.selftest.speed import SIZES, Size, workload
 from swimm3r.splat.medium.field import grid_of, initial_field, medium_at_pixels, per_z_depth
@@ -34,22 +37,30 @@ from swimm3r.splat.training.scene import TrainingScene
 from swimm3r.splat.training.state import first_state, parameters_of
 from swimm3r.splat.views import TrainingView
 
+LENSES = ("pinhole", "fisheye")
+FISHEYE = (0.02, -0.01, 0.004, -0.001)
 
-def camera(size: Size) -> Cameras:
-    """A camera of about 65 degrees at the origin."""
-    f = 0.78 * size.width
+
+def camera(size: Size, lens: str = "pinhole") -> Cameras:
+    """A camera at the origin: of about 65 degrees, or a fisheye."""
+    fisheye = lens == "fisheye"
+    f = math.hypot(size.width, size.height) / 2 / math.radians(75) if fisheye else 0.78 * size.width
     K = torch.tensor([[f, 0, size.width / 2], [0, f, size.height / 2], [0, 0, 1]], dtype=torch.float64)
     pose = torch.eye(4, dtype=torch.float64)[None]
-    return Cameras(K[None], torch.zeros(1, 0, dtype=torch.float64), pose, size.width, size.height)
+    distortion = torch.tensor([FISHEYE if fisheye else ()], dtype=torch.float64)
+    model = "OPENCV_FISHEYE" if fisheye else "PINHOLE"
+    return Cameras(K[None], distortion, pose, size.width, size.height, model)
 
 
-def lifted(size: Size) -> BetaPrimitives:
+def lifted(size: Size, lens: str = "pinhole") -> BetaPrimitives:
     """Primitives in space that project to about the ellipses of the rasterizer's workload."""
     p, _ = workload(size)
     rng = torch.Generator().manual_seed(2)
-    n, K = size.primitives, camera(size).K[0].float()
-    xy = (p.mean2d - K[:2, 2]) / K[0, 0]
-    xyz = torch.cat([xy, torch.ones(n, 1)], -1) * p.depth[:, None]
+    n, K = size.primitives, camera(size, lens).K[0].float()
+    rays = directions(camera(size, lens), p.mean2d[None].double())[0].float()
+    if lens == "fisheye":  # the size of its image follows the distance, not the depth
+        rays = torch.nn.functional.normalize(torch.nan_to_num(rays), dim=-1)
+    xyz = rays * p.depth[:, None]
     covariance = torch.linalg.inv(torch.stack([p.conic[:, :2], p.conic[:, 1:]], 1).double())
     axes = torch.linalg.eigvalsh(covariance).sqrt().float() * (p.depth / K[0, 0])[:, None]
     spatial = torch.cat([axes, axes.mean(-1, keepdim=True)], -1)
@@ -110,19 +121,19 @@ def gsplat_ms(size: Size, repeats: int, device: torch.device) -> float | None:
     return median_ms(work, repeats, device)
 
 
-def measure(size: Size, repeats: int, device: torch.device) -> dict[str, float]:
+def measure(size: Size, lens: str, repeats: int, device: torch.device) -> dict[str, float]:
     """Milliseconds of the step and of its parts."""
     settings = UwbsSettings(iterations=20_000)
     rng = torch.Generator().manual_seed(1)
     height, width = size.height, size.width
     unread: Any = None  # reconstruction and views are read at the start only
     recipe = uwbs.Uwbs(settings, TrainingScene(unread, 1.0, 1.0, unread, device=device))
-    state = first_state(lifted(size), initial_field(None, settings.medium, rng), None).to(device)
+    state = first_state(lifted(size, lens), initial_field(None, settings.medium, rng), None).to(device)
     p, field = state.primitives, state.field
     prior = 1 + 9 * torch.rand(height, width, generator=rng)
     view = TrainingView(
         name="benchmark",
-        camera=camera(size),
+        camera=camera(size, lens),
         rgb=torch.rand(3, height, width, generator=rng),
         seen=torch.ones(height, width, dtype=torch.bool),
         z_depth=prior,
@@ -187,20 +198,22 @@ def main() -> None:
     """Print the table."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--sizes", nargs="+", default=["S", "M"], choices=["XS", "S", "M", "L"])
+    parser.add_argument("--lenses", nargs="+", default=["pinhole"], choices=LENSES)
     parser.add_argument("--threads", type=int, default=torch.get_num_threads())
     parser.add_argument("--repeats", type=int, default=7)
     arguments = parser.parse_args()
     torch.set_num_threads(arguments.threads)
     print(f"{arguments.threads} threads; CPU-ms, on a GPU milliseconds")
-    print(
-        "| size | on | step with SGG | step | raster | step / raster | projection | medium | losses | adam | peak MB |"
-    )
-    print("|---|---|---|---|---|---|---|---|---|---|---|")
+    columns = ["size", "lens", "on", "step with SGG", "step", "raster", "step / raster"]
+    columns += ["projection", "medium", "losses", "adam", "peak MB"]
+    print(f"| {' | '.join(columns)} |")
+    print("|---" * len(columns) + "|")
     devices = ["cpu", "cuda"] if torch.cuda.is_available() else ["cpu"]
-    for device, name in [(torch.device(device), name) for device in devices for name in arguments.sizes]:
+    for kind, name, lens in product(devices, arguments.sizes, arguments.lenses):
+        device = torch.device(kind)
         if device.type == "cuda":
             torch.cuda.reset_peak_memory_stats()
-        row = measure(SIZES[name], arguments.repeats, device)
+        row = measure(SIZES[name], lens, arguments.repeats, device)
         peak = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 1024
         if device.type == "cuda":
             peak = torch.cuda.max_memory_allocated() / 2**20
@@ -209,8 +222,8 @@ def main() -> None:
             f"{row[part]:.{digits}f}" for part in ("step", "plain", "raster", "projection", "medium", "losses", "adam")
         ]
         times.insert(3, f"{row['plain'] / row['raster']:.2f}")
-        print(f"| {name} | {device.type} | {' | '.join(times)} | {peak:.0f} |")
-        if device.type == "cuda":
+        print(f"| {name} | {lens} | {device.type} | {' | '.join(times)} | {peak:.0f} |")
+        if device.type == "cuda" and lens == "pinhole":
             theirs, ours = gsplat_ms(SIZES[name], arguments.repeats, device), row["raster"] + row["projection"]
             found = (
                 "cannot be built here" if theirs is None else f"{theirs:.2f} ms, {theirs / ours:.2f} of our {ours:.2f}"

@@ -22,14 +22,16 @@ def script(path: Path) -> ModuleType:
 
 def test_a_training_step_is_measured_part_by_part():
     command = [sys.executable, str(FOLDER / "train_step.py"), "--sizes", "XS", "--threads", "1", "--repeats", "1"]
+    command += ["--lenses", "pinhole", "fisheye"]
     run = subprocess.run(command, capture_output=True, text=True, check=True)
-    heads, cells = (
+    heads, *rows = (
         [cell.strip() for cell in line.strip("|").split("|")]
         for line in run.stdout.splitlines()
         if line.startswith(("| size", "| XS"))
     )
-    assert len(heads) == len(cells)
-    assert all(float(cell) >= 0 for cell in cells[2:])
+    assert [row[1] for row in rows] == ["pinhole", "fisheye"]
+    assert all(len(heads) == len(row) for row in rows)
+    assert all(float(cell) >= 0 for row in rows for cell in row[3:])
 
 
 def test_every_script_loads_and_names_its_command(monkeypatch: pytest.MonkeyPatch):

@@ -100,6 +100,17 @@ def test_without_camera_info_no_camera_has_a_lens(tmp_path: Path):
     assert [camera.lens for camera in frames.rig.cameras] == [None, None]
 
 
+def test_a_lens_of_any_camera_that_changes_is_told_where_its_images_are_used(tmp_path: Path):
+    left, right = stereo_info(0.12)
+    other = camera_info(right.topic, size=SIZE, K=(66.0, 0, 31.5, 0, 66, 23.5, 0, 0, 1), D=(0.0,) * 5, stamp=START)
+    changed = replace(other, stamp=START + round(0.4 * SECOND))
+    path = write_bag(tmp_path, "mcap", [*pair(), left, right, changed])
+    told = [warning for warning in read(path, tmp_path / "prepare").warnings if "changes" in warning]
+    assert len(told) == 1
+    assert "The lens in /stereo/right/camera_info changes after 0.4 s" in told[0]
+    assert not any("changes" in warning for warning in read(path, tmp_path / "before", end=0.4).warnings)
+
+
 def test_the_rectification_turns_the_second_camera(tmp_path: Path):
     R = Rotation.from_rotvec([0, 0.05, 0.01]).as_matrix()
     frames = read(write_bag(tmp_path, "bag", [*pair(), *stereo_info(0.12, R)]), tmp_path / "prepare")

@@ -11,8 +11,15 @@ import torch
 from swimm3r.errors import InputError, UsageError
 from swimm3r.refraction.settings import PortSettings
 from swimm3r.sfm.colmap.calibration import first_camera
-from swimm3r.sfm.lens import behind_port, check_calibration, check_lens_settings, lens_of, with_calibration
-from swimm3r.sfm.settings import ColmapSettings, LensSettings, Mast3rSettings
+from swimm3r.sfm.lens import (
+    behind_port,
+    check_calibration,
+    check_lens_settings,
+    known_lens,
+    lens_of,
+    with_calibration,
+)
+from swimm3r.sfm.settings import ColmapModelSettings, ColmapSettings, LensSettings, Mast3rSettings
 
 GIVEN: dict[str, Any] = {"focal": 900.0, "k1": -0.1, "p2": 0.002}
 
@@ -154,3 +161,19 @@ def test_a_calibration_that_cannot_be_used_is_refused_before_any_frame_is_read(t
     (tmp_path / "a").write_text("not a calibration")
     with pytest.raises(InputError, match="cannot be read as a calibration"):
         check_calibration(ColmapSettings(calibration=tmp_path / "a"))
+
+
+def test_the_lens_that_is_known_before_frames_are_placed_is_that_of_their_size_in_water(tmp_path: Path):
+    (tmp_path / "cameras.txt").write_text(LINES["PINHOLE"])
+    stated = tmp_path / "cameras.txt"
+    assert known_lens(ColmapSettings(), 640, 360) is None
+    assert known_lens(ColmapModelSettings(stated), 640, 360) is None
+    given = known_lens(ColmapSettings(focal=700.0, k1=0.1), 640, 360, stated)
+    of_source = known_lens(Mast3rSettings(), 640, 360, stated)
+    housed = known_lens(ColmapSettings(calibration=stated, housing="flat"), 640, 360)
+    assert given is not None
+    assert of_source is not None
+    assert housed is not None
+    assert (given.K[0, 0, 0], given.distortion.tolist()) == (700, [[0.1]])
+    assert of_source.K[0, 0, 0] == 450
+    assert housed.K[0, 0, 0] > 1.3 * 450

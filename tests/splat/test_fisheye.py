@@ -9,6 +9,7 @@ import torch
 from swimm3r.cameras import Cameras, image_directions, project
 from swimm3r.imaging.undistortion import undistorted
 from swimm3r.splat.medium.field import ray_lengths
+from swimm3r.splat.projection import view_camera as camera_module
 from swimm3r.splat.projection.conditioning import Conditioned
 from swimm3r.splat.projection.observed import coverage_from, coverage_of
 from swimm3r.splat.projection.plain import project_conditioned
@@ -93,6 +94,13 @@ def test_near_the_axis_a_fisheye_is_a_pinhole():
 def test_the_water_s_rays_are_those_of_the_camera():
     lengths = torch.linalg.vector_norm(image_directions(camera()), dim=-1)
     torch.testing.assert_close(ray_lengths(view_camera(camera())), lengths.float(), rtol=1e-4, atol=0)
+
+
+def test_the_rays_of_a_lens_are_found_once_whatever_the_pose(monkeypatch: pytest.MonkeyPatch):
+    first = view_camera(camera((0.03, 0.0, 0.0, 0.0)))
+    lengths = ray_lengths(first)
+    monkeypatch.setattr(camera_module, "undistort", None)
+    assert torch.equal(ray_lengths(first.shifted(torch.ones(3))), lengths)
 
 
 def test_a_fisheye_s_frame_is_drawn_whole_and_unchanged():

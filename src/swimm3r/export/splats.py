@@ -92,7 +92,7 @@ def open_map(folder: Path, settings: SplatSettings) -> ExportedMap:
     table = refined if refined.is_file() else folder / "sfm" / "cameras.json"
     cameras = cameras_of(cameras_json.read_cameras(table))
     time = sum(scene.span) / 2 if settings.time is None else settings.time
-    canvas = cameras.pinhole(scene.settings.long_side)
+    canvas = cameras.drawn(scene.settings.long_side)  # what is at the border of a fisheye alone is seen by no pinhole
     own = settings.colors == "physical" or not scene.has_water
     balance = UNBALANCED if own else read_run_balance(folder / "sfm")
     asked = canvas[spread(len(canvas), ASKED)]

@@ -74,7 +74,8 @@ def shown_clear(out: RenderOutput, camera: Cameras, style: DisplayStyle) -> Floa
     So does what the water lets no channel see: the clear color of such a surface is noise. `out.clear` itself is
     physical, and what scores are taken of.
     """
-    ray_depth = ray_depth_from_z(out.z_depth, image_directions(camera).to(out.z_depth))
+    rays = image_directions(camera).nan_to_num(nan=0.0).to(out.z_depth)  # 0 of a fisheye's pixels without a ray
+    ray_depth = ray_depth_from_z(out.z_depth, rays)
     T_D, _ = transmittances(ray_depth, out.medium)
     return keep_open_water(out.clear * style.gains, T_D, out.rgb, 1 - out.alpha, style.restore)
 
@@ -134,7 +135,7 @@ def write_video(
     style: DisplayStyle,
     progress: Progress = silent,
 ) -> None:
-    """An H.264 video of one pinhole camera at these poses and times: with the water, and beside it without."""
+    """An H.264 video of one camera at these poses and times: with the water, and beside it without."""
 
     def views() -> Iterable[UInt8[np.ndarray, "h w 3"]]:
         for i, pose in enumerate(cam2world):
@@ -162,7 +163,8 @@ def render_run(
 
     Clear images look like the frames that `restore` made, by default the run's own settings. A dynamic map shows the
     settings' time (seconds of the clip), by default the cameras' own times, else when the frames of their names were
-    taken. The cameras are written beside the images, in the axes of RUN/sfm. Raises InputError where the run has no map
+    taken. Views through a fisheye are of the same fisheye, those through other lenses without their distortion. The
+    cameras of the images are written beside them, in the axes of RUN/sfm. Raises InputError where the run has no map
     or no moment is known.
     """
     settings = settings or ViewSettings()
@@ -173,20 +175,18 @@ def render_run(
     rec = load_reconstruction(folder / "sfm", frames)
     dive, out = _dive(folder, scene, rec), out or folder / "renders" / "views"
     path = camera_path(dive, settings)
-    times = moments_of(scene, path, frames, settings.time)
+    times, drawn = moments_of(scene, path, frames, settings.time), path.cameras.drawn(settings.long_side)
     style = display_style(scene, rec, restore)
-    _write_cameras(out / "rendered_cameras.json", path, times, dive, rec)
+    _write_cameras(out / "rendered_cameras.json", replace(path, cameras=drawn), times, dive, rec)
     stems = view_stems(path.names)
     if settings.video != "only":
         for i, name in enumerate(path.names):
             progress("rendering", i, len(path.names))
-            camera = path.cameras[i].pinhole(settings.long_side)
+            camera = drawn[i]
             write_view(out, stems[name], scene.render(camera, times[i]), camera, style)
         progress("rendering", len(path.names), len(path.names))
     if settings.video != "no":
-        canvas = path.cameras[0].pinhole(settings.long_side)
-        poses = path.cameras.cam2world
-        write_video(out / "flythrough.mp4", scene, canvas, poses, times, style, progress)
+        write_video(out / "flythrough.mp4", scene, drawn[0], drawn.cam2world, times, style, progress)
     return out
 
 

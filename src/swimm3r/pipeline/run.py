@@ -9,6 +9,7 @@ import json
 import platform
 from collections.abc import Callable
 from dataclasses import asdict, dataclass, replace
+from functools import partial
 from importlib.metadata import version
 from pathlib import Path
 
@@ -37,6 +38,7 @@ from swimm3r.scene.reconstruction_io import load_reconstruction, unfiltered_matc
 from swimm3r.scene.run_folder import open_run
 from swimm3r.sfm import reconstruct
 from swimm3r.sfm.between import read_between
+from swimm3r.sfm.lens import known_lens
 from swimm3r.splat import train
 from swimm3r.splat.map_file import load_map
 from swimm3r.splat.settings import MapDevice
@@ -113,7 +115,9 @@ def _make_stages(
     frames = record.stage(
         "prepare",
         keys["prepare"],
-        make=lambda: read_frames(source, settings.frames, folder / "prepare", progress),
+        make=lambda: read_frames(
+            source, settings.frames, folder / "prepare", progress, partial(known_lens, settings.sfm)
+        ),
         reuse=lambda: load_frames(folder / "prepare"),
     )
     record.summary["input"] |= {

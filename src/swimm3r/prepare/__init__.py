@@ -7,6 +7,7 @@ from swimm3r.progress import Progress, watched
 from swimm3r.scene.settings import FrameSettings
 
 if TYPE_CHECKING:
+    import swimm3r.prepare.frames_folder
     import swimm3r.scene.frames
 
 __all__ = ["check_source", "load_frames", "read_frames"]
@@ -17,6 +18,7 @@ def read_frames(
     settings: FrameSettings | None = None,
     folder: str | Path | None = None,
     progress: Progress | None = None,
+    lens: "swimm3r.prepare.frames_folder.LensOf | None" = None,
     **changes: Any,
 ) -> "swimm3r.scene.frames.Frames":
     """The frames of a video, a ROS bag or a folder of stills, prepared into `folder`.
@@ -24,13 +26,15 @@ def read_frames(
     Without a folder they go into the user's cache and are found there the next time. `changes` replace single settings:
     `read_frames("dive.mp4", fps=2)`. An earlier preparation in `folder` is replaced. Raises InputError on
     input that cannot be used, and OSError where the disk refuses; then nothing is left behind. A terminal or a notebook
-    shows the progress, unless `progress` is given (`swimm3r.silent`: nothing).
+    shows the progress, unless `progress` is given (`swimm3r.silent`: nothing). `lens` gives the lens of frames of a
+    width and a height, where it is known: with a gyroscope in the video it decides on keyframes (`prepare.rotation`).
+    It takes a folder, and raises ValueError without one.
     """
     from swimm3r.prepare import frames_folder
 
     folder = None if folder is None else Path(folder)
     with watched(progress) as told:
-        return frames_folder.read_frames(source, settings, folder, told, **changes)
+        return frames_folder.read_frames(source, settings, folder, told, lens, **changes)
 
 
 def load_frames(folder: str | Path) -> "swimm3r.scene.frames.Frames":

@@ -55,7 +55,10 @@ class BagRig:
         """The topics of `settings.rig`. Raises InputError and UsageError where they are no rig."""
         _check_options(path, settings)
         self.path, self._settings = path, settings
-        self._clips = [BagClip(path, topic, settings.stamps) for topic in settings.rig]
+        self._clips = [
+            BagClip(path, topic, settings.stamps, start=settings.start, camera_info=settings.camera_info)
+            for topic in settings.rig
+        ]
         self._notes: list[str] = []
         first = self._clips[0]
         self.width, self.height, self.lens = first.width, first.height, first.lens
@@ -82,11 +85,11 @@ class BagRig:
         margin = self._settings.rig_tolerance
         span = max(start - margin, 0.0), min(end + margin, self._last)
         times = {clip.topic.name: clip.times(*span) for clip in self._clips}
-        reading = [_Reading(clip.frames(*span)) for clip in self._clips]
-        for instant in self._paired(times):
+        instants = [instant for instant in self._paired(times) if start - 1e-6 <= min(instant) < end]
+        beyond = math.nextafter(max(map(max, instants), default=0.0), math.inf)
+        reading = [_Reading(clip.frames(span[0], beyond)) for clip in self._clips]
+        for instant in instants:
             begin = min(instant)
-            if not start - 1e-6 <= begin < end:
-                continue
             found = zip(self.rig.names, reading, instant, strict=True)
             images = {name: image for name, read, time in found if (image := read.at(time)) is not None}
             if len(images) == len(reading):
@@ -114,7 +117,7 @@ class BagRig:
         names = camera_names(settings.rig)
         stated = None
         if settings.rig_calibration is None:
-            stated = stated_poses(self._clips, camera_info=settings.camera_info)
+            stated = stated_poses(self._clips)
         if stated is None:
             rig = rig_of(names, settings, (self.width, self.height))
             return rig if settings.rig_calibration is not None else self._with_lenses(rig)
@@ -128,8 +131,6 @@ class BagRig:
 
     def _with_lenses(self, rig: Rig) -> Rig:
         """The rig with the lenses that the camera_info of its topics state."""
-        if not self._settings.camera_info:
-            return rig
         stated = [None if clip.lens is None else read_document(from_yaml(clip.lens))[0] for clip in self._clips]
         size = self.width, self.height
         lines = [None if lens is None else lens_line(lens, size) for lens in stated]

@@ -57,7 +57,9 @@ class _View:
 
 def open_camera(source: Path, settings: FrameSettings) -> Camera:
     """A video, or one camera of a bag. Raises InputError, and UsageError where a bag holds several."""
-    return BagClip(source, settings.topic, settings.stamps) if is_bag(source) else Video(source)
+    if not is_bag(source):
+        return Video(source)
+    return BagClip(source, settings.topic, settings.stamps, start=settings.start, camera_info=settings.camera_info)
 
 
 def open_clip(source: Path, settings: FrameSettings) -> Clip:
@@ -129,7 +131,7 @@ def _completed(chosen: SelectedImages, clip: Clip, draft: Path, settings: FrameS
         images = with_telemetry(chosen.images, clip.path)
         chosen = replace(chosen, images=images, gyroscope=gyroscope_of(clip.path))
     else:
-        chosen = _of_bag(chosen, clip, draft, settings)
+        chosen = _of_bag(chosen, clip, draft)
     if isinstance(clip, BagRig):
         rig = clip.rig
     elif settings.rig == (SIDE_BY_SIDE,):
@@ -140,12 +142,12 @@ def _completed(chosen: SelectedImages, clip: Clip, draft: Path, settings: FrameS
     return replace(chosen, rig=rig, calibration=lens or chosen.calibration)
 
 
-def _of_bag(chosen: SelectedImages, clip: BagClip | BagRig, draft: Path, settings: FrameSettings) -> SelectedImages:
+def _of_bag(chosen: SelectedImages, clip: BagClip | BagRig, draft: Path) -> SelectedImages:
     """The images with the clock of their headers, and the lens that the bag states."""
-    lens = draft / LENS if clip.lens is not None and settings.camera_info else None
-    if lens is not None and clip.lens is not None:
-        write_text(lens, clip.lens)
-    return replace(chosen, start_ns=clip.start_ns, calibration=lens)
+    if clip.lens is None:
+        return replace(chosen, start_ns=clip.start_ns)
+    write_text(draft / LENS, clip.lens)
+    return replace(chosen, start_ns=clip.start_ns, calibration=draft / LENS)
 
 
 def _views(frame: ClipFrame, *, split: bool) -> list[_View]:

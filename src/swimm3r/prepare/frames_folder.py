@@ -8,7 +8,7 @@ second 0, lens, development of raw or log images, and warnings of them all.
 import logging
 import os
 import shutil
-from collections.abc import Container, Iterator
+from collections.abc import Callable, Container, Iterator
 from contextlib import contextmanager, suppress
 from dataclasses import dataclass, replace
 from datetime import datetime
@@ -19,6 +19,7 @@ from typing import Any
 import numpy as np
 from jaxtyping import UInt8
 
+from swimm3r.cameras import Cameras
 from swimm3r.errors import InputError
 from swimm3r.io import images
 from swimm3r.io.bags.bag import is_bag, open_bag
@@ -32,13 +33,17 @@ from swimm3r.prepare.candidates import SelectedImages, SourceImage, small_gray, 
 from swimm3r.prepare.clip import prepare_clip
 from swimm3r.prepare.image_folder import images_of, only_video, prepare_stills
 from swimm3r.prepare.keyframes import SIDE as MOTION_SIDE
+from swimm3r.prepare.keyframes import Gray
 from swimm3r.prepare.masks import check_masks, prepare_masks
-from swimm3r.prepare.rotation import rotation_motion
+from swimm3r.prepare.rotation import RotationMotion, rotation_motion
 from swimm3r.prepare.split import split_frames
 from swimm3r.progress import Progress, silent
 from swimm3r.scene.frames import Frame, Frames, Part, write_index
 from swimm3r.scene.rig import Rig, first_of_instants
 from swimm3r.scene.settings import FrameSettings
+
+LensOf = Callable[[int, int, Path | None], Cameras | None]
+"""The lens of frames of a width and a height, by the calibration file of their source or a better one; None unknown."""
 
 log = logging.getLogger(__name__)
 
@@ -51,6 +56,7 @@ def read_frames(
     settings: FrameSettings | None = None,
     folder: Path | None = None,
     progress: Progress = silent,
+    lens: LensOf | None = None,
     **changes: Any,
 ) -> Frames:
     """See `swimm3r.prepare.read_frames`."""
@@ -60,6 +66,8 @@ def read_frames(
     if source != given:
         log.info("%s holds no images and one video, which is taken: %s", given, source.name)
     if folder is None:
+        if lens is not None:
+            raise ValueError("frames of a known lens are prepared into a folder of their own, and none was given")
         folder = _cache_folder(source, settings)
         if (folder / "frames.json").is_file():
             return load_frames(folder)
@@ -68,7 +76,7 @@ def read_frames(
             dive = prepare_stills(source, draft, settings, progress, leave_out=[folder, folder.parent])
         else:
             dive = prepare_clip(source, draft, settings, progress)
-        _write_frames(dive, draft, source, settings, progress)
+        _write_frames(dive, draft, source, settings, progress, lens)
     return load_frames(folder)
 
 
@@ -201,7 +209,14 @@ def _checked(source: Path) -> Path:
     return source
 
 
-def _write_frames(dive: SelectedImages, draft: Path, source: Path, settings: FrameSettings, progress: Progress) -> None:
+def _write_frames(
+    dive: SelectedImages,
+    draft: Path,
+    source: Path,
+    settings: FrameSettings,
+    progress: Progress,
+    lens: LensOf | None,
+) -> None:
     """Masks and frames.json; frames.json is the last file of the folder."""
     warnings = list(dive.warnings)
     size = target_size(dive.images[0].size, settings.long_side) if dive.images else (0, 0)
@@ -219,7 +234,8 @@ def _write_frames(dive: SelectedImages, draft: Path, source: Path, settings: Fra
             "The frames are gray: their three channels are equal. The water's coefficients are those of one channel, "
             "and removing the water restores contrast, not color."
         )
-    parts = _parts(replace(dive, images=kept), draft, settings, progress)
+    known = None if lens is None else partial(lens, *size, dive.calibration)
+    parts = _parts(replace(dive, images=kept), draft, settings, progress, known)
     listed = tuple(
         Frame(
             name=image.name,
@@ -267,7 +283,13 @@ def _unmasked(dive: SelectedImages, covered: Container[str], warnings: list[str]
     return kept
 
 
-def _parts(dive: SelectedImages, draft: Path, settings: FrameSettings, progress: Progress) -> list[Part]:
+def _parts(
+    dive: SelectedImages,
+    draft: Path,
+    settings: FrameSettings,
+    progress: Progress,
+    lens: Callable[[], Cameras | None] | None,
+) -> list[Part]:
     """The part of each image; those of one instant of a rig are of one part."""
     starts = first_of_instants([image.instant for image in dive.images])
     first = [dive.images[start] for start in starts]
@@ -276,9 +298,12 @@ def _parts(dive: SelectedImages, draft: Path, settings: FrameSettings, progress:
     def gray_of(i: int) -> UInt8[np.ndarray, "h w"]:
         return small_gray(images.read_rgb(draft / first[i].name), MOTION_SIDE)
 
-    rotation = None
-    if dive.gyroscope is not None:
-        rotation = partial(rotation_motion, dive.gyroscope, [image.time for image in first])
+    def rotation(gray_of: Callable[[int], Gray]) -> RotationMotion | None:
+        if dive.gyroscope is None:
+            return None
+        times = [image.time for image in first]
+        return rotation_motion(dive.gyroscope, times, gray_of, None if lens is None else lens())
+
     sharpness = [image.sharpness for image in first]
     of_instant = split_frames(gray_of, sharpness, settings, progress, ordered=dive.ordered, rotation=rotation)
     counts = np.diff([*starts, len(dive.images)])

@@ -74,7 +74,9 @@ def displacement(before: Gray, after: Gray, rotated: Callable[[Points], Points] 
         return None
     here, there = corners
     expected = here if rotated is None else rotated(here)
-    return float(np.median(np.linalg.norm(there - expected, axis=1)) / max(before.shape))
+    moved = np.linalg.norm(there - expected, axis=1)
+    moved = moved[np.isfinite(moved)]
+    return float(np.median(moved) / max(before.shape)) if len(moved) >= _FEW else None
 
 
 def median_flow(before: Gray, after: Gray) -> Float[np.ndarray, "2"] | None:

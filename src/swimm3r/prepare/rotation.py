@@ -1,21 +1,26 @@
 """Motion of an image by the camera's rotation alone, from the gyroscope: x' = K R^T K^-1 x, whatever the distance.
 
-Neither focal length nor the delay of the sensor is known before structure from motion. Both follow from the median
-displacement u_i of corners from frame i to i + 1 and the direction p_i in which the gyroscope says that the middle of
-frame i is then seen (in units of the focal length): translation is smooth, hands and thrusters are not, so that
+The delay of the sensor is not known before structure from motion, and the focal length only where the lens was
+calibrated. Both follow from the median displacement u_i of corners from frame i to i + 1 and the direction p_i in which
+the gyroscope says that the middle of frame i is then seen (in units of the focal length): translation is smooth, hands
+and thrusters are not, so that
 
     u_i+1 - u_i = f (p_i+1 - p_i) + ...
 
 by least squares, at the delay at which the two go together best. A camera that sways as it turns moves the image by
-both: where that makes a focal length which no lens has, the motion by rotation is not known.
+both: where that makes a focal length which no lens has, the motion by rotation is known for a calibrated lens alone,
+whose distortion then counts, too.
 """
 
+import logging
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
-from jaxtyping import Float
+import torch
+from jaxtyping import Bool, Float
 
+from swimm3r.cameras import Cameras, directions, project, resized
 from swimm3r.io.telemetry.gyroscope import Gyroscope
 from swimm3r.prepare.keyframes import Gray, Points, median_flow
 
@@ -26,6 +31,8 @@ _MOST = 200  # pairs of frames that are looked at
 _ROUNDS = 3  # of the focal length
 _FOCALS = 0.4, 4.0  # by the longer side: fields of view of 103 and 14 degrees
 
+log = logging.getLogger(__name__)
+
 
 @dataclass(frozen=True)
 class RotationMotion:
@@ -33,30 +40,33 @@ class RotationMotion:
 
     gyroscope: Gyroscope
     times: tuple[float, ...]  # of the frames, seconds
-    focal: float  # pixels
+    lens: Cameras  # one at the origin
     delay: float  # seconds by which the gyroscope is late
-    center: tuple[float, float]  # pixels
 
     def moved(self, i: int, j: int, xy: Points) -> Points:
-        """Places in frame j of points of frame i, had the camera only turned."""
-        rays = np.concatenate([(xy - self.center) / self.focal, np.ones((len(xy), 1))], 1)
+        """Places in frame j of points of frame i, had the camera only turned; NaN where the lens has no ray.
+
+        The center of the first pixel is (0, 0), as corners are found.
+        """
+        rays = directions(self.lens, torch.from_numpy(xy + 0.5)[None].double())[0].numpy()
         turned = rays @ self.gyroscope.turn(self.times[i] + self.delay, self.times[j] + self.delay)
-        return self.focal * turned[:, :2] / np.maximum(turned[:, 2:], 1e-3) + self.center
+        turned[:, 2] = np.maximum(turned[:, 2], 1e-3)
+        return project(self.lens, torch.from_numpy(turned)[None])[0][0].numpy() - 0.5
 
 
 def rotation_motion(
-    gyroscope: Gyroscope, times: Sequence[float], gray_of: Callable[[int], Gray]
+    gyroscope: Gyroscope, times: Sequence[float], gray_of: Callable[[int], Gray], lens: Cameras | None = None
 ) -> RotationMotion | None:
     """The motion by rotation of frames at these times; None where the images do not move as the gyroscope says.
 
-    `gray_of` gives a small gray copy of a frame.
+    `gray_of` gives a small gray copy of a frame; `lens` is that of the frames in any size, where it is known.
     """
     count = len(times)
     starts = range(max(0, (count - _MOST) // 2), min(count - 1, (count + _MOST) // 2))
     moved = [median_flow(gray_of(i), gray_of(i + 1)) for i in starts]
     flows = np.array([(np.nan, np.nan) if each is None else each for each in moved]).reshape(-1, 2)
     changes = np.diff(flows, axis=0)
-    known = np.isfinite(changes).all(1)
+    known = np.isfinite(changes).all(axis=1).reshape(-1)
     if known.sum() < _FEWEST:
         return None
     u, best = changes[known].ravel(), (0.0, 0.0, 0.0)
@@ -68,14 +78,41 @@ def rotation_motion(
             best = together, float(u @ p) / float(p @ p), delay
     together, focal, delay = best
     if together < _CORRELATED:
+        log.info("keyframes without the gyroscope: the images move otherwise (correlation %.2f)", together)
         return None
     height, width = gray_of(starts[0]).shape
-    motion = RotationMotion(gyroscope, tuple(times), focal, delay, (width / 2, height / 2))
-    for _ in range(_ROUNDS):  # off its middle an image moves more: the whole of it tells the focal length
-        expected = np.diff([_median_flow(motion, i) for i in starts], axis=0)[known].ravel()
-        motion = replace(motion, focal=motion.focal * float(u @ expected) / float(expected @ expected))
+    if lens is not None:
+        motion = RotationMotion(gyroscope, tuple(times), resized(lens, width, height), delay)
+    else:
+        motion = RotationMotion(gyroscope, tuple(times), _pinhole(focal, width, height), delay)
+        motion = _with_fitted_focal(motion, starts, u, known)
+    focal = float(motion.lens.K[0, 0, 0])
+    log.info(
+        "gyroscope: %.3f s late, correlation %.2f with the images; focal length %.0f px, %s, in images %d px wide",
+        *(delay, together, focal, "fitted" if lens is None else "that of the lens", width),
+    )
     low, high = (share * max(height, width) for share in _FOCALS)
-    return motion if low <= motion.focal <= high else None
+    if lens is None and not low <= focal <= high:
+        log.info("keyframes without the gyroscope: no lens has that focal length; a calibrated one takes its place")
+        return None
+    return motion
+
+
+def _pinhole(focal: float, width: int, height: int) -> Cameras:
+    K = torch.tensor([[[focal, 0, width / 2], [0, focal, height / 2], [0, 0, 1]]], dtype=torch.float64)
+    return Cameras(K, K.new_zeros(1, 0), torch.eye(4, dtype=K.dtype)[None], width, height)
+
+
+def _with_fitted_focal(
+    motion: RotationMotion, starts: range, u: Float[np.ndarray, " changes"], known: Bool[np.ndarray, " pairs"]
+) -> RotationMotion:
+    """The motion with the focal length of the whole image: off its middle an image moves more."""
+    for _ in range(_ROUNDS):
+        expected = np.diff([_median_flow(motion, i) for i in starts], axis=0)[known].ravel()
+        by = float(u @ expected) / float(expected @ expected)
+        focal, lens = by * float(motion.lens.K[0, 0, 0]), motion.lens
+        motion = replace(motion, lens=_pinhole(focal, lens.width, lens.height))
+    return motion
 
 
 def _ahead(turn: Float[np.ndarray, "3 3"]) -> Float[np.ndarray, "2"]:
@@ -86,6 +123,6 @@ def _ahead(turn: Float[np.ndarray, "3 3"]) -> Float[np.ndarray, "2"]:
 
 def _median_flow(motion: RotationMotion, i: int) -> Float[np.ndarray, "2"]:
     """Median displacement over the image from frame i to the next, pixels."""
-    (x, y), steps = motion.center, np.linspace(0.05, 1.95, 8)
-    grid = np.stack(np.meshgrid(x * steps, y * steps), -1).reshape(-1, 2)
+    steps = np.linspace(0.025, 0.975, 8)
+    grid = np.stack(np.meshgrid(motion.lens.width * steps, motion.lens.height * steps), -1).reshape(-1, 2)
     return np.median(motion.moved(i, i + 1, grid) - grid, axis=0)

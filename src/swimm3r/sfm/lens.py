@@ -16,7 +16,14 @@ from swimm3r.errors import UsageError
 from swimm3r.io.calibration.read import read_calibration, read_lens
 from swimm3r.refraction.central import CameraInWater, camera_in_water
 from swimm3r.refraction.ports import port_of
-from swimm3r.sfm.settings import LENS_NUMBERS, ColmapSettings, LensSettings, Mast3rSettings
+from swimm3r.sfm.settings import (
+    LENS_NUMBERS,
+    ColmapModelSettings,
+    ColmapSettings,
+    LensSettings,
+    Mast3rSettings,
+    SfmSettings,
+)
 
 DISTORTION = ("k1", "k2", "k3", "k4", "p1", "p2")
 
@@ -31,7 +38,7 @@ _TOLD = (0.5, 1.0, 2.0, 5.0)  # m from the port
 
 log = logging.getLogger(__name__)
 
-Given = TypeVar("Given", ColmapSettings, Mast3rSettings)
+Given = TypeVar("Given", bound=ColmapSettings | Mast3rSettings)
 
 
 def check_calibration(settings: LensSettings) -> None:
@@ -69,6 +76,21 @@ def with_calibration(settings: Given, width: int, height: int, stated: Path | No
     changed = replace(settings, **blank, focal=fx, fy=fy, cx=cx, cy=cy, **numbers)
     undecided = isinstance(settings, ColmapSettings) and model != "OPENCV_FISHEYE"  # auto goes by the numbers
     return changed if undecided else replace(changed, camera=model)
+
+
+def known_lens(settings: SfmSettings, width: int, height: int, stated: Path | None = None) -> Cameras | None:
+    """The lens in water of frames of this size, by the settings or the file that their source states; None unknown.
+
+    Raises InputError and UsageError as `with_calibration` and `behind_port` do.
+    """
+    if isinstance(settings, ColmapModelSettings):  # its model has lenses of its own
+        return None
+    found, _ = behind_port(with_calibration(settings, width, height, stated), width, height)
+    if found.focal is None:
+        return None
+    model = model_of(found)
+    check_lens_settings(found, model, width, height)
+    return lens_of(found, model, width, height, found.focal)
 
 
 def gives_lens(settings: LensSettings) -> bool:

@@ -219,7 +219,7 @@ class LiveView:
             if found.source != "neighbors":  # a guess would show the map off its place
                 name, label, pose = test, "Test frame", found.cam2world
         lens = rec.cameras[rec.index(name) if pose is None else 0]
-        camera = lens.pinhole(_PREVIEW)
+        camera = lens.drawn(_PREVIEW)
         number = frames.index(name)
         image, _ = undistorted(frames.image(number), frames.mask(number), lens, camera)
         if pose is not None:

@@ -7,7 +7,6 @@ depth, so that a scene of any scale fits the browser's depth buffer. Everything 
 from dataclasses import dataclass, field, replace
 from pathlib import Path
 
-import cv2
 import numpy as np
 import torch
 from jaxtyping import Bool, Float, UInt8
@@ -40,7 +39,7 @@ _FRAME_SIDE = 960  # pixels of a frame shown over the picture
 
 @dataclass(frozen=True)
 class FrameImage:
-    """A frame without lens distortion, with the pinhole camera it belongs to."""
+    """A frame without lens distortion, or of a fisheye as it is, with the camera it belongs to."""
 
     rgb: UInt8[np.ndarray, "h w 3"]
     seen: Bool[np.ndarray, "h w"]  # false where the lens showed nothing
@@ -92,7 +91,7 @@ class ViewedRun:
         if restored and not path.is_file():
             return None
         lens = self.cameras[self.rec.index(name)]
-        canvas = lens.pinhole(_FRAME_SIDE)
+        canvas = lens.drawn(_FRAME_SIDE)
 
         def make() -> tuple[np.ndarray, np.ndarray]:
             number = self.frames.index(name)
@@ -104,13 +103,14 @@ class ViewedRun:
         return FrameImage(rgb, seen, canvas)
 
     def thumbnail(self, name: str) -> UInt8[np.ndarray, "h w 3"]:
-        """A small copy of a frame."""
+        """A small copy of a frame as a pinhole has it, which is what the frustum of a camera shows."""
+        lens = self.cameras[self.rec.index(name)]
 
         def make() -> tuple[np.ndarray]:
-            image = (self.frames.image(self.frames.index(name)).numpy() * 255).astype(np.uint8)
-            scale = _THUMBNAIL / max(image.shape[:2])
-            size = (max(1, round(image.shape[1] * scale)), max(1, round(image.shape[0] * scale)))
-            return (cv2.resize(image, size, interpolation=cv2.INTER_AREA),)
+            image = self.frames.image(self.frames.index(name))
+            everything = torch.ones(image.shape[:2], dtype=torch.bool)
+            small, _ = undistorted(image, everything, lens, lens.pinhole(_THUMBNAIL))
+            return ((small * 255).to(torch.uint8).numpy(),)
 
         (small,) = self.cache.get((name, "thumbnail"), make)
         return small

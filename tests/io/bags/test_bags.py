@@ -155,24 +155,56 @@ def test_rectified_images_have_the_lens_of_the_projection(tmp_path: Path):
     assert found.model == "PINHOLE"
 
 
+OTHER = lens(K=(33.0, 0, 32, 0, 33, 24, 0, 0, 1))
+
+
+def at(second: float, sent: Sent) -> Sent:
+    return replace(sent, stamp=START + round(second * SECOND))
+
+
+def about_lenses(path: Path, folder: Path, **changes) -> list[str]:
+    return [warning for warning in read_frames(path, folder=folder, **changes).warnings if "lens" in warning]
+
+
 @pytest.mark.parametrize(
     ("later", "told"),
     [
         (lens(), None),
-        (lens(K=(33.0, 0, 32, 0, 33, 24, 0, 0, 1)), "fx 33 fy 33"),
-        (lens(D=(0.2, 0, 0, 0, 0)), "distortion 0.2 px at last"),
+        (OTHER, "to fx 33 fy 33"),
+        (lens(D=(0.2, 0, 0, 0, 0)), "px distortion 0.2: the"),
         (lens(K=(0,) * 9), None),  # the driver shuts down
     ],
 )
 @pytest.mark.parametrize("version", VERSIONS)
 def test_a_lens_that_changes_is_told(version: str, later: Sent, told: str | None, tmp_path: Path):
-    path = write_bag(tmp_path, version, [*camera(), lens(), replace(later, stamp=START + SECOND)])
+    path = write_bag(tmp_path, version, [*camera(), lens(), at(1, later)])
     frames = read_frames(path, folder=tmp_path / "prepare")
     assert frames.calibration is not None
     np.testing.assert_allclose(read_lens(frames.calibration, 64, 48).camera.K[0, 0, 0].numpy(), K[0])
     changes = [warning for warning in frames.warnings if "changes" in warning]
     assert len(changes) == (told is not None)
-    assert all(told in warning and "--end" in warning for warning in changes if told)
+    assert all(told in warning and "changes after 1 s, from fx 60" in warning for warning in changes if told)
+
+
+@pytest.mark.parametrize("version", VERSIONS)
+def test_a_lens_that_changes_and_reverts_is_told_with_the_first_time(version: str, tmp_path: Path):
+    sent = [at(i, OTHER if i in (2, 3) else lens()) for i in range(6)]
+    (told,) = about_lenses(write_bag(tmp_path, version, [*camera(), *sent]), tmp_path / "prepare")
+    assert "changes 2 times, first after 2 s, from fx 60 fy 61" in told
+    assert "to fx 33 fy 33" in told
+
+
+def test_only_the_lenses_of_the_time_that_is_used_count(tmp_path: Path):
+    sent = [at(i, OTHER if i >= 3 else lens()) for i in range(8)]
+    path = write_bag(tmp_path, "mcap", [*camera(), *sent])
+    assert about_lenses(path, tmp_path / "before", end=3.0) == []
+    later = read_frames(path, folder=tmp_path / "after", start=3.0)
+    assert later.calibration is not None
+    assert read_lens(later.calibration, 64, 48).camera.K[0, 0, 0] == 33
+    assert not any("lens" in warning for warning in later.warnings)
+    assert about_lenses(path, tmp_path / "without", camera_info=False) == []
+    once = write_bag(tmp_path, "bag", [*camera(), lens()])
+    assert read_frames(once, folder=tmp_path / "once", start=3.0).calibration is not None
 
 
 @pytest.mark.parametrize(

@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 import torch
 from scipy.spatial.transform import Rotation
-from tests.scale.conftest import SCALE, survey_along
+from tests.scale.conftest import SCALE, Survey, survey_along
 
 from swimm3r.geometry import align_similarity
 from swimm3r.io.colmap.model import from_pycolmap, to_pycolmap
@@ -16,8 +16,9 @@ from swimm3r.progress import silent
 from swimm3r.scale.navigation.navigator import NavigationFile
 from swimm3r.scale.settings import ScaleSettings
 from swimm3r.scene.frames import Frame, Frames
+from swimm3r.scene.reconstruction import Reconstruction
 from swimm3r.sfm.colmap import poses
-from swimm3r.sfm.colmap.adjustment import bundle_adjust
+from swimm3r.sfm.colmap.adjustment import bundle_adjust, typical_error
 from swimm3r.sfm.colmap.navigated import Prior, adjust_to_positions
 from swimm3r.sfm.settings import ColmapSettings
 
@@ -32,25 +33,53 @@ def path_error(centers: np.ndarray, truth: np.ndarray) -> float:
     return float(np.sqrt(((moved - truth) ** 2).sum(1).mean()))
 
 
-def test_priors_of_positions_straighten_a_strip_that_bends():
-    x = np.arange(60) * 0.4
-    strip = np.stack([x, 0.5 * np.sin(x / 3), 2 + 0.2 * np.cos(x / 2)], -1)
-    survey = survey_along(strip)
-    rng = np.random.default_rng(0)
+X = np.arange(60) * 0.4
+STRIP = np.stack([X, 0.5 * np.sin(X / 3), 2 + 0.2 * np.cos(X / 2)], -1)
+
+
+def seen_with_errors(survey: Survey, pixels: float, rng: np.random.Generator) -> Reconstruction:
+    """A tenth of a survey's points, the others without tracks, with errors of this standard deviation."""
     tracks = survey.rec.tracks
     seen = torch.bincount(tracks.point, minlength=len(survey.rec.points.xyz)) > 1
     few = (seen & torch.from_numpy(rng.random(len(seen)) < 0.1))[tracks.point]
-    xy = tracks.xy[few] + torch.from_numpy(rng.normal(size=(int(few.sum()), 2))).float()
-    noisy = replace(survey.rec, tracks=replace(tracks, point=tracks.point[few], frame=tracks.frame[few], xy=xy))
-    bent = bundle_adjust(noisy)
-    model = to_pycolmap(bent.colmap_model())
-    std = 0.05  # metres
-    stated = survey.position + std * rng.normal(size=strip.shape)
+    xy = tracks.xy[few] + pixels * torch.from_numpy(rng.normal(size=(int(few.sum()), 2))).float()
+    return replace(survey.rec, tracks=replace(tracks, point=tracks.point[few], frame=tracks.frame[few], xy=xy))
+
+
+def held_to(rec: Reconstruction, survey: Survey, stated: np.ndarray, std: float) -> float:
+    """The error of the path after an adjustment with positions of this standard deviation, metres."""
     cov = np.eye(3) * (std / SCALE) ** 2
     priors = {name: Prior(p, cov) for name, p in zip(survey.rec.names, survey.in_run(stated), strict=True)}
-    held = from_pycolmap(adjust_to_positions(model, priors, silent, lens=False))
+    held = from_pycolmap(adjust_to_positions(to_pycolmap(rec.colmap_model()), priors, silent, lens=False))
+    return path_error(held.cam2world[:, :3, 3], survey.position)
+
+
+def test_priors_of_positions_straighten_a_strip_that_bends():
+    survey, rng, std = survey_along(STRIP), np.random.default_rng(0), 0.05
+    bent = bundle_adjust(seen_with_errors(survey, 1.0, rng))
+    stated = survey.position + std * rng.normal(size=STRIP.shape)
     free = path_error(bent.cameras.centers.double().numpy(), survey.position)
-    assert path_error(held.cam2world[:, :3, 3], survey.position) < 0.5 * min(free, std * np.sqrt(3))
+    assert held_to(bent, survey, stated, std) < 0.5 * min(free, std * np.sqrt(3))
+
+
+@pytest.mark.parametrize("pixels", [0.03, 1.0])
+def test_typical_errors_are_those_of_points_with_tracks(pixels: float):
+    rec = seen_with_errors(survey_along(STRIP), pixels, np.random.default_rng(0))
+    model = to_pycolmap(rec.colmap_model())
+    model.update_point_3d_errors()
+    assert typical_error(model) == pytest.approx(min(1.0, 1.25 * pixels), rel=0.15)
+
+
+def test_images_count_by_their_own_errors_against_positions():
+    """Positions that jump to and fro by 5 cm: images that are exact to 0.03 px know better, those of 1 px do not."""
+    survey, std = survey_along(STRIP), 0.05
+    jumping = survey.position + std * np.where(np.arange(len(STRIP)) % 2, 1, -1)[:, None] * np.array([0, 0, 1])
+    errors = []
+    for pixels in (0.03, 1.0):
+        rec = seen_with_errors(survey, pixels, np.random.default_rng(0))
+        errors.append(held_to(rec, survey, jumping, std))
+    assert errors[0] < 0.2 * std
+    assert errors[1] > 0.3 * std
 
 
 @pytest.fixture(scope="module")

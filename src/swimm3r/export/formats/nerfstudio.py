@@ -2,7 +2,7 @@
 
 Poses are camera to world with OpenGL's camera axes (x right, y up, z back). As nerfstudio's own converter does, the
 world is turned so that a camera held level has z up: (x, y, z) -> (x, z, -y). `applied_transform` says so, and the
-points are turned, too.
+points are turned, too. Instant-NGP takes a fisheye by `is_fisheye`, others by `camera_model`.
 """
 
 import json
@@ -58,6 +58,7 @@ def transforms(cameras: Cameras, names: tuple[str, ...]) -> dict[str, Any]:
     model = {"SIMPLE_RADIAL": "OPENCV"}.get(cameras.model, cameras.model)  # with k2 = p1 = p2 = 0
     return {
         "camera_model": model,
+        **({"is_fisheye": True} if model == "OPENCV_FISHEYE" else {}),
         "w": cameras.width,
         "h": cameras.height,
         **shared,

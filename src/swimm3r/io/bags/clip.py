@@ -5,11 +5,10 @@ ahead, is refused with the number of the image: times of recording (`stamps="rec
 """
 
 import math
-from collections.abc import Iterator
+from collections.abc import Iterable, Iterator
 from dataclasses import dataclass
 from datetime import UTC, datetime
 from functools import cached_property
-from itertools import islice
 from pathlib import Path
 from typing import Any, Literal
 
@@ -18,17 +17,18 @@ from jaxtyping import UInt8
 
 from swimm3r.errors import InputError, Swimm3rError
 from swimm3r.io.bags.bag import Bag, Message, open_bag
-from swimm3r.io.bags.lens import lens_text
+from swimm3r.io.bags.lens import LensChange, change_warning, lens_numbers, lens_text
 from swimm3r.io.bags.pixels import compressed_image_of, image_of
 from swimm3r.io.bags.topics import IMAGE, Topic, choose_images, lens_topic, topics_of
 from swimm3r.io.calibration.documents import from_yaml, read_document
-from swimm3r.io.calibration.record import Calibration, lens_at
+from swimm3r.io.calibration.record import lens_at
 from swimm3r.io.files.damage import first_line
 from swimm3r.io.images import Rgb
 
 Stamps = Literal["header", "received"]
 
-_TRIED = 100  # messages of a lens, of which the first that is calibrated counts
+_TRIED = 100  # messages of a lens after the start among which a calibrated one is looked for: drivers are set up late
+_STAMPED = 12  # bytes of a message that end with its stamp: another one of the same content differs in these alone
 _LEAP = 60.0  # seconds that a header may be ahead of the recording between two images: buffers hold less
 _FIRST_YEAR = 631_152_000  # 1990 in seconds since 1970: earlier stamps are of a clock that was never set
 
@@ -73,15 +73,27 @@ class BagClip:
     rate: float  # images per second on average
     recorded: str | None  # date of the first header, ISO 8601; None of a clock that was not set
     start_ns: int  # stamp of second 0, by default that of the first image
-    lens: str | None  # ROS camera_info of the images, as YAML; None where the bag has none that can be used
+    lens: str | None  # ROS camera_info of the images, as YAML; None where it is not asked for or cannot be used
     damaged: int  # messages that did not decode so far
     interlaced: bool
     frame_id: str  # of the images' axes, as the first one states them
 
-    def __init__(self, path: Path, topic: str | None = None, stamps: Stamps = "header") -> None:
-        """Raises InputError where the bag cannot be read or has no images, UsageError where a topic is to be chosen."""
+    def __init__(
+        self,
+        path: Path,
+        topic: str | None = None,
+        stamps: Stamps = "header",
+        *,
+        start: float = 0.0,
+        camera_info: bool = True,
+    ) -> None:
+        """Take the lens of the images from second `start` on, unless no `camera_info` is wanted.
+
+        Raises InputError where the bag cannot be read or has no images, UsageError where a topic is to be chosen.
+        """
         self.path, self.stamps = path, stamps
         self.damaged, self.interlaced, self._notes, self._cut = 0, False, [], None
+        self._lens_changes: list[LensChange] = []
         with open_bag(path) as bag:
             topics = topics_of(bag)
             self.topic = choose_images(topics, topic)
@@ -90,9 +102,10 @@ class BagClip:
             assert last is not None
             self.frame_id, image = self._first_decoded(bag)
             self.height, self.width = image.shape[:2]
-            self.lens = self._lens(bag, lens_topic(topics, self.topic))
-        self._first_received = first.received
-        self.start_ns, end = self._stamp(first), self._stamp(last)
+            self._first_received = first.received
+            self.start_ns, end = self._stamp(first), self._stamp(last)
+            self._info = lens_topic(topics, self.topic) if camera_info else None
+            self.lens = self._lens(bag, start) if camera_info else None
         self.seconds = (end - self.start_ns) * 1e-9 if end > self.start_ns else None
         self.rate = (self.topic.count - 1) / self.seconds if self.seconds else 1.0
         self.recorded = recorded_at(self.start_ns)
@@ -104,8 +117,9 @@ class BagClip:
 
     def frames(self, start: float = 0.0, end: float = math.inf) -> Iterator[BagImage]:
         """The images from second `start` up to before second `end`. Raises InputError where the clock is no clock."""
+        self._lens_changes = []
         with open_bag(self.path) as bag:
-            for time, message in self._messages(bag, start, end):
+            for time, message in self._timed(self._beside_lenses(bag, start, end), start, end):
                 image = BagImage(time, message, self, bag)
                 if self._decodes(image):
                     yield image
@@ -117,13 +131,16 @@ class BagClip:
         Raises InputError where the clock is no clock.
         """
         with open_bag(self.path) as bag:
-            return [time for time, _ in self._messages(bag, start, end)]
+            messages = bag.messages(self.topic.name, since=self._since(start))
+            return [time for time, _ in self._timed(messages, start, end)]
 
     def warnings(self) -> list[str]:
         """Faults that were met so far, in plain words."""
         name, found = self.path.name, list(self._notes)
         if self.damaged:
             found.append(f"{self.damaged} images of {self.topic.name} in {name} are damaged and were left out.")
+        if self._info is not None and self._lens_changes:
+            found.append(change_warning(self._info.name, self._lens_changes))
         if self._cut is not None:
             found.append(f"{name} cannot be read to its end ({self._cut}): what was read until there is used.")
         return found
@@ -133,18 +150,21 @@ class BagClip:
         place = Path(f"{self.path}:{message.topic}")
         return image_of(content) if message.type == IMAGE else compressed_image_of(content, place)
 
-    def _messages(self, bag: Bag, start: float, end: float) -> Iterator[tuple[float, Message]]:
+    def _since(self, start: float) -> int | None:
+        """The time of recording from which messages of second `start` may be expected; None for the whole bag."""
+        skipped = start - _LEAP  # recorders write a message within that time of its header
+        return self._first_received + int(skipped * 1e9) if skipped > 0 else None
+
+    def _timed(self, messages: Iterable[Message], start: float, end: float) -> Iterator[tuple[float, Message]]:
         """The images from second `start` up to before second `end`, with their times."""
-        skipped = max(0.0, start - _LEAP)  # recorders write a message within that time of its header
-        since = self._first_received + int(skipped * 1e9) if skipped else None
         before: Message | None = None
-        for number, message in enumerate(bag.messages(self.topic.name, since=since), 1):
-            place = f"image {number}" if since is None else f"image {number} from {skipped:.0f} s on"
+        for number, message in enumerate(messages, 1):
+            place = f"image {number}" if start <= _LEAP else f"image {number} from {start - _LEAP:.0f} s on"
             self._check_clock(message, before, place)
             if before is not None and self._stamp(message) == self._stamp(before):
                 continue  # the same image twice
             before = message
-            time = (self._stamp(message) - self.start_ns) * 1e-9
+            time = self._time(message)
             if time >= end:
                 return
             if time >= start - 1e-6:
@@ -181,24 +201,52 @@ class BagClip:
             hint=f"swimm3r topics {self.path} lists the encodings; another --topic",
         )
 
-    def _lens(self, bag: Bag, topic: Topic | None) -> str | None:
-        """The camera_info of the images; without a calibration in it None, and a note."""
-        space = self.topic.name
-        if topic is None:
+    def _beside_lenses(self, bag: Bag, start: float, end: float) -> Iterator[Message]:
+        """The messages of the images; of the lenses recorded between them, the changes from `lens` on are kept."""
+        names = [self.topic.name] if self.lens is None or self._info is None else [self.topic.name, self._info.name]
+        current, same = lens_numbers(self.lens) if self.lens is not None else "", b""
+        end = min(end, (self.seconds or 0.0) + 1e-6)  # a lens that no image follows is that of none
+        for message in bag.messages(*names, since=self._since(start)):
+            if message.topic == self.topic.name:
+                yield message
+                continue
+            body = message.data[_STAMPED:]
+            if body == same or not start - 1e-6 <= (time := self._time(message)) < end:
+                continue
+            same = body
+            try:
+                found = lens_numbers(self._calibrated(bag, message))
+            except (ValueError, Swimm3rError):  # a driver that starts or shuts down
+                continue
+            if found != current:
+                self._lens_changes.append(LensChange(time, current, found))
+                current = found
+
+    def _lens(self, bag: Bag, start: float) -> str | None:
+        """The camera_info that holds at a second, or the first after it; without a calibration None, and a note."""
+        if self._info is None:
+            space = self.topic.name
             self._notes.append(
                 f"There is no camera_info beside {space}: the lens is estimated unless --calibration tells it."
             )
             return None
         why: object = "it holds no message that can be read"
-        for message in islice(bag.messages(topic.name), _TRIED):  # drivers send empty ones until they are set up
-            try:
-                text = self._calibrated(bag, message)
-            except (ValueError, Swimm3rError) as error:
-                why = first_line(error)
-            else:
-                self._note_change(bag, topic, text)
-                return text
-        self._notes.append(f"The lens in {topic.name} is not used: {why}.")
+        for since in dict.fromkeys((self._since(start), None)):  # one that is sent once lies long before the start
+            held, same, tried = None, b"", 0
+            for message in bag.messages(self._info.name, since=since):
+                later, body = self._time(message) > start + 1e-6, message.data[_STAMPED:]
+                tried += later
+                if tried > _TRIED or (later and held is not None):
+                    break
+                if body != same:
+                    try:
+                        held = self._calibrated(bag, message)
+                    except (ValueError, Swimm3rError) as error:
+                        why = first_line(error)
+                same = body
+            if held is not None:
+                return held
+        self._notes.append(f"The lens in {self._info.name} is not used: {why}.")
         return None
 
     def _calibrated(self, bag: Bag, message: Message) -> str:
@@ -207,20 +255,11 @@ class BagClip:
         lens_at(read_document(from_yaml(text))[0], self.width, self.height)
         return text
 
-    def _note_change(self, bag: Bag, topic: Topic, text: str) -> None:
-        """Add a note where the last message of a lens is of another lens than its text."""
-        last = bag.last(topic.name)
-        assert last is not None  # it has a first
-        try:
-            at_last = self._calibrated(bag, last)
-        except (ValueError, Swimm3rError):  # a driver that shuts down
-            return
-        first, second = (read_document(from_yaml(each))[0] for each in (text, at_last))
-        if (told := _numbers(first)) != (then := _numbers(second)):
-            self._notes.append(
-                f"The lens in {topic.name} changes, from {told} px at first to {then} px at last: the first is that of"
-                " all images. Use --end to stop before the change, or --no-camera-info."
-            )
+    def _time(self, message: Message) -> float:
+        """Seconds of the clip; of a message without a stamp, those at which it was recorded."""
+        if self._stamp(message) == 0:
+            return (message.received - self._first_received) * 1e-9
+        return (self._stamp(message) - self.start_ns) * 1e-9
 
     def _stamp(self, message: Message) -> int:
         return message.stamp if self.stamps == "header" else message.received
@@ -242,12 +281,6 @@ class BagClip:
                 cause="the driver does not stamp its images, or its clock was set while they were recorded",
                 hint="--stamps received, which takes the times at which they were recorded",
             )
-
-
-def _numbers(lens: Calibration) -> str:
-    (fx, _, cx), (_, fy, cy), _ = lens.K
-    bent = "".join(f" {value:.4g}" for value in (*lens.k, *lens.p, *lens.divisor) if value)
-    return f"fx {fx:.6g} fy {fy:.6g} cx {cx:.6g} cy {cy:.6g}" + (f" distortion{bent}" if bent else "")
 
 
 def recorded_at(stamp: int) -> str | None:

@@ -1,9 +1,23 @@
-"""camera_info messages -> the text of a ROS camera_info file, which `--calibration` reads."""
+"""camera_info messages -> the text of a ROS camera_info file, which `--calibration` reads, and changes among them."""
 
+import math
+from collections.abc import Sequence
+from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
 import yaml
+
+from swimm3r.io.calibration.documents import from_yaml, read_document
+
+
+@dataclass(frozen=True)
+class LensChange:
+    """A camera_info that states another lens than the one before it."""
+
+    time: float  # seconds of the clip
+    before: str  # `lens_numbers`
+    after: str
 
 
 def lens_text(info: Any, name: str, *, rectified: bool = False) -> str:
@@ -40,3 +54,22 @@ def lens_text(info: Any, name: str, *, rectified: bool = False) -> str:
 def _either(info: Any, letter: str) -> Any:
     """A field that version 1 writes in capitals and version 2 does not."""
     return getattr(info, letter) if hasattr(info, letter) else getattr(info, letter.upper())
+
+
+def lens_numbers(text: str) -> str:
+    """The numbers of a lens in words, from the text of its file; equal lenses have equal words."""
+    lens = read_document(from_yaml(text))[0]
+    (fx, _, cx), (_, fy, cy), _ = lens.K
+    bent = "".join(f" {value:.4g}" for value in (*lens.k, *lens.p, *lens.divisor) if value)
+    return f"fx {fx:.6g} fy {fy:.6g} cx {cx:.6g} cy {cy:.6g} px" + (f" distortion{bent}" if bent else "")
+
+
+def change_warning(topic: str, changes: Sequence[LensChange]) -> str:
+    """The warning about a lens that changes at least once."""
+    first = changes[0]
+    at = math.floor(first.time * 1e3) / 1e3  # not later than the change, for --end
+    times = f"changes {len(changes)} times, first" if len(changes) > 1 else "changes"
+    return (
+        f"The lens in {topic} {times} after {at:.10g} s, from {first.before} to {first.after}: the lens before that is"
+        f" used for all images. Use --end {at:.10g} to stop before the change, or --no-camera-info."
+    )

@@ -20,13 +20,13 @@ from swimm3r.io.calibration.rig import check_rig_poses, rectified_poses
 Poses = Float[np.ndarray, "s 4 4"]
 
 
-def stated_poses(clips: Sequence[BagClip], *, camera_info: bool = True) -> tuple[Poses, str] | None:
+def stated_poses(clips: Sequence[BagClip]) -> tuple[Poses, str] | None:
     """camera_from_rig in metres, the first the identity, and the topics of the bag that state them; None without any.
 
     Cameras that topics put in one place have no stated poses there. Raises InputError where transforms are damaged.
     """
     texts = [clip.lens for clip in clips if clip.lens is not None]
-    if camera_info and len(texts) == len(clips) and (poses := _projected(texts)) is not None:
+    if len(texts) == len(clips) and (poses := _projected(texts)) is not None:
         return poses, "camera_info"
     with open_bag(clips[0].path) as bag:
         parents = _static_transforms(bag)

@@ -32,22 +32,30 @@ _TURNS = 3  # the shift changes with the change of depth, a hundredth of a pixel
 
 def typical_error(model: "pycolmap.Reconstruction") -> float:
     """Median reprojection error of the tracks of a model in pixels, 0.01 to 1: the width of the loss that suits it."""
-    errors = [point.error for point in model.points3D.values()]
+    errors = [point.error for point in model.points3D.values() if point.track.length() > 1]
     return float(np.clip(np.median(errors), _NARROWEST, WIDEST)) if errors else WIDEST
+
+
+def robust_adjustment(width: float) -> "pycolmap.BundleAdjustmentOptions":
+    """Options of an adjustment whose loss is quadratic up to errors of `width` pixels, and linear far beyond."""
+    import pycolmap
+
+    options = pycolmap.BundleAdjustmentOptions()
+    options.print_summary = False
+    options.ceres.loss_function_type = pycolmap.LossFunctionType.SOFT_L1
+    options.ceres.loss_function_scale = width
+    return options
 
 
 def bundle_adjust(rec: Reconstruction, *, lens: bool = False) -> Reconstruction:
     """The same frames and tracks with poses and points that reproject best, and the lens too where asked."""
     import pycolmap
 
-    options = pycolmap.BundleAdjustmentOptions()
-    options.refine_focal_length = options.refine_extra_params = lens
-    options.print_summary = False
-    options.ceres.loss_function_type = pycolmap.LossFunctionType.SOFT_L1
-    options.ceres.solver_options.num_threads = 1  # as in mapping: the same sums in the same order
     model = to_pycolmap(rec.colmap_model())
     model.update_point_3d_errors()
-    options.ceres.loss_function_scale = typical_error(model)
+    options = robust_adjustment(typical_error(model))
+    options.refine_focal_length = options.refine_extra_params = lens
+    options.ceres.solver_options.num_threads = 1  # as in mapping: the same sums in the same order
     pycolmap.bundle_adjustment(model, options)
     model.update_point_3d_errors()
     table = from_pycolmap(model)

@@ -15,7 +15,7 @@ from swimm3r.cameras import distort
 from swimm3r.errors import UsageError
 from swimm3r.io.colmap.cameras import from_pycolmap_camera, to_pycolmap_camera, under_model
 from swimm3r.progress import Progress
-from swimm3r.sfm.colmap.adjustment import WIDEST, typical_error
+from swimm3r.sfm.colmap.adjustment import WIDEST, robust_adjustment, typical_error
 from swimm3r.sfm.colmap.pair_focal import focal_of_pairs
 from swimm3r.sfm.features.database import MIN_INLIERS, FeatureDatabase
 from swimm3r.sfm.lens import check_lens_settings, lens_of, model_of
@@ -238,13 +238,10 @@ def _adjust(
     mapping.ba_global_ignore_redundant_points3D = is_large
     triangulation = pycolmap.IncrementalTriangulatorOptions()
     triangulation.random_seed = SEED
-    adjustment = pycolmap.BundleAdjustmentOptions()
-    adjustment.print_summary = False
+    adjustment = robust_adjustment(width)
     adjustment.refine_focal_length, adjustment.refine_extra_params = focal, distortion
     adjustment.ceres.solver_options.num_threads = THREADS
     adjustment.ceres.solver_options.function_tolerance = STILL
-    adjustment.ceres.loss_function_type = pycolmap.LossFunctionType.SOFT_L1
-    adjustment.ceres.loss_function_scale = width
     mapper.iterative_global_refinement(5, 0.0005, mapping, adjustment, triangulation)
     mapper.end_reconstruction(False)
     out.update_point_3d_errors()

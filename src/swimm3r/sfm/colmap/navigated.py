@@ -1,9 +1,11 @@
 """Navigation in mapping: parts of a clip that share no ground joined by it, and positions as COLMAP's pose priors.
 
-    sum rho(reprojection) + sum_i |Sigma_i^-1/2 (c_i - p_i)|^2
+    sum rho(e / w) + sum_i rho'(Sigma_i^-1/2 (c_i - p_i))
 
-over poses, points and, where the images determine it, the lens; c_i are camera centers, p_i positions by navigation in
-the axes and the unit of the largest part, Sigma_i their covariances.
+over poses, points and, where the images determine it, the lens; e are reprojection errors and w the typical one
+(`adjustment`), at first 1 px, c_i camera centers, p_i positions by navigation in the axes and the unit of the largest
+part, Sigma_i their covariances. rho is quadratic up to 1 and so is rho', up to its own width. COLMAP counts errors in
+pixels: its sum is w^2 times this one, with covariances divided by w^2.
 """
 
 from collections.abc import Callable, Sequence
@@ -18,6 +20,7 @@ from swimm3r.scene.frames import Frames
 from swimm3r.scene.placement import Navigator, Placement
 from swimm3r.scene.reconstruction import QualityWarning, Reconstruction
 from swimm3r.sfm.colmap import calibration
+from swimm3r.sfm.colmap.adjustment import WIDEST, robust_adjustment, typical_error
 from swimm3r.sfm.colmap.chunks.assemble import assemble
 from swimm3r.sfm.colmap.chunks.join import Joined
 from swimm3r.sfm.colmap.chunks.parts import LEAST_FRAMES, part_of
@@ -94,22 +97,25 @@ def adjust_to_positions(
 
     out = pycolmap.Reconstruction(model)
     images = {out.images[i].name: out.images[i] for i in out.reg_image_ids()}
-    stated = [_pose_prior(images[name], prior) for name, prior in sorted(priors.items()) if name in images]
-    options = pycolmap.BundleAdjustmentOptions()
-    options.print_summary = False
-    options.refine_focal_length = options.refine_extra_params = lens
-    options.ceres.solver_options.num_threads = calibration.THREADS
-    options.ceres.solver_options.function_tolerance = calibration.STILL
-    options.ceres.loss_function_type = pycolmap.LossFunctionType.SOFT_L1
+    stated = [(images[name], prior) for name, prior in sorted(priors.items()) if name in images]
     prior_options = pycolmap.PosePriorBundleAdjustmentOptions()
     prior_options.alignment_ransac.random_seed = calibration.SEED
     prior_options.ceres.prior_position_loss_function_type = pycolmap.LossFunctionType.CAUCHY
+    prior_width = prior_options.ceres.prior_position_loss_scale
     for done in range(_ROUNDS):
         progress(_STEP, done, _ROUNDS)
+        out.update_point_3d_errors()
+        width = typical_error(out) if done else WIDEST  # the priors move poses at first
+        options = robust_adjustment(width)
+        options.refine_focal_length = options.refine_extra_params = lens
+        options.ceres.solver_options.num_threads = calibration.THREADS
+        options.ceres.solver_options.function_tolerance = calibration.STILL
+        prior_options.ceres.prior_position_loss_scale = prior_width * width
+        known = [_pose_prior(image, prior, width) for image, prior in stated]
         config = pycolmap.BundleAdjustmentConfig()
         for image in out.reg_image_ids():
             config.add_image(image)
-        pycolmap.create_pose_prior_bundle_adjuster(options, prior_options, config, stated, out).solve()
+        pycolmap.create_pose_prior_bundle_adjuster(options, prior_options, config, known, out).solve()
         pycolmap.ObservationManager(out).filter_all_points3D(_MAX_ERROR, _MIN_ANGLE)
     progress(_STEP, _ROUNDS, _ROUNDS)
     out.update_point_3d_errors()
@@ -148,13 +154,13 @@ def _priors(placements: Sequence[Placement], frames: Frames) -> dict[str, Prior]
     return priors
 
 
-def _pose_prior(image: "pycolmap.Image", prior: Prior) -> "pycolmap.PosePrior":
+def _pose_prior(image: "pycolmap.Image", prior: Prior, width: float) -> "pycolmap.PosePrior":
     import pycolmap
 
     return pycolmap.PosePrior(
         corr_data_id=image.data_id,
         position=prior.position,
-        position_covariance=prior.covariance,
+        position_covariance=prior.covariance / width**2,
         coordinate_system=pycolmap.PosePriorCoordinateSystem.CARTESIAN,
     )
 

@@ -1,6 +1,7 @@
 """From the conditioned primitives of a block to the image plane, and their gradients: parts of `cpu_project`.
 
-The gradients are those of docs/derivations/gradients.md#projection; D_ names the loss's gradient by a quantity.
+The gradients are those of docs/derivations/gradients.md#projection; D_ names the loss's gradient by a quantity. `lens`
+is None of a pinhole, else k1 to k4 of a fisheye: Numba compiles a kernel for either, without the code of the other.
 """
 
 from typing import Any, NamedTuple, no_type_check
@@ -28,6 +29,7 @@ from swimm3r.splat.projection.cpu_conditioning import (  # fmt: skip
     B,
     O,
 )
+from swimm3r.splat.projection.cpu_fisheye import bend, bend_gradients
 from swimm3r.splat.projection.cpu_matrices import (
     HALF,
     ONE,
@@ -50,9 +52,10 @@ POSE = 15  # gradient of R (9), t (3), center (3)
 (FX, FY, CX, CY, X_LOW, X_HIGH, Y_LOW, Y_HIGH, NEAR, UPPER, WORLD) = range(15, 26)
 ON_PLANE = WORLD + 2
 # matrices after those of conditioning
-(AT, J, RV, COV_SEEN, M, M_COV, PLANE, D_AT, D_M, D_J, D_PLANE, D_WIDTH, OUTER) = map(
-    np.uintp, range(MATRICES, MATRICES + 13)
+(AT, J, RV, COV_SEEN, M, M_COV, PLANE, D_AT, D_M, D_J, D_PLANE, D_WIDTH, OUTER, BENT) = map(
+    np.uintp, range(MATRICES, MATRICES + 14)
 )
+WORKSPACE = MATRICES + 14  # matrices in all; row 0 of BENT is A, B, C of `cpu_fisheye` and A + s B
 
 _ONTO_PLANE = products(
     product(M, J, RV, SIZE_2, SIZE_3, SIZE_3),
@@ -83,7 +86,7 @@ class OnPlane(NamedTuple):
 
 @no_type_check
 @inlined
-def onto_plane(g, camera, three, two):
+def onto_plane(g, camera, lens, three, two):
     """AT in camera axes and PLANE, the widened covariance on the image plane of the widened one in the world."""
     for i in range(three):
         at, x, y, z = g[AT, i, 0], g[MEAN, 0, 0], g[MEAN, 1, 0], g[MEAN, 2, 0]
@@ -101,13 +104,10 @@ def onto_plane(g, camera, three, two):
             for q in range(g.shape[3]):
                 seen[q] = mix * upper[q] + (ONE - mix) * lower[q]
                 rotation[q] = r
-    for axis in range(two):
-        f, low, high = camera[FX + axis], camera[X_LOW + 2 * axis], camera[X_HIGH + 2 * axis]
-        at, z, straight, slant = g[AT, axis, 0], g[AT, 2, 0], g[J, axis, axis], g[J, axis, 2]
-        for q in range(g.shape[3]):
-            inverse = ONE / max(z[q], camera[NEAR])
-            straight[q] = f * inverse
-            slant[q] = -f * inverse * min(max(at[q] * inverse, low), high)
+    if lens is None:
+        pinhole_jacobian(g, camera, two)
+    else:
+        fisheye_jacobian(g, camera, lens)
     exponent, footprint2 = g[B, 0, 0], g[FOOTPRINT2, 0, 0]
     for k in range(three):
         seen, u, v = g[COV_SEEN, k, k], camera[WORLD], camera[WORLD + 1]
@@ -122,40 +122,83 @@ def onto_plane(g, camera, three, two):
 
 @no_type_check
 @inlined
-def plane_gradients(g, ids, start, count, camera, three, two, d):
+def pinhole_jacobian(g, camera, two):
+    """J at the clamped ray."""
+    for axis in range(two):
+        f, low, high = camera[FX + axis], camera[X_LOW + 2 * axis], camera[X_HIGH + 2 * axis]
+        at, z, straight, slant = g[AT, axis, 0], g[AT, 2, 0], g[J, axis, axis], g[J, axis, 2]
+        for q in range(g.shape[3]):
+            inverse = ONE / max(z[q], camera[NEAR])
+            straight[q] = f * inverse
+            slant[q] = -f * inverse * min(max(at[q] * inverse, low), high)
+
+
+@no_type_check
+@inlined
+def fisheye_jacobian(g, camera, lens):
+    """J at the primitive, and BENT."""
+    for q in range(g.shape[3]):
+        z = max(np.float64(g[AT, 2, 0, q]), np.float64(camera[NEAR]))
+        x, y = g[AT, 0, 0, q] / z, g[AT, 1, 0, q] / z
+        s = x * x + y * y
+        A, B, C = bend(s, lens)
+        mixed, ahead = B * x * y, A + s * B
+        g[BENT, 0, 0, q], g[BENT, 0, 1, q], g[BENT, 0, 2, q], g[BENT, 0, 3, q] = A, B, C, ahead
+        fx, fy = camera[FX] / z, camera[FY] / z
+        g[J, 0, 0, q], g[J, 0, 1, q], g[J, 0, 2, q] = fx * (A + B * x * x), fx * mixed, -fx * ahead * x
+        g[J, 1, 0, q], g[J, 1, 1, q], g[J, 1, 2, q] = fy * mixed, fy * (A + B * y * y), -fy * ahead * y
+
+
+@no_type_check
+@inlined
+def hidden(g, q, camera, lens):
+    """Return whether lane q is behind the camera, or where the image of its lens no longer grows with the angle."""
+    if lens is None:
+        return g[AT, 2, 0, q] <= camera[NEAR]
+    return g[AT, 2, 0, q] <= camera[NEAR] or g[BENT, 0, 3, q] <= ZERO
+
+
+@no_type_check
+@inlined
+def center_gradient(g, q, camera, lens, u, v, depth):
+    """D_AT of lane q by the gradients of its center and depth."""
+    if lens is None:
+        fx, fy = camera[FX], camera[FY]
+        x, y, z = g[AT, 0, 0, q], g[AT, 1, 0, q], g[AT, 2, 0, q]
+        g[D_AT, 0, 0, q], g[D_AT, 1, 0, q] = fx / z * u, fy / z * v
+        g[D_AT, 2, 0, q] = depth - (fx * x * u + fy * y * v) / (z * z)
+    else:
+        for k in range(3):
+            g[D_AT, k, 0, q] = g[J, 0, k, q] * u + g[J, 1, k, q] * v
+        g[D_AT, 2, 0, q] += depth
+
+
+@no_type_check
+@inlined
+def plane_gradients(g, ids, start, count, camera, lens, three, two, d):
     """D_AT, D_M, D_COV and D_MEAN of centers, conics and depths (docs/derivations/gradients.md#projection).
 
     D_WIDTH is the gradient of the exponents that comes through the widening.
     """
     zero(g, D_AT, three, 1)
     zero(g, D_PLANE, two, two)
-    fx, fy = camera[FX], camera[FY]
     for q in range(count):
         i = ids[start + q]
-        x, y, z = g[AT, 0, 0, q], g[AT, 1, 0, q], g[AT, 2, 0, q]
         a, b, c = g[PLANE, 0, 0, q], g[PLANE, 0, 1, q], g[PLANE, 1, 1, q]
         det = a * c - b * b
-        if z <= camera[NEAR] or det <= ZERO:
+        if hidden(g, q, camera, lens) or det <= ZERO:
             continue
-        u, v = d.mean2d[i, 0], d.mean2d[i, 1]
-        g[D_AT, 0, 0, q], g[D_AT, 1, 0, q] = fx / z * u, fy / z * v
-        g[D_AT, 2, 0, q] = d.depth[i] - (fx * x * u + fy * y * v) / (z * z)
+        center_gradient(g, q, camera, lens, d.mean2d[i, 0], d.mean2d[i, 1], d.depth[i])
         xx, xy, yy = c / det, -b / det, a / det
         g00, g01, g11 = d.conic[i, 0], HALF * d.conic[i, 1], d.conic[i, 2]
         r00, r01, r10, r11 = g00 * xx + g01 * xy, g00 * xy + g01 * yy, g01 * xx + g11 * xy, g01 * xy + g11 * yy
         g[D_PLANE, 0, 0, q], g[D_PLANE, 0, 1, q] = -(xx * r00 + xy * r10), -(xx * r01 + xy * r11)
         g[D_PLANE, 1, 0, q], g[D_PLANE, 1, 1, q] = g[D_PLANE, 0, 1, q], -(xy * r01 + yy * r11)
     run(g, _D_JACOBIAN, two, three, 0)
-    for axis in range(two):
-        f, low, high = camera[FX + axis], camera[X_LOW + 2 * axis], camera[X_HIGH + 2 * axis]
-        at, z, d_at, d_z = g[AT, axis, 0], g[AT, 2, 0], g[D_AT, axis, 0], g[D_AT, 2, 0]
-        straight, slant = g[D_J, axis, axis], g[D_J, axis, 2]
-        for q in range(g.shape[3]):
-            inverse = ONE / max(z[q], camera[NEAR])
-            s, v = at[q] * inverse, f * slant[q]
-            inside = low <= s <= high  # beyond, J follows z alone
-            d_at[q] -= v * inverse * inverse if inside else ZERO
-            d_z[q] -= (f * straight[q] - v * (TWO * s if inside else min(max(s, low), high))) * inverse * inverse
+    if lens is None:
+        pinhole_gradients(g, camera, two)
+    else:
+        fisheye_gradients(g, camera)
     run(g, _D_WORLD, two, three, 0)
     d_width, footprint2 = g[D_WIDTH, 0, 0], g[FOOTPRINT2, 0, 0]
     for q in range(g.shape[3]):
@@ -172,6 +215,44 @@ def plane_gradients(g, ids, start, count, camera, three, two, d):
 
 @no_type_check
 @inlined
+def pinhole_gradients(g, camera, two):
+    """Add to D_AT the gradients that come through J."""
+    for axis in range(two):
+        f, low, high = camera[FX + axis], camera[X_LOW + 2 * axis], camera[X_HIGH + 2 * axis]
+        at, z, d_at, d_z = g[AT, axis, 0], g[AT, 2, 0], g[D_AT, axis, 0], g[D_AT, 2, 0]
+        straight, slant = g[D_J, axis, axis], g[D_J, axis, 2]
+        for q in range(g.shape[3]):
+            inverse = ONE / max(z[q], camera[NEAR])
+            s, v = at[q] * inverse, f * slant[q]
+            inside = low <= s <= high  # beyond, J follows z alone
+            d_at[q] -= v * inverse * inverse if inside else ZERO
+            d_z[q] -= (f * straight[q] - v * (TWO * s if inside else min(max(s, low), high))) * inverse * inverse
+
+
+@no_type_check
+@inlined
+def fisheye_gradients(g, camera):
+    """Add to D_AT the gradients that come through J."""
+    for q in range(g.shape[3]):
+        z = max(np.float64(g[AT, 2, 0, q]), np.float64(camera[NEAR]))
+        x, y = g[AT, 0, 0, q] / z, g[AT, 1, 0, q] / z
+        bent = np.float64(g[BENT, 0, 0, q]), np.float64(g[BENT, 0, 1, q]), np.float64(g[BENT, 0, 2, q])
+        fx, fy = np.float64(camera[FX]), np.float64(camera[FY])
+        h = fx * g[D_J, 0, 2, q], fy * g[D_J, 1, 2, q]
+        e = (
+            fx * g[D_J, 0, 0, q] - h[0] * x,
+            fx * g[D_J, 0, 1, q] - h[0] * y,
+            fy * g[D_J, 1, 0, q] - h[1] * x,
+            fy * g[D_J, 1, 1, q] - h[1] * y,
+        )
+        by_x, by_y, total = bend_gradients(x, y, bent, e, h)
+        g[D_AT, 0, 0, q] += by_x / (z * z)
+        g[D_AT, 1, 0, q] += by_y / (z * z)
+        g[D_AT, 2, 0, q] -= (x * by_x + y * by_y + total) / (z * z)
+
+
+@no_type_check
+@inlined
 def along_view(g, q, three):
     """The part of D_X along lane q's view direction, which a unit vector does not follow."""
     along = ZERO
@@ -182,7 +263,7 @@ def along_view(g, q, three):
 
 @no_type_check
 @inlined
-def store_on_plane(g, ids, start, count, camera, out):
+def store_on_plane(g, ids, start, count, camera, lens, out):
     """A block on the image plane; depth and radius are 0 of what does not show."""
     for q in range(count):
         i = ids[start + q]
@@ -190,10 +271,12 @@ def store_on_plane(g, ids, start, count, camera, out):
         xx, xy, yy = g[PLANE, 0, 0, q], g[PLANE, 0, 1, q], g[PLANE, 1, 1, q]
         det = xx * yy - xy * xy
         out.opacity[i], out.exponent[i] = g[OC, 0, 0, q], g[B, 0, 0, q]
-        if z <= camera[NEAR] or det <= ZERO:
+        if hidden(g, q, camera, lens) or det <= ZERO:
             out.mean2d[i, 0], out.mean2d[i, 1], out.depth[i], out.radius[i] = ZERO, ZERO, ZERO, ZERO
             out.conic[i, 0], out.conic[i, 1], out.conic[i, 2] = ONE, ZERO, ONE
             continue
+        if lens is not None:
+            x, y = x * g[BENT, 0, 0, q], y * g[BENT, 0, 0, q]
         out.mean2d[i, 0], out.mean2d[i, 1] = camera[FX] * x / z + camera[CX], camera[FY] * y / z + camera[CY]
         out.conic[i, 0], out.conic[i, 1], out.conic[i, 2] = yy / det, -xy / det, xx / det
         middle = HALF * (xx + yy)

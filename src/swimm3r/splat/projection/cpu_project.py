@@ -20,7 +20,7 @@ from swimm3r.raster import Primitives2D
 from swimm3r.raster.cpu import math
 from swimm3r.raster.cpu.threads import spread
 from swimm3r.splat.primitives.beta import BetaPrimitives
-from swimm3r.splat.projection import cpu_conditioning, cpu_matrices, cpu_plane
+from swimm3r.splat.projection import cpu_conditioning, cpu_fisheye, cpu_matrices, cpu_plane
 from swimm3r.splat.projection.cpu_conditioning import (  # fmt: skip
     D_MEAN,
     D_WX,
@@ -36,17 +36,15 @@ from swimm3r.splat.projection.cpu_conditioning import (  # fmt: skip
 )
 from swimm3r.splat.projection.cpu_matrices import LANES, SIZE_1, SIZE_3, SIZE_C, product_at, products, run, zero
 from swimm3r.splat.projection.cpu_plane import (  # fmt: skip
-    AT,
     D_AT,
-    FX,
-    FY,
-    NEAR,
-    OUTER,
     POSE,
     RV,
+    WORKSPACE,
     OnPlane,
     add_pose_gradients,
     along_view,
+    center_gradient,
+    hidden,
     onto_plane,
     plane_gradients,
     store_gradients,
@@ -57,7 +55,7 @@ from swimm3r.splat.projection.view_camera import Projection, ViewCamera, ray_lim
 from swimm3r.splat.settings import RenderSettings
 
 # enters the kernels' signatures, so that Numba's cache notices when what is inlined into them changes
-_INLINED = (cpu_conditioning, cpu_matrices, cpu_plane, math)
+_INLINED = (cpu_conditioning, cpu_fisheye, cpu_matrices, cpu_plane, math)
 SOURCES = zlib.crc32(b"".join(Path(str(module.__file__)).read_bytes() for module in _INLINED))
 _D_CENTER = products(
     product_at(D_MEAN, RV, D_AT, SIZE_3, SIZE_3, SIZE_1),
@@ -69,7 +67,7 @@ kernel = njit(nogil=True, cache=True, error_model="numpy", fastmath=math.FLAGS)
 
 @no_type_check
 @kernel
-def run_blocks(first, beyond, g, ids, back, stored, camera, time, plane, gradients, d_pose, sources=SOURCES):
+def run_blocks(first, beyond, g, ids, back, stored, camera, lens, time, plane, gradients, d_pose, sources=SOURCES):
     """Blocks first..beyond-1 of `ids`. Forward fills `plane`; `back` reads its gradients there and fills the others."""
     three, c, two = stored.xyz.shape[1], stored.query_mean.shape[1], plane.mean2d.shape[1]
     for block in range(first, beyond):
@@ -77,38 +75,34 @@ def run_blocks(first, beyond, g, ids, back, stored, camera, time, plane, gradien
         count = min(LANES, len(ids) - start)
         load(g, ids, start, count, stored, camera, time)
         condition(g, three, c)
-        onto_plane(g, camera, three, two)
+        onto_plane(g, camera, lens, three, two)
         if back:
-            plane_gradients(g, ids, start, count, camera, three, two, plane)
+            plane_gradients(g, ids, start, count, camera, lens, three, two, plane)
             conditioning_gradients(g, ids, start, count, three, c, plane.opacity, plane.exponent)
             add_pose_gradients(g, count, three, d_pose[block])
             store_gradients(g, ids, start, count, three, c, plane.opacity, gradients, d_pose[block])
         else:
-            store_on_plane(g, ids, start, count, camera, plane)
+            store_on_plane(g, ids, start, count, camera, lens, plane)
 
 
 @no_type_check
 @kernel
-def center_blocks(first, beyond, g, ids, on_plane, stored, camera, time, d_xyz, sources=SOURCES):
+def center_blocks(first, beyond, g, ids, on_plane, stored, camera, lens, time, d_xyz, sources=SOURCES):
     """Blocks of `ids`: d_xyz [n, k, 3] of what on_plane [n, k, 3] says about centers and depths, k times over."""
     three, c, two = stored.xyz.shape[1], stored.query_mean.shape[1], on_plane.shape[2] - 1
-    fx, fy = camera[FX], camera[FY]
     for block in range(first, beyond):
         start = block * LANES
         count = min(LANES, len(ids) - start)
         load(g, ids, start, count, stored, camera, time)
         condition(g, three, c)
-        onto_plane(g, camera, three, two)
+        onto_plane(g, camera, lens, three, two)
         for k in range(on_plane.shape[1]):
             zero(g, D_AT, three, 1)
             for q in range(count):
-                i = ids[start + q]
-                x, y, z = g[AT, 0, 0, q], g[AT, 1, 0, q], g[AT, 2, 0, q]
-                if z <= camera[NEAR]:
+                if hidden(g, q, camera, lens):
                     continue
-                u, v = on_plane[i, k, 0], on_plane[i, k, 1]
-                g[D_AT, 0, 0, q], g[D_AT, 1, 0, q] = fx / z * u, fy / z * v
-                g[D_AT, 2, 0, q] = on_plane[i, k, 2] - (fx * x * u + fy * y * v) / (z * z)
+                i = ids[start + q]
+                center_gradient(g, q, camera, lens, on_plane[i, k, 0], on_plane[i, k, 1], on_plane[i, k, 2])
             run(g, _D_CENTER, two, three, c)
             for q in range(count):
                 i, along = ids[start + q], along_view(g, q, three)
@@ -125,13 +119,13 @@ class _Project(torch.autograd.Function):
         ctx: Any, view: ViewCamera, settings: RenderSettings, time: float, *tensors: Tensor
     ) -> tuple[Tensor, ...]:
         stored = Stored(*(tensor.detach().contiguous() for tensor in tensors[:-3]))
-        camera = _camera(view, settings)
+        camera, lens = _camera(view, settings), _lens(view)
         n = len(stored.xyz)
         out = OnPlane(*(torch.empty(shape) for shape in ((n, 2), (n, 3), (n,), (n,), (n,), (n,))))
         nothing = Stored(*(torch.empty(0, *values.shape[1:]) for values in stored))
-        _run(np.arange(n), False, stored, camera, time, out, nothing, torch.empty(0, POSE))
+        _run(np.arange(n), False, stored, camera, lens, time, out, nothing, torch.empty(0, POSE))
         ctx.save_for_backward(*stored)
-        ctx.camera, ctx.time = camera, time
+        ctx.camera, ctx.lens, ctx.time = camera, lens, time
         ctx.mark_non_differentiable(out.radius)
         return tuple(out)
 
@@ -144,7 +138,7 @@ class _Project(torch.autograd.Function):
         stored = Stored(*ctx.saved_tensors)
         results = Stored(*(torch.zeros_like(values) for values in stored))
         d_pose = torch.zeros(-(-len(ids) // LANES), POSE)
-        _run(ids, True, stored, ctx.camera, ctx.time, d, results, d_pose)
+        _run(ids, True, stored, ctx.camera, ctx.lens, ctx.time, d, results, d_pose)
         pose = d_pose.double().sum(0).float()
         return None, None, None, *results[:-1], None, pose[:9].reshape(3, 3), pose[9:12], pose[12:]
 
@@ -158,11 +152,17 @@ def _camera(view: ViewCamera, settings: RenderSettings) -> np.ndarray:
     return np.concatenate([pose, np.array(rest)]).astype(np.float32)
 
 
+def _lens(view: ViewCamera) -> np.ndarray | None:
+    """The distortion of a fisheye; None of a pinhole."""
+    return None if view.fisheye is None else np.array(view.fisheye)
+
+
 def _run(
     ids: np.ndarray,
     back: bool,
     stored: Stored,
     camera: np.ndarray,
+    lens: np.ndarray | None,
     time: float,
     plane: OnPlane,
     gradients: Stored,
@@ -173,8 +173,8 @@ def _run(
     pose, moment = d_pose.numpy(), np.float32(time)
 
     def work(first: int, beyond: int) -> None:
-        g = np.zeros((OUTER + 1, 4, 4, LANES), np.float32)
-        run_blocks(first, beyond, g, ids, back, primitives, camera, moment, seen, by_primitive, pose)
+        g = np.zeros((WORKSPACE, 4, 4, LANES), np.float32)
+        run_blocks(first, beyond, g, ids, back, primitives, camera, lens, moment, seen, by_primitive, pose)
 
     spread(work, -(-len(ids) // LANES), at_least=8)
 
@@ -213,12 +213,12 @@ def center_gradients(
     ids = on_plane.flatten(1).any(-1).nonzero()[:, 0].numpy()
     d_xyz = torch.zeros(*on_plane.shape[:2], 3)
     stored = _arrays(Stored(*(tensor.detach().contiguous() for tensor in _stored(p))))
-    given, camera = on_plane.detach().contiguous().numpy(), _camera(view, settings)
+    given, camera, lens = on_plane.detach().contiguous().numpy(), _camera(view, settings), _lens(view)
     moment, result = np.float32(0.0 if time is None else float(time)), d_xyz.numpy()
 
     def work(first: int, beyond: int) -> None:
-        g = np.zeros((OUTER + 1, 4, 4, LANES), np.float32)
-        center_blocks(first, beyond, g, ids, given, stored, camera, moment, result)
+        g = np.zeros((WORKSPACE, 4, 4, LANES), np.float32)
+        center_blocks(first, beyond, g, ids, given, stored, camera, lens, moment, result)
 
     spread(work, -(-len(ids) // LANES), at_least=8)
     return d_xyz

@@ -25,7 +25,7 @@ def project(
         assert isinstance(settings, GaussianRenderSettings)
         return project_gaussians(p, view, settings)
     assert isinstance(settings, RenderSettings)
-    if _has_fast_form(p, view, settings):
+    if _has_fast_form(p, settings):
         return cpu_project.project(p, view, settings, time)
     return project_plainly(p, view, settings, time)
 
@@ -41,7 +41,7 @@ def center_gradients(
 
     The direction that primitives are conditioned on follows xyz, as in `project`.
     """
-    if _has_fast_form(p, view, settings):
+    if _has_fast_form(p, settings):
         return cpu_project.center_gradients(p, view, settings, on_plane, time)
     with torch.enable_grad():
         xyz = p.xyz.detach().requires_grad_()
@@ -51,6 +51,6 @@ def center_gradients(
     return torch.stack(parts, 1)
 
 
-def _has_fast_form(p: BetaPrimitives, view: ViewCamera, settings: RenderSettings) -> bool:
+def _has_fast_form(p: BetaPrimitives, settings: RenderSettings) -> bool:
     on_cpu = p.xyz.device.type == "cpu" and p.xyz.dtype == torch.float32
-    return on_cpu and settings.rotation == "first_order" and view.fisheye is None
+    return on_cpu and settings.rotation == "first_order"

@@ -1,6 +1,7 @@
 """The one camera that primitives are projected into, a pinhole or a fisheye, and their record on its image plane."""
 
 from dataclasses import dataclass, replace
+from functools import lru_cache
 
 import torch
 from jaxtyping import Float
@@ -29,10 +30,11 @@ class ViewCamera:
 
     def rays(self, x: Float[Tensor, " w"], y: Float[Tensor, " h"]) -> Float[Tensor, "h w 3"]:
         """Rays with z = 1 of a grid of pixels, by its columns and rows, in camera axes."""
-        plane = torch.stack(torch.meshgrid((x - self.cx) / self.fx, (y - self.cy) / self.fy, indexing="xy"), -1)
-        if self.fisheye is not None:
-            plane = undistort(plane, plane.new_tensor(self.fisheye), "OPENCV_FISHEYE")
-            plane = torch.nan_to_num(plane, nan=0.0)  # no ray of the lens: such a pixel is masked
+        at = (x - self.cx) / self.fx, (y - self.cy) / self.fy
+        if self.fisheye is None:
+            plane = torch.stack(torch.meshgrid(*at, indexing="xy"), -1)
+        else:
+            plane = _fisheye_plane(self.fisheye, *(tuple(values.tolist()) for values in at), x.dtype).to(x.device)
         return torch.cat([plane, torch.ones_like(plane[..., :1])], -1)
 
     def pixels(self, points: Float[Tensor, "*n 3"]) -> Float[Tensor, "*n 2"]:
@@ -94,6 +96,18 @@ def view_camera(camera: Cameras, dtype: torch.dtype = torch.float32) -> ViewCame
         camera.height,
         fisheye,
     )
+
+
+@lru_cache(
+    maxsize=8
+)  # one lens as a rule, its pixels and the grid of its water at two sizes: Newton's method takes long
+def _fisheye_plane(
+    k: tuple[float, float, float, float], x: tuple[float, ...], y: tuple[float, ...], dtype: torch.dtype
+) -> Float[Tensor, "h w 2"]:
+    """Points of the plane z = 1 that a lens images at columns x and rows y, in units of its focal lengths."""
+    grid = torch.meshgrid(*(torch.tensor(values, dtype=torch.float64) for values in (x, y)), indexing="xy")
+    plane = undistort(torch.stack(grid, -1), torch.tensor(k, dtype=torch.float64), "OPENCV_FISHEYE").to(dtype)
+    return torch.nan_to_num(plane, nan=0.0)  # no ray of the lens: such a pixel is masked
 
 
 def ray_limits(view: ViewCamera) -> tuple[float, float, float, float]:

@@ -22,7 +22,7 @@ from swimm3r.progress import Progress, silent
 from swimm3r.scene.frames import Frames
 from swimm3r.scene.reconstruction import Points, QualityWarning, Reconstruction, Tracks
 from swimm3r.scene.rig import PlacedCamera, Rig, RigFit, pose_of
-from swimm3r.sfm.colmap.adjustment import WIDEST, typical_error
+from swimm3r.sfm.colmap.adjustment import WIDEST, robust_adjustment, typical_error
 from swimm3r.sfm.colmap.calibration import STILL, THREADS, is_lens
 from swimm3r.sfm.rig_poses import LEAST, RigRows, delay_of, relative_scatter, relative_to_first, rig_rows, robust_mean
 from swimm3r.sfm.settings import ColmapSettings
@@ -137,12 +137,9 @@ def _adjusted(model: "pycolmap.Reconstruction", width: float, *, lens: bool = Fa
     import pycolmap
 
     out = pycolmap.Reconstruction(model)
-    options = pycolmap.BundleAdjustmentOptions()
+    options = robust_adjustment(width)
     options.refine_focal_length = options.refine_extra_params = lens
     options.refine_sensor_from_rig = True
-    options.print_summary = False
-    options.ceres.loss_function_type = pycolmap.LossFunctionType.SOFT_L1
-    options.ceres.loss_function_scale = width
     options.ceres.solver_options.num_threads = THREADS
     options.ceres.solver_options.function_tolerance = STILL
     images = pycolmap.BundleAdjustmentConfig()  # `pycolmap.bundle_adjustment` is the same, and prints
