@@ -10,10 +10,9 @@ from typing import Any
 os.environ.setdefault("OMP_WAIT_POLICY", "PASSIVE")  # as the command line does
 os.environ.setdefault("NUMBA_CACHE_DIR", str(Path(__file__).parents[1] / ".venv" / "numba-cache"))
 
-from jaxtyping import install_import_hook
+from tests.checked_types import check_annotations
 
-# ints may stand for floats, as PEP 484 says
-install_import_hook("swimm3r", "beartype.beartype(conf=beartype.BeartypeConf(is_pep484_tower=True))")
+check_annotations("swimm3r")
 
 import av
 import numpy as np
