@@ -214,7 +214,8 @@ def test_a_settings_file_of_another_version_is_named(tmp_path: Path, text: str):
 def test_a_map_is_trained_on_any_colmap_model(dive: Path, finished: tuple[Path, dict], tmp_path: Path):
     like = TINY_MAP.sfm
     assert isinstance(like, ColmapSettings)
-    own = replace(TINY_MAP, sfm=ColmapModelSettings(finished[0] / "sfm" / "sparse", depth=like.depth, water=like.water))
+    depth, model = replace(like.depth, long_side=160, sources=2), finished[0] / "sfm" / "sparse"
+    own = replace(TINY_MAP, sfm=ColmapModelSettings(model, depth=depth, water=like.water))
     summary = run_pipeline(dive / "images", tmp_path / "run", own)
     assert summary["sfm"]["backend"] == "COLMAP model"
     assert summary["sfm"]["registered"] == finished[1]["sfm"]["registered"]
