@@ -8,7 +8,8 @@ each function once, and only functions with shapes get a record of axes around i
 import dataclasses
 import inspect
 from collections.abc import Callable
-from functools import partial
+from functools import partial, wraps
+from types import CodeType
 from typing import Any, get_args, get_type_hints
 
 import jaxtyping
@@ -39,7 +40,24 @@ def checked(function: Any = None, *, typechecker: Callable) -> Any:
     except NameError:  # a name that is local, or not there yet
         return _jaxtyped(function, typechecker=typechecker)
     once = typechecker(function)
-    return _jaxtyped(once, typechecker=None) if any(map(_has_shape, hints.values())) else once
+    if any(map(_has_shape, hints.values())):
+        return _jaxtyped(once, typechecker=None)
+    return _with_axes_of_its_own(once) if _asks_for_types(function.__code__) else once
+
+
+def _with_axes_of_its_own(function: Callable) -> Callable:
+    """The function, in whose body `isinstance(x, Float[...])` does not see the axes of its caller."""
+
+    @wraps(function)
+    def call(*arguments: Any, **options: Any) -> Any:
+        with _jaxtyped("context"):
+            return function(*arguments, **options)
+
+    return call
+
+
+def _asks_for_types(code: CodeType) -> bool:
+    return "isinstance" in code.co_names or any(_asks_for_types(c) for c in code.co_consts if isinstance(c, CodeType))
 
 
 def _has_shape(hint: Any) -> bool:

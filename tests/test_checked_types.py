@@ -40,6 +40,16 @@ def each(count: int) -> Iterator:
     yield from range(count)
 
 
+@check
+def are_points(some: object) -> bool:
+    return isinstance(some, Points)  # pyright: ignore[reportArgumentType]
+
+
+@check
+def all_points(points: Points, others: tuple) -> bool:
+    return all(are_points(one) for one in (points, *others))
+
+
 @pytest.mark.parametrize(
     "call",
     [
@@ -64,6 +74,11 @@ def each(count: int) -> Iterator:
 def test_what_an_annotation_forbids_is_refused(call: Callable[[], Any]):
     with pytest.raises(Exception, match=r"(?i)type-check|violates type hint"):
         call()
+
+
+def test_a_question_for_a_shape_does_not_see_the_axes_of_the_caller():
+    assert all_points(np.zeros((4, 3)), (np.zeros((5, 3)),))
+    assert not all_points(np.zeros((4, 3)), (np.zeros((5, 2)),))
 
 
 def test_what_an_annotation_allows_is_passed_on():
