@@ -3,7 +3,7 @@ PYTHON ?= python3
 VENV := .venv
 BIN := $(VENV)/bin
 
-.PHONY: setup demo test test-processors attack lint site clean
+.PHONY: setup demo test test-long test-processors attack lint types suite site clean
 .DEFAULT_GOAL := demo
 
 $(VENV)/.installed: pyproject.toml
@@ -22,10 +22,18 @@ attack: setup  ## Bad input over every command; hours on two cores, or one famil
 lint: setup
 	$(BIN)/ruff check .
 	$(BIN)/ruff format --check .
+
+types: setup
 	$(BIN)/pyright
 
-test: lint  ## Linters, type checker and the whole test suite
+suite: setup
 	$(BIN)/pytest -n 2 --dist loadfile
+
+test: lint  ## Linters, then the type checker beside the test suite
+	$(MAKE) --no-print-directory -j 2 types suite
+
+test-long: setup  ## The tests that `make test` leaves out because they compute for long
+	$(BIN)/pytest -n 2 --dist load -m long
 
 test-processors: setup  ## The numerically delicate tests as other processors and thread counts see them
 	$(BIN)/python tests/processors.py $(PROFILES)

@@ -4,16 +4,16 @@ import logging
 import os
 from collections.abc import Callable, Iterable, Iterator, Sequence
 from fractions import Fraction
+from functools import lru_cache
 from pathlib import Path
 from typing import Any
 
 os.environ.setdefault("OMP_WAIT_POLICY", "PASSIVE")  # as the command line does
 os.environ.setdefault("NUMBA_CACHE_DIR", str(Path(__file__).parents[1] / ".venv" / "numba-cache"))
 
-from jaxtyping import install_import_hook
+from tests.checked_types import check_annotations
 
-# ints may stand for floats, as PEP 484 says
-install_import_hook("swimm3r", "beartype.beartype(conf=beartype.BeartypeConf(is_pep484_tower=True))")
+check_annotations("swimm3r")
 
 import av
 import numpy as np
@@ -22,6 +22,7 @@ import torch
 from tests.browser import WatchedPage, headless_chromium, reason_to_skip, watched_page
 
 from swimm3r.sfm.mast3r.network import Architecture, Mast3r
+from swimm3r.synthetic import dive as synthetic_dive
 
 THREADS = int(os.environ.get("SWIMM3R_TEST_THREADS", "1"))  # two xdist workers share two cores
 torch.set_num_threads(THREADS)
@@ -42,6 +43,15 @@ def _as_in_a_new_process() -> None:
     """Take back what a test that runs commands or engines may leave behind."""
     torch.set_num_threads(THREADS)
     logging.getLogger("swimm3r").setLevel(logging.NOTSET)
+
+
+@pytest.fixture(scope="session", autouse=True)
+def seafloors() -> Iterator[Any]:
+    """Keep the last two seafloors, each of which takes 3 seconds to make; `seafloors.cache_clear()` forgets them."""
+    with pytest.MonkeyPatch.context() as patch:
+        kept = lru_cache(maxsize=2)(synthetic_dive.make_seafloor)
+        patch.setattr(synthetic_dive, "make_seafloor", kept)
+        yield kept
 
 
 @pytest.fixture(scope="session")

@@ -3,6 +3,7 @@
 import importlib
 import re
 from collections.abc import Callable, Iterator
+from functools import cache
 from pathlib import Path
 
 import pytest
@@ -30,6 +31,7 @@ def commands(*options: str) -> Iterator[tuple[tuple[str, ...], Callable]]:
             yield (name,), one
 
 
+@cache
 def all_options() -> dict[tuple[str, ...], dict[str, Option]]:
     """The options of every command, whatever the back end and the recipe."""
     found: dict[tuple[str, ...], dict[str, Option]] = {}
@@ -48,9 +50,6 @@ def all_options() -> dict[tuple[str, ...], dict[str, Option]]:
     return found
 
 
-OPTIONS = all_options()
-
-
 def shown(capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch, *arguments: str) -> str:
     monkeypatch.setenv("COLUMNS", "200")
     with pytest.raises(SystemExit) as stop:
@@ -62,12 +61,12 @@ def shown(capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch, *
 def test_every_option_of_a_short_help_exists():
     for path, groups in BRIEF.items():
         for names in groups.values():
-            assert set(names) <= OPTIONS[path].keys(), path
+            assert set(names) <= all_options()[path].keys(), path
 
 
 def test_a_short_help_is_short_and_a_long_one_has_a_short_form():
     of_mast3r = {"--adapter", "--weights"}  # in the place of COLMAP's --focal and --housing
-    for path, options in OPTIONS.items():
+    for path, options in all_options().items():
         names = [name for group in BRIEF[path].values() for name in group] if path in BRIEF else list(options)
         counted = [name for name in names if name.startswith("--") and name not in ("--quiet", "--verbose")]
         assert len(set(counted) - of_mast3r) <= MOST, path
@@ -85,7 +84,7 @@ def test_the_short_help_has_groups_by_purpose_and_says_where_the_rest_is(
     assert brief.splitlines()[-1].startswith("Options of one group: swimm3r run --help GROUP")
     whole = shown(capsys, monkeypatch, "run", "--help-all")
     assert "--splat.iterations" in whole
-    for name in (name for names in BRIEF[("run",)].values() for name in names if name in OPTIONS[("run",)]):
+    for name in (name for names in BRIEF[("run",)].values() for name in names if name in all_options()[("run",)]):
         assert name in brief or name in ("--adapter", "--weights")
         assert name in whole or name in ("--adapter", "--weights")
 
@@ -110,9 +109,9 @@ def test_the_short_help_shows_defaults_and_choices_of_the_whole(
 
 
 def test_out_has_one_short_form_and_messages_have_two_options_in_every_command():
-    with_out = [path for path, options in OPTIONS.items() if "--out" in options]
+    with_out = [path for path, options in all_options().items() if "--out" in options]
     assert len(with_out) >= 15
-    for path, options in OPTIONS.items():
+    for path, options in all_options().items():
         assert {"--quiet", "--verbose"} <= options.keys(), path
         assert "--out" not in options or "'-o'" in str(options["--out"].hint), path
 
@@ -127,7 +126,7 @@ def test_options_of_one_name_take_the_same_values():
         "--path",  # of a synthetic dive, and of the views of a map
     }  # fmt: skip
     kinds: dict[str, set[str]] = {}
-    for options in OPTIONS.values():
+    for options in all_options().values():
         for name, one in options.items():
             kinds.setdefault(name, set()).add(description(one.hint))
     differing = {name: found for name, found in kinds.items() if len(found) > 1 and name.startswith("--")}
@@ -184,7 +183,7 @@ def test_every_setting_has_a_help_string_that_stands_alone():
 
 
 def test_every_help_string_is_a_sentence_of_its_own():
-    texts = {(one.name, one.help) for options in OPTIONS.values() for one in options.values()}
+    texts = {(one.name, one.help) for options in all_options().values() for one in options.values()}
     texts |= {(one.name, one.help) for one in settings_options()}
     for name, text in texts:
         assert text, name

@@ -15,6 +15,7 @@ from swimm3r.localization.matchers import Mast3rMatcher, SiftMatcher, matcher_fo
 from swimm3r.localization.references import rendered
 from swimm3r.localization.settings import LocalizationSettings, with_checkpoint_of
 from swimm3r.sfm.mast3r import checkpoint
+from swimm3r.sfm.mast3r.settings import MatchingSettings
 from swimm3r.sfm.settings import ColmapSettings, FeatureSettings, Mast3rSettings
 from swimm3r.splat.medium.field import initial_field
 from swimm3r.splat.primitives.beta import with_time
@@ -136,7 +137,7 @@ def test_masked_pixels_take_no_part(place):
 
 
 def test_the_network_finds_the_image_itself_and_matches_within_both_images(place, small_network):
-    matcher = Mast3rMatcher(small_network, SETTINGS)
+    matcher = Mast3rMatcher(small_network, replace(SETTINGS, matching=MatchingSettings(subsample=32)))
     everywhere = torch.ones(180, 240, dtype=torch.bool)
     described = {
         name: matcher.describe(place.frames.image(place.frames.index(name)), everywhere) for name in place.rec.names

@@ -32,7 +32,7 @@ from swimm3r.report.outputs import OUTPUTS, outputs_of
 from swimm3r.report.scores import TRUTH_LABELS, truth_rows
 from swimm3r.scene.ground_truth import read_ground_truth
 from swimm3r.scene.reconstruction_io import load_reconstruction
-from swimm3r.sfm.settings import ColmapModelSettings, ColmapSettings
+from swimm3r.sfm.settings import ColmapModelSettings, ColmapSettings, SeathruSettings
 from swimm3r.splat.settings import (
     DensifySettings,
     InitialSettings,
@@ -51,8 +51,13 @@ def dive(tmp_path_factory: pytest.TempPathFactory) -> Path:
     return folder
 
 
-TINY_MAP = replace(
+FEWER = ("--water.max-pixels", "60000", "--water.max-observations", "20000")  # a third of the time of the poses
+AS_TYPED = replace(
     PRESETS["fast"],
+    sfm=replace(PRESETS["fast"].sfm, water=SeathruSettings(max_pixels=60_000, max_observations=20_000)),
+)
+TINY_MAP = replace(
+    AS_TYPED,
     splat=UwbsSettings(
         iterations=60,
         long_side=160,
@@ -207,8 +212,10 @@ def test_a_settings_file_of_another_version_is_named(tmp_path: Path, text: str):
 
 
 def test_a_map_is_trained_on_any_colmap_model(dive: Path, finished: tuple[Path, dict], tmp_path: Path):
-    assert isinstance(TINY_MAP.sfm, ColmapSettings)
-    own = replace(TINY_MAP, sfm=ColmapModelSettings(finished[0] / "sfm" / "sparse", depth=TINY_MAP.sfm.depth))
+    like = TINY_MAP.sfm
+    assert isinstance(like, ColmapSettings)
+    depth, model = replace(like.depth, long_side=160, sources=2), finished[0] / "sfm" / "sparse"
+    own = replace(TINY_MAP, sfm=ColmapModelSettings(model, depth=depth, water=like.water))
     summary = run_pipeline(dive / "images", tmp_path / "run", own)
     assert summary["sfm"]["backend"] == "COLMAP model"
     assert summary["sfm"]["registered"] == finished[1]["sfm"]["registered"]
@@ -353,16 +360,17 @@ def test_a_disk_that_fills_under_the_database_is_said_with_its_exit_code(dive: P
     assert list((tmp_path / "temporary").iterdir()) == []  # of no library
 
 
-@pytest.mark.parametrize("marker", ["sfm/database.db", "sfm/reconstruction.json"])
+@pytest.mark.parametrize("marker", [pytest.param("sfm/database.db", marks=pytest.mark.long), "sfm/reconstruction.json"])
 def test_a_killed_run_goes_on(marker: str, dive: Path, finished: tuple[Path, dict], tmp_path: Path):
     folder = tmp_path / "run"
     command = [sys.executable, "-m", "swimm3r", "run", str(dive), "--out", str(folder), "--preset", "fast"]
+    command += FEWER
     with subprocess.Popen(command, stdout=subprocess.DEVNULL, stderr=subprocess.DEVNULL) as process:
         while not (folder / marker).is_file() and process.poll() is None:
             time.sleep(0.02)
         os.kill(process.pid, signal.SIGKILL)
     before = digests(folder / "prepare")
-    run_pipeline(dive, folder, PRESETS["fast"], last_stage="sfm")
+    run_pipeline(dive, folder, AS_TYPED, last_stage="sfm")
     assert digests(folder / "prepare") == before
     again, first = (load_reconstruction(f / "sfm") for f in (folder, finished[0]))
     assert again.names == first.names

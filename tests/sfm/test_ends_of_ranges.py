@@ -23,7 +23,7 @@ from swimm3r.sfm.medium.seathru import estimate_medium
 from swimm3r.sfm.plane_sweep.estimate import estimate_depth
 from swimm3r.sfm.settings import FeatureSettings, PlaneSweepSettings, RestoreSettings, SeathruSettings, TrackSettings
 
-FEW = SeathruSettings(max_pixels=2000, max_observations=2000, start_observations=300, reweightings=2, min_samples=100)
+FEW = SeathruSettings(max_pixels=2000, max_observations=2000, start_observations=300, reweightings=1, min_samples=100)
 SMALL = PlaneSweepSettings(long_side=48, sources=2, planes=32, rounds=1, threads=1)
 
 

@@ -2,6 +2,7 @@
 
 import json
 from dataclasses import dataclass
+from functools import cache
 from pathlib import Path
 
 import numpy as np
@@ -36,6 +37,7 @@ def dome_volume() -> float:
     return np.pi * MOUND[2] ** 2 * MOUND[3] / 2
 
 
+@cache
 def _texture(seed: int) -> np.ndarray:
     """Colors of the ground 0..1, a cell every 4 mm over 4 x 4 m."""
     rng = np.random.default_rng(seed)

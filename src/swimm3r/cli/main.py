@@ -170,7 +170,7 @@ def _parse_and_run(commands: Commands, arguments: list[str]) -> None:
         is_missing = not given or (len(given) == 1 and isinstance(commands.get(given[0]), Family))
         try:
             given += ["--help"] if is_missing else []
-            tyro.cli(_parser(commands), prog="swimm3r", description=_DESCRIPTION, args=given)
+            tyro.cli(_parser(commands, path), prog="swimm3r", description=_DESCRIPTION, args=given)
         except SystemExit:
             if is_missing:
                 raise SystemExit(UsageError.exit_code) from None
@@ -207,15 +207,21 @@ def _help_view(commands: Commands, path: tuple[str, ...], arguments: Sequence[st
 
 
 def _parser(commands: Commands, path: tuple[str, ...] = (), view: View | None = None) -> Any:
-    """The commands as tyro takes them: a union of constructors; the one at `path` is replaced by the view."""
+    """The commands as tyro takes them: a union of constructors; the one at `path` is replaced by the view.
+
+    Where a command is named, the others only stand in the list: making them ready would take longer than the parsing.
+    """
 
     def union(members: Commands, above: tuple[str, ...]) -> Any:
         kinds = []
         for name, member in members.items():
+            here = (*above, name)
             if isinstance(member, Family):
-                made = _family(member.about, union(member.commands, (*above, name)))
+                made = _family(member.about, union(member.commands, here))
+            elif here == path and view is not None:
+                made = view.command
             else:
-                made = view.command if view is not None and (*above, name) == path else _ready(member)
+                made = _ready(member) if path in (here, ()) else member
             kinds.append(Annotated[Any, subcommand(name=name, constructor=made)])
         return Union[tuple(kinds)]  # noqa: UP007 - of as many as there are
 

@@ -185,6 +185,7 @@ def errors(rec: Reconstruction, dive: Dive) -> tuple[float, float]:
     return absolute_pose_errors(rec.cameras.cam2world, dive.cameras.cam2world).rotation_deg, abs(float(focal))
 
 
+@pytest.mark.long
 @pytest.mark.parametrize(("noise", "degrees"), [(0.0, 0.5), (0.01, 1.0)])
 def test_cameras_of_a_dive_at_full_size_are_found(
     noise: float,

@@ -22,7 +22,7 @@ SETTINGS = SeathruSettings()
 LAMP = lamp_of(LampSettings(strength=1.0))
 
 
-def lamp_samples(medium, *, points: int = 1200, views: int = 8, open_water: int = 400) -> tuple[WaterSamples, dict]:
+def lamp_samples(medium, *, points: int = 700, views: int = 8, open_water: int = 400) -> tuple[WaterSamples, dict]:
     """Points seen `views` times each from 1 to 6 m at any place of the image, with pixel noise of 0.004."""
     g = torch.Generator().manual_seed(7)
     count = points * views

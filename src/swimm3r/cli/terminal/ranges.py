@@ -87,14 +87,16 @@ def parsed(hint: Any) -> Any:
     plain = ConstructorRegistry.get_primitive_spec(PrimitiveTypeInfo.make(hint, set()))
     assert not isinstance(plain, UnsupportedTypeAnnotationError)
 
-    def construct(words: list[str]) -> Any:
-        return accepted("", plain.instance_from_str(words), hint)
-
     metavar = plain.metavar.replace("{None}|", "").replace("{None,", "{")
     for number in ("INT", "FLOAT"):
         metavar = metavar.replace(number, ranges[0].brief(number)) if ranges else metavar
-    spec = replace(plain, metavar=metavar, instance_from_str=construct if ranges else plain.instance_from_str)
+    construct = partial(_construct, plain, hint) if ranges else plain.instance_from_str
+    spec = replace(plain, metavar=metavar, instance_from_str=construct)
     return Annotated[hint, spec, arg(help_behavior_hint=_default_shown)] if optional else Annotated[hint, spec]
+
+
+def _construct(plain: PrimitiveConstructorSpec, hint: Any, words: list[str]) -> Any:
+    return accepted("", plain.instance_from_str(words), hint)
 
 
 def _default_shown(default: str) -> str:
