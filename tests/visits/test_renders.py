@@ -34,7 +34,7 @@ class Scene:
     def __init__(self, first_from_map: Sim3, poses: RefinedPoses | None = None) -> None:
         self.first_from_map, self.poses = first_from_map, poses
 
-    def render(self, camera: Cameras, time: float) -> SimpleNamespace:
+    def render(self, camera: Cameras, time: float, *, backscatter: bool, observed: bool) -> SimpleNamespace:
         pose = camera.cam2world[0].double().numpy()
         center, ahead = self.first_from_map(pose[:3, 3]), self.first_from_map.R @ pose[:3, 2]
         seen = np.tile(np.stack([center, ahead]) / 8 + 0.5, (camera.height // 2, 1))
