@@ -246,7 +246,7 @@ def named(survey: Survey, latency: float, noise: float = 0.02, seed: int = 0) ->
     return path_of(survey.rec, matched, ScaleSettings()), survey.seconds
 
 
-@pytest.mark.parametrize("latency", [-0.6, 0.45])
+@pytest.mark.parametrize("latency", [-0.6, 0.0, 0.45])
 def test_the_latency_of_named_positions_is_found_with_its_standard_deviation(latency):
     survey = heaving()
     found = [find_latency(*named(survey, latency, seed=seed), ScaleSettings()) for seed in range(2)]

@@ -85,6 +85,14 @@ def test_channels_without_error_stay_and_those_of_any_error_become_alike(teal, s
     torch.testing.assert_close(found - found.mean(), expected, rtol=1e-3, atol=1e-4)
 
 
+def test_a_channel_without_light_or_backscatter_stays_finite(teal):
+    dark = replace(teal, Binf=torch.tensor([0.0, 0.5, 0.4]))
+    alike = with_like_channels(fit_of(dark, 0.3, known=False), torch.tensor([0.0, 0.5, 0.4]))
+    for value in (alike.Binf, alike.beta_D, alike.curve.at(torch.tensor(2.0))):
+        assert bool(value.isfinite().all())
+        assert bool((value >= 0).all())
+
+
 def test_a_surface_of_the_mean_color_keeps_its_hue_in_water_that_is_not_determined(teal):
     color, z = TINT / 2, torch.tensor(2.0)
     fit = fit_of(teal, 1e6, known=False)

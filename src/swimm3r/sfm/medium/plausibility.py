@@ -16,13 +16,18 @@ from swimm3r.medium import MediumFit
 from swimm3r.scene.reconstruction import QualityWarning
 
 _GUESS = 0.5  # standard deviation of the optical depth, in every channel, from which T_D is a guess: a factor of 1.6
+_DARKEST = 1e-3  # mean of a channel of the frames: shares of less light say nothing
 
 
 def optical_depth(fit: MediumFit) -> tuple[Float[Tensor, "3"], Float[Tensor, "3"]]:
     """-ln T_D at the middle of the depths the fit has seen, and its standard deviation."""
-    near, far = fit.z_range
-    middle = (near * far) ** 0.5
+    middle = _middle_depth(fit)
     return fit.beta_D * middle, fit.std.beta_D * middle
+
+
+def _middle_depth(fit: MediumFit) -> float:
+    near, far = fit.z_range
+    return (near * far) ** 0.5
 
 
 def attenuation_is_a_guess(fit: MediumFit) -> bool:
@@ -51,13 +56,13 @@ def with_like_channels(fit: MediumFit, mean_color: Float[Tensor, "3"]) -> Medium
         return fit
     tau, tau_std = optical_depth(fit)
     thinner = _drawn_together(tau, tau_std) / tau
-    z = (fit.z_range[0] * fit.z_range[1]) ** 0.5
-    left = torch.exp(-fit.beta_B * z)
-    share = fit.Binf * (1 - left) / mean_color
-    share_std = torch.hypot(fit.std.Binf * (1 - left), fit.Binf * left * z * fit.std.beta_B) / mean_color
-    fainter = _drawn_together(share, share_std) / share
+    z, color = _middle_depth(fit), mean_color.clamp(min=_DARKEST)
+    built_up = -torch.expm1(-fit.beta_B * z)
+    share = fit.Binf * built_up / color
+    share_std = torch.hypot(fit.std.Binf * built_up, fit.Binf * (1 - built_up) * z * fit.std.beta_B) / color
+    Binf = _drawn_together(share, share_std) * color / built_up
     curve = replace(fit.curve, a=fit.curve.a * thinner, c=fit.curve.c * thinner)
-    return replace(fit, Binf=(fit.Binf * fainter).clamp(max=1), beta_D=fit.beta_D * thinner, curve=curve)
+    return replace(fit, Binf=Binf.clamp(max=1), beta_D=fit.beta_D * thinner, curve=curve)
 
 
 def _drawn_together(x: Float[Tensor, "3"], std: Float[Tensor, "3"]) -> Float[Tensor, "3"]:
