@@ -27,7 +27,7 @@ types: setup
 	$(BIN)/pyright
 
 suite: setup
-	$(BIN)/pytest -n 2 --dist loadfile
+	$(BIN)/pytest -n 2 --dist loadfile --no-loadscope-reorder
 
 test: lint  ## Linters, then the type checker beside the test suite
 	$(MAKE) --no-print-directory -j 2 types suite

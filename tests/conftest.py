@@ -27,7 +27,22 @@ from swimm3r.synthetic import dive as synthetic_dive
 THREADS = int(os.environ.get("SWIMM3R_TEST_THREADS", "1"))  # two xdist workers share two cores
 torch.set_num_threads(THREADS)
 
+LONG_FILES = (  # of more than 20 seconds: started first, so that no worker ends long after the other
+    "visits/test_visits.py", "batch/test_run.py", "examples/test_examples.py", "splat/test_elsewhere.py",
+    "sfm/medium/test_lamp_fit.py", "sfm/colmap/chunks/test_long_clip.py", "visits/test_alignment.py",
+    "localization/test_online.py", "test_architecture.py", "synthetic/test_optics.py",
+    "bench/protocols/test_localization.py", "synthetic/test_survey.py", "localization/test_localizer.py",
+    "viewer/test_in_browser.py", "sfm/backends/test_imported.py", "raster/cpu/test_backend.py", "tasks/test_tasks.py",
+    "test_readme.py",
+)  # fmt: skip
+
 SHARED = Path(os.environ.get("SWIMM3R_SHARED", Path(__file__).parents[2] / "shared"))
+
+
+def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
+    """Sort the tests of `LONG_FILES` before the others; each file's tests keep their order."""
+    first = {Path(__file__).parent / name for name in LONG_FILES}
+    items.sort(key=lambda item: item.path not in first)
 
 
 @pytest.fixture(autouse=True)

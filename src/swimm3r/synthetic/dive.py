@@ -5,9 +5,9 @@
 on values as stored (sRGB), before fish, snow, vignetting, the camera's exposure and white balance, and noise; under a
 lamp, `lamp_light` says how both terms change, and `clear` is the scene evenly lit. Truth is of the still scene by a
 camera whose gains are 1: depth and `clear` are what lies behind the fish, and `usable` is False wherever it shows.
-Caustics are light, not water: `clear` has them. Where a ray meets nothing, depth is 0 and `clear` is black. Behind a
-port every ray is traced through it (`optics`), attenuation begins at its outer surface, and the cameras are the central
-ones of `swimm3r.refraction.central`.
+Caustics are in `raw` alone: `clear` has the light that they have on average. Where a ray meets nothing, depth is 0 and
+`clear` is black. Behind a port every ray is traced through it (`optics`), attenuation begins at its outer surface, and
+the cameras are the central ones of `swimm3r.refraction.central`.
 
 On disk: images/NAME, and truth/ as `ground_truth` reads it, with masks/NAME.png (0 at the fish) if there is one, and
 gains.json, the camera's factors on linear light per frame, if they change; markers.json, the printed markers, if any;
@@ -103,20 +103,16 @@ class Dive:
         floor = self.floor.around(*camera.centers[0, :2].tolist())
         centers, samples = self.rays
         rays, sample_rays = centers.direction, samples.direction
-        radiance, z = render(floor, camera.cam2world[0].numpy(), centers, samples, seconds, settings.caustics)
-        if self.plates:
-            radiance, z = with_plates(radiance, z, camera, self.plates)
-        radiance = radiance * np.array(settings.daylight)
-        clear = srgb_from_linear(torch.from_numpy(radiance)).clamp(0, 1).float()
-        z_depth = torch.from_numpy(z).float()
+        z_depth, clear = self._surfaces(camera, floor, seconds, 0.0)
+        lit = self._surfaces(camera, floor, seconds, settings.caustics)[1] if settings.caustics else clear
         ray_depth = centers.water_path(z_depth)
         light, glow = None, None
         if (lamp := self.lamp) is None:
-            raw = torch.where((z_depth > 0)[..., None], add_water(clear, ray_depth, self.medium), self.medium.Binf)
+            raw = torch.where((z_depth > 0)[..., None], add_water(lit, ray_depth, self.medium), self.medium.Binf)
         else:
             light = light_on(rays.float(), ray_depth, lamp, self.medium)
             glow = lamp_backscatter(rays.float(), ray_depth, lamp, self.medium)
-            raw = clear * light * transmittances(ray_depth, self.medium)[0] + glow
+            raw = lit * light * transmittances(ray_depth, self.medium)[0] + glow
         usable = torch.ones_like(z_depth, dtype=torch.bool)
         rng = np.random.default_rng(settings.stream(2, i))
         if settings.moving_object:
@@ -134,6 +130,16 @@ class Dive:
         if settings.noise:
             raw = disturbances.sensor_noise(raw, settings.noise, rng)
         return DiveFrame(raw, clear, z_depth, ray_depth, usable, light, glow)
+
+    def _surfaces(
+        self, camera: Cameras, floor: Seafloor | Plain, time: float, caustics: float
+    ) -> tuple[Float[Tensor, "h w"], Float[Tensor, "h w 3"]]:
+        """Z depth and clear color of what a camera sees at a time (s), under caustics of a strength."""
+        radiance, z = render(floor, camera.cam2world[0].numpy(), *self.rays, time, caustics)
+        if self.plates:
+            radiance, z = with_plates(radiance, z, camera, self.plates)
+        clear = srgb_from_linear(torch.from_numpy(radiance * np.array(self.settings.daylight))).clamp(0, 1).float()
+        return torch.from_numpy(z).float(), clear
 
 
 def make_dive(settings: DiveSettings) -> Dive:
