@@ -21,7 +21,7 @@ from swimm3r.batch.results import Row, is_finished
 from swimm3r.batch.run import BatchError, check_outcome, run_batch
 from swimm3r.cli.main import main
 from swimm3r.errors import UsageError
-from swimm3r.io.files.cache_key import stat_digest
+from swimm3r.io.files.cache_key import sample_digest
 from swimm3r.io.images import write_rgb
 from swimm3r.pipeline.presets import PRESETS, to_yaml
 from swimm3r.pipeline.run_record import stage_keys
@@ -172,7 +172,7 @@ def test_a_dive_is_finished_where_it_has_the_scale_of_its_sources(tapes: Path, t
     plain = Dive("reef", tapes / "reef", replace(TINY, sfm=without))
     given = replace(plain, settings=replace(plain.settings, scale=ScaleSettings(nav=file, nav_offset=0.0)))
     run = write_run(tmp_path / "reef", survey)
-    digest = stat_digest(plain.source, leave_out=run)
+    digest = sample_digest(plain.source, leave_out=run)
     keys = stage_keys(digest, plain.settings, None)
     stages = {stage: {"status": "done", "key": keys[stage]} for stage in ("prepare", "sfm")}
     summary = json.loads((run / "summary.json").read_text())

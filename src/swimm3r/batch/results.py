@@ -11,7 +11,7 @@ from swimm3r.batch.dive import Dive
 from swimm3r.errors import InputError, UsageError
 from swimm3r.io import medium_json
 from swimm3r.io.files.atomic import write_text
-from swimm3r.io.files.cache_key import stat_digest
+from swimm3r.io.files.cache_key import sample_digest
 from swimm3r.io.files.damage import remake
 from swimm3r.pipeline.presets import from_yaml
 from swimm3r.pipeline.run_record import stage_keys
@@ -60,7 +60,7 @@ def is_finished(dive: Dive, out: Path, last_stage: str) -> bool:
     stages = STAGES[: STAGES.index(last_stage) + 1]
     if not all(run.is_finished(stage) for stage in stages):
         return False
-    if run.input.fingerprint != stat_digest(dive.source, leave_out=folder):
+    if run.input.fingerprint != sample_digest(dive.source, leave_out=folder):
         return False
     settings = with_stages_of(dive.settings, held, STAGES[len(stages) :])
     scored = run.stages.get("eval")

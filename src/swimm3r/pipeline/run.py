@@ -15,7 +15,7 @@ from pathlib import Path
 
 from swimm3r import devices
 from swimm3r.io.files.atomic import write_text
-from swimm3r.io.files.cache_key import stat_digest
+from swimm3r.io.files.cache_key import sample_digest
 from swimm3r.pipeline import held_out
 from swimm3r.pipeline import summary as sections
 from swimm3r.pipeline.estimate import estimate_run
@@ -77,7 +77,7 @@ def run_pipeline(
     source, folder = Path(source), Path(folder)
     check_source(source)
     device = devices.for_maps(map_device)  # before there is a folder, and minutes of structure from motion
-    digest = stat_digest(source, leave_out=folder)
+    digest = sample_digest(source, leave_out=folder)
     with watched(progress) as told, open_record(folder, source, digest, redo=redo) as record:
         settings, reference = record.settle(settings, reference, last_stage)
         check_inputs(source, settings, reference)

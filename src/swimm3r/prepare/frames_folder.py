@@ -24,7 +24,7 @@ from swimm3r.errors import InputError
 from swimm3r.io import images
 from swimm3r.io.bags.bag import is_bag, open_bag
 from swimm3r.io.files.atomic import DRAFT
-from swimm3r.io.files.cache_key import cache_key, stat_digest
+from swimm3r.io.files.cache_key import cache_key, sample_digest
 from swimm3r.io.files.damage import guard, remake
 from swimm3r.io.files.json_file import read_json
 from swimm3r.io.files.safe_names import check_name, check_names, shown_name
@@ -354,5 +354,5 @@ def _whole_folder(folder: Path) -> Iterator[Path]:
 
 def _cache_folder(source: Path, settings: FrameSettings) -> Path:
     """Folder in the cache for frames that were given none; the same source and settings find it again."""
-    key = cache_key(str(source.resolve()), stat_digest(source), settings)[:16]
+    key = cache_key(str(source.resolve()), sample_digest(source), settings)[:16]
     return Path(os.environ.get("XDG_CACHE_HOME") or Path.home() / ".cache") / "swimm3r" / "frames" / key

@@ -1,12 +1,13 @@
 """A key is another one wherever what decided a result is, and the same where it is not."""
 
 import os
+import shutil
 from dataclasses import dataclass, replace
 from pathlib import Path
 
 import pytest
 
-from swimm3r.io.files.cache_key import cache_key, code_version, content_digest, statements
+from swimm3r.io.files.cache_key import cache_key, code_version, content_digest, sample_digest, statements
 
 
 @dataclass(frozen=True)
@@ -58,6 +59,28 @@ def test_a_folders_digest_is_of_names_and_bytes(tmp_path: Path):
     before = content_digest(tmp_path / "model")
     (tmp_path / "model" / "points").rename(tmp_path / "model" / "cameras")
     assert content_digest(tmp_path / "model") not in (before, None)
+
+
+def test_a_dive_is_known_again_on_another_disk_and_another_one_is_not(tmp_path: Path):
+    dive = tmp_path / "dive"
+    (dive / "masks").mkdir(parents=True)
+    video = dive / "clip.mp4"
+    video.write_bytes(bytes(100_000))
+    (dive / "masks" / "0.png").write_bytes(b"mask")
+    before = sample_digest(dive)
+    copy = tmp_path / "elsewhere" / "renamed"
+    shutil.copytree(dive, copy, copy_function=shutil.copyfile)
+    assert sample_digest(copy) == before
+    assert sample_digest(copy / "clip.mp4") == sample_digest(video) != before
+    for change in (b"\1" + bytes(99_999), bytes(99_999) + b"\1", bytes(100_001)):
+        (copy / "clip.mp4").write_bytes(change)
+        assert sample_digest(copy) != before
+    (dive / "masks" / "0.png").rename(dive / "masks" / "1.png")
+    assert sample_digest(dive) != before
+    (dive / "masks" / "1.png").rename(dive / "masks" / "0.png")
+    (dive / "runs").mkdir()
+    (dive / "runs" / "report.html").write_bytes(b"<html>")
+    assert sample_digest(dive, leave_out=dive / "runs") == before
 
 
 def test_code_is_its_statements():

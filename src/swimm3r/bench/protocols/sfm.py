@@ -21,7 +21,7 @@ from swimm3r.bench.tables import Table
 from swimm3r.errors import InputError, RegistrationError
 from swimm3r.evaluate import NotComputed
 from swimm3r.geometry import Similarity, best_similarity
-from swimm3r.io.files.cache_key import stat_digest
+from swimm3r.io.files.cache_key import sample_digest
 from swimm3r.pipeline.inputs import truth_of
 from swimm3r.pipeline.presets import RunSettings
 from swimm3r.pipeline.run import run_pipeline
@@ -92,7 +92,7 @@ def _cells_of_clip(
         if isinstance(chosen, NotComputed):
             cells.append(Result(scene, method, 0, not_run=chosen.reason))
             continue
-        made_from = [stat_digest(clip, leave_out=out), settings.frames, chosen, files_of(chosen)]
+        made_from = [sample_digest(clip, leave_out=out), settings.frames, chosen, files_of(chosen)]
         scored_by = [None if truth is None else reference.digest(truth), [c.score for c in COLUMNS]]
         make = partial(_scores, clip=clip, settings=replace(settings, sfm=chosen), truth=truth, progress=progress)
         cells.append(kept_cell(out, ResultKey(scene, method), made_from, make, scored_by))
