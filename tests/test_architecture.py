@@ -39,7 +39,8 @@ ROWS = {  # by package: a room or module imports only rooms of rows before its o
         {"features", "lens", "plane_sweep"},
         {"alignment", "student", "colmap"},
         {"mast3r_sfm"},
-        {"medium", "moving", "between"},
+        {"moving", "between"},
+        {"medium"},
         {"backends", "distillation"},
     ],
     "swimm3r.splat": [

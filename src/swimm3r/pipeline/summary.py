@@ -57,6 +57,8 @@ def sfm_sections(
         shares = [share for _, share in rec.moving.shares(frames)]
         covered = {"share": sum(shares) / len(rec.names), "largest_share": max(shares, default=0.0)}
         sections["moving"] = {"frames": len(shares), **covered}
+    if rec.steady is not None:
+        sections["flicker"] = {"evened_frames": rec.steady.count(frames)}
     if rec.medium is not None:
         sections["medium"] = {"sfm": _medium_section(rec.medium, rec.metric)}
         if rec.medium_linear is not None:

@@ -1,10 +1,10 @@
 """The result of structure from motion: the one record that every back end fills and every later stage reads.
 
 On disk (`Reconstruction.save`, `reconstruction_io.load_reconstruction`) it is a folder: sparse/ (COLMAP model),
-cameras.json, trajectory.tum, z_depth/NAME.npz, masks/NAME.png (0 at moving objects), matches.npz, medium.json,
-white_balance.json, reconstruction.json (back end, metric flag, warnings, points found), and the dense cloud in three
-colors, points.ply (as shown: restored and white-balanced), points_physical.ply (restored) and points_raw.ply (as
-filmed); backdrop.ply and its two are ground at a guessed depth.
+cameras.json, trajectory.tum, z_depth/NAME.npz, masks/NAME.png (0 at moving objects), steady/NAME.png (frames without
+the flicker of the sun), matches.npz, medium.json, white_balance.json, reconstruction.json (back end, metric flag,
+warnings, points found), and the dense cloud in three colors, points.ply (as shown: restored and white-balanced),
+points_physical.ply (restored) and points_raw.ply (as filmed); backdrop.ply and its two are ground at a guessed depth.
 """
 
 import json
@@ -29,8 +29,8 @@ from swimm3r.io.files.outputs import check_empty
 from swimm3r.io.trajectory import write_tum
 from swimm3r.lamp import Lamp, rescaled_lamp
 from swimm3r.medium import MediumFit, save_fits
+from swimm3r.scene.frame_changes import STEADY, MovingMasks, SteadyFrames
 from swimm3r.scene.frames import MASKS, Frames
-from swimm3r.scene.moving_masks import MovingMasks
 from swimm3r.scene.rig import RigFit
 from swimm3r.scene.white_balance import UNBALANCED, WHITE_BALANCE, WhiteBalance
 
@@ -173,6 +173,7 @@ class Reconstruction:
     up: tuple[float, float, float] | None = None  # away from the earth, where the camera measured it; world axes
     rig: RigFit | None = None  # of a clip of several cameras that are fixed to each other
     moving: MovingMasks | None = None  # None: moving objects were not looked for
+    steady: SteadyFrames | None = None  # None: the light does not flicker, or was kept
 
     def __repr__(self) -> str:
         dense = "" if self.cloud is None else f", {len(self.cloud.xyz):,} dense points"
@@ -208,8 +209,9 @@ class Reconstruction:
         return None if lamp is None else rescaled_lamp(lamp, scale)
 
     def still(self, frames: Frames) -> Frames:
-        """The frames with masks of moving objects, where these were looked for."""
-        return frames if self.moving is None else self.moving.on(frames)
+        """The frames with masks of moving objects, where these were looked for, and in steady light."""
+        masked = frames if self.moving is None else self.moving.on(frames)
+        return masked if self.steady is None else self.steady.on(masked)
 
     def index(self, name: str) -> int:
         """The position of a registered frame by its name."""
@@ -256,6 +258,8 @@ class Reconstruction:
         self._place_depth(folder)
         if self.moving is not None:
             self.moving.copy(folder / MASKS)
+        if self.steady is not None:
+            self.steady.copy(folder / STEADY)
         times = None if frames is None else frames.times_of(self.names)
         colmap.write_model(folder / "sparse", self.colmap_model())
         if times is not None:

@@ -16,8 +16,8 @@ from swimm3r.io.colmap import model as colmap
 from swimm3r.io.files.array_file import Layout, read_arrays
 from swimm3r.io.files.damage import guard, remake
 from swimm3r.io.files.json_file import read_json
+from swimm3r.scene.frame_changes import STEADY, MovingMasks, SteadyFrames
 from swimm3r.scene.frames import MASKS, Frames
-from swimm3r.scene.moving_masks import MovingMasks
 from swimm3r.scene.reconstruction import DenseCloud, DepthMaps, Matches, Points, QualityWarning, Reconstruction, Tracks
 from swimm3r.scene.rig import RigFit
 from swimm3r.scene.white_balance import UNBALANCED, WHITE_BALANCE, WhiteBalance, read_white_balance
@@ -81,6 +81,7 @@ def load_reconstruction(folder: str | Path, frames: Frames | None = None) -> Rec
         up=about.up,
         rig=about.rig,
         moving=MovingMasks(folder / MASKS) if (folder / MASKS).is_dir() else None,
+        steady=SteadyFrames(folder / STEADY) if (folder / STEADY).is_dir() else None,
     )
 
 

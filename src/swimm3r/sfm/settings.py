@@ -112,6 +112,7 @@ class RestoreSettings(Settings):
 
 LightChoice = Literal["auto", "sun", "lamp"]
 MovingChoice = Literal["auto", "none"]
+FlickerChoice = Literal["auto", "keep"]
 
 
 @dataclass(frozen=True)
@@ -320,6 +321,9 @@ class ColmapSettings(LensSettings):
     """Masks of moving objects: found where they hide surfaces that other frames measured (auto), or none."""
     light: LightChoice = "sun"
     """Light of the dive: the sun, a lamp on the camera, or the one of them that the frames tell (auto)."""
+    flicker: FlickerChoice = "auto"
+    """Sunlight that flickers over the ground (caustics): evened out where the frames show it (auto), or kept as filmed.
+    """
     water: SeathruSettings = field(default_factory=SeathruSettings)
     restore: RestoreSettings = field(default_factory=RestoreSettings)
 
@@ -382,6 +386,9 @@ class Mast3rSettings(LensSettings):
     """Masks of moving objects: found where they hide surfaces that other frames measured (auto), or none."""
     light: LightChoice = "sun"
     """Light of the dive: the sun, a lamp on the camera, or the one of them that the frames tell (auto)."""
+    flicker: FlickerChoice = "auto"
+    """Sunlight that flickers over the ground (caustics): evened out where the frames show it (auto), or kept as filmed.
+    """
     water: SeathruSettings = field(default_factory=SeathruSettings)
     restore: RestoreSettings = field(default_factory=RestoreSettings)
 
@@ -404,6 +411,9 @@ class ColmapModelSettings(Settings):
     """Masks of moving objects: found where they hide surfaces that other frames measured (auto), or none."""
     light: LightChoice = "sun"
     """Light of the dive: the sun, a lamp on the camera, or the one of them that the frames tell (auto)."""
+    flicker: FlickerChoice = "auto"
+    """Sunlight that flickers over the ground (caustics): evened out where the frames show it (auto), or kept as filmed.
+    """
     water: SeathruSettings = field(default_factory=SeathruSettings)
     restore: RestoreSettings = field(default_factory=RestoreSettings)
 

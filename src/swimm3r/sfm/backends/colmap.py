@@ -55,7 +55,7 @@ def reconstruct(
         if rec.rig is None and navigator is None and settings.housing == "none":  # which hold poses in their own ways
             rec = _of_still_scene(rec, frames, settings, folder, progress, engine)
     return_freed()
-    rec = with_water(rec, rec.still(frames), settings, folder, progress)
+    rec = with_water(rec, frames, settings, folder, progress)
     rec.save(folder, frames)
     return rec
 

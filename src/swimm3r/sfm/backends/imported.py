@@ -62,7 +62,7 @@ def reconstruct(
         write_depth(rec, frames, foreign, progress)
     if settings.moving == "auto":
         rec = with_moving(rec, frames, folder / MASKS, progress)
-    rec = with_water(rec, rec.still(frames), settings, folder, progress)
+    rec = with_water(rec, frames, settings, folder, progress)
     rec.save(folder, frames)
     return rec
 

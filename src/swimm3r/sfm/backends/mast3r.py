@@ -94,13 +94,12 @@ def reconstruct(
     rec = load_reconstruction(folder, frames)  # also where it was just made: the same bits as after an interruption
     if settings.moving == "auto":
         rec = with_moving(rec, frames, folder / MASKS, progress)
-    still = rec.still(frames)
     if settings.adapter is None:
-        rec = with_water(rec, still, settings, folder, progress)
+        rec = with_water(rec, frames, settings, folder, progress)
     else:
         facts = adapter_file.head_facts(settings.adapter)
         predicted = from_head.read(folder / _WATER, network_images(frames, settings), facts)
-        rec = with_water(rec, still, settings, folder, progress, predicted)
+        rec = with_water(rec, frames, settings, folder, progress, predicted)
     rec.save(folder, frames)
     if settings.cache is None:
         shutil.rmtree(cache, ignore_errors=True)

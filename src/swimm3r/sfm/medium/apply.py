@@ -8,11 +8,13 @@ from swimm3r.errors import InputError
 from swimm3r.io import images
 from swimm3r.medium import MediumFit
 from swimm3r.progress import Progress, silent
+from swimm3r.scene.frame_changes import STEADY
 from swimm3r.scene.frames import Frames
 from swimm3r.scene.reconstruction import QualityWarning, Reconstruction
 from swimm3r.sfm.medium.backdrop import Backdrop
 from swimm3r.sfm.medium.dense_cloud import MIN_TRANSMITTANCE, dense_cloud
 from swimm3r.sfm.medium.dense_tracks import fuse_depth
+from swimm3r.sfm.medium.flicker import with_steady
 from swimm3r.sfm.medium.from_head import PredictedWater, dive_fit, predicted_images
 from swimm3r.sfm.medium.light import judge_light
 from swimm3r.sfm.medium.plausibility import water_warnings, with_like_channels
@@ -52,9 +54,13 @@ def with_water(
 ) -> Reconstruction:
     """The reconstruction with its water, in both encodings, restored cloud and backdrop, and restored images on disk.
 
-    Where depth is too scarce to tell the water, the poses and depth stand without it, under a warning. `predicted` is
-    the physics head's water, which then restores images and cloud; only the fit in linear light is Sea-Thru's.
+    The water is that of the frames as filmed; where the sunlight flickers, cloud and images are those of the frames in
+    steady light. Where depth is too scarce to tell the water, the poses and depth stand without it, under a warning.
+    `predicted` is the physics head's water, which then restores images and cloud, with the light as filmed; only the
+    fit in linear light is Sea-Thru's.
     """
+    rec = replace(rec, steady=None)
+    frames = rec.still(frames)
     tracks = fuse_depth(rec, frames, settings.water.tracks, progress)
     samples = collect_samples(rec, frames, tracks, settings.water, progress)
     try:
@@ -66,11 +72,15 @@ def with_water(
     except InputError as failure:
         warning = QualityWarning(f"The water was not estimated: {failure.what}.", f"Try: {failure.hint}")
         return replace(rec, warnings=(*rec.warnings, warning))
+    doubts = water_warnings(stored, gray=frames.gray, predicted=predicted is not None, linear=linear)
+    rec = replace(rec, medium=stored, medium_linear=linear, warnings=(*rec.warnings, *doubts))
+    if settings.flicker == "auto" and predicted is None:
+        rec = with_steady(rec, frames, settings.restore, folder / STEADY, progress)
+        frames = rec.still(frames)
     at, eps_inv = (None, MIN_TRANSMITTANCE) if predicted is None else (predicted.at, predicted.head.min_transmittance)
     fusion = settings.water.tracks
     cloud = dense_cloud(rec, frames, tracks, stored, settings.restore, fusion, progress, at, eps_inv)
-    doubts = water_warnings(stored, gray=frames.gray, predicted=predicted is not None, linear=linear)
-    rec = replace(rec, medium=stored, medium_linear=linear, cloud=cloud, warnings=(*rec.warnings, *doubts))
+    rec = replace(rec, cloud=cloud)
     rec = replace(rec, white_balance=white_balance(rec, settings.restore))
     filmed = rec.white_balance.source == "filmed"
 

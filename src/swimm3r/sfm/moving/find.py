@@ -20,8 +20,8 @@ from swimm3r.imaging.filters import blur
 from swimm3r.io import images
 from swimm3r.io.files.atomic import atomic_folder
 from swimm3r.progress import Progress, silent
+from swimm3r.scene.frame_changes import MovingMasks
 from swimm3r.scene.frames import Frames
-from swimm3r.scene.moving_masks import MovingMasks
 from swimm3r.scene.reconstruction import DepthMap, QualityWarning, Reconstruction, Tracks
 from swimm3r.sfm.moving.comparison import SmallView
 from swimm3r.sfm.moving.occluders import Layer, measured_range, moving_pixels
@@ -56,7 +56,8 @@ class StillScene:
     cameras: Cameras  # of the small images
 
     @cached_property
-    def _view(self) -> Callable[[int], SmallView]:
+    def view(self) -> Callable[[int], SmallView]:
+        """The small image of a frame, with its depth."""
         return lru_cache(maxsize=_KEPT)(self._read_view)
 
     @cached_property
@@ -70,15 +71,13 @@ class StillScene:
         for i in range(len(self.rec.names)):
             z_depth = self._z_depth(i)
             at = np.flatnonzero(z_depth)
-            points.append(self._points(i, z_depth, at[:: max(1, len(at) // _SAMPLES)]))
+            points.append(self.points(i, z_depth, at[:: max(1, len(at) // _SAMPLES)]))
         of = torch.repeat_interleave(torch.arange(len(points)), torch.tensor([len(few) for few in points]))
         return torch.cat(points), of
 
     def moving_in_frame(self, i: int) -> Bool[np.ndarray, "h w"]:
         """The pixels of the small image of frame `i` that show moving objects."""
-        camera = self.cameras[i]
-        others = [j for j in self._overlapping(camera) if j != i]
-        return moving_pixels(self._view(i), self._layers(camera, others))
+        return moving_pixels(self.view(i), self._layers(self.cameras[i], self.others(i)))
 
     def moving_in(self, lens: Cameras, image: Float[Tensor, "h w 3"]) -> Bool[Tensor, "h w"]:
         """The pixels of another image of the scene, of known pose, that show moving objects.
@@ -86,10 +85,14 @@ class StillScene:
         Its depth is the nearest that the frames measured on each pixel's ray.
         """
         camera = resized(lens, self.cameras.width, self.cameras.height)
-        layers = self._layers(camera, self._overlapping(camera))
+        layers = self._layers(camera, _spread(self._overlapping(camera)))
         z_depth = measured_range((camera.height, camera.width), layers).nearest
         view = SmallView(camera, _small(image, camera), z_depth, np.ones_like(z_depth, dtype=bool))
         return enlarged(moving_pixels(view, layers), lens.height, lens.width)
+
+    def others(self, i: int) -> list[int]:
+        """Up to 16 frames that see the same surfaces as frame `i`, spread over the time in which they do."""
+        return _spread([j for j in self._overlapping(self.cameras[i]) if j != i])
 
     def _overlapping(self, camera: Cameras) -> list[int]:
         """The frames whose surfaces a camera sees."""
@@ -99,7 +102,7 @@ class StillScene:
         return ((total > 0) & (seen >= _SHARED * total)).nonzero()[:, 0].tolist()
 
     def _layers(self, camera: Cameras, others: Sequence[int]) -> list[Layer]:
-        return [_layer(camera, self._surface(j)) for j in _spread(others)]
+        return [_layer(camera, self._surface(j)) for j in others]
 
     def _read_view(self, i: int) -> SmallView:
         f = self.frames.index(self.rec.names[i])
@@ -108,14 +111,14 @@ class StillScene:
         return SmallView(camera, _small(self.frames.image(f), camera), self._z_depth(i), usable)
 
     def _read_surface(self, i: int) -> _Surface:
-        view = self._view(i)
+        view = self.view(i)
         known = np.flatnonzero((view.z_depth > 0) & ~beside_edges(view.z_depth))
-        return _Surface(view, self._points(i, view.z_depth, known), known)
+        return _Surface(view, self.points(i, view.z_depth, known), known)
 
     def _z_depth(self, i: int) -> Float[np.ndarray, "h w"]:
         return self._small_grid(self.rec.depth[self.rec.names[i]].z_depth.numpy())
 
-    def _points(self, i: int, z_depth: Float[np.ndarray, "h w"], at: Int[np.ndarray, " n"]) -> Float[Tensor, "n 3"]:
+    def points(self, i: int, z_depth: Float[np.ndarray, "h w"], at: Int[np.ndarray, " n"]) -> Float[Tensor, "n 3"]:
         """World points of some pixels, by their row-major index."""
         camera = self.cameras[i]
         pixels = pixel_grid(camera.height, camera.width).reshape(-1, 2)[at]
