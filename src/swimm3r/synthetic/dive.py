@@ -132,7 +132,7 @@ class Dive:
         return DiveFrame(raw, clear, z_depth, ray_depth, usable, light, glow)
 
     def _surfaces(
-        self, camera: Cameras, floor: Seafloor | Plain, time: float, caustics: float
+        self, camera: Cameras, floor: Seafloor, time: float, caustics: float
     ) -> tuple[Float[Tensor, "h w"], Float[Tensor, "h w 3"]]:
         """Z depth and clear color of what a camera sees at a time (s), under caustics of a strength."""
         radiance, z = render(floor, camera.cam2world[0].numpy(), *self.rays, time, caustics)
