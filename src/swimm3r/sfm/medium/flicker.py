@@ -46,7 +46,8 @@ _PROBES = 4  # frames that tell whether the light flickers
 _NEXT = 2  # places in time to the frame that they are compared with
 _FLICKERS = 0.032  # spread of the change, per frame, from which on it does; strobes that near the ground reach 0.03
 _SAME = 0.03  # of a depth, within which two frames see the same surface
-_TELLING = 0.05  # of an image, below which its measured part tells nothing
+_TELLING = 0.25  # of an image, below which its measured part tells nothing
+_LEAST_CHANGE = 0.012  # of brightness itself, 0..1: on dark ground a small error of the water is a large ratio
 _LEAST_FRAMES = 4  # that see a surface, for their mean to stand for it
 _SMOOTH, _FILL, _LARGE = 1.5, 8.0, 30.0  # pixels of the small images: scale of gamma, of gaps, of what is no flicker
 _HOLD, _FAR_HOLD = 0.1, 0.05  # weight of a gap's surroundings beside measured pixels, and of 1 beside surroundings
@@ -106,6 +107,10 @@ class LitScene:
         left[at] -= np.polyval(np.polyfit(between, left[at], 2), between)
         return replace(change, log_gain=left)
 
+    def brightness(self, i: int, at: Bool[np.ndarray, "h w"]) -> float:
+        """Median brightness of some pixels of frame `i`."""
+        return float(np.median(self._brightness(i)[at]))
+
     def _seen(self, i: int, j: int) -> Float[np.ndarray, "h w"]:
         """Brightness in frame `j` of the surfaces at the pixels of frame `i`; 0 where it does not show them."""
         import cv2
@@ -146,8 +151,8 @@ def with_steady(
         return rec
     if not folder.is_dir():
         lit = LitScene(still_scene(rec, frames), rec.medium)
-        spread = _spread(lit, len(rec.names))
-        if not spread >= _FLICKERS:
+        spread, change = _spread(lit, len(rec.names))
+        if not (spread >= _FLICKERS and change >= _LEAST_CHANGE):
             return rec
         log.info("the sunlight flickers over the ground, by %.1f%% of its brightness from frame to frame", 100 * spread)
         _write_steady(rec, frames, lit, restore, folder, progress)
@@ -175,12 +180,22 @@ def _write_steady(
     progress("evening out the sunlight", len(rec.names), len(rec.names))
 
 
-def _spread(lit: LitScene, count: int) -> float:
-    """Median over a few frames of the change until the second next, per frame; NaN where too little is seen twice."""
+def _spread(lit: LitScene, count: int) -> tuple[float, float]:
+    """Medians over a few frames of the change until the second next, per frame: of the logarithm, and of brightness.
+
+    NaN where in half of them too little is seen twice.
+    """
     probes = np.unique(np.linspace(0, count - 1 - _NEXT, _PROBES).round().astype(int)) if count > _NEXT else []
-    spreads = [lit.change(int(i), int(i) + _NEXT).spread / 2**0.5 for i in probes]
-    told = [spread for spread in spreads if np.isfinite(spread)]
-    return float(np.median(told)) if told else float("nan")
+    told = []
+    for i in map(int, probes):
+        change = lit.change(i, i + _NEXT)
+        spread = change.spread / 2**0.5
+        if np.isfinite(spread):
+            told.append((spread, spread * lit.brightness(i, change.measured)))
+    if 2 * len(told) <= len(probes):
+        return float("nan"), float("nan")
+    spread, change = np.median(told, axis=0).tolist()
+    return spread, change
 
 
 def _evened(
