@@ -5,6 +5,8 @@ import subprocess
 import sys
 from pathlib import Path
 
+from tests.conftest import LONG_FILES
+
 import swimm3r
 
 PACKAGE = Path(swimm3r.__file__).parent
@@ -173,6 +175,10 @@ def test_no_module_imports_itself_through_others():
 
     for module in below:
         visit(module, ())
+
+
+def test_files_that_are_started_first_exist():
+    assert [name for name in LONG_FILES if not (Path(__file__).parent / name).is_file()] == []
 
 
 def test_no_folder_is_a_heap():

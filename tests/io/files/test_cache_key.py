@@ -83,6 +83,20 @@ def test_a_dive_is_known_again_on_another_disk_and_another_one_is_not(tmp_path: 
     assert sample_digest(dive, leave_out=dive / "runs") == before
 
 
+def test_a_file_that_may_not_be_read_counts_by_name_and_size(tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
+    (tmp_path / "locked").write_bytes(b"of root")
+    before = sample_digest(tmp_path)
+
+    def refuse(*_: object) -> None:
+        raise PermissionError
+
+    monkeypatch.setattr(Path, "open", refuse)
+    unread = sample_digest(tmp_path)
+    assert unread != before
+    (tmp_path / "locked").rename(tmp_path / "other")
+    assert sample_digest(tmp_path) != unread
+
+
 def test_code_is_its_statements():
     code = '''"""Says."""
 def f(x):

@@ -48,16 +48,17 @@ def sample_digest(path: Path, leave_out: Path | None = None) -> str:
     """Of a file's size and of its first and last 16 KiB, or of those of all files below a folder with their names.
 
     Hours of video are told apart as fast as they are found, and a copy on another disk is the same. Files below
-    `leave_out` are no part of it.
+    `leave_out` are no part of it; those that may not be read count by name and size.
     """
     digest = sha256()
     for file in files_below(path, leave_out):
-        with suppress(FileNotFoundError), file.open("rb") as opened:  # removed meanwhile
-            size = opened.seek(0, os.SEEK_END)
+        with suppress(FileNotFoundError):  # removed meanwhile
+            size = file.stat().st_size
             digest.update(f"{file.relative_to(path)}|{size}\n".encode(errors="surrogateescape"))
-            for start in sorted({0, max(0, size - _SAMPLE)}):
-                opened.seek(start)
-                digest.update(opened.read(_SAMPLE))
+            with suppress(PermissionError), file.open("rb") as opened:  # whoever needs the file says so
+                for start in sorted({0, max(0, size - _SAMPLE)}):
+                    opened.seek(start)
+                    digest.update(opened.read(_SAMPLE))
     return digest.hexdigest()[:_LENGTH]
 
 

@@ -35,6 +35,7 @@ from swimm3r.progress import Progress, silent
 from swimm3r.scene.frame_changes import SteadyFrames
 from swimm3r.scene.frames import Frames
 from swimm3r.scene.reconstruction import QualityWarning, Reconstruction
+from swimm3r.sfm.medium.dense_tracks import ray_depth_map
 from swimm3r.sfm.medium.restore import restore_image
 from swimm3r.sfm.medium.side_by_side import in_order
 from swimm3r.sfm.moving.find import StillScene, still_scene
@@ -133,7 +134,7 @@ class LitScene:
         view = self.scene.view(i)
         known = (view.z_depth > 0) & view.usable
         z_depth = torch.from_numpy(view.z_depth.astype(np.float32))
-        ray_depth = z_depth * torch.nan_to_num(frame_rays(view.camera), nan=0.0).norm(dim=-1)
+        ray_depth = ray_depth_map(z_depth, frame_rays(view.camera))
         medium = self.medium.at(ray_depth, frame_directions(view.camera))
         direct = torch.from_numpy(view.rgb.astype(np.float32)) - backscatter(ray_depth, medium)
         bright = direct.sum(-1) / transmittances(ray_depth, medium)[0].sum(-1)
