@@ -20,6 +20,7 @@ from swimm3r.cameras import Cameras
 from swimm3r.evaluate.registration import fit_colors
 from swimm3r.imaging.undistortion import undistorted
 from swimm3r.progress import Progress, silent
+from swimm3r.raster.cpu.threads import threads_for_kernels_alone
 from swimm3r.splat.pose_mlp import moved
 from swimm3r.splat.primitives.beta import select
 from swimm3r.splat.primitives.kinds import Primitives
@@ -45,6 +46,7 @@ class RefinedPose:
 
 
 @memory_for_views
+@threads_for_kernels_alone()
 def refine_pose(
     scene: SplatMap,
     camera: Cameras,

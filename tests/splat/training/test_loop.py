@@ -8,6 +8,7 @@ from pathlib import Path
 import pytest
 import torch
 
+from swimm3r.devices import torch_threads
 from swimm3r.errors import UsageError
 from swimm3r.evaluate.images import psnr
 from swimm3r.splat import train
@@ -81,6 +82,16 @@ def test_an_interrupted_training_ends_with_the_bits_of_one_that_was_not(tiny_div
     assert len(whole.primitives.xyz) > 500
     steps = [[row["step"] for row in rows(tmp_path / name)] for name in ("whole", "cut")]
     assert steps[0] == steps[1] == [5, 10, 15, 20, 25, 30, 35, 40]
+
+
+def test_the_number_of_threads_changes_no_bit_of_a_map(tiny_dive, tmp_path):
+    maps = []
+    for threads in (1, 2, 3):
+        with torch_threads(threads):
+            maps.append(train(tiny_dive.rec, tiny_dive.frames, SETTINGS, tmp_path / str(threads)))
+            assert torch.get_num_threads() == threads
+    assert equal(maps[0], maps[1])
+    assert equal(maps[0], maps[2])
 
 
 def test_a_checkpoint_of_other_settings_is_not_continued(tiny_dive, tmp_path):

@@ -4,10 +4,7 @@ The kernels release the GIL. Each pair of tile and primitive owns a slot for its
 primitive in a fixed order: no atomics, and results that do not depend on the number of threads, to the bit.
 """
 
-import os
-from collections.abc import Callable, Iterable
-from concurrent.futures import ThreadPoolExecutor
-from functools import lru_cache
+from collections.abc import Iterable
 from typing import Any
 
 import numpy as np
@@ -17,6 +14,7 @@ from torch import Tensor
 from swimm3r.raster.cpu.adjoint import PLAIN, WITH_SGG, adjoint_tiles, sum_slots
 from swimm3r.raster.cpu.bins import bin_primitives
 from swimm3r.raster.cpu.forward import forward_tiles
+from swimm3r.raster.cpu.threads import spread_by_cost
 from swimm3r.raster.records import Bins, CpuBins, MediumMaps, Primitives2D, RasterOutput, SggBuffers
 
 __all__ = ["backward", "bin_primitives", "forward"]
@@ -30,7 +28,7 @@ def forward(bins: Bins, p: Primitives2D, medium: MediumMaps | None) -> RasterOut
     lists = (bins.packed, bins.tile_start, bins.ids, _lists(bins).blocks)
     maps = (None,) * 3 if medium is None else _arrays(medium)
     arguments: tuple[Any, ...] = (*_arrays(lists), *maps, *_arrays(out), _gaussian(bins))
-    _spread(lambda first, beyond: forward_tiles(first, beyond, *arguments), bins.tile_start.numpy())
+    spread_by_cost(lambda first, beyond: forward_tiles(first, beyond, *arguments), bins.tile_start.numpy())
     if medium is None:
         out.rgb.copy_(out.clear)
     return out
@@ -60,10 +58,10 @@ def backward(
     d_medium = (None,) * 3 if medium_grads is None else _arrays(medium_grads)
     with_sgg = None if sgg is None else True
     arguments: tuple[Any, ...] = (*_arrays(lists), *images, slots, *d_medium, with_sgg, _gaussian(bins))
-    _spread(lambda first, beyond: adjoint_tiles(first, beyond, *arguments), bins.tile_start.numpy())
+    spread_by_cost(lambda first, beyond: adjoint_tiles(first, beyond, *arguments), bins.tile_start.numpy())
     buffers = (None,) * 5 if sgg is None else _arrays(sgg)
     totals: tuple[Any, ...] = (*_arrays((bins.packed, own.order, own.first_slot)), slots, *_arrays(grads), *buffers)
-    _spread(lambda first, beyond: sum_slots(first, beyond, *totals), own.first_slot.numpy())
+    spread_by_cost(lambda first, beyond: sum_slots(first, beyond, *totals), own.first_slot.numpy())
     return grads, medium_grads
 
 
@@ -76,24 +74,6 @@ def _lists(bins: Bins) -> CpuBins:
 def _gaussian(bins: Bins) -> bool | None:
     """The kernel as the compiled code is told: by type."""
     return True if bins.kernel == "gaussian" else None
-
-
-@lru_cache(maxsize=4)
-def _pool(threads: int, process: int) -> ThreadPoolExecutor:
-    """Kept for the life of the process; a forked child makes its own."""
-    return ThreadPoolExecutor(threads, thread_name_prefix="raster")
-
-
-def _spread(work: Callable[[int, int], None], cost: np.ndarray) -> None:
-    """Call work(first, beyond) over ranges of about equal cost (cumulative), on as many threads as torch uses."""
-    n, threads = len(cost) - 1, torch.get_num_threads()
-    if threads == 1 or n < 2:
-        work(0, n)
-        return
-    shares = np.linspace(0, int(cost[-1]), 8 * threads + 1)[1:-1]
-    edges = np.unique(np.concatenate([[0], np.searchsorted(cost, shares), [n]])).tolist()
-    for done in _pool(threads, os.getpid()).map(work, edges[:-1], edges[1:]):
-        assert done is None
 
 
 def _arrays(tensors: Iterable[Tensor]) -> tuple[Any, ...]:

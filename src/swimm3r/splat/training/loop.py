@@ -1,7 +1,8 @@
 """The training loop: which view when, the record of every few steps, checkpoints, and going on where it stopped.
 
 A recipe brings the step itself. Everything random is drawn from the seed and the step, so a state needs no generators,
-and a run that was interrupted ends with the same bits as one that was not (at the same number of threads).
+and a run that was interrupted ends with the same bits as one that was not. On a processor torch computes on one thread
+between kernels that use all of them, so the number of threads changes no bit either.
 """
 
 import logging
@@ -19,6 +20,7 @@ from swimm3r.io.files import metrics_log
 from swimm3r.io.files.cache_key import cache_key
 from swimm3r.io.files.damage import guard
 from swimm3r.progress import Progress
+from swimm3r.raster.cpu.threads import threads_for_kernels_alone
 from swimm3r.splat.appearance import fit_to_view
 from swimm3r.splat.medium.kinds import Water
 from swimm3r.splat.pose_mlp import PoseMlp
@@ -110,6 +112,7 @@ def view_of_step(step: int, views: int, seed: int) -> int:
     return int(torch.randperm(views, generator=generator(seed, epoch, 1))[place])
 
 
+@threads_for_kernels_alone()
 def run(
     parts: RecipeParts,
     scene: TrainingScene,
