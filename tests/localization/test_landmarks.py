@@ -5,13 +5,13 @@ from dataclasses import replace
 import pytest
 import torch
 
-from swimm3r.cameras import Cameras, project
+from swimm3r.cameras import Cameras, image_directions, project
 from swimm3r.geometry import pose_from, relative_poses, rotation_angle, so3_exp
 from swimm3r.io.images import write_rgb
 from swimm3r.localization.interpolation import between, neighbors, pose_from_neighbors
 from swimm3r.localization.landmarks import Landmarks, landmarks_of, locate
 from swimm3r.scene.frames import Frame, Frames
-from swimm3r.scene.reconstruction import DepthMaps, Matches, Points, Reconstruction, Tracks
+from swimm3r.scene.reconstruction import DepthMap, DepthMaps, Matches, Points, Reconstruction, Tracks
 from swimm3r.sfm.features.sift import extract_features
 from swimm3r.sfm.settings import FeatureSettings
 
@@ -90,6 +90,32 @@ def test_a_image_is_placed_where_it_was_taken(plane):
     points = rec.points.xyz[None]
     there = replace(lens, cam2world=found.cam2world[None])
     assert (project(there, points)[0] - project(cameras[2], points)[0]).norm(dim=-1).median() < 0.5
+
+
+def test_measured_depth_places_a_image_where_no_point_was_triangulated(plane, tmp_path):
+    """As at the end of a strip: one frame shares ground with it, and no third one has that in its image."""
+    rec, frames, cameras = plane
+    none = torch.zeros(0, dtype=torch.int64)
+    rec = replace(rec, tracks=Tracks(none, none, torch.zeros(0, 2)), depth=DepthMaps(tmp_path))
+    lens = rec.cameras[0]
+    without = landmarks_of(rec, frames, SETTINGS)("1.png")
+    assert not len(without.xyz)
+    assert locate(frames.image(2), frames.mask(2), lens, [without], SETTINGS) is None
+    z_depth = _depth_of_plane(cameras[1])
+    z_depth[:, 120:] = 0  # unknown
+    rec.depth.write("1.png", DepthMap(z_depth, (z_depth > 0).float()))
+    landmarks = landmarks_of(rec, frames, SETTINGS)("1.png")
+    assert (landmarks.xyz[:, 2] - 2).abs().max() < 0.01
+    found = locate(frames.image(2), frames.mask(2), lens, [landmarks], SETTINGS)
+    assert found is not None
+    points = rec.points.xyz[None]
+    there = replace(lens, cam2world=found.cam2world[None])
+    assert (project(there, points)[0] - project(cameras[2], points)[0]).norm(dim=-1).median() < 1
+
+
+def _depth_of_plane(camera: Cameras) -> torch.Tensor:
+    rays = image_directions(camera).double() @ camera.cam2world[0, :3, :3].mT
+    return ((2 - camera.centers[0, 2]) / rays[..., 2]).float()
 
 
 def test_a_image_of_another_place_is_not_placed(plane):

@@ -1,7 +1,9 @@
 """Pose of an image from pixels that match points of the reconstruction: PnP with RANSAC over SIFT.
 
-A *landmark* is a keypoint of a registered frame that lies on the observation of a triangulated point. An image's
-keypoints are matched with the landmarks of frames that may show the same place; its pose reprojects most of them.
+A *landmark* is a keypoint of a registered frame whose place is known: that of the triangulated point whose observation
+it is, else that of its pixel's measured depth. (At the end of a strip of stills two frames share little ground, and a
+third frame, with which points could have been triangulated there, none of it.) An image's keypoints are matched with
+the landmarks of frames that may show the same place; its pose reprojects most of them.
 """
 
 from collections.abc import Callable, Sequence
@@ -13,7 +15,7 @@ from jaxtyping import Bool, Float
 from scipy.spatial import KDTree
 from torch import Tensor
 
-from swimm3r.cameras import Cameras
+from swimm3r.cameras import Cameras, unproject
 from swimm3r.io.colmap.model import silence_log
 from swimm3r.scene.frames import Frames
 from swimm3r.scene.reconstruction import Reconstruction
@@ -30,7 +32,7 @@ _SAME_KEYPOINT = 1.0  # pixels between an observation and the keypoint that it i
 
 @dataclass(frozen=True)
 class Landmarks:
-    """The points that one registered frame observes."""
+    """The points that one registered frame shows."""
 
     descriptors: Float[Tensor, "n 128"]  # of unit length
     xyz: Float[Tensor, "n 3"]  # world
@@ -55,16 +57,31 @@ def landmarks_of(
     def of(name: str) -> Landmarks:
         f = frames.index(name)
         found = extract_features(frames.image(f), frames.mask(f), settings)
+        keypoints = torch.from_numpy(found.keypoints[:, :2]).double()
+        xyz = _measured(rec, name, keypoints)
         mine = rec.tracks.frame == rec.index(name)
         observations, points = rec.tracks.xy[mine].double(), rec.tracks.point[mine]
-        if not len(observations) or not len(found.keypoints):
-            return Landmarks(torch.zeros(0, 128), torch.zeros(0, 3, dtype=torch.float64))
-        distance, row = KDTree(observations.numpy()).query(found.keypoints[:, :2])
-        near = torch.from_numpy(distance < _SAME_KEYPOINT)
-        xyz = rec.points.xyz[points[torch.from_numpy(row)[near]]].double()
-        return Landmarks(unit_descriptors(found.descriptors)[near], xyz)
+        if len(observations) and len(keypoints):
+            distance, row = KDTree(observations.numpy()).query(keypoints.numpy())
+            near = torch.from_numpy(distance < _SAME_KEYPOINT)
+            xyz[near] = rec.points.xyz[points[torch.from_numpy(row)[near]]].double()
+        placed = torch.isfinite(xyz).all(-1)
+        return Landmarks(unit_descriptors(found.descriptors)[placed], xyz[placed])
 
     return of
+
+
+def _measured(rec: Reconstruction, name: str, pixels: Float[Tensor, "n 2"]) -> Float[Tensor, "n 3"]:
+    """The surface at pixels of a frame, world axes; not a number where no depth was measured."""
+    if name not in rec.depth or not len(pixels):
+        return torch.full((len(pixels), 3), torch.nan, dtype=torch.float64)
+    z_depth = rec.depth[name].z_depth.double()
+    height, width = z_depth.shape
+    column = (pixels[:, 0] * width / rec.cameras.width).long().clamp(0, width - 1)
+    row = (pixels[:, 1] * height / rec.cameras.height).long().clamp(0, height - 1)
+    z = z_depth[row, column]
+    camera = rec.cameras[rec.index(name)]
+    return unproject(camera, pixels[None], torch.where(z > 0, z, torch.nan)[None])[0]
 
 
 def locate(

@@ -1,9 +1,9 @@
 """Held-out views: poses of the test frames, the map rendered from there, and its scores.
 
-A frame's first pose comes from a reference where one is given, else from its matches with points of the reconstruction,
-else from its neighbors in time. Then it is refined on the frozen map (`splat.poses`), for a score should be about the
-map and not about a pose that is a pixel off. Scores count the pixels that the lens shows and the mask admits, on the
-pinhole canvas of the training size.
+A frame's first pose comes from a reference where one is given, else from its matches with triangulated points and
+measured depth of the reconstruction, else from its neighbors in time. Then it is refined on the frozen map
+(`splat.poses`), for a score should be about the map and not about a pose that is a pixel off. Scores count the pixels
+that the lens shows and the mask admits, on the pinhole canvas of the training size.
 """
 
 from collections import Counter
