@@ -10,8 +10,8 @@ import pytest
 from swimm3r.prepare import read_frames
 from swimm3r.progress import silent
 from swimm3r.scene.frames import Frames
-from swimm3r.sfm.colmap import calibration, mapping, poses
-from swimm3r.sfm.colmap.epipolar_outliers import contradicting_frames, pair_distances
+from swimm3r.sfm.colmap import calibration, epipolar_outliers, mapping, poses
+from swimm3r.sfm.colmap.epipolar_outliers import CheckedPair, checked_pairs, contradicting_frames
 from swimm3r.sfm.colmap.resection_outliers import misplaced_frames
 from swimm3r.sfm.features.database import FeatureDatabase
 from swimm3r.sfm.settings import ColmapSettings
@@ -97,6 +97,24 @@ def test_a_part_of_the_clip_that_agrees_with_itself_but_not_with_the_rest_is_pla
     assert_same(rotations(mapping.replace_misplaced(store, wrong, SETTINGS, silent)), rotations(model))
 
 
+def test_pairs_that_passed_the_verification_by_chance_take_no_frame_out(
+    store: FeatureDatabase, model: pycolmap.Reconstruction, monkeypatch: pytest.MonkeyPatch
+):
+    """As looser matching finds them between frames that share no ground: with few matches each."""
+    pairs = checked_pairs(store, model)
+    chance = {
+        pair: CheckedPair(150.0, 16) if WRONG in pair and k % 2 else each
+        for k, (pair, each) in enumerate(pairs.items())
+    }
+    wrong = [pair for pair in chance if chance[pair] != pairs[pair]]
+    assert len(wrong) > 0.3 * sum(WRONG in pair for pair in pairs)
+    monkeypatch.setattr(epipolar_outliers, "checked_pairs", lambda *_: chance)
+    assert contradicting_frames(store, model) == []
+    strong = {pair: CheckedPair(150.0, pairs[pair].matches) if pair in wrong else each for pair, each in pairs.items()}
+    monkeypatch.setattr(epipolar_outliers, "checked_pairs", lambda *_: strong)
+    assert contradicting_frames(store, model) == [WRONG]
+
+
 @pytest.mark.parametrize("wrong_one", ["_try_focal_lengths", "_map_globally"])
 def test_of_two_ways_to_place_a_small_clip_the_one_that_explains_more_is_kept(
     store: FeatureDatabase, model: pycolmap.Reconstruction, monkeypatch: pytest.MonkeyPatch, wrong_one: str
@@ -145,10 +163,10 @@ def test_the_lens_that_pairs_agree_on_is_tried_alone_unless_it_is_known(
 def test_distances_from_the_lines_are_below_a_pixel_in_a_right_model_and_grow_with_the_error(
     store: FeatureDatabase, model: pycolmap.Reconstruction
 ):
-    right, wrong = pair_distances(store, model), pair_distances(store, moved(model, 25))
-    assert max(right.values()) < 1
+    right, wrong = checked_pairs(store, model), checked_pairs(store, moved(model, 25))
+    assert max(each.distance for each in right.values()) < 1
     assert all(wrong[pair] == right[pair] for pair in right if WRONG not in pair)
-    assert np.median([wrong[pair] / right[pair] for pair in right if WRONG in pair]) > 3
+    assert np.median([wrong[pair].distance / right[pair].distance for pair in right if WRONG in pair]) > 3
 
 
 def assert_same(found: dict[int, np.ndarray], expected: dict[int, np.ndarray]) -> None:

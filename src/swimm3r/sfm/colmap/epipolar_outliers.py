@@ -2,12 +2,14 @@
 
 Every pair's verified matches speak for one motion. Where a part of a clip was placed wrongly, many frames support each
 other's errors and resection from one another finds nothing; but their pairs, within the part and to the rest, do not
-meet their epipolar lines. Frames are taken away, the one with the fewest pairs that agree first, until most pairs of
-each that is left do.
+meet their epipolar lines. Frames are taken away, the one whose pairs agree least first, until most pairs of each that
+is left do. Pairs with hardly more matches than the verification asks for count little: some are of frames that share no
+ground.
 """
 
 from collections import defaultdict
 from collections.abc import Collection, Mapping
+from dataclasses import dataclass
 from typing import TYPE_CHECKING
 
 import numpy as np
@@ -17,19 +19,19 @@ from swimm3r.sfm.features.database import FeatureDatabase
 if TYPE_CHECKING:
     import pycolmap
 
-_FEW = 15  # matches below which a pair is not asked
+_FEW = 15  # matches below which a pair is not asked; skerki_survey has wrong pairs with 15 to 26
+_SURE = 15  # matches beyond those, from which on a pair counts fully
 _AGREES = 2.0  # mean reprojection errors, a pixel at least: the median distance from the lines that a right pair keeps
-_MOST = 0.7  # share of a frame's pairs that must agree
+_MOST = 0.7  # share of a frame's pairs that must agree, by what they count
 _KEPT = 0.3  # share of the frames that must be left to build upon, else nothing is said
 
 
 def contradicting_frames(store: FeatureDatabase, model: "pycolmap.Reconstruction") -> list[int]:
     """Image ids of registered frames that stand against their own pairs; none where too few would be left."""
-    distances = pair_distances(store, model)
     limit = max(1.0, _AGREES * model.compute_mean_reprojection_error())
-    partners: defaultdict[int, dict[int, bool]] = defaultdict(dict)
-    for (i, j), distance in distances.items():
-        partners[i][j] = partners[j][i] = distance < limit
+    partners: defaultdict[int, dict[int, _Verdict]] = defaultdict(dict)
+    for (i, j), pair in checked_pairs(store, model).items():
+        partners[i][j] = partners[j][i] = _Verdict(pair.distance < limit, pair.weight)
     left = set(model.reg_image_ids())
     share = {i: _share(partners[i], left) for i in left}
     while True:
@@ -44,14 +46,35 @@ def contradicting_frames(store: FeatureDatabase, model: "pycolmap.Reconstruction
     return sorted(set(placed) - left)
 
 
-def _share(partners: Mapping[int, bool], left: Collection[int]) -> float:
-    """Share of a frame's pairs with frames that are left which agree; 1 without any."""
-    asked = [agrees for partner, agrees in partners.items() if partner in left]
-    return sum(asked) / len(asked) if asked else 1.0
+@dataclass(frozen=True)
+class _Verdict:
+    """One pair's, on both of its frames."""
+
+    agrees: bool
+    weight: int
 
 
-def pair_distances(store: FeatureDatabase, model: "pycolmap.Reconstruction") -> dict[tuple[int, int], float]:
-    """Median distance, pixels, of registered pairs' verified matches from their epipolar lines under the model."""
+def _share(partners: Mapping[int, _Verdict], left: Collection[int]) -> float:
+    """Share of a frame's pairs with frames that are left which agree, by their weights; 1 without any."""
+    asked = [pair for partner, pair in partners.items() if partner in left]
+    return sum(pair.agrees * pair.weight for pair in asked) / sum(pair.weight for pair in asked) if asked else 1.0
+
+
+@dataclass(frozen=True)
+class CheckedPair:
+    """A registered pair's verified matches under a model."""
+
+    distance: float  # median, pixels, from their epipolar lines
+    matches: int
+
+    @property
+    def weight(self) -> int:
+        """What the pair counts beside others, at least 1."""
+        return min(self.matches - _FEW + 1, _SURE)
+
+
+def checked_pairs(store: FeatureDatabase, model: "pycolmap.Reconstruction") -> dict[tuple[int, int], CheckedPair]:
+    """Registered pairs of frames with enough verified matches, by image ids."""
     import pycolmap
 
     placed, camera = set(model.reg_image_ids()), model.cameras[1]
@@ -71,7 +94,7 @@ def pair_distances(store: FeatureDatabase, model: "pycolmap.Reconstruction") -> 
             off = np.abs((y * lines_b).sum(1))
             lengths = (np.linalg.norm(lines[:, :2], axis=1) for lines in (lines_a, lines_b))
             mean = sum(off / np.maximum(length, 1e-12) for length in lengths) / 2
-            out[a, b] = float(np.median(mean)) * camera.mean_focal_length()
+            out[a, b] = CheckedPair(float(np.median(mean)) * camera.mean_focal_length(), len(matches))
     return out
 
 

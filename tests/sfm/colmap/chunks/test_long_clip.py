@@ -133,3 +133,14 @@ def test_a_part_is_cut_where_the_scale_jumps_and_where_few_points_hold():
     jumped = chain([1.0, 1.0, 1.0, 50.0, 50.0, 50.0])
     assert [piece.images for piece in coherent_parts(jumped)] == [(1, 2, 3), (4, 5, 6)]
     assert coherent_parts(chain([1.0] * 6, shared=8)) == []
+
+
+def test_a_part_is_cut_where_only_the_points_that_two_frames_share_are_in_one_scale():
+    """A frame placed on few points, at which the scale was lost: all else that it sees is ten times as far."""
+    part = chain([1.0] * 6, shared=20)
+    rng = np.random.default_rng(1)
+    far = np.column_stack([rng.uniform(3, 5, 90), rng.uniform(0, 1, 90), np.full(90, 10.0)])
+    rows = np.arange(len(part.xyz), len(part.xyz) + len(far))
+    point_of = {i: np.concatenate([points, rows]) if i > 3 else points for i, points in part.point_of.items()}
+    part = Part(part.cam_from_world, point_of, np.concatenate([part.xyz, far]))
+    assert [piece.images for piece in coherent_parts(part)] == [(1, 2, 3), (4, 5, 6)]

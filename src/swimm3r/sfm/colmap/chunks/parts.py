@@ -5,6 +5,7 @@ match joins features of two frames that have points in different parts.
 """
 
 from collections import defaultdict
+from collections.abc import Mapping
 from dataclasses import dataclass
 from typing import TYPE_CHECKING
 
@@ -20,7 +21,7 @@ if TYPE_CHECKING:
 
 LEAST_FRAMES = 3  # of a part
 _HOLDING = 15  # points that two frames must share to hold together, as many as a verified pair has matches
-_DEPTH_RATIO = 3.0  # of the points that two frames share: stills of a survey differ by less than 1.5
+_DEPTH_RATIO = 3.0  # of two frames that share points: stills of a survey differ by less than 1.5
 
 
 @dataclass(frozen=True)
@@ -70,10 +71,11 @@ def part_of(model: "pycolmap.Reconstruction") -> Part:
 
 
 def coherent_parts(part: Part) -> list[Part]:
-    """The part, cut where only few points hold it together, or where those stand at quite another depth.
+    """The part, cut where only few points hold it together, or where frames stand at quite another depth.
 
     Along a chain of frames that share little a mapper may lose the scale between two of them, and go on in another
-    unit. Each piece has at least `LEAST_FRAMES` frames.
+    unit: the points that both share then stand elsewhere for one of them, or at the same depth for both, though all
+    else that the one sees is far from that. Each piece has at least `LEAST_FRAMES` frames.
     """
     images = part.images
     rows = {image: np.unique(points[points >= 0]) for image, points in part.point_of.items()}
@@ -84,7 +86,7 @@ def coherent_parts(part: Part) -> list[Part]:
     common = triu(seen @ seen.T, 1).tocoo()
     kept = np.array(
         [
-            count >= _HOLDING and _alike_depths(part, images[i], images[j], rows)
+            count >= _HOLDING and _in_one_scale(part, images[i], images[j], rows)
             for i, j, count in zip(common.row, common.col, common.data, strict=True)
         ],
         bool,
@@ -110,12 +112,19 @@ def without_jumps(model: "pycolmap.Reconstruction") -> "pycolmap.Reconstruction"
     return kept
 
 
-def _alike_depths(part: Part, i: int, j: int, rows: dict[int, Int[np.ndarray, " k"]]) -> bool:
-    """Return whether the points that two images share are about as far from the one as from the other."""
-    xyz = part.xyz[np.intersect1d(rows[i], rows[j], assume_unique=True)]
-    depths = [xyz @ part.cam_from_world[image][2, :3] + part.cam_from_world[image][2, 3] for image in (i, j)]
-    ratio = np.median(np.maximum(depths[0], 1e-12) / np.maximum(depths[1], 1e-12))
-    return bool(1 / _DEPTH_RATIO < ratio < _DEPTH_RATIO)
+def _in_one_scale(part: Part, i: int, j: int, rows: Mapping[int, Int[np.ndarray, " k"]]) -> bool:
+    """Return whether two images have about the same depth, that of the points they share and that of all of theirs."""
+    shared = np.intersect1d(rows[i], rows[j], assume_unique=True)
+    ratios = (
+        _depth(part, i, seen_i) / _depth(part, j, seen_j) for seen_i, seen_j in ((shared, shared), (rows[i], rows[j]))
+    )
+    return all(1 / _DEPTH_RATIO < ratio < _DEPTH_RATIO for ratio in ratios)
+
+
+def _depth(part: Part, image: int, points: Int[np.ndarray, " k"]) -> float:
+    """Median depth of some points in an image; hardly above 0 where they are behind it."""
+    last_row = part.cam_from_world[image][2]
+    return max(1e-12, float(np.median(part.xyz[points] @ last_row[:3] + last_row[3])))
 
 
 def _piece(part: Part, images: list[int]) -> Part:
