@@ -69,7 +69,7 @@ class CheckedPair:
 
     @property
     def weight(self) -> int:
-        """What the pair counts beside others, at least 1."""
+        """Weight beside other pairs, at least 1."""
         return min(self.matches - _FEW + 1, _SURE)
 
 
