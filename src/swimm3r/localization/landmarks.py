@@ -12,11 +12,11 @@ from functools import lru_cache
 
 import torch
 from jaxtyping import Bool, Float
-from scipy.spatial import KDTree
 from torch import Tensor
 
 from swimm3r.cameras import Cameras, unproject
 from swimm3r.io.colmap.model import silence_log
+from swimm3r.localization.keypoint_places import measured_depth, tracked_points
 from swimm3r.scene.frames import Frames
 from swimm3r.scene.reconstruction import Reconstruction
 from swimm3r.sfm.colmap.absolute_pose import absolute_pose
@@ -27,7 +27,6 @@ MIN_INLIERS = 12
 """Landmarks that agree on a pose before it is believed: 6 of them fix it, and wrong matches agree on a few more."""
 _MAX_ERROR = 4.0  # pixels of an image of 1000; never less than _LEAST_ERROR
 _LEAST_ERROR = 2.5
-_SAME_KEYPOINT = 1.0  # pixels between an observation and the keypoint that it is
 
 
 @dataclass(frozen=True)
@@ -58,30 +57,14 @@ def landmarks_of(
         f = frames.index(name)
         found = extract_features(frames.image(f), frames.mask(f), settings)
         keypoints = torch.from_numpy(found.keypoints[:, :2]).double()
-        xyz = _measured(rec, name, keypoints)
-        mine = rec.tracks.frame == rec.index(name)
-        observations, points = rec.tracks.xy[mine].double(), rec.tracks.point[mine]
-        if len(observations) and len(keypoints):
-            distance, row = KDTree(observations.numpy()).query(keypoints.numpy())
-            near = torch.from_numpy(distance < _SAME_KEYPOINT)
-            xyz[near] = rec.points.xyz[points[torch.from_numpy(row)[near]]].double()
+        i, z = rec.index(name), measured_depth(rec, name, keypoints)
+        xyz = unproject(rec.cameras[i], keypoints[None], torch.where(z > 0, z, torch.nan)[None])[0]
+        point = tracked_points(rec, i, keypoints)
+        xyz[point >= 0] = rec.points.xyz[point[point >= 0]].double()
         placed = torch.isfinite(xyz).all(-1)
         return Landmarks(unit_descriptors(found.descriptors)[placed], xyz[placed])
 
     return of
-
-
-def _measured(rec: Reconstruction, name: str, pixels: Float[Tensor, "n 2"]) -> Float[Tensor, "n 3"]:
-    """The surface at pixels of a frame, world axes; not a number where no depth was measured."""
-    if name not in rec.depth or not len(pixels):
-        return torch.full((len(pixels), 3), torch.nan, dtype=torch.float64)
-    z_depth = rec.depth[name].z_depth.double()
-    height, width = z_depth.shape
-    column = (pixels[:, 0] * width / rec.cameras.width).long().clamp(0, width - 1)
-    row = (pixels[:, 1] * height / rec.cameras.height).long().clamp(0, height - 1)
-    z = z_depth[row, column]
-    camera = rec.cameras[rec.index(name)]
-    return unproject(camera, pixels[None], torch.where(z > 0, z, torch.nan)[None])[0]
 
 
 def locate(

@@ -11,12 +11,12 @@ from dataclasses import dataclass
 import numpy as np
 import torch
 from jaxtyping import Float, Int, UInt8
-from scipy.spatial import KDTree
 from torch import Tensor
 
 from swimm3r.cameras import Cameras, project, project_visible, unproject
 from swimm3r.errors import InputError
 from swimm3r.io.colmap.model import silence_log
+from swimm3r.localization.keypoint_places import measured_depth, tracked_points
 from swimm3r.progress import Progress, silent
 from swimm3r.scene.frames import Frames
 from swimm3r.scene.reconstruction import Reconstruction
@@ -24,7 +24,6 @@ from swimm3r.sfm.features import vlad
 from swimm3r.sfm.features.sift import Features, extract_features, unit_descriptors
 from swimm3r.sfm.settings import FeatureSettings
 
-_SAME_KEYPOINT = 1.0  # pixels between an observation and the keypoint that it is
 _LEAST_TRACKED = 50  # landmarks of a mean frame with tracks; below, depth maps take their place
 _TURNED_AWAY = 0.7  # cosine of the angle between two views of a point beyond which SIFT no longer finds it again
 
@@ -93,9 +92,10 @@ def landmark_map(
         f = frames.index(name)
         found.append(extract_features(frames.image(f), frames.mask(f), settings))
     progress("describing the map", len(rec.names), len(rec.names))
-    xyz, points = rec.points.xyz.double(), [_tracked_points(rec, i, one) for i, one in enumerate(found)]
+    pixels = [torch.from_numpy(one.keypoints[:, :2]).double() for one in found]
+    xyz, points = rec.points.xyz.double(), [tracked_points(rec, i, each) for i, each in enumerate(pixels)]
     if sum(int((each >= 0).sum()) for each in points) < _LEAST_TRACKED * len(rec.names):
-        xyz, points = _points_by_depth(rec, found)
+        xyz, points = _points_by_depth(rec, pixels)
     known = [each >= 0 for each in points]
     if not any(bool(each.any()) for each in known):
         raise InputError(
@@ -122,24 +122,13 @@ def landmark_map(
     )
 
 
-def _tracked_points(rec: Reconstruction, i: int, found: Features) -> Int[Tensor, " k"]:
-    """The point that each keypoint of frame i observes; -1 of others."""
-    mine = (rec.tracks.frame == i).nonzero()[:, 0]
-    if not len(mine) or not len(found.keypoints):
-        return torch.full((len(found.keypoints),), -1)
-    off, row = KDTree(rec.tracks.xy[mine].double().numpy()).query(found.keypoints[:, :2])
-    same = torch.from_numpy(off < _SAME_KEYPOINT)
-    return torch.where(same, rec.tracks.point[mine[torch.from_numpy(row)]], -1)
-
-
 def _points_by_depth(
-    rec: Reconstruction, found: Sequence[Features]
+    rec: Reconstruction, keypoints: Sequence[Float[Tensor, "_ 2"]]
 ) -> tuple[Float[Tensor, "p 3"], list[Int[Tensor, " k"]]]:
     """A point for every keypoint at which a depth map knows the depth, and the keypoints' points."""
     xyz, points, count = [], [], 0
-    for i, (name, one) in enumerate(zip(rec.names, found, strict=True)):
-        pixels = torch.from_numpy(one.keypoints[:, :2]).double()
-        z = _depth_at(rec, name, pixels)
+    for i, (name, pixels) in enumerate(zip(rec.names, keypoints, strict=True)):
+        z = measured_depth(rec, name, pixels)
         known = z > 0
         point = torch.full((len(pixels),), -1)
         point[known] = torch.arange(count, count + int(known.sum()))
@@ -147,14 +136,6 @@ def _points_by_depth(
         points.append(point)
         xyz.append(unproject(rec.cameras[i], pixels[known][None], z[known][None])[0])
     return torch.cat(xyz), points
-
-
-def _depth_at(rec: Reconstruction, name: str, pixels: Float[Tensor, "k 2"]) -> Float[Tensor, " k"]:
-    if name not in rec.depth:
-        return torch.zeros(len(pixels), dtype=torch.float64)
-    z_depth = rec.depth[name].z_depth
-    column, row = pixels.long().unbind(-1)
-    return z_depth[row.clamp(0, z_depth.shape[0] - 1), column.clamp(0, z_depth.shape[1] - 1)].double()
 
 
 def _median_depth(

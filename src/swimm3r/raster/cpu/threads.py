@@ -1,4 +1,4 @@
-"""Ranges of independent work on as many threads as torch uses; the kernels release the GIL."""
+"""Ranges of independent work on several threads; the kernels release the GIL."""
 
 import os
 from collections.abc import Callable, Iterator
@@ -17,7 +17,7 @@ _kernels: ContextVar[int | None] = ContextVar("threads of the kernels", default=
 
 
 def kernel_threads() -> int:
-    """Number of threads that a kernel is spread over."""
+    """Number of threads that a kernel is spread over: torch's, those before where these are for kernels alone."""
     return _kernels.get() or torch.get_num_threads()
 
 

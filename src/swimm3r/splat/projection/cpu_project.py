@@ -168,7 +168,7 @@ def _run(
     gradients: Stored,
     d_pose: Tensor,
 ) -> None:
-    """The kernel over all blocks of `ids`, on as many threads as torch uses."""
+    """The kernel over all blocks of `ids`, spread over threads."""
     primitives, seen, by_primitive = _arrays(stored), _arrays(plane), _arrays(gradients)
     pose, moment = d_pose.numpy(), np.float32(time)
 
