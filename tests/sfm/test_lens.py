@@ -1,5 +1,6 @@
 """Every back end makes the same lens of the same numbers, and refuses the same slips."""
 
+import json
 import logging
 from dataclasses import replace
 from pathlib import Path
@@ -8,13 +9,15 @@ from typing import Any
 import pytest
 import torch
 
+from swimm3r.cameras import Cameras
 from swimm3r.errors import InputError, UsageError
 from swimm3r.refraction.settings import PortSettings
-from swimm3r.sfm.colmap.calibration import first_camera
+from swimm3r.sfm.colmap.calibration.start import first_camera
 from swimm3r.sfm.lens import (
     behind_port,
     check_calibration,
     check_lens_settings,
+    gives_lens,
     known_lens,
     lens_of,
     with_calibration,
@@ -177,3 +180,68 @@ def test_the_lens_that_is_known_before_frames_are_placed_is_that_of_their_size_i
     assert (given.K[0, 0, 0], given.distortion.tolist()) == (700, [[0.1]])
     assert of_source.K[0, 0, 0] == 450
     assert housed.K[0, 0, 0] > 1.3 * 450
+
+
+def run_with_lens(folder: Path, focal: float, frames: int, size: tuple[int, int] = (1280, 720)) -> Path:
+    """A run folder whose cameras have this lens."""
+    K = torch.tensor([[focal, 0, 640.0], [0, 0.75 * focal, 350.0], [0, 0, 1]], dtype=torch.float64)
+    distortion = torch.tensor([[0.05, 0.01, 0.002, -0.003]], dtype=torch.float64)
+    poses = torch.eye(4, dtype=torch.float64).repeat(frames, 1, 1)
+    cameras = Cameras(K.repeat(frames, 1, 1), distortion.repeat(frames, 1), poses, *size, "OPENCV")
+    cameras.save(folder / "sfm" / "cameras.json", [f"{i}.png" for i in range(frames)])
+    return folder
+
+
+@pytest.mark.parametrize("kind", [ColmapSettings, Mast3rSettings])
+def test_the_lens_of_a_run_is_held_at_the_size_of_the_frames(tmp_path: Path, kind: Any):
+    run = run_with_lens(tmp_path / "run", 900.0, 3)
+    settings = with_calibration(kind(lens_from=run), 640, 360)
+    found = settings.focal, settings.fy, settings.cx, settings.cy
+    assert found == pytest.approx((450, 337.5, 320, 175))
+    assert (settings.k1, settings.k2, settings.p1, settings.p2) == (0.05, 0.01, 0.002, -0.003)
+    assert settings.lens_from is None
+    assert gives_lens(kind(lens_from=run))
+    if kind is ColmapSettings:
+        assert settings.intrinsics == "fixed"
+        assert first_camera(640, 360, settings).params.tolist() == pytest.approx([*found, 0.05, 0.01, 0.002, -0.003])
+
+
+def test_of_a_folder_of_runs_the_one_with_the_most_frames_in_place_has_the_lens(
+    tmp_path: Path, caplog: pytest.LogCaptureFixture
+):
+    for name, focal, frames in (("a", 800.0, 2), ("b", 900.0, 5), ("c", 700.0, 3)):
+        run_with_lens(tmp_path / name, focal, frames)
+    (tmp_path / "logs").mkdir()
+    with caplog.at_level(logging.INFO, "swimm3r"):
+        assert with_calibration(ColmapSettings(lens_from=tmp_path), 1280, 720).focal == 900
+    assert "lens of the run b, with the most frames in place" in caplog.text
+    assert "a 0.625, b 0.703, c 0.547" in caplog.text
+
+
+def test_runs_without_a_lens_and_frames_of_another_shape_are_refused(tmp_path: Path):
+    with pytest.raises(UsageError, match="neither a run with a lens nor a folder of such runs"):
+        check_calibration(ColmapSettings(lens_from=tmp_path))
+    run = run_with_lens(tmp_path / "run", 900.0, 3)
+    check_calibration(ColmapSettings(lens_from=run))
+    with pytest.raises(InputError, match="is of images of 1280x720"):
+        with_calibration(ColmapSettings(lens_from=run), 640, 480)
+    (run / "sfm" / "cameras.json").write_text("{}")
+    with pytest.raises(InputError, match=r"cameras\.json"):
+        check_calibration(ColmapSettings(lens_from=run))
+
+
+def test_a_run_of_cameras_with_several_lenses_is_refused(tmp_path: Path):
+    run = run_with_lens(tmp_path / "run", 900.0, 3)
+    path = run / "sfm" / "cameras.json"
+    document = json.loads(path.read_text())
+    lens = {key: document[key] for key in ("fx", "fy", "cx", "cy", "model", "distortion")}
+    document["frames"][1] |= lens | {"fx": 800.0}
+    path.write_text(json.dumps(document))
+    with pytest.raises(InputError, match="several lenses"):
+        check_calibration(ColmapSettings(lens_from=run))
+
+
+@pytest.mark.parametrize("other", [{"focal": 900.0}, {"calibration": Path("a.yaml")}, {"housing": "flat"}])
+def test_the_lens_of_a_run_stands_alone(other: dict[str, Any]):
+    with pytest.raises(UsageError, match="--lens-from and --"):
+        ColmapSettings(lens_from=Path("run"), **other)

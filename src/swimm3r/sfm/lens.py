@@ -14,6 +14,8 @@ import torch
 from swimm3r.cameras import DISTORTION_PARAMETERS, Cameras
 from swimm3r.errors import UsageError
 from swimm3r.io.calibration.read import read_calibration, read_lens
+from swimm3r.io.calibration.record import CalibratedLens, lens_at
+from swimm3r.io.calibration.run import calibration_of_run
 from swimm3r.refraction.central import CameraInWater, camera_in_water
 from swimm3r.refraction.ports import port_of
 from swimm3r.sfm.settings import (
@@ -42,25 +44,28 @@ Given = TypeVar("Given", bound=ColmapSettings | Mast3rSettings)
 
 
 def check_calibration(settings: LensSettings) -> None:
-    """Raise InputError or UsageError where the calibration file that the settings name cannot be used, and UsageError
-    where parts of a lens are given without the whole.
+    """Raise InputError or UsageError where the calibration file or the run that the settings name cannot be used, and
+    UsageError where parts of a lens are given without the whole.
     """
     _check_whole(settings)
     if settings.calibration is not None:
         read_calibration(settings.calibration, settings.calibration_camera, settings.calibration_size)
+    if settings.lens_from is not None:
+        calibration_of_run(settings.lens_from)
 
 
 def with_calibration(settings: Given, width: int, height: int, stated: Path | None = None) -> Given:
-    """The settings with the numbers of their calibration file, in pixels of frames of this size, in its place.
+    """The settings with the numbers of their calibration file or run, in pixels of frames of this size, in its place.
 
-    Settings without a lens take the one of the file that the frames' source states. Raises InputError where the file
-    cannot be used or is of images of another shape, and UsageError where the settings ask for another camera model.
+    Settings without a lens take the one of the file that the frames' source states. The lens of a run is held. Raises
+    InputError where the file or run cannot be used or is of images of another shape, and UsageError where the settings
+    ask for another camera model.
     """
     _check_whole(settings)
-    path = settings.calibration if gives_lens(settings) else stated
+    path = settings.lens_from or (settings.calibration if gives_lens(settings) else stated)
     if path is None:
         return settings
-    read = read_lens(path, width, height, settings.calibration_camera, settings.calibration_size)
+    read = _read(path, settings, width, height)
     lens = read.camera
     model = _chosen_model(settings, lens.model)
     (fx, _, cx), (_, fy, cy), _ = lens.K[0].tolist()
@@ -72,10 +77,18 @@ def with_calibration(settings: Given, width: int, height: int, stated: Path | No
         *(path, width, height, model, fx, fy, cx, cy, f", {said}" if said else ""),
         f"; within {read.error:.2g} px of the file's" if read.error > 1e-6 else "",
     )
-    blank = dict.fromkeys(("calibration", "calibration_camera", "calibration_size"))
+    blank = dict.fromkeys(("calibration", "calibration_camera", "calibration_size", "lens_from"))
     changed = replace(settings, **blank, focal=fx, fy=fy, cx=cx, cy=cy, **numbers)
+    if settings.lens_from is not None and isinstance(changed, ColmapSettings):
+        changed = replace(changed, intrinsics="fixed")
     undecided = isinstance(settings, ColmapSettings) and model != "OPENCV_FISHEYE"  # auto goes by the numbers
     return changed if undecided else replace(changed, camera=model)
+
+
+def _read(path: Path, settings: LensSettings, width: int, height: int) -> CalibratedLens:
+    if settings.lens_from is not None:
+        return lens_at(calibration_of_run(path), width, height)
+    return read_lens(path, width, height, settings.calibration_camera, settings.calibration_size)
 
 
 def known_lens(settings: SfmSettings, width: int, height: int, stated: Path | None = None) -> Cameras | None:
@@ -95,7 +108,8 @@ def known_lens(settings: SfmSettings, width: int, height: int, stated: Path | No
 
 def gives_lens(settings: LensSettings) -> bool:
     """Return whether the settings themselves say something of the lens."""
-    return settings.calibration is not None or any(getattr(settings, name) is not None for name in LENS_NUMBERS)
+    files = settings.calibration, settings.lens_from
+    return any(part is not None for part in (*files, *(getattr(settings, name) for name in LENS_NUMBERS)))
 
 
 def behind_port(settings: Given, width: int, height: int) -> tuple[Given, CameraInWater | None]:

@@ -279,6 +279,8 @@ class LensSettings(Settings):
     """Name of the camera to use of a calibration file that holds several."""
     calibration_size: tuple[Count, Count] | None = None
     """Width and height in pixels of the images of the calibration, where its file does not state them."""
+    lens_from: Path | None = None
+    """Run folder whose lens, found in water by the same camera in the same mode, is held; or a folder of such runs."""
     housing: HousingKind = "none"
     """Port of the camera housing: flat or dome, where `focal` or `calibration` are of the lens in air."""
     port: PortSettings = field(default_factory=PortSettings)
@@ -292,6 +294,13 @@ class LensSettings(Settings):
                 cause="both say what the lens is",
                 hint="leave out one of them; the lens of a calibration is changed in its file",
             )
+        other = "calibration" if self.calibration is not None else given[0] if given else None
+        if self.lens_from is not None and (other is not None or self.housing != "none"):
+            raise UsageError(
+                f"--lens-from and --{other or 'housing'} exclude each other",
+                cause="the lens of a run is known as it is in water",
+                hint="leave out one of them",
+            )
 
 
 @dataclass(frozen=True)
@@ -302,6 +311,11 @@ class ColmapSettings(LensSettings):
     """Lens model of the whole clip; auto uses SIMPLE_RADIAL, or OPENCV where it explains the matches clearly better."""
     intrinsics: Literal["prior", "fixed"] = "prior"
     """Use of the given focal length and distortion: as a start to refine, or fixed."""
+    shutter: Literal["global", "rolling"] = "global"
+    """Exposure of a frame's rows: all at once, or one after another as in most video cameras."""
+    readout: Annotated[float, Range(-1, 1)] | None = None
+    """Seconds between the first and the last row of a rolling shutter, negative where a film was turned upside down;
+    estimated without it. Of stills without times, in intervals between them."""
     pairs: Literal["auto", "exhaustive", "sequential"] = "auto"
     """Frames to match: every pair, or neighbors in time and similar frames; auto matches every pair up to
     `exhaustive_to` frames."""
@@ -326,6 +340,21 @@ class ColmapSettings(LensSettings):
     """
     water: SeathruSettings = field(default_factory=SeathruSettings)
     restore: RestoreSettings = field(default_factory=RestoreSettings)
+
+    def __post_init__(self) -> None:
+        super().__post_init__()
+        if self.readout is not None and self.shutter != "rolling":
+            raise UsageError(
+                "--readout needs --shutter rolling",
+                cause="rows that are exposed all at once have no readout time",
+                hint="add --shutter rolling, or leave it out",
+            )
+        if self.shutter == "rolling" and self.housing != "none":
+            raise UsageError(
+                "--shutter rolling and --housing exclude each other",
+                cause="both move observations by the depth of what they show",
+                hint="the one of them that matters more: refraction in slow dives, the shutter in shaky ones",
+            )
 
     @property
     def backend(self) -> BackendName:

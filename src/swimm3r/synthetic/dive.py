@@ -7,7 +7,8 @@ lamp, `lamp_light` says how both terms change, and `clear` is the scene evenly l
 camera whose gains are 1: depth and `clear` are what lies behind the fish, and `usable` is False wherever it shows.
 Caustics are in `raw` alone: `clear` has the light that they have on average. Where a ray meets nothing, depth is 0 and
 `clear` is black. Behind a port every ray is traced through it (`optics`), attenuation begins at its outer surface, and
-the cameras are the central ones of `swimm3r.refraction.central`.
+the cameras are the central ones of `swimm3r.refraction.central`. Where rows are exposed one after another, poses are
+those at half time, and depth counts along their axes.
 
 On disk: images/NAME, and truth/ as `ground_truth` reads it, with masks/NAME.png (0 at the fish) if there is one, and
 gains.json, the camera's factors on linear light per frame, if they change; markers.json, the printed markers, if any;
@@ -39,8 +40,8 @@ from swimm3r.refraction.central import CameraInWater
 from swimm3r.scene.ground_truth import FOLDER
 from swimm3r.synthetic import disturbances
 from swimm3r.synthetic.lamp_light import lamp_backscatter, lamp_of, light_on
-from swimm3r.synthetic.optics import PixelRays, behind_port, lens_of, rays_of
-from swimm3r.synthetic.path import loop, right_of, survey
+from swimm3r.synthetic.optics import PixelRays, behind_port, lens_of, rays_of, rolled
+from swimm3r.synthetic.path import loop, motion_between, right_of, survey
 from swimm3r.synthetic.plain import Plain
 from swimm3r.synthetic.printed_markers import FAMILY, Plate, plates_along, with_plates
 from swimm3r.synthetic.render_frame import SAMPLES, render
@@ -72,6 +73,7 @@ class Dive:
     floor: Seafloor | Plain
     plates: tuple[Plate, ...] = ()  # with printed markers
     housed: CameraInWater | None = None  # the lens behind a port, for which `cameras` are the central ones
+    motion: Float[np.ndarray, "n 6"] | None = None  # of each camera while its rows are exposed; None all at once
 
     def __len__(self) -> int:
         return len(self.names)
@@ -83,8 +85,15 @@ class Dive:
 
     @cached_property
     def rays(self) -> tuple[PixelRays, PixelRays]:
-        """The rays of pixel centers, and those of the samples that colors are means of."""
+        """The rays of pixel centers, and of the samples that colors are means of, where all are exposed at once."""
         return rays_of(self.cameras[0], self.housed), rays_of(self.cameras[0], self.housed, SAMPLES)
+
+    def rays_of(self, i: int) -> tuple[PixelRays, PixelRays]:
+        """The `rays` of frame i, in the axes of its camera at half of the exposure."""
+        if self.motion is None:
+            return self.rays
+        centers, samples = self.rays
+        return rolled(centers, self.motion[i]), rolled(samples, self.motion[i])
 
     def seconds(self, i: int) -> float:
         """Time at which image i is taken, from that of the first one on."""
@@ -101,10 +110,10 @@ class Dive:
         settings, camera = self.settings, self.cameras[i]
         seconds = self.seconds(i)
         floor = self.floor.around(*camera.centers[0, :2].tolist())
-        centers, samples = self.rays
+        centers, samples = self.rays_of(i)
         rays, sample_rays = centers.direction, samples.direction
-        z_depth, clear = self._surfaces(camera, floor, seconds, 0.0)
-        lit = self._surfaces(camera, floor, seconds, settings.caustics)[1] if settings.caustics else clear
+        z_depth, clear = self._surfaces(i, floor, seconds, 0.0)
+        lit = self._surfaces(i, floor, seconds, settings.caustics)[1] if settings.caustics else clear
         ray_depth = centers.water_path(z_depth)
         light, glow = None, None
         if (lamp := self.lamp) is None:
@@ -132,12 +141,12 @@ class Dive:
         return DiveFrame(raw, clear, z_depth, ray_depth, usable, light, glow)
 
     def _surfaces(
-        self, camera: Cameras, floor: Seafloor, time: float, caustics: float
+        self, i: int, floor: Seafloor, time: float, caustics: float
     ) -> tuple[Float[Tensor, "h w"], Float[Tensor, "h w 3"]]:
-        """Z depth and clear color of what a camera sees at a time (s), under caustics of a strength."""
-        radiance, z = render(floor, camera.cam2world[0].numpy(), *self.rays, time, caustics)
+        """Z depth and clear color of what camera i sees at a time (s), under caustics of a strength."""
+        radiance, z = render(floor, self.cameras.cam2world[i].numpy(), *self.rays_of(i), time, caustics)
         if self.plates:
-            radiance, z = with_plates(radiance, z, camera, self.plates)
+            radiance, z = with_plates(radiance, z, self.cameras[i], self.plates)
         clear = srgb_from_linear(torch.from_numpy(radiance * np.array(self.settings.daylight))).clamp(0, 1).float()
         return torch.from_numpy(z).float(), clear
 
@@ -147,16 +156,15 @@ def make_dive(settings: DiveSettings) -> Dive:
 
     Raises UsageError where a survey's camera would see too far.
     """
-    later = settings.stereo_delay
+    floor: Seafloor | Plain
     if settings.path == "loop":
         floor = make_seafloor(settings.seed, settings.corals, settings.season)
-        of_side = [loop(floor, settings.frames, settings.stream(1), t * settings.fps) for t in (0.0, later)]
     else:
         floor = Plain(settings.seed, settings.corals, settings.season)
-        of_side = [survey(settings, t) for t in (0.0, later)]
-    poses = of_side[0]
-    if settings.sides:
-        poses = np.stack([of_side[0], right_of(of_side[1], settings.stereo)], 1).reshape(-1, 4, 4)
+    poses, motion = poses_of(settings, floor), None
+    if settings.readout:
+        before, after = (poses_of(settings, floor, sign * settings.readout / 2) for sign in (-1, 1))
+        motion = motion_between(before, after, poses)
     housed, count = behind_port(settings), len(poses)
     lens = housed.central if housed else lens_of(settings)
     cameras = replace(
@@ -167,7 +175,21 @@ def make_dive(settings: DiveSettings) -> Dive:
     )
     marked = settings.printed_markers
     plates = plates_along(floor, poses[:, :3, 3], marked, settings.printed_marker_size, settings.seed) if marked else []
-    return Dive(settings, _names(settings), cameras, water(settings), floor, tuple(plates), housed)
+    return Dive(settings, _names(settings), cameras, water(settings), floor, tuple(plates), housed, motion)
+
+
+def poses_of(settings: DiveSettings, floor: Seafloor | Plain, moment: float = 0.0) -> Float[np.ndarray, "n 4 4"]:
+    """cam2world of all cameras of a dive, `moment` seconds after their images."""
+
+    def side(later: float) -> Float[np.ndarray, "n 4 4"]:
+        if isinstance(floor, Plain):
+            return survey(settings, later + moment)
+        return loop(floor, settings.frames, settings.stream(1), later * settings.fps, moment * settings.fps)
+
+    if not settings.sides:
+        return side(0.0)
+    right = right_of(side(settings.stereo_delay), settings.stereo)
+    return np.stack([side(0.0), right], 1).reshape(-1, 4, 4)
 
 
 def write_dive(settings: DiveSettings, folder: Path, progress: Progress = silent) -> None:

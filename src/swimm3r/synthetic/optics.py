@@ -1,4 +1,4 @@
-"""The lens of a synthetic dive, in air or behind a port, and the exact ray of every pixel.
+"""The lens of a synthetic dive, in air or behind a port, the exact ray of every pixel, and a shutter that rolls.
 
 A ray is the line (x0, y0, 0) + z (x, y, 1) in camera axes, so that its parameter is the z depth. Behind a port the
 camera is the central one of `swimm3r.refraction.central`: the rays do not meet in it, and their z depth counts from it.
@@ -9,6 +9,7 @@ from dataclasses import dataclass
 import numpy as np
 import torch
 from jaxtyping import Float
+from scipy.spatial.transform import Rotation
 from torch import Tensor
 
 from swimm3r.cameras import Cameras, directions, pixel_grid, resized
@@ -38,7 +39,8 @@ def lens_of(settings: DiveSettings) -> Cameras:
     half = np.radians(settings.fov) / 2
     fisheye = settings.fisheye
     focal = np.hypot(width, height) / 2 / half if fisheye else width / 2 / np.tan(half)
-    K = torch.tensor([[[focal, 0, width / 2], [0, focal, height / 2], [0, 0, 1]]], dtype=torch.float64)
+    tall = focal * settings.squeeze
+    K = torch.tensor([[[focal, 0, width / 2], [0, tall, height / 2], [0, 0, 1]]], dtype=torch.float64)
     distortion = torch.zeros(1, 4 if fisheye else 0, dtype=torch.float64)
     model = "OPENCV_FISHEYE" if fisheye else "PINHOLE"
     return Cameras(K, distortion, torch.eye(4, dtype=torch.float64)[None], width, height, model)
@@ -72,3 +74,21 @@ def rays_of(lens: Cameras, housed: CameraInWater | None, factor: int = 1) -> Pix
     seen = through_port(inside, housed.port)
     direction = seen.direction / seen.direction[..., 2:]
     return PixelRays(seen.at_depth(housed.center)[..., :2], direction, seen.start[..., 2] - housed.center)
+
+
+def rolled(rays: PixelRays, motion: Float[np.ndarray, "6"]) -> PixelRays:
+    """The rays of an image whose rows are exposed one after another, in the axes of the camera at half time.
+
+    `motion` is that of the camera between the exposures of the first and the last row, even over that time: a rotation
+    vector and a translation (meters) in its axes at half time.
+    """
+    rows = len(rays.direction)
+    share = (np.arange(rows) + 0.5) / rows - 0.5
+    R = torch.from_numpy(Rotation.from_rotvec(share[:, None] * motion[:3]).as_matrix())
+    t = torch.from_numpy(share[:, None] * motion[3:])
+    start = torch.cat([rays.start, torch.zeros_like(rays.start[..., :1])], -1)
+    direction = torch.einsum("hij,hwj->hwi", R, rays.direction)
+    start = torch.einsum("hij,hwj->hwi", R, start) + t[:, None]
+    wet = start[..., 2] + rays.wet * direction[..., 2]
+    unit = direction / direction[..., 2:]
+    return PixelRays((start - start[..., 2:] * unit)[..., :2], unit, wet)

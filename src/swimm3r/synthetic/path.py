@@ -12,10 +12,11 @@ from swimm3r.synthetic.settings import DiveSettings
 CLEARANCE = 0.65  # m above what is below, after smoothing
 
 
-def loop(floor: Seafloor, frames: int, stream: list[int], later: float = 0.0) -> np.ndarray:
+def loop(floor: Seafloor, frames: int, stream: list[int], later: float = 0.0, moment: float = 0.0) -> np.ndarray:
     """cam2world [frames, 4, 4] (OpenCV axes) along the loop; `stream` seeds what differs from visit to visit.
 
-    `later` is the share of an interval between frames by which all of them are taken later.
+    `later` is the share of an interval between frames by which all of them are taken later; the path has 512 places,
+    the nearest of which is taken, and `moment` is a share from there on, between places.
     """
     rng = np.random.default_rng(stream)
     phase = rng.uniform(-0.3, 0.3, 6)
@@ -27,11 +28,14 @@ def loop(floor: Seafloor, frames: int, stream: list[int], later: float = 0.0) ->
     around = [height_at(floor, x + r * np.cos(a), y + r * np.sin(a)) for r in (0.0, 0.25, 0.5) for a in ring]
     below = ndimage.gaussian_filter1d(np.max(around, axis=0), 40, mode="wrap")
     z = below + CLEARANCE + 0.16 * np.sin(2 * turn + phase[3]) + 0.1
-    at = ((np.arange(frames) + later) * len(fine) // max(frames, 1)).astype(int) % len(fine)
+    at = ((np.arange(frames) + later) * len(fine) // max(frames, 1)).astype(int) + moment * len(fine) / max(frames, 1)
     yaw = 0.30 * np.sin(turn + np.pi + phase[4]) + 0.10 * np.sin(2 * turn + phase[5])
     pitch = np.radians(20) + np.radians(4) * np.sin(2 * turn + phase[1])
     roll = np.radians(5) * np.sin(turn + phase[2]) + np.radians(2.5) * np.sin(3 * turn + phase[0])
-    return _poses(np.stack([x, y, z], 1)[at], yaw[at], pitch[at], roll[at])
+    x, y, z, yaw, pitch, roll = (
+        np.interp(at, np.arange(len(fine)), v, period=len(fine)) for v in (x, y, z, yaw, pitch, roll)
+    )
+    return _poses(np.stack([x, y, z], 1), yaw, pitch, roll)
 
 
 PITCH = np.radians(65)  # below the horizon, of a survey's camera
@@ -61,6 +65,13 @@ def survey(settings: DiveSettings, later: float = 0.0) -> np.ndarray:
     poses = _poses(np.stack([x, y, settings.altitude + up], 1), heading + yaw, PITCH + pitch, roll)
     _check_reach(poses, settings)
     return poses
+
+
+def motion_between(before: np.ndarray, after: np.ndarray, middle: np.ndarray) -> np.ndarray:
+    """Motion [n, 6] of cameras from poses [n, 4, 4] to others: rotation vectors and translations in a middle's axes."""
+    ends = [np.linalg.inv(middle) @ poses for poses in (before, after)]
+    turns = [Rotation.from_matrix(poses[:, :3, :3]).as_rotvec() for poses in ends]
+    return np.concatenate([turns[1] - turns[0], ends[1][:, :3, 3] - ends[0][:, :3, 3]], 1)
 
 
 _TOE = np.radians([0.4, -0.9, 0.3])  # turns of the right camera about its x, y and z axes: no two are quite parallel
@@ -139,7 +150,7 @@ def _sway(seconds: np.ndarray, rng: np.random.Generator) -> list[np.ndarray]:
 def _check_reach(poses: np.ndarray, settings: DiveSettings) -> None:
     """Raise UsageError where a corner of an image may see past the reach of a patch."""
     tangent = np.tan(np.radians(settings.fov) / 2)
-    upright = tangent * settings.height / settings.width
+    upright = tangent * settings.height / settings.width / settings.squeeze
     corners = np.array([[i * tangent, j * upright, 1.0] for i in (-1, 1) for j in (-1, 1)])
     rays = corners @ poses[:, :3, :3].transpose(0, 2, 1)
     drop = poses[:, 2, 3] + _HOLLOWS

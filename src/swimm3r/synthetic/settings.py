@@ -93,6 +93,10 @@ class DiveSettings(Settings):
     """Height of the frames in pixels."""
     fov: Annotated[float, Range(10, 170)] = 56.0
     """Field of view in degrees in air: horizontal, or diagonal of a fisheye lens."""
+    squeeze: Annotated[float, Range(0.5, 2)] = 1.0
+    """Factor by which the image is narrower than the lens drew it: 4/3 for a film of 16:9 that is stored as 4:3."""
+    readout: Annotated[float, Range(0, 0.1)] = 0.0
+    """Seconds between the exposures of the first and the last row (rolling shutter); 0 exposes all at once."""
     fisheye: bool = False
     """Film through an equidistant fisheye lens, whose image grows evenly with the angle from the axis."""
     housing: HousingKind = "none"
@@ -162,6 +166,18 @@ class DiveSettings(Settings):
                 "a fisheye lens would see further than the synthetic plain shows",
                 cause=f"fisheye was asked for together with path={self.path!r}",
                 hint="path='loop', or no fisheye lens",
+            )
+        if (self.fisheye or self.housing != "none") and self.squeeze != 1:
+            raise UsageError(
+                "squeezed films are of plain lenses",
+                cause="squeeze was asked for together with a fisheye lens or a port",
+                hint="squeeze=1, or neither of them",
+            )
+        if self.printed_markers and self.readout:
+            raise UsageError(
+                "printed markers are seen by cameras that expose all rows at once",
+                cause="printed_markers was asked for together with readout",
+                hint="readout=0, or no printed markers",
             )
         if self.housing != "none" and (self.moving_object or self.printed_markers or self.lit_by == "lamp"):
             raise UsageError(

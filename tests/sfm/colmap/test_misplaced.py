@@ -10,7 +10,9 @@ import pytest
 from swimm3r.prepare import read_frames
 from swimm3r.progress import silent
 from swimm3r.scene.frames import Frames
-from swimm3r.sfm.colmap import calibration, epipolar_outliers, mapping, poses
+from swimm3r.sfm.colmap import epipolar_outliers, mapping, poses
+from swimm3r.sfm.colmap.calibration import start
+from swimm3r.sfm.colmap.calibration.start import lenses_of_pairs
 from swimm3r.sfm.colmap.epipolar_outliers import CheckedPair, checked_pairs, contradicting_frames
 from swimm3r.sfm.colmap.resection_outliers import misplaced_frames
 from swimm3r.sfm.features.database import FeatureDatabase
@@ -152,11 +154,11 @@ def test_all_frames_at_once_stay_in_place_though_the_lens_was_far_off(
 def test_the_lens_that_pairs_agree_on_is_tried_alone_unless_it_is_known(
     store: FeatureDatabase, monkeypatch: pytest.MonkeyPatch, known: float | None, expected: float
 ):
-    monkeypatch.setattr(calibration, "focal_of_pairs", lambda _: 0.7 * WIDTH)
+    monkeypatch.setattr(start, "focal_of_pairs", lambda _: 0.7 * WIDTH)
     settings = replace(SETTINGS, focal=None if known is None else known * WIDTH)
-    assert [lens.mean_focal_length() for lens in calibration.lenses_of_pairs(store, settings)] == [expected * WIDTH]
-    monkeypatch.setattr(calibration, "focal_of_pairs", lambda _: None)
-    tried = [lens.mean_focal_length() for lens in calibration.lenses_of_pairs(store, settings)]
+    assert [lens.mean_focal_length() for lens in lenses_of_pairs(store, settings)] == [expected * WIDTH]
+    monkeypatch.setattr(start, "focal_of_pairs", lambda _: None)
+    tried = [lens.mean_focal_length() for lens in lenses_of_pairs(store, settings)]
     assert tried == ([share * WIDTH for share in SETTINGS.mapping.focal_ladder] if known is None else [known * WIDTH])
 
 

@@ -15,10 +15,11 @@ from swimm3r.errors import InputError, RegistrationError, StorageError, UsageErr
 from swimm3r.geometry import align_similarity, rotation_angle, so3_exp
 from swimm3r.scene.frames import Frame, Frames
 from swimm3r.scene.reconstruction import Points, Reconstruction
-from swimm3r.sfm.colmap import calibration, plausibility
+from swimm3r.sfm.colmap import plausibility
 from swimm3r.sfm.colmap import poses as colmap
 from swimm3r.sfm.colmap.absolute_pose import absolute_pose
 from swimm3r.sfm.colmap.adjustment import bundle_adjust
+from swimm3r.sfm.colmap.calibration.start import first_camera, is_lens
 from swimm3r.sfm.colmap.messages import too_few
 from swimm3r.sfm.colmap.pairs import choose_pairs
 from swimm3r.sfm.features import database as feature_database
@@ -172,7 +173,7 @@ def test_an_interrupted_run_leaves_a_database_that_a_later_one_completes(
 
 
 def test_other_settings_start_a_new_database(frames: Frames, tmp_path: Path) -> None:
-    camera = calibration.first_camera(WIDTH, HEIGHT, SETTINGS)
+    camera = first_camera(WIDTH, HEIGHT, SETTINGS)
     store = feature_database.start_database(tmp_path, frames, camera, SETTINGS.features)
     with store.open() as database:
         database.write_keypoints(1, np.zeros((1, 4), np.float32))
@@ -270,7 +271,7 @@ def test_one_frame_is_an_input_error(frames: Frames, tmp_path: Path) -> None:
 )
 def test_settings_that_contradict_themselves_are_usage_errors(settings: ColmapSettings, message: str) -> None:
     with pytest.raises(UsageError, match=message):
-        calibration.first_camera(WIDTH, HEIGHT, settings)
+        first_camera(WIDTH, HEIGHT, settings)
 
 
 def test_a_full_disk_is_a_storage_error(frames: Frames, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
@@ -283,7 +284,7 @@ def test_a_full_disk_is_a_storage_error(frames: Frames, tmp_path: Path, monkeypa
 
 
 def test_video_is_matched_with_neighbors_and_lookalikes_only(rec, frames: Frames, folder: Path) -> None:
-    camera = calibration.first_camera(WIDTH, HEIGHT, SETTINGS)
+    camera = first_camera(WIDTH, HEIGHT, SETTINGS)
     store = feature_database.start_database(folder, frames, camera, SETTINGS.features)
     sparse = replace(SETTINGS, exhaustive_to=4, overlap=1, loops=1)
     pairs = choose_pairs(store, frames, sparse)
@@ -306,7 +307,7 @@ def test_only_what_can_be_a_lens_is_kept(params: list[float], believable: bool) 
     import pycolmap
 
     camera = pycolmap.Camera(model="SIMPLE_RADIAL", width=WIDTH, height=HEIGHT, params=params)
-    assert calibration.is_lens(camera) is believable
+    assert is_lens(camera) is believable
 
 
 @pytest.mark.parametrize(("tangential", "believable"), [(0.08, True), (-0.12, False)])
@@ -315,7 +316,7 @@ def test_a_lens_is_not_far_askew(tangential: float, believable: bool) -> None:
 
     params = [260, 260, 160, 120, 0.05, 0.0, 0.0, tangential]
     camera = pycolmap.Camera(model="OPENCV", width=WIDTH, height=HEIGHT, params=params)
-    assert calibration.is_lens(camera) is believable
+    assert is_lens(camera) is believable
 
 
 def test_pnp_finds_the_pose_among_outliers() -> None:
@@ -366,7 +367,7 @@ def test_a_tiled_floor_has_twins_and_a_reef_has_none() -> None:
 
 
 def test_halves_that_share_no_points_are_called_badly_joined(rec, frames: Frames, folder: Path) -> None:
-    camera = calibration.first_camera(WIDTH, HEIGHT, SETTINGS)
+    camera = first_camera(WIDTH, HEIGHT, SETTINGS)
     store = feature_database.start_database(folder, frames, camera, SETTINGS.features)
     first = rec.tracks.frame < COUNT // 2
     half = torch.where(first, rec.tracks.point, rec.tracks.point + len(rec.points.xyz))
@@ -380,7 +381,7 @@ def test_halves_that_share_no_points_are_called_badly_joined(rec, frames: Frames
 
 
 def test_a_camera_that_only_turned_is_implausible(rec, frames: Frames, folder: Path) -> None:
-    camera = calibration.first_camera(WIDTH, HEIGHT, SETTINGS)
+    camera = first_camera(WIDTH, HEIGHT, SETTINGS)
     store = feature_database.start_database(folder, frames, camera, SETTINGS.features)
     far = replace(rec, points=replace(rec.points, xyz=rec.points.xyz * 300))
     said = [warning.what for warning in plausibility.implausible(far, store, frames)]
@@ -400,7 +401,7 @@ def test_a_model_without_one_scale_is_refused(frames: Frames, folder: Path, rec,
 
 
 def test_a_leap_of_the_camera_is_said(rec, frames: Frames, folder: Path) -> None:
-    camera = calibration.first_camera(WIDTH, HEIGHT, SETTINGS)
+    camera = first_camera(WIDTH, HEIGHT, SETTINGS)
     store = feature_database.start_database(folder, frames, camera, SETTINGS.features)
     poses = rec.cameras.cam2world.clone()
     poses[5:, :3, 3] += 100 * rec.cameras.centers.std()
@@ -411,7 +412,7 @@ def test_a_leap_of_the_camera_is_said(rec, frames: Frames, folder: Path) -> None
 
 @pytest.mark.parametrize("seconds", [1.0, 2.0])
 def test_a_turn_over_a_frame_that_was_held_back_is_no_leap(rec, frames: Frames, folder: Path, seconds: float) -> None:
-    camera = calibration.first_camera(WIDTH, HEIGHT, SETTINGS)
+    camera = first_camera(WIDTH, HEIGHT, SETTINGS)
     store = feature_database.start_database(folder, frames, camera, SETTINGS.features)
     poses = rec.cameras.cam2world.clone()
     about = torch.tensor([0.0, math.radians(40.0), 0.0], dtype=torch.float64)

@@ -15,7 +15,9 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 from swimm3r.progress import Progress
-from swimm3r.sfm.colmap import calibration
+from swimm3r.sfm.colmap.calibration.adjust import SEED, STILL, THREADS
+from swimm3r.sfm.colmap.calibration.refinement import adjust_lens
+from swimm3r.sfm.colmap.calibration.start import lenses_of_pairs, lenses_to_try, set_camera
 from swimm3r.sfm.colmap.epipolar_outliers import contradicting_frames
 from swimm3r.sfm.colmap.resection_outliers import misplaced_frames
 from swimm3r.sfm.features.database import MIN_INLIERS, FeatureDatabase, flat_share
@@ -36,7 +38,7 @@ def map_frames(store: FeatureDatabase, settings: ColmapSettings, progress: Progr
     method = settings.mapping.method
     if method == "global":
         return _checked(store, _place_at_once(store, settings, progress), settings, progress).models
-    lenses = calibration.lenses(store, settings)
+    lenses = lenses_to_try(store, settings)
     one_by_one = _checked(store, _try_focal_lengths(store, lenses, settings, progress), settings, progress)
     if method == "incremental" or not one_by_one.models or not _leaves_doubt(store, one_by_one, settings):
         return one_by_one.models
@@ -53,9 +55,9 @@ def _place_at_once(
 
     Under a lens that is far off, frames bend the scene, stand against their own pairs and would be taken out for it.
     """
-    calibration.set_camera(store, calibration.lenses_of_pairs(store, settings)[0])
+    set_camera(store, lenses_of_pairs(store, settings)[0])
     models = _map_globally(store, settings, progress)
-    return [calibration.adjust_lens(store, model, settings, progress) for model in models[:1]] + models[1:]
+    return [adjust_lens(store, model, settings, progress) for model in models[:1]] + models[1:]
 
 
 @dataclass(frozen=True)
@@ -95,7 +97,7 @@ def _try_focal_lengths(
     """The models under the best of some lenses, which is left in the database."""
     best: list[pycolmap.Reconstruction] = []
     for k, lens in enumerate(lenses):
-        calibration.set_camera(store, lens)
+        set_camera(store, lens)
         what = "placing frames" if k == 0 else f"placing frames, lens {k + 1} of {len(lenses)}"
         models = _map_in_turn(store, settings, what, progress)
         frames, score = _quality(models)
@@ -106,7 +108,7 @@ def _try_focal_lengths(
         if best and best[0].num_reg_images() >= settings.mapping.enough * store.frames:
             break
     if best:
-        calibration.set_camera(store, best[0].cameras[1])
+        set_camera(store, best[0].cameras[1])
     return best
 
 
@@ -114,7 +116,7 @@ def place_leftovers(
     store: FeatureDatabase, model: "pycolmap.Reconstruction", settings: ColmapSettings, progress: Progress
 ) -> "pycolmap.Reconstruction":
     """The model with those of its missing frames that looser limits can place; the lens is held."""
-    calibration.set_camera(store, model.cameras[1])
+    set_camera(store, model.cameras[1])
     with tempfile.TemporaryDirectory(dir=store.path.parent, prefix=".mapping.") as folder:
         model.write_binary(folder)
         what, missing = "placing the frames left over", store.frames - model.num_reg_images()
@@ -183,13 +185,13 @@ def _map_in_turn(
 
     options = pycolmap.IncrementalPipelineOptions()
     options.extract_colors = False
-    options.num_threads = calibration.THREADS
-    options.random_seed = calibration.SEED
+    options.num_threads = THREADS
+    options.random_seed = SEED
     options.min_model_size = 2
     most = total or store.frames
     options.min_num_matches = MIN_INLIERS
     options.ba_refine_focal_length = options.ba_refine_extra_params = False
-    options.ba_global_function_tolerance = calibration.STILL
+    options.ba_global_function_tolerance = STILL
     options.mapper.abs_pose_refine_focal_length = options.mapper.abs_pose_refine_extra_params = False
     if goes_on_from is not None:
         options.multiple_models = False
@@ -225,8 +227,8 @@ def _map_globally(
     import pycolmap
 
     options = pycolmap.GlobalPipelineOptions()
-    options.num_threads = calibration.THREADS
-    options.random_seed = calibration.SEED
+    options.num_threads = THREADS
+    options.random_seed = SEED
     options.min_num_matches = MIN_INLIERS
     options.mapper.bundle_adjustment.refine_focal_length = False
     options.mapper.bundle_adjustment.refine_extra_params = False

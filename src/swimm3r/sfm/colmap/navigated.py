@@ -19,8 +19,8 @@ from swimm3r.progress import Progress
 from swimm3r.scene.frames import Frames
 from swimm3r.scene.placement import Navigator, Placement
 from swimm3r.scene.reconstruction import QualityWarning, Reconstruction
-from swimm3r.sfm.colmap import calibration
 from swimm3r.sfm.colmap.adjustment import WIDEST, robust_adjustment, typical_error
+from swimm3r.sfm.colmap.calibration.adjust import SEED, STILL, THREADS
 from swimm3r.sfm.colmap.chunks.assemble import assemble
 from swimm3r.sfm.colmap.chunks.join import Joined
 from swimm3r.sfm.colmap.chunks.parts import LEAST_FRAMES, part_of
@@ -99,7 +99,7 @@ def adjust_to_positions(
     images = {out.images[i].name: out.images[i] for i in out.reg_image_ids()}
     stated = [(images[name], prior) for name, prior in sorted(priors.items()) if name in images]
     prior_options = pycolmap.PosePriorBundleAdjustmentOptions()
-    prior_options.alignment_ransac.random_seed = calibration.SEED
+    prior_options.alignment_ransac.random_seed = SEED
     prior_options.ceres.prior_position_loss_function_type = pycolmap.LossFunctionType.CAUCHY
     prior_width = prior_options.ceres.prior_position_loss_scale
     for done in range(_ROUNDS):
@@ -108,8 +108,8 @@ def adjust_to_positions(
         width = typical_error(out) if done else WIDEST  # the priors move poses at first
         options = robust_adjustment(width)
         options.refine_focal_length = options.refine_extra_params = lens
-        options.ceres.solver_options.num_threads = calibration.THREADS
-        options.ceres.solver_options.function_tolerance = calibration.STILL
+        options.ceres.solver_options.num_threads = THREADS
+        options.ceres.solver_options.function_tolerance = STILL
         prior_options.ceres.prior_position_loss_scale = prior_width * width
         known = [_pose_prior(image, prior, width) for image, prior in stated]
         config = pycolmap.BundleAdjustmentConfig()

@@ -12,7 +12,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 from swimm3r.cameras import Cameras
-from swimm3r.errors import InputError, StorageError
+from swimm3r.errors import InputError, StorageError, UsageError
 from swimm3r.io.colmap.cameras import to_pycolmap_camera
 from swimm3r.io.colmap.model import silence_log
 from swimm3r.io.files.atomic import atomic_path
@@ -23,8 +23,10 @@ from swimm3r.scene.reconstruction import (
     QualityWarning,
     Reconstruction,
 )
-from swimm3r.sfm.colmap import calibration, mapping
+from swimm3r.sfm.colmap import mapping
 from swimm3r.sfm.colmap.adjustment import adjust_through_port
+from swimm3r.sfm.colmap.calibration.refinement import Calibrated, refine
+from swimm3r.sfm.colmap.calibration.start import first_camera
 from swimm3r.sfm.colmap.chunks.long_clip import is_long, map_long_clip
 from swimm3r.sfm.colmap.chunks.parts import without_jumps
 from swimm3r.sfm.colmap.messages import (
@@ -40,6 +42,7 @@ from swimm3r.sfm.colmap.pairs import choose_pairs
 from swimm3r.sfm.colmap.plausibility import depth_change, implausible
 from swimm3r.sfm.colmap.record import PARTS, record_of, write_parts
 from swimm3r.sfm.colmap.rig.lenses import RigLenses, lenses_of_rig
+from swimm3r.sfm.colmap.rolling_shutter import adjust_rolling
 from swimm3r.sfm.features.database import FeatureDatabase, fill_features, match_pairs, start_database
 from swimm3r.sfm.lens import behind_port, with_calibration
 from swimm3r.sfm.settings import ColmapSettings
@@ -85,12 +88,14 @@ def reconstruct(
         )
     silence_log()
     threads = settings.threads or thread_count()
-    housed = lenses = None
+    housed = lenses = shutter = None
+    if settings.shutter == "rolling":
+        _check_rolling(frames, navigator)
     if lens is None:
         given = settings
         settings = with_calibration(settings, frames.width, frames.height, frames.calibration)
         settings, housed = behind_port(settings, frames.width, frames.height)
-        camera = calibration.first_camera(frames.width, frames.height, settings)
+        camera = first_camera(frames.width, frames.height, settings)
         lenses = lenses_of_rig(frames, given, camera)
     else:
         camera, settings = to_pycolmap_camera(lens), replace(settings, intrinsics="fixed")
@@ -107,6 +112,11 @@ def reconstruct(
                 mapped = _navigated(mapped, working, frames, folder, navigator, progress, lenses)
             _check_placed(mapped.model, frames, settings)
             rec = record_of(mapped.model, working, frames, folder, lenses)
+            if settings.shutter == "rolling":
+                free = mapped.lens_refined and settings.intrinsics != "fixed"
+                times = frames.times_of(rec.names)
+                rolled = adjust_rolling(rec, times, settings.readout, lens=free, progress=progress)
+                rec, shutter = rolled.reconstruction, rolled.warning
             if housed is not None:
                 free = settings.intrinsics != "fixed"
                 rec = adjust_through_port(rec, housed, settings.port.range, lens=free, progress=progress)
@@ -116,8 +126,20 @@ def reconstruct(
                 raise scale_lost(len(rec.names), len(frames))
             found = implausible(rec, working, frames)
     port = [unknown_port()] if settings.housing == "flat" and housed is None else []
-    warnings = (*found, *mapped.warnings, *registration_warnings(len(rec.names), sizes, frames), *port)
+    shaken = [] if shutter is None else [shutter]
+    warnings = (*found, *mapped.warnings, *registration_warnings(len(rec.names), sizes, frames), *port, *shaken)
     return replace(rec, warnings=warnings)
+
+
+def _check_rolling(frames: Frames, navigator: Navigator | None) -> None:
+    """Raise UsageError where the exposure of rows is not corrected."""
+    other = "a rig's cameras" if frames.rig is not None else "--nav" if navigator is not None else None
+    if other is not None:
+        raise UsageError(
+            f"--shutter rolling and {other} exclude each other",
+            cause="the adjustment with rows exposed one after another knows a single camera and its images alone",
+            hint="leave out one of them",
+        )
 
 
 @contextmanager
@@ -176,15 +198,12 @@ def _map(
         looser = replace(settings.features, max_ratio=settings.mapping.retry_ratio)
         match_pairs(store, again, looser, threads, progress, again=True)
         if not long:
-            model = calibration.refine(store, model, settings, progress).model  # a better lens places more
+            model = refine(store, model, settings, progress).model  # a better lens places more
         more = mapping.place_leftovers(store, model, settings, progress)
         more = mapping.replace_misplaced(store, more, settings, progress)
         more = without_jumps(more)
         model = more if more.num_reg_images() >= model.num_reg_images() else model
-    if long:
-        calibrated = calibration.Calibrated(model, refined=determined)
-    else:
-        calibrated = calibration.refine(store, model, settings, progress)
+    calibrated = Calibrated(model, refined=determined) if long else refine(store, model, settings, progress)
     warnings = []
     if not calibrated.refined and settings.intrinsics != "fixed":
         warnings.append(assumed_lens(calibrated.model.cameras[1].focal_length_x))

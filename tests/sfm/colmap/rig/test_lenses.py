@@ -20,7 +20,8 @@ from swimm3r.scene.ground_truth import read_ground_truth
 from swimm3r.scene.reconstruction import Reconstruction
 from swimm3r.scene.rig import Rig
 from swimm3r.scene.settings import FrameSettings
-from swimm3r.sfm.colmap import calibration, poses
+from swimm3r.sfm.colmap import poses
+from swimm3r.sfm.colmap.calibration.start import first_camera
 from swimm3r.sfm.colmap.rig.adjustment import as_rig
 from swimm3r.sfm.colmap.rig.lenses import RigLenses, lenses_of_rig
 from swimm3r.sfm.features.sift import Features
@@ -97,7 +98,7 @@ def test_cameras_of_one_lens_keep_their_pixels(frames: tuple[Frames, torch.Tenso
     assert both.rig is not None
     left, right = both.rig.cameras
     settings = with_calibration(ColmapSettings(), WIDTH, HEIGHT, both.calibration)
-    first = calibration.first_camera(WIDTH, HEIGHT, settings)
+    first = first_camera(WIDTH, HEIGHT, settings)
     assert lenses_of_rig(both, ColmapSettings(), first) is not None
     assert (
         lenses_of_rig(replace(both, rig=Rig((left, replace(right, lens=left.lens)))), ColmapSettings(), first) is None
@@ -124,12 +125,12 @@ def test_keypoints_whose_rays_the_first_lens_does_not_have_are_left_out():
 def test_a_lens_or_a_port_that_the_settings_give_is_that_of_all_cameras(
     frames: tuple[Frames, torch.Tensor], given: ColmapSettings
 ):
-    first = calibration.first_camera(WIDTH, HEIGHT, given)
+    first = first_camera(WIDTH, HEIGHT, given)
     assert lenses_of_rig(frames[0], given, first) is None
 
 
 def test_without_the_lens_of_the_first_camera_that_of_another_is_not_used(frames: tuple[Frames, torch.Tensor]):
-    first = calibration.first_camera(WIDTH, HEIGHT, ColmapSettings())
+    first = first_camera(WIDTH, HEIGHT, ColmapSettings())
     assert lenses_of_rig(replace(frames[0], calibration=None), ColmapSettings(), first) is None
 
 
@@ -150,6 +151,6 @@ def test_a_fisheye_lens_beside_another_kind_is_refused(frames: tuple[Frames, tor
     assert both.rig is not None
     left, right = both.rig.cameras
     fisheye = f"1 OPENCV_FISHEYE {WIDTH} {HEIGHT} 150 150 {WIDTH / 2} {HEIGHT / 2} 0 0 0 0"
-    first = calibration.first_camera(WIDTH, HEIGHT, ColmapSettings(focal=225.0))
+    first = first_camera(WIDTH, HEIGHT, ColmapSettings(focal=225.0))
     with pytest.raises(InputError, match="fisheye"):
         lenses_of_rig(replace(both, rig=Rig((left, replace(right, lens=fisheye)))), ColmapSettings(), first)

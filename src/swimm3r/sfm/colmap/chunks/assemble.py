@@ -10,7 +10,8 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from swimm3r.progress import Progress
-from swimm3r.sfm.colmap import calibration
+from swimm3r.sfm.colmap.calibration.adjust import SEED
+from swimm3r.sfm.colmap.calibration.start import set_camera
 from swimm3r.sfm.colmap.chunks.join import Joined
 from swimm3r.sfm.colmap.chunks.parts import Part
 from swimm3r.sfm.features.database import MIN_INLIERS, FeatureDatabase
@@ -29,7 +30,7 @@ def assemble(
     import pycolmap
 
     poses = best_poses(parts, joined)
-    calibration.set_camera(store, camera)
+    set_camera(store, camera)
     options = pycolmap.DatabaseCacheOptions()
     options.min_num_matches = MIN_INLIERS
     options.image_names = {f"{image - 1:06d}" for image in poses}
@@ -43,7 +44,7 @@ def assemble(
         frame.set_cam_from_world(model.images[image].camera_id, pycolmap.Rigid3d(pycolmap.Rotation3d(R), t))
         model.register_frame(frame.frame_id)
     triangulation = pycolmap.IncrementalTriangulatorOptions()
-    triangulation.random_seed = calibration.SEED
+    triangulation.random_seed = SEED
     for done, image in enumerate(sorted(poses)):
         progress(_STEP, done, len(poses))
         mapper.triangulate_image(triangulation, image)

@@ -13,7 +13,8 @@ import numpy as np
 
 from swimm3r.io.files.cache_key import cache_key
 from swimm3r.progress import Progress
-from swimm3r.sfm.colmap import calibration
+from swimm3r.sfm.colmap.calibration.refinement import adjust_lens, adjust_poses
+from swimm3r.sfm.colmap.calibration.start import set_camera
 from swimm3r.sfm.colmap.chunks.assemble import assemble
 from swimm3r.sfm.colmap.chunks.join import Joined, join_parts
 from swimm3r.sfm.colmap.chunks.links import link
@@ -117,12 +118,12 @@ def _join(
     for group in sorted(groups, key=lambda group: _frames_of(group, parts), reverse=True):
         model = assemble(store, parts, group, lens, progress)
         if pilot.determined and not models:
-            model = calibration.adjust_lens(store, model, settings, progress, is_large=True)
+            model = adjust_lens(store, model, settings, progress, is_large=True)
             lens = model.cameras[1]
         else:
-            model = calibration.adjust_poses(store, model)
+            model = adjust_poses(store, model)
         models.append(without_jumps(model))
-    calibration.set_camera(store, lens)
+    set_camera(store, lens)
     return sorted(models, key=lambda model: model.num_reg_images(), reverse=True)
 
 

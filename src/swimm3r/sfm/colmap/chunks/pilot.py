@@ -18,7 +18,8 @@ from swimm3r.io.files.cache_key import cache_key
 from swimm3r.io.files.damage import remake
 from swimm3r.io.files.json_file import read_json
 from swimm3r.progress import Progress
-from swimm3r.sfm.colmap import calibration
+from swimm3r.sfm.colmap.calibration.refinement import refine
+from swimm3r.sfm.colmap.calibration.start import lenses_to_try
 from swimm3r.sfm.colmap.chunks.place import lens_with
 from swimm3r.sfm.colmap.mapping import map_frames
 from swimm3r.sfm.features.database import FeatureDatabase, write_excerpt
@@ -59,7 +60,7 @@ def pilot_lens(
 
     None where none of a few chunks can be placed. A lens that the user holds fixed is taken as it is.
     """
-    likely = calibration.lenses(store, settings)
+    likely = lenses_to_try(store, settings)
     if settings.intrinsics == "fixed":
         return _record("", likely[0], determined=False)
     path = folder / "lens.json"
@@ -77,7 +78,7 @@ def pilot_lens(
             models = map_frames(excerpt, settings, progress)
             if models:
                 share = models[0].num_reg_images() / len(chunks[k])
-                refined = calibration.refine(excerpt, models[0], settings, progress)
+                refined = refine(excerpt, models[0], settings, progress)
                 tried.append(_Trial(share, models[0].cameras[1], refined.model.cameras[1], refined.refined))
         if tried and tried[-1].share >= _ENOUGH:
             break

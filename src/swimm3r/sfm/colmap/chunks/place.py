@@ -16,7 +16,7 @@ from typing import TYPE_CHECKING
 from swimm3r.errors import DeviceError
 from swimm3r.io.files.atomic import atomic_folder
 from swimm3r.progress import Progress, silent
-from swimm3r.sfm.colmap import calibration
+from swimm3r.sfm.colmap.calibration.start import set_camera
 from swimm3r.sfm.colmap.chunks.parts import LEAST_FRAMES
 from swimm3r.sfm.colmap.mapping import map_frames
 from swimm3r.sfm.features.database import FeatureDatabase, write_excerpt
@@ -55,7 +55,7 @@ def place_chunk(task: ChunkTask, progress: Progress = silent) -> None:
         name, parameters = task.lens
         with store.open() as database:
             camera = database.read_camera(1)
-        calibration.set_camera(store, lens_with(camera, name, parameters))
+        set_camera(store, lens_with(camera, name, parameters))
         models = map_frames(store, replace(task.settings, intrinsics="fixed"), progress)
     with atomic_folder(task.folder) as draft:
         for k, model in enumerate(m for m in models if m.num_reg_images() >= LEAST_FRAMES):

@@ -23,7 +23,8 @@ from swimm3r.scene.frames import Frames
 from swimm3r.scene.reconstruction import Points, QualityWarning, Reconstruction, Tracks
 from swimm3r.scene.rig import PlacedCamera, Rig, RigFit, pose_of
 from swimm3r.sfm.colmap.adjustment import WIDEST, robust_adjustment, typical_error
-from swimm3r.sfm.colmap.calibration import STILL, THREADS, is_lens
+from swimm3r.sfm.colmap.calibration.adjust import STILL, THREADS
+from swimm3r.sfm.colmap.calibration.start import is_lens
 from swimm3r.sfm.rig_poses import LEAST, RigRows, delay_of, relative_scatter, relative_to_first, rig_rows, robust_mean
 from swimm3r.sfm.settings import ColmapSettings
 

@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
-from swimm3r.sfm.colmap.pair_focal import agreed_focal
+from swimm3r.sfm.colmap.calibration.pair_focal import agreed_focal
 
 WIDTH, HEIGHT = 400, 300
 

@@ -1,0 +1,59 @@
+"""The lens that a run found, for other clips of the same camera in the same mode."""
+
+import logging
+from pathlib import Path
+
+import numpy as np
+
+from swimm3r.cameras import DISTORTION_PARAMETERS
+from swimm3r.errors import UsageError
+from swimm3r.io.calibration.record import Calibration
+from swimm3r.io.cameras_json import CameraTable, read_cameras
+from swimm3r.io.files.damage import Remedy, guard
+
+CAMERAS = Path("sfm") / "cameras.json"
+_REMEDY = Remedy("name a run whose structure from motion is finished", fault="has no lens that can be read")
+
+log = logging.getLogger(__name__)
+
+
+def calibration_of_run(folder: Path) -> Calibration:
+    """The lens of a run folder, or of a folder of runs of one camera: that of the run with the most frames in place.
+
+    Raises UsageError where there is none, and InputError where a run's cameras are damaged or differ in their lens.
+    """
+    own = folder / CAMERAS
+    found = [own] if own.is_file() else sorted(folder.glob(str(Path("*") / CAMERAS)))
+    if not found:
+        raise UsageError(
+            f"{folder} is neither a run with a lens nor a folder of such runs",
+            cause="its structure from motion is not finished, or the name has a slip",
+            hint="--lens-from RUN, after swimm3r sfm has finished there",
+        )
+    tables = {path.parents[1]: read_cameras(path) for path in found}
+    chosen = max(tables, key=lambda run: len(tables[run].names))
+    if len(tables) > 1:
+        focals = ", ".join(f"{run.name} {_focal(table):.3f}" for run, table in tables.items())
+        log.info("lens of the run %s, with the most frames in place; focal lengths in widths: %s", chosen.name, focals)
+    with guard(found[0], _REMEDY):
+        return _calibration(chosen.name, tables[chosen])
+
+
+def _focal(table: CameraTable) -> float:
+    return float(table.K[0, 0, 0]) / table.width
+
+
+def _calibration(name: str, table: CameraTable) -> Calibration:
+    if np.ptp(table.K, axis=0).any() or np.ptp(table.distortion, axis=0).any():
+        raise ValueError(f"the cameras of {name} have several lenses")
+    numbers = dict(zip(DISTORTION_PARAMETERS[table.model], table.distortion[0].tolist(), strict=True))
+    p = numbers.pop("p1", 0.0), numbers.pop("p2", 0.0)
+    return Calibration(
+        name,
+        "Swimm3R",
+        (table.width, table.height),
+        np.asarray(table.K[0]),
+        fisheye=table.model == "OPENCV_FISHEYE",
+        k=tuple(numbers.values()),
+        p=p,
+    )
