@@ -89,6 +89,8 @@ def adjust_rolling(
         progress(_STEP, turn, _TURNS)
         off, std = _remaining(found, times, T)
         tried.append((T, off))
+        if not np.isfinite(std):  # nothing moves
+            break
         if turn and abs(off) * _taken_up(tried) < _EXACT * abs(T):
             break
         T = float(np.clip(_next(tried), -longest, longest))
@@ -123,9 +125,9 @@ def motion_of(cameras: Cameras, times: Sequence[float]) -> Motion:
 
 def not_shown(T: float, std: float) -> QualityWarning:
     """The warning about frames that do not say how fast their rows were read."""
+    found = f"a readout of {1e3 * T:.1f} ms, give or take {1e3 * std:.1f}" if np.isfinite(std) else "no time passes"
     return QualityWarning(
-        f"The frames do not show a rolling shutter (a readout of {1e3 * T:.1f} ms, give or take {1e3 * std:.1f}): all"
-        " rows are taken as exposed at once.",
+        f"The frames do not show a rolling shutter ({found}): all rows are taken as exposed at once.",
         "Give --readout in seconds, if it is known; or a higher --fps, so that the path between frames is smooth.",
     )
 
