@@ -141,6 +141,15 @@ def behind_port(settings: Given, width: int, height: int) -> tuple[Given, Camera
     return replace(settings, camera=lens.model, focal=fx, fy=fy, cx=cx, cy=cy, **numbers), housed
 
 
+def at_scale(settings: ColmapSettings, width: int, height: int, scale: float) -> ColmapSettings:
+    """The settings of frames of this size for frames that are enlarged by a factor: a lens in their pixels."""
+    if scale == 1:
+        return settings
+    cx, cy = (half if own is None else own for own, half in ((settings.cx, width / 2), (settings.cy, height / 2)))
+    focal, fy = (None if f is None else f * scale for f in (settings.focal, settings.fy))
+    return replace(settings, focal=focal, fy=fy, cx=cx * scale, cy=cy * scale)
+
+
 def model_of(settings: ColmapSettings | Mast3rSettings) -> str:
     """The camera model of the lens that settings begin with."""
     if settings.camera != "auto":

@@ -44,7 +44,7 @@ from swimm3r.sfm.colmap.record import PARTS, record_of, write_parts
 from swimm3r.sfm.colmap.rig.lenses import RigLenses, lenses_of_rig
 from swimm3r.sfm.colmap.rolling_shutter import adjust_rolling
 from swimm3r.sfm.features.database import FeatureDatabase, fill_features, match_pairs, start_database
-from swimm3r.sfm.lens import behind_port, with_calibration
+from swimm3r.sfm.lens import at_scale, behind_port, with_calibration
 from swimm3r.sfm.settings import ColmapSettings
 from swimm3r.tasks.settings import EngineSettings
 from swimm3r.tasks.threads import thread_count
@@ -107,7 +107,8 @@ def reconstruct(
         pairs = choose_pairs(store, frames, settings)
         match_pairs(store, pairs, settings.features, threads, progress)
         with _working_copy(store) as working:
-            mapped = _map(working, frames, pairs, settings, progress, engine)
+            own = at_scale(settings, frames.width, frames.height, store.scale)
+            mapped = _map(working, frames, pairs, own, progress, engine)
             if navigator is not None:
                 mapped = _navigated(mapped, working, frames, folder, navigator, progress, lenses)
             _check_placed(mapped.model, frames, settings)
@@ -120,7 +121,7 @@ def reconstruct(
             if housed is not None:
                 free = settings.intrinsics != "fixed"
                 rec = adjust_through_port(rec, housed, settings.port.range, lens=free, progress=progress)
-            parts = write_parts(mapped.model, mapped.others, frames, folder / PARTS, lenses)
+            parts = write_parts(mapped.model, mapped.others, working, frames, folder / PARTS, lenses)
             sizes = [mapped.model.num_reg_images(), *parts]
             if depth_change(rec) > LOST_SCALE:
                 raise scale_lost(len(rec.names), len(frames))
@@ -149,7 +150,7 @@ def _working_copy(store: FeatureDatabase) -> Iterator[FeatureDatabase]:
     """
     for leftover in store.path.parent.glob(".mapping.*"):  # of a killed run
         shutil.rmtree(leftover)
-    working = FeatureDatabase(store.path.with_name("mapping.db"), store.frames)
+    working = replace(store, path=store.path.with_name("mapping.db"))
     try:
         with atomic_path(working.path) as draft:
             shutil.copyfile(store.path, draft)
@@ -206,7 +207,7 @@ def _map(
     calibrated = Calibrated(model, refined=determined) if long else refine(store, model, settings, progress)
     warnings = []
     if not calibrated.refined and settings.intrinsics != "fixed":
-        warnings.append(assumed_lens(calibrated.model.cameras[1].focal_length_x))
+        warnings.append(assumed_lens(calibrated.model.cameras[1].focal_length_x / store.scale))
     return _Mapped(calibrated.model, models[1:], calibrated.refined, warnings)
 
 

@@ -33,9 +33,10 @@ def record_of(
 ) -> Reconstruction:
     """The record of a model whose images are named by their number in the clip; `folder` is the run's sfm.
 
-    With `lenses` keypoints of the database and the model are in pixels of a rig's first lens.
+    It is in pixels of the frames. With `lenses` keypoints of the database and the model are as a rig's first lens has
+    them.
     """
-    table = from_pycolmap(model)
+    table = _in_pixels_of(frames, from_pycolmap(model), store.scale)
     index = [int(name) for name in table.names]
     table = replace(table, names=tuple(frames.names[i] for i in index))
     matches = verified_matches(store, index)
@@ -52,6 +53,22 @@ def record_of(
     )
 
 
+def _in_pixels_of(frames: Frames, table: ColmapModel, scale: float) -> ColmapModel:
+    """The model of a database of so many pixels per pixel of the frames in pixels of the frames."""
+    if scale == 1:
+        return table
+    K = table.K.copy()
+    K[:, :2] /= scale
+    return replace(
+        table,
+        width=frames.width,
+        height=frames.height,
+        K=K,
+        error=table.error / scale,
+        track_xy=table.track_xy / scale,
+    )
+
+
 def _colors(table: ColmapModel, frames: Frames, index: list[int]) -> Float[Tensor, "p 3"]:
     total = torch.zeros(len(table.xyz), 3)
     point, frame = torch.from_numpy(table.track_point), torch.from_numpy(table.track_frame)
@@ -63,12 +80,15 @@ def _colors(table: ColmapModel, frames: Frames, index: list[int]) -> Float[Tenso
 
 
 def verified_matches(store: FeatureDatabase, index: list[int]) -> Matches:
-    """The verified matches among the database's frames of these numbers; `index[k]` is frame k of the result."""
+    """The verified matches among the database's frames of these numbers, in pixels of the frames.
+
+    `index[k]` is frame k of the result.
+    """
     import pycolmap
 
     row_of = {i: row for row, i in enumerate(index)}
     with store.open() as database:
-        pixels = {i: torch.from_numpy(database.read_keypoints(i + 1)[:, :2].astype(np.float32)) for i in index}
+        pixels = {i: torch.from_numpy(database.read_keypoints(i + 1)[:, :2] / np.float32(store.scale)) for i in index}
         found = [
             (*(image - 1 for image in pycolmap.pair_id_to_image_pair(pair)), count)
             for pair, count in sorted(zip(*database.read_two_view_geometry_num_inliers(), strict=True))
@@ -95,6 +115,7 @@ def verified_matches(store: FeatureDatabase, index: list[int]) -> Matches:
 def write_parts(
     model: "pycolmap.Reconstruction",
     others: "list[pycolmap.Reconstruction]",
+    store: FeatureDatabase,
     frames: Frames,
     folder: Path,
     lenses: RigLenses | None = None,
@@ -112,7 +133,7 @@ def write_parts(
             continue
         known |= own
         sizes.append(len(own))
-        table = from_pycolmap(other)
+        table = _in_pixels_of(frames, from_pycolmap(other), store.scale)
         if lenses is not None:
             table = lenses.own_model(table, [int(name) for name in table.names])
         write_model(folder / f"{len(sizes)}", replace(table, names=tuple(frames.names[int(n)] for n in table.names)))

@@ -18,7 +18,7 @@ from swimm3r.scene.frames import Frames
 from swimm3r.scene.reconstruction import Points, Reconstruction, Tracks
 from swimm3r.sfm.colmap.pairs import choose_pairs
 from swimm3r.sfm.colmap.record import verified_matches
-from swimm3r.sfm.features.database import fill_features, match_pairs, start_database
+from swimm3r.sfm.features.database import fill_features, match_pairs, scaled_camera, start_database
 from swimm3r.sfm.settings import ColmapSettings, FeatureSettings
 from swimm3r.sfm.tracks import MatchTracks, as_points
 from swimm3r.tasks.threads import thread_count
@@ -46,6 +46,9 @@ def triangulate(
     camera = to_pycolmap(bare).cameras[1]
     camera.has_prior_focal_length = True
     store = start_database(folder, placed, camera, settings)
+    for each in model.cameras.values():
+        own = scaled_camera(each, store.scale)
+        each.width, each.height, each.params = own.width, own.height, own.params
     fill_features(store, placed, settings, threads, progress)
     match_pairs(store, choose_pairs(store, placed, ColmapSettings()), settings, threads, progress)
     options = pycolmap.IncrementalPipelineOptions()
@@ -57,14 +60,15 @@ def triangulate(
         found = pycolmap.triangulate_points(model, str(store.path), str(folder), scratch, options=options)
         progress("triangulating points", 1, 1)
     made = from_pycolmap(found)
+    track_xy = made.track_xy / store.scale
     rows = np.array([int(name) for name in made.names])
     tracks = MatchTracks(
         torch.from_numpy(made.xyz),
         torch.from_numpy(made.track_point),
         torch.from_numpy(rows[made.track_frame].astype(np.int64)),
-        torch.from_numpy(made.track_xy).long(),
+        torch.from_numpy(track_xy).long(),
     )
-    points, observations = as_points(tracks, torch.from_numpy(made.track_xy), rec.cameras, frames, order)
+    points, observations = as_points(tracks, torch.from_numpy(track_xy), rec.cameras, frames, order)
     old = rec.points
     return replace(
         rec,

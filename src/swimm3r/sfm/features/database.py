@@ -1,7 +1,9 @@
 """COLMAP's database of one dive: keypoints per frame, verified matches per pair; what is in it is not computed again.
 
 Frames stand in it as 000000, 000001, ... in the order of `Frames`, all of one camera; keypoints of a rig's frames that
-have another lens stand where the one lens has their rays. Two-view geometry is verified by fundamental matrix and
+have another lens stand where the one lens has their rays. Its pixels are those of the images that keypoints are found
+in: COLMAP's limits of a few pixels are meant for keypoints that are exact to one, and those of an image of 3840 pixels
+that was reduced to 1000 would be four times as far off. Two-view geometry is verified by fundamental matrix and
 homography as long as nobody knows the focal length, so that matches outlive any guess of it.
 
 Nothing is written in COLMAP's transactions: one that meets a full disk aborts the process. Instead the last write of a
@@ -47,6 +49,7 @@ class FeatureDatabase:
 
     path: Path
     frames: int
+    scale: float = 1.0  # pixels of the database per pixel of the frames
 
     @contextmanager
     def open(self) -> "Iterator[pycolmap.Database]":
@@ -69,7 +72,8 @@ def start_database(
 ) -> FeatureDatabase:
     """The database in `folder`, new unless the one there was made of the same frames with the same settings.
 
-    `lenses` are the numbers of those that keypoints are moved from, see `fill_features`.
+    `camera` is in pixels of the frames. `lenses` are the numbers of those that keypoints are moved from, see
+    `fill_features`.
     """
     path, about = folder / "database.db", folder / "database.json"
     content = {
@@ -81,7 +85,11 @@ def start_database(
     }
     if lenses:
         content["lenses"] = [list(numbers) for numbers in lenses]
-    out = FeatureDatabase(path, len(frames))
+    scale = min(1.0, settings.long_side / max(frames.width, frames.height))
+    if scale < 1:
+        content["scale"] = scale
+        camera = scaled_camera(camera, scale)
+    out = FeatureDatabase(path, len(frames), scale)
     described = json.dumps(content)
     if path.is_file() and about.is_file() and about.read_bytes() == described.encode():
         if _is_whole(path, len(frames)):
@@ -97,6 +105,23 @@ def start_database(
         camera_id = database.write_camera(camera, use_camera_id=True)
         _write_frames(database, camera_id, range(len(frames)))
     write_text(about, described)
+    return out
+
+
+def scaled_camera(camera: "pycolmap.Camera", scale: float) -> "pycolmap.Camera":
+    """The camera of images that are enlarged by a factor; width and height are rounded, the lens is not."""
+    import pycolmap
+
+    pixels = {*camera.focal_length_idxs(), *camera.principal_point_idxs()}
+    params = [value * scale if i in pixels else value for i, value in enumerate(camera.params)]
+    out = pycolmap.Camera(
+        model=camera.model,
+        width=round(camera.width * scale),
+        height=round(camera.height * scale),
+        params=params,
+        camera_id=camera.camera_id,
+    )
+    out.has_prior_focal_length = camera.has_prior_focal_length
     return out
 
 
@@ -125,7 +150,7 @@ def write_excerpt(store: FeatureDatabase, path: Path, images: Sequence[int]) -> 
         for i, j in itertools.combinations(images, 2):
             if database.exists_two_view_geometry(i, j):
                 excerpt.write_two_view_geometry(new_id[i], new_id[j], database.read_two_view_geometry(i, j))
-    return FeatureDatabase(path, len(images))
+    return FeatureDatabase(path, len(images), store.scale)
 
 
 def _write_frames(database: "pycolmap.Database", camera_id: int, numbers: Sequence[int]) -> None:
@@ -166,7 +191,8 @@ def fill_features(
 ) -> None:
     """Extract the keypoints of the frames that have none yet.
 
-    `under_one_lens` gives those of a frame, by its number, as the lens of the database would have them.
+    `under_one_lens` gives those of a frame, by its number, as the lens of the database would have them, in pixels of
+    the frames.
     """
     import pycolmap
 
@@ -176,7 +202,10 @@ def fill_features(
 
     def extract(i: int) -> tuple[int, Features]:
         found = extract_features(frames.image(i), frames.mask(i), settings)
-        return i, found if under_one_lens is None else under_one_lens(i, found)
+        found = found if under_one_lens is None else under_one_lens(i, found)
+        if store.scale < 1:
+            found.keypoints[:, :3] *= store.scale  # column, row, size
+        return i, found
 
     progress("finding features", done, store.frames)
     for start in range(0, len(missing), _BATCH):

@@ -18,7 +18,7 @@ import shutil
 import tempfile
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import TYPE_CHECKING
 
@@ -27,7 +27,6 @@ import numpy as np
 from swimm3r.io.colmap.cameras import under_model
 from swimm3r.progress import Progress
 from swimm3r.sfm.colmap.calibration.adjust import adjusted, settled
-from swimm3r.sfm.colmap.calibration.start import is_lens
 from swimm3r.sfm.features.database import FeatureDatabase
 
 if TYPE_CHECKING:
@@ -138,10 +137,8 @@ _NOTHING = Kept(0, 0.0)
 def _held_out(
     store: FeatureDatabase, own: "pycolmap.Reconstruction", other: "pycolmap.Reconstruction", family: LensFamily
 ) -> Kept:
-    """Observations of other frames that the lens fitted to some keeps; none where it is no lens."""
-    lens = fitted(store, own, family, _free(family)).cameras[1]
-    if not is_lens(lens):
-        return _NOTHING
+    """Observations of other frames that the lens fitted to some keeps; none where it loses frames."""
+    lens = fitted(store, own, family, _free(family)).cameras[1]  # no real one, perhaps: then it errs on other frames
     held = _with_lens(other, lens)
     held = settled(lambda model: adjusted(store, model, lens.model.name), held)
     if held.num_reg_images() < other.num_reg_images():
@@ -198,7 +195,7 @@ def _stretched(
     _set_lens(out, family.model, [focal, cx, cy * tall, k], round(lens.height * tall))
     out.update_point_3d_errors()
     with tempfile.TemporaryDirectory(dir=store.path.parent, prefix=".mapping.") as folder:
-        own = FeatureDatabase(Path(folder) / "database.db", store.frames)
+        own = replace(store, path=Path(folder) / "database.db")
         shutil.copyfile(store.path, own.path)
         with own.open() as database:
             database.update_camera(out.cameras[1])
