@@ -13,6 +13,7 @@ import torch
 from swimm3r.cameras import Cameras, project
 from swimm3r.errors import InputError, RegistrationError, StorageError, UsageError
 from swimm3r.geometry import align_similarity, rotation_angle, so3_exp
+from swimm3r.prepare import read_frames
 from swimm3r.scene.frames import Frame, Frames
 from swimm3r.scene.reconstruction import Points, Reconstruction
 from swimm3r.sfm.colmap import plausibility
@@ -24,6 +25,8 @@ from swimm3r.sfm.colmap.messages import too_few
 from swimm3r.sfm.colmap.pairs import choose_pairs
 from swimm3r.sfm.features import database as feature_database
 from swimm3r.sfm.settings import ColmapSettings, MappingSettings
+from swimm3r.synthetic import write_dive
+from swimm3r.synthetic.settings import DiveSettings
 
 WIDTH, HEIGHT, FOCAL, COUNT = 320, 240, 260.0, 8
 SETTINGS = ColmapSettings(threads=2)
@@ -432,3 +435,24 @@ def test_a_murky_real_clip_is_placed_without_any_prior(shared: Path, tmp_path: P
     found = colmap.reconstruct(real, SETTINGS, tmp_path)
     assert len(found.names) >= 0.9 * len(real)
     assert not any("implausible" in warning.what for warning in found.warnings)
+
+
+def test_frames_larger_than_the_images_of_keypoints_are_mapped_in_their_pixels(tmp_path: Path):
+    settings = replace(SETTINGS, features=replace(SETTINGS.features, long_side=160))
+    dive = DiveSettings(frames=10, width=240, height=160)
+    write_dive(dive, tmp_path / "dive")
+    frames = read_frames(tmp_path / "dive", folder=tmp_path / "prepare").train
+    rec = colmap.reconstruct(frames, settings, tmp_path / "sfm")
+    store = feature_database.FeatureDatabase(tmp_path / "sfm" / "database.db", len(frames))
+    with store.open() as database:
+        assert (database.read_camera(1).width, database.read_camera(1).height) == (160, 107)
+        assert database.read_keypoints(1)[:, 0].max() <= 160
+    assert (rec.cameras.width, rec.cameras.height) == (240, 160)
+    focal = 120 / np.tan(np.deg2rad(dive.fov / 2))
+    assert rec.cameras.K[0, 0, 0].item() == pytest.approx(focal, rel=0.05)
+    assert rec.cameras.K[0, :2, 2].tolist() == pytest.approx([120, 80])
+    assert rec.tracks.xy[:, 0].max() > 170
+    assert rec.matches.xy_i[:, 0].max() > 170
+    pixels = project(rec.cameras[0], rec.points.xyz[None].double())[0][0]
+    own = rec.tracks.frame == 0
+    assert (pixels[rec.tracks.point[own]] - rec.tracks.xy[own]).norm(dim=1).median() < 1
