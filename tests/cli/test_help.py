@@ -124,6 +124,7 @@ def test_options_of_one_name_take_the_same_values():
         "--frames", "--seed",
         "--fps",  # 0 takes every frame of a video; a synthetic dive has no such rate
         "--path",  # of a synthetic dive, and of the views of a map
+        "--readout",  # of a synthetic camera, and of one that may be upside down or not known
     }  # fmt: skip
     kinds: dict[str, set[str]] = {}
     for options in all_options().values():

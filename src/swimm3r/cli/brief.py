@@ -32,7 +32,7 @@ BRIEF: dict[tuple[str, ...], Groups] = {
         "input": _INPUT,
         "output": _OUTPUT,
         "speed and quality": _SETTINGS,
-        "camera and poses": ("--backend", *_CAMERA, "--calibration", "--lens-from", "--shutter", "--reference"),
+        "camera and poses": ("--backend", *_CAMERA, "--calibration", "--lens-from", "--reference"),
         "": _MESSAGES,
     },
     ("splat",): {
@@ -47,7 +47,7 @@ BRIEF: dict[tuple[str, ...], Groups] = {
         "output": ("--out", "--redo", "--last-stage"),
         "speed and quality": (*_SETTINGS, "--recipe"),
         "place of the work": ("--engine", "--jobs", "--retries"),
-        "camera and poses": ("--backend", "--housing", "--focal", "--lens-from"),
+        "camera and poses": ("--backend", "--housing", "--focal"),
         "": _MESSAGES,
     },
     ("train-sfm",): {
