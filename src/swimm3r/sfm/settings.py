@@ -244,7 +244,8 @@ class MappingSettings(Settings):
     thin_share: Share = 0.6
     """Share of the frames from which a model with few points is accepted."""
     opencv_gain: Share = 0.03
-    """Relative decrease of the reprojection error from which camera `auto` uses OPENCV's additional parameters."""
+    """Relative decrease of the reprojection error from which camera `auto` compares lenses on frames that they were not
+    fitted to, and by which one with more freedom must be better there."""
 
 
 @dataclass(frozen=True)

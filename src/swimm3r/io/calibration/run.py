@@ -35,7 +35,7 @@ def calibration_of_run(folder: Path) -> Calibration:
     if len(tables) > 1:
         focals = ", ".join(f"{run.name} {_focal(table):.3f}" for run, table in tables.items())
         log.info("lens of the run %s, with the most frames in place; focal lengths in widths: %s", chosen.name, focals)
-    with guard(found[0], _REMEDY):
+    with guard(chosen / CAMERAS, _REMEDY):
         return _calibration(chosen.name, tables[chosen])
 
 
