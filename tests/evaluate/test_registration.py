@@ -8,7 +8,15 @@ from scipy.ndimage import gaussian_filter
 
 from swimm3r.evaluate import NotComputed
 from swimm3r.evaluate.images import psnr
-from swimm3r.evaluate.registration import Displacement, displacement, fit_colors, psnr_affine, recolored_by_halves
+from swimm3r.evaluate.registration import (
+    Displacement,
+    displacement,
+    fit_colors,
+    psnr_affine,
+    recolored_by_halves,
+    recolored_by_tiles,
+)
+from swimm3r.shading import ORDERS, gains
 
 HEIGHT, WIDTH = 180, 240
 INNER = torch.zeros(HEIGHT, WIDTH, dtype=torch.bool)
@@ -125,3 +133,29 @@ def test_no_pixel_is_compared_in_colors_that_it_was_fitted_to(ground):
 def test_a_half_that_nobody_trusts_recolors_nothing(ground):
     nowhere = torch.zeros(HEIGHT, WIDTH, dtype=torch.bool)
     assert torch.equal(recolored_by_halves(ground, 0.5 * ground, nowhere), ground)
+
+
+def test_recoloring_by_tiles_undoes_a_smooth_gain(ground):
+    shading = 0.06 * torch.randn(len(ORDERS), 3, generator=torch.Generator().manual_seed(1))
+    everywhere = torch.ones(HEIGHT, WIDTH, dtype=torch.bool)
+    target = (ground @ RECOLOR.mT + 0.05) * gains(shading, HEIGHT, WIDTH).permute(1, 2, 0)
+    after = recolored_by_tiles(ground, target, everywhere)
+    assert psnr(after, target) > psnr(recolored_by_halves(ground, target, everywhere), target) + 6
+    assert psnr(after, target) > 35
+
+
+def test_no_tile_is_compared_in_colors_that_it_was_fitted_to(ground):
+    everywhere = torch.ones(HEIGHT, WIDTH, dtype=torch.bool)
+    row, column = torch.arange(HEIGHT)[:, None] // 30, torch.arange(WIDTH) // 30
+    dark = (row + column) % 2 == 0
+    other = torch.where(dark[..., None], 0.5 * ground.flip(-1), ground)
+    first, second = (recolored_by_tiles(ground, target, everywhere) for target in (ground, other))
+    torch.testing.assert_close(first[dark], second[dark])
+    assert (first[~dark] - second[~dark]).abs().mean() > 0.05
+
+
+def test_a_gain_finer_than_the_tiles_is_not_taken_for_one(ground):
+    noise = torch.randn(HEIGHT, WIDTH, 3, generator=torch.Generator().manual_seed(2))
+    target = ground + 0.03 * noise
+    everywhere = torch.ones(HEIGHT, WIDTH, dtype=torch.bool)
+    assert abs(psnr(recolored_by_tiles(ground, target, everywhere), target) - psnr(ground, target)) < 0.1

@@ -6,6 +6,7 @@ import pytest
 import torch
 
 from swimm3r.imaging.frame_colors import ColorTracks, about_identity, fit_frame_colors, identity_maps
+from swimm3r.shading import ORDERS, cosines
 
 FRAMES, POINTS = 24, 3000
 BINF, BETA_D, BETA_B = torch.tensor([0.1, 0.5, 0.5]), torch.tensor([0.4, 0.15, 0.12]), torch.tensor([0.3, 0.25, 0.2])
@@ -163,3 +164,40 @@ def test_a_record_of_something_else_explains_nothing_and_leaves_the_maps_as_they
     assert other.evidence.by_record is not None
     assert other.evidence.by_record < 0.3 < without.evidence.by_frames
     assert (other.maps - without.maps).abs().max() < 0.02
+
+
+def shaded(tracks: ColorTracks, size: float) -> tuple[ColorTracks, torch.Tensor]:
+    """The same tracks at random places of their images, in gains that change over each image."""
+    rng = torch.Generator().manual_seed(4)
+    waves = cosines(torch.rand(len(tracks.point), 2, generator=rng))
+    shading = size * torch.randn(FRAMES, len(ORDERS), 3, generator=rng)
+    shading = shading - shading.mean(0)
+    gain = torch.einsum("ok,okc->oc", waves, shading[tracks.frame]).exp()
+    return replace(tracks, color=tracks.color * gain, cosines=waves), shading
+
+
+@pytest.mark.parametrize("known_water", [True, False])
+def test_gains_that_change_over_the_image_are_found(known_water):
+    tracks, shading = shaded(dive(jitter()), 0.05)
+    if not known_water:
+        tracks = replace(tracks, T_D=None, backscatter=None)
+    found = fit_frame_colors(tracks)
+    assert found is not None
+    assert found.evidence.by_shading is not None
+    assert found.evidence.by_shading > 0.7
+    assert found.shaded is not None
+    assert float((found.shaded.shading - shading).square().mean().sqrt()) < 0.012
+    torch.testing.assert_close(found.shaded.shading.mean(0), torch.zeros(len(ORDERS), 3), atol=1e-6, rtol=0)
+
+
+def test_water_and_exposure_are_not_read_as_gains_over_the_image():
+    tracks = dive(jitter(), rise=1.5)
+    # places that tell the distance, as ground that recedes toward the upper border does
+    far = (tracks.ray_depth - tracks.ray_depth.min()) / (tracks.ray_depth.max() - tracks.ray_depth.min())
+    aside = torch.rand(len(far), generator=torch.Generator().manual_seed(6))
+    found = fit_frame_colors(replace(tracks, cosines=cosines(torch.stack([aside, 1 - far], -1))))
+    assert found is not None
+    assert found.evidence.by_shading is not None
+    assert found.evidence.by_shading < 0.05
+    assert found.shaded is not None
+    assert float(found.shaded.shading.abs().mean()) < 0.01

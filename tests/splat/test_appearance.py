@@ -9,10 +9,11 @@ import torch
 from swimm3r.cameras import project_visible
 from swimm3r.errors import InputError
 from swimm3r.evaluate.images import psnr
-from swimm3r.imaging.frame_colors import identity_maps
+from swimm3r.imaging.frame_colors import about_identity, identity_maps
 from swimm3r.io.images import write_rgb
 from swimm3r.scene.frames import Frames
 from swimm3r.scene.reconstruction import Reconstruction, Tracks
+from swimm3r.shading import ORDERS, gains
 from swimm3r.splat import train
 from swimm3r.splat.appearance import (
     FrameColors,
@@ -165,20 +166,23 @@ class StoppedError(Exception):
     pass
 
 
-def test_an_interrupted_training_goes_on_with_its_colors(tracked, relit, tmp_path):
+def test_an_interrupted_training_goes_on_with_its_colors(tracked, tone_mapped, tmp_path):
     short = replace(SETTINGS, iterations=40)
 
     def stop(what: str, done: int, total: int, /) -> None:
         if done == 29:
             raise StoppedError
 
-    whole = train(tracked, relit, short, tmp_path / "whole")
+    whole = train(tracked, tone_mapped, short, tmp_path / "whole")
     with pytest.raises(StoppedError):
-        train(tracked, relit, short, tmp_path / "cut", stop)
-    resumed = train(tracked, relit, short, tmp_path / "cut")
+        train(tracked, tone_mapped, short, tmp_path / "cut", stop)
+    resumed = train(tracked, tone_mapped, short, tmp_path / "cut")
     assert whole.colors is not None
     assert resumed.colors is not None
     assert torch.equal(whole.colors.maps, resumed.colors.maps)
+    assert whole.colors.shading is not None
+    assert resumed.colors.shading is not None
+    assert torch.equal(whole.colors.shading, resumed.colors.shading)
     assert torch.equal(whole.primitives.xyz, resumed.primitives.xyz)
     stored = load_map(tmp_path / "cut/map.safetensors").colors
     assert stored is not None
@@ -201,7 +205,7 @@ def test_a_refit_composes_with_the_maps_of_before():
     ]
     filmed = {name: image.reshape(3, 20, 24) for name, image in zip(colors.names, images, strict=True)}
     fits = [fit_to_view(scene, colors.common(name, filmed[name]), seen) for name in colors.names]
-    after = colors.refitted(torch.stack(fits))
+    after = colors.refitted(fits)
     common = [after.common(name, filmed[name]) for name in colors.names]
     before = [colors.common(name, filmed[name]) for name in colors.names]
 
@@ -210,6 +214,93 @@ def test_a_refit_composes_with_the_maps_of_before():
 
     assert spread(common) < 0.3 * spread(before)
     torch.testing.assert_close(after.maps.mean(0), identity_maps(1)[0], atol=1e-6, rtol=0)
+
+
+def shadings(count: int, size: float = 0.04) -> torch.Tensor:
+    drawn = size * torch.randn(count, len(ORDERS), 3, generator=torch.Generator().manual_seed(5))
+    return drawn - drawn.mean(0)
+
+
+@pytest.fixture(scope="module")
+def tone_mapped(tiny_dive, tmp_path_factory) -> Frames:
+    """The tiny dive's frames, each exposed by itself, in gains that change over the image."""
+    folder: Path = tmp_path_factory.mktemp("tones")
+    listed, shading = [], shadings(len(tiny_dive.frames), 0.08)
+    for i, frame in enumerate(tiny_dive.frames):
+        path, image = folder / frame.name, tiny_dive.frames.image(i)
+        image = image * GAINS[i % 5] * gains(shading[i], *image.shape[:2]).permute(1, 2, 0)
+        write_rgb(path, image.clamp(0, 1).numpy())
+        listed.append(replace(frame, path=path))
+    return replace(tiny_dive.frames, frames=tuple(listed))
+
+
+def test_gains_that_change_over_frames_are_told_from_those_that_do_not(tiny_dive, tracked, relit, tone_mapped):
+    plain = decide_appearance(tracked, relit, tracked.names, AppearanceSettings())
+    assert plain.decision.on
+    assert not plain.decision.shaded
+    assert plain.colors is not None
+    assert plain.colors.shading is None
+    local = decide_appearance(tracked, tone_mapped, tracked.names, AppearanceSettings())
+    assert local.decision.shaded
+    assert local.decision.by_shading is not None
+    assert local.decision.by_shading > 0.4
+    assert "smoothly over each frame" in local.decision.reason
+    by_hand = decide_appearance(tracked, tone_mapped, tracked.names, AppearanceSettings(shading="off"))
+    assert by_hand.decision.on
+    assert not by_hand.decision.shaded
+
+
+def test_common_colors_of_tone_mapped_frames_are_those_of_the_dive(tiny_dive, tracked, tone_mapped):
+    mean = torch.stack([GAINS[tiny_dive.frames.index(name) % 5] for name in tracked.names]).mean(0)
+    errors = {}
+    for shading in ("auto", "off"):
+        settings = AppearanceSettings(shading=shading)
+        colors = decide_appearance(tracked, tone_mapped, tracked.names, settings).colors
+        assert colors is not None
+        off = []
+        for name in tracked.names:
+            f = tone_mapped.index(name)
+            common = colors.common(name, tone_mapped.image(f).permute(2, 0, 1)).permute(1, 2, 0)
+            off.append((common - tiny_dive.frames.image(f) * mean)[8:-8, 8:-8].square().mean())
+        errors[shading] = float(torch.stack(off).mean().sqrt())
+    assert errors["auto"] < 0.6 * errors["off"]
+
+
+def test_a_map_of_tone_mapped_frames_learns_from_common_colors(tiny_dive, tracked, tone_mapped, tmp_path):
+    scenes = {
+        shading: train(
+            tracked, tone_mapped, replace(SETTINGS, appearance=AppearanceSettings(shading=shading)), tmp_path / shading
+        )
+        for shading in ("auto", "off")
+    }
+    kept = load_map(tmp_path / "auto/map.safetensors").colors
+    assert kept is not None
+    assert kept.shading is not None
+    torch.testing.assert_close(kept.shading.mean(0), torch.zeros(len(ORDERS), 3), atol=1e-6, rtol=0)
+    mean = torch.stack([GAINS[tiny_dive.frames.index(name) % 5] for name in tracked.names]).mean(0)
+    truth = tiny_dive.frames.image(8)
+    score = {name: psnr(scene.render(tiny_dive.cameras[8]).rgb / mean, truth) for name, scene in scenes.items()}
+    assert score["auto"] > score["off"]
+
+
+def test_a_refit_finds_what_a_shading_leaves():
+    rng = torch.Generator().manual_seed(0)
+    true = FrameColors(("a", "b", "c"), about_identity(identity_maps(3) + 0.05 * torch.randn(3, 3, 4, generator=rng)))
+    true = replace(true, shading=shadings(3))
+    scene = 0.2 + 0.5 * torch.rand(3, 40, 48, generator=rng)
+    filmed = {}
+    for k, name in enumerate(true.names):
+        affine = (true.maps[k, :, :3] @ scene.flatten(1) + true.maps[k, :, 3:]).reshape(scene.shape)
+        filmed[name] = affine * gains(true.shading[k], 40, 48)
+    colors = FrameColors(true.names, identity_maps(3), torch.zeros(3, len(ORDERS), 3))
+    off = []
+    for _ in range(4):
+        common = {name: colors.common(name, filmed[name]) for name in true.names}
+        off.append(max(float((image - scene).abs().mean()) for image in common.values()))
+        fits = [fit_to_view(scene, image, torch.ones(40, 48), shaded=True) for image in common.values()]
+        colors = colors.refitted(fits)
+    assert off[1] < 0.4 * off[0]
+    assert off[3] < 0.1 * off[0]
 
 
 def test_a_pose_is_refined_in_the_frames_own_colors(tiny_dive):

@@ -10,6 +10,7 @@ from swimm3r.errors import InputError, UsageError
 from swimm3r.io import images
 from swimm3r.medium import add_water, linear_from_srgb
 from swimm3r.scene.ground_truth import read_ground_truth
+from swimm3r.shading import gains
 from swimm3r.synthetic import Coefficients, DiveSettings, make_dive, write_dive
 from swimm3r.synthetic.disturbances import swimming
 from swimm3r.synthetic.dive import water
@@ -237,16 +238,27 @@ def test_a_dive_that_is_there_already_is_left_alone(tmp_path):
     assert {path: path.stat().st_mtime_ns for path in tmp_path.rglob("*")} == before
 
 
+def test_a_camera_that_maps_tones_by_place_changes_gains_over_its_frames(dive, frames):
+    mapped = replace(dive, settings=replace(QUIET, local_exposure=0.4))
+    seen, still = linear_from_srgb(mapped.frame(0).raw), linear_from_srgb(frames[0].raw)
+    told = gains(mapped.shading(0), *seen.shape[:2]).permute(1, 2, 0)
+    unclipped = (seen < 0.99).all(-1)
+    torch.testing.assert_close(seen[unclipped], (still * told)[unclipped], atol=1e-5, rtol=1e-4)
+    stops = torch.stack([gains(mapped.shading(i), 60, 80).log2() for i in range(200)])
+    assert float(stops.square().mean().sqrt()) == pytest.approx(0.4, rel=0.1)
+    assert torch.equal(mapped.frame(0).clear, frames[0].clear)
+
+
 def test_a_camera_that_exposes_by_itself_multiplies_the_light_and_says_by_what(dive, frames, tmp_path):
     jittery = replace(dive, settings=replace(QUIET, exposure=0.5, white_balance=0.15))
-    gains = torch.stack([jittery.gains(i) for i in range(len(dive))])
-    assert (gains[:, 1] >= 2**-0.5).all()
-    assert (gains[:, 1] <= 2**0.5).all()
-    assert ((gains[:, [0, 2]] / gains[:, 1:2] - 1).abs() <= 0.15 + 1e-6).all()
-    assert gains[:, 1].log2().std() > 0.2
+    by_frame = torch.stack([jittery.gains(i) for i in range(len(dive))])
+    assert (by_frame[:, 1] >= 2**-0.5).all()
+    assert (by_frame[:, 1] <= 2**0.5).all()
+    assert ((by_frame[:, [0, 2]] / by_frame[:, 1:2] - 1).abs() <= 0.15 + 1e-6).all()
+    assert by_frame[:, 1].log2().std() > 0.2
     seen, still = linear_from_srgb(jittery.frame(0).raw), linear_from_srgb(frames[0].raw)
     unclipped = (seen < 0.99).all(-1)
-    torch.testing.assert_close(seen[unclipped], (still * gains[0])[unclipped], atol=1e-5, rtol=1e-4)
+    torch.testing.assert_close(seen[unclipped], (still * by_frame[0])[unclipped], atol=1e-5, rtol=1e-4)
     assert torch.equal(jittery.frame(0).clear, frames[0].clear)
     written = replace(QUIET, frames=2, exposure=0.5)
     write_dive(written, tmp_path)

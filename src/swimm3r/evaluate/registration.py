@@ -20,6 +20,7 @@ from torch import Tensor
 
 from swimm3r.evaluate import NotComputed
 from swimm3r.evaluate.images import as_8_bit, psnr
+from swimm3r.shading import image_cosines
 
 FLOW_SIDE = 480
 """Longer side in pixels of the images whose flow is taken; larger ones are reduced to it."""
@@ -29,6 +30,7 @@ _FOUND = 0.35  # px, the largest error of a round trip where flow counts
 _CONTRAST = 6.0  # px, sigma of the window that local contrast is taken in
 _FLAT = 0.01  # pixel value, contrast below which noise would pass for texture
 _LEAST = 0.02  # of the asked pixels, fewer of which say nothing
+_TILES = 8  # of a chessboard along the longer side, finer than the smooth gains that are fitted over it
 _STAY = 1e-3  # of maps that are used beyond the pixels they were fitted to: noise of 0.006 over a spread of 0.2
 
 
@@ -85,6 +87,39 @@ def recolored_by_halves(
         fit = fit_colors(render[:, there][known], target[:, there][known], _STAY)
         halves.append(fit(render[:, here]))
     return torch.cat(halves, 1)
+
+
+def recolored_by_tiles(
+    render: Float[Tensor, "h w 3"], target: Float[Tensor, "h w 3"], trusted: Bool[Tensor, "h w"]
+) -> Float[Tensor, "h w 3"]:
+    """A rendering in the colors of a frame whose gains change over the image, each half by the fit to the other half.
+
+    The fit is an affine map and a smooth gain (`swimm3r.shading`), A c + b + s(x, y) c. The halves are the dark and the
+    light fields of a chessboard, for a gain beyond the pixels that it was fitted to would be a guess.
+    """
+    height, width = render.shape[:2]
+    side = max(1, round(max(height, width) / _TILES))
+    row, column = torch.arange(height)[:, None] // side, torch.arange(width) // side
+    dark = (row + column) % 2 == 0
+    waves = image_cosines(height, width).permute(1, 2, 0)
+    shown = render.clone()
+    for here, there in ((dark, ~dark), (~dark, dark)):
+        known = there & trusted
+        if int(known.sum()) < _LEAST * int(there.sum()):
+            continue
+        for c in range(3):
+            terms, fitted = (_terms(render[part], waves[part], c) for part in (here, known))
+            stay = torch.full((terms.shape[1],), _STAY * len(fitted), dtype=torch.float64)
+            stay[3] = 0.0
+            first = stay * torch.eye(len(stay), dtype=torch.float64)[c]
+            products = fitted.mT @ target[known][:, c].double() + first
+            shown[..., c][here] = (terms @ torch.linalg.solve(fitted.mT @ fitted + stay.diag(), products)).to(shown)
+    return shown
+
+
+def _terms(colors: Float[Tensor, "p 3"], waves: Float[Tensor, "p k"], c: int) -> Float[Tensor, "p n"]:
+    colors = colors.double()
+    return torch.cat([colors, torch.ones_like(colors[:, :1]), waves.double() * colors[:, c : c + 1]], 1)
 
 
 def psnr_affine(

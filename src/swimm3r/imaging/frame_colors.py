@@ -15,6 +15,9 @@ and free maps would share out between them what both can explain. Diagonal entri
 exposure and white balance are; the others, and offsets, are held closer to 0, as frames that look farther than others
 resemble frames with an offset.
 
+Where the gains of a frame change over the image, as under local tone mapping, I_f = e^(s_f) (M_f S + b_f) with the
+shading s_f of `swimm3r.shading`, 0 on average over frames at every place. A fifth model has them, too.
+
 Where the camera recorded its gains g_f on linear light, they make a model of their own, whose one free number is the
 slope of the tone curve: M_f = diag(g_f^slope), about the identity. Maps of frames are then held to these, not to 1.
 """
@@ -28,9 +31,13 @@ from jaxtyping import Float, Int
 from scipy.sparse import csr_matrix
 from torch import Tensor
 
+from swimm3r.shading import ORDERS
+
 _ROUNDS = 8  # of alternating fits
 _GAIN_STD, _MIX_STD, _OFFSET_STD = 0.3, 0.05, 0.02  # of a frame's map about the identity, before anything is seen
+_SHADING_STD = 0.2  # of a logarithmic gain's slowest cosines, before anything is seen; faster ones have less
 _REDUNDANCY = 100.0  # observations that share an error: what is common to a frame and no map of colors
+_NEAR = 20.0  # observations that share an error as they are near each other in a frame
 _LEAST_SCALE = 2e-3  # pixel value, the least spread that residuals are weighed by
 _BRIGHTEST = 1.2  # clear color of a point
 _TERMS = 4  # of the water, per channel
@@ -51,6 +58,7 @@ class ColorTracks:
     T_D: Float[Tensor, "o 3"] | None = None  # of the measured water; None where none was
     backscatter: Float[Tensor, "o 3"] | None = None
     gains: Float[Tensor, "f 3"] | None = None  # of linear light, by the camera's record
+    cosines: Float[Tensor, "o k"] | None = None  # `swimm3r.shading`, at the places of the observations in their images
 
 
 @dataclass(frozen=True)
@@ -62,6 +70,7 @@ class ColorEvidence:
     water: float  # about that and the water
     frames: float  # about that and the frames' maps
     both: float
+    shaded: float | None = None  # about both and the frames' shadings; None where places in the image are not known
     recorded: float | None = None  # about the water and the gains that the camera recorded; None without any
     slope: float | None = None  # of the tone curve that they act through
 
@@ -76,6 +85,11 @@ class ColorEvidence:
         return _explained(self.water, self.both)
 
     @property
+    def by_shading(self) -> float | None:
+        """Share that shadings explain of what water and frames leave; None where places in the image are not known."""
+        return None if self.shaded is None else _explained(self.both, self.shaded)
+
+    @property
     def by_record(self) -> float | None:
         """Share that the recorded gains explain of what the water leaves; None without any."""
         return None if self.recorded is None else _explained(self.water, self.recorded)
@@ -83,10 +97,19 @@ class ColorEvidence:
 
 @dataclass(frozen=True)
 class FrameColorFit:
-    """A frame's colors as an affine map of the dive's: (M, b) as [3, 4], the mean over frames being (identity, 0)."""
+    """A frame's colors from the dive's: maps (M, b) as [3, 4], their mean over frames (identity, 0), and shadings."""
 
     maps: Float[Tensor, "f 3 4"]
     evidence: ColorEvidence
+    shaded: "ShadedFit | None" = None  # None where places in the image are not known
+
+
+@dataclass(frozen=True)
+class ShadedFit:
+    """The maps of all frames with their shadings, which are 0 on average over frames."""
+
+    maps: Float[Tensor, "f 3 4"]
+    shading: Float[Tensor, "f k 3"]
 
 
 def fit_frame_colors(tracks: ColorTracks) -> FrameColorFit | None:
@@ -97,12 +120,16 @@ def fit_frame_colors(tracks: ColorTracks) -> FrameColorFit | None:
         return None
     half = np.searchsorted(points, seen.point) % 2 == 0
     spreads = np.array([_spreads(seen.rows(half), seen.rows(~half)), _spreads(seen.rows(~half), seen.rows(half))])
-    alone, water, frames, both, recorded = np.sqrt((spreads**2).mean(0)).tolist()
+    alone, water, frames, both, recorded, shaded = np.sqrt((spreads**2).mean(0)).tolist()
     of_record = (None, None) if seen.log_gains is None else (recorded, _recorded(seen).slope)
     center = _recorded(seen).maps
-    maps = _fitted(seen, True, _own_maps(center)).maps if seen.T_D is None else _fitted_in_water(seen, center)
-    evidence = ColorEvidence(len(points), alone, water, frames, both, *of_record)
-    return FrameColorFit(torch.from_numpy(maps).float(), evidence)
+    of_shading = None if seen.cosines is None else shaded
+    evidence = ColorEvidence(len(points), alone, water, frames, both, of_shading, *of_record)
+    with_shading = None
+    if seen.cosines is not None:
+        fit = _final(seen, center, shaded=True)
+        with_shading = ShadedFit(torch.from_numpy(fit.maps).float(), torch.from_numpy(fit.shading).float())
+    return FrameColorFit(torch.from_numpy(_final(seen, center).maps).float(), evidence, with_shading)
 
 
 def identity_maps(count: int) -> Float[Tensor, "f 3 4"]:
@@ -128,17 +155,28 @@ class _Seen:
     T_D: np.ndarray | None
     backscatter: np.ndarray | None
     log_gains: np.ndarray | None  # [f, 3], 0 on average; None where the camera recorded none, or held them
+    cosines: np.ndarray | None = None  # [o, k]
 
     def rows(self, which: np.ndarray) -> "_Seen":
-        T_D, backscatter = (None if values is None else values[which] for values in (self.T_D, self.backscatter))
+        T_D, backscatter, cosines = (
+            None if values is None else values[which] for values in (self.T_D, self.backscatter, self.cosines)
+        )
         own = self.color[which], self.z[which], self.point[which], self.frame[which], self.frames
-        return _Seen(*own, T_D, backscatter, self.log_gains)
+        return _Seen(*own, T_D, backscatter, self.log_gains, cosines)
+
+    def evened(self, shading: np.ndarray) -> "_Seen":
+        """The same observations without the frames' shadings [f, k, 3]."""
+        if self.cosines is None or not shading.any():
+            return self
+        log_gain = np.einsum("ok,okc->oc", self.cosines, shading[self.frame])
+        return replace(self, color=self.color / np.exp(log_gain))
 
 
 @dataclass(frozen=True)
 class _Fit:
     water: np.ndarray  # [terms, 3]
     maps: np.ndarray  # [f, 3, 4]
+    shading: np.ndarray  # [f, k, 3]
     slope: float = 0.0  # of the tone curve through which recorded gains act
 
 
@@ -155,7 +193,8 @@ def _usable(tracks: ColorTracks) -> _Seen:
     good &= count[point] >= 3
     T_D, backscatter = (None if each is None else each.double().numpy() for each in (tracks.T_D, tracks.backscatter))
     unit = np.median(z[good]) if good.any() else 1.0
-    seen = _Seen(color, z / unit, point, frame, tracks.frames, T_D, backscatter, _log_gains(tracks))
+    cosines = None if tracks.cosines is None else tracks.cosines.double().numpy()
+    seen = _Seen(color, z / unit, point, frame, tracks.frames, T_D, backscatter, _log_gains(tracks), cosines)
     return seen.rows(good)
 
 
@@ -194,19 +233,24 @@ def _basis(seen: _Seen, mean: _Means, a: np.ndarray) -> np.ndarray:
 
 
 def _spreads(fitted: _Seen, held: _Seen) -> list[float]:
-    """Spreads of held-out points: alone, with water, with frames' maps, with both, with water and recorded gains."""
+    """Spreads of held-out points: alone, with water, with frames' maps, with both, with water and recorded gains, and
+    with water, maps and shadings."""
     recorded = _recorded(fitted)
     own = _own_maps(recorded.maps)
-    models = (_fitted(fitted, False), _fitted(fitted, True), _fitted(fitted, False, own), _fitted(fitted, True, own))
-    return [_spread(held, model) for model in (*models, recorded)]
+    both = _fitted(fitted, True, own)
+    shaded = both if fitted.cosines is None else _fitted(fitted, True, own, shaded=True)
+    models = (_fitted(fitted, False), _fitted(fitted, True), _fitted(fitted, False, own), both, recorded, shaded)
+    return [_spread(held, model) for model in models]
 
 
-def _fitted(seen: _Seen, with_water: bool, map_fit: MapFit | None = None) -> _Fit:
+def _fitted(seen: _Seen, with_water: bool, map_fit: MapFit | None = None, *, shaded: bool = False) -> _Fit:
     """Robust alternating least squares."""
-    maps = np.tile(np.eye(3, 4), (seen.frames, 1, 1))
+    filmed, maps = seen, np.tile(np.eye(3, 4), (seen.frames, 1, 1))
+    shading = np.zeros((seen.frames, len(ORDERS), 3))
     water = np.zeros((_TERMS, 3))
     mean = _Means(seen.point)
     for _ in range(_ROUNDS if with_water or map_fit is not None else 0):
+        seen = filmed.evened(shading)
         S = _common(seen, maps)
         a = mean(S)
         basis = _basis(seen, mean, a)
@@ -217,7 +261,9 @@ def _fitted(seen: _Seen, with_water: bool, map_fit: MapFit | None = None) -> _Fi
         scale = mean.reweigh(seen.color - _filmed(seen, maps, predicted))
         if map_fit is not None:
             maps = map_fit(seen, predicted, mean.weight, scale, maps)
-    return _Fit(water, maps)
+        if shaded:
+            shading = _shadings(filmed, _filmed(seen, maps, predicted), mean.weight, scale)
+    return _Fit(water, maps, shading)
 
 
 def _recorded(seen: _Seen) -> _Fit:
@@ -252,22 +298,53 @@ def _own_maps(center: np.ndarray) -> MapFit:
     return fit
 
 
-def _fitted_in_water(seen: _Seen, center: np.ndarray) -> np.ndarray:
-    """The maps [f, 3, 4] in known water, held to `center`."""
+def _final(seen: _Seen, center: np.ndarray, *, shaded: bool = False) -> _Fit:
+    """The maps of all observations, held to `center`: in the measured water, in free water where none was measured."""
+    if seen.T_D is None:
+        return _fitted(seen, True, _own_maps(center), shaded=shaded)
+    return _fitted_in_water(seen, center, shaded=shaded)
+
+
+def _fitted_in_water(seen: _Seen, center: np.ndarray, *, shaded: bool) -> _Fit:
+    """The maps in known water, held to `center`."""
     assert seen.T_D is not None
     assert seen.backscatter is not None
-    maps, mean = center, _Means(seen.point)
+    filmed, maps, mean = seen, center, _Means(seen.point)
+    shading = np.zeros((seen.frames, len(ORDERS), 3))
     for _ in range(_ROUNDS):
+        seen = filmed.evened(shading)
         direct = _common(seen, maps) - seen.backscatter
         J = (mean(seen.T_D * direct) / mean(seen.T_D**2).clip(1e-9)).clip(0.0, _BRIGHTEST)
         predicted = J * seen.T_D + seen.backscatter
         scale = mean.reweigh(seen.color - _filmed(seen, maps, predicted))
         maps = _frame_maps(seen, predicted, mean.weight, scale, maps, center)
-    return maps
+        if shaded:
+            shading = _shadings(filmed, _filmed(seen, maps, predicted), mean.weight, scale)
+    return _Fit(np.zeros((_TERMS, 3)), maps, shading)
+
+
+def _shadings(seen: _Seen, unshaded: np.ndarray, weight: np.ndarray, scale: float) -> np.ndarray:
+    """The shadings [f, k, 3] from what the frames would show without, 0 on average, held to 0 where little is seen."""
+    assert seen.cosines is not None
+    unshaded = unshaded.clip(_DARK)
+    delta, weights = np.log(seen.color / unshaded), weight[:, None] * unshaded**2
+    order = np.hypot(*np.array(ORDERS).T)
+    stay = np.diag(_NEAR * scale**2 * (order / _SHADING_STD) ** 2)
+    found = np.zeros((seen.frames, len(ORDERS), 3))
+    rows = np.argsort(seen.frame, kind="stable")
+    ends = np.searchsorted(seen.frame[rows], np.arange(seen.frames + 1))
+    for f in range(seen.frames):
+        own = rows[ends[f] : ends[f + 1]]
+        B = seen.cosines[own]
+        for c in range(3):
+            weighted = B * weights[own, c, None]
+            found[f, :, c] = np.linalg.solve(weighted.T @ B + stay, weighted.T @ delta[own, c])
+    return found - found.mean(0)
 
 
 def _spread(seen: _Seen, fit: _Fit) -> float:
     """Robust spread of held-out points about what a fit says of their other observations."""
+    seen = seen.evened(fit.shading)
     mean, off = _Means(seen.point), seen.color
     for _ in range(3):
         S = _common(seen, fit.maps)

@@ -20,7 +20,7 @@ from swimm3r.cameras import Cameras
 from swimm3r.evaluate import NotComputed
 from swimm3r.evaluate.images import ViewScores, as_8_bit, blur4_psnr, mean_view_scores, psnr, sharpness, view_scores
 from swimm3r.evaluate.lpips import Lpips, load_lpips
-from swimm3r.evaluate.registration import displacement, psnr_affine, recolored_by_halves
+from swimm3r.evaluate.registration import displacement, psnr_affine, recolored_by_halves, recolored_by_tiles
 from swimm3r.geometry import best_similarity
 from swimm3r.imaging.undistortion import shown_pixels, undistorted
 from swimm3r.io.view_names import view_stems
@@ -34,6 +34,7 @@ from swimm3r.scene.ground_truth import GroundTruth
 from swimm3r.scene.reconstruction import Reconstruction
 from swimm3r.sfm.moving.find import still_scene
 from swimm3r.sfm.settings import FeatureSettings, RestoreSettings
+from swimm3r.splat.appearance import FrameColors
 from swimm3r.splat.pose_refinement import refine_pose
 from swimm3r.splat.rendering import SplatMap
 from swimm3r.splat.settings import PoseRefinementSettings
@@ -198,27 +199,32 @@ def score_views(
         camera = cut(canvas, window)
         out = scene.render(camera, time)
         write_view(folder, stems[name], out, camera, style)
-        known = coverage.of(camera)
-        shown = out.rgb if scene.colors is None else recolored_by_halves(out.rgb, target, seen & known)
-        scores = view_scores(shown, target, perceptual, seen)
-        covered = covered_scores(shown, target, seen, known)
-        observed = observed_scores(shown, target, seen, out.observed)
-        quiet = None
+        known, quiet = coverage.of(camera), None
         if surfaces is not None:
             unmoved = frames.mask(f) & ~surfaces.moving_in(lens, frames.image(f))
             quiet = undistorted(frames.image(f), unmoved, lens, canvas)[1][window.rows, window.columns]
+        shown = out.rgb
+        if scene.colors is not None:
+            recolored = recolored_by_halves if scene.colors.shading is None else recolored_by_tiles
+            told = seen & (known if out.observed is None else out.observed)
+            shown = recolored(shown, target, told if quiet is None else told & quiet)
+        scores = view_scores(shown, target, perceptual, seen)
+        covered = covered_scores(shown, target, seen, known)
+        observed = observed_scores(shown, target, seen, out.observed)
         still = still_scores(shown, target, seen, quiet)
         views.append(HeldOutView(name, time, lens, canvas, window, first.source, scores, covered, observed, still))
     progress("scoring test frames", len(poses), len(poses))
     return views
 
 
-def protocol(views: Sequence[HeldOutView], settings: PoseRefinementSettings, recolored: bool) -> str:
+def protocol(views: Sequence[HeldOutView], settings: PoseRefinementSettings, colors: FrameColors | None) -> str:
     """In words, how the poses of the scored frames, and the colors they are compared in, came about."""
     counts = Counter(view.source for view in views)
     starts = ", ".join(f"{count} from {source}" for source, count in counts.items())
-    colors = "; each half in colors fitted on the other half, as frames differ in exposure" if recolored else ""
-    return f"every 8th frame; poses {starts}, refined {settings.steps} steps on the frozen map{colors}"
+    fit = "; each half in colors fitted on the other half, as frames differ in exposure" if colors else ""
+    if colors is not None and colors.shading is not None:
+        fit += ", and in gains over the image: halves of a chessboard"
+    return f"every 8th frame; poses {starts}, refined {settings.steps} steps on the frozen map{fit}"
 
 
 def mean_scores(views: Sequence[HeldOutView]) -> ViewScores:

@@ -17,7 +17,7 @@ from swimm3r.medium import Medium, MediumFit
 from swimm3r.pipeline.held_out import HeldOutView, mean_part, mean_scores, protocol
 from swimm3r.scene.frames import Frames
 from swimm3r.scene.reconstruction import Matches, Reconstruction
-from swimm3r.splat.appearance import read_decision
+from swimm3r.splat.appearance import FrameColors, read_decision
 from swimm3r.splat.rendering import SplatMap, mean_water
 from swimm3r.splat.settings import PoseRefinementSettings
 
@@ -107,14 +107,16 @@ def splat_sections(scene: SplatMap, rec: Reconstruction, frames: Frames, folder:
     return {"splat": summary_entries(section), "medium": {"splat": medium}}
 
 
-def test_section(views: Sequence[HeldOutView], settings: PoseRefinementSettings, recolored: bool) -> dict[str, object]:
+def test_section(
+    views: Sequence[HeldOutView], settings: PoseRefinementSettings, colors: FrameColors | None
+) -> dict[str, object]:
     """Mean scores of the frames that training did not see, and how they were placed and compared."""
     means = {
         **vars(mean_scores(views)),
         **mean_part([view.observed for view in views]).summary(),
         **mean_part([view.covered for view in views]).summary(),
         **mean_part([view.still for view in views]).summary(),
-        "protocol": protocol(views, settings, recolored),
+        "protocol": protocol(views, settings, colors),
     }
     return summary_entries(means) | {"frames": [frame_entry(view) for view in views]}
 

@@ -1,10 +1,11 @@
 """Frames that a camera exposed and balanced each by itself: their maps, and whether a dive needs any.
 
-    I_f = M_f S + b_f,    mean of M_f = identity, mean of b_f = 0
+    I_f = e^(s_f) (M_f S + b_f),    mean of M_f = identity, mean of b_f = 0, mean of s_f = 0
 
-S being what the map renders, water included: a frame's map is applied after the water. Training compares in the colors
-of S, which the dive has on average: a view is handed out as M_f^-1 (I_f - b_f), so that every recipe is served alike.
-The first maps are those of the sparse tracks (`imaging.frame_colors`), which also decide before training whether there
+S being what the map renders, water included: a frame's map is applied after the water. Its shading s_f changes smoothly
+over the image (`swimm3r.shading`), and is 0 where the dive shows none. Training compares in the colors of S, which the
+dive has on average: a view is handed out as M_f^-1 (e^(-s_f) I_f - b_f), so that every recipe is served alike. The
+first maps are those of the sparse tracks (`imaging.frame_colors`), which also decide before training whether there
 are any; a few times during training they are fitted again to what the map shows by then.
 """
 
@@ -19,7 +20,7 @@ from jaxtyping import Float
 from torch import Tensor
 from torch.nn.functional import normalize
 
-from swimm3r.cameras import directions, rows_of_frames
+from swimm3r.cameras import directions, project, rows_of_frames
 from swimm3r.imaging.filters import blur
 from swimm3r.imaging.frame_colors import ColorEvidence, ColorTracks, about_identity, fit_frame_colors, identity_maps
 from swimm3r.io.files.atomic import write_text
@@ -28,6 +29,7 @@ from swimm3r.io.files.json_file import read_json
 from swimm3r.medium import backscatter, transmittances
 from swimm3r.scene.frames import Frames
 from swimm3r.scene.reconstruction import Reconstruction
+from swimm3r.shading import ORDERS, cosines, gains, image_cosines
 from swimm3r.splat.shared_settings import AppearanceSettings
 
 log = logging.getLogger(__name__)
@@ -38,24 +40,43 @@ _STAY_GAIN, _STAY_MIX = 1e-4, 3e-3  # hold of a refit to the map of before: gain
 
 
 @dataclass(frozen=True)
+class ColorFit:
+    """The way from colors that were rendered to those of a frame: affine, and then shaded where there is a shading."""
+
+    maps: Float[Tensor, "3 4"]
+    shading: Float[Tensor, "k 3"] | None
+
+
+@dataclass(frozen=True)
 class FrameColors:
-    """The maps of some frames; identity on average."""
+    """The maps and shadings of some frames; identity on average."""
 
     names: tuple[str, ...]
     maps: Float[Tensor, "n 3 4"]
+    shading: Float[Tensor, "n k 3"] | None = None  # None where gains do not change over the image
 
     def common(self, name: str, rgb: Float[Tensor, "3 h w"]) -> Float[Tensor, "3 h w"]:
         """A frame's colors as the dive has them on average."""
-        M = self.maps[self.names.index(name)]
+        k = self.names.index(name)
+        if self.shading is not None:
+            rgb = rgb / gains(self.shading[k], *rgb.shape[1:])
+        M = self.maps[k]
         inverse = torch.linalg.inv(M[:, :3].double()).float()
         return torch.einsum("ij,jhw->ihw", inverse, rgb - M[:, 3, None, None])
 
-    def refitted(self, fits: Float[Tensor, "n 3 4"]) -> "FrameColors":
-        """The maps after `fits`, from what the map shows to each frame in the common colors of before."""
-        old, new = self.maps.double(), fits.double()
+    def refitted(self, fits: Sequence[ColorFit]) -> "FrameColors":
+        """The maps after `fits`, from what the map shows to each frame in the common colors of before.
+
+        Shadings add up, as they would if maps did not mix channels; later fits find what that leaves.
+        """
+        old, new = self.maps.double(), torch.stack([fit.maps for fit in fits]).double()
         matrix = old[..., :3] @ new[..., :3]
         offset = (old[..., :3] @ new[..., 3:])[..., 0] + old[..., 3]
-        return FrameColors(self.names, about_identity(torch.cat([matrix, offset[..., None]], -1)).float())
+        maps = about_identity(torch.cat([matrix, offset[..., None]], -1)).float()
+        if self.shading is None:
+            return FrameColors(self.names, maps)
+        shading = self.shading + torch.stack([fit.shading for fit in fits if fit.shading is not None])
+        return FrameColors(self.names, maps, shading - shading.mean(0))
 
 
 @dataclass(frozen=True)
@@ -69,6 +90,8 @@ class AppearanceDecision:
     spread: float | None = None  # of a point's color between frames, pixel values; no outliers
     spread_left: float | None = None  # after water and frames
     points: int = 0
+    shaded: bool = False  # whether gains also change over the image
+    by_shading: float | None = None  # share that such gains explain of what water and frames leave
     by_record: float | None = None  # share of the rest that the exposures and white balances explain which are recorded
     record_stops: tuple[float, float, float] | None = None  # range of the recorded gains of red, green, blue, in EV
     record_slope: float | None = None  # of the tone curve: the power of the recorded gains that the images show
@@ -91,13 +114,25 @@ def decide_appearance(
     tracks = color_tracks(rec, frames, names)
     fit = fit_frame_colors(tracks) if len(names) > 2 else None
     if fit is None:
-        colors = FrameColors(tuple(names), identity_maps(len(names))) if settings.mode == "on" else None
+        maps, shading = identity_maps(len(names)), None
+        if settings.shading == "on":
+            shading = torch.zeros(len(names), len(ORDERS), 3)
+        colors = FrameColors(tuple(names), maps, shading) if settings.mode == "on" else None
         return Appearance(AppearanceDecision(colors is not None, "too few points are seen by three frames"), colors)
     on, reason = _judged(fit.evidence, settings)
     e = fit.evidence
-    decision = AppearanceDecision(on, reason, e.by_water, e.by_frames, e.alone, e.both, e.points)
-    decision = replace(decision, by_record=e.by_record, record_stops=_stops(tracks), record_slope=e.slope)
+    shaded = fit.shaded if on and _shaded(e, settings) else None
+    if shaded is not None:
+        reason += (
+            f"; gains that change smoothly over each frame explain {max(0.0, e.by_shading or 0.0):.0%} of the rest"
+        )
+    left = e.both if shaded is None or e.shaded is None else e.shaded
+    decision = AppearanceDecision(on, reason, e.by_water, e.by_frames, e.alone, left, e.points, shaded is not None)
+    decision = replace(decision, by_shading=e.by_shading, by_record=e.by_record, record_stops=_stops(tracks))
+    decision = replace(decision, record_slope=e.slope)
     log.info("colors of single frames %s: %s", "fitted" if on else "not fitted", reason)
+    if shaded is not None:
+        return Appearance(decision, FrameColors(tuple(names), shaded.maps, shaded.shading))
     return Appearance(decision, FrameColors(tuple(names), fit.maps) if on else None)
 
 
@@ -116,6 +151,14 @@ def _judged(e: ColorEvidence, settings: AppearanceSettings) -> tuple[bool, str]:
     return explained and moved >= settings.least_change, told
 
 
+def _shaded(e: ColorEvidence, settings: AppearanceSettings) -> bool:
+    """Return whether gains of frames change over the image."""
+    if settings.shading != "auto" or e.shaded is None or e.by_shading is None:
+        return settings.shading == "on"
+    moved = max(0.0, e.both**2 - e.shaded**2) ** 0.5
+    return e.by_shading >= settings.least_shading and moved >= settings.least_change
+
+
 def _stops(tracks: ColorTracks) -> tuple[float, float, float] | None:
     """Range of the recorded gains per channel in EV; None without any."""
     if tracks.gains is None or not len(tracks.gains):
@@ -130,6 +173,7 @@ def color_tracks(rec: Reconstruction, frames: Frames, names: Sequence[str]) -> C
     place = {rec.index(name): k for k, name in enumerate(names)}
     rows_of = rows_of_frames(rec.tracks.frame, len(rec.names))
     parts: list[tuple[Tensor, ...]] = []
+    canvases = rec.cameras.drawn()
     for i, k in place.items():
         rows = rows_of[i]
         f = frames.index(rec.names[i])
@@ -142,12 +186,15 @@ def color_tracks(rec: Reconstruction, frames: Frames, names: Sequence[str]) -> C
         away = rec.points.xyz[point].double() - rec.cameras.centers[i].double()
         color = blur(image, _POINT * max(image.shape[:2]))[row, column]
         toward = normalize(directions(rec.cameras[i], rec.tracks.xy[rows].double()[None])[0], dim=-1)
-        parts.append((color, away.norm(dim=-1).float(), point, torch.full_like(point, k), toward.float()))
+        ahead = rec.cameras.centers[i].double() + toward
+        place_in_view = project(canvases[i], ahead[None])[0][0] / torch.tensor([canvases.width, canvases.height])
+        at = cosines(place_in_view.float())
+        parts.append((color, away.norm(dim=-1).float(), point, torch.full_like(point, k), toward.float(), at))
     if not parts:
         nothing = torch.zeros(0, dtype=torch.int64)
         return ColorTracks(torch.zeros(0, 3), torch.zeros(0), nothing, nothing, 0)
-    color, ray_depth, point, frame, toward = (torch.cat(part) for part in zip(*parts, strict=True))
-    tracks = ColorTracks(color, ray_depth, point, frame, len(names), gains=_recorded_gains(frames, names))
+    color, ray_depth, point, frame, toward, at = (torch.cat(part) for part in zip(*parts, strict=True))
+    tracks = ColorTracks(color, ray_depth, point, frame, len(names), gains=_recorded_gains(frames, names), cosines=at)
     if rec.medium is None or rec.medium.encoding != "srgb":
         return tracks
     medium = rec.medium.at(ray_depth, toward)
@@ -161,20 +208,28 @@ def _recorded_gains(frames: Frames, names: Sequence[str]) -> Float[Tensor, "f 3"
 
 
 def fit_to_view(
-    render: Float[Tensor, "3 h w"], target: Float[Tensor, "3 h w"], seen: Float[Tensor, "h w"]
-) -> Float[Tensor, "3 4"]:
-    """The affine map from a rendering to a view, held to the identity where the view's colors do not tell."""
+    render: Float[Tensor, "3 h w"], target: Float[Tensor, "3 h w"], seen: Float[Tensor, "h w"], *, shaded: bool = False
+) -> ColorFit:
+    """The map from a rendering to a view, held to the identity where the view's colors do not tell.
+
+    A shading is found together with the affine map, to first order in both.
+    """
     weight = seen.reshape(-1).double()
     x = torch.cat([render, torch.ones_like(render[:1])]).reshape(4, -1).double()
     y = target.reshape(3, -1).double()
-    information, products = (x * weight) @ x.mT, (x * weight) @ y.mT
-    rows = []
+    waves = image_cosines(*render.shape[1:]).to(x).reshape(len(ORDERS), -1) if shaded else x[:0]
+    maps, shading = [], []
     for c in range(3):
-        stay = torch.full((4,), _STAY_MIX, dtype=torch.float64, device=x.device)
+        terms = torch.cat([x, waves * x[c]])
+        stay = torch.full((len(terms),), _STAY_MIX, dtype=torch.float64, device=x.device)
         stay[c] = _STAY_GAIN
+        stay[4:] = _STAY_GAIN
         stay = stay * weight.sum().clamp(min=1.0)
-        rows.append(torch.linalg.solve(information + stay.diag(), products[:, c] + stay * torch.eye(4).to(stay)[c]))
-    return torch.stack(rows).float()
+        products = (terms * weight) @ y[c] + stay * torch.eye(len(terms)).to(stay)[c]
+        found = torch.linalg.solve((terms * weight) @ terms.mT + stay.diag(), products)
+        maps.append(found[:4])
+        shading.append(found[4:] / found[c])
+    return ColorFit(torch.stack(maps).float(), torch.stack(shading, -1).float() if shaded else None)
 
 
 def write_decision(folder: Path, decision: AppearanceDecision) -> None:

@@ -23,6 +23,7 @@ from swimm3r.io.files.damage import Remedy, guard
 from swimm3r.io.files.safe_names import check_names
 from swimm3r.io.files.tensor_file import read_tensors
 from swimm3r.settings_document import from_document
+from swimm3r.shading import ORDERS
 from swimm3r.splat.appearance import FrameColors
 from swimm3r.splat.block_store import BlockEntry, StoredBlocks
 from swimm3r.splat.medium.lamp import NO_LIGHT
@@ -132,10 +133,12 @@ def _of_field(tensors: Mapping[str, Tensor], *, convolutions: bool) -> dict[str,
 
 
 def _colors(tensors: Mapping[str, Tensor], names: tuple[str, ...]) -> FrameColors:
-    maps = tensors["colors.maps"]
+    maps, shading = tensors["colors.maps"], tensors.get("colors.shading")
     if maps.shape != (len(names), 3, 4) or not bool(maps.isfinite().all()):
         raise ValueError(f"colors.maps has the shape {tuple(maps.shape)} for {len(names)} frames, or is not finite")
-    return FrameColors(names, maps)
+    if shading is not None and (shading.shape != (len(names), len(ORDERS), 3) or not bool(shading.isfinite().all())):
+        raise ValueError(f"colors.shading has the shape {tuple(shading.shape)}, or is not finite")
+    return FrameColors(names, maps, shading)
 
 
 def _viewpoint(tensors: Mapping[str, Tensor], size: _ImageSize) -> Cameras:

@@ -191,6 +191,8 @@ class SplatMap:
             about["viewpoint"] = {"width": self.viewpoint.width, "height": self.viewpoint.height}
         if self.colors is not None:
             tensors["colors.maps"] = self.colors.maps
+            if self.colors.shading is not None:
+                tensors["colors.shading"] = self.colors.shading
             about["colors"] = self.colors.names
         if self.coverage is not None:
             tensors |= self.coverage.tensors()

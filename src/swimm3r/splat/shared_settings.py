@@ -74,6 +74,11 @@ class AppearanceSettings(Settings):
     `auto`: but for one slope of the tone curve, nothing is fitted to them."""
     least_change: Share = 0.006
     """Smallest change of colors, in pixel values, that frames must explain, with `auto`."""
+    shading: Literal["auto", "on", "off"] = "auto"
+    """Give every frame with a color map gains that change smoothly over the image, too: always, never, or where the
+    sparse points say so (auto)."""
+    least_shading: Share = 0.2
+    """Smallest share that such gains must explain of the variation that water and color maps leave, with `auto`."""
     refits: Annotated[int, Range(0, 100)] = 3
     """Number of times that the maps are fitted again during training, evenly spaced over its second part."""
 

@@ -149,7 +149,9 @@ def _schedule(settings: SplatSettings, rec: Reconstruction, views: TrainingViews
     matches = []
     if settings.poses.enabled:
         matches.append(float(rec.matches.xy_i.double().sum() + rec.matches.xy_j.double().sum()))
-    colors = [] if views.colors is None else [views.colors.maps.tolist()]
+    colors = []
+    if views.colors is not None:
+        colors = [part.tolist() for part in (views.colors.maps, views.colors.shading) if part is not None]
     return loop.schedule_of(settings, views.names, views.times, *cameras, *matches, *colors)
 
 

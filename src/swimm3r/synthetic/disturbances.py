@@ -1,5 +1,6 @@
-"""Disturbances between a clean image and a camera's: a fish, marine snow, vignetting, exposure, sensor noise."""
+"""Disturbances between a clean image and a camera's: a fish, marine snow, vignetting, exposure, tone mapping, noise."""
 
+import math
 from dataclasses import dataclass
 
 import numpy as np
@@ -9,6 +10,7 @@ from torch import Tensor
 
 from swimm3r.cameras import Cameras, ray_depth_from_z
 from swimm3r.medium import Medium, add_water, linear_from_srgb, srgb_from_linear
+from swimm3r.shading import ORDERS
 from swimm3r.synthetic.seafloor import Seafloor, height_at
 
 _BODY = (0.19, 0.072, 0.04)  # m, half axes: along, up, across
@@ -157,8 +159,16 @@ def camera_gains(exposure: float, white_balance: float, rng: np.random.Generator
     return torch.tensor([red, 1.0, blue], dtype=torch.float32) * 2.0**stops
 
 
-def exposed(raw: Float[Tensor, "h w 3"], gains: Float[Tensor, "3"]) -> Float[Tensor, "h w 3"]:
-    """The image as a camera with other gains stores it, clipped where it is full."""
+def local_tones(stops: float, rng: np.random.Generator) -> Float[Tensor, "k 3"]:
+    """One frame's shading of linear light (`swimm3r.shading`), `stops` over the image; all channels have nearly one."""
+    shape = (len(ORDERS), 3)
+    drawn = rng.standard_normal((shape[0], 1)) + 0.3 * rng.standard_normal(shape)
+    each = stops * math.log(2) / math.sqrt(sum(0.5 ** ((i > 0) + (j > 0)) for i, j in ORDERS))
+    return torch.from_numpy(each * drawn / math.sqrt(1 + 0.3**2)).float()
+
+
+def exposed(raw: Float[Tensor, "h w 3"], gains: Float[Tensor, "*over 3"]) -> Float[Tensor, "h w 3"]:
+    """The image as a camera with other gains stores it, the same everywhere or by pixel; clipped where it is full."""
     return srgb_from_linear(linear_from_srgb(raw) * gains).clamp(0, 1)
 
 

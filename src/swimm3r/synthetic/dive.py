@@ -2,13 +2,13 @@
 
     raw = add_water(clear, ray_depth, medium), and Binf where a ray meets nothing      (paper Eqs. 2-4)
 
-on values as stored (sRGB), before fish, snow, vignetting, the camera's exposure and white balance, and noise; under a
-lamp, `lamp_light` says how both terms change, and `clear` is the scene evenly lit. Truth is of the still scene by a
-camera whose gains are 1: depth and `clear` are what lies behind the fish, and `usable` is False wherever it shows.
-Caustics are in `raw` alone: `clear` has the light that they have on average. Where a ray meets nothing, depth is 0 and
-`clear` is black. Behind a port every ray is traced through it (`optics`), attenuation begins at its outer surface, and
-the cameras are the central ones of `swimm3r.refraction.central`. Where rows are exposed one after another, poses are
-those at half time, and depth counts along their axes.
+on values as stored (sRGB), before fish, snow, vignetting, the camera's exposure, white balance and tone mapping, and
+noise; under a lamp, `lamp_light` says how both terms change, and `clear` is the scene evenly lit. Truth is of the still
+scene by a camera whose gains are 1: depth and `clear` are what lies behind the fish, and `usable` is False wherever it
+shows. Caustics are in `raw` alone: `clear` has the light that they have on average. Where a ray meets nothing, depth is
+0 and `clear` is black. Behind a port every ray is traced through it (`optics`), attenuation begins at its outer
+surface, and the cameras are the central ones of `swimm3r.refraction.central`. Where rows are exposed one after another,
+poses are those at half time, and depth counts along their axes.
 
 On disk: images/NAME, and truth/ as `ground_truth` reads it, with masks/NAME.png (0 at the fish) if there is one, and
 gains.json, the camera's factors on linear light per frame, if they change; markers.json, the printed markers, if any;
@@ -38,6 +38,7 @@ from swimm3r.medium import Medium, add_water, srgb_from_linear, transmittances
 from swimm3r.progress import Progress, silent
 from swimm3r.refraction.central import CameraInWater
 from swimm3r.scene.ground_truth import FOLDER
+from swimm3r.shading import gains as shading_gains
 from swimm3r.synthetic import disturbances
 from swimm3r.synthetic.lamp_light import lamp_backscatter, lamp_of, light_on
 from swimm3r.synthetic.optics import PixelRays, behind_port, lens_of, rays_of, rolled
@@ -105,6 +106,11 @@ class Dive:
         rng = np.random.default_rng(self.settings.stream(6, i))
         return disturbances.camera_gains(self.settings.exposure, self.settings.white_balance, rng)
 
+    def shading(self, i: int) -> Float[Tensor, "k 3"]:
+        """The shading of frame i on linear light (`swimm3r.shading`); 0 without changes over the image."""
+        rng = np.random.default_rng(self.settings.stream(7, i))
+        return disturbances.local_tones(self.settings.local_exposure, rng)
+
     def frame(self, i: int) -> DiveFrame:
         """Render frame i; the same every time."""
         settings, camera = self.settings, self.cameras[i]
@@ -136,6 +142,9 @@ class Dive:
             raw = disturbances.vignette(raw, settings.vignetting)
         if settings.exposure or settings.white_balance:
             raw = disturbances.exposed(raw, self.gains(i))
+        if settings.local_exposure:
+            shade = shading_gains(self.shading(i), *raw.shape[:2])
+            raw = disturbances.exposed(raw, shade.permute(1, 2, 0))
         if settings.noise:
             raw = disturbances.sensor_noise(raw, settings.noise, rng)
         return DiveFrame(raw, clear, z_depth, ray_depth, usable, light, glow)

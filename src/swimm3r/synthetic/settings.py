@@ -134,6 +134,8 @@ class DiveSettings(Settings):
     """Largest change of the camera's exposure from frame to frame, in stops up or down."""
     white_balance: Annotated[float, Range(0, below=1)] = 0.0
     """Largest change of the camera's gains of red and blue from frame to frame, as a share."""
+    local_exposure: Annotated[float, Range(0, 3)] = 0.0
+    """Change of the exposure over a single frame, as local tone mapping makes it, in stops (standard deviation)."""
     moving_object: bool = False
     """Let a fish swim across the view once during the dive."""
     printed_markers: Annotated[int, Range(0, 50)] = 0

@@ -21,7 +21,7 @@ from swimm3r.io.files.cache_key import cache_key
 from swimm3r.io.files.damage import guard
 from swimm3r.progress import Progress
 from swimm3r.raster.cpu.threads import threads_for_kernels_alone
-from swimm3r.splat.appearance import fit_to_view
+from swimm3r.splat.appearance import ColorFit, fit_to_view
 from swimm3r.splat.medium.kinds import Water
 from swimm3r.splat.pose_mlp import PoseMlp
 from swimm3r.splat.primitives.kinds import Primitives
@@ -39,7 +39,7 @@ log = logging.getLogger(__name__)
 _TRAINING = 2  # raised by every change of the code that trains differently from the same settings
 _FIRST_REFIT = 0.4  # of the run: every recipe has its water by then
 _REFIT_SIDE = 160  # pixels of the longer side, at least, of the images that colors are fitted on
-_COLORS = "frame_colors"  # of a checkpoint
+_COLORS, _SHADING = "frame_colors", "frame_shading"  # of a checkpoint
 _FOOTPRINTS_EVERY = 0.1  # of the run: primitives move little, and those that take another's place take its footprint
 
 Numbers = dict[str, float | Tensor]
@@ -171,27 +171,34 @@ def fit_frame_colors_again(recipe: Recipe, state: State) -> None:
     colors = scene.views.colors
     if colors is None:
         return
-    fits = []
+    fits: list[ColorFit] = []
     for k in range(len(scene.views)):
         view = scene.view(k)
         view = smaller(view, max(1, max(view.seen.shape) // _REFIT_SIDE))
         shown = images(state.primitives, state.field, scene.pinhole_view(view, state.poses), settings, view.time)
-        fits.append(fit_to_view(shown.rgb, view.rgb, view.seen.float()).cpu())
-    scene.views.colors = colors.refitted(torch.stack(fits))
+        shaded = colors.shading is not None
+        fits.append(fit_to_view(shown.rgb.cpu(), view.rgb.cpu(), view.seen.float().cpu(), shaded=shaded))
+    scene.views.colors = colors.refitted(fits)
 
 
 def _stored_colors(scene: TrainingScene) -> dict[str, Tensor]:
-    return {} if scene.views.colors is None else {_COLORS: scene.views.colors.maps}
+    colors = scene.views.colors
+    if colors is None:
+        return {}
+    return {_COLORS: colors.maps} | ({} if colors.shading is None else {_SHADING: colors.shading})
 
 
 def _restore_colors(scene: TrainingScene, tensors: dict[str, Tensor]) -> None:
     """Raises KeyError or ValueError where a state has no maps, or those of another number of frames."""
     colors = scene.views.colors
-    if colors is not None:
-        maps = tensors[_COLORS]
-        if maps.shape != colors.maps.shape:
-            raise ValueError(f"{_COLORS} has the shape {tuple(maps.shape)} for {len(colors.names)} frames")
-        scene.views.colors = replace(colors, maps=maps)
+    if colors is None:
+        return
+    kept = {_COLORS: colors.maps} if colors.shading is None else {_COLORS: colors.maps, _SHADING: colors.shading}
+    for name, now in kept.items():
+        if tensors[name].shape != now.shape:
+            raise ValueError(f"{name} has the shape {tuple(tensors[name].shape)} for {len(colors.names)} frames")
+    shading = None if colors.shading is None else tensors[_SHADING]
+    scene.views.colors = replace(colors, maps=tensors[_COLORS], shading=shading)
 
 
 def _resume(recipe: Recipe, parts: RecipeParts, path: Path, metrics: Path, schedule: Schedule) -> tuple[State, int]:
