@@ -256,6 +256,13 @@ def test_warnings_of_the_run_are_the_warnings_of_the_page(make_run: Callable[...
     assert "One. Two. Do three." in text_of(write_report(folder).read_text(encoding="utf-8"))
 
 
+def test_commands_in_warnings_are_set_as_commands_and_nothing_else_is_markup(make_run: Callable[..., Path]):
+    folder = make_run(warnings=(QualityWarning("Depth < 1 m.", "`--flicker keep` takes the <frames> as filmed."),))
+    page = write_report(folder).read_text(encoding="utf-8")
+    assert "<code>--flicker keep</code> takes the &lt;frames&gt; as filmed." in page
+    assert "Depth &lt; 1 m." in page
+
+
 @pytest.mark.parametrize("section", ["stages", "test", "sfm", "truth"])
 def test_a_summary_of_another_form_is_damaged_and_named(make_run: Callable[..., Path], section: str):
     folder = make_run()

@@ -2,12 +2,13 @@
 
 import base64
 import json
+import re
 from importlib.resources import files
 from pathlib import Path
 from typing import Any
 
 import jinja2
-from markupsafe import Markup
+from markupsafe import Markup, escape
 
 from swimm3r.io import images
 from swimm3r.io.files.atomic import write_text
@@ -50,6 +51,7 @@ def write(folder: Path) -> Path:
     template = jinja2.Environment(
         autoescape=True, undefined=jinja2.StrictUndefined, trim_blocks=True, lstrip_blocks=True
     )
+    template.filters["commands"] = _commands
     try:
         fields |= _of_summary(summary, folder) | {"rig": rig_section(summary, frames)}
         page = template.from_string(_part("page.html.j2")).render(fields)
@@ -58,6 +60,11 @@ def write(folder: Path) -> Path:
     path = folder / "report.html"
     write_text(path, page)
     return path
+
+
+def _commands(text: str) -> Markup:
+    """Text as HTML, with `commands` in the type of commands."""
+    return Markup(re.sub(r"`([^`]+)`", r"<code>\1</code>", str(escape(text))))
 
 
 def _of_summary(summary: dict[str, Any], folder: Path) -> dict[str, object]:
