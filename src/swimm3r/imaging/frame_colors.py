@@ -89,6 +89,13 @@ class ColorEvidence:
         """Share that shadings explain of what water and frames leave; None where places in the image are not known."""
         return None if self.shaded is None else _explained(self.both, self.shaded)
 
+    def is_shaded(self, least_share: float, least_change: float = 0.0) -> bool:
+        """Return whether shadings explain so much of what water and frames leave, and change colors by so much."""
+        if self.shaded is None or self.by_shading is None:
+            return False
+        moved = max(0.0, self.both**2 - self.shaded**2) ** 0.5
+        return self.by_shading >= least_share and moved >= least_change
+
     @property
     def by_record(self) -> float | None:
         """Share that the recorded gains explain of what the water leaves; None without any."""

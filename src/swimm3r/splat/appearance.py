@@ -121,7 +121,8 @@ def decide_appearance(
         return Appearance(AppearanceDecision(colors is not None, "too few points are seen by three frames"), colors)
     on, reason = _judged(fit.evidence, settings)
     e = fit.evidence
-    shaded = fit.shaded if on and _shaded(e, settings) else None
+    over_image = e.is_shaded(settings.least_shading, settings.least_change)
+    shaded = fit.shaded if on and (settings.shading == "on" or (settings.shading == "auto" and over_image)) else None
     if shaded is not None:
         reason += (
             f"; gains that change smoothly over each frame explain {max(0.0, e.by_shading or 0.0):.0%} of the rest"
@@ -149,14 +150,6 @@ def _judged(e: ColorEvidence, settings: AppearanceSettings) -> tuple[bool, str]:
     moved = max(0.0, e.water**2 - e.both**2) ** 0.5
     explained = e.by_frames >= settings.least_explained or (by_record or 0.0) >= settings.least_recorded
     return explained and moved >= settings.least_change, told
-
-
-def _shaded(e: ColorEvidence, settings: AppearanceSettings) -> bool:
-    """Return whether gains of frames change over the image."""
-    if settings.shading != "auto" or e.shaded is None or e.by_shading is None:
-        return settings.shading == "on"
-    moved = max(0.0, e.both**2 - e.shaded**2) ** 0.5
-    return e.by_shading >= settings.least_shading and moved >= settings.least_change
 
 
 def _stops(tracks: ColorTracks) -> tuple[float, float, float] | None:
