@@ -71,8 +71,8 @@ def test_uciqe_is_that_of_the_vectors(shared, name):
 
 
 def test_lab_is_that_of_scikit_image():
-    rgb = torch.rand(30, 31, 3, generator=torch.Generator().manual_seed(0), dtype=torch.float64)
-    rgb[0, :3] = torch.tensor([[0.0, 0, 0], [1, 1, 1], [0.01, 0, 0.02]])
+    rgb = torch.randint(0, 256, (30, 31, 3), generator=torch.Generator().manual_seed(0)).to(torch.uint8)
+    rgb[0, :3] = torch.tensor([[0, 0, 0], [255, 255, 255], [3, 0, 5]])
     torch.testing.assert_close(_lab_from_srgb(rgb), torch.from_numpy(rgb2lab(rgb.numpy())), rtol=0, atol=1e-9)
 
 

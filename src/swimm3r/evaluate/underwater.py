@@ -12,7 +12,7 @@ from dataclasses import dataclass
 
 import numpy as np
 import torch
-from jaxtyping import Bool, Float
+from jaxtyping import Bool, Float, UInt8
 from numpy import ndarray
 from PIL import Image
 from scipy.ndimage import sobel
@@ -96,11 +96,11 @@ def uciqe(rgb: Float[Tensor, "h w 3"]) -> float:
 
     The contrast is the mean of the brightest 1 % of L less that of the darkest 1 %; scored as the 8-bit file shows it.
     """
-    lab = _lab_from_srgb(as_8_bit(rgb.double())).reshape(-1, 3)
-    L, chroma = lab[:, 0], lab[:, 1:].norm(dim=-1)
+    lab = _lab_from_srgb((as_8_bit(rgb) * 255).round().to(torch.uint8)).reshape(-1, 3)
+    L, chroma = lab[:, 0], lab[:, 1:].square().sum(-1).sqrt()
     extreme = max(1, round(0.01 * len(L)))
-    ordered = L.sort().values
-    contrast = ordered[-extreme:].mean() - ordered[:extreme].mean()
+    ordered = np.partition(L.numpy(), (extreme - 1, len(L) - extreme))
+    contrast = float(ordered[len(L) - extreme :].mean() - ordered[:extreme].mean())
     saturation = torch.where(L > 0, chroma / L, 0.0)
     return (0.4680 * chroma.std(correction=0) + 0.2745 * contrast + 0.2576 * saturation.mean()).item()
 
@@ -260,14 +260,16 @@ def _blocks(image: ndarray) -> ndarray:
     return tiles.reshape(rows * columns, -1)
 
 
-def _lab_from_srgb(srgb: Float[Tensor, "h w 3"]) -> Float[Tensor, "h w 3"]:
-    """CIE 1976 L*a*b* under D65, L in 0..100."""
+def _lab_from_srgb(srgb: UInt8[Tensor, "h w 3"]) -> Float[Tensor, "h w 3"]:
+    """CIE 1976 L*a*b* under D65, L in 0..100, of 8-bit values; float64."""
     xyz_from_rgb = torch.tensor(
         [[0.412453, 0.357580, 0.180423], [0.212671, 0.715160, 0.072169], [0.019334, 0.119193, 0.950227]],
         dtype=torch.float64,
     )
     white = torch.tensor([0.95047, 1.0, 1.08883], dtype=torch.float64)
-    t = linear_from_srgb(srgb) @ xyz_from_rgb.T / white
-    f = torch.where(t > 0.008856, t.clamp(min=1e-12) ** (1 / 3), 7.787 * t + 16 / 116)
+    levels = (torch.arange(256, dtype=torch.float64) / 255)[:, None].expand(-1, 3)
+    linear = linear_from_srgb(levels)[:, 0][srgb.int()]
+    t = linear @ (xyz_from_rgb / white[:, None]).T
+    f = torch.where(t > 0.008856, torch.from_numpy(np.cbrt(t.numpy())), 7.787 * t + 16 / 116)
     x, y, z = f.unbind(-1)
     return torch.stack((116 * y - 16, 500 * (x - y), 200 * (y - z)), -1)

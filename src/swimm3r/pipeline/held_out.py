@@ -70,7 +70,10 @@ class HeldOutView:
 
 @dataclass(frozen=True)
 class CoveredScores:
-    """The scores where some training frame saw what this frame shows; a map cannot know the rest."""
+    """The scores where training frames measured what this frame shows; a map cannot know the rest.
+
+    A moving object in front of measured ground is none of it.
+    """
 
     share: float  # of the pixels
     psnr: float | NotComputed  # dB
@@ -209,7 +212,7 @@ def score_views(
             told = seen & (known if out.observed is None else out.observed)
             shown = recolored(shown, target, told if quiet is None else told & quiet)
         scores = view_scores(shown, target, perceptual, seen)
-        covered = covered_scores(shown, target, seen, known)
+        covered = covered_scores(shown, target, seen, known if quiet is None else known & quiet)
         observed = observed_scores(shown, target, seen, out.observed)
         still = still_scores(shown, target, seen, quiet)
         views.append(HeldOutView(name, time, lens, canvas, window, first.source, scores, covered, observed, still))

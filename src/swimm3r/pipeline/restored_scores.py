@@ -15,6 +15,7 @@ from swimm3r.evaluate import NotComputed, summary_entries
 from swimm3r.evaluate.underwater import URANKER, uciqe, uiqm
 from swimm3r.io import images
 from swimm3r.progress import Progress, silent
+from swimm3r.sfm.medium.side_by_side import in_order
 
 
 @dataclass(frozen=True)
@@ -32,12 +33,16 @@ def no_reference_scores(paths: Sequence[Path], progress: Progress = silent) -> N
     if not there:
         nothing = NotComputed("no frame was restored" if not paths else f"there is no image in {paths[0].parent}")
         return NoReferenceScores(nothing, nothing, nothing)
-    scores = []
-    for done, path in enumerate(there):
-        progress("scoring restored images", done, len(there))
-        stored = images.read_rgb(path)
+
+    def scored(k: int) -> tuple[float, float]:
+        stored = images.read_rgb(there[k])
         rgb = torch.from_numpy(stored.astype(np.float32) / np.iinfo(stored.dtype).max)
-        scores.append((uiqm(rgb).uiqm, uciqe(rgb)))
+        return uiqm(rgb).uiqm, uciqe(rgb)
+
+    scores = []
+    for done, of_image in enumerate(in_order(scored, range(len(there)))):
+        progress("scoring restored images", done, len(there))
+        scores.append(of_image)
     progress("scoring restored images", len(there), len(there))
     mean = torch.tensor(scores).mean(0).tolist()
     return NoReferenceScores(mean[0], mean[1])

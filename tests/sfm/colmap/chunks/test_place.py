@@ -1,14 +1,25 @@
-"""Chunks that other processes place: finished ones are left alone, and one that cannot be placed is told."""
+"""Chunks that other processes place, and those that fall apart.
 
+Finished ones are left alone, and one that cannot be placed is told.
+"""
+
+import shutil
+from dataclasses import replace
 from pathlib import Path
 
+import pycolmap
 import pytest
 
 from swimm3r.errors import StorageError
+from swimm3r.prepare import read_frames
 from swimm3r.progress import silent
+from swimm3r.sfm.colmap import mapping, poses
 from swimm3r.sfm.colmap.chunks import place
-from swimm3r.sfm.colmap.chunks.place import ChunkTask, place_chunks, placed_models
+from swimm3r.sfm.colmap.chunks.place import ChunkTask, grown, place_chunks, placed_models
+from swimm3r.sfm.features.database import FeatureDatabase
 from swimm3r.sfm.settings import ColmapSettings
+from swimm3r.synthetic import write_dive
+from swimm3r.synthetic.settings import DiveSettings
 from swimm3r.tasks import EngineSettings
 from swimm3r.tasks.outcome import Failure
 
@@ -37,3 +48,29 @@ def test_an_error_of_the_disk_is_no_chunks_own(tmp_path: Path, monkeypatch: pyte
     task = ChunkTask("a", tmp_path / "a.db", 3, (1, 2, 3), ("PINHOLE", ()), ColmapSettings(), tmp_path / "chunks" / "a")
     with pytest.raises(StorageError, match="disk is full"):
         place_chunks([task], 1, "placing chunks", silent, EngineSettings(jobs=2))
+
+
+def of_frames(model: pycolmap.Reconstruction, images: set[int]) -> pycolmap.Reconstruction:
+    """The model without its other frames."""
+    out = pycolmap.Reconstruction(model)
+    for image in set(out.reg_image_ids()) - images:
+        out.deregister_frame(out.images[image].frame_id)
+    return out
+
+
+def test_the_models_of_a_chunk_that_fell_apart_grow_and_those_taken_over_are_left_out(tmp_path: Path):
+    write_dive(DiveSettings(frames=10, width=240, height=160), tmp_path / "dive")
+    frames = read_frames(tmp_path / "dive", folder=tmp_path / "prepare").train
+    settings = ColmapSettings(threads=1, mapping=replace(ColmapSettings().mapping, method="incremental"))
+    poses.reconstruct(frames, settings, tmp_path / "sfm")
+    shutil.copyfile(tmp_path / "sfm" / "database.db", tmp_path / "mapping.db")
+    store = FeatureDatabase(tmp_path / "mapping.db", len(frames))
+    held = replace(settings, intrinsics="fixed")
+    whole = mapping.map_frames(store, held, silent)[0]
+    images = sorted(whole.reg_image_ids())
+    fallen = [of_frames(whole, set(images[:5])), of_frames(whole, set(images[5:]))]
+    (found,) = grown(store, fallen, held, silent)
+    assert sorted(found.reg_image_ids()) == images
+    assert found.compute_mean_reprojection_error() < 1.2 * whole.compute_mean_reprojection_error()
+    (same,) = grown(store, [whole], held, silent)
+    assert same is whole

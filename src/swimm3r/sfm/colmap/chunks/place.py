@@ -18,7 +18,7 @@ from swimm3r.io.files.atomic import atomic_folder
 from swimm3r.progress import Progress, silent
 from swimm3r.sfm.colmap.calibration.start import set_camera
 from swimm3r.sfm.colmap.chunks.parts import LEAST_FRAMES
-from swimm3r.sfm.colmap.mapping import map_frames
+from swimm3r.sfm.colmap.mapping import map_frames, place_leftovers, replace_misplaced
 from swimm3r.sfm.features.database import FeatureDatabase, write_excerpt
 from swimm3r.sfm.settings import ColmapSettings
 from swimm3r.tasks import run_tasks
@@ -56,11 +56,36 @@ def place_chunk(task: ChunkTask, progress: Progress = silent) -> None:
         with store.open() as database:
             camera = database.read_camera(1)
         set_camera(store, lens_with(camera, name, parameters))
-        models = map_frames(store, replace(task.settings, intrinsics="fixed"), progress)
+        held = replace(task.settings, intrinsics="fixed")
+        models = grown(store, map_frames(store, held, progress), held, progress)
     with atomic_folder(task.folder) as draft:
         for k, model in enumerate(m for m in models if m.num_reg_images() >= LEAST_FRAMES):
             (draft / str(k)).mkdir()
             model.write_binary(str(draft / str(k)))
+
+
+def grown(
+    store: FeatureDatabase,
+    models: "list[pycolmap.Reconstruction]",
+    settings: ColmapSettings,
+    progress: Progress,
+) -> "list[pycolmap.Reconstruction]":
+    """The models of a chunk that fell apart, the largest first, each with the frames that looser limits can add.
+
+    A model most of whose frames a larger one took over is left out.
+    """
+    out: list[pycolmap.Reconstruction] = []
+    taken: set[int] = set()
+    for model in models:
+        own = set(model.reg_image_ids())
+        if 2 * len(own & taken) > len(own):
+            continue
+        if len(own) < store.frames:
+            more = place_leftovers(store, model, settings, progress)
+            model = replace_misplaced(store, more, settings, progress)
+        out.append(model)
+        taken |= set(model.reg_image_ids())
+    return out
 
 
 def place_chunks(
