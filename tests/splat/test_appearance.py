@@ -245,6 +245,9 @@ def test_gains_that_change_over_frames_are_told_from_those_that_do_not(tiny_dive
     assert local.decision.by_shading is not None
     assert local.decision.by_shading > 0.4
     assert "smoothly over each frame" in local.decision.reason
+    for_these_alone = AppearanceSettings(least_explained=1.0, least_recorded=1.0)
+    assert decide_appearance(tracked, tone_mapped, tracked.names, for_these_alone).decision.shaded
+    assert not decide_appearance(tracked, relit, tracked.names, for_these_alone).decision.on
     by_hand = decide_appearance(tracked, tone_mapped, tracked.names, AppearanceSettings(shading="off"))
     assert by_hand.decision.on
     assert not by_hand.decision.shaded

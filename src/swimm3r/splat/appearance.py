@@ -119,10 +119,9 @@ def decide_appearance(
             shading = torch.zeros(len(names), len(ORDERS), 3)
         colors = FrameColors(tuple(names), maps, shading) if settings.mode == "on" else None
         return Appearance(AppearanceDecision(colors is not None, "too few points are seen by three frames"), colors)
-    on, reason = _judged(fit.evidence, settings)
     e = fit.evidence
-    over_image = e.is_shaded(settings.least_shading, settings.least_change)
-    shaded = fit.shaded if on and (settings.shading == "on" or (settings.shading == "auto" and over_image)) else None
+    on, reason = _judged(e, settings)
+    shaded = fit.shaded if on and _over_images(e, settings) else None
     if shaded is not None:
         reason += (
             f"; gains that change smoothly over each frame explain {max(0.0, e.by_shading or 0.0):.0%} of the rest"
@@ -149,7 +148,14 @@ def _judged(e: ColorEvidence, settings: AppearanceSettings) -> tuple[bool, str]:
         return True, f"switched on; {told}"
     moved = max(0.0, e.water**2 - e.both**2) ** 0.5
     explained = e.by_frames >= settings.least_explained or (by_record or 0.0) >= settings.least_recorded
-    return explained and moved >= settings.least_change, told
+    return (explained and moved >= settings.least_change) or _over_images(e, settings), told
+
+
+def _over_images(e: ColorEvidence, settings: AppearanceSettings) -> bool:
+    """Return whether gains of frames change over the image."""
+    if settings.shading != "auto":
+        return settings.shading == "on"
+    return e.is_shaded(settings.least_shading, settings.least_change)
 
 
 def _stops(tracks: ColorTracks) -> tuple[float, float, float] | None:

@@ -75,8 +75,8 @@ class AppearanceSettings(Settings):
     least_change: Share = 0.006
     """Smallest change of colors, in pixel values, that frames must explain, with `auto`."""
     shading: Literal["auto", "on", "off"] = "auto"
-    """Give every frame with a color map gains that change smoothly over the image, too: always, never, or where the
-    sparse points say so (auto)."""
+    """Give every frame gains that change smoothly over the image beside its color map, which it then has in any case:
+    always, never, or where the sparse points say so (auto)."""
     least_shading: Share = 0.2
     """Smallest share that such gains must explain of the variation that water and color maps leave, with `auto`."""
     refits: Annotated[int, Range(0, 100)] = 3

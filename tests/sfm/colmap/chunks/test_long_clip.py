@@ -135,6 +135,13 @@ def test_a_part_is_cut_where_the_scale_jumps_and_where_few_points_hold():
     assert coherent_parts(chain([1.0] * 6, shared=8)) == []
 
 
+def test_frames_that_share_few_points_must_stand_at_depths_that_differ_little():
+    doubled = [1.0, 1.0, 1.0, 2.1, 2.1, 2.1]
+    weak, strong = (coherent_parts(chain(doubled, shared)) for shared in (30, 60))
+    assert [piece.images for piece in weak] == [(1, 2, 3), (4, 5, 6)]
+    assert [piece.images for piece in strong] == [(1, 2, 3, 4, 5, 6)]
+
+
 def test_a_part_is_cut_where_only_the_points_that_two_frames_share_are_in_one_scale():
     """A frame placed on few points, at which the scale was lost: all else that it sees is ten times as far."""
     part = chain([1.0] * 6, shared=20)

@@ -21,7 +21,9 @@ if TYPE_CHECKING:
 
 LEAST_FRAMES = 3  # of a part
 _HOLDING = 15  # points that two frames must share to hold together, as many as a verified pair has matches
-_DEPTH_RATIO = 3.0  # of two frames that share points: stills of a survey differ by less than 1.5
+_DEPTH_RATIO = 3.0  # of two frames that share points
+_FEW = 50  # shared points, below which the scale between two frames is weak, and their ratio of depths must be smaller
+_RATIO_OF_FEW = 1.6  # stills of a survey differ by less than 1.5
 
 
 @dataclass(frozen=True)
@@ -118,7 +120,8 @@ def _in_one_scale(part: Part, i: int, j: int, rows: Mapping[int, Int[np.ndarray,
     ratios = (
         _depth(part, i, seen_i) / _depth(part, j, seen_j) for seen_i, seen_j in ((shared, shared), (rows[i], rows[j]))
     )
-    return all(1 / _DEPTH_RATIO < ratio < _DEPTH_RATIO for ratio in ratios)
+    most = _DEPTH_RATIO if len(shared) >= _FEW else _RATIO_OF_FEW
+    return all(1 / most < ratio < most for ratio in ratios)
 
 
 def _depth(part: Part, image: int, points: Int[np.ndarray, " k"]) -> float:
