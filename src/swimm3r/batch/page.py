@@ -7,7 +7,6 @@ from importlib.resources import files
 from pathlib import Path
 from urllib.parse import quote
 
-import jinja2
 import numpy as np
 from markupsafe import Markup
 
@@ -18,7 +17,7 @@ from swimm3r.io.files.atomic import write_text
 from swimm3r.prepare import load_frames
 from swimm3r.report.frames import filmed
 from swimm3r.report.head import clock
-from swimm3r.report.style import style_sheet
+from swimm3r.report.style import page_template, style_sheet
 from swimm3r.scene.run_folder import MARKERS, is_run, read_run
 
 _LONG_SIDE, _QUALITY = 320, 78  # of thumbnails: pixels, and JPEG's
@@ -68,9 +67,7 @@ def write_page(rows: Sequence[Shown], skipped: Sequence[Skipped], out: Path) -> 
     count: Mapping[str, int] = {
         status: sum(shown.row.status == status for shown in rows) for status in ("finished", "failed", "waiting")
     }
-    template = jinja2.Environment(
-        autoescape=True, undefined=jinja2.StrictUndefined, trim_blocks=True, lstrip_blocks=True
-    ).from_string(files("swimm3r.batch").joinpath("results.html.j2").read_text(encoding="utf-8"))
+    template = page_template(files("swimm3r.batch").joinpath("results.html.j2").read_text(encoding="utf-8"))
     path = out / "results.html"
     page = template.render(
         title=out.resolve().name,

@@ -2,13 +2,12 @@
 
 import base64
 import json
-import re
 from importlib.resources import files
 from pathlib import Path
 from typing import Any
 
 import jinja2
-from markupsafe import Markup, escape
+from markupsafe import Markup
 
 from swimm3r.io import images
 from swimm3r.io.files.atomic import write_text
@@ -21,7 +20,7 @@ from swimm3r.report.maps import map_section
 from swimm3r.report.plan_view import path_overlay, plan_view
 from swimm3r.report.rig import rig_section
 from swimm3r.report.scene import pack_scene, shown_points
-from swimm3r.report.style import style_sheet
+from swimm3r.report.style import page_template, style_sheet
 from swimm3r.scene.frames import Frames
 from swimm3r.scene.reconstruction import Reconstruction
 from swimm3r.scene.reconstruction_io import load_reconstruction
@@ -48,23 +47,14 @@ def write(folder: Path) -> Path:
     fields = _made_with(folder, remedy) | _of_dive(frames, rec, folder)
     if "test" in summary:
         fields["tests"] = shown_frames.test_frames(frames, folder)
-    template = jinja2.Environment(
-        autoescape=True, undefined=jinja2.StrictUndefined, trim_blocks=True, lstrip_blocks=True
-    )
-    template.filters["commands"] = _commands
     try:
         fields |= _of_summary(summary, folder) | {"rig": rig_section(summary, frames)}
-        page = template.from_string(_part("page.html.j2")).render(fields)
+        page = page_template(_part("page.html.j2")).render(fields)
     except (jinja2.UndefinedError, TypeError, ValueError, KeyError, AttributeError) as error:
         raise damaged(folder / "summary.json", first_line(error), remedy) from error
     path = folder / "report.html"
     write_text(path, page)
     return path
-
-
-def _commands(text: str) -> Markup:
-    """Text as HTML, with `commands` in the type of commands."""
-    return Markup(re.sub(r"`([^`]+)`", r"<code>\1</code>", str(escape(text))))
 
 
 def _of_summary(summary: dict[str, Any], folder: Path) -> dict[str, object]:
