@@ -10,7 +10,6 @@ from importlib.metadata import version
 from importlib.resources import files
 from pathlib import Path
 
-import jinja2
 import numpy as np
 from jaxtyping import UInt8
 from markupsafe import Markup
@@ -18,7 +17,7 @@ from scipy import ndimage
 
 from swimm3r.io import images
 from swimm3r.io.files.atomic import write_text
-from swimm3r.report.style import style_sheet
+from swimm3r.report.style import page_template, style_sheet
 from swimm3r.rounding import rounded
 from swimm3r.visits.change import LESS, MORE, Change
 from swimm3r.visits.places import Place
@@ -98,10 +97,7 @@ def overlay(image: UInt8[np.ndarray, "h w 3"], change: Change) -> UInt8[np.ndarr
 
 def write_page(record: VisitsRecord, pairs: Sequence[Pair], folder: Path) -> Path:
     """Write visits.html, whole or not at all, and return its path."""
-    environment = jinja2.Environment(
-        autoescape=True, undefined=jinja2.StrictUndefined, trim_blocks=True, lstrip_blocks=True
-    )
-    template = environment.from_string(files("swimm3r.visits").joinpath("visits.html.j2").read_text(encoding="utf-8"))
+    template = page_template(files("swimm3r.visits").joinpath("visits.html.j2").read_text(encoding="utf-8"))
     script = files("swimm3r.report").joinpath("page.js").read_text(encoding="utf-8")
     page = template.render(
         title=", ".join(visit.name for visit in record.visits),
