@@ -2,8 +2,9 @@
 
     python benchmarks/shading.py RUN... --out DIR [--iterations 2000]
 
-RUN are folders with finished structure from motion. `psnr_affine` compares both alike: after one affine map of all of a
-test frame, on ground that training frames measured. Results stay in DIR: the same command resumes.
+RUN are folders with finished structure from motion. Each map is scored in the colors that its test frames are fitted
+in, which is a finer fit with shadings: the scores do not compare across the two. The renderings and targets in DIR do,
+under any one fit of `swimm3r.evaluate.registration`. Results stay in DIR: the same command resumes.
 """
 
 import argparse
