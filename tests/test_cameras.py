@@ -4,9 +4,11 @@ import pytest
 import torch
 
 from swimm3r.cameras import (
+    EXPONENTS,
     CameraModel,
     Cameras,
     directions,
+    distort,
     image_directions,
     inside_image,
     pixel_grid,
@@ -24,6 +26,7 @@ LENSES: dict[CameraModel, list[float]] = {
     "SIMPLE_RADIAL": [-0.12],
     "OPENCV": [0.11, -0.05, 0.003, -0.002],
     "OPENCV_FISHEYE": [-0.02, 0.01, -0.004, 0.001],
+    "POLYNOMIAL": [0.01, -0.02, 0.03, 0.15, 0.02, 0.1, *[0.0] * 12, 0.02, 0.01, -0.01, 0.05, -0.12, 0.02, *[0.01] * 12],
 }
 
 
@@ -46,7 +49,7 @@ def test_projecting_undoes_unprojecting(model: CameraModel):
     torch.testing.assert_close(z_again, z)
 
 
-@pytest.mark.parametrize("model", LENSES)
+@pytest.mark.parametrize("model", [model for model in LENSES if model != "POLYNOMIAL"])
 def test_models_agree_with_colmap(model: CameraModel):
     pycolmap = pytest.importorskip("pycolmap")
     cameras = two_cameras(model)
@@ -59,6 +62,16 @@ def test_models_agree_with_colmap(model: CameraModel):
     pixels = pixel_grid(300, 400).reshape(-1, 2)[::611].double()
     ours = directions(cameras[0], pixels[None])[0, :, :2]
     torch.testing.assert_close(ours, torch.from_numpy(theirs.cam_from_img(pixels.numpy())), atol=1e-7, rtol=0)
+
+
+def test_a_polynomial_has_the_lenses_of_colmap_as_special_cases():
+    k1, k2, p1, p2 = LENSES["OPENCV"]
+    a = {(3, 0): k1, (1, 2): k1, (5, 0): k2, (3, 2): 2 * k2, (1, 4): k2, (1, 1): 2 * p1, (2, 0): 3 * p2, (0, 2): p2}
+    b = {(2, 1): k1, (0, 3): k1, (4, 1): k2, (2, 3): 2 * k2, (0, 5): k2, (1, 1): 2 * p2, (2, 0): p1, (0, 2): 3 * p1}
+    terms = torch.tensor([axis.get(exponent, 0.0) for axis in (a, b) for exponent in EXPONENTS], dtype=torch.float64)
+    xy = torch.rand(50, 2, dtype=torch.float64) - 0.5
+    own = distort(xy, torch.tensor(LENSES["OPENCV"], dtype=torch.float64), "OPENCV")
+    torch.testing.assert_close(distort(xy, terms, "POLYNOMIAL"), own)
 
 
 def test_a_ray_the_lens_cannot_see_is_nan():

@@ -36,6 +36,7 @@ if TYPE_CHECKING:
     from swimm3r.scene.reconstruction_io import load_reconstruction
     from swimm3r.scene.settings import FrameSettings
     from swimm3r.sfm import reconstruct
+    from swimm3r.sfm.rectified import rectify_frames
     from swimm3r.sfm.settings import ColmapSettings, Mast3rSettings
     from swimm3r.splat import train
     from swimm3r.splat.map_file import load_map
@@ -66,6 +67,7 @@ _HOME = {
     "Progress": "progress",
     "silent": "progress",
     "reconstruct": "sfm",
+    "rectify_frames": "sfm.rectified",
     "ColmapSettings": "sfm.settings",
     "Mast3rSettings": "sfm.settings",
     "SplatMap": "splat.rendering",
@@ -104,6 +106,7 @@ __all__ = [
     "localize",
     "read_frames",
     "reconstruct",
+    "rectify_frames",
     "remove_water",
     "run_pipeline",
     "silent",

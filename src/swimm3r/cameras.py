@@ -8,6 +8,10 @@ follows COLMAP's models, for (x, y) on the plane z = 1, r^2 = x^2 + y^2 and thet
     OPENCV (k1, k2, p1, p2)            (x, y) (1 + k1 r^2 + k2 r^4)
                                          + (2 p1 x y + p2 (r^2 + 2 x^2), p1 (r^2 + 2 y^2) + 2 p2 x y)
     OPENCV_FISHEYE (k1, k2, k3, k4)    (x, y) theta / r (1 + k1 theta^2 + k2 theta^4 + k3 theta^6 + k4 theta^8)
+
+One more is of no other program, for images that are bent as none of these lenses bends them (`imaging.rectification`):
+
+    POLYNOMIAL (a20 .. a05, b20 .. b05)  (x + sum a_ij x^i y^j, y + sum b_ij x^i y^j),  2 <= i + j <= 5
 """
 
 import json
@@ -25,12 +29,15 @@ from torch import Tensor
 from swimm3r.io.files.atomic import write_text
 from swimm3r.io.files.safe_names import check_names
 
-CameraModel = Literal["PINHOLE", "SIMPLE_RADIAL", "OPENCV", "OPENCV_FISHEYE"]
+CameraModel = Literal["PINHOLE", "SIMPLE_RADIAL", "OPENCV", "OPENCV_FISHEYE", "POLYNOMIAL"]
+EXPONENTS = tuple((degree - j, j) for degree in range(2, 6) for j in range(degree + 1))
+"""i and j of the monomials x^i y^j of POLYNOMIAL, by degree."""
 DISTORTION_PARAMETERS: dict[str, tuple[str, ...]] = {
     "PINHOLE": (),
     "SIMPLE_RADIAL": ("k1",),
     "OPENCV": ("k1", "k2", "p1", "p2"),
     "OPENCV_FISHEYE": ("k1", "k2", "k3", "k4"),
+    "POLYNOMIAL": tuple(f"{axis}{i}{j}" for axis in "ab" for i, j in EXPONENTS),
 }
 _ORTHONORMAL = 5e-3  # of R R^T: rotations are printed with as few as three decimals
 _FOCAL = (0.01, 1000.0)  # of the long side: fields of view of 178 and 0.06 degrees
@@ -254,6 +261,11 @@ def distort(
             t2 = theta * theta
             k1, k2, k3, k4 = (value[..., None] for value in k)
             return xy * theta * (1 + t2 * (k1 + t2 * (k2 + t2 * (k3 + t2 * k4)))) / r
+        case "POLYNOMIAL":
+            x, y = (axis[..., None] for axis in xy.unbind(-1))
+            terms = torch.cat([x**i * y**j for i, j in EXPONENTS], -1)
+            a, b = distortion[..., : len(EXPONENTS)], distortion[..., len(EXPONENTS) :]
+            return xy + torch.stack([(a * terms).sum(-1), (b * terms).sum(-1)], -1)
         case _:
             raise ValueError(f"camera model is one of {', '.join(DISTORTION_PARAMETERS)}, got {model}")
 

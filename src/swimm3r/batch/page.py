@@ -14,11 +14,11 @@ from swimm3r.batch.dives import Skipped
 from swimm3r.batch.results import Row
 from swimm3r.io import images
 from swimm3r.io.files.atomic import write_text
-from swimm3r.prepare import load_frames
 from swimm3r.report.frames import filmed
 from swimm3r.report.head import clock
 from swimm3r.report.style import page_template, style_sheet
 from swimm3r.scene.run_folder import MARKERS, is_run, read_run
+from swimm3r.sfm.rectified import run_frames
 
 _LONG_SIDE, _QUALITY = 320, 78  # of thumbnails: pixels, and JPEG's
 
@@ -91,7 +91,7 @@ def _verdict(count: Mapping[str, int]) -> str:
 
 def _thumbnails(folder: Path) -> tuple[str, str]:
     """The middle one of the restored frames as filmed and restored; without any, the middle frame of all."""
-    frames = load_frames(folder / "prepare")
+    frames = run_frames(folder)
     restored = [name for name in frames.names if (folder / "sfm" / "restored" / f"{name}.png").is_file()]
     names = restored or list(frames.names)
     if not names:

@@ -7,8 +7,8 @@ from swimm3r.cameras import Cameras, cameras_of
 from swimm3r.errors import InputError
 from swimm3r.io import cameras_json
 from swimm3r.io.files.damage import remake
-from swimm3r.prepare import load_frames
 from swimm3r.scene.run_folder import open_run
+from swimm3r.sfm.rectified import run_frames
 
 
 @dataclass(frozen=True)
@@ -43,7 +43,7 @@ def wanted_poses(folder: Path, *, refined: bool) -> TimedCameras:
             hint="leave out --refined: they are the same",
         )
     table = cameras_json.read_own_cameras(room / "cameras.json", remake(room))
-    frames = load_frames(folder / "prepare")
+    frames = run_frames(folder)
     times = table.times or frames.times_of(table.names)
     return TimedCameras(table.names, times, cameras_of(table), table.units, frames.stamps_of(table.names))
 

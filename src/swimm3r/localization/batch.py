@@ -18,16 +18,17 @@ from torch import Tensor
 from swimm3r import devices
 from swimm3r.cameras import Cameras, cameras_of
 from swimm3r.errors import InputError, RegistrationError
+from swimm3r.imaging.rectification import Rectification
 from swimm3r.io import cameras_json, images
 from swimm3r.io.files.atomic import write_text
 from swimm3r.io.image_header import read_header
 from swimm3r.io.trajectory import write_tum
 from swimm3r.localization.localizer import STAGES, Evidence, Localization, Localizer
 from swimm3r.localization.settings import LocalizationSettings
-from swimm3r.prepare import load_frames
 from swimm3r.progress import Progress, silent
 from swimm3r.scene.reconstruction_io import load_reconstruction
 from swimm3r.scene.run_folder import open_run
+from swimm3r.sfm.rectified import run_frames, run_rectification
 from swimm3r.splat.map_file import load_map
 from swimm3r.splat.settings import MapDevice
 
@@ -76,10 +77,11 @@ def localize_run(
         read_header(path)  # before minutes of matching
     open_run(folder, "splat")
     scene = load_map(folder / "splat" / "map.safetensors").to(devices.for_maps(map_device))
-    frames = load_frames(folder / "prepare")
+    frames = run_frames(folder)
     rec = load_reconstruction(folder / "sfm", frames)
     localizer = Localizer(scene, rec, rec.still(frames), settings, progress=progress)
     out = out or folder / "localization"
+    rectification = run_rectification(folder) if camera is None else None
     answers = []
     names = [path.name for path in image_files] or list(frames.test.names)
     if len(set(names)) < len(names):
@@ -91,7 +93,7 @@ def localize_run(
     for i, name in enumerate(names):
         progress("localizing", i, len(names))
         if image_files:
-            query = Query(name, float(i), _image(image_files[i]))
+            query = Query(name, float(i), _image(image_files[i], rectification))
         else:
             f = frames.index(name)
             time = frames.frames[f].time
@@ -141,8 +143,10 @@ def _in_axes_of_sfm(a: Answer, localizer: Localizer) -> Answer:
     return replace(a, found=replace(a.found, cam2world=localizer.in_axes_of_sfm(a.found.cam2world)))
 
 
-def _image(path: Path) -> Float[Tensor, "h w 3"]:
+def _image(path: Path, rectification: Rectification | None) -> Float[Tensor, "h w 3"]:
     stored = images.read_rgb(path)
+    if rectification is not None:
+        stored = rectification.any_image(stored)
     return torch.from_numpy(stored.astype(np.float32) / np.iinfo(stored.dtype).max)
 
 

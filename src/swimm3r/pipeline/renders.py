@@ -31,13 +31,13 @@ from swimm3r.medium import transmittances
 from swimm3r.pipeline.camera_paths import CameraPath, Dive, camera_path, smooth_path, times_along
 from swimm3r.pipeline.presets import from_yaml
 from swimm3r.pipeline.view_settings import ViewSettings
-from swimm3r.prepare import load_frames
 from swimm3r.progress import Progress, silent
 from swimm3r.scene.frames import Frames
 from swimm3r.scene.reconstruction import Reconstruction
 from swimm3r.scene.reconstruction_io import load_reconstruction
 from swimm3r.scene.run_folder import open_run
 from swimm3r.sfm.medium.restore import keep_open_water
+from swimm3r.sfm.rectified import run_frames
 from swimm3r.sfm.settings import RestoreSettings
 from swimm3r.splat.map_file import load_map
 from swimm3r.splat.rendering import RenderOutput, SplatMap
@@ -171,7 +171,7 @@ def render_run(
     open_run(folder, "splat")
     restore = restore or from_yaml(folder / "settings.yaml").sfm.restore
     scene = load_map(folder / "splat" / "map.safetensors").to(devices.for_maps(map_device))
-    frames = load_frames(folder / "prepare")
+    frames = run_frames(folder)
     rec = load_reconstruction(folder / "sfm", frames)
     dive, out = _dive(folder, scene, rec), out or folder / "renders" / "views"
     path = camera_path(dive, settings)

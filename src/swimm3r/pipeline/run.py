@@ -6,6 +6,7 @@ short goes on from what it left on disk; one whose settings changed is refused o
 """
 
 import json
+import logging
 import platform
 from collections.abc import Callable
 from dataclasses import asdict, dataclass, replace
@@ -33,17 +34,21 @@ from swimm3r.scale.rig import has_known_baseline
 from swimm3r.scale.run import is_scaled, scale_folder, scale_sections
 from swimm3r.scene.frames import Frames
 from swimm3r.scene.ground_truth import GroundTruth
+from swimm3r.scene.placement import Navigator
 from swimm3r.scene.reconstruction import Reconstruction
 from swimm3r.scene.reconstruction_io import load_reconstruction, unfiltered_matches
 from swimm3r.scene.run_folder import open_run
 from swimm3r.sfm import reconstruct
 from swimm3r.sfm.between import read_between
 from swimm3r.sfm.lens import known_lens
+from swimm3r.sfm.rectified import RECTIFIED, BentImagesError, given_rectification, rectify_frames, run_frames
 from swimm3r.splat import train
 from swimm3r.splat.map_file import load_map
 from swimm3r.splat.settings import MapDevice
 from swimm3r.splat.training.observer import Observer
 from swimm3r.tasks.settings import EngineSettings
+
+log = logging.getLogger(__name__)
 
 
 def run_pipeline(
@@ -140,9 +145,11 @@ def _make_stages(
     record.stage(
         "sfm",
         keys["sfm"],
-        make=lambda: reconstruct(frames, settings.sfm, folder / "sfm", progress, engine, navigator),
+        make=lambda: _reconstruct(frames, settings, folder, progress, engine, navigator),
         reuse=lambda: None,
     )
+    frames = run_frames(folder)
+    record.summary["input"] |= {"width": frames.width, "height": frames.height}
     rec = load_reconstruction(folder / "sfm", frames)
     between = read_between(folder / "sfm")
     placed = 0 if between is None else len(between.names)
@@ -167,6 +174,26 @@ def _make_stages(
 
     run = MappedRun(folder, frames, rec, scene, settings)
     _own_scores(record, run, Protocol(settings.test, reference), truth, progress, reuse=True)
+
+
+def _reconstruct(
+    prepared: Frames,
+    settings: RunSettings,
+    folder: Path,
+    progress: Progress,
+    engine: EngineSettings,
+    navigator: Navigator | None,
+) -> None:
+    """Structure from motion of a run, of rectified frames where no lens model explains the prepared ones."""
+    frames = run_frames(folder)  # rectified ones where an interrupted run has left them
+    if not (folder / RECTIFIED).is_dir() and (known := given_rectification(settings.sfm, prepared)) is not None:
+        frames = rectify_frames(prepared, known, folder / RECTIFIED, progress)
+    try:
+        reconstruct(frames, settings.sfm, folder / "sfm", progress, engine, navigator)
+    except BentImagesError as bent:
+        log.info("%s: they are rectified, and everything from here on works on the rectified ones", bent.what)
+        frames = rectify_frames(prepared, bent.rectification, folder / RECTIFIED, progress)
+        reconstruct(frames, settings.sfm, folder / "sfm", progress, engine, navigator)
 
 
 def _scaled(record: RunRecord, rec: Reconstruction, settings: RunSettings, progress: Progress) -> bool:
@@ -199,7 +226,7 @@ class FinishedSfm:
 def open_finished_sfm(folder: Path, reference: Path | None = None) -> FinishedSfm:
     """Read a run folder up to its map. Raises InputError where structure from motion is not finished."""
     run = open_run(folder, "sfm")
-    frames = load_frames(folder / "prepare")
+    frames = run_frames(folder)
     return FinishedSfm(
         frames,
         load_reconstruction(folder / "sfm", frames),
@@ -232,7 +259,7 @@ def evaluate_run(
     with watched(progress) as told, open_record(folder, source, before.input.fingerprint) as record:
         record.summary |= before.sections
         scene = load_map(folder / "splat" / "map.safetensors").to(devices.for_maps(map_device))
-        frames = load_frames(folder / "prepare")
+        frames = run_frames(folder)
         run = MappedRun(folder, frames, load_reconstruction(folder / "sfm", frames), scene, settings)
         truth = truth_of(source, asked.reference)
         if beside := asked.key_beside(own):

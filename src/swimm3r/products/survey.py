@@ -14,12 +14,12 @@ from swimm3r.errors import InputError
 from swimm3r.imaging.undistortion import frame_rays
 from swimm3r.io import images
 from swimm3r.io.files.cache import ArrayCache
-from swimm3r.prepare import load_frames
 from swimm3r.scene.frames import Frames
 from swimm3r.scene.georeference import Georeference, load_georeference, local_georeference
 from swimm3r.scene.reconstruction import Reconstruction
 from swimm3r.scene.reconstruction_io import load_reconstruction
 from swimm3r.scene.run_folder import open_run
+from swimm3r.sfm.rectified import run_frames
 
 Colors = Literal["filmed", "restored", "physical"]
 """As filmed; without the water, as shown; without the water, before the white balance."""
@@ -151,7 +151,7 @@ class Survey:
 def open_survey(folder: Path) -> Survey:
     """A run with finished structure from motion. Raises InputError where it has not come so far, or is damaged."""
     open_run(folder, "sfm")
-    frames = load_frames(folder / "prepare")
+    frames = run_frames(folder)
     rec = load_reconstruction(folder / "sfm", frames)
     return Survey(folder, rec, rec.still(frames), load_georeference(folder) or local_georeference(rec))
 

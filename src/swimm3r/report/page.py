@@ -13,7 +13,6 @@ from swimm3r.io import images
 from swimm3r.io.files.atomic import write_text
 from swimm3r.io.files.damage import Remedy, damaged, first_line, guard
 from swimm3r.io.video import Video
-from swimm3r.prepare import load_frames
 from swimm3r.report import frames as shown_frames
 from swimm3r.report import head, outputs, scale, scores, verdict, water
 from swimm3r.report.maps import map_section
@@ -25,6 +24,7 @@ from swimm3r.scene.frames import Frames
 from swimm3r.scene.reconstruction import Reconstruction
 from swimm3r.scene.reconstruction_io import load_reconstruction
 from swimm3r.scene.run_folder import open_run
+from swimm3r.sfm.rectified import run_frames
 from swimm3r.weights.manifest import MANIFEST
 
 _EMBEDDED_BYTES = 6 << 20  # a video up to this size travels inside the page, a larger one lies beside it
@@ -41,7 +41,7 @@ def write(folder: Path) -> Path:
     """Write RUN/report.html and return its path. Raises InputError where there is no run, or its files are damaged."""
     summary = open_run(folder, "prepare").sections
     remedy = Remedy(f"swimm3r run {folder}, which writes it anew")
-    frames = load_frames(folder / "prepare")
+    frames = run_frames(folder)
     sfm = folder / "sfm"
     rec = load_reconstruction(sfm, frames) if (sfm / "reconstruction.json").is_file() else None
     fields = _made_with(folder, remedy) | _of_dive(frames, rec, folder)

@@ -17,7 +17,6 @@ from swimm3r.io.files.cache_key import cache_key
 from swimm3r.io.files.damage import Remedy
 from swimm3r.io.files.folder_lock import folder_lock
 from swimm3r.io.files.json_file import read_json
-from swimm3r.prepare import load_frames
 from swimm3r.progress import Progress, silent
 from swimm3r.scale.estimate import RunScale, estimate_scale
 from swimm3r.scale.rescale import finish_rescale, rescale_run
@@ -27,6 +26,7 @@ from swimm3r.scene.georeference import GEOREFERENCE, Georeference, load_georefer
 from swimm3r.scene.reconstruction import Reconstruction
 from swimm3r.scene.reconstruction_io import load_reconstruction
 from swimm3r.scene.run_folder import RunFolder, open_run
+from swimm3r.sfm.rectified import run_frames
 
 SCALE = "scale.json"
 _SAME = 1e-9  # of a factor: the same sources again, by other roundings
@@ -74,7 +74,7 @@ def scale_folder(folder: Path, run: RunFolder, settings: ScaleSettings, progress
             cause="its training was interrupted",
             hint=f"swimm3r run {folder} without sources of scale finishes it; then swimm3r scale {folder}",
         )
-    frames = load_frames(folder / "prepare")
+    frames = run_frames(folder)
     rec = load_reconstruction(folder / "sfm", frames)
     before, record = load_georeference(folder), read_record(folder)
     found = estimate_scale(rec, frames, settings, before, progress)

@@ -15,9 +15,10 @@ from swimm3r.cameras import DISTORTION_PARAMETERS, Cameras
 from swimm3r.errors import UsageError
 from swimm3r.io.calibration.read import read_calibration, read_lens
 from swimm3r.io.calibration.record import CalibratedLens, lens_at
-from swimm3r.io.calibration.run import calibration_of_run
+from swimm3r.io.calibration.run import calibration_of_run, run_with_lens
 from swimm3r.refraction.central import CameraInWater, camera_in_water
 from swimm3r.refraction.ports import port_of
+from swimm3r.sfm.rectified import run_rectification
 from swimm3r.sfm.settings import (
     LENS_NUMBERS,
     ColmapModelSettings,
@@ -98,6 +99,8 @@ def known_lens(settings: SfmSettings, width: int, height: int, stated: Path | No
     """
     if isinstance(settings, ColmapModelSettings):  # its model has lenses of its own
         return None
+    if settings.lens_from is not None and run_rectification(run_with_lens(settings.lens_from)) is not None:
+        return None  # that of rectified frames
     found, _ = behind_port(with_calibration(settings, width, height, stated), width, height)
     if found.focal is None:
         return None

@@ -113,6 +113,7 @@ class RestoreSettings(Settings):
 LightChoice = Literal["auto", "sun", "lamp"]
 MovingChoice = Literal["auto", "none"]
 FlickerChoice = Literal["auto", "keep"]
+RectifyChoice = Literal["auto", "keep"]
 
 
 @dataclass(frozen=True)
@@ -312,6 +313,9 @@ class ColmapSettings(LensSettings):
     """Lens model of the whole clip; auto uses SIMPLE_RADIAL, or OPENCV where it explains the matches clearly better."""
     intrinsics: Literal["prior", "fixed"] = "prior"
     """Use of the given focal length and distortion: as a start to refine, or fixed."""
+    rectify: RectifyChoice = "auto"
+    """Images that no lens model explains, stretched by the camera or filmed through a curved window: drawn anew as a
+    pinhole camera sees them (auto), or kept as filmed."""
     shutter: Literal["global", "rolling"] = "global"
     """Exposure of a frame's rows: all at once, or one after another as in most video cameras."""
     readout: Annotated[float, Range(-1, 1)] | None = None

@@ -20,11 +20,11 @@ from swimm3r.io import images
 from swimm3r.io.files.cache import ArrayCache
 from swimm3r.pipeline.presets import from_yaml
 from swimm3r.pipeline.renders import DisplayStyle, display_style
-from swimm3r.prepare import load_frames
 from swimm3r.scene.frames import Frames
 from swimm3r.scene.reconstruction import Reconstruction
 from swimm3r.scene.reconstruction_io import load_reconstruction
 from swimm3r.scene.run_folder import open_run
+from swimm3r.sfm.rectified import run_frames
 from swimm3r.splat.map_file import load_map
 from swimm3r.splat.rendering import SplatMap
 from swimm3r.splat.settings import MapDevice
@@ -152,7 +152,7 @@ def with_map(run: ViewedRun, scene: SplatMap, style: DisplayStyle) -> ViewedRun:
 def open_viewed_run(folder: Path, map_device: MapDevice = "auto") -> ViewedRun:
     """Read a run as far as it is finished. Raises InputError where structure from motion is not."""
     record = open_run(folder, "sfm")
-    frames = load_frames(folder / "prepare")
+    frames = run_frames(folder)
     run = of_reconstruction(folder, frames, load_reconstruction(folder / "sfm", frames))
     if not record.is_finished("splat"):
         return run

@@ -22,12 +22,13 @@ from swimm3r.pipeline.inputs import truth_of
 from swimm3r.pipeline.presets import RunSettings
 from swimm3r.pipeline.run import run_pipeline
 from swimm3r.pipeline.stage_start import StageStart
-from swimm3r.prepare import load_frames, read_frames
+from swimm3r.prepare import read_frames
 from swimm3r.progress import Progress, silent
 from swimm3r.scene.ground_truth import GroundTruth
 from swimm3r.scene.reconstruction import Reconstruction
 from swimm3r.scene.reconstruction_io import load_reconstruction
 from swimm3r.sfm.colmap import poses
+from swimm3r.sfm.rectified import run_frames
 from swimm3r.sfm.settings import ColmapSettings
 from swimm3r.synthetic import DiveSettings, write_dive
 
@@ -113,7 +114,7 @@ def _scores(folder: Path, dive: Path, last: str, settings: RunSettings) -> dict[
         summary = run_pipeline(
             dive, folder / "run", settings, last_stage=last, progress=clock, on_stage=clock.next_stage
         )
-        frames, rec = load_frames(folder / "run" / "prepare"), load_reconstruction(folder / "run" / "sfm")
+        frames, rec = run_frames(folder / "run"), load_reconstruction(folder / "run" / "sfm")
         steps = by_part(clock.stages, summary["stages"])
         peak = max(stage["peak_mb"] for stage in summary["stages"].values())
         psnr = summary["test"]["psnr"] if "test" in summary else NotComputed("no map was asked for")

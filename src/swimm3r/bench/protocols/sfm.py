@@ -25,12 +25,13 @@ from swimm3r.io.files.cache_key import sample_digest
 from swimm3r.pipeline.inputs import truth_of
 from swimm3r.pipeline.presets import RunSettings
 from swimm3r.pipeline.run import run_pipeline
-from swimm3r.prepare import check_source, load_frames
+from swimm3r.prepare import check_source
 from swimm3r.progress import Progress, silent
 from swimm3r.report.plan_view import plan_view
 from swimm3r.scene.ground_truth import GroundTruth
 from swimm3r.scene.reconstruction import Reconstruction
 from swimm3r.scene.reconstruction_io import load_reconstruction
+from swimm3r.sfm.rectified import run_frames
 from swimm3r.sfm.settings import ColmapSettings, Mast3rSettings
 from swimm3r.tasks.settings import EngineSettings
 
@@ -110,7 +111,7 @@ def _scores(
         seconds = summary["stages"]["sfm"]["cpu_seconds"]
     except RegistrationError as failure:  # no frame counts as registered, and the row says why
         seconds = NotComputed(failure.what)
-    frames = load_frames(run / "prepare")
+    frames = run_frames(run)
     if rec is not None:
         uncapped = Uncapped.of(run / "sfm", rec, frames, settings.sfm.water.tracks, progress)
     scores = model_scores(rec, uncapped, len(frames.train), original_pixels(clip, frames))

@@ -18,9 +18,9 @@ from swimm3r.export.settings import NerfstudioSettings
 from swimm3r.io.files.atomic import atomic_folder, write_text
 from swimm3r.io.files.outputs import check_empty
 from swimm3r.io.ply import write_points
-from swimm3r.prepare import load_frames
 from swimm3r.scene.reconstruction_io import load_reconstruction
 from swimm3r.scene.run_folder import open_run
+from swimm3r.sfm.rectified import run_frames
 
 _APPLIED = np.array([[1.0, 0, 0, 0], [0, 0, 1, 0], [0, -1, 0, 0]])
 _OPENGL = np.diag([1.0, -1, -1, 1])
@@ -34,7 +34,7 @@ def export_run(folder: Path, path: Path, settings: NerfstudioSettings) -> Export
     """Write a run with finished structure from motion into a folder that is new or empty."""
     check_empty(path)
     open_run(folder, "sfm")
-    frames = load_frames(folder / "prepare")
+    frames = run_frames(folder)
     rec = load_reconstruction(folder / "sfm", frames)
     names = image_names(rec, settings.with_images)
     with atomic_folder(path) as draft:

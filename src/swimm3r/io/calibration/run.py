@@ -17,10 +17,10 @@ _REMEDY = Remedy("name a run whose structure from motion is finished", fault="ha
 log = logging.getLogger(__name__)
 
 
-def calibration_of_run(folder: Path) -> Calibration:
-    """The lens of a run folder, or of a folder of runs of one camera: that of the run with the most frames in place.
+def run_with_lens(folder: Path) -> Path:
+    """A run folder, or that run in a folder of runs of one camera which has the most frames in place.
 
-    Raises UsageError where there is none, and InputError where a run's cameras are damaged or differ in their lens.
+    Raises UsageError where there is none, and InputError where a run's cameras are damaged.
     """
     own = folder / CAMERAS
     found = [own] if own.is_file() else sorted(folder.glob(str(Path("*") / CAMERAS)))
@@ -30,13 +30,24 @@ def calibration_of_run(folder: Path) -> Calibration:
             cause="its structure from motion is not finished, or the name has a slip",
             hint="--lens-from RUN, after swimm3r sfm has finished there",
         )
+    if len(found) == 1:
+        return found[0].parents[1]
     tables = {path.parents[1]: read_cameras(path) for path in found}
     chosen = max(tables, key=lambda run: len(tables[run].names))
-    if len(tables) > 1:
-        focals = ", ".join(f"{run.name} {_focal(table):.3f}" for run, table in tables.items())
-        log.info("lens of the run %s, with the most frames in place; focal lengths in widths: %s", chosen.name, focals)
-    with guard(chosen / CAMERAS, _REMEDY):
-        return _calibration(chosen.name, tables[chosen])
+    focals = ", ".join(f"{run.name} {_focal(table):.3f}" for run, table in tables.items())
+    log.info("lens of the run %s, with the most frames in place; focal lengths in widths: %s", chosen.name, focals)
+    return chosen
+
+
+def calibration_of_run(folder: Path) -> Calibration:
+    """The lens of a run folder, or of a folder of runs of one camera (`run_with_lens`).
+
+    Raises UsageError where there is none, and InputError where a run's cameras are damaged or differ in their lens.
+    """
+    run = run_with_lens(folder)
+    table = read_cameras(run / CAMERAS)
+    with guard(run / CAMERAS, _REMEDY):
+        return _calibration(run.name, table)
 
 
 def _focal(table: CameraTable) -> float:

@@ -1,5 +1,6 @@
 """The landmarks of a run on disk, RUN/localization/landmarks.npz: made once, read by every later stream."""
 
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -9,10 +10,10 @@ from swimm3r.io.files.atomic import atomic_path
 from swimm3r.io.files.cache_key import cache_key, code_version, content_digest
 from swimm3r.io.files.damage import guard, remake
 from swimm3r.localization.online.landmark_map import LandmarkMap, landmark_map
-from swimm3r.prepare import load_frames
 from swimm3r.progress import Progress, silent
 from swimm3r.scene.reconstruction import Reconstruction
 from swimm3r.scene.reconstruction_io import load_reconstruction
+from swimm3r.sfm.rectified import run_frames, run_rectification
 from swimm3r.sfm.settings import FeatureSettings
 
 _ARRAYS = ("xyz", "point", "frame", "descriptors", "words", "looks")
@@ -23,7 +24,7 @@ def landmarks_of_run(folder: Path, settings: FeatureSettings, progress: Progress
 
     Raises InputError where the file is damaged.
     """
-    frames = load_frames(folder / "prepare")
+    frames = run_frames(folder)
     rec = load_reconstruction(folder / "sfm", frames)
     path = folder / "localization" / "landmarks.npz"
     made_from = (content_digest(folder / "sfm" / name) for name in ("cameras.json", "sparse"))
@@ -34,7 +35,7 @@ def landmarks_of_run(folder: Path, settings: FeatureSettings, progress: Progress
         with atomic_path(path) as draft:
             arrays = {name: getattr(found, name).numpy() for name in _ARRAYS}
             np.savez(draft, key=np.array(key), distance=np.array(found.distance), **arrays)
-    return found
+    return replace(found, rectification=run_rectification(folder))
 
 
 def _read(path: Path, key: str, rec: Reconstruction) -> LandmarkMap | None:
@@ -42,5 +43,6 @@ def _read(path: Path, key: str, rec: Reconstruction) -> LandmarkMap | None:
     with guard(path, remake(path)), np.load(path, allow_pickle=False) as stored:
         if str(stored["key"]) != key:
             return None
-        arrays = {name: torch.from_numpy(stored[name]) for name in _ARRAYS}
-        return LandmarkMap(cameras=rec.cameras, metric=rec.metric, distance=float(stored["distance"]), **arrays)
+        xyz, point, frame, descriptors, words, looks = (torch.from_numpy(stored[name]) for name in _ARRAYS)
+        distance = float(stored["distance"])
+        return LandmarkMap(rec.cameras, rec.metric, xyz, point, frame, descriptors, words, looks, distance)

@@ -15,6 +15,7 @@ from torch import Tensor
 
 from swimm3r.cameras import Cameras, project, project_visible, unproject
 from swimm3r.errors import InputError
+from swimm3r.imaging.rectification import Rectification
 from swimm3r.io.colmap.model import silence_log
 from swimm3r.localization.keypoint_places import measured_depth, tracked_points
 from swimm3r.progress import Progress, silent
@@ -41,6 +42,7 @@ class LandmarkMap:
     words: Float[Tensor, "k 128"]  # visual words of the retrieval
     looks: Float[Tensor, "c d"]  # VLAD descriptors of the frames
     distance: float  # median z depth of landmarks in the frames that saw them
+    rectification: Rectification | None = None  # of images as the camera takes them, where the run rectified its frames
 
     def alike(self, descriptors: Float[Tensor, "m 128"], count: int) -> list[int]:
         """The frames that look most like an image with these descriptors, the likest first."""

@@ -91,8 +91,11 @@ class Tracker:
     ) -> Keypoints:
         """The keypoints of an image (0..1) taken through `lens`, by default that of the map; no state is touched.
 
+        Where the map is of rectified frames, an image without a `lens` may be as the camera takes it, and has no mask.
         Raises InputError where the image's shape is not that of its lens.
         """
+        if lens is None and mask is None and self.map.rectification is not None:
+            image = torch.from_numpy(self.map.rectification.any_image(image.numpy()))
         height, width = image.shape[:2]
         lens = _at_size(self.map.cameras[0] if lens is None else lens, width, height)
         usable = torch.ones(height, width, dtype=torch.bool) if mask is None else mask

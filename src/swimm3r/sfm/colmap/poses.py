@@ -11,8 +11,9 @@ from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from swimm3r.cameras import Cameras
+from swimm3r.cameras import Cameras, resized
 from swimm3r.errors import InputError, StorageError, UsageError
+from swimm3r.imaging.rectification import rectification_of
 from swimm3r.io.colmap.cameras import to_pycolmap_camera
 from swimm3r.io.colmap.model import silence_log
 from swimm3r.io.files.atomic import atomic_path
@@ -25,6 +26,7 @@ from swimm3r.scene.reconstruction import (
 )
 from swimm3r.sfm.colmap import mapping
 from swimm3r.sfm.colmap.adjustment import adjust_through_port
+from swimm3r.sfm.colmap.calibration.polynomial import bent_lens
 from swimm3r.sfm.colmap.calibration.refinement import Calibrated, refine
 from swimm3r.sfm.colmap.calibration.start import first_camera
 from swimm3r.sfm.colmap.chunks.long_clip import is_long, map_long_clip
@@ -44,7 +46,8 @@ from swimm3r.sfm.colmap.record import PARTS, record_of, write_parts
 from swimm3r.sfm.colmap.rig.lenses import RigLenses, lenses_of_rig
 from swimm3r.sfm.colmap.rolling_shutter import adjust_rolling
 from swimm3r.sfm.features.database import FeatureDatabase, fill_features, match_pairs, start_database
-from swimm3r.sfm.lens import at_scale, behind_port, with_calibration
+from swimm3r.sfm.lens import at_scale, behind_port, gives_lens, with_calibration
+from swimm3r.sfm.rectified import BentImagesError
 from swimm3r.sfm.settings import ColmapSettings
 from swimm3r.tasks.settings import EngineSettings
 from swimm3r.tasks.threads import thread_count
@@ -76,8 +79,8 @@ def reconstruct(
 
     `lens` (one camera, its pose unused) is held where it is given; else the settings say what is known of it, or the
     frames' source, which may know another one of each camera of a rig. A `navigator` joins what shares no ground, and
-    holds long paths straight. Raises InputError for fewer than 2 frames or navigation that contradicts them, and
-    RegistrationError where too few can be placed.
+    holds long paths straight. Raises InputError for fewer than 2 frames or navigation that contradicts them,
+    BentImagesError where no lens model explains the images, and RegistrationError where too few can be placed.
     """
 
     if len(frames) < 2:
@@ -109,6 +112,8 @@ def reconstruct(
         with _working_copy(store) as working:
             own = at_scale(settings, frames.width, frames.height, store.scale)
             mapped = _map(working, frames, pairs, own, progress, engine)
+            if _lens_is_open(settings, lenses):
+                _check_lens(mapped.model, frames, progress)
             if navigator is not None:
                 mapped = _navigated(mapped, working, frames, folder, navigator, progress, lenses)
             _check_placed(mapped.model, frames, settings)
@@ -130,6 +135,19 @@ def reconstruct(
     shaken = [] if shutter is None else [shutter]
     warnings = (*found, *mapped.warnings, *registration_warnings(len(rec.names), sizes, frames), *port, *shaken)
     return replace(rec, warnings=warnings)
+
+
+def _lens_is_open(settings: ColmapSettings, lenses: RigLenses | None) -> bool:
+    """Return whether the frames alone say which lens took them, and may be rectified."""
+    known = settings.intrinsics == "fixed" or settings.housing != "none" or gives_lens(settings)
+    return settings.rectify == "auto" and settings.camera == "auto" and not known and lenses is None
+
+
+def _check_lens(model: "pycolmap.Reconstruction", frames: Frames, progress: Progress) -> None:
+    """Raise BentImagesError where a polynomial explains the images, and no lens of COLMAP's does."""
+    lens = bent_lens(model, progress)
+    if lens is not None:
+        raise BentImagesError(rectification_of(resized(lens, frames.width, frames.height)))
 
 
 def _check_rolling(frames: Frames, navigator: Navigator | None) -> None:
