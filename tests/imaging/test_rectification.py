@@ -98,3 +98,11 @@ def test_any_image_of_the_camera_becomes_one_of_the_pinhole_and_no_other_does(wa
 def test_a_lens_that_fills_no_image_is_refused():
     with pytest.raises(ValueError, match="filled by this lens"):
         rectification_of(stretching_lens(12, 10, stretch=0.0))
+
+
+def test_a_mask_goes_back_to_where_it_was_filmed(way: Rectification):
+    usable = np.ones(SIZE[::-1], bool)
+    usable[40:70, 60:110] = False
+    back = way.mask_as_filmed(way.mask(usable))
+    assert (back == usable).mean() > 0.99
+    assert back[0, 0]  # where the pinhole's image shows nothing

@@ -19,7 +19,7 @@ from jaxtyping import Bool, Float, UInt8, UInt16
 from torch import Tensor
 
 from swimm3r.cameras import Cameras, directions, distort, resized
-from swimm3r.imaging.undistortion import distorted_grid
+from swimm3r.imaging.undistortion import distorted_grid, pinhole_grid
 
 _WIDEST = 2.5  # tangent of the half angle that an image shows at most: 136 degrees
 _ROUNDS = 4  # in which the middle of the image and the axis of the pinhole come together
@@ -53,6 +53,15 @@ class Rectification:
 
         column, row, shown = _grid(self.key)
         return (cv2.remap(usable.astype(np.uint8), column, row, cv2.INTER_NEAREST) > 0) & shown
+
+    def mask_as_filmed(self, usable: Bool[np.ndarray, "rh rw"]) -> Bool[np.ndarray, "h w"]:
+        """A mask of the pinhole's image as the lens's image has it, true where the pinhole's shows nothing."""
+        import cv2
+
+        size = self.lens.height, self.lens.width
+        place = pinhole_grid(self.lens, self.pinhole, self.turn)
+        column, row = (part.reshape(size).astype(np.float32) for part in place)
+        return cv2.remap(usable.astype(np.uint8), column, row, cv2.INTER_NEAREST, borderValue=1) > 0
 
     def resized(self, width: int, height: int) -> "Rectification":
         """The same for images of the lens at another size."""

@@ -41,7 +41,15 @@ from swimm3r.scene.run_folder import open_run
 from swimm3r.sfm import reconstruct
 from swimm3r.sfm.between import read_between
 from swimm3r.sfm.lens import known_lens
-from swimm3r.sfm.rectified import RECTIFIED, BentImagesError, given_rectification, rectify_frames, run_frames
+from swimm3r.sfm.rectified import (
+    RECTIFIED,
+    BentImagesError,
+    given_rectification,
+    rectify_frames,
+    run_frames,
+    run_rectification,
+    write_masks_as_filmed,
+)
 from swimm3r.splat import train
 from swimm3r.splat.map_file import load_map
 from swimm3r.splat.settings import MapDevice
@@ -149,7 +157,8 @@ def _make_stages(
         reuse=lambda: None,
     )
     frames = run_frames(folder)
-    record.summary["input"] |= {"width": frames.width, "height": frames.height}
+    rectified = (folder / RECTIFIED).is_dir()
+    record.summary["input"] |= {"width": frames.width, "height": frames.height, "rectified": rectified}
     rec = load_reconstruction(folder / "sfm", frames)
     between = read_between(folder / "sfm")
     placed = 0 if between is None else len(between.names)
@@ -185,15 +194,20 @@ def _reconstruct(
     navigator: Navigator | None,
 ) -> None:
     """Structure from motion of a run, of rectified frames where no lens model explains the prepared ones."""
-    frames = run_frames(folder)  # rectified ones where an interrupted run has left them
-    if not (folder / RECTIFIED).is_dir() and (known := given_rectification(settings.sfm, prepared)) is not None:
-        frames = rectify_frames(prepared, known, folder / RECTIFIED, progress)
-    try:
-        reconstruct(frames, settings.sfm, folder / "sfm", progress, engine, navigator)
-    except BentImagesError as bent:
-        log.info("%s: they are rectified, and everything from here on works on the rectified ones", bent.what)
-        frames = rectify_frames(prepared, bent.rectification, folder / RECTIFIED, progress)
-        reconstruct(frames, settings.sfm, folder / "sfm", progress, engine, navigator)
+    rectified = folder / RECTIFIED
+    if not rectified.is_dir():
+        rectification = given_rectification(settings.sfm, prepared)
+        try:
+            if rectification is None:
+                reconstruct(prepared, settings.sfm, folder / "sfm", progress, engine, navigator)
+                return
+        except BentImagesError as bent:
+            log.info("%s: they are rectified, and everything from here on works on the rectified ones", bent.what)
+            rectification = bent.rectification
+        rectify_frames(prepared, rectification, rectified, progress)
+    reconstruct(run_frames(folder), settings.sfm, folder / "sfm", progress, engine, navigator)
+    if (found := run_rectification(folder)) is not None:
+        write_masks_as_filmed(prepared, found, folder / "sfm")
 
 
 def _scaled(record: RunRecord, rec: Reconstruction, settings: RunSettings, progress: Progress) -> bool:

@@ -27,9 +27,9 @@ def dated(frames: Frames, folder: Path) -> str:
     return f"{processed}the files do not state when they were recorded"
 
 
-def size_of_dive(frames: Frames) -> str:
+def size_of_dive(frames: Frames, *, rectified: bool) -> str:
     """Number, size and length of the frames, and how many of them are held back."""
-    count = f"{len(frames):,} frames of {frames.width} \u00d7 {frames.height} pixels"
+    count = f"{len(frames):,} {'rectified ' * rectified}frames of {frames.width} \u00d7 {frames.height} pixels"
     span = frames.span[1] - frames.span[0]
     length = f" over {clock(span)}" if has_times(frames) and span > 0 else ""
     return f"{count}{length}; {len(frames.train):,} used, {len(frames.test):,} held back for testing" + (

@@ -23,6 +23,7 @@ from swimm3r.scene.frames import MASKS, Frame, Frames, write_index
 from swimm3r.sfm.settings import LensSettings, SfmSettings
 
 RECTIFIED = Path("sfm") / "rectified"
+AS_FILMED = "masks_as_filmed"
 _RECORD = "rectification.json"
 _LENS = "cameras.txt"
 _STEP = "rectifying frames"
@@ -126,9 +127,24 @@ def rectify_frames(
     return load_frames(folder)
 
 
+def write_masks_as_filmed(prepared: Frames, rectification: Rectification, folder: Path) -> None:
+    """The masks of moving objects in `folder` (RUN/sfm) as the prepared frames have them, for users to correct."""
+    for frame in prepared.frames:
+        path = folder / MASKS / f"{_rectified_name(frame.name)}.png"
+        if path.is_file():
+            images.write_mask(
+                folder / AS_FILMED / f"{frame.name}.png", rectification.mask_as_filmed(images.read_mask(path))
+            )
+
+
+def _rectified_name(name: str) -> str:
+    """The name of a rectified frame: a PNG, whatever the prepared one is."""
+    return Path(name).with_suffix(".png").as_posix()
+
+
 def _drawn(frame: Frame, rectification: Rectification, folder: Path) -> Frame:
-    """A frame with its image and mask rectified, in a folder; a PNG, whatever it was."""
-    name = Path(frame.name).with_suffix(".png").as_posix()
+    """A frame with its image and mask rectified, in a folder."""
+    name = _rectified_name(frame.name)
     images.write_rgb(folder / name, rectification.image(images.read_rgb(frame.path)))
     mask = None
     if frame.mask is not None:
