@@ -100,6 +100,11 @@ def test_a_lens_that_fills_no_image_is_refused():
         rectification_of(stretching_lens(12, 10, stretch=0.0))
 
 
+def test_a_lens_that_folds_is_refused():
+    with pytest.raises(ValueError, match=r"folds|filled"):
+        rectification_of(stretching_lens(stretch=-4.0))
+
+
 def test_a_mask_goes_back_to_where_it_was_filmed(way: Rectification):
     usable = np.ones(SIZE[::-1], bool)
     usable[40:70, 60:110] = False

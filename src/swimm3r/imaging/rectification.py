@@ -109,7 +109,7 @@ def from_key(numbers: tuple[float, ...], width: int, height: int, own_width: int
 
 
 def rectification_of(lens: Cameras) -> Rectification:
-    """The rectification of one lens. Raises ValueError where it fills no upright image of a pinhole camera."""
+    """The rectification of one lens. Raises ValueError where it folds, or no upright image of a pinhole is filled."""
     turn = _axes(lens, torch.tensor([lens.width / 2, lens.height / 2], dtype=torch.float64))
     across = down = pixel = 0.0
     for _ in range(_ROUNDS):
@@ -125,7 +125,11 @@ def rectification_of(lens: Cameras) -> Rectification:
     width, height = (2 * int(min(-before, after)) for before, after in ((left, right), (top, bottom)))
     if min(width, height) < _LEAST:
         raise ValueError("no upright image of a pinhole camera is filled by this lens")
-    return Rectification(lens, _pinhole(focal, width, height), turn)
+    found = Rectification(lens, _pinhole(focal, width, height), turn)
+    column, row, _ = _grid(found.key)
+    if np.diff(column, axis=1).min() <= 0 or np.diff(row, axis=0).min() <= 0:
+        raise ValueError("the image of this lens folds")
+    return found
 
 
 def _pinhole(focal: float, width: int, height: int) -> Cameras:

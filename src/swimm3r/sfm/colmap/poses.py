@@ -4,6 +4,7 @@
 ends where an undisturbed one does. Poses are free in scale and place: nothing here is metric.
 """
 
+import logging
 import shutil
 from collections.abc import Iterator
 from contextlib import contextmanager
@@ -54,6 +55,8 @@ from swimm3r.tasks.threads import thread_count
 
 if TYPE_CHECKING:
     import pycolmap
+
+log = logging.getLogger(__name__)
 
 
 @dataclass(frozen=True)
@@ -146,8 +149,14 @@ def _lens_is_open(settings: ColmapSettings, lenses: RigLenses | None) -> bool:
 def _check_lens(model: "pycolmap.Reconstruction", frames: Frames, progress: Progress) -> None:
     """Raise BentImagesError where a polynomial explains the images, and no lens of COLMAP's does."""
     lens = bent_lens(model, progress)
-    if lens is not None:
-        raise BentImagesError(rectification_of(resized(lens, frames.width, frames.height)))
+    if lens is None:
+        return
+    try:
+        rectification = rectification_of(resized(lens, frames.width, frames.height))
+    except ValueError as error:
+        log.info("the polynomial is no lens, and the one that there is stays: %s", error)
+        return
+    raise BentImagesError(rectification)
 
 
 def _check_rolling(frames: Frames, navigator: Navigator | None) -> None:
