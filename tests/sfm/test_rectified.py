@@ -20,12 +20,14 @@ from swimm3r.pipeline import run as pipeline
 from swimm3r.pipeline.presets import RunSettings
 from swimm3r.progress import silent
 from swimm3r.scene.frames import Frame, Frames, write_index
+from swimm3r.scene.ground_truth import GroundTruth
 from swimm3r.scene.reconstruction import Reconstruction
 from swimm3r.sfm.colmap import poses
 from swimm3r.sfm.rectified import (
     RECTIFIED,
     BentImagesError,
     given_rectification,
+    rectified_truth,
     rectify_frames,
     run_frames,
     run_rectification,
@@ -152,6 +154,20 @@ def test_the_lens_of_a_run_brings_its_rectification(bent: Frames, truth: Cameras
     assert given_rectification(SETTINGS, bent) is None
     with pytest.raises(InputError, match="another mode"):
         given_rectification(settings, replace(bent, height=WIDTH))
+
+
+def test_reference_poses_turn_with_the_frames(bent: Frames, truth: Cameras, tmp_path: Path):
+    way = rectification_of(stretching_lens(WIDTH, HEIGHT))
+    stated = GroundTruth(tuple(f"{i}.jpg" for i in range(len(truth))), truth, metric=False, folder=tmp_path)
+    assert rectified_truth(tmp_path, stated) is stated
+    rectify_frames(bent, way, tmp_path / RECTIFIED)
+    turned = rectified_truth(tmp_path, stated)
+    assert turned is not None
+    assert turned.names == bent.names
+    torch.testing.assert_close(turned.cameras.centers, truth.centers)
+    ahead = turned.cameras.cam2world[:, :3, 2]
+    torch.testing.assert_close(ahead, truth.cam2world[:, :3, :3] @ way.turn[:, 2])
+    assert turned.clear("0.png") is None
 
 
 def test_a_run_rectifies_once_and_goes_on_from_there(bent: Frames, tmp_path: Path, monkeypatch: pytest.MonkeyPatch):

@@ -45,6 +45,7 @@ from swimm3r.sfm.rectified import (
     RECTIFIED,
     BentImagesError,
     given_rectification,
+    rectified_truth,
     rectify_frames,
     run_frames,
     run_rectification,
@@ -156,7 +157,7 @@ def _make_stages(
         make=lambda: _reconstruct(frames, settings, folder, progress, engine, navigator),
         reuse=lambda: None,
     )
-    frames = run_frames(folder)
+    frames, truth = run_frames(folder), rectified_truth(folder, truth)
     rectified = (folder / RECTIFIED).is_dir()
     record.summary["input"] |= {"width": frames.width, "height": frames.height, "rectified": rectified}
     rec = load_reconstruction(folder / "sfm", frames)
@@ -245,7 +246,7 @@ def open_finished_sfm(folder: Path, reference: Path | None = None) -> FinishedSf
         frames,
         load_reconstruction(folder / "sfm", frames),
         from_yaml(folder / "settings.yaml"),
-        truth_of(Path(run.input.path), reference),
+        rectified_truth(folder, truth_of(Path(run.input.path), reference)),
         run.stages["sfm"].key,
     )
 
@@ -275,7 +276,7 @@ def evaluate_run(
         scene = load_map(folder / "splat" / "map.safetensors").to(devices.for_maps(map_device))
         frames = run_frames(folder)
         run = MappedRun(folder, frames, load_reconstruction(folder / "sfm", frames), scene, settings)
-        truth = truth_of(source, asked.reference)
+        truth = rectified_truth(folder, truth_of(source, asked.reference))
         if beside := asked.key_beside(own):
             record.add_protocol(beside, _other_scores(run, asked, truth, f"renders/protocols/{beside}", told))
         else:

@@ -20,6 +20,7 @@ from swimm3r.io.files.json_file import read_json
 from swimm3r.prepare import load_frames
 from swimm3r.progress import Progress, silent
 from swimm3r.scene.frames import MASKS, Frame, Frames, write_index
+from swimm3r.scene.ground_truth import GroundTruth
 from swimm3r.sfm.settings import LensSettings, SfmSettings
 
 RECTIFIED = Path("sfm") / "rectified"
@@ -74,6 +75,21 @@ def run_rectification(run: Path) -> Rectification | None:
     document = read_json(path, _Document, remedy)
     with guard(path, remedy):
         return from_key(*astuple(document))
+
+
+def rectified_truth(run: Path, truth: GroundTruth | None) -> GroundTruth | None:
+    """Reference poses as a run's frames have them: named like rectified frames and in the axes of their cameras.
+
+    Depth and images of the truth are of frames as filmed, and rectified ones go without.
+    """
+    rectification = run_rectification(run)
+    if truth is None or rectification is None:
+        return truth
+    turn = torch.eye(4, dtype=torch.float64)
+    turn[:3, :3] = rectification.turn
+    cameras = replace(rectification.pinhole[[0] * len(truth.names)], cam2world=truth.cameras.cam2world.double() @ turn)
+    names = tuple(_rectified_name(name) for name in truth.names)
+    return replace(truth, names=names, cameras=cameras, folder=None)
 
 
 def given_rectification(settings: SfmSettings, frames: Frames) -> Rectification | None:
