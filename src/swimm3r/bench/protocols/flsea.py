@@ -68,6 +68,7 @@ def compare_on_flsea(
     check_choice("methods", given.methods)
     accepted("stride", stride, Count)
     found = chosen_sequences(root, sequences)
+    colmap = replace(colmap, rectify="keep")  # depth is scored in pixels of the images as they are published
     options = {"root": root, "out": out, "given": given, "colmap": colmap, "mast3r": mast3r, "stride": stride}
     cells = over_scenes(found, partial(_cells_of_sequence, **options), out, how or EngineSettings(), progress)
     return Table(name, "Depth and poses on FLSea's test sequences", cells, COLUMNS)

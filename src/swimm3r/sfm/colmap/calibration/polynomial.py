@@ -22,7 +22,7 @@ from scipy import sparse
 from scipy.spatial.transform import Rotation
 
 from swimm3r.cameras import DISTORTION_PARAMETERS, EXPONENTS, Cameras
-from swimm3r.progress import Progress
+from swimm3r.progress import Progress, silent
 
 if TYPE_CHECKING:
     import pycolmap
@@ -93,22 +93,33 @@ def _gains(start: _State, seen: _Observations) -> bool:
     return _held_error(bent, seen) < _TRIED * _held_error(held, seen)
 
 
+def errors_left_out(model: "pycolmap.Reconstruction", progress: Progress = silent) -> dict[int, float] | None:
+    """Median error of observations left out, px, under a model's own lens (0) and polynomials by their degree; None of
+    a fisheye.
+    """
+    start, seen = _start(model, _MOST)
+    if start is None:
+        return None
+    return {degree: _held_error(state, seen) for degree, state in _by_degree(start, seen, progress).items()}
+
+
+def _by_degree(start: _State, seen: _Observations, progress: Progress) -> dict[int, _State]:
+    """The state with its lens held, and adjusted with polynomials of degree 3 and 5."""
+    states = {0: _adjusted(start, seen, 0)}
+    for done, (before, degree) in enumerate(((0, 3), (3, 5)), 2):
+        states[degree] = _adjusted(states[before], seen, degree)
+        progress(_STEP, done, 4)
+    return states
+
+
 def _fitted(start: _State, seen: _Observations, progress: Progress) -> _State | None:
     """The state with the lens that explains observations left out; None where that is the one that there is."""
-    own = _adjusted(start, seen, 0)
-    bent = _adjusted(own, seen, 3)
-    progress(_STEP, 2, 4)
-    more = _adjusted(bent, seen, 5)
-    progress(_STEP, 3, 4)
-    before, third, fifth = (_held_error(state, seen) for state in (own, bent, more))
-    log.info(
-        "error of observations left out: %.3f px under the lens, %.3f and %.3f px under polynomials of degree 3 and 5",
-        before,
-        third,
-        fifth,
-    )
-    best, after = (more, fifth) if fifth < _NEXT * third else (bent, third)
-    return best if after < _BETTER * before else None
+    states = _by_degree(start, seen, progress)
+    errors = {degree: _held_error(state, seen) for degree, state in states.items()}
+    told = ", ".join(f"{error:.3f} px under degree {degree}" for degree, error in errors.items())
+    log.info("error of observations left out, under the lens as degree 0: %s", told)
+    best = 5 if errors[5] < _NEXT * errors[3] else 3
+    return states[best] if errors[best] < _BETTER * errors[0] else None
 
 
 def _start(model: "pycolmap.Reconstruction", most: int) -> tuple[_State | None, _Observations]:
