@@ -35,7 +35,8 @@ def reconstruct(
     notebook shows how far it is, unless `progress` is given (`swimm3r.silent`: nothing). `engine` can spread the chunks
     of a long clip and dense depth over processes or a cluster. A `navigator` (`swimm3r.scale.navigation`)
     holds the path of COLMAP's mapping, and joins parts that share no ground; other back ends do without.
-    Raises InputError for fewer than 2 frames and RegistrationError where too few can be placed.
+    Raises InputError for fewer than 2 frames, BentImagesError (`sfm.rectified`) where no lens model explains the images
+    and `settings.rectify` is "auto", and RegistrationError where too few can be placed.
     """
     settings = settings or ColmapSettings()
     used = frames.train
