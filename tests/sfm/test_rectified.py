@@ -1,6 +1,7 @@
 """Frames that no lens of COLMAP's explains: found to be so, rectified, placed, and found again by all that follows."""
 
 import math
+import pickle
 from dataclasses import replace
 from pathlib import Path
 
@@ -154,6 +155,13 @@ def test_the_lens_of_a_run_brings_its_rectification(bent: Frames, truth: Cameras
     assert given_rectification(SETTINGS, bent) is None
     with pytest.raises(InputError, match="another mode"):
         given_rectification(settings, replace(bent, height=WIDTH))
+
+
+def test_the_error_goes_from_process_to_process():
+    error = BentImagesError(rectification_of(stretching_lens(WIDTH, HEIGHT)))
+    again = pickle.loads(pickle.dumps(error))
+    assert str(again) == str(error)
+    assert again.rectification.key == error.rectification.key
 
 
 def test_reference_poses_turn_with_the_frames(bent: Frames, truth: Cameras, tmp_path: Path):

@@ -42,6 +42,9 @@ class BentImagesError(InputError):
         )
         self.rectification = rectification
 
+    def __reduce__(self) -> tuple[type["BentImagesError"], tuple[Rectification]]:
+        return BentImagesError, (self.rectification,)  # between processes
+
 
 @dataclass(frozen=True)
 class _Document:
