@@ -18,10 +18,9 @@ import torch
 from jaxtyping import Bool, Float, UInt8, UInt16
 from torch import Tensor
 
-from swimm3r.cameras import Cameras, directions, distort, resized
-from swimm3r.imaging.undistortion import distorted_grid, pinhole_grid
+from swimm3r.cameras import Cameras, directions, resized
+from swimm3r.imaging.undistortion import WIDEST, distorted_grid, pinhole_grid, through_lens
 
-_WIDEST = 2.5  # tangent of the half angle that an image shows at most: 136 degrees
 _ROUNDS = 4  # in which the middle of the image and the axis of the pinhole come together
 _SIDE = 256  # pixels of the small image in which the rectangle is sought
 _LEAST = 16  # pixels along a side of the result, below which nothing of the image is left
@@ -114,12 +113,13 @@ def rectification_of(lens: Cameras) -> Rectification:
     across = down = pixel = 0.0
     for _ in range(_ROUNDS):
         focal = _focal(lens, turn)
-        reach = min(_WIDEST * focal, 2.0 * max(lens.width, lens.height))
+        reach = min(WIDEST * focal, 2.0 * max(lens.width, lens.height))
         pixel = 2 * reach / _SIDE
         left, top, right, bottom = _largest(lens, turn, focal, (reach, reach), pixel)
         across, down = (right - left) / 2, (bottom - top) / 2
         middle = torch.tensor([(left + right) / 2 / focal, (top + bottom) / 2 / focal, 1.0], dtype=torch.float64)
-        turn = _axes(lens, _pixels(lens, turn @ middle))
+        ahead = turn @ middle
+        turn = _axes(lens, through_lens(lens, ahead[:2] / ahead[2]))
     focal = _focal(lens, turn)
     left, top, right, bottom = _largest(lens, turn, focal, (across + pixel, down + pixel), 1.0)
     width, height = (2 * int(min(-before, after)) for before, after in ((left, right), (top, bottom)))
@@ -147,17 +147,12 @@ def _axes(lens: Cameras, pixel: Float[Tensor, "2"]) -> Float[Tensor, "3 3"]:
     return torch.stack([x, torch.linalg.cross(z, x), z], -1)
 
 
-def _pixels(lens: Cameras, rays: Float[Tensor, "*n 3"]) -> Float[Tensor, "*n 2"]:
-    """Pixels of rays in the axes of the lens."""
-    xy = distort(rays[..., :2] / rays[..., 2:], lens.distortion[0].to(rays), lens.model)
-    return xy @ lens.K[0, :2, :2].to(rays).mT + lens.K[0, :2, 2].to(rays)
-
-
 def _focal(lens: Cameras, turn: Float[Tensor, "3 3"]) -> float:
     """Focal length at which the pinhole has as many pixels to the solid angle in its middle as the lens."""
     step = 1e-4
     plane = torch.tensor([[step, 0.0, 1.0], [-step, 0.0, 1.0], [0.0, step, 1.0], [0.0, -step, 1.0]]).double()
-    right, left, down, up = _pixels(lens, plane @ turn.mT)
+    rays = plane @ turn.mT
+    right, left, down, up = through_lens(lens, rays[:, :2] / rays[:, 2:])
     columns = torch.stack([right - left, down - up], -1) / (2 * step)
     return torch.linalg.det(columns).abs().sqrt().item()
 

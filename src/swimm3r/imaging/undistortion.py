@@ -26,7 +26,7 @@ from swimm3r.cameras import (
 )
 
 _ASIDE = 1e-3  # cosine of the angle from the axis beyond which a ray has no place in the image
-_WIDEST = 2.5  # tangent of the half angle that covering pinhole images show at most: 136 degrees
+WIDEST = 2.5  # tangent of the half angle that pinhole images made here show at most: 136 degrees
 
 
 def undistorted(
@@ -106,7 +106,7 @@ def undistorted_matches(
 def distorted_pixels(camera: Cameras, xy: Float[Tensor, "*m 2"]) -> Float[Tensor, "*m 2"]:
     """The inverse of `undistorted_pixels` with the camera's own K."""
     K = camera.K[0].double()
-    return _through_lens(camera, (xy.double() - K[:2, 2]) / K[:2, :2].diagonal())
+    return through_lens(camera, (xy.double() - K[:2, 2]) / K[:2, :2].diagonal())
 
 
 def covering_pinholes(cameras: Cameras, long_side: int) -> Cameras:
@@ -118,7 +118,7 @@ def covering_pinholes(cameras: Cameras, long_side: int) -> Cameras:
     extents = []
     for k in range(len(lenses)):
         rays = directions(lenses[k], border)[0, :, :2]
-        rays = rays[rays.isfinite().all(-1)].clamp(-_WIDEST, _WIDEST)
+        rays = rays[rays.isfinite().all(-1)].clamp(-WIDEST, WIDEST)
         extents.append(torch.cat([rays.amin(0), rays.amax(0)]))
     extent = torch.stack(extents)
     focal = torch.stack([lenses.K[:, 0, 0], lenses.K[:, 1, 1]], -1).to(extent)
@@ -139,7 +139,7 @@ def distorted_grid(
         rays = rays @ turn.mT
         ahead = rays[..., 2] > _ASIDE * torch.linalg.vector_norm(rays, dim=-1)
     rays = rays[..., :2] / torch.where(ahead, rays[..., 2], 1.0)[..., None]
-    pixels = _through_lens(camera, rays)
+    pixels = through_lens(camera, rays)
     edge = directions(camera, _outline(camera.width, camera.height)[None])[0, :, :2]
     reach = torch.linalg.vector_norm(edge[edge.isfinite().all(-1)], dim=-1).max()
     shown = inside_image(pixels, camera.width, camera.height)
@@ -147,7 +147,7 @@ def distorted_grid(
     return pixels, shown & ahead & (torch.linalg.vector_norm(rays, dim=-1) <= reach * 1.001)
 
 
-def _through_lens(camera: Cameras, rays: Float[Tensor, "*m 2"]) -> Float[Tensor, "*m 2"]:
+def through_lens(camera: Cameras, rays: Float[Tensor, "*m 2"]) -> Float[Tensor, "*m 2"]:
     """Pixels of points on the plane z = 1."""
     xy = distort(rays, camera.distortion[0].to(rays), camera.model)
     return xy @ camera.K[0, :2, :2].to(rays).mT + camera.K[0, :2, 2].to(rays)

@@ -45,10 +45,10 @@ from swimm3r.sfm.rectified import (
     RECTIFIED,
     BentImagesError,
     given_rectification,
+    is_rectified,
     rectified_truth,
     rectify_frames,
     run_frames,
-    run_rectification,
     write_masks_as_filmed,
 )
 from swimm3r.splat import train
@@ -158,8 +158,11 @@ def _make_stages(
         reuse=lambda: None,
     )
     frames, truth = run_frames(folder), rectified_truth(folder, truth)
-    rectified = (folder / RECTIFIED).is_dir()
-    record.summary["input"] |= {"width": frames.width, "height": frames.height, "rectified": rectified}
+    record.summary["input"] |= {
+        "width": frames.width,
+        "height": frames.height,
+        "rectified": is_rectified(folder),
+    }
     rec = load_reconstruction(folder / "sfm", frames)
     between = read_between(folder / "sfm")
     placed = 0 if between is None else len(between.names)
@@ -195,20 +198,18 @@ def _reconstruct(
     navigator: Navigator | None,
 ) -> None:
     """Structure from motion of a run, of rectified frames where no lens model explains the prepared ones."""
-    rectified = folder / RECTIFIED
-    if not rectified.is_dir():
+    if not is_rectified(folder):
         rectification = given_rectification(settings.sfm, prepared)
-        try:
-            if rectification is None:
+        if rectification is None:
+            try:
                 reconstruct(prepared, settings.sfm, folder / "sfm", progress, engine, navigator)
                 return
-        except BentImagesError as bent:
-            log.info("%s: they are rectified, and everything from here on works on the rectified ones", bent.what)
-            rectification = bent.rectification
-        rectify_frames(prepared, rectification, rectified, progress)
+            except BentImagesError as bent:
+                log.info("%s: they are rectified, and everything from here on works on the rectified ones", bent.what)
+                rectification = bent.rectification
+        rectify_frames(prepared, rectification, folder / RECTIFIED, progress)
     reconstruct(run_frames(folder), settings.sfm, folder / "sfm", progress, engine, navigator)
-    if (found := run_rectification(folder)) is not None:
-        write_masks_as_filmed(prepared, found, folder / "sfm")
+    write_masks_as_filmed(prepared, folder)
 
 
 def _scaled(record: RunRecord, rec: Reconstruction, settings: RunSettings, progress: Progress) -> bool:

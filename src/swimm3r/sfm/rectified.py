@@ -57,13 +57,17 @@ class _Document:
     rectified_height: int
 
 
+def is_rectified(run: Path) -> bool:
+    """Return whether a run works on rectified frames; their folder appears whole."""
+    return (run / RECTIFIED).is_dir()
+
+
 def run_frames(run: Path) -> Frames:
     """The frames that a run's structure from motion and all after it work on: rectified ones where there are any.
 
     Raises InputError where they are incomplete.
     """
-    rectified = run / RECTIFIED
-    return load_frames(rectified if (rectified / "frames.json").is_file() else run / "prepare")
+    return load_frames(run / RECTIFIED if is_rectified(run) else run / "prepare")
 
 
 def run_rectification(run: Path) -> Rectification | None:
@@ -71,9 +75,9 @@ def run_rectification(run: Path) -> Rectification | None:
 
     Raises InputError where its record is damaged.
     """
-    path = run / RECTIFIED / _RECORD
-    if not path.is_file():
+    if not is_rectified(run):
         return None
+    path = run / RECTIFIED / _RECORD
     remedy = remake(path.parent)
     document = read_json(path, _Document, remedy)
     with guard(path, remedy):
@@ -146,14 +150,16 @@ def rectify_frames(
     return load_frames(folder)
 
 
-def write_masks_as_filmed(prepared: Frames, rectification: Rectification, folder: Path) -> None:
-    """The masks of moving objects in `folder` (RUN/sfm) as the prepared frames have them, for users to correct."""
+def write_masks_as_filmed(prepared: Frames, run: Path) -> None:
+    """The masks of moving objects of a rectified run as its prepared frames have them, for users to correct."""
+    rectification = run_rectification(run)
+    if rectification is None:
+        raise ValueError(f"{run} works on frames as filmed")
     for frame in prepared.frames:
-        path = folder / MASKS / f"{_rectified_name(frame.name)}.png"
+        path = run / "sfm" / MASKS / f"{_rectified_name(frame.name)}.png"
         if path.is_file():
-            images.write_mask(
-                folder / AS_FILMED / f"{frame.name}.png", rectification.mask_as_filmed(images.read_mask(path))
-            )
+            usable = rectification.mask_as_filmed(images.read_mask(path))
+            images.write_mask(run / "sfm" / AS_FILMED / f"{frame.name}.png", usable)
 
 
 def _rectified_name(name: str) -> str:
