@@ -261,6 +261,7 @@ def test_cameras_are_named_by_what_tells_their_topics_apart():
     assert camera_names(("/../image", "/a b/image")) == ("_", "a_b")
 
 
+@pytest.mark.long
 def test_a_stereo_dive_in_a_bag_is_that_of_its_folder_and_in_metres(tmp_path: Path):
     dive = DiveSettings(frames=12, width=320, height=214, seed=2, stereo=0.1)
     write_dive(dive, tmp_path / "dive")

@@ -85,7 +85,7 @@ def worst_turn(rec: Reconstruction, turn: torch.Tensor, truth: Cameras) -> float
     return math.degrees(rotation_angle(turned.mT @ truth.cam2world[:, :3, :3] @ turn).max().item())
 
 
-def test_rectified_frames_are_placed_where_they_were_taken_and_bent_ones_are_not(
+def test_rectified_frames_are_placed_where_they_were_taken(
     bent: Frames, found: Rectification, truth: Cameras, tmp_path: Path
 ):
     frames = rectify_frames(bent, found, tmp_path / "rectified")
@@ -93,11 +93,16 @@ def test_rectified_frames_are_placed_where_they_were_taken_and_bent_ones_are_not
     assert rec.names == bent.names
     assert worst_turn(rec, found.turn, truth) < 0.3
     assert rec.points.error.median() < 0.4
+
+
+@pytest.mark.long
+def test_bent_frames_that_are_kept_are_placed_worse(bent: Frames, tmp_path: Path):
     kept = poses.reconstruct(bent, replace(SETTINGS, rectify="keep"), tmp_path / "kept")
     assert (kept.cameras.width, kept.cameras.height) == (WIDTH, HEIGHT)
-    assert kept.points.error.median() > 1.3 * rec.points.error.median()
+    assert kept.points.error.median() > 0.52  # 1.3 times that of rectified frames
 
 
+@pytest.mark.long
 def test_a_lens_that_is_given_is_believed(bent: Frames, tmp_path: Path):
     rec = poses.reconstruct(bent, replace(SETTINGS, focal=280.0), tmp_path)
     assert rec.cameras.width == WIDTH

@@ -63,12 +63,17 @@ def warp_on_the_processor(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(cuda_backend, "_launch", unwrapped)
 
 
+BOTH_KINDS = ("uwbs-static", "watersplatting")  # Beta primitives and Gaussians; the others are made of their parts
+
+
 def losses(folder: Path) -> list[float]:
     return [json.loads(line)["loss"] for line in (folder / "metrics.jsonl").read_text().splitlines()]
 
 
 @on_the_processor
-@pytest.mark.parametrize("recipe", RECIPES)
+@pytest.mark.parametrize(
+    "recipe", [recipe if recipe in BOTH_KINDS else pytest.param(recipe, marks=pytest.mark.long) for recipe in RECIPES]
+)
 def test_every_recipe_trains_elsewhere_as_on_the_processor(recipe: RecipeName, tiny_dive, tmp_path):
     settings = with_recipe(SIZE, recipe)
     here = train_map.train(tiny_dive.rec, tiny_dive.frames, settings, tmp_path / "here")

@@ -153,8 +153,16 @@ def displacement(
     share = float(counted.sum() / asked.sum())
     if share < _LEAST:
         return NotComputed(f"only {share:.1%} of the pixels have texture enough for optical flow")
-    length = np.linalg.norm(_flow(_contrast(there), _contrast(shown)), axis=-1)[counted]
+    length = np.linalg.norm(flow_between(there, shown), axis=-1)[counted]
     return Displacement(float(np.median(length)), float(np.quantile(length, 0.9)), share)
+
+
+def flow_between(source: Float[np.ndarray, "h w"], target: Float[np.ndarray, "h w"]) -> Float[np.ndarray, "h w 2"]:
+    """Dense optical flow (DIS) of gray images 0..1, in pixels: the source shows at x what the target shows at x + flow.
+
+    Both in units of their local contrast. Where there is no texture it is filled from where there is.
+    """
+    return _flow(_contrast(source), _contrast(target))
 
 
 def _resized(image: np.ndarray, size: tuple[int, int]) -> np.ndarray:

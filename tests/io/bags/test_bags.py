@@ -328,6 +328,7 @@ def test_a_bag_of_a_real_clip_gives_the_frames_of_its_folder(version: str, tmp_p
         np.testing.assert_array_equal(read_rgb(one.path), read_rgb(other.path))
 
 
+@pytest.mark.long
 def test_bags_of_a_real_clip_give_the_reconstruction_of_its_folder_under_the_same_lens(tmp_path: Path, shared: Path):
     images = [read_rgb(path) for path in find_images(shared / "data" / "ruie_teal_rocks" / "images").paths[:10]]
     height, width = images[0].shape[:2]

@@ -63,9 +63,9 @@ def packed_operations(assembly: str) -> list[int]:
     [
         # light through near and far water, then the coverage; in the adjoint, before that, the sums
         ("forward_tiles", "beta", [70, 50, 30]),
-        ("forward_tiles", "gaussian", [70, 50, 15]),  # no logarithm
+        pytest.param("forward_tiles", "gaussian", [70, 50, 15], marks=pytest.mark.long),  # no logarithm
         ("adjoint_tiles", "beta", [110, 100, 60, 35]),
-        ("adjoint_tiles", "gaussian", [110, 100, 60, 18]),
+        pytest.param("adjoint_tiles", "gaussian", [110, 100, 60, 18], marks=pytest.mark.long),
     ],
 )
 def test_the_loops_over_pixels_are_simd(name: str, kernel: Kernel, expected: list[int], scene: Scene):

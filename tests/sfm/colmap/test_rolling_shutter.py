@@ -138,6 +138,7 @@ def test_velocities_are_those_of_the_path_and_none_across_a_gap():
     np.testing.assert_allclose(again.turning, motion.turning[shuffled], atol=1e-12)
 
 
+@pytest.mark.long
 def test_a_dive_through_a_rolling_shutter_is_straightened(tmp_path: Path):
     settings = DiveSettings(frames=24, width=240, height=160, fps=2.0, readout=0.05)
     write_dive(settings, tmp_path / "dive")

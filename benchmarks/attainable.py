@@ -1,0 +1,187 @@
+"""How well the training frames of a clip predict its held-out frames at all, beside how well maps do.
+
+    python benchmarks/attainable.py RUN... [--tables DIR] [--recipes NAME ...]
+
+RUN are finished run folders; DIR is the --out of `swimm3r bench render RUN...`. Each of the training frames nearest in
+time is drawn from the test camera by the map's depth, moved onto the test frame by dense flow, and given the affine map
+of colors that fits it best. All three use the test frame, which no map may, so these are bounds and no method:
+
+    share   of the test frame's pixels, those that two of them show; every column is over them alone
+    one     the training frame that comes closest
+    mean    all of them averaged
+    limit   the error that they have in common, the mean product of the errors of two: what endlessly many of them
+            would leave, as is their own noise's share of the errors of one and of their mean
+    lead    the limit over the best map of another recipe: what a perfect map could be ahead of it
+
+Columns of maps are PSNR in dB after an affine map of colors, and in brackets after being moved by the flow as well.
+"""
+
+import argparse
+from dataclasses import dataclass
+from pathlib import Path
+from tempfile import TemporaryDirectory
+
+import cv2
+import numpy as np
+import torch
+from jaxtyping import Bool, Float
+from torch import Tensor
+
+from swimm3r.cameras import Cameras, pixel_grid, project, unproject
+from swimm3r.evaluate.images import as_8_bit, psnr
+from swimm3r.evaluate.registration import fit_colors, flow_between
+from swimm3r.imaging.undistortion import undistorted
+from swimm3r.io import images
+from swimm3r.io.view_names import view_stems
+from swimm3r.pipeline.held_out import HeldOutView, cut, in_axes_of, score_views
+from swimm3r.pipeline.run import FinishedSfm, open_finished_sfm
+from swimm3r.splat.map_file import load_map
+from swimm3r.splat.rendering import SplatMap
+
+NEAREST = 16  # training frames that are asked for each test frame
+SAME_DEPTH = 0.05  # relative difference up to which a frame shows the surface and not one before it
+LEAST_SHARE = 0.15  # of the pixels, fewer of which say little of a frame
+BORDER = 7  # px, taken off what a frame shows: flow there is a guess
+SMOOTH = 2.0  # px, sigma that flow is smoothed by: single pixels' noise is no displacement
+
+
+@dataclass(frozen=True)
+class Target:
+    """A held-out frame on its canvas, and what the map says of the place."""
+
+    camera: Cameras
+    image: Float[Tensor, "h w 3"]
+    counted: Bool[Tensor, "h w"]
+    points: Float[Tensor, "1 p 3"]  # of its pixels, by the map's depth
+
+
+def target_of(sfm: FinishedSfm, scene: SplatMap, view: HeldOutView) -> Target:
+    """The frame of a scored view."""
+    f, camera = sfm.frames.index(view.name), cut(view.canvas, view.window)
+    image, seen = undistorted(sfm.frames.image(f), sfm.frames.mask(f), view.lens, view.canvas)
+    image, seen = image[view.window.rows, view.window.columns], seen[view.window.rows, view.window.columns]
+    out = scene.render(camera, view.time)
+    pixels = pixel_grid(camera.height, camera.width).reshape(1, -1, 2).to(camera.K)
+    points = unproject(camera, pixels, out.z_depth.reshape(1, -1).to(camera.K))
+    return Target(camera, as_8_bit(image), seen if out.observed is None else seen & out.observed, points)
+
+
+def drawn_from(
+    name: str, sfm: FinishedSfm, scene: SplatMap, target: Target
+) -> tuple[Float[Tensor, "h w 3"], Bool[Tensor, "h w"]] | None:
+    """A training frame as the test camera sees it, and where it shows the same surface; None where that is hardly so.
+
+    Placed by the map, then by flow; recolored before and after.
+    """
+    f, lens = sfm.frames.index(name), sfm.rec.cameras[sfm.rec.index(name)]
+    canvas = lens.drawn(scene.settings.long_side)
+    image, seen = undistorted(sfm.frames.image(f), sfm.frames.mask(f), lens, canvas)
+    pixels, z = project(canvas, target.points.to(canvas.K))
+    at = pixels[0].reshape(*target.counted.shape, 2).float().numpy() - 0.5
+    z = z[0].reshape(target.counted.shape)
+    surface = _sampled(scene.render(canvas, sfm.frames.frames[f].time).z_depth, at)
+    shown = target.counted & (_sampled(seen.float(), at) > 0.99) & (z > 0)
+    shown &= ((z / surface.clamp(min=1e-6)) - 1).abs() < SAME_DEPTH
+    if float(shown.float().mean()) < LEAST_SHARE:
+        return None
+    placed = _recolored(_sampled(image, at), target.image, shown)
+    there = _sampled(torch.from_numpy(at), _grid(shown) + smooth_flow(target.image, placed)).numpy()
+    moved = _sampled(image, there)  # resampled once
+    inner = cv2.erode(shown.numpy().astype(np.uint8), np.ones((BORDER, BORDER), np.uint8))
+    shown = torch.from_numpy(inner) > 0
+    return None if not bool(shown.any()) else (_recolored(moved, target.image, shown), shown)
+
+
+def smooth_flow(source: Float[Tensor, "h w 3"], target: Float[Tensor, "h w 3"]) -> Float[np.ndarray, "h w 2"]:
+    """The flow between two images without what single pixels' noise makes of it."""
+    flow = flow_between(*(each.float().mean(-1).numpy() for each in (source, target)))
+    return cv2.GaussianBlur(flow, (0, 0), SMOOTH)
+
+
+def _grid(like: Tensor) -> np.ndarray:
+    row, column = np.mgrid[: like.shape[0], : like.shape[1]].astype(np.float32)
+    return np.stack([column, row], -1)
+
+
+def _sampled(values: Tensor, at: np.ndarray) -> Tensor:
+    x, y = (np.ascontiguousarray(part, dtype=np.float32) for part in np.moveaxis(at, -1, 0))
+    drawn = cv2.remap(values.float().numpy(), x, y, cv2.INTER_LANCZOS4, borderMode=cv2.BORDER_REPLICATE)
+    return torch.from_numpy(drawn)
+
+
+def _recolored(
+    image: Float[Tensor, "h w 3"], target: Float[Tensor, "h w 3"], where: Bool[Tensor, "h w"]
+) -> Float[Tensor, "h w 3"]:
+    """In the colors of the target where both show the same; elsewhere the target, so that flow finds nothing there."""
+    return torch.where(where[..., None], fit_colors(image[where], target[where])(image), target)
+
+
+def row_of(view: HeldOutView, sfm: FinishedSfm, scene: SplatMap, folders: dict[str, Path]) -> list[float] | None:
+    """Share, one, mean, limit, then two columns per map; None where no two training frames show the test frame."""
+    target = target_of(sfm, scene, view)
+    f = sfm.frames.index(view.name)
+    trained = {frame.name for frame in sfm.frames.train}
+    near = sorted((n for n in sfm.rec.names if n in trained), key=lambda n: abs(sfm.frames.index(n) - f))[:NEAREST]
+    found = [each for name in near if (each := drawn_from(name, sfm, scene, target)) is not None]
+    if len(found) < 2:
+        return None
+    drawn, shown = (torch.stack(parts) for parts in zip(*found, strict=True))
+    where = shown.sum(0) >= 2
+    if not bool(where.any()):
+        return None
+
+    def score(image: Float[Tensor, "h w 3"], over: Bool[Tensor, "h w"] = where) -> float:
+        fitted = fit_colors(image[over], target.image[over])(image[over])
+        return psnr(as_8_bit(fitted.clamp(0, 1)), target.image[over])
+
+    mean = (drawn * shown[..., None]).sum(0) / shown.sum(0).clamp(min=1)[..., None]
+    one = max(score(image, where & there) for image, there in zip(drawn, shown, strict=True) if (where & there).any())
+    row = [float(where.float().mean()), one, score(mean), _common_psnr(drawn - target.image, shown, where)]
+    stem = view_stems(sfm.frames.names)[view.name]
+    for folder in folders.values():
+        image = torch.from_numpy(images.read_rgb(folder / f"{stem}_rgb.png")).float() / 255
+        image = _recolored(image, target.image, where)
+        row += [score(image), score(_sampled(image, _grid(where) + smooth_flow(target.image, image)))]
+    return row
+
+
+def _common_psnr(errors: Float[Tensor, "n h w 3"], shown: Bool[Tensor, "n h w"], where: Bool[Tensor, "h w"]) -> float:
+    """PSNR, dB, of the error that the frames share: the mean over pixels of the products of the errors of two."""
+    errors = errors * shown[..., None]
+    count = shown.sum(0)[where][:, None]
+    products = (errors.sum(0) ** 2 - (errors**2).sum(0))[where] / (count * (count - 1))
+    return float(-10 * torch.log10(products.mean()))
+
+
+def main() -> None:
+    """Print a row per clip, means over its test frames."""
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("runs", nargs="+", type=Path)
+    parser.add_argument("--tables", type=Path)
+    parser.add_argument("--recipes", nargs="*", default=["watersplatting"])
+    a = parser.parse_args()
+    torch.set_num_threads(1)
+    others = a.recipes if a.tables else []
+    print("| clip | frames | share | one | mean | limit | " + " | ".join(["own map", *others]) + " | lead |")
+    print("| --- " * (7 + len(others) + 1) + "|")
+    for run in a.runs:
+        sfm, scene = open_finished_sfm(run), load_map(run / "splat" / "map.safetensors")
+        with TemporaryDirectory() as own:
+            folders = {"own map": Path(own)}
+            for recipe in others:
+                folders[recipe] = next((a.tables / run.name).glob(f"*/{recipe}/0/test"))
+            start = in_axes_of(scene, sfm.rec, sfm.first_poses())
+            views = score_views(scene, sfm.rec, sfm.frames, start, Path(own), sfm.settings.test)
+            rows = [row for view in views if (row := row_of(view, sfm, scene, folders)) is not None]
+        if not rows:
+            print(f"| {run.name} | 0 |" + " |" * (6 + len(others)), flush=True)
+            continue
+        share, one, mean, limit, *maps = np.mean(rows, 0).tolist()
+        told = [f"{maps[i]:.2f} ({maps[i + 1]:.2f})" for i in range(0, len(maps), 2)]
+        lead = f"{np.mean([row[3] - max(row[6::2]) for row in rows]):.2f}" if others else ""
+        cells = [run.name, str(len(rows)), f"{share:.2f}", f"{one:.2f}", f"{mean:.2f}", f"{limit:.2f}", *told, lead]
+        print("| " + " | ".join(cells) + " |", flush=True)
+
+
+if __name__ == "__main__":
+    main()
