@@ -35,7 +35,7 @@ class GaussianInitialSettings(Settings):
     """The Gaussians that training starts from."""
 
     primitives: MapSize = 400_000
-    """Number of points of the cloud and its backdrop that become Gaussians, one per voxel."""
+    """Number of points of the cloud and its backdrop that become Gaussians, for as many pixels each."""
     backdrop: Share = 0.4
     """Largest share of the initial Gaussians on ground of guessed depth; 0 starts from measured points alone."""
     colors: Literal["restored", "raw"] = "raw"

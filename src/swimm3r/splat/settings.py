@@ -69,7 +69,7 @@ class InitialSettings(Settings):
     """The primitives and the water that training starts from."""
 
     primitives: MapSize = 400_000
-    """Number of points of the restored cloud and its backdrop that become primitives, one per voxel."""
+    """Number of points of the restored cloud and its backdrop that become primitives, for as many pixels each."""
     backdrop: Share = 0.4
     """Largest share of the initial primitives on ground of guessed depth; 0 starts from measured points alone."""
     directions: Literal["mean", "uniform"] = "mean"

@@ -5,12 +5,13 @@ from dataclasses import replace
 import pytest
 import torch
 
-from swimm3r.cameras import Cameras
-from swimm3r.scene.reconstruction import DenseCloud
+from swimm3r.cameras import Cameras, project_visible
+from swimm3r.scene.reconstruction import DenseCloud, DepthMaps
 from swimm3r.splat.primitives.beta import (
     initial_primitives,
     inverse_softplus,
     mean_directions,
+    pixel_spacing,
     rescaled,
     starting_points,
     voxel_sample,
@@ -35,6 +36,38 @@ def test_dense_places_lose_more_points_than_sparse_ones():
 
 def test_few_points_are_all_kept():
     assert torch.equal(voxel_sample(torch.rand(10, 3).double(), 100), torch.arange(10))
+
+
+def test_voxels_are_as_large_as_the_spacing_asks():
+    points = torch.rand(40_000, 3, generator=torch.Generator().manual_seed(0)).double()
+    points[:, 2] = 0
+    coarse = points[:, 0] > 0.5
+    chosen = voxel_sample(points, 2000, torch.where(coarse, 2.0, 1.0).double())
+    assert len(chosen) == pytest.approx(2000, rel=0.01)
+    fine, few = float((~coarse[chosen]).sum()), float(coarse[chosen].sum())
+    assert fine / few == pytest.approx(4, rel=0.1)
+    assert torch.equal(voxel_sample(points, 2000, torch.full((40_000,), 7.0).double()), voxel_sample(points, 2000))
+
+
+def test_points_are_spaced_by_the_pixels_that_show_them(tiny_dive, tmp_path):
+    rec = replace(tiny_dive.rec, depth=DepthMaps(tmp_path))  # nothing hides anything
+    camera = rec.cameras[3]
+    center, ahead = camera.centers[0].double(), camera.cam2world[0, :3, 2].double()
+    points = torch.stack([center + t * ahead for t in (1.0, 1.5, 2.0)])
+    one = replace(rec, names=rec.names[3:4], cameras=camera)
+    torch.testing.assert_close(pixel_spacing(points, one), torch.tensor([1.0, 1.5, 2.0]).double(), atol=1e-6, rtol=0)
+
+    counted = torch.zeros(len(rec.points.xyz), dtype=torch.float64)
+    for k in range(len(rec.names)):
+        seen = project_visible(rec.cameras[k], rec.points.xyz[None])[2][0]
+        counted += seen / (rec.points.xyz - rec.cameras.centers[k]).square().sum(-1)
+    expected = (counted / len(rec.names)) ** -0.5
+    middle = expected[counted > 0].median()
+    spacing = pixel_spacing(rec.points.xyz, rec)
+    torch.testing.assert_close(spacing, expected.clamp(middle / 3, middle * 3), atol=0, rtol=1e-9)
+    assert spacing.amin() < 0.8 * spacing[counted > 0].median()
+    behind = pixel_spacing(torch.cat([rec.points.xyz, (center - 5 * ahead)[None]]), one)
+    assert behind[-1] == behind.amax()  # no frame sees it
 
 
 def test_the_mean_direction_is_that_of_the_frames_which_see_the_point(tiny_dive):
