@@ -217,19 +217,21 @@ def _voxels(points: Float[Tensor, "p 3"], edge: float, step: Float[Tensor, " p"]
 
 
 def pixel_spacing(xyz: Float[Tensor, "n 3"], rec: Reconstruction) -> Float[Tensor, " n"]:
-    """Spacing at which points stand for as many pixels of all frames everywhere, up to a common factor.
+    """Spacing at which points stand for as many pixels of the frames that see them everywhere, up to a common factor.
 
-        spacing = (mean over frames of [seen] / d^2)^(-1/2)
+        spacing = (mean over the frames that see the point of 1 / d^2)^(-1/2)
 
-    as an area at the distance d fills pixels as 1 / d^2; float64, within a factor of 3 of its median.
+    as an area at the distance d fills pixels as 1 / d^2; float64, within a factor of 3 of its median, the largest where
+    no frame sees the point. How many do plays no part: ground that a diver passes once is to look like any other.
     """
-    density = torch.zeros(len(xyz), dtype=torch.float64)
+    total, seen_by = torch.zeros(2, len(xyz), dtype=torch.float64)
     for sight in _sights(xyz, rec, _VIEWS):
-        density += sight.seen / sight.distance**2
-    density = density / min(_VIEWS, len(rec.names))
-    spacing = density.clamp(min=torch.finfo(density.dtype).tiny) ** -0.5
-    middle = spacing[density > 0].median() if bool((density > 0).any()) else torch.ones(())
-    return spacing.clamp(middle / _RANGE, middle * _RANGE)
+        total += sight.seen / sight.distance**2
+        seen_by += sight.seen
+    spacing = (seen_by / total.clamp(min=torch.finfo(total.dtype).tiny)) ** 0.5
+    seen = seen_by > 0
+    middle = spacing[seen].median() if bool(seen.any()) else torch.ones(()).double()
+    return torch.where(seen, spacing, middle * _RANGE).clamp(middle / _RANGE, middle * _RANGE)
 
 
 def mean_directions(xyz: Float[Tensor, "n 3"], rec: Reconstruction, max_views: int) -> Float[Tensor, "n 3"]:
