@@ -134,6 +134,7 @@ def test_the_map_knows_the_water(finished: tuple[Path, dict]):
     assert max(water["T_D_abs"]) < 0.1
     assert max(water["B_abs"]) < 0.05
     assert water["clear_psnr"] > 10  # after 60 steps much is still transparent
+    assert water["clear_psnr_observed"] > water["clear_psnr"] - 0.5  # what no frame saw is no better
     assert finished[1]["medium"]["splat"]["unit"] == finished[1]["medium"]["sfm"]["unit"]
 
 

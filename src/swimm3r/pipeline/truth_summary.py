@@ -138,6 +138,7 @@ class _View:
     ray_depth: Float[Tensor, "h w"]  # true
     medium: Medium
     lamp: LampImages | None  # true; None in daylight
+    observed: Bool[Tensor, "h w"] | None = None  # some training frame saw what the map shows there; None of a fit
 
     @property
     def light(self) -> Float[Tensor, "h w 3"] | None:
@@ -176,13 +177,13 @@ def _views_of_map(scene: SplatMap, views: Sequence[HeldOutView], truth: GroundTr
         true_clear, shown = undistorted(clear, everything, view.lens, view.canvas)
         true_z = torch.where(shown, z_depth[nearest_pixels(view.lens, view.canvas)], 0.0)
         ray_depth = ray_depth_from_z(true_z, image_directions(view.canvas).float())[window]
-        out = scene.render(cut(view.canvas, view.window), view.time, backscatter=False, observed=False)
+        out = scene.render(cut(view.canvas, view.window), view.time, backscatter=False)
         medium = Medium(out.medium.Binf, out.medium.beta_D / scale, out.medium.beta_B / scale)
         lamp = truth.lamp(view.name)
         if lamp is not None:
             parts = (undistorted(part, everything, view.lens, view.canvas)[0] for part in vars(lamp).values())
             lamp = LampImages(*(part[window] for part in parts))
-        yield _View(out.clear, true_clear[window], ray_depth, medium, lamp)
+        yield _View(out.clear, true_clear[window], ray_depth, medium, lamp, out.observed)
 
 
 def _against_water(
@@ -192,7 +193,7 @@ def _against_water(
     identifiable: dict[str, Bool[Tensor, "3"]],
     true: Medium,
 ) -> dict[str, object]:
-    """Errors of the water, and the mean PSNR of clear colors.
+    """Errors of the water, and the mean PSNR of clear colors, of a map also that of what training frames saw.
 
     Under a lamp the colors are compared after the one gain that images do not tell, for which all views are gone
     through a first time; it is kept beside the PSNR.
@@ -201,17 +202,27 @@ def _against_water(
     if lit:
         counted = ((v.restored, v.clear, lit_enough(v.ray_depth, true, light=v.light)) for v in views())
         gain = strength_gain(counted)
-    psnrs, errors = [], []
+    psnrs, observed, errors = [], [], []
     for v in views():
         psnrs.append(clear_psnr(gain * v.restored, v.clear, v.ray_depth, true, light=v.light))
+        if v.observed is not None:
+            asked = torch.where(v.observed, v.ray_depth, 0.0)
+            observed.append(clear_psnr(gain * v.restored, v.clear, asked, true, light=v.light))
         errors.append(view_water_errors(v.ray_depth, v.medium, true, v.backscatter))
     if not psnrs:
         return summary_entries({"clear_psnr": NotComputed("the truth has no depth of a held-out frame")})
-    known = [value for value in psnrs if not isinstance(value, NotComputed)]
-    colors: dict[str, object] = {"clear_psnr": sum(known) / len(known) if known else psnrs[0]}
+    colors: dict[str, object] = {"clear_psnr": _mean(psnrs)}
+    if observed:
+        colors["clear_psnr_observed"] = _mean(observed)
     if lit:
         colors["clear_gain"] = gain
     return summary_entries(colors) | water_scores_from_errors(errors, coefficients, identifiable, true).summary()
+
+
+def _mean(values: Sequence[float | NotComputed]) -> float | NotComputed:
+    """The mean of those that were computed; the first one's reason where none was."""
+    known = [value for value in values if not isinstance(value, NotComputed)]
+    return sum(known) / len(known) if known else values[0]
 
 
 def _moving_section(

@@ -20,6 +20,7 @@ TRUTH_LABELS = {  # key of summary.json -> name, unit, factor, decimals
     "depth_absrel": ("Depth, mean relative error", " %", 100, 2),
     "depth_coverage": ("Pixels with a depth", " %", 100, 1),
     "clear_psnr": ("Colors without the water, PSNR", " dB", 1, 1),
+    "clear_psnr_observed": ("The same, of what training frames saw", " dB", 1, 1),
     "T_D_abs": ("Share of light kept T_D, mean error (red, green, blue)", "", 1, 3),
     "B_abs": ("Backscatter B, mean error (red, green, blue)", "", 1, 3),
     "Binf_abs": ("Veiling light Binf, error (red, green, blue)", "", 1, 3),
