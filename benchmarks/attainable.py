@@ -1,4 +1,4 @@
-"""How well the training frames of a clip predict its held-out frames at all, beside how well maps do.
+"""Held-out frames as the other frames of a clip predict them, with all that can be known of the way, beside maps.
 
     python benchmarks/attainable.py RUN... [--tables DIR] [--recipes NAME ...]
 

@@ -17,8 +17,8 @@ from torch.nn.functional import normalize
 from swimm3r.geometry import rotation_from_quaternion
 from swimm3r.scene.reconstruction import Reconstruction
 from swimm3r.splat.gaussian_settings import GaussianInitialSettings
-from swimm3r.splat.primitives.beta import starting_points
 from swimm3r.splat.primitives.spherical_harmonics import Y_00, spherical_harmonics
+from swimm3r.splat.primitives.start import starting_points
 
 
 class GaussianPrimitives(NamedTuple):
