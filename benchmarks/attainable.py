@@ -4,14 +4,15 @@
 
 RUN are finished run folders; DIR is the --out of `swimm3r bench render RUN...`. Each of the training frames nearest in
 time is drawn from the test camera by the map's depth, moved onto the test frame by dense flow, and given the affine map
-of colors that fits it best. All three use the test frame, which no map may, so these are bounds and no method:
+of colors that fits it best. All three use the test frame, which no map may. That tells what frames have in common; it
+is an estimate and no bound, for drawing a frame blurs it and flow is not exact, which a map need not pay for:
 
     share   of the test frame's pixels, those that two of them show; every column is over them alone
     one     the training frame that comes closest
     mean    all of them averaged
     limit   the error that they have in common, the mean product of the errors of two: what endlessly many of them
             would leave, as is their own noise's share of the errors of one and of their mean
-    lead    the limit over the best map of another recipe: what a perfect map could be ahead of it
+    lead    the limit over the best map of another recipe
 
 Columns of maps are PSNR in dB after an affine map of colors, and in brackets after being moved by the flow as well.
 """
@@ -31,8 +32,6 @@ from swimm3r.cameras import Cameras, pixel_grid, project, unproject
 from swimm3r.evaluate.images import as_8_bit, psnr
 from swimm3r.evaluate.registration import fit_colors, flow_between
 from swimm3r.imaging.undistortion import undistorted
-from swimm3r.io import images
-from swimm3r.io.view_names import view_stems
 from swimm3r.pipeline.held_out import HeldOutView, cut, in_axes_of, score_views
 from swimm3r.pipeline.run import FinishedSfm, open_finished_sfm
 from swimm3r.splat.map_file import load_map
@@ -116,13 +115,29 @@ def _recolored(
     return torch.where(where[..., None], fit_colors(image[where], target[where])(image), target)
 
 
-def row_of(view: HeldOutView, sfm: FinishedSfm, scene: SplatMap, folders: dict[str, Path]) -> list[float] | None:
-    """Share, one, mean, limit, then two columns per map; None where no two training frames show the test frame."""
+Rendered = tuple[SplatMap, dict[str, HeldOutView]]  # a map, and its scored views by the names of their frames
+
+
+def rendered(sfm: FinishedSfm, path: Path) -> Rendered:
+    """A map with the poses of its test frames refined on it."""
+    scene = load_map(path)
+    start = in_axes_of(scene, sfm.rec, sfm.first_poses())
+    with TemporaryDirectory() as folder:
+        views = score_views(scene, sfm.rec, sfm.frames, start, Path(folder), sfm.settings.test)
+    return scene, {view.name: view for view in views}
+
+
+def row_of(name: str, sfm: FinishedSfm, maps: list[Rendered]) -> list[float] | None:
+    """Share, one, mean, limit, then two columns per map; None where no two training frames show the test frame.
+
+    The first map places the training frames.
+    """
+    scene, view = maps[0][0], maps[0][1][name]
     target = target_of(sfm, scene, view)
-    f = sfm.frames.index(view.name)
+    f = sfm.frames.index(name)
     trained = {frame.name for frame in sfm.frames.train}
     near = sorted((n for n in sfm.rec.names if n in trained), key=lambda n: abs(sfm.frames.index(n) - f))[:NEAREST]
-    found = [each for name in near if (each := drawn_from(name, sfm, scene, target)) is not None]
+    found = [each for other in near if (each := drawn_from(other, sfm, scene, target)) is not None]
     if len(found) < 2:
         return None
     drawn, shown = (torch.stack(parts) for parts in zip(*found, strict=True))
@@ -137,9 +152,12 @@ def row_of(view: HeldOutView, sfm: FinishedSfm, scene: SplatMap, folders: dict[s
     mean = (drawn * shown[..., None]).sum(0) / shown.sum(0).clamp(min=1)[..., None]
     one = max(score(image, where & there) for image, there in zip(drawn, shown, strict=True) if (where & there).any())
     row = [float(where.float().mean()), one, score(mean), _common_psnr(drawn - target.image, shown, where)]
-    stem = view_stems(sfm.frames.names)[view.name]
-    for folder in folders.values():
-        image = torch.from_numpy(images.read_rgb(folder / f"{stem}_rgb.png")).float() / 255
+    for (
+        scene,
+        views,
+    ) in maps:  # its picture files will not do: they mark what that map's own training frames did not see
+        view = views[name]
+        image = as_8_bit(scene.render(cut(view.canvas, view.window), view.time).rgb)
         image = _recolored(image, target.image, where)
         row += [score(image), score(_sampled(image, _grid(where) + smooth_flow(target.image, image)))]
     return row
@@ -165,19 +183,15 @@ def main() -> None:
     print("| clip | frames | share | one | mean | limit | " + " | ".join(["own map", *others]) + " | lead |")
     print("| --- " * (7 + len(others) + 1) + "|")
     for run in a.runs:
-        sfm, scene = open_finished_sfm(run), load_map(run / "splat" / "map.safetensors")
-        with TemporaryDirectory() as own:
-            folders = {"own map": Path(own)}
-            for recipe in others:
-                folders[recipe] = next((a.tables / run.name).glob(f"*/{recipe}/0/test"))
-            start = in_axes_of(scene, sfm.rec, sfm.first_poses())
-            views = score_views(scene, sfm.rec, sfm.frames, start, Path(own), sfm.settings.test)
-            rows = [row for view in views if (row := row_of(view, sfm, scene, folders)) is not None]
+        sfm, paths = open_finished_sfm(run), [run / "splat" / "map.safetensors"]
+        paths += [next((a.tables / run.name).glob(f"*/{recipe}/0/map.safetensors")) for recipe in others]
+        maps = [rendered(sfm, path) for path in paths]
+        rows = [row for name in maps[0][1] if (row := row_of(name, sfm, maps)) is not None]
         if not rows:
             print(f"| {run.name} | 0 |" + " |" * (6 + len(others)), flush=True)
             continue
-        share, one, mean, limit, *maps = np.mean(rows, 0).tolist()
-        told = [f"{maps[i]:.2f} ({maps[i + 1]:.2f})" for i in range(0, len(maps), 2)]
+        share, one, mean, limit, *scores = np.mean(rows, 0).tolist()
+        told = [f"{scores[i]:.2f} ({scores[i + 1]:.2f})" for i in range(0, len(scores), 2)]
         lead = f"{np.mean([row[3] - max(row[6::2]) for row in rows]):.2f}" if others else ""
         cells = [run.name, str(len(rows)), f"{share:.2f}", f"{one:.2f}", f"{mean:.2f}", f"{limit:.2f}", *told, lead]
         print("| " + " | ".join(cells) + " |", flush=True)

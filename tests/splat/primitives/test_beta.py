@@ -5,11 +5,7 @@ from dataclasses import replace
 import torch
 
 from swimm3r.cameras import Cameras
-from swimm3r.splat.primitives.beta import (
-    initial_primitives,
-    inverse_softplus,
-    rescaled,
-)
+from swimm3r.splat.primitives.beta import initial_primitives, inverse_softplus, rescaled
 from swimm3r.splat.rendering import SplatMap
 from swimm3r.splat.settings import InitialSettings
 
