@@ -1,9 +1,9 @@
-"""Depth that spilled over a silhouette into open water is taken back; surfaces keep theirs."""
+"""Open water is told from far surfaces; depth that spilled over a silhouette into it is taken back."""
 
 import pytest
 import torch
 
-from swimm3r.imaging.open_water import without_fringe
+from swimm3r.imaging.open_water import sea_share, without_fringe
 
 H, W, SPILLED = 240, 320, 4
 VEIL = torch.tensor([0.1, 0.5, 0.5])
@@ -51,3 +51,17 @@ def test_without_open_water_nothing_changes(shore):
     assert torch.equal(without_fringe(shore, everywhere, VEIL), everywhere)
     nowhere = torch.zeros(H, W)
     assert torch.equal(without_fringe(shore, nowhere, VEIL), nowhere)
+
+
+def test_a_far_rock_that_stands_out_in_one_channel_only_is_no_water(shore):
+    rng = torch.Generator().manual_seed(1)
+    row, column = torch.meshgrid(torch.arange(H), torch.arange(W), indexing="ij")
+    rock = ((row - H // 2) ** 2 + (column - 90) ** 2 < 40**2) & (row < H // 2)
+    blotches = (0.04 * torch.randn(H // 4, W // 4, generator=rng)).repeat_interleave(4, 0).repeat_interleave(4, 1)
+    image = shore.clone()
+    image[..., 2] += torch.where(rock, 0.02 + blotches, 0.0)
+    known = torch.where(surface() & (row > H // 2 + 4), 1.0, 0.0)
+    water = sea_share(image, known, VEIL) > 0.5
+    beyond = ~surface() & ~rock
+    assert water[rock].float().mean() < 0.15  # half of it before colors were compared in units of their spread
+    assert water[beyond].float().mean() > 0.95

@@ -11,12 +11,13 @@ import torch
 from jaxtyping import Bool, Float
 from torch import Tensor
 
-from swimm3r.imaging.filters import LUMA, blur, local_linear
+from swimm3r.imaging.filters import blur, local_linear
 
 _WINDOW = 7
 _RIM = 9  # pixels around a region in which its neighbors are looked for
 _SAMPLES = 50_000  # pixels whose quantiles stand for all
 _SPILL = 0.02  # of the longer side, how far depth spills over silhouettes
+_SEA_STD = 0.007  # of the colors of open water about their local mean, at least
 _WATER_STD, _SURFACE_STD = 0.01, 0.03  # of colors about their local mean, at least
 _FEW = 100  # pixels of known depth that decide nothing
 
@@ -71,16 +72,24 @@ def open_water_mask(
 def sea_share(
     image: Float[Tensor, "h w 3"], z_depth: Float[Tensor, "h w"], veil: Float[Tensor, "3"] | None = None
 ) -> Float[Tensor, "h w"]:
-    """Probability that a pixel shows water only: open water, or unknown depth of the same color; soft where hazy."""
+    """Probability that a pixel shows water only: open water, or unknown depth of the same color; soft where hazy.
+
+    Colors are compared with those of the open water nearby in units of their spread there, channel by channel: far
+    rocks may stand out in one channel only.
+    """
     water = open_water_mask(image, z_depth, veil).float()
     if not water.any():
         return water
     reach = 0.02 * max(image.shape[:2])
-    nearby = blur(water[..., None], reach)
-    local = blur(water[..., None] * image, reach) / nearby.clamp(min=1e-6)
-    away = (blur(image, 0.7) - local).square().sum(-1) / (2 * 0.02**2)
-    hard = torch.maximum(torch.exp(-away) * (nearby[..., 0] > 1e-3), water)
-    guide = blur(image @ LUMA[:, None], 0.7)[..., 0]
+    weight = water[..., None]
+    nearby = blur(weight, reach)
+    total = nearby.clamp(min=1e-6)
+    local = blur(weight * image, reach) / total
+    variance = (blur(weight * image**2, reach) / total - local**2).clamp(min=0) + _SEA_STD**2
+    difference = blur(image, 0.7) - local
+    alike = torch.exp(-(difference**2 / (2 * variance)).sum(-1))
+    hard = torch.maximum(alike * (nearby[..., 0] > 1e-3), water)
+    guide = difference.norm(dim=-1)
     soft = local_linear(guide, hard[..., None], torch.ones_like(hard)[..., None], reach / 2, 2e-5)[..., 0]
     share = blur(torch.maximum(soft, hard)[..., None], reach / 5)[..., 0]
     return torch.where(z_depth > 0, 0.0, share.clamp(0, 1))
