@@ -138,6 +138,7 @@ PAPER = UwbsSettings(  # Eq. 18 and nothing else; where the paper is silent UBS'
         coverage=0.0,
         open_water=0.0,
         gamut=0.0,
+        hidden=0.0,
     ),
     densify=DensifySettings(noise_dynamic=1.0),
     movers=MoverSettings(at=0.0),

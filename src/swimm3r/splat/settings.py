@@ -160,6 +160,11 @@ class LossWeights(Settings):
     """Weight of primitives drawn over open water, which would glare in clear images; 0 is the paper's objective."""
     gamut: NotNegative = 1.0
     """Weight of the squared excess of clear colors over 0..1; 0 is the paper's objective."""
+    hidden: NotNegative = 0.05
+    """Weight of the squared distance of clear colors, in channels that the water hides, from the hue that the dive has;
+    0 is the paper's objective."""
+    hidden_transmittance: PositiveShare = 0.01
+    """T_D at which a channel's color is half hidden."""
     depth_confidence: NotNegative = 0.3
     """Smallest confidence of a depth that the regularizer uses."""
     depth_alpha: Share = 0.5
@@ -349,7 +354,7 @@ def with_recipe(settings: UwbsSettings, recipe: RecipeName) -> SplatSettings:
             return peer
 
 
-_BEYOND_UBS = ("depth", "medium_smoothness", "medium_prior", "radius", "coverage", "open_water", "gamut")
+_BEYOND_UBS = ("depth", "medium_smoothness", "medium_prior", "radius", "coverage", "open_water", "gamut", "hidden")
 _SHORT = 10_000
 """Runs shorter than this give the peers what they would else lack the time for. WaterSplatting's Gaussians start at an
 opacity of 0.1 and are culled below 0.5: of 4,000 on ruie_green_rock (160 px) 724 were left after 400 steps, at 23.6 dB

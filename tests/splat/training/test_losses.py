@@ -129,6 +129,26 @@ def test_colors_in_view_are_drawn_back_to_those_that_there_are(primitives):
     torch.testing.assert_close(slope, expected.to(slope), rtol=1e-5, atol=1e-8)
 
 
+def test_channels_that_the_water_hides_are_drawn_to_the_hue_of_those_seen(primitives):
+    p = primitives(3)
+    rgb = torch.tensor([[0.6, 0.3, 0.3], [0.9, 0.2, 0.2], [5.0, 5.0, 5.0]]).to(p.rgb).requires_grad_()
+    T_D = torch.tensor([[1.0, 1.0, 1.0], [0.0, 1.0, 1.0], [0.0, 1.0, 1.0]]).to(p.rgb)
+    radius = torch.tensor([2.0, 7.0, 0.0])  # the first tells the hue, 2 : 1 : 1; the last is out of view
+    off = losses.hidden_colors(p._replace(rgb=rgb), T_D, radius, 0.01)
+    assert off.item() == pytest.approx((0.9 - 0.4) ** 2 / 6, rel=0.02)
+    (slope,) = torch.autograd.grad(off, rgb)
+    expected = torch.zeros(3, 3)
+    expected[1, 0] = 2 * (0.9 - 0.4) / 6
+    torch.testing.assert_close(slope, expected.to(slope), rtol=0.02, atol=1e-4)
+
+
+def test_colors_that_the_water_leaves_are_free(primitives):
+    p = primitives(3)
+    clear = torch.ones(3, 3).to(p.rgb)
+    assert losses.hidden_colors(p, clear, torch.tensor([2.0, 7.0, 1.0]), 0.01).item() < 1e-4
+    assert losses.hidden_colors(p, 0 * clear, torch.tensor([0.0, 0.0, 0.0]), 0.01).item() == 0
+
+
 def test_depth_may_step_where_color_does():
     rgb = torch.zeros(3, 6, 8)
     rgb[:, :, 4:] = 0.2

@@ -3,7 +3,8 @@
 L = L_3DGS + lambda_opa L_opa + lambda_scale L_scale + lambda_depth L_depth + lambda_smooth L_smooth + lambda_rad L_rad
 
 and, beyond the paper, terms that hold the water to what structure from motion measured (`LossWeights.medium_prior`),
-known surfaces opaque (`coverage`), open water empty (`open_water`) and clear colors to those that there are (`gamut`).
+known surfaces opaque (`coverage`), open water empty (`open_water`), clear colors to those that there are (`gamut`) and,
+in channels that the water hides, to those that the others let expect (`hidden`).
 """
 
 import copy
@@ -241,13 +242,15 @@ def objective(
     open_share = losses.uncovered(drawing.images, view.surface)
     on_water = losses.drawn_on_water(drawing.images, view.open_water)
     outside = losses.outside_gamut(p, drawing.projection.radius)
+    hidden = losses.hidden_colors(p, _transmittance(drawing), drawing.projection.radius, w.hidden_transmittance)
     shrunk = view.camera.width / w.max_radius_width if w.max_radius_width else 1.0
     large = losses.oversize(p, drawing.projection.radius, w.max_radius * shrunk)
     depth = w.depth * depth_error
     total = photo.loss + depth + w.medium_smoothness * smooth + w.radius * large
-    total = total + w.coverage * open_share + w.open_water * on_water + w.gamut * outside
+    total = total + w.coverage * open_share + w.open_water * on_water
+    total = total + w.gamut * outside + w.hidden * hidden
     numbers = {"l1": photo.l1, "ssim": photo.ssim, "depth": depth_error, "medium_smoothness": smooth, "radius": large}
-    numbers |= {"uncovered": open_share, "drawn_on_water": on_water, "outside_gamut": outside}
+    numbers |= {"uncovered": open_share, "drawn_on_water": on_water, "outside_gamut": outside, "hidden": hidden}
     if prior is not None:
         off = deviation(drawing.grid, prior)
         total = total + w.medium_prior * off
@@ -257,6 +260,15 @@ def objective(
         total = total + w.opacity * opacity + w.scale * scale
         numbers |= {"opacity": opacity, "scale": scale}
     return UwbsObjective(total, depth, {"loss": total} | numbers)
+
+
+@torch.no_grad()
+def _transmittance(drawing: Drawing) -> Float[Tensor, "n 3"]:
+    """T_D of a view's primitives at their z depth, in its mean water; 1 in maps without water."""
+    if drawing.maps is None:
+        return torch.ones_like(drawing.projection.primitives.color)
+    beta_D = drawing.grid.values[6:9].mean((1, 2))
+    return torch.exp(-beta_D * drawing.projection.primitives.depth.clamp(min=0)[:, None])
 
 
 def _on_larger_pixels(settings: UwbsSettings) -> UwbsSettings:

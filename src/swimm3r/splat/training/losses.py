@@ -13,6 +13,7 @@ from swimm3r.splat.primitives.beta import BetaPrimitives
 from swimm3r.splat.training import ssim_cpu
 
 _NEAREST = 1e-3  # of the scene's unit: the least depth whose inverse is taken
+_FEW_COLORS = 1e-3  # of one primitive's weight, for the hue and brightness where no color is seen
 _LEAST_WEIGHT = 1e-12  # of an image's edge-aware weights together, below which none of its depths counts
 
 
@@ -141,3 +142,25 @@ def outside_gamut(p: BetaPrimitives, radius: Float[Tensor, " n"]) -> Float[Tenso
     in_view = (radius > 0)[:, None]
     excess = p.rgb - p.rgb.detach().clamp(0, 1)
     return torch.where(in_view, excess.square(), 0.0).sum() / (3 * in_view.sum()).clamp(min=1)
+
+
+def hidden_colors(
+    p: BetaPrimitives, T_D: Float[Tensor, "n 3"], radius: Float[Tensor, " n"], half: float
+) -> Float[Tensor, ""]:
+    """Mean squared distance of clear colors in channels that the water hides from those that the others let expect.
+
+    A primitive in view (`radius` > 0) is expected to have the mean hue of those in view whose channels are all seen, at
+    the brightness of its own seen channels. A channel of transmittance T_D is seen to T_D^2 / (T_D^2 + half^2); the
+    rest of it counts. 0 for no primitive in view.
+    """
+    in_view = (radius > 0)[:, None]
+    with torch.no_grad():
+        known = T_D.square() / (T_D.square() + half**2)
+        rgb = p.rgb.clamp(0, 1)
+        well = torch.where(in_view, known.prod(-1, keepdim=True), 0.0)
+        hue = (well * rgb).sum(0) + _FEW_COLORS
+        hue = hue / hue.mean()
+        weight = known.square() + _FEW_COLORS
+        brightness = (weight * rgb).sum(-1, keepdim=True) / (weight * hue).sum(-1, keepdim=True)
+    off = (1 - known) * (p.rgb - brightness * hue).square()
+    return torch.where(in_view, off, 0.0).sum() / (3 * in_view.sum()).clamp(min=1)
