@@ -242,7 +242,7 @@ def objective(
     open_share = losses.uncovered(drawing.images, view.surface)
     on_water = losses.drawn_on_water(drawing.images, view.open_water)
     outside = losses.outside_gamut(p, drawing.projection.radius)
-    hidden = losses.hidden_colors(p, _transmittance(drawing), drawing.projection.radius, w.hidden_transmittance)
+    hidden = losses.hidden_colors(p, _arriving(drawing), drawing.projection.radius, w.hidden_transmittance)
     shrunk = view.camera.width / w.max_radius_width if w.max_radius_width else 1.0
     large = losses.oversize(p, drawing.projection.radius, w.max_radius * shrunk)
     depth = w.depth * depth_error
@@ -263,12 +263,15 @@ def objective(
 
 
 @torch.no_grad()
-def _transmittance(drawing: Drawing) -> Float[Tensor, "n 3"]:
-    """T_D of a view's primitives at their z depth, in its mean water; 1 in maps without water."""
+def _arriving(drawing: Drawing) -> Float[Tensor, "n 3"]:
+    """Share of the light of a view's primitives that arrives: T_D at their z depth in the view's mean water, times the
+    light of a lamp on them; 1 in maps without water.
+    """
     if drawing.maps is None:
         return torch.ones_like(drawing.projection.primitives.color)
     beta_D = drawing.grid.values[6:9].mean((1, 2))
-    return torch.exp(-beta_D * drawing.projection.primitives.depth.clamp(min=0)[:, None])
+    T_D = torch.exp(-beta_D * drawing.projection.primitives.depth.clamp(min=0)[:, None])
+    return T_D if drawing.light is None else T_D * drawing.light
 
 
 def _on_larger_pixels(settings: UwbsSettings) -> UwbsSettings:
