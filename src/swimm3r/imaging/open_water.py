@@ -17,7 +17,7 @@ _WINDOW = 7
 _RIM = 9  # pixels around a region in which its neighbors are looked for
 _SAMPLES = 50_000  # pixels whose quantiles stand for all
 _SPILL = 0.02  # of the longer side, how far depth spills over silhouettes
-_SEA_STD = 0.007  # of the colors of open water about their local mean, at least
+_SEA_STD = 0.004  # of the colors of open water about their local mean, at least
 _WATER_STD, _SURFACE_STD = 0.01, 0.03  # of colors about their local mean, at least
 _FEW = 100  # pixels of known depth that decide nothing
 
