@@ -21,6 +21,9 @@ from swimm3r import notebook
 from swimm3r.io.files.atomic import write_text
 from swimm3r.lamp import Lamp, LightEvidence, lamp_distance, lamp_document, log_light, rescaled_lamp, share_scattered
 
+_FEW_COLORS = 1e-3  # of one surface known in every channel: gray, where there is none
+_UNSEEN = 1e-6  # of a known channel, the weight of those that are not
+
 Encoding = Literal["srgb", "linear"]
 Estimator = Literal["Sea-Thru", "physics head"]
 
@@ -214,6 +217,26 @@ def remove_water(
     """The inverse of `add_water` (Eq. 4). Not clamped: who shows it clamps, losses that punish overshoot need it."""
     T_D, _ = transmittances(ray_depth, medium)
     return (I - backscatter(ray_depth, medium)) / T_D.clamp(min=min_transmittance)
+
+
+def expected_colors(
+    J: Float[Tensor, "*pixels 3"],
+    known: Float[Tensor, "*pixels 3"],
+    counted: Bool[Tensor, "*pixels 1"] | None = None,
+) -> Float[Tensor, "*pixels 3"]:
+    """Clear colors that the known channels let expect of all: the mean hue, at the brightness of what is known.
+
+    `known` is how far each channel is known, 0..1: below a T_D of some percent an error of the backscatter outweighs
+    the color. The hue is that of the surfaces known in every channel, of those `counted`; gray where there are none.
+    """
+    weight = known**2
+    well = weight.prod(-1, keepdim=True) * (known.amin(-1, keepdim=True) > 0.5)
+    if counted is not None:
+        well = well * counted
+    hue = (well * J).reshape(-1, 3).sum(0) + _FEW_COLORS
+    hue = hue / hue.mean()
+    weight = weight + _UNSEEN
+    return hue * (weight * J).sum(-1, keepdim=True) / (weight * hue).sum(-1, keepdim=True)
 
 
 def rescale(fit: MediumFit, scale: float) -> MediumFit:

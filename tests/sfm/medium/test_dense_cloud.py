@@ -1,5 +1,7 @@
 """The dense cloud: colors of the seafloor, as many points as asked for, and more of a larger surface."""
 
+from dataclasses import replace
+
 import pytest
 import torch
 
@@ -18,6 +20,16 @@ def test_restored_points_have_the_clear_colors_of_the_seafloor(dive, known_water
     cloud = restored_points(dive.rec, dive.frames, tracks, known_water)
     assert (cloud.restored - dive.seafloor(cloud.xyz[:, :2])).abs().mean() < 0.02
     assert (cloud.raw - cloud.restored).abs().mean() > 0.05
+
+
+def test_far_points_have_the_hue_of_the_dive_in_channels_that_no_frame_shows(dive, known_water: MediumFit):
+    """The same frames, said to be taken through water that takes nearly all red."""
+    tracks = fuse_depth(dive.rec, dive.frames, FEW)
+    without_red = replace(known_water.curve, a=known_water.curve.a * torch.tensor([50.0, 1.0, 1.0]))
+    plain = restored_points(dive.rec, dive.frames, tracks, known_water).restored
+    seen = restored_points(dive.rec, dive.frames, tracks, replace(known_water, curve=without_red)).restored
+    assert (seen[:, 1:] - plain[:, 1:]).abs().median() < 1e-3
+    assert (seen[:, 0] - seen[:, 1:].mean(1)).abs().mean() < 0.02  # gray, as no surface is known in red
 
 
 def test_a_cloud_is_thinned_to_the_asked_count_and_keeps_its_extent(dive, known_water: MediumFit):

@@ -12,7 +12,15 @@ from jaxtyping import Float, Int
 from torch import Tensor
 
 from swimm3r.imaging.undistortion import frame_directions
-from swimm3r.medium import Medium, MediumFit, linear_from_srgb, remove_water, srgb_from_linear, transmittances
+from swimm3r.medium import (
+    Medium,
+    MediumFit,
+    expected_colors,
+    linear_from_srgb,
+    remove_water,
+    srgb_from_linear,
+    transmittances,
+)
 from swimm3r.progress import Progress, silent
 from swimm3r.scene.frames import Frames
 from swimm3r.scene.reconstruction import DenseCloud, Reconstruction
@@ -22,7 +30,7 @@ from swimm3r.sfm.settings import RestoreSettings, TrackSettings
 
 MediumOfPixels = Callable[[str, Int[Tensor, " n"], Float[Tensor, " n"]], Medium]  # frame, pixels, ray depth
 
-MIN_TRANSMITTANCE = 0.05  # what is divided by at least, of the fitted water
+MIN_TRANSMITTANCE = 0.025  # of the fitted water: what is divided by at least, and where a color is half known
 _FULL, _TURNS = 0.85, 12  # share of the points wanted, and trials of a voxel size, that end the search for it
 _ROWS = 1_000_000  # points averaged at once
 
@@ -73,8 +81,9 @@ def restored_points(
 ) -> DenseCloud:
     """The tracks as points: raw and restored colors averaged over the observations.
 
-    Restored colors are weighted by confidence and mean T_D squared, the inverse variance of an amplified color.
-    `medium_at` gives each pixel its own water in the place of the dive's, in the encoding of `fit`, and
+    Restored colors are weighted by confidence and mean T_D squared, the inverse variance of an amplified color. In
+    channels of which no observation kept more than `min_transmittance` they are those that the others let expect.
+    `medium_at` gives each pixel its own water in the place of the dive's, in the encoding of `fit`, and Eq. 4 alone.
     `min_transmittance` bounds what is divided by (eps_inv).
     """
     n = len(tracks.xyz)
@@ -95,13 +104,18 @@ def restored_points(
         else:
             medium = medium_at(name, tracks.pixel[mine], z)
         T_D, _ = transmittances(z, medium)
-        weight = trust * T_D.clamp(min=0.01) ** 2
+        weight = trust * T_D.clamp(min=1e-3) ** 2
         raw.index_add_(0, tracks.track[mine], I * trust)
         raw_weight.index_add_(0, tracks.track[mine], trust)
         restored.index_add_(0, tracks.track[mine], remove_water(light, z, medium, min_transmittance) * weight)
         restored_weight.index_add_(0, tracks.track[mine], weight)
     progress("restoring points", len(rec.names), len(rec.names))
     J = restored / restored_weight.clamp(min=1e-12)
+    if medium_at is None:
+        T_D = (restored_weight / raw_weight.clamp(min=1e-12)).sqrt()
+        known = T_D**2 / (T_D**2 + min_transmittance**2)
+        J = J.clamp(0, 1)
+        J = known * J + (1 - known) * expected_colors(J, known)
     if fit.encoding == "linear":
         J = srgb_from_linear(J.clamp(min=0))
     return DenseCloud(tracks.xyz, (raw / raw_weight.clamp(min=1e-12)).clamp(0, 1), J.clamp(0, 1))

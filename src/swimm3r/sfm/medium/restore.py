@@ -29,6 +29,7 @@ from swimm3r.imaging.undistortion import frame_rays
 from swimm3r.medium import (
     MediumFit,
     backscatter,
+    expected_colors,
     linear_from_srgb,
     remove_water,
     srgb_from_linear,
@@ -244,13 +245,8 @@ def _without_noise(
     J = direct / T_D.clamp(min=floor / 2)
     smooth = local_linear(brightness, J, T_D**2 + 1e-6, settings.window * max(brightness.shape) / 2, settings.noise**2)
     J = smooth + T_D**2 / (T_D**2 + (settings.noise / settings.texture) ** 2) * (J - smooth)
-    weight = sees**2
-    gray = (weight * J).sum(-1, keepdim=True) / weight.sum(-1, keepdim=True).clamp(min=1e-6)
-    well = weight.prod(-1, keepdim=True) * ((J > 0) & (J < 1)).all(-1, keepdim=True)
-    share = (well * J).sum((0, 1)) + 1e-3
-    share = share / share.mean()
-    used = (weight * share).sum(-1, keepdim=True) / weight.sum(-1, keepdim=True).clamp(min=1e-6)
-    return sees * J + (1 - sees) * share * gray / used.clamp(min=1e-3)
+    expected = expected_colors(J, sees, ((J > 0) & (J < 1)).all(-1, keepdim=True))
+    return sees * J + (1 - sees) * expected
 
 
 def _color_weight(T_D: Float[Tensor, "*pixels 3"], settings: RestoreSettings) -> Float[Tensor, "*pixels 3"]:

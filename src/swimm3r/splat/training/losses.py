@@ -8,12 +8,12 @@ from jaxtyping import Bool, Float
 from torch import Tensor
 from torch.nn.functional import conv2d, softplus
 
+from swimm3r.medium import expected_colors
 from swimm3r.raster import RasterOutput
 from swimm3r.splat.primitives.beta import BetaPrimitives
 from swimm3r.splat.training import ssim_cpu
 
 _NEAREST = 1e-3  # of the scene's unit: the least depth whose inverse is taken
-_FEW_COLORS = 1e-3  # of one primitive's weight, for the hue and brightness where no color is seen
 _LEAST_WEIGHT = 1e-12  # of an image's edge-aware weights together, below which none of its depths counts
 
 
@@ -156,11 +156,6 @@ def hidden_colors(
     in_view = (radius > 0)[:, None]
     with torch.no_grad():
         known = T_D.square() / (T_D.square() + half**2)
-        rgb = p.rgb.clamp(0, 1)
-        well = torch.where(in_view, known.prod(-1, keepdim=True), 0.0)
-        hue = (well * rgb).sum(0) + _FEW_COLORS
-        hue = hue / hue.mean()
-        weight = known.square() + _FEW_COLORS
-        brightness = (weight * rgb).sum(-1, keepdim=True) / (weight * hue).sum(-1, keepdim=True)
-    off = (1 - known) * (p.rgb - brightness * hue).square()
+        expected = expected_colors(p.rgb.clamp(0, 1), known, in_view)
+    off = (1 - known) * (p.rgb - expected).square()
     return torch.where(in_view, off, 0.0).sum() / (3 * in_view.sum()).clamp(min=1)
