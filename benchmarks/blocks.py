@@ -30,7 +30,7 @@ from swimm3r.scene.surface import surface_of
 from swimm3r.splat import train
 from swimm3r.splat.blocks.plan import PlannedBlock, plan_blocks
 from swimm3r.splat.rendering import SplatMap
-from swimm3r.splat.settings import UwbsSettings
+from swimm3r.splat.settings import UwbsSettings, with_primitives
 from swimm3r.splat.views import median_z_depth
 
 BANDS = (0.02, 0.1, math.inf)  # median depths from the nearest border
@@ -38,13 +38,11 @@ BANDS = (0.02, 0.1, math.inf)  # median depths from the nearest border
 
 def of_size(preset: UwbsSettings, images: float, long_side: int) -> UwbsSettings:
     """The preset with points, primitives and steps in proportion to ground of so many images."""
-    share = images / preset.blocks.largest
     return replace(
-        preset,
+        with_primitives(preset, images / preset.full_area),
+        full_area=images,
         long_side=long_side,
-        iterations=round(share * preset.iterations),
-        initial=replace(preset.initial, primitives=round(share * preset.initial.primitives)),
-        densify=replace(preset.densify, cap_max=round(share * preset.densify.cap_max)),
+        iterations=round(images / preset.blocks.largest * preset.iterations),
         blocks=replace(preset.blocks, largest=0),
     )
 

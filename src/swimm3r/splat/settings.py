@@ -217,7 +217,7 @@ class BlockSettings(Settings):
 
     largest: NotNegative = 12.0
     """Largest ground of a block, in the area that one image shows at the median depth; 0 trains one map however large.
-    `initial.primitives` and `densify.cap_max` are those of a block as large as this."""
+    """
     margin: NotNegative = 0.25
     """Ground around a block that is trained with it and then left to its neighbors, in median depths."""
     steps: Annotated[float, Range(above=0, most=10)] = 1.5
@@ -352,6 +352,25 @@ def with_recipe(settings: UwbsSettings, recipe: RecipeName) -> SplatSettings:
             if peer.iterations < _SHORT:
                 peer = replace(peer, initial=replace(peer.initial, scale=_SHORT_SCALE))
             return peer
+
+
+OfRecipe = TypeVar("OfRecipe", bound=SplatSettings)
+
+FEWEST_PRIMITIVES = 4
+"""A map or block of fewer is not trained."""
+
+
+def with_primitives(settings: OfRecipe, share: float) -> OfRecipe:
+    """The settings of a map with `share` of the primitives, at first and at most."""
+
+    def part(number: int) -> int:
+        return max(FEWEST_PRIMITIVES, round(share * number))
+
+    initial = replace(settings.initial, primitives=part(settings.initial.primitives))
+    if isinstance(settings, UwbsSettings):
+        densify = replace(settings.densify, cap_max=part(settings.densify.cap_max))
+        return replace(settings, initial=initial, densify=densify)
+    return replace(settings, initial=initial, cap_max=part(settings.cap_max))
 
 
 _BEYOND_UBS = ("depth", "medium_smoothness", "medium_prior", "radius", "coverage", "open_water", "gamut", "hidden")

@@ -3,7 +3,7 @@
 from dataclasses import dataclass, field
 from typing import Annotated, Literal
 
-from swimm3r.settings import Cadence, Count, LongSideOrOwn, NotNegative, Range, Rate, Seed, Settings, Share
+from swimm3r.settings import Cadence, Count, LongSideOrOwn, NotNegative, Positive, Range, Rate, Seed, Settings, Share
 
 DILATION = 0.3
 """Variance, pixels^2, that 3DGS and UBS add to every primitive on the image plane."""
@@ -93,6 +93,9 @@ class MapSettings(Settings):
     """Longer side of the training images in pixels; images are never enlarged."""
     working_depth: Annotated[float, Range(1e-3, 1e6)] = 3.0
     """Median depth, in working units, that a scene without metric scale is scaled to for training."""
+    full_area: Positive = 12.0
+    """Ground that `initial.primitives` and `densify.cap_max` are for, in the area that one image shows at the median
+    depth. More ground has primitives in proportion, up to that of a block (`blocks.largest`)."""
     poses: TrainingPoseSettings = field(default_factory=TrainingPoseSettings)
     appearance: AppearanceSettings = field(default_factory=AppearanceSettings)
     seed: Seed = 0

@@ -16,7 +16,7 @@ from swimm3r.imaging.undistortion import nearest_pixels, shown_pixels
 from swimm3r.progress import Progress, silent
 from swimm3r.scene.frames import Frames
 from swimm3r.scene.reconstruction import Reconstruction
-from swimm3r.scene.surface import surface_of
+from swimm3r.scene.surface import Surface, surface_of
 from swimm3r.splat.appearance import AppearanceDecision, decide_appearance, write_decision
 from swimm3r.splat.block_store import no_primitives
 from swimm3r.splat.blocks.plan import PlannedBlock, plan_blocks
@@ -25,7 +25,7 @@ from swimm3r.splat.medium.field import in_unit
 from swimm3r.splat.projection.observed import MOST, SIDE, TrainingCoverage, coverage_of
 from swimm3r.splat.recipes import recipe_parts
 from swimm3r.splat.rendering import SplatMap
-from swimm3r.splat.settings import IN_BLOCKS, BlockSettings, SplatSettings, UwbsSettings
+from swimm3r.splat.settings import IN_BLOCKS, BlockSettings, SplatSettings, UwbsSettings, with_primitives
 from swimm3r.splat.training import loop
 from swimm3r.splat.training.observer import Observer
 from swimm3r.splat.training.scene import TrainingScene, path_radius
@@ -54,12 +54,14 @@ def train(
     """
     if settings.recipe != "uwbs-dynamic":  # a dynamic map is trained on what moves
         frames = rec.still(frames)
-    scale = working_scale(rec, settings)
-    _check_near(settings, scale * median_z_depth(rec))
-    if plan := _plan(rec, settings):
+    scale, depth = working_scale(rec, settings), median_z_depth(rec)
+    _check_near(settings, scale * depth)
+    surface = surface_of(rec, depth)
+    if plan := _plan(surface, depth, settings):
         assert isinstance(settings, UwbsSettings)
         write_decision(folder, AppearanceDecision(False, "maps in blocks have no colors of single frames"))
         return _in_blocks(rec, frames, settings, plan, scale, folder, progress, device, observer, engine)
+    settings = _for_ground(settings, float(surface.area.sum()))
     views = TrainingViews(rec, frames, settings, scale)
     appearance = decide_appearance(rec, frames, views.names, settings.appearance)
     write_decision(folder, appearance.decision)
@@ -155,13 +157,20 @@ def _schedule(settings: SplatSettings, rec: Reconstruction, views: TrainingViews
     return loop.schedule_of(settings, views.names, views.times, *cameras, *matches, *colors)
 
 
-def _plan(rec: Reconstruction, settings: SplatSettings) -> tuple[PlannedBlock, ...]:
+def _limits(settings: SplatSettings) -> BlockSettings:
+    return settings.blocks if isinstance(settings, UwbsSettings) else BlockSettings()
+
+
+def _for_ground(settings: SplatSettings, area: float) -> SplatSettings:
+    """Settings of a map in one piece, with primitives for its ground, in images, but for no more than a block holds."""
+    return with_primitives(settings, max(1.0, min(area, _limits(settings).largest) / settings.full_area))
+
+
+def _plan(surface: Surface, depth: float, settings: SplatSettings) -> tuple[PlannedBlock, ...]:
     """The blocks of a map; none where it is trained as a whole."""
-    limits = settings.blocks if isinstance(settings, UwbsSettings) else BlockSettings()
+    limits = _limits(settings)
     if not limits.largest:
         return ()
-    depth = median_z_depth(rec)
-    surface = surface_of(rec, depth)
     plan = plan_blocks(surface, depth, limits)
     if len(plan) == 1:
         return ()

@@ -21,6 +21,7 @@ from swimm3r.tasks.settings import EngineSettings
 
 FEW = UwbsSettings(
     iterations=20,
+    full_area=1.3,
     checkpoint_every=0.25,
     initial=InitialSettings(primitives=700, scale=2.0),
     densify=DensifySettings(cap_max=900, min_refine_every=10),
@@ -77,6 +78,22 @@ def test_a_map_in_blocks_looks_like_one_map_of_the_same_density(tiny_dive, train
         views = [(scene.render(tiny_dive.cameras[i]).rgb, tiny_dive.frames.image(i)) for i in (0, 8)]
         scores.append(sum(float(psnr(out, target)) for out, target in views) / len(views))
     assert scores[0] > scores[1] - 2.0
+
+
+def test_more_ground_has_more_primitives(tiny_dive, tmp_path):
+    """Up to that of a block; a map of the same many, asked for as such, has the same bits."""
+    area = float(surface_of(tiny_dive.rec, median_z_depth(tiny_dive.rec)).area.sum())
+    few = replace(FEW, full_area=area / 2, blocks=BlockSettings(largest=1.5 * area))
+    many = replace(
+        FEW,
+        initial=replace(FEW.initial, primitives=1400),
+        densify=replace(FEW.densify, cap_max=1800),
+        full_area=2 * area,
+        blocks=few.blocks,
+    )
+    maps = [train(tiny_dive.rec, tiny_dive.frames, s, tmp_path / str(s.full_area)) for s in (few, many)]
+    assert maps[0].count > 1400
+    assert maps[0].primitives.xyz.equal(maps[1].primitives.xyz)
 
 
 def test_a_finished_training_is_not_repeated(tiny_dive, trained):

@@ -84,12 +84,15 @@ def test_no_limit_is_one_block(tiny_dive):
 
 def test_primitives_are_in_proportion_to_area():
     settings = UwbsSettings(
-        initial=InitialSettings(primitives=1000), densify=DensifySettings(cap_max=3000), blocks=BlockSettings(largest=8)
+        initial=InitialSettings(primitives=1000),
+        densify=DensifySettings(cap_max=3000),
+        full_area=8.0,
+        blocks=BlockSettings(largest=16),
     )
     block = PlannedBlock(Window(GroundPlane((0, 0, 0), (1, 0, 0), (0, 1, 0))), 0.2, 4.0, open_area=4.0)
     half = of_block(settings, block, BlockViews(("a",) * 30, 10.0))
     assert (half.initial.primitives, half.densify.cap_max) == (500, 1500)
-    assert half.iterations == 1.5 * settings.blocks.steps * settings.iterations
+    assert half.iterations == 0.75 * settings.blocks.steps * settings.iterations
     assert half.weights.opacity == pytest.approx(settings.weights.opacity / 3)
     assert half.weights.scale == pytest.approx(settings.weights.scale / 3)
 

@@ -20,6 +20,7 @@ from swimm3r.splat.settings import (
     settings_of,
     threers_gs,
     ubs,
+    with_primitives,
     with_recipe,
 )
 
@@ -138,3 +139,13 @@ def test_no_peer_depends_on_the_unit_of_the_scene(recipe, tiny_dive, tmp_path):
         rec = replace(tiny_dive.rec, metric=metric)
         found.append(train(rec, tiny_dive.frames, settings, tmp_path / name).render(tiny_dive.cameras[4]).rgb)
     assert psnr(found[0], found[1]) > 33
+
+
+@pytest.mark.parametrize("recipe", RECIPES)
+def test_every_recipe_has_primitives_by_the_share(recipe):
+    whole = with_recipe(UwbsSettings(), recipe)
+    half = with_primitives(whole, 0.5)
+    assert half.initial.primitives == whole.initial.primitives // 2
+    cap_max = [s.densify.cap_max if isinstance(s, UwbsSettings) else s.cap_max for s in (half, whole)]
+    assert cap_max[0] == cap_max[1] // 2
+    assert with_primitives(whole, 1.0) == whole

@@ -41,7 +41,7 @@ from swimm3r.splat.medium.field import MediumField
 from swimm3r.splat.primitives.beta import BetaPrimitives, rescaled, select
 from swimm3r.splat.recipes import recipe_parts
 from swimm3r.splat.rendering import settings_in_scene_units
-from swimm3r.splat.settings import UwbsSettings
+from swimm3r.splat.settings import FEWEST_PRIMITIVES, UwbsSettings, with_primitives
 from swimm3r.splat.training import loop
 from swimm3r.splat.training.observer import Observer
 from swimm3r.splat.training.scene import Surroundings, TrainingScene, path_radius
@@ -53,7 +53,6 @@ from swimm3r.tasks.settings import EngineSettings
 log = logging.getLogger(__name__)
 
 _STRIP = 0.1  # of the margin: ground of finished neighbors where a block starts with primitives of its own, too
-_FEWEST = 4  # points that a block's training starts from
 
 
 @dataclass(frozen=True, eq=False)
@@ -248,7 +247,7 @@ def _tasks(
         inner = [window.widened(-_STRIP * block.margin) for window in closed]
         part = part_of(rec, views.names, block.window.widened(block.margin), inner)
         points = part.points.xyz if part.cloud is None else part.cloud.xyz
-        if not views.names or len(points) < _FEWEST:
+        if not views.names or len(points) < FEWEST_PRIMITIVES:
             log.warning("block %d of %d is left empty: no training frame sees it", k + 1, len(plan))
             continue
         tasks[k] = BlockTask(
@@ -265,14 +264,12 @@ def of_block(settings: UwbsSettings, block: PlannedBlock, views: BlockViews) -> 
     ground is seen as often as in a map of one block. The image loss is a mean over whole views, so that what is weighed
     against it, for all primitives in every step, has less weight by the share of the views that takes part.
     """
-    share, steps = (area / settings.blocks.largest for area in (block.open_area, block.area))
-    start = replace(settings.initial, primitives=max(_FEWEST, round(share * settings.initial.primitives)))
-    most = replace(settings.densify, cap_max=max(_FEWEST, round(share * settings.densify.cap_max)))
     taking_part = views.images / len(views.names)
-    count = round(settings.blocks.steps * steps / taking_part * settings.iterations)
+    count = round(settings.blocks.steps * block.area / settings.blocks.largest / taking_part * settings.iterations)
     w = settings.weights
     weights = replace(w, opacity=taking_part * w.opacity, scale=taking_part * w.scale)
-    return replace(settings, iterations=max(1, count), initial=start, densify=most, weights=weights)
+    dense = with_primitives(settings, block.open_area / settings.full_area)
+    return replace(dense, iterations=max(1, count), weights=weights)
 
 
 def _key(rec: Reconstruction, settings: UwbsSettings, views: TrainingViews, plan: Sequence[PlannedBlock]) -> str:
