@@ -152,10 +152,8 @@ def row_of(name: str, sfm: FinishedSfm, maps: list[Rendered]) -> list[float] | N
     mean = (drawn * shown[..., None]).sum(0) / shown.sum(0).clamp(min=1)[..., None]
     one = max(score(image, where & there) for image, there in zip(drawn, shown, strict=True) if (where & there).any())
     row = [float(where.float().mean()), one, score(mean), _common_psnr(drawn - target.image, shown, where)]
-    for (
-        scene,
-        views,
-    ) in maps:  # its picture files will not do: they mark what that map's own training frames did not see
+    # rendered anew, for the pictures of a table mark what the map's own training frames did not see
+    for scene, views in maps:
         view = views[name]
         image = as_8_bit(scene.render(cut(view.canvas, view.window), view.time).rgb)
         image = _recolored(image, target.image, where)

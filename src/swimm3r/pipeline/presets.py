@@ -152,7 +152,7 @@ PRESETS: dict[Preset, RunSettings] = {
         splat=UwbsSettings(
             iterations=2000,
             long_side=480,
-            full_area=6.0,  # of most clips; twice as much with as many primitives has strokes on sand
+            full_area=6.0,  # most clips have no more; twice as much shows sand in strokes
             coarse_until=0.4,  # a fifth of the training time for 0.07 dB of the demo
             initial=InitialSettings(primitives=25_000),
             densify=DensifySettings(cap_max=50_000),

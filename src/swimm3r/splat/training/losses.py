@@ -145,17 +145,17 @@ def outside_gamut(p: BetaPrimitives, radius: Float[Tensor, " n"]) -> Float[Tenso
 
 
 def hidden_colors(
-    p: BetaPrimitives, T_D: Float[Tensor, "n 3"], radius: Float[Tensor, " n"], half: float
+    p: BetaPrimitives, arriving: Float[Tensor, "n 3"], radius: Float[Tensor, " n"], half: float
 ) -> Float[Tensor, ""]:
     """Mean squared distance of clear colors in channels that the water hides from those that the others let expect.
 
     A primitive in view (`radius` > 0) is expected to have the mean hue of those in view whose channels are all seen, at
-    the brightness of its own seen channels. A channel of transmittance T_D is seen to T_D^2 / (T_D^2 + half^2); the
-    rest of it counts. 0 for no primitive in view.
+    the brightness of its own seen channels. A channel of whose light the share a is `arriving` (T_D, times the light of
+    a lamp) is seen to a^2 / (a^2 + half^2); the rest of it counts. 0 for no primitive in view.
     """
     in_view = (radius > 0)[:, None]
     with torch.no_grad():
-        known = T_D.square() / (T_D.square() + half**2)
+        known = arriving.square() / (arriving.square() + half**2)
         expected = expected_colors(p.rgb.clamp(0, 1), known, in_view)
     off = (1 - known) * (p.rgb - expected).square()
     return torch.where(in_view, off, 0.0).sum() / (3 * in_view.sum()).clamp(min=1)
