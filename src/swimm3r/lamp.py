@@ -31,7 +31,6 @@ STORED = 2.2
 """Exponent between linear light and values as stored: there q is 2 / 2.2."""
 _NODES, _FEW_NODES = 48, 16  # of the integral along a ray: within 3e-4 of its limit, and within 0.01
 _FAR = 20.0  # reference distances, in the place of infinity
-_WIDE, _RIDGE = (0.6, 0.45), 0.01  # of the image that a pattern is fitted over, and the hold of its terms to 0
 
 
 @dataclass(frozen=True)
@@ -58,8 +57,13 @@ class LightEvidence:
 
 def pattern(direction: Float[Tensor, "*points 3"], coefficients: Float[Tensor, "6"]) -> Float[Tensor, "*points"]:
     """Logarithm of a smooth gain over unit directions; 0 on the optical axis."""
+    return pattern_terms(direction) @ coefficients.to(direction)
+
+
+def pattern_terms(direction: Float[Tensor, "*points 3"]) -> Float[Tensor, "*points 6"]:
+    """phi over unit directions."""
     x, y, z = direction.unbind(-1)
-    return torch.stack([x, y, 1 - z, x * x, x * y, y * y], -1) @ coefficients.to(direction)
+    return torch.stack([x, y, 1 - z, x * x, x * y, y * y], -1)
 
 
 def log_light(points: Float[Tensor, "*points 3"], lamp: Lamp) -> Float[Tensor, "*points"]:
@@ -109,17 +113,6 @@ def share_scattered(
     ahead = torch.tensor([0.0, 0.0, 1.0]).to(direction)
     whole = scattered(ahead, torch.tensor(far).to(direction), lamp, beta_D)
     return scattered(direction, ray_depth.clamp(max=far), lamp, beta_D, _FEW_NODES) / whole
-
-
-def single_scattering_pattern(lamp: Lamp, beta_D: Float[Tensor, " c"]) -> Float[Tensor, "6"]:
-    """v of the open water's light, the same for all channels, over the directions of a wide image."""
-    x, y = torch.meshgrid(*(torch.linspace(-e, e, 15, dtype=torch.float64) for e in _WIDE), indexing="ij")
-    toward = torch.nn.functional.normalize(torch.stack([x, y, torch.ones_like(x)], -1).reshape(-1, 3), dim=-1)
-    far = torch.full((len(toward),), torch.inf, dtype=torch.float64)
-    logs = share_scattered(toward, far, lamp, beta_D.double().mean(0, keepdim=True)).log()
-    terms = torch.stack([pattern(toward, one) for one in torch.eye(TERMS, dtype=torch.float64)], -1)
-    held = torch.cat([terms, _RIDGE * len(toward) ** 0.5 * torch.eye(TERMS, dtype=torch.float64)])
-    return torch.linalg.lstsq(held, torch.cat([logs, logs.new_zeros(TERMS, 1)])).solution[:, 0]
 
 
 def rescaled_lamp(lamp: Lamp, scale: float) -> Lamp:

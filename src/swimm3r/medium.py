@@ -19,7 +19,16 @@ from torch import Tensor
 
 from swimm3r import notebook
 from swimm3r.io.files.atomic import write_text
-from swimm3r.lamp import Lamp, LightEvidence, lamp_distance, lamp_document, log_light, rescaled_lamp, share_scattered
+from swimm3r.lamp import (
+    Lamp,
+    LightEvidence,
+    lamp_distance,
+    lamp_document,
+    log_light,
+    rescaled_lamp,
+    share_scattered,
+    veil_pattern,
+)
 
 _FEW_COLORS = 1e-3  # of one surface known in every channel: gray, where there is none
 _UNSEEN = 1e-6  # of a known channel, the weight of those that are not
@@ -114,6 +123,10 @@ class MediumFit:
         before = beta_D * lamp_distance(points, self.lamp)[..., None] - log_light(points, self.lamp)[..., None]
         scattered = share_scattered(direction, z[..., 0], self.lamp, self.beta_D)
         return Medium(Binf * scattered / -torch.expm1(-beta_B * z), beta_D + before / z, beta_B)
+
+    def open_water(self, direction: Float[Tensor, "*pixels 3"]) -> Float[Tensor, "*#pixels 3"]:
+        """Color of open water in unit directions of the camera's axes: Binf, under a lamp with its pattern."""
+        return self.Binf if self.lamp is None else self.Binf * veil_pattern(direction, self.lamp)[..., None].float()
 
     def constant(self) -> Medium:
         """The three numbers per channel alone, without the curve."""

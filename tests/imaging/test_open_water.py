@@ -53,6 +53,22 @@ def test_without_open_water_nothing_changes(shore):
     assert torch.equal(without_fringe(shore, nowhere, VEIL), nowhere)
 
 
+def test_before_the_dark_water_of_a_lamp_a_far_rock_is_no_water(shore):
+    rng = torch.Generator().manual_seed(2)
+    row, column = torch.meshgrid(torch.arange(H), torch.arange(W), indexing="ij")
+    rock = ((row - H // 2) ** 2 + (column - 90) ** 2 < 50**2) & (row < H // 2)
+    dark = VEIL * (0.3 + 0.15 * column / W)[..., None]  # to one side, as the lamp stands beside the camera
+    image = torch.where(surface()[..., None], shore, shore - VEIL + dark)
+    blotches = 0.006 * torch.randn(H // 4, W // 4, 3, generator=rng)
+    image = image + rock[..., None] * (0.01 + blotches.repeat_interleave(4, 0).repeat_interleave(4, 1))
+    known = torch.where(surface() & (row > H // 2 + 4), 1.0, 0.0)
+    water = sea_share(image, known, dark) > 0.5
+    assert water[rock].float().mean() < 0.1
+    assert water[~surface() & ~rock].float().mean() > 0.9
+    as_in_daylight = sea_share(image, known, dark[H // 2, W // 2]) > 0.5
+    assert as_in_daylight[rock].float().mean() > 0.2
+
+
 def test_a_far_rock_that_stands_out_in_one_channel_only_is_no_water(shore):
     rng = torch.Generator().manual_seed(1)
     row, column = torch.meshgrid(torch.arange(H), torch.arange(W), indexing="ij")

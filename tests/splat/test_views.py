@@ -11,7 +11,7 @@ from swimm3r.io.images import write_rgb
 from swimm3r.scene.frames import Frame, Frames
 from swimm3r.scene.reconstruction import DepthMap, DepthMaps
 from swimm3r.splat.settings import UwbsSettings
-from swimm3r.splat.views import TrainingViews, median_z_depth, working_scale
+from swimm3r.splat.views import TrainingViews, median_z_depth, smaller, working_scale
 
 
 def lens(width: int = 96, height: int = 64, k: float = -0.15) -> Cameras:
@@ -60,6 +60,29 @@ def test_what_is_not_open_water_is_a_surface_where_depth_tells_the_two_apart(tin
     assert torch.equal(measured.surface, surface)
     hardly = replace(measured, z_depth=torch.where(rows < h // 20, 2.0, 0.0))
     assert torch.equal(hardly.surface, rows < h // 20)
+
+
+def test_a_rendering_may_be_brighter_than_values_that_are_clipped(tiny_dive, tmp_path):
+    rgb = torch.full((64, 96, 3), 0.5)
+    rgb[:8, :8] = 1.0
+    rgb[40:, :, 2] = 0.985
+    write_rgb(tmp_path / "a.png", rgb.numpy())
+    frames = Frames((Frame("a.png", tmp_path / "a.png", 0.0, 1.0, "train"),), 96, 64, True)
+    rec = replace(tiny_dive.rec, names=("a.png",), cameras=lens(96, 64, 0.0), depth=DepthMaps(tmp_path / "z_depth"))
+    view = TrainingViews(rec, frames, UwbsSettings(), 1.0)[0]
+    brighter, darker = view.compared(view.rgb + 0.3), view.compared(view.rgb - 0.3)
+    assert darker.all()
+    assert torch.equal(~brighter, view.rgb > 0.95)
+    assert torch.equal(~view.measured, (view.rgb > 0.95).any(0))
+    half = smaller(view, 2)
+    assert torch.equal(half.compared(half.rgb + 0.3), brighter[:, ::2, ::2])
+
+
+def test_without_clipped_values_every_pixel_seen_is_compared(tiny_dive):
+    view = TrainingViews(tiny_dive.rec, tiny_dive.frames, UwbsSettings(), 1.0)[0]
+    assert view.clipped is None
+    assert torch.equal(view.compared(view.rgb + 1), view.seen)
+    assert torch.equal(view.measured, view.seen)
 
 
 def test_test_frames_are_never_views(tiny_dive):

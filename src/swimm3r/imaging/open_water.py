@@ -17,6 +17,7 @@ _WINDOW = 7
 _RIM = 9  # pixels around a region in which its neighbors are looked for
 _SAMPLES = 50_000  # pixels whose quantiles stand for all
 _SPILL = 0.02  # of the longer side, how far depth spills over silhouettes
+_BRIGHT = 0.5  # open water under a lamp, in its brightest channel, from which colors count as in daylight
 _SEA_STD = 0.004  # of the colors of open water about their local mean, at least
 _WATER_STD, _SURFACE_STD = 0.01, 0.03  # of colors about their local mean, at least
 _FEW = 100  # pixels of known depth that decide nothing
@@ -25,19 +26,25 @@ _FEW = 100  # pixels of known depth that decide nothing
 def open_water_mask(
     image: Float[Tensor, "h w 3"],
     z_depth: Float[Tensor, "h w"],
-    veil: Float[Tensor, "3"] | None = None,
+    veil: Float[Tensor, "*#image 3"] | None = None,
     max_texture: float = 0.006,
     min_share: float = 0.02,
 ) -> Bool[Tensor, "h w"]:
     """True where the image shows water and nothing else; z_depth is 0 where unknown.
 
     Pixels within 0.05 of `veil`, the color of open water where it is known already, need not be bright, and regions of
-    that color may be a tenth as large.
+    that color may be a tenth as large. A veil that differs from pixel to pixel is that of a lamp on the camera, whose
+    light falls off on the way, too: the darker it is, the closer to it colors have to be, and the less texture tells
+    far surfaces.
     """
     known = z_depth.numpy() > 0
     if not known.any():
         return torch.zeros_like(z_depth, dtype=torch.bool)
     value = _without_pixel_noise(image.numpy())
+    off = 0.05
+    if veil is not None and veil.dim() > 1:
+        share = min(1.0, float(veil.max()) / _BRIGHT)
+        off, max_texture = share * off, share * max_texture
     smooth = _texture(value) < max_texture
     crowded = _box(known.astype(np.float32), _RIM) > 0.1
     textured = value[~smooth] if (~smooth).any() else value.reshape(-1, 3)
@@ -48,7 +55,7 @@ def open_water_mask(
     bright, brightest = brightness >= fifth[leading], brightness >= half[leading]
     alike = np.zeros_like(bright)
     if veil is not None:
-        alike = _largest(np.abs(value - veil.numpy())) < 0.05
+        alike = _largest(np.abs(value - veil.numpy())) < off
         bright |= alike
     labels = _pieces(_dilated(_eroded(smooth & bright & ~crowded, 3), 3))
     found = np.zeros(labels.shape, dtype=bool)
@@ -70,7 +77,7 @@ def open_water_mask(
 
 
 def sea_share(
-    image: Float[Tensor, "h w 3"], z_depth: Float[Tensor, "h w"], veil: Float[Tensor, "3"] | None = None
+    image: Float[Tensor, "h w 3"], z_depth: Float[Tensor, "h w"], veil: Float[Tensor, "*#image 3"] | None = None
 ) -> Float[Tensor, "h w"]:
     """Probability that a pixel shows water only: open water, or unknown depth of the same color; soft where hazy.
 
@@ -96,7 +103,7 @@ def sea_share(
 
 
 def without_fringe(
-    image: Float[Tensor, "h w 3"], z_depth: Float[Tensor, "h w"], veil: Float[Tensor, "3"] | None = None
+    image: Float[Tensor, "h w 3"], z_depth: Float[Tensor, "h w"], veil: Float[Tensor, "*#image 3"] | None = None
 ) -> Float[Tensor, "h w"]:
     """The depth without that of surfaces which spilled over their silhouettes into open water.
 

@@ -21,6 +21,7 @@ from torch import Tensor
 from torch.nn.functional import normalize
 
 from swimm3r.cameras import directions, project, rows_of_frames
+from swimm3r.imaging.clipped import clipped
 from swimm3r.imaging.filters import blur
 from swimm3r.imaging.frame_colors import ColorEvidence, ColorTracks, about_identity, fit_frame_colors, identity_maps
 from swimm3r.io.files.atomic import write_text
@@ -168,7 +169,7 @@ def _stops(tracks: ColorTracks) -> tuple[float, float, float] | None:
 
 
 def color_tracks(rec: Reconstruction, frames: Frames, names: Sequence[str]) -> ColorTracks:
-    """Colors of the sparse points in some frames; masked observations are left out."""
+    """Colors of the sparse points in some frames; masked and clipped observations are left out."""
     place = {rec.index(name): k for k, name in enumerate(names)}
     rows_of = rows_of_frames(rec.tracks.frame, len(rec.names))
     parts: list[tuple[Tensor, ...]] = []
@@ -179,11 +180,11 @@ def color_tracks(rec: Reconstruction, frames: Frames, names: Sequence[str]) -> C
         image, mask = frames.image(f), frames.mask(f)
         column, row = rec.tracks.xy[rows].long().unbind(-1)
         row, column = row.clamp(0, image.shape[0] - 1), column.clamp(0, image.shape[1] - 1)
-        kept = mask[row, column]
-        rows, row, column = rows[kept], row[kept], column[kept]
+        color = blur(image, _POINT * max(image.shape[:2]))[row, column]
+        kept = mask[row, column] & ~clipped(color).any(-1)
+        rows, color = rows[kept], color[kept]
         point = rec.tracks.point[rows]
         away = rec.points.xyz[point].double() - rec.cameras.centers[i].double()
-        color = blur(image, _POINT * max(image.shape[:2]))[row, column]
         toward = normalize(directions(rec.cameras[i], rec.tracks.xy[rows].double()[None])[0], dim=-1)
         ahead = rec.cameras.centers[i].double() + toward
         place_in_view = project(canvases[i], ahead[None])[0][0] / torch.tensor([canvases.width, canvases.height])

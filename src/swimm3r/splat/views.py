@@ -2,7 +2,8 @@
 
 Every frame becomes a pinhole image with its own K at the training size. Depth along the optical axis is the same
 number on both grids. Time runs from 0 at the clip's first frame to 1 at its last, test frames included. Pixels
-that the frame does not show, or its mask excludes, are not `seen` and take no part in any loss.
+that the frame does not show, or its mask excludes, are not `seen` and take no part in any loss; of values that are
+clipped a rendering may be brighter.
 """
 
 from dataclasses import dataclass, replace
@@ -12,10 +13,11 @@ import torch
 from jaxtyping import Bool, Float
 from scipy.ndimage import distance_transform_edt
 from torch import Tensor
-from torch.nn.functional import interpolate
+from torch.nn.functional import interpolate, normalize
 
-from swimm3r.cameras import Cameras, pixel_grid, resized, unproject
+from swimm3r.cameras import Cameras, image_directions, pixel_grid, resized, unproject
 from swimm3r.errors import InputError
+from swimm3r.imaging.clipped import clipped
 from swimm3r.imaging.open_water import sea_share, without_fringe
 from swimm3r.imaging.undistortion import nearest_pixels, undistorted
 from swimm3r.io.files.cache import ArrayCache
@@ -39,6 +41,16 @@ class TrainingView:
     z_depth: Float[Tensor, "h w"]  # working units, 0 = unknown or doubtful
     open_water: Bool[Tensor, "h w"]  # looks past every surface; nowhere where depth is not read
     time: Float[Tensor, ""] | None = None  # of the clip, 0..1; static maps do not ask
+    clipped: Bool[Tensor, "3 h w"] | None = None  # None where no value is
+
+    def compared(self, render: Float[Tensor, "3 h w"]) -> Bool[Tensor, "h w"] | Bool[Tensor, "3 h w"]:
+        """Mask of the values that a rendering has to match: those seen, but clipped ones that it exceeds."""
+        return self.seen if self.clipped is None else self.seen & ~(self.clipped & (render.detach() > self.rgb))
+
+    @property
+    def measured(self) -> Bool[Tensor, "h w"]:
+        """Pixels seen whose colors are known in every channel."""
+        return self.seen if self.clipped is None else self.seen & ~self.clipped.any(0)
 
     @property
     def surface(self) -> Bool[Tensor, "h w"]:
@@ -55,6 +67,7 @@ class TrainingView:
             z_depth=self.z_depth.to(device),
             open_water=self.open_water.to(device),
             time=None if self.time is None else self.time.to(device),
+            clipped=None if self.clipped is None else self.clipped.to(device),
         )
 
 
@@ -115,6 +128,7 @@ class TrainingViews:
 
         stored, seen, z_depth, open_water = self._cache.get(name, make)
         rgb = torch.from_numpy(stored.astype(np.float32)) / 255
+        full = clipped(rgb)
         return TrainingView(
             name,
             _in_working_units(canvas, self.scale),
@@ -123,6 +137,7 @@ class TrainingViews:
             torch.from_numpy(z_depth.astype(np.float32)),
             torch.from_numpy(open_water.copy()),
             self._times[name],
+            full if bool(full.any()) else None,
         )
 
     def _depth(
@@ -139,11 +154,11 @@ class TrainingViews:
         known = seen & z_depth.isfinite() & (z_depth > 0) & (confidence >= least)
         z_depth = torch.where(known, z_depth * self.scale, 0.0)
         fit = self.rec.medium
-        veil = None if fit is None else fit.Binf
-        if veil is not None:
-            z_depth = without_fringe(rgb, z_depth, veil)
-        open_water = sea_share(rgb, z_depth, veil) > 0.5
-        return z_depth, open_water & seen
+        if fit is None:
+            return z_depth, (sea_share(rgb, z_depth) > 0.5) & seen
+        veil = fit.open_water(normalize(image_directions(canvas).float(), dim=-1))
+        z_depth = without_fringe(rgb, z_depth, veil)
+        return z_depth, (sea_share(rgb, z_depth, veil) > 0.5) & seen
 
     def _inside(self, window: Window, canvas: Cameras, z_depth: Float[Tensor, "h w"]) -> Bool[Tensor, "h w"]:
         """Mask of the pixels whose surface lies over a window; where depth is unknown it is that of the next pixel."""
@@ -179,7 +194,11 @@ def smaller(view: TrainingView, divisor: int) -> TrainingView:
         for few, many in zip((height, width), view.seen.shape, strict=True)
     )
     z_depth, open_water = (values[row[:, None], column] for values in (view.z_depth, view.open_water))
-    return TrainingView(view.name, resized(view.camera, width, height), rgb, seen, z_depth, open_water, view.time)
+    full = None
+    if view.clipped is not None:
+        full = interpolate(view.clipped[None].float(), (height, width), mode="area")[0] > 0
+    camera = resized(view.camera, width, height)
+    return TrainingView(view.name, camera, rgb, seen, z_depth, open_water, view.time, full)
 
 
 def _in_working_units(cameras: Cameras, scale: float) -> Cameras:

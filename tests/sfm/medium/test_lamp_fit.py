@@ -100,6 +100,18 @@ def test_the_reference_point_has_the_lamps_light_and_far_water_on_the_axis_the_v
     torch.testing.assert_close(backscatter(far, fit.at(far, axis)), fit.Binf, rtol=0.02, atol=0)
 
 
+def test_the_form_that_maps_give_backscatter_is_near_to_light_scattered_once(drawn, fit):
+    samples, _ = drawn
+    z, direction = samples.ray_depth, samples.direction
+    lit = fit.at(z, direction)
+    of_map = fit.open_water(direction) * -torch.expm1(-fit.beta_B * z[:, None])
+    off = (of_map - backscatter(z, lit)) / transmittances(z, lit)[0]
+    told = transmittances(z, lit)[0] > 0.1
+    assert off[told].abs().mean() < 0.015  # in clear colors; 0.04 with the rate of the median depth
+    far = backscatter(torch.full_like(z, 15 * fit.lamp.reference), fit.at(15 * fit.lamp.reference + 0 * z, direction))
+    assert (fit.open_water(direction) - far).abs().mean() < 0.005
+
+
 def test_a_lamp_is_not_told_from_single_pixels(drawn):
     samples, _ = drawn
     alone = replace(samples, track=torch.full_like(samples.track, -1))

@@ -59,6 +59,18 @@ def test_pixels_that_are_not_seen_have_no_gradient_and_no_say():
     assert float(losses.photometric(a, painted, seen, 0.2).loss) == float(loss.detach())
 
 
+def test_values_that_are_not_seen_are_left_out_channel_by_channel():
+    render, target = images()
+    seen = torch.rand(render.shape, generator=torch.Generator().manual_seed(3)) > 0.2
+    gradients = []
+    for render_as in (render, render.double()):  # the fast form, and the plain one
+        x = render_as.clone().requires_grad_()
+        losses.photometric(x, target.to(x), seen, 0.2).loss.backward()
+        assert not x.grad[~seen].any()
+        gradients.append(x.grad)
+    torch.testing.assert_close(gradients[0].double(), gradients[1], rtol=1e-3, atol=1e-8)
+
+
 def depth_images(z: torch.Tensor, alpha: torch.Tensor) -> RasterOutput:
     nothing = torch.zeros(3, *z.shape, dtype=z.dtype)
     return RasterOutput(nothing, nothing, z * alpha, alpha)

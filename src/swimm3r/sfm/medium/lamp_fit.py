@@ -12,12 +12,14 @@ attenuation looks much like it over the distances of a dive: it is that of a sma
 reason the lamp stands beside the camera, not ahead of it or behind.
 """
 
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from typing import Any, cast
 
 import numpy as np
 import torch
+from jaxtyping import Float
 from scipy.optimize import least_squares
+from torch import Tensor
 
 from swimm3r.lamp import (
     INVERSE_SQUARE,
@@ -26,9 +28,8 @@ from swimm3r.lamp import (
     Lamp,
     lamp_distance,
     log_light,
-    rescaled_lamp,
+    pattern_terms,
     share_scattered,
-    single_scattering_pattern,
 )
 from swimm3r.medium import Encoding
 from swimm3r.sfm.medium import kernels
@@ -59,6 +60,11 @@ _STEPS = 40
 _ROUNDS = 12
 _SETTLED = 0.01  # change of the lamp's unknowns in a round, in their standard deviations, that ends the rounds
 _SHARED = 1 + TERMS + 2  # unknowns of the lamp
+_SCATTERING = 2000  # pixels that maps' form of the backscatter is fitted to
+_ARRIVING = 0.05  # share of light below which a surface tells little of its color
+_WATER_COLOR = 0.3  # color of open water that counts as a pixel's of white in full light
+_WIDE = (0.6, 0.45)  # of the image that open water is looked at in
+_HOLD = 1e-3  # of v to 0
 _START_BETA = 0.4  # attenuation over a median depth before anything is known
 
 
@@ -131,10 +137,34 @@ def fit_lamp(
     return lamp, beta_D
 
 
-def in_scene_unit(lamp: Lamp, beta_D: np.ndarray, unit: float) -> Lamp:
-    """A lamp whose lengths are in medians, `unit` scene units each, with the pattern of its backscatter."""
-    pattern = single_scattering_pattern(lamp, torch.from_numpy(beta_D))
-    return rescaled_lamp(replace(lamp, veil=pattern), unit)
+def exponential_backscatter(
+    pixels: LampPixels, lamp: Lamp, Binf: np.ndarray, beta_D: np.ndarray
+) -> tuple[Float[Tensor, "6"], np.ndarray]:
+    """v and beta_B of maps, whose backscatter is Binf V(d) (1 - exp(-beta_B z)), nearest to light scattered once.
+
+    Nearest on the pixels in units of the light that arrives from their surfaces, as what backscatter is wrong by is
+    read as color; and in open water all around.
+    """
+    every = max(1, len(pixels.z) // _SCATTERING)
+    direction, z = torch.from_numpy(pixels.direction[::every]), torch.from_numpy(pixels.z[::every])
+    points, beta = direction * z[:, None], torch.from_numpy(beta_D)
+    arriving = (log_light(points, lamp)[:, None] - beta * (lamp_distance(points, lamp) + z)[:, None]).exp().numpy()
+    share = share_scattered(direction, z, lamp, beta).numpy()
+    around = torch.stack(torch.meshgrid(*(torch.linspace(-e, e, 9) for e in _WIDE), torch.ones(1), indexing="ij"), -1)
+    around = torch.nn.functional.normalize(around.reshape(-1, 3).double(), dim=-1)
+    whole = share_scattered(around, torch.full((len(around),), torch.inf).double(), lamp, beta).numpy()
+    here, there = pattern_terms(direction).numpy(), pattern_terms(around).numpy()
+    weight = Binf / np.hypot(arriving, _ARRIVING) / len(z) ** 0.5
+    of_water = Binf / _WATER_COLOR / len(around) ** 0.5
+
+    def residuals(x: np.ndarray) -> np.ndarray:
+        v, beta_B = x[:TERMS], np.exp(x[TERMS:])
+        near = np.exp(here @ v)[:, None] * -np.expm1(-beta_B * z.numpy()[:, None]) - share
+        far = np.exp(there @ v)[:, None] - whole
+        return np.concatenate([(weight * near).ravel(), (of_water * far).ravel(), _HOLD * v])
+
+    found = least_squares(residuals, np.zeros(TERMS + len(Binf)), max_nfev=_STEPS).x
+    return torch.from_numpy(found[:TERMS]), np.exp(found[TERMS:])
 
 
 def _lamp(shared: np.ndarray, fall_off: float) -> Lamp:

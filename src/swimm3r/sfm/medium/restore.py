@@ -112,13 +112,14 @@ def restore_image(
     surfaces and not the open water behind them, which keeps the color the diver saw.
     """
     settings = settings or RestoreSettings()
-    veil = srgb_from_linear(fit.Binf) if fit.encoding == "linear" else fit.Binf
+    direction = torch.nn.functional.normalize(torch.nan_to_num(rays, nan=0.0), dim=-1)
+    water = fit.open_water(direction)
+    veil = srgb_from_linear(water) if fit.encoding == "linear" else water
     depth = replace(depth, z_depth=without_fringe(image, depth.z_depth, veil))
     sea = sea_share(image, depth.z_depth, veil)
     z_depth = fill_z_depth(image, depth, sea)
     ray_depth = ray_depth_map(z_depth, rays)
     I = linear_from_srgb(image) if fit.encoding == "linear" else image
-    direction = torch.nn.functional.normalize(torch.nan_to_num(rays, nan=0.0), dim=-1)
     path = _not_beyond_white(I, ray_depth, direction, depth.z_depth == 0, fit)
     medium = fit.at(path, direction)
     T_D, _ = transmittances(path, medium)

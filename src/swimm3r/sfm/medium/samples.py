@@ -12,6 +12,7 @@ import torch
 from jaxtyping import Bool, Float, Int
 from torch import Tensor
 
+from swimm3r.imaging.clipped import clipped
 from swimm3r.imaging.depth_completion import fill_z_depth
 from swimm3r.imaging.filters import blur
 from swimm3r.imaging.open_water import open_water_mask
@@ -153,7 +154,8 @@ def _patch_means(
         return torch.zeros(len(patch), x.shape[1]).index_add_(0, which, x) / count[:, None]
 
     offset = (mean(tracks.xyz[tracks.track[seen]]) - patches.middle[patch]).norm(dim=-1) / patches.size[patch]
-    whole = (count >= settings.patch_observations) & (offset < settings.patch_offset)
+    full = torch.zeros(len(patch)).index_add_(0, which, clipped(colors).any(-1).float())
+    whole = (count >= settings.patch_observations) & (offset < settings.patch_offset) & (full == 0)
     I, z = mean(colors), mean(tracks.ray_depth[seen, None])[:, 0]
     return I[whole], z[whole], patch[whole], torch.nn.functional.normalize(mean(direction), dim=-1)[whole]
 

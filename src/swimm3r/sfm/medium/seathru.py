@@ -26,7 +26,7 @@ import torch
 from torch import Tensor
 
 from swimm3r.errors import InputError
-from swimm3r.lamp import Light, share_scattered
+from swimm3r.lamp import Light, rescaled_lamp
 from swimm3r.medium import AttenuationCurve, Encoding, Medium, MediumFit, linear_from_srgb
 from swimm3r.progress import Progress, silent
 from swimm3r.scene.frames import Frames
@@ -44,9 +44,11 @@ from swimm3r.sfm.medium.channel_fit import (
     fit_channel,
 )
 from swimm3r.sfm.medium.dense_tracks import fuse_depth
-from swimm3r.sfm.medium.lamp_fit import LampPixels, fit_lamp, in_scene_unit
+from swimm3r.sfm.medium.lamp_fit import LampPixels, exponential_backscatter, fit_lamp
 from swimm3r.sfm.medium.samples import WaterSamples, collect_samples
 from swimm3r.sfm.settings import SeathruSettings
+
+_BACKSCATTER_FORM = 0.1  # standard deviation, relative, of beta_B under a lamp: maps' form of it is not exact
 
 
 def estimate_medium(
@@ -100,10 +102,11 @@ def fit_medium(samples: WaterSamples, settings: SeathruSettings, encoding: Encod
     fit = _medium_fit(channels * (3 // len(channels)), unit, ray_depth, settings, encoding)
     if lamp is None:
         return fit
-    lamp = in_scene_unit(lamp, fit.beta_D.double().numpy() * unit, unit)
-    ahead = torch.tensor([0.0, 0.0, 1.0])
-    half = share_scattered(ahead, torch.tensor(unit), lamp, fit.beta_D)  # as much as beta_B has at the median depth
-    return replace(fit, beta_B=-torch.log1p(-half.clamp(max=0.99)) / unit, lamp=lamp)
+    Binf, beta_D = fit.Binf.double().numpy(), fit.beta_D.double().numpy() * unit
+    veil, beta_B = exponential_backscatter(lit, lamp, Binf, beta_D)
+    beta = torch.from_numpy(beta_B / unit).float()
+    std = replace(fit.std, beta_B=_BACKSCATTER_FORM * beta)
+    return replace(fit, beta_B=beta, std=std, lamp=rescaled_lamp(replace(lamp, veil=veil), unit))
 
 
 def encoded(samples: WaterSamples, encoding: Encoding) -> tuple[np.ndarray, np.ndarray]:

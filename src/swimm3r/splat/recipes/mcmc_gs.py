@@ -50,7 +50,8 @@ class McmcGs:
         """One view: forward, adjoint, Adam, relocation and growth on their cadence, noise."""
         settings, w = self.settings, self.settings.weights
         seen = render_for_training(self.scene, state, view, settings, step)
-        photo = losses.photometric(seen.drawing.images.rgb, view.rgb, view.seen, w.ssim)
+        rgb = seen.drawing.images.rgb
+        photo = losses.photometric(rgb, view.rgb, view.compared(rgb), w.ssim)
         opacity, scale = torch.sigmoid(seen.p.opacity).mean(), seen.p.scale.exp().mean()
         loss = photo.loss + w.opacity * opacity + w.scale * scale
         total, numbers = with_matches(self.scene, state, loss, settings, step)

@@ -147,7 +147,7 @@ def objective(
     """The sum of the losses of a clear view, with the water over it once it is `wet`."""
     J, depth = images.clear, relative_depth(images)
     shown = seen_through(J, layer(water, depth)) if wet else J + water.Binf[:, None, None] * (1 - images.alpha)
-    photo = losses.photometric(shown, view.rgb, view.seen, w.ssim)
+    photo = losses.photometric(shown, view.rgb, view.compared(shown), w.ssim)
     terms = {
         "far": (w.far, mean_seen(depth.detach() * (shown - view.rgb).abs(), view.seen)),
         "background": (w.background, covered_background(shown if wet else J, images.alpha, water, view, w)),

@@ -72,7 +72,7 @@ class Uir:
         share = step / settings.iterations
         seen = render_for_training(self.scene, state, view, settings, step)
         images = seen.drawing.images
-        photo = losses.photometric(images.rgb, view.rgb, view.seen, w.ssim)
+        photo = losses.photometric(images.rgb, view.rgb, view.compared(images.rgb), w.ssim)
         depth = inverse_depth_error(images, view.z_depth, w.depth_alpha) * self.unit
         flat = smallest_scale(seen.p) / self.unit
         loss = photo.loss + (w.depth and log_linear(w.depth, w.depth_end, share)) * depth + w.flat * flat

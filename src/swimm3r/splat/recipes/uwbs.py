@@ -235,7 +235,7 @@ def objective(
 ) -> UwbsObjective:
     """Eq. 18 and the terms beyond it. Opacity and scale count only while `regularized`."""
     w = settings.weights
-    photo = losses.photometric(drawing.images.rgb, view.rgb, view.seen, w.ssim)
+    photo = losses.photometric(drawing.images.rgb, view.rgb, view.compared(drawing.images.rgb), w.ssim)
     edges = losses.edge_weight(view.rgb, w.depth_edges)
     depth_error = losses.depth_error(drawing.images, view.z_depth, edges, w.depth_alpha)
     smooth = smoothness(drawing.grid)

@@ -137,4 +137,4 @@ def relative_photometric(
 ) -> losses.Photometric:
     """reg-L1 and reg-SSIM: both images in units of the rendered value, so that dark water counts as much."""
     unit = render.detach() + floor
-    return losses.photometric(render / unit, view.rgb / unit, view.seen, ssim_weight)
+    return losses.photometric(render / unit, view.rgb / unit, view.compared(render), ssim_weight)

@@ -177,7 +177,7 @@ def fit_frame_colors_again(recipe: Recipe, state: State) -> None:
         view = smaller(view, max(1, max(view.seen.shape) // _REFIT_SIDE))
         shown = images(state.primitives, state.field, scene.pinhole_view(view, state.poses), settings, view.time)
         shaded = colors.shading is not None
-        fits.append(fit_to_view(shown.rgb.cpu(), view.rgb.cpu(), view.seen.float().cpu(), shaded=shaded))
+        fits.append(fit_to_view(shown.rgb.cpu(), view.rgb.cpu(), view.measured.float().cpu(), shaded=shaded))
     scene.views.colors = colors.refitted(fits)
 
 

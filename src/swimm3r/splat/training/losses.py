@@ -27,11 +27,12 @@ class Photometric:
 
 
 def photometric(
-    render: Float[Tensor, "3 h w"], target: Float[Tensor, "3 h w"], seen: Bool[Tensor, "h w"], ssim_weight: float
+    render: Float[Tensor, "3 h w"], target: Float[Tensor, "3 h w"], seen: Bool[Tensor, "*c h w"], ssim_weight: float
 ) -> Photometric:
-    """(1 - w) L1 + w (1 - SSIM) (Eq. 14), SSIM zero-padded; pixels not `seen` count as matched."""
+    """(1 - w) L1 + w (1 - SSIM) (Eq. 14), SSIM zero-padded; pixels or values not `seen` count as matched."""
     if render.device.type != "cpu" or render.dtype != torch.float32:
-        target = torch.where(seen, target, render.detach())
+        still = render.detach()
+        target, render = torch.where(seen, target, still), torch.where(seen, render, still)
         l1, ssim = (render - target).abs().mean(), mean_ssim(render, target)
         loss = (1 - ssim_weight) * l1 + ssim_weight * (1 - ssim)
         return Photometric(loss, l1.detach(), ssim.detach())
