@@ -3,10 +3,10 @@
 from jaxtyping import Bool, Float
 from torch import Tensor
 
-CLIPPED = 250 / 255
-"""The least of such values as stored, 0..1; compression moves them, 255 before it, by a few levels."""
+CLIPPED = 0.98
+"""The least of such values as stored: compression moves 255 of 255 by a few levels."""
 
 
-def clipped(I: Float[Tensor, "*values"]) -> Bool[Tensor, "*values"]:
+def clipped(I: Float[Tensor, "*values"], level: float = CLIPPED) -> Bool[Tensor, "*values"]:
     """Mask of the values of images as stored, 0..1, that are clipped."""
-    return I >= CLIPPED
+    return I.ge(level)

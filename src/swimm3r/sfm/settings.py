@@ -148,7 +148,7 @@ class SeathruSettings(Settings):
     mean_reflectance_std: Positive = 0.5
     """Standard deviation of ln(1/f) over a whole dive, which weights the gray-world assumption."""
     average_std: Positive = 0.3
-    """Standard deviation of the logarithm of one range bin's average color."""
+    """Relative standard deviation of one range bin's average color."""
     slope_std: Positive = 0.1
     """Standard deviation of b times the median depth in beta_D(z) = a exp(b z)."""
     open_water_std: PositiveShare = 0.01

@@ -10,7 +10,7 @@ import torch
 from swimm3r.errors import InputError
 from swimm3r.medium import Medium, add_water, backscatter, rescale, srgb_from_linear, transmittances
 from swimm3r.sfm.medium import seathru
-from swimm3r.sfm.medium.channel_fit import fit_channel
+from swimm3r.sfm.medium.channel_fit import Pixels, daylight, evidence_of, fit_channel, prior_residuals
 from swimm3r.sfm.medium.samples import WaterSamples
 from swimm3r.sfm.medium.seathru import estimate_medium, fit_medium
 from swimm3r.sfm.settings import SeathruSettings
@@ -160,6 +160,17 @@ def gray_copy(samples: WaterSamples) -> WaterSamples:
         return colors.mean(-1, keepdim=True).expand_as(colors).contiguous()
 
     return replace(samples, I=gray(samples.I), open_water=gray(samples.open_water), gray=True)
+
+
+def test_distances_that_no_light_comes_back_from_say_nothing_of_the_surfaces():
+    g = np.random.default_rng(2)
+    z, J = np.linspace(0.3, 6, 4000), g.uniform(0.1, 0.7, 4000)
+    Binf, beta_D, beta_B = 0.3, 2.0, 1.0
+    I = J * np.exp(-beta_D * z) - Binf * np.expm1(-beta_B * z) + 0.004 * g.normal(0, 1, 4000)
+    pixels = Pixels(I, I, daylight(z), np.zeros(4000, dtype=np.int64), np.full(300, Binf))
+    true = np.array([Binf, np.log(beta_B), np.log(beta_D), 0.0, 0.1, np.log(0.4)])
+    averages = prior_residuals(true, evidence_of(pixels, SETTINGS), SETTINGS)[SETTINGS.range_bins : -5]
+    assert np.abs(averages).max() < 0.2  # 1.7 where the logarithm of no light was compared
 
 
 def test_of_a_gray_clip_one_channel_is_fitted_and_stands_for_all(teal, monkeypatch: pytest.MonkeyPatch):

@@ -266,11 +266,8 @@ def prior_residuals(x: np.ndarray, evidence: Evidence, settings: SeathruSettings
     if not evidence.alone:
         dark = np.where(dark < 0, 3.0 * dark, np.sqrt(2 * (np.sqrt(1 + dark.clip(0) ** 2) - 1)))
     _, B = attenuations(x, bins.of_mean)
-    floor = settings.dark_std
-    excess = ((bins.mean - B) / floor).clip(-500.0)  # exp(-500) still is a number
-    direct = np.logaddexp(0.0, excess) * floor  # a soft max(., 0)
-    expected = x[LOG_MEAN] + _log_transmittance(x, bins.of_mean)
-    average = (np.log(direct) - expected) / np.hypot(settings.average_std, floor / direct)
+    expected = np.exp(x[LOG_MEAN] + _log_transmittance(x, bins.of_mean))
+    average = (bins.mean - B - expected) / np.hypot(settings.average_std * expected, settings.dark_std)
     single = [
         x[DARK] / 0.003 if evidence.alone else (x[DARK] - settings.dark_reflectance) / settings.dark_reflectance_std,
         (x[LOG_MEAN] + np.log(settings.lsac_f)) / settings.mean_reflectance_std,

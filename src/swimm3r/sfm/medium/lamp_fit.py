@@ -3,8 +3,8 @@
     I_k = J_t L(X_k) exp(-beta_D (|X_k - p| + z_k)) + Binf G(d_k, z_k) / G(axis, infinity)
 
 One robust least-squares problem over all channels finds strength, beam and position of the lamp, which the channels
-share, with the water of each, which is then fitted again by itself. The colors J_t are eliminated. G is that of the
-lamp and the water found in the round before: it changes slowly with both.
+share, with the water of each, which is then fitted again by itself. The colors J_t are eliminated. G moves with lamp
+and water in every step: held at that of the step before, it leads both to others that explain less.
 
 Known is the light on the same point in several places of the image and at several distances. Its strength is known as a
 product with J alone: it is what makes surfaces reflect 1 / f on average. The power of its fall-off is not fitted, as
@@ -12,7 +12,7 @@ attenuation looks much like it over the distances of a dive: it is that of a sma
 reason the lamp stands beside the camera, not ahead of it or behind.
 """
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any, cast
 
 import numpy as np
@@ -53,11 +53,13 @@ from swimm3r.sfm.settings import SeathruSettings
 _BEAM_STD, _STRENGTH_STD = 3.0, 1.0  # of the beam's coefficients, and of the strength's logarithm
 _OFFSET_STD = 0.2  # of the lamp's position beside the camera, in median depths
 _WIDEST = 3.0  # of these that an unknown may reach
-_OBSERVATIONS = 12_000  # of the points, which stand for all
-_WATER = 400  # pixels of open water, likewise
+_NEAR = 1.4  # median depths within which a point is seen at least once
+_OBSERVATIONS = 9_000  # of the points, which stand for all
+_WATER = 200  # pixels of open water, likewise
 _WATER_SHARED = 20.0  # of them that share an error
-_STEPS = 40
-_ROUNDS = 12
+_STEPS = 25
+_ROUNDS = 8
+_START = 0.1  # offset of the lamp to either side, in median depths: at the camera the light scattered has no derivative
 _SETTLED = 0.01  # change of the lamp's unknowns in a round, in their standard deviations, that ends the rounds
 _SHARED = 1 + TERMS + 2  # unknowns of the lamp
 _SCATTERING = 2000  # pixels that maps' form of the backscatter is fitted to
@@ -100,6 +102,17 @@ class LampPixels:
         )
 
 
+def seen_nearby(rows: np.ndarray, point: np.ndarray, z: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """The rows of points that a frame sees from near, their points numbered anew.
+
+    The others are lit by little, and a third of their depths is off by 3 % and more: beam and water would explain that.
+    """
+    nearest = np.full(int(point.max()) + 1, np.inf)
+    np.minimum.at(nearest, point, z[rows])
+    kept = nearest[point] < _NEAR
+    return rows[kept], np.unique(point[kept], return_inverse=True)[1]
+
+
 def fit_lamp(
     pixels: LampPixels, rows: np.ndarray, point: np.ndarray, settings: SeathruSettings, encoding: Encoding
 ) -> tuple[Lamp, np.ndarray]:
@@ -115,23 +128,24 @@ def fit_lamp(
         pixels.color[every.rows], pixels.z[every.rows], pixels.direction[every.rows], every.frame,
         *(values[:: max(1, len(values) // _WATER)] for values in (pixels.open_water, pixels.water_direction)),
     )  # fmt: skip
-    unknowns, lamp, beta_D = np.zeros(_SHARED), _lamp(np.zeros(_SHARED), fall_off), np.full(len(channels), _START_BETA)
+    unknowns, beta_D = np.zeros(_SHARED), np.full(len(channels), _START_BETA)
+    unknowns[-2:] = _START
+    lamp = _lamp(unknowns, fall_off)
     noise = np.full(len(channels), settings.loss_scale)
-    for _ in range(_ROUNDS):  # backscatter, range bins of the priors and noise are those of the light found so far
-        whole, scatter = pixels.scatter(lamp, beta_D), few.scatter(lamp, beta_D)
+    for _ in range(_ROUNDS):  # range bins of the priors and noise are those of the light found so far
+        whole = pixels.scatter(lamp, beta_D)
         priors = [evidence_of(pixels.of_channel(c, lamp, whole), settings) for c in channels]
         if len(unknowns) == _SHARED:
-            waters = []
+            waters, (scatter, _) = [], few.scatter(lamp, beta_D)
             for c in channels:
-                ways = few.ways(lamp, scatter[0][:, c])
+                ways = few.ways(lamp, scatter[:, c])
                 seen = Observations(every.rows, ways, every.point, every.frame, few.color[:, c])
                 waters.append(best_start(priors[c], seen, 0.0, settings))
             unknowns = np.concatenate([unknowns, *waters])
-        problem = _Problem(few, every.point, scatter, priors, noise, fall_off, settings)
+        problem = _Problem(few, every.point, priors, noise, fall_off, settings)
         before, unknowns = unknowns[:_SHARED], problem.solved(unknowns)
         noise, lamp = problem.noise_at(unknowns), _lamp(unknowns[:_SHARED], fall_off)
-        x = unknowns[_SHARED:].reshape(len(priors), -1)
-        beta_D = np.exp(x[:, LOG_BETA_D] + x[:, SLOPE])
+        beta_D = _beta_D(unknowns[_SHARED:].reshape(len(priors), -1))
         if np.all(np.abs(unknowns[:_SHARED] - before) < _SETTLED * _std()):
             break
     return lamp, beta_D
@@ -180,7 +194,6 @@ class _Problem:
 
     few: LampPixels  # that see the points
     point: np.ndarray
-    scatter: tuple[np.ndarray, np.ndarray]  # B over Binf of these pixels and of open water
     priors: list[Evidence]  # of the channels
     noise: np.ndarray  # of the channels' pixels
     fall_off: float
@@ -199,16 +212,17 @@ class _Problem:
 
     def noise_at(self, unknowns: np.ndarray) -> np.ndarray:
         """Robust spread of each channel's pixels about a solution."""
-        lit, waters = self._lit(unknowns), unknowns[_SHARED:].reshape(len(self.priors), -1)
-        off = [np.median(np.abs(self._off(c, x, lit))) for c, x in enumerate(waters)]
+        lamp, waters = self._parts(unknowns)
+        ways, (scatter, _) = self.few.ways(lamp), self.few.scatter(lamp, _beta_D(waters))
+        off = [np.median(np.abs(self._off(c, x, replace(ways, scatter=scatter[:, c])))) for c, x in enumerate(waters)]
         return np.clip(1.4826 * np.array(off), 1e-3, self.settings.loss_scale)
 
     def residuals(self, unknowns: np.ndarray) -> np.ndarray:
         """Everything in its own standard deviations: the lamp, then the channels one after another."""
-        lit, waters = self._lit(unknowns), unknowns[_SHARED:].reshape(len(self.priors), -1)
-        return np.concatenate(
-            [unknowns[:_SHARED] / _std(), *(self._of_channel(c, x, lit) for c, x in enumerate(waters))]
-        )
+        lamp, waters = self._parts(unknowns)
+        ways, scatter = self.few.ways(lamp), self.few.scatter(lamp, _beta_D(waters))
+        of_channels = [self._of_channel(c, x, ways, *(s[:, c] for s in scatter)) for c, x in enumerate(waters)]
+        return np.concatenate([unknowns[:_SHARED] / _std(), *of_channels])
 
     def jacobian(self, unknowns: np.ndarray) -> np.ndarray:
         """By forward differences; the water of a channel moves its own rows alone."""
@@ -216,31 +230,43 @@ class _Problem:
         rows = np.zeros((len(here), len(unknowns)))
         for k in range(_SHARED):
             rows[:, k] = (self.residuals(unknowns + 1e-6 * np.eye(len(unknowns))[k]) - here) / 1e-6
-        lit, waters = self._lit(unknowns), unknowns[_SHARED:].reshape(len(self.priors), -1)
+        lamp, waters = self._parts(unknowns)
+        ways, scatter = self.few.ways(lamp), self.few.scatter(lamp, _beta_D(waters))
         each = (len(here) - _SHARED) // len(waters)
         for c, x in enumerate(waters):
             mine = slice(_SHARED + c * each, _SHARED + (c + 1) * each)
             for k in range(len(x)):
-                moved = self._of_channel(c, x + 1e-6 * np.eye(len(x))[k], lit)
-                rows[mine, _SHARED + c * len(x) + k] = (moved - here[mine]) / 1e-6
+                moved, seen = x + 1e-6 * np.eye(len(x))[k], [s[:, c] for s in scatter]
+                if k in (LOG_BETA_D, SLOPE):
+                    seen = [s[:, 0] for s in self.few.scatter(lamp, _beta_D(moved[None]))]
+                of_channel = self._of_channel(c, moved, ways, *seen)
+                rows[mine, _SHARED + c * len(x) + k] = (of_channel - here[mine]) / 1e-6
         return rows
 
-    def _lit(self, unknowns: np.ndarray) -> Ways:
-        return self.few.ways(_lamp(unknowns[:_SHARED], self.fall_off))
+    def _parts(self, unknowns: np.ndarray) -> tuple[Lamp, np.ndarray]:
+        """The lamp, and the unknowns of each channel's water."""
+        return _lamp(unknowns[:_SHARED], self.fall_off), unknowns[_SHARED:].reshape(len(self.priors), -1)
 
-    def _off(self, c: int, x: np.ndarray, lit: Ways) -> np.ndarray:
+    def _off(self, c: int, x: np.ndarray, ways: Ways) -> np.ndarray:
         """Pixels of a channel less what they should be, with the J of every point eliminated."""
-        T_D, B = attenuations(x, Ways(lit.z, lit.path, lit.log_gain, self.scatter[0][:, c]))
+        T_D, B = attenuations(x, ways)
         direct = self.few.color[:, c] - B
         J = kernels.surface_colors(T_D, direct, np.ones(len(T_D)), self.point, int(self.point.max()) + 1)
         return direct - J[self.point] * T_D
 
-    def _of_channel(self, c: int, x: np.ndarray, lit: Ways) -> np.ndarray:
+    def _of_channel(
+        self, c: int, x: np.ndarray, ways: Ways, scatter: np.ndarray, scatter_of_water: np.ndarray
+    ) -> np.ndarray:
         settings, water = self.settings, self.few.open_water[:, c]
-        off = self._off(c, x, lit) / (self.noise[c] * np.sqrt(settings.min_redundancy))
+        off = self._off(c, x, replace(ways, scatter=scatter)) / (self.noise[c] * np.sqrt(settings.min_redundancy))
         shared = settings.open_water_std * np.sqrt(max(1.0, len(water) / _WATER_SHARED))
-        of_water = (water - x[BINF] * self.scatter[1][:, c]) / shared
+        of_water = (water - x[BINF] * scatter_of_water) / shared
         return np.concatenate([off, of_water, prior_residuals(x, self.priors[c], settings)])
+
+
+def _beta_D(waters: np.ndarray) -> np.ndarray:
+    """beta_D per median depth of the waters of some channels."""
+    return np.exp(waters[:, LOG_BETA_D] + waters[:, SLOPE])
 
 
 def _std() -> np.ndarray:

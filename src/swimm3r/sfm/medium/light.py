@@ -14,6 +14,7 @@ a lamp, but less so.
 import numpy as np
 import torch
 
+from swimm3r.imaging.clipped import clipped
 from swimm3r.lamp import TERMS, LightEvidence, pattern
 from swimm3r.medium import MediumFit, backscatter, transmittances
 from swimm3r.sfm.medium.samples import WaterSamples
@@ -31,7 +32,7 @@ def judge_light(samples: WaterSamples, fit: MediumFit, settings: SeathruSettings
     z = samples.ray_depth
     medium = fit.at(z)
     direct, T_D = samples.I - backscatter(z, medium), transmittances(z, medium)[0]
-    exposed = (samples.I.amin(-1) > settings.black) & (samples.I.amax(-1) < settings.saturated)
+    exposed = (samples.I.amin(-1) > settings.black) & ~clipped(samples.I.amax(-1), settings.saturated)
     told = (direct > _LEAST_LIGHT) & (T_D > _LEAST_T_D)
     logs = torch.where(told, (direct.clamp(min=_LEAST_LIGHT) / T_D).log(), 0.0)
     channel = told.float().mean(0).argmax()  # one for all, as points differ in color

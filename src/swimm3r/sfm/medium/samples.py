@@ -154,7 +154,7 @@ def _patch_means(
         return torch.zeros(len(patch), x.shape[1]).index_add_(0, which, x) / count[:, None]
 
     offset = (mean(tracks.xyz[tracks.track[seen]]) - patches.middle[patch]).norm(dim=-1) / patches.size[patch]
-    full = torch.zeros(len(patch)).index_add_(0, which, clipped(colors).any(-1).float())
+    full = torch.zeros(len(patch)).index_add_(0, which, clipped(colors, settings.saturated).any(-1).float())
     whole = (count >= settings.patch_observations) & (offset < settings.patch_offset) & (full == 0)
     I, z = mean(colors), mean(tracks.ray_depth[seen, None])[:, 0]
     return I[whole], z[whole], patch[whole], torch.nn.functional.normalize(mean(direction), dim=-1)[whole]

@@ -26,6 +26,7 @@ import torch
 from torch import Tensor
 
 from swimm3r.errors import InputError
+from swimm3r.imaging.clipped import clipped
 from swimm3r.lamp import Light, rescaled_lamp
 from swimm3r.medium import AttenuationCurve, Encoding, Medium, MediumFit, linear_from_srgb
 from swimm3r.progress import Progress, silent
@@ -44,7 +45,7 @@ from swimm3r.sfm.medium.channel_fit import (
     fit_channel,
 )
 from swimm3r.sfm.medium.dense_tracks import fuse_depth
-from swimm3r.sfm.medium.lamp_fit import LampPixels, exponential_backscatter, fit_lamp
+from swimm3r.sfm.medium.lamp_fit import LampPixels, exponential_backscatter, fit_lamp, seen_nearby
 from swimm3r.sfm.medium.samples import WaterSamples, collect_samples
 from swimm3r.sfm.settings import SeathruSettings
 
@@ -85,6 +86,7 @@ def fit_medium(samples: WaterSamples, settings: SeathruSettings, encoding: Encod
     if light == "lamp":
         if chosen is None:
             raise _too_little_for_a_lamp()
+        chosen = seen_nearby(*chosen, z)
         lit = _lit(samples, color, z, frame, open_water)
         lamp, beta_D = fit_lamp(lit, *chosen, settings, encoding)
         scatter = lit.scatter(lamp, beta_D)
@@ -142,7 +144,7 @@ def telling_rows(
 ) -> tuple[np.ndarray, np.ndarray] | None:
     """Rows and point numbers of the points with the largest ratio of depths, at most `max_observations` rows."""
     track = samples.track.numpy()
-    exposed = ((samples.I.amin(-1) > settings.black) & (samples.I.amax(-1) < settings.saturated)).numpy()
+    exposed = ((samples.I.amin(-1) > settings.black) & ~clipped(samples.I.amax(-1), settings.saturated)).numpy()
     rows = np.flatnonzero((track >= 0) & exposed)
     if len(rows) == 0:
         return None
