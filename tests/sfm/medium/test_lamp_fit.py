@@ -128,6 +128,15 @@ def test_a_lamp_is_not_told_from_single_pixels(drawn):
         fit_medium(alone, SETTINGS, "srgb", "lamp")
 
 
+def test_a_lamp_is_not_told_from_points_seen_from_afar_alone(drawn):
+    samples, _ = drawn
+    z = samples.ray_depth
+    beyond = torch.where(torch.arange(len(z)) % 8 < 6, z.clamp(max=1.0), 3 * z)
+    afar = replace(samples, ray_depth=beyond, track=torch.where(beyond > 1, samples.track, -1))
+    with pytest.raises(InputError, match="lamp"):
+        fit_medium(afar, SETTINGS, "srgb", "lamp")
+
+
 def test_a_lamp_is_kept_in_the_file_of_the_water(fit, tmp_path):
     evidence = LightEvidence("lamp", 0.5, 0.2, 1200)
     replace(fit, light=evidence).save(tmp_path / "medium.json")

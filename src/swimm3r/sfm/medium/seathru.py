@@ -84,9 +84,9 @@ def fit_medium(samples: WaterSamples, settings: SeathruSettings, encoding: Encod
     frame = np.unique(samples.frame.numpy(), return_inverse=True)[1]
     chosen = telling_rows(samples, z, settings)
     if light == "lamp":
-        if chosen is None:
+        chosen = None if chosen is None else seen_nearby(*chosen, z)
+        if chosen is None or len(np.unique(chosen[1])) < settings.min_tracks:
             raise _too_little_for_a_lamp()
-        chosen = seen_nearby(*chosen, z)
         lit = _lit(samples, color, z, frame, open_water)
         lamp, beta_D = fit_lamp(lit, *chosen, settings, encoding)
         scatter = lit.scatter(lamp, beta_D)
@@ -134,7 +134,7 @@ def _lit(
 def _too_little_for_a_lamp() -> InputError:
     return InputError(
         "the light of a lamp cannot be told from these frames",
-        cause="too few points of the scene are seen from several distances",
+        cause="too few points of the scene are seen from several distances and from nearby",
         hint="footage that comes nearer to what it shows; or --light sun",
     )
 
