@@ -77,7 +77,7 @@ def test_the_light_is_recovered_up_to_its_strength(drawn, fit):
     samples, _ = drawn
     points = samples.direction * samples.ray_depth[:, None]
     off = log_light(points, fit.lamp) - log_light(points, LAMP)
-    assert off.std() < 0.005  # 0.02 where the backscatter was held at that of the step before
+    assert off.std() < 0.005
 
 
 def test_points_seen_from_afar_alone_are_left_out():
@@ -116,7 +116,7 @@ def test_the_form_that_maps_give_backscatter_is_near_to_light_scattered_once(dra
     of_map = fit.open_water(direction) * -torch.expm1(-fit.beta_B * z[:, None])
     off = (of_map - backscatter(z, lit)) / transmittances(z, lit)[0]
     told = transmittances(z, lit)[0] > 0.1
-    assert off[told].abs().mean() < 0.015  # in clear colors; 0.04 with the rate of the median depth
+    assert off[told].abs().mean() < 0.015  # in clear colors
     far = backscatter(torch.full_like(z, 15 * fit.lamp.reference), fit.at(15 * fit.lamp.reference + 0 * z, direction))
     assert (fit.open_water(direction) - far).abs().mean() < 0.005
 

@@ -146,7 +146,9 @@ def _patch_means(
     patches: _Patches,
     settings: SeathruSettings,
 ) -> tuple[Float[Tensor, "k 3"], Float[Tensor, " k"], Int[Tensor, " k"], Float[Tensor, "k 3"]]:
-    """Mean color and ray depth, number and direction of each patch one frame shows, without those shown in part."""
+    """Mean color and ray depth, number and direction of each patch one frame shows, without those shown in part or
+    clipped in part.
+    """
     patch, which = torch.unique(patches.of_track[tracks.track[seen]], return_inverse=True)
     count = torch.bincount(which, minlength=len(patch)).float()
 
