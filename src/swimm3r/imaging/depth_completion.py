@@ -3,7 +3,7 @@
 import numpy as np
 import torch
 from jaxtyping import Float
-from scipy.sparse import coo_matrix, diags
+from scipy.sparse import coo_array, csr_array, diags
 from scipy.sparse.linalg import spsolve
 from torch import Tensor
 
@@ -11,29 +11,41 @@ from swimm3r.imaging.filters import LUMA, local_linear
 from swimm3r.scene.reconstruction import DepthMap
 
 _COARSE = 96  # long side of the grid on which unknown depth is filled
+_NEARER, _FARTHER = 1.6, 2.5  # times as near as the nearest known, and as far as the farthest, that is filled in
+_LEAST_TRUST = 0.05  # in depth, as a confidence: that of an image's own, at least, and that of other images'
+_SLOPE = 0.003  # weight of first differences of inverse depth beside second ones
 
 
-def fill_z_depth(image: Float[Tensor, "h w 3"], depth: DepthMap, sea: Float[Tensor, "h w"]) -> Float[Tensor, "h w"]:
-    """Depth for every pixel: known values stay, gaps follow their surroundings along similar colors.
+def fill_z_depth(
+    image: Float[Tensor, "h w 3"],
+    depth: DepthMap,
+    sea: Float[Tensor, "h w"],
+    elsewhere: Float[Tensor, "h w"] | None = None,
+) -> Float[Tensor, "h w"]:
+    """Depth for every pixel: known values stay, gaps go on as planes along similar colors.
 
-    Inverse depth is diffused on a coarse grid and fitted to the image by local linear models, between the nearest and
-    the farthest hundredth of what is known. `sea` (0..1) says where there is none; what is filled in there is no depth.
+    Inverse depth, which is linear over the image of a plane, has the least second differences on a coarse grid, and is
+    fitted to the image by local linear models, to 1.6 times as near and 2.5 times as far as the nearest and the
+    farthest hundredth of what is known. `sea` (0..1) says where there is none; what is filled in there is no depth.
+    `elsewhere` is the depth of points in this image that others have measured, 0 where there are none: what is filled
+    in follows them.
     """
     known = depth.z_depth > 0
     if not known.any():
         raise ValueError("a depth map without a single known pixel cannot be filled")
     middle = float(depth.z_depth[known].median())
-    inverse = torch.where(known, middle / depth.z_depth.clamp(min=1e-9), 0.0)
-    trust = torch.where(known, depth.confidence.clamp(min=0.05), 0.0)
-    coarse = _diffused(image, inverse, trust, sea)
+    measured = depth.z_depth if elsewhere is None else torch.where(known, depth.z_depth, elsewhere * (sea < 0.5))
+    inverse = torch.where(measured > 0, middle / measured.clamp(min=1e-9), 0.0)
+    trust = torch.where(known, depth.confidence, 0.0).clamp(min=_LEAST_TRUST) * (measured > 0)
+    coarse = _continued(image, inverse, trust, sea)
     guide = image @ LUMA
     smooth = local_linear(guide, coarse[..., None], (1.001 - sea)[..., None], 0.01 * max(image.shape[:2]), 1e-3)[..., 0]
-    farthest, nearest = np.quantile(inverse[known].numpy(), [0.01, 0.99]).tolist()
-    filled = smooth.clamp(min=farthest, max=nearest)
+    farthest, nearest = np.quantile(inverse[measured > 0].numpy(), [0.01, 0.99]).tolist()
+    filled = smooth.clamp(min=farthest / _FARTHER, max=nearest * _NEARER)
     return middle / torch.where(known, inverse, filled)
 
 
-def _diffused(
+def _continued(
     image: Float[Tensor, "h w 3"],
     inverse: Float[Tensor, "h w"],
     trust: Float[Tensor, "h w"],
@@ -41,7 +53,8 @@ def _diffused(
 ) -> Float[Tensor, "h w"]:
     """Inverse depth everywhere, from a sparse linear system on a coarse grid.
 
-    Neighboring cells conduct with exp(-|dI|^2 / 0.04^2), and not at all into the sea, which is no surface.
+    Neighboring cells conduct with exp(-|dI|^2 / 0.04^2), and not at all into the sea, which is no surface. Three cells
+    in a row lie on a line as far as both pairs conduct.
     """
     height, width = inverse.shape
     factor = max(1.0, max(height, width) / _COARSE)
@@ -53,14 +66,31 @@ def _diffused(
     color, land = shrink(image.permute(2, 0, 1)), 1 - shrink(sea[None])[0]
     weight = shrink(trust[None])[0]
     value = shrink((trust * inverse)[None])[0] / np.maximum(weight, 1e-9)
-    index = np.arange(weight.size).reshape(size)
-    a = np.concatenate([index[:-1].ravel(), index[:, :-1].ravel()])
-    b = np.concatenate([index[1:].ravel(), index[:, 1:].ravel()])
-    flat = color.reshape(3, -1)
-    g = np.exp(-((flat[:, a] - flat[:, b]) ** 2).sum(0) / 0.04**2) * land.ravel()[a] * land.ravel()[b] + 1e-4
-    n = index.size
-    affinity = coo_matrix((np.r_[g, g], (np.r_[a, b], np.r_[b, a])), shape=(n, n)).tocsr()
-    laplacian = diags(np.asarray(affinity.sum(1)).ravel()) - affinity
-    solved = spsolve((laplacian + diags(10 * weight.ravel() + 1e-8)).tocsc(), (10 * weight * value).ravel())
+    flat, surface, n = color.reshape(3, -1), land.ravel(), weight.size
+    first, second = _in_a_row(size, 2), _in_a_row(size, 3)
+
+    def conducted(a: np.ndarray, b: np.ndarray) -> np.ndarray:
+        return np.exp(-((flat[:, a] - flat[:, b]) ** 2).sum(0) / 0.04**2) * surface[a] * surface[b] + 1e-4
+
+    slope = _differences(first, np.sqrt(_SLOPE * conducted(*first)), [1, -1], n)
+    bend = _differences(second, np.sqrt(conducted(*second[:2]) * conducted(*second[1:])), [1, -2, 1], n)
+    smoothness = slope.T @ slope + bend.T @ bend
+    known = 10 * weight.ravel()
+    solved = spsolve((smoothness + diags(known + 1e-8)).tocsc(), known * value.ravel())
     grid = torch.from_numpy(np.asarray(solved, dtype=np.float32)).reshape(1, 1, *size)
     return torch.nn.functional.interpolate(grid, (height, width), mode="bilinear", align_corners=False)[0, 0]
+
+
+def _in_a_row(size: tuple[int, int], count: int) -> list[np.ndarray]:
+    """Numbers of the cells of a grid that lie side by side, `count` of them, along columns and along rows."""
+    index = np.arange(size[0] * size[1]).reshape(size)
+    down = [index[k : size[0] - count + 1 + k].ravel() for k in range(count)]
+    across = [index[:, k : size[1] - count + 1 + k].ravel() for k in range(count)]
+    return [np.concatenate(pair) for pair in zip(down, across, strict=True)]
+
+
+def _differences(cells: list[np.ndarray], weight: np.ndarray, factors: list[int], count: int) -> csr_array:
+    """The matrix (rows, count) of weighted differences between cells in a row."""
+    row = np.tile(np.arange(len(weight)), len(cells))
+    values = np.concatenate([factor * weight for factor in factors])
+    return coo_array((values, (row, np.concatenate(cells))), shape=(len(weight), count)).tocsr()

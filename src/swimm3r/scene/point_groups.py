@@ -5,9 +5,10 @@ import torch
 from jaxtyping import Bool, Float
 from torch import Tensor
 
-from swimm3r.cameras import Cameras, directions
+from swimm3r.cameras import Cameras, directions, project_visible
 
 _GROUP = 2048  # points, at most
+_SQUARE = 2  # pixels along the side of a square that shows the nearest of its points alone
 
 
 class PointGroups:
@@ -36,6 +37,17 @@ class PointGroups:
         angle = torch.arccos(((toward @ camera.cam2world[0, :3, 2].double()) / away).clamp(-1.0, 1.0))
         spread = torch.arcsin((self._radius / away).clamp(max=1.0))
         return self._of((angle - spread <= half) | (away <= self._radius))
+
+    def z_depth(self, camera: Cameras) -> Float[Tensor, "h w"]:
+        """Depth of the nearest point in each square of 2 x 2 pixels of a pinhole camera's image; 0 where none is."""
+        pixels, z, visible = project_visible(camera, self.before(camera)[None].double())
+        column, row = (pixels[visible] / _SQUARE).long().unbind(-1)
+        rows, columns = -(-camera.height // _SQUARE), -(-camera.width // _SQUARE)
+        nearest = torch.full((rows * columns,), torch.inf)
+        nearest.scatter_reduce_(0, row * columns + column, z[visible].float(), "amin")
+        squares = torch.where(nearest.isfinite(), nearest, 0.0).reshape(rows, columns)
+        pixelwise = squares.repeat_interleave(_SQUARE, 0).repeat_interleave(_SQUARE, 1)
+        return pixelwise[: camera.height, : camera.width]
 
     def _of(self, chosen: Bool[Tensor, " groups"]) -> Float[Tensor, "m 3"]:
         """The points of the chosen groups."""

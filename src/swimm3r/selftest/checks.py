@@ -21,7 +21,7 @@ from swimm3r.selftest.scenes import (
     overlapping,
     turned_camera,
 )
-from swimm3r.sfm.plane_sweep.estimate import sweep
+from swimm3r.sfm.plane_sweep.sweep import sweep
 from swimm3r.sfm.plane_sweep.views import make_view
 from swimm3r.sfm.settings import PlaneSweepSettings
 from swimm3r.splat.primitives.beta import BetaPrimitives, trained

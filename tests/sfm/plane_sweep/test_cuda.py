@@ -10,12 +10,12 @@ from swimm3r.devices import for_depth
 from swimm3r.errors import DeviceError
 
 wp = pytest.importorskip("warp", reason="warp-lang is not installed: the GPU source was not compiled")
+from swimm3r.sfm.plane_sweep import numba_backend  # noqa: E402
 from swimm3r.sfm.plane_sweep.cuda import backend  # noqa: E402
 from swimm3r.sfm.plane_sweep.cuda import kernels as cuda_kernels  # noqa: E402
-from swimm3r.sfm.plane_sweep.estimate import numba_sweep  # noqa: E402
-from swimm3r.sfm.plane_sweep.kernels import SCALE, best_plane, packed, semi_global, sweep_costs  # noqa: E402
+from swimm3r.sfm.plane_sweep.kernels import SCALE, doubled, packed  # noqa: E402
 from swimm3r.sfm.plane_sweep.level import Level, Round, SweepNumbers  # noqa: E402
-from swimm3r.sfm.plane_sweep.refinement import refine, window  # noqa: E402
+from swimm3r.sfm.plane_sweep.refinement import window  # noqa: E402
 from swimm3r.sfm.settings import PlaneSweepSettings  # noqa: E402
 
 HEIGHT, WIDTH = 24, 36
@@ -51,16 +51,25 @@ def level(height: int = HEIGHT, width: int = WIDTH) -> Level:
     return Level(gray * np.float32(SCALE), gray + 0.5, np.ones(gray.shape, bool), packed(sources), seen, lenses)
 
 
+def swept(device: str | None = None) -> np.ndarray:
+    """Inverse depth after a whole sweep, by Warp on a device or by Numba."""
+    coarse, fine = level(), level(2 * HEIGHT, 2 * WIDTH)
+    rounds = [Round(OFFSETS, 1.0, 3), Round(OFFSETS, 2.5, 0)]
+    if device is None:
+        start = doubled(numba_backend.coarse_depth(coarse, NUMBERS))
+        return numba_backend.refined(fine, NUMBERS, start, rounds)[0][..., 0]
+    start = doubled(backend.coarse_depth(coarse, NUMBERS, device))
+    return backend.refined(fine, NUMBERS, start, rounds, device)[0][..., 0]
+
+
 def shares_apart(a: np.ndarray, b: np.ndarray, tolerance: float) -> float:
     return float((np.abs(a - b) > tolerance).mean())
 
 
 def test_cost_volume_and_paths_agree_with_numba_to_1e_4():
     half, n = level(), NUMBERS
-    volume = sweep_costs(half.reference, half.flat, half.seen, half.lenses, n.planes, n.radius, n.noise, n.keep)
-    total = semi_global(volume, half.guide, n.smooth, 8 * n.smooth, n.edge)
-    ours = backend.coarse_depth(half, n, "cpu")
-    assert shares_apart(ours, best_plane(total, n.planes), 1e-4) < 0.01  # pixels on the border of what a source shows
+    ours, theirs = backend.coarse_depth(half, n, "cpu"), numba_backend.coarse_depth(half, n)
+    assert shares_apart(ours, theirs, 1e-4) < 0.01  # pixels on the border of what a source shows
     assert np.median(np.abs(ours - 0.5)) < 0.02
 
 
@@ -70,21 +79,15 @@ def test_a_round_of_refinement_agrees_with_numba_to_1e_3(step: float, reach: int
     rng = np.random.default_rng(1)
     surface = (0.003 * rng.standard_normal((HEIGHT, WIDTH, 3))).astype(np.float32)
     surface[..., 0] = 0.5 + 0.05 * rng.standard_normal((HEIGHT, WIDTH))
-    theirs = refine(
-        fine.reference, fine.guide, fine.usable, fine.flat, fine.seen, fine.lenses, surface, OFFSETS, n.noise, n.edge,
-        n.keep, n.smooth_fine, step, reach,
-    )  # fmt: skip
-    ours = backend.refined(fine, n, surface, [Round(OFFSETS, step, reach)], "cpu")
+    rounds = [Round(OFFSETS, step, reach)]
+    theirs = numba_backend.refined(fine, n, surface, rounds)
+    ours = backend.refined(fine, n, surface, rounds, "cpu")
     for a, b in zip(ours, theirs, strict=True):
         assert shares_apart(a, b, 1e-3) < 0.01  # ties of two candidates
 
 
 def test_a_whole_sweep_on_warp_finds_the_plane_that_numba_finds():
-    coarse, fine = level(), level(2 * HEIGHT, 2 * WIDTH)
-    rounds = [Round(OFFSETS, 1.0, 3), Round(OFFSETS, 2.5, 0)]
-    ours = backend.sweep(coarse, fine, NUMBERS, rounds, "cpu")[0]
-    theirs = numba_sweep(coarse, fine, NUMBERS, rounds)[0]
-    assert shares_apart(ours[..., 0], theirs[..., 0], 2e-3) < 0.02
+    assert shares_apart(swept("cpu"), swept(), 2e-3) < 0.02
 
 
 @pytest.mark.parametrize("arch", [75, 80, 86, 89, 90])
@@ -98,10 +101,7 @@ def test_the_kernels_compile_ahead_of_time_without_a_gpu(arch: int, tmp_path: Pa
 @pytest.mark.gpu
 @pytest.mark.skipif(not torch.cuda.is_available(), reason="no CUDA device: nothing ran on a GPU")
 def test_on_the_gpu_a_sweep_agrees_with_numba():
-    coarse, fine = level(), level(2 * HEIGHT, 2 * WIDTH)
-    rounds = [Round(OFFSETS, 1.0, 3), Round(OFFSETS, 2.5, 0)]
-    ours, theirs = backend.sweep(coarse, fine, NUMBERS, rounds)[0], numba_sweep(coarse, fine, NUMBERS, rounds)[0]
-    assert shares_apart(ours[..., 0], theirs[..., 0], 2e-3) < 0.02
+    assert shares_apart(swept("cuda"), swept(), 2e-3) < 0.02
 
 
 @pytest.mark.skipif(torch.cuda.is_available(), reason="there is a CUDA device")

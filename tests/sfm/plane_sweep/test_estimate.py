@@ -15,7 +15,9 @@ from swimm3r.io import images
 from swimm3r.scene.frames import Frame, Frames
 from swimm3r.scene.reconstruction import DepthMaps, Matches, Points, Reconstruction, Tracks
 from swimm3r.sfm.plane_sweep import estimate
-from swimm3r.sfm.plane_sweep.estimate import RawDepth, consistent, estimate_depth, sweep
+from swimm3r.sfm.plane_sweep import sweep as sweep_of_a_view
+from swimm3r.sfm.plane_sweep.estimate import consistent, estimate_depth
+from swimm3r.sfm.plane_sweep.sweep import RawDepth, sweep
 from swimm3r.sfm.plane_sweep.views import SweepView, choose_sources, depth_range, make_view, points_by_frame
 from swimm3r.sfm.settings import PlaneSweepSettings
 from swimm3r.tasks import EngineSettings
@@ -130,6 +132,27 @@ def test_contrast_lost_and_light_added_in_the_sources_change_nothing():
 def test_the_same_views_give_the_same_depth_bit_for_bit():
     views = views_of(SLANTED)
     assert torch.equal(middle_depth(views).inverse_depth, middle_depth(views).inverse_depth)
+
+
+def test_wide_windows_tell_the_depth_of_a_texture_that_noise_hides_from_small_ones(monkeypatch):
+    generator = torch.Generator().manual_seed(0)
+    cameras, canvas = dive(), covering_pinholes(dive(), 640)
+    everywhere = torch.ones(HEIGHT, WIDTH, dtype=torch.bool)
+
+    def faint(i: int) -> SweepView:
+        image = 0.3 + 0.05 * photograph(cameras[i], SLANTED)
+        noise = 1.2 / 255 * torch.randn(HEIGHT, WIDTH, 1, generator=generator)
+        return make_view(image + noise, everywhere, cameras[i], canvas[i])
+
+    views = [faint(i) for i in range(5)]
+    raw = middle_depth(views).inverse_depth
+    error = relative_error(torch.where(raw > 0, 1 / raw, 0.0), z_of_plane(cameras[2], SLANTED))
+    monkeypatch.setattr(sweep_of_a_view, "_FAINT", 0.0)
+    without = middle_depth(views).inverse_depth
+    assert (raw > 0)[MIDDLE].double().mean() > 2 * (without > 0)[MIDDLE].double().mean()
+    assert torch.equal(raw[without > 0], without[without > 0])
+    assert error.median() < 0.015
+    assert error.quantile(0.95) < 0.05
 
 
 def test_open_water_stays_unknown():

@@ -31,6 +31,7 @@ from swimm3r.io.files.damage import guard, remake
 from swimm3r.medium import AttenuationCurve, Medium, MediumFit, remove_water
 from swimm3r.progress import Progress, silent
 from swimm3r.scene.frames import Frames
+from swimm3r.scene.point_groups import PointGroups
 from swimm3r.scene.reconstruction import Reconstruction
 from swimm3r.sfm.mast3r_sfm.network_frames import NetworkImages
 from swimm3r.sfm.medium.dense_tracks import ray_depth_map
@@ -178,6 +179,8 @@ def predicted_images(
 
     Unknown depth is filled in along the edges; open water keeps the color it has. `keep` is as in `restored_images`.
     """
+    assert rec.cloud is not None
+    cloud = PointGroups(rec.cloud.xyz)
 
     def restored(i: int) -> RestoredImage | None:
         name = rec.names[i]
@@ -187,7 +190,8 @@ def predicted_images(
         filmed = frames.image(frames.index(name))
         own = water.frame(name)
         sea = sea_share(filmed, depth.z_depth, own.Binf)
-        ray_depth = ray_depth_map(fill_z_depth(filmed, depth, sea), frame_rays(rec.cameras[i]))
+        z_depth = fill_z_depth(filmed, depth, sea, cloud.z_depth(rec.cameras[i]))
+        ray_depth = ray_depth_map(z_depth, frame_rays(rec.cameras[i]))
         z = ray_depth.flatten()
         J = remove_water(filmed.reshape(-1, 3), z, own.at(z, water.place), water.head.min_transmittance)
         J = J.clamp(0, 1).reshape(filmed.shape)

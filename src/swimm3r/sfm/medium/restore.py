@@ -37,6 +37,7 @@ from swimm3r.medium import (
 )
 from swimm3r.progress import Progress, silent
 from swimm3r.scene.frames import Frames
+from swimm3r.scene.point_groups import PointGroups
 from swimm3r.scene.reconstruction import DepthMap, Reconstruction
 from swimm3r.scene.white_balance import WhiteBalance
 from swimm3r.sfm.medium.dense_tracks import ray_depth_map
@@ -68,19 +69,21 @@ def restored_images(
     progress: Progress = silent,
     keep: Callable[[int, RestoredImage], None] = lambda i, image: None,
 ) -> Iterator[tuple[int, RestoredImage]]:
-    """Every registered frame with some known depth, by its place in `rec`; needs the medium and the balance.
+    """Every registered frame with some known depth, by its place in `rec`; needs medium, cloud and balance.
 
     Frames are restored side by side and come in their order; `keep` is called with each where it was made.
     """
     assert rec.medium is not None
-    medium, gains = rec.medium, rec.white_balance.factors
+    assert rec.cloud is not None
+    medium, gains, cloud = rec.medium, rec.white_balance.factors, PointGroups(rec.cloud.xyz)
 
     def restored(i: int) -> RestoredImage | None:
         depth = rec.depth[rec.names[i]]
         if not bool((depth.z_depth > 0).any()):
             return None
         filmed = frames.image(frames.index(rec.names[i]))
-        image = restore_image(filmed, depth, frame_rays(rec.cameras[i]), medium, settings, gains)
+        elsewhere = cloud.z_depth(rec.cameras[i])
+        image = restore_image(filmed, depth, frame_rays(rec.cameras[i]), medium, settings, gains, elsewhere)
         keep(i, image)
         return image
 
@@ -105,8 +108,10 @@ def restore_image(
     fit: MediumFit,
     settings: RestoreSettings | None = None,
     gains: Float[Tensor, "3"] | None = None,
+    elsewhere: Float[Tensor, "h w"] | None = None,
 ) -> RestoredImage:
-    """The whole image without its water; unknown depth is filled in along the edges.
+    """The whole image without its water; unknown depth is filled in along the edges, and from z-depth `elsewhere`
+    measured (`fill_z_depth`).
 
     `rays` are the directions of the pixels with z = 1 (`cameras.image_directions`). `gains` (`display_gains`) color
     surfaces and not the open water behind them, which keeps the color the diver saw.
@@ -117,7 +122,7 @@ def restore_image(
     veil = srgb_from_linear(water) if fit.encoding == "linear" else water
     depth = replace(depth, z_depth=without_fringe(image, depth.z_depth, veil))
     sea = sea_share(image, depth.z_depth, veil)
-    z_depth = fill_z_depth(image, depth, sea)
+    z_depth = fill_z_depth(image, depth, sea, elsewhere)
     ray_depth = ray_depth_map(z_depth, rays)
     I = linear_from_srgb(image) if fit.encoding == "linear" else image
     path = _not_beyond_white(I, ray_depth, direction, depth.z_depth == 0, fit)

@@ -21,7 +21,7 @@ from jaxtyping import Float
 from torch import Tensor
 
 from swimm3r.cameras import Cameras
-from swimm3r.devices import CPU, for_depth
+from swimm3r.devices import for_depth
 from swimm3r.imaging.undistortion import frame_rays
 from swimm3r.io.files.array_file import Layout, read_arrays
 from swimm3r.io.files.atomic import atomic_path, write_text
@@ -32,16 +32,13 @@ from swimm3r.progress import Progress, silent
 from swimm3r.scene.frames import Frames
 from swimm3r.scene.reconstruction import DepthMap, DepthMaps, Reconstruction
 from swimm3r.scene.reconstruction_io import load_reconstruction
-from swimm3r.sfm.plane_sweep import consistency, kernels
+from swimm3r.sfm.plane_sweep import consistency
 from swimm3r.sfm.plane_sweep.facets import facets_of, in_facets, merged
-from swimm3r.sfm.plane_sweep.level import Level, Round, SweepNumbers
-from swimm3r.sfm.plane_sweep.refinement import refine, window
+from swimm3r.sfm.plane_sweep.sweep import RawDepth, sweep, transfer
 from swimm3r.sfm.plane_sweep.views import (
     SweepView,
     choose_sources,
     depth_range,
-    halved,
-    likely_edge,
     make_view,
     on_frame_grid,
     points_by_frame,
@@ -58,17 +55,6 @@ _RAW_LAYOUTS = {"inverse_depth": Layout("h w"), "correlation": Layout("h w")}
 _STAMP = ".made_from"  # of which cameras, points and settings the folder's maps were made
 _OF_A_TASK = 16  # frames
 _NEIGHBORS = 8  # frames asked whether they agree
-_MOST_SOURCES = 16
-_REACH = np.arange(-3, 4)  # the slanted windows' pixels, along each axis
-_ASIDE = 2.5  # source pixels beside a match where it must be worse; nearer, small errors of the poses blur it
-
-
-@dataclass(frozen=True)
-class RawDepth:
-    """One frame's own opinion, before others are asked; 0 = unknown."""
-
-    inverse_depth: Float[Tensor, "h w"]  # 1 / z_depth
-    correlation: Float[Tensor, "h w"]  # NCC with the best half of the sources, 0..1
 
 
 def estimate_depth(
@@ -203,88 +189,6 @@ class _Passes:
         return on_frame_grid(fused.inverse_depth, fused.correlation, gray, image, lens, canvas[view], turn)
 
 
-def sweep(
-    reference: SweepView,
-    sources: Sequence[SweepView],
-    z_range: tuple[float, float],
-    settings: PlaneSweepSettings,
-    device: torch.device = CPU,
-) -> RawDepth:
-    """Depth of one view from the others, between two z depths; 0 where the images do not determine it."""
-    if not 1 <= len(sources) <= _MOST_SOURCES:
-        raise ValueError(f"a sweep takes 1 to {_MOST_SOURCES} sources, got {len(sources)}")
-    half, halves = halved(reference), [halved(source) for source in sources]
-    coarse = _level(half, halves, settings.window)
-    fine = _level(reference, sources, int(_REACH.max()))
-    numbers = SweepNumbers(
-        planes=_planes(half.gray.shape, coarse.lenses, z_range, settings.planes),
-        radius=settings.window,
-        noise=(kernels.SCALE * settings.noise) ** 2,
-        edge=likely_edge(reference.gray),
-        keep=(len(sources) + 1) // 2,
-        smooth=settings.smooth,
-        smooth_fine=settings.smooth_fine,
-    )
-    surface, cost, peak = _backend(device)(coarse, fine, numbers, _rounds(settings.rounds))
-    q = np.ascontiguousarray(surface[..., 0])
-    alone = _sighting(fine, q) == 1  # the sweep has counted a second source, which does not see the pixel, as no match
-    cost, peak = np.where(alone, 2 * cost - 1, cost).clip(0), np.where(alone, 2 * peak, peak)
-    cost, peak = _with_neighbors(cost), _with_neighbors(peak)
-    sure = (1 - cost >= settings.min_ncc) & (peak >= settings.min_peak * (cost + 0.03)) & (q > 0)
-    return RawDepth(torch.from_numpy(np.where(sure, q, 0)), torch.from_numpy(np.where(sure, 1 - cost, 0)))
-
-
-def _sighting(level: Level, q: np.ndarray) -> np.ndarray:
-    """Number of sources that see each pixel's point, by its inverse depth."""
-    h, w = q.shape
-    y, x = np.mgrid[:h, :w].astype(np.float32)
-    count = np.zeros((h, w), np.int32)
-    for lens, seen in zip(level.lenses, level.seen, strict=True):
-        H, e = lens[:9].reshape(3, 3), lens[9:]
-        X, Y, Z = (H[k, 0] * x + H[k, 1] * y + H[k, 2] + q * e[k] for k in range(3))
-        u, v = (axis / np.maximum(Z, 1e-9) for axis in (X, Y))
-        inside = (Z > 0) & (u >= 0) & (v >= 0) & (u < w - 1) & (v < h - 1)
-        count[inside] += seen[v[inside].astype(int), u[inside].astype(int)]
-    return count
-
-
-def numba_sweep(
-    coarse: Level, fine: Level, numbers: SweepNumbers, rounds: Sequence[Round]
-) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """The slanted surface of a view, its cost and its peak, on the CPU."""
-    n = numbers
-    volume = kernels.sweep_costs(
-        coarse.reference, coarse.flat, coarse.seen, coarse.lenses, n.planes, n.radius, n.noise, n.keep
-    )
-    total = kernels.semi_global(volume, coarse.guide, n.smooth, 8 * n.smooth, n.edge)
-    surface = kernels.doubled(kernels.best_plane(total, n.planes))
-    cost = peak = np.zeros(fine.reference.shape, np.float32)
-    for turn in rounds:
-        surface, cost, peak = refine(
-            fine.reference, fine.guide, fine.usable, fine.flat, fine.seen, fine.lenses, surface, turn.offsets, n.noise,
-            n.edge, n.keep, n.smooth_fine, turn.step, turn.reach,
-        )  # fmt: skip
-    return surface, cost, peak
-
-
-def _backend(device: torch.device) -> Callable[..., tuple[np.ndarray, np.ndarray, np.ndarray]]:
-    """The sweep of a processor."""
-    if device.type == "cpu":
-        return numba_sweep
-    from swimm3r.sfm.plane_sweep.cuda import backend as cuda_backend
-
-    return cuda_backend.sweep
-
-
-def _rounds(count: int) -> list[Round]:
-    """The rounds that look for better planes, and a last one that judges: is it good, is it worse beside it."""
-    every = np.stack(np.meshgrid(_REACH, _REACH), -1).reshape(-1, 2).astype(np.float32)
-    chequered = window(every[np.abs(every).sum(1) % 2 == 0])  # half of the window judges as well as all of it
-    odd = window(every[(np.abs(every) % 2 == 1).all(1)])  # and a third finds as well
-    moves = [Round(odd, 0.5 if n else 1.0, (3, 1)[n % 2]) for n in range(count)]
-    return [*moves, Round(chequered, _ASIDE, 0)]
-
-
 def consistent(
     raw: RawDepth, others: Sequence[RawDepth], cameras: Cameras, pose_error: float, settings: PlaneSweepSettings
 ) -> RawDepth:
@@ -297,8 +201,8 @@ def consistent(
     if not others:
         return RawDepth(torch.zeros_like(raw.inverse_depth), torch.zeros_like(raw.correlation))
     (K, *Ks), (pose, *poses) = cameras.K.numpy(), cameras.world2cam.numpy()
-    there = [_transfer(K, pose, K_other, other) for K_other, other in zip(Ks, poses, strict=True)]
-    back = [_transfer(K_other, other, K, pose) for K_other, other in zip(Ks, poses, strict=True)]
+    there = [transfer(K, pose, K_other, other) for K_other, other in zip(Ks, poses, strict=True)]
+    back = [transfer(K_other, other, K, pose) for K_other, other in zip(Ks, poses, strict=True)]
     fused, count, possible = consistency.agreement(
         raw.inverse_depth.numpy(), np.stack([other.inverse_depth.numpy() for other in others]),
         np.stack([H for H, _ in there]), np.stack([e for _, e in there]),
@@ -311,60 +215,12 @@ def consistent(
     return RawDepth(torch.from_numpy(fused), torch.from_numpy(confidence))
 
 
-def _with_neighbors(values: np.ndarray) -> np.ndarray:
-    """Means of 3 x 3 pixels: single-pixel NCC is too noisy without texture."""
-    padded = torch.nn.functional.pad(torch.from_numpy(values)[None, None], (1, 1, 1, 1), mode="replicate")
-    return torch.nn.functional.avg_pool2d(padded, 3, stride=1)[0, 0].numpy()
-
-
 def _pose_error(rec: Reconstruction, canvas: Cameras) -> float:
     """The median reprojection error of the sparse points in canvas pixels, at most 1.5."""
     error = rec.points.error[rec.points.error.isfinite()]
     if not len(error):
         return 0.0
     return min(1.5, float(error.median() * canvas.K[0, 0, 0] / rec.cameras.K[0, 0, 0]))
-
-
-def _transfer(K: np.ndarray, pose: np.ndarray, K_there: np.ndarray, pose_there: np.ndarray) -> tuple:
-    """H and e that take a pixel index at inverse depth q to H x + q e in another view."""
-    half = np.array([[0, 0, 0.5], [0, 0, 0.5], [0, 0, 0]])  # pixel centers stand at +0.5, indices do not
-    there = pose_there @ np.linalg.inv(pose)
-    K_there = K_there - half
-    return K_there @ there[:3, :3] @ np.linalg.inv(K - half), K_there @ there[:3, 3]
-
-
-def _transfers(reference: SweepView, sources: Sequence[SweepView]) -> tuple[np.ndarray, np.ndarray]:
-    pairs = [
-        _transfer(*(t.double().numpy() for t in (reference.K, reference.world2cam, s.K, s.world2cam))) for s in sources
-    ]
-    return np.stack([H for H, _ in pairs]), np.stack([e for _, e in pairs])
-
-
-def _level(view: SweepView, sources: Sequence[SweepView], margin: int) -> Level:
-    """The arrays of the kernels; a source sees where a window of half width `margin` lies wholly in what it shows."""
-    H, e = _transfers(view, sources)
-    unseen = torch.stack([(~s.seen).float() for s in sources])[:, None]
-    near = torch.nn.functional.max_pool2d(unseen, 2 * margin + 1, stride=1, padding=margin)[:, 0]
-    return Level(
-        reference=view.detail.numpy() * np.float32(kernels.SCALE),
-        guide=view.gray.numpy(),
-        usable=view.seen.numpy(),
-        flat=kernels.packed(torch.stack([s.detail for s in sources]).numpy()),
-        seen=(near == 0).numpy(),
-        lenses=np.concatenate([H.reshape(-1, 9), e], 1).astype(np.float32),
-    )
-
-
-def _planes(shape: torch.Size, lenses: np.ndarray, z_range: tuple[float, float], most: int) -> np.ndarray:
-    """Inverse depths from far to near, evenly spaced: one per pixel of the largest motion, 32 to `most` of them."""
-    near, far = z_range
-    h, w = shape
-    H, e = lenses[:, :9].reshape(-1, 3, 3).astype(np.float64), lenses[:, 9:].astype(np.float64)
-    x = np.array([[0.5 * w, 0.5 * h, 1], [0, 0, 1], [w, 0, 1], [0, h, 1], [w, h, 1]])
-    ends = [x @ H.transpose(0, 2, 1) + q * e[:, None] for q in (1 / far, 1 / near)]
-    a, b = (p[..., :2] / np.maximum(p[..., 2:], 1e-3) for p in ends)
-    motion = float(np.median(np.linalg.norm(a - b, axis=-1), axis=1).max())
-    return np.linspace(1 / far, 1 / near, int(np.clip(np.ceil(motion), 32, most)))
 
 
 def _stamp(rec: Reconstruction, frames: Frames, settings: PlaneSweepSettings) -> str:

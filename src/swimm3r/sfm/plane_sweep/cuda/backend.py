@@ -1,4 +1,4 @@
-"""The plane sweep on a CUDA device: one view's arrays go there, its planes and costs come back."""
+"""The plane sweep on a CUDA device: one view's arrays go there, its planes and costs come back (`numba_backend`)."""
 
 import threading
 from collections.abc import Sequence
@@ -7,7 +7,6 @@ from typing import Any
 import numpy as np
 import warp as wp
 
-from swimm3r.sfm.plane_sweep import kernels as numba_kernels
 from swimm3r.sfm.plane_sweep.cuda import kernels
 from swimm3r.sfm.plane_sweep.level import Level, Round, SweepNumbers
 
@@ -15,8 +14,13 @@ _one_at_a_time = threading.Lock()  # a view's volume is the largest thing in the
 _DIRECTIONS = ((0, 1), (0, -1), (1, 0), (-1, 0), (1, 1), (1, -1), (-1, 1), (-1, -1))
 
 
-def coarse_depth(level: Level, numbers: SweepNumbers, device: str) -> np.ndarray:
-    """Inverse depth at half size from the cost volume, smoothed along paths."""
+def coarse_depth(level: Level, numbers: SweepNumbers, device: str = "cuda") -> np.ndarray:
+    """Inverse depth from the cost volume, smoothed along paths. Other threads wait for the device."""
+    with _one_at_a_time:
+        return _coarse_depth(level, numbers, device)
+
+
+def _coarse_depth(level: Level, numbers: SweepNumbers, device: str) -> np.ndarray:
     h, w = level.reference.shape
     count = len(numbers.planes)
     reference, guide, flat, seen, lenses = _images(level, device)
@@ -38,9 +42,16 @@ def coarse_depth(level: Level, numbers: SweepNumbers, device: str) -> np.ndarray
 
 
 def refined(
+    level: Level, numbers: SweepNumbers, surface: np.ndarray, rounds: Sequence[Round], device: str = "cuda"
+) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """The slanted surface after all rounds, its cost and its peak. Other threads wait for the device."""
+    with _one_at_a_time:
+        return _refined(level, numbers, surface, rounds, device)
+
+
+def _refined(
     level: Level, numbers: SweepNumbers, surface: np.ndarray, rounds: Sequence[Round], device: str
 ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """The surface after all rounds, its cost and its peak."""
     h, w = level.reference.shape
     reference, guide, flat, seen, lenses = _images(level, device)
     usable = _sent(level.usable.astype(np.uint8), device)
@@ -57,15 +68,6 @@ def refined(
         )  # fmt: skip
         now, new = new, now
     return now.numpy(), cost.numpy(), peak.numpy()
-
-
-def sweep(
-    coarse: Level, fine: Level, numbers: SweepNumbers, rounds: Sequence[Round], device: str = "cuda"
-) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """The slanted surface of a view, its cost and its peak. Threads that prepare other frames wait for the device."""
-    with _one_at_a_time:
-        surface = numba_kernels.doubled(coarse_depth(coarse, numbers, device))
-        return refined(fine, numbers, surface, rounds, device)
 
 
 def _images(level: Level, device: str) -> tuple[Any, Any, Any, Any, Any]:
