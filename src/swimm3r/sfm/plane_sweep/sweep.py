@@ -28,7 +28,7 @@ _ASIDE = 2.5  # source pixels beside a match where it must be worse; nearer, sma
 _FAINT = 3.0  # times the least texture: where small windows have less, wide ones are asked
 _FAINT_EDGE = 2 / 255  # change of gray that makes a depth edge likely in wide windows
 _BEND = 0.03  # share of inverse depth that wide windows may lie off the mean of their surroundings
-_WIDE_ROUNDS = 2
+_WIDE_ROUNDS, _WIDE_ASIDE = 2, 1.5  # of refinement; as `_ASIDE`, in pixels of half size
 
 
 @dataclass(frozen=True)
@@ -76,7 +76,7 @@ def sweep(
     if not 1 <= len(sources) <= _MOST_SOURCES:
         raise ValueError(f"a sweep takes 1 to {_MOST_SOURCES} sources, got {len(sources)}")
     half, halves = halved(reference), [halved(source) for source in sources]
-    coarse = _level(half, halves, settings.window)
+    coarse = _level(half, halves, max(settings.window, int(_REACH.max())))
     fine = _level(reference, sources, int(_REACH.max()))
     numbers = SweepNumbers(
         planes=_planes(half.gray.shape, coarse.lenses, z_range, settings.planes),
@@ -89,12 +89,12 @@ def sweep(
     )
     backend = _backend(device)
     found = backend.coarse_depth(coarse, numbers)
-    narrow = _judged(
-        fine, backend.refined(fine, numbers, kernels.doubled(found), _rounds(settings.rounds, _ASIDE)), settings
-    )
-    level = np.ascontiguousarray(np.stack([found, np.zeros_like(found), np.zeros_like(found)], -1))
+    refined = backend.refined(fine, numbers, kernels.doubled(found), _rounds(settings.rounds, _ASIDE))
+    narrow = _judged(fine, refined, settings)
+    frontal = np.stack([found, np.zeros_like(found), np.zeros_like(found)], -1)
     averaged = replace(numbers, noise=numbers.noise / 4, edge=_FAINT_EDGE)
-    wide = _judged(coarse, backend.refined(coarse, averaged, level, _rounds(_WIDE_ROUNDS, 0.6 * _ASIDE)), settings)
+    refined = backend.refined(coarse, averaged, frontal, _rounds(_WIDE_ROUNDS, _WIDE_ASIDE))
+    wide = _judged(coarse, refined, settings)
     added = ~narrow.sure & _at_full_size(_smooth(wide, narrow)) & (_texture(reference) < _FAINT * settings.noise)
     full_size = interpolate(torch.from_numpy(wide.q)[None, None], added.shape, mode="bilinear")[0, 0].numpy()
     q = np.where(added, full_size, np.where(narrow.sure, narrow.q, 0))
