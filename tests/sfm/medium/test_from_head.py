@@ -8,6 +8,7 @@ import torch
 
 from swimm3r.errors import InputError
 from swimm3r.medium import AttenuationCurve, Medium, remove_water
+from swimm3r.scene.reconstruction import DenseCloud, Reconstruction
 from swimm3r.scene.white_balance import WhiteBalance
 from swimm3r.sfm.mast3r_sfm.network_frames import NetworkImages, network_images
 from swimm3r.sfm.medium.dense_cloud import restored_points
@@ -48,6 +49,11 @@ def water(dive, images: NetworkImages, tmp_path: Path) -> PredictedWater:
     found = read(tmp_path / "water", images, SURE)
     assert found is not None
     return found
+
+
+def with_cloud(rec: Reconstruction) -> Reconstruction:
+    """The reconstruction with its sparse points for a cloud."""
+    return replace(rec, cloud=DenseCloud(rec.points.xyz.float(), rec.points.rgb, rec.points.rgb))
 
 
 def test_the_dives_water_is_what_the_frames_say(dive, water: PredictedWater):
@@ -100,7 +106,7 @@ def test_true_water_restores_the_cloud_to_its_clear_colors(dive, water: Predicte
 
 
 def test_restored_images_are_clear(dive, water: PredictedWater):
-    for i, restored in predicted_images(dive.rec, dive.frames, water):
+    for i, restored in predicted_images(with_cloud(dive.rec), dive.frames, water):
         name, J = dive.rec.names[i], restored.clear
         known = dive.rec.depth[name].z_depth > 0
         raw = dive.frames.image(dive.frames.index(name))
@@ -110,8 +116,8 @@ def test_restored_images_are_clear(dive, water: PredictedWater):
 
 def test_shown_images_are_white_balanced_and_the_clear_ones_stay_physical(dive, water: PredictedWater):
     balance = WhiteBalance((1.5, 1.0, 0.7))
-    plain = dict(predicted_images(dive.rec, dive.frames, water))
-    for i, restored in predicted_images(replace(dive.rec, white_balance=balance), dive.frames, water):
+    plain = dict(predicted_images(with_cloud(dive.rec), dive.frames, water))
+    for i, restored in predicted_images(replace(with_cloud(dive.rec), white_balance=balance), dive.frames, water):
         torch.testing.assert_close(restored.clear, plain[i].clear)
         surface = (restored.sea == 0) & (restored.clear > 0).all(-1) & (restored.clear < 0.6).all(-1)
         assert surface.float().mean() > 0.1
@@ -120,7 +126,7 @@ def test_shown_images_are_white_balanced_and_the_clear_ones_stay_physical(dive, 
 
 def test_restoration_divides_by_no_less_than_the_head_was_trained_with(dive, water: PredictedWater):
     half = replace(water, head=HeadFacts(0.5))
-    i, restored = next(predicted_images(dive.rec, dive.frames, half))
+    i, restored = next(predicted_images(with_cloud(dive.rec), dive.frames, half))
     name, z = dive.rec.names[i], restored.ray_depth.flatten()
     image = dive.frames.image(dive.frames.index(name))
     J = remove_water(image.reshape(-1, 3), z, water.frame(name).at(z, water.place), 0.5).clamp(0, 1)

@@ -114,7 +114,7 @@ def _judged(level: Level, refined: tuple[np.ndarray, np.ndarray, np.ndarray], se
 
 
 def _smooth(wide: _Judged, narrow: _Judged) -> np.ndarray:
-    """Where wide windows are sure, and lie on one surface with all of their neighbors: none stands before another.
+    """Mask of sure wide windows that lie on one surface with all of their neighbors: none stands before another.
 
     Windows that reach over a silhouette take what lies behind it for the surface before it.
     """
