@@ -117,7 +117,7 @@ def test_filling_goes_on_as_planes_beyond_the_nearest_and_the_farthest_known():
     assert (filled * inverse).log().abs().max() < 0.1  # 0.22 off if depth stayed what it is at the rim
 
 
-def test_filling_follows_depth_that_other_images_measured(dive):
+def test_filling_follows_depth_that_other_images_measured():
     z = torch.full((72, 96), 1.0)
     z[:, 48:] = 3.0
     known = torch.zeros(72, 96, dtype=torch.bool)
