@@ -23,6 +23,7 @@ from jaxtyping import Bool, Float, Int
 from torch import Tensor
 
 from swimm3r.imaging.depth_completion import fill_z_depth
+from swimm3r.imaging.depth_from_color import depth_from_color
 from swimm3r.imaging.filters import LUMA, blur, local_linear
 from swimm3r.imaging.open_water import sea_share, without_fringe
 from swimm3r.imaging.undistortion import frame_rays
@@ -122,9 +123,9 @@ def restore_image(
     veil = srgb_from_linear(water) if fit.encoding == "linear" else water
     depth = replace(depth, z_depth=without_fringe(image, depth.z_depth, veil))
     sea = sea_share(image, depth.z_depth, veil)
-    z_depth = fill_z_depth(image, depth, sea, elsewhere)
-    ray_depth = ray_depth_map(z_depth, rays)
     I = linear_from_srgb(image) if fit.encoding == "linear" else image
+    z_depth = fill_z_depth(image, depth, sea, elsewhere, depth_from_color(I, depth, sea, rays, fit))
+    ray_depth = ray_depth_map(z_depth, rays)
     path = _not_beyond_white(I, ray_depth, direction, depth.z_depth == 0, fit)
     medium = fit.at(path, direction)
     T_D, _ = transmittances(path, medium)
