@@ -73,7 +73,7 @@ def depth_from_color(
 
     at_known, true = some[asked], 1 / z[some]
     error = float((inverse[at_known] / true - 1).square().mean())
-    told = precision.clamp(max=1 / (error * true.mean().square()))
+    told = torch.minimum(precision, 1 / (error * inverse.square()))
     spread = float((true / true.mean()).var())
     weight = _WEIGHT * min(_MOST, (spread / error) ** 2) * true.median().square()
     cue = DepthCue(torch.ones_like(z), torch.zeros_like(z))
