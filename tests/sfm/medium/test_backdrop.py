@@ -72,10 +72,11 @@ def test_known_depth_and_open_water_leave_nothing_to_guess(dive, patchy):
     assert len(backdrop.points().xyz) == 0
 
 
-def test_ground_too_white_for_its_guessed_distance_is_not_pulled_toward_the_camera(patchy, dive):
-    """Its color is restored over a shorter path; a point there would hang before the lens."""
+def test_ground_too_white_for_its_guessed_distance_is_pulled_toward_the_camera_by_a_third_at_most(patchy, dive):
+    """Its color is restored over a shorter path; a point there would hang before the lens where the water is wrong."""
     _, image = next(restored_images(patchy, dive.frames, RestoreSettings()))
     glaring = replace(dive.medium, beta_D=3 * dive.medium.beta_D)
     _, white = next(restored_images(replace(patchy, medium=exact(glaring)), dive.frames, RestoreSettings()))
-    torch.testing.assert_close(white.ray_depth, image.ray_depth)
-    assert (white.ray_depth[:, :32] > 0.8 * white.ray_depth[:, 32:].amin()).all()
+    torch.testing.assert_close(white.ray_depth[:, 32:], image.ray_depth[:, 32:])
+    assert (white.ray_depth >= 0.7 * image.ray_depth).all()
+    assert (white.ray_depth < 0.9 * image.ray_depth).any()

@@ -48,6 +48,7 @@ from swimm3r.sfm.settings import RestoreSettings
 
 _MAX_TINT = 1.0  # times the other channels, for blurred colors at a guessed distance
 _MAX_BRIGHTNESS = 0.9  # of blurred colors there, in any channel
+_STILL_DEPTH = 0.7  # of a guessed depth, down to which colors correct it; where they ask for less, the water is wrong
 _LEVELS, _FEWEST = 20, 20  # levels of brightness from 0 to 1, and surfaces of a level that tell how bright it becomes
 _NEARLY_ALL = 0.95  # of the surfaces at known distance
 _SAMPLES = 20_000  # of them, which stand for all of an image
@@ -59,7 +60,7 @@ class RestoredImage:
 
     clear: Float[Tensor, "h w 3"]
     shown: Float[Tensor, "h w 3"]  # white-balanced for the eye where asked for
-    ray_depth: Float[Tensor, "h w"]  # of the surface; filled in along the edges where the depth map has gaps
+    ray_depth: Float[Tensor, "h w"]  # of the surface; a guess where the depth map has gaps, corrected by color
     sea: Float[Tensor, "h w"]  # 0..1, how surely there is open water and no surface; it keeps the color it has
 
 
@@ -134,7 +135,8 @@ def restore_image(
     stored = srgb_from_linear(J.clamp(min=0)) if fit.encoding == "linear" else J
     clear = keep_open_water(stored, T_D, image, sea, settings).clamp(0, 1)
     shown = clear if gains is None else keep_open_water(stored * gains, T_D, image, sea, settings).clamp(0, 1)
-    return RestoredImage(clear, shown, ray_depth, sea)
+    surface = torch.where(path > _STILL_DEPTH * ray_depth, path, ray_depth)
+    return RestoredImage(clear, shown, surface, sea)
 
 
 def white_balance(rec: Reconstruction, settings: RestoreSettings) -> WhiteBalance:
