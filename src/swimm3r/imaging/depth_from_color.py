@@ -25,10 +25,9 @@ from swimm3r.scene.reconstruction import DepthMap
 _NOISE = 0.01  # of a cell's color, and of the water's
 _LEAST_VARIANCE = 1e-4  # of J along any direction of color
 _DEPTHS = 16  # that are tried
-_FEWEST, _SAMPLES = (
-    30,
-    500,
-)  # cells of known depth that tell the frame's colors, and that tell how well these tell depth
+_FEWEST = 30  # cells of known depth that tell the frame's colors
+_SAMPLES = 500  # of them that tell how well colors tell depth
+_LEAST_ERROR = 0.02  # of the depth that colors tell
 _WEIGHT = 1e-7  # as a confidence, where colors tell depth as well as its mean does: neighbors err alike
 _MOST = 100.0  # times that weight
 
@@ -44,8 +43,8 @@ def depth_from_color(
     known.
 
     `rays` are the pixels' directions with z = 1. How far colors are to be believed is measured on the frame itself:
-    with r = spread of 1/z over what is known / error of the 1/z that color tells there, cells weigh as r^4. Weight and
-    power are those that `benchmarks/guessed_depth.py` was best with over real clips.
+    with r = spread of 1/z over the known cells / error of the 1/z that color tells there, cells weigh as r^4. Weight
+    and power are those that `benchmarks/guessed_depth.py` was best with over real clips.
     """
     known = (depth.z_depth > 0).float()
     share = on_grid(known)
@@ -72,7 +71,7 @@ def depth_from_color(
     inverse, precision = _moments(1 / depths, likelihood)
 
     at_known, true = some[asked], 1 / z[some]
-    error = float((inverse[at_known] / true - 1).square().mean())
+    error = max(_LEAST_ERROR**2, float((inverse[at_known] / true - 1).square().mean()))
     told = torch.minimum(precision, 1 / (error * inverse.square()))
     spread = float((true / true.mean()).var())
     weight = _WEIGHT * min(_MOST, (spread / error) ** 2) * true.median().square()
