@@ -91,7 +91,7 @@ ENGINES = [
     ),
     pytest.param(
         EngineSettings(engine="ray", jobs=2, cpus=1),
-        marks=pytest.mark.skipif(find_spec("ray") is None, reason="ray is not installed"),
+        marks=[pytest.mark.long, pytest.mark.skipif(find_spec("ray") is None, reason="ray is not installed")],
     ),
 ]
 
