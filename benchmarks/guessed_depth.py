@@ -2,9 +2,10 @@
 
     python benchmarks/guessed_depth.py RUN[:TRUTH] ...
 
-RUN are finished run folders. Beside a TRUTH (of a synthetic dive) the pixels without measured depth are compared with
-it, the cloud's depth being used as in a run. Without one, depth along the border of the frames (18 % of the long side)
-is hidden and compared with what is filled in there, without the cloud, which saw it. Eight frames of each run:
+RUN are finished run folders. Beside a TRUTH (of a synthetic dive; the demo's is found) pixels without measured depth
+are compared with it, the cloud's depth being used as in a run. Without one, depth along the border of the frames (18 %
+of the long side) is hidden and compared with what is filled in there, without the cloud, which saw it. Eight frames of
+each run:
 
     hidden   share of the pixels compared
     error    mean |ln(filled / true)|, without and with color

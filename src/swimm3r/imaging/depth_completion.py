@@ -27,12 +27,13 @@ class DepthCue:
     trust: Float[Tensor, "r c"]  # as a confidence; 0 where it tells nothing
 
 
-def on_grid(values: Float[Tensor, "h w"]) -> Float[Tensor, "r c"]:
+def on_grid(values: Float[Tensor, "*channels h w"]) -> Float[Tensor, "*channels r c"]:
     """Means over the cells of the grid on which unknown depth is filled."""
-    factor = max(1.0, max(values.shape) / _COARSE)
-    height, width = values.shape
+    *channels, height, width = values.shape
+    factor = max(1.0, max(height, width) / _COARSE)
     size = (max(2, round(height / factor)), max(2, round(width / factor)))
-    return torch.nn.functional.interpolate(values[None, None], size, mode="area")[0, 0]
+    cells = torch.nn.functional.interpolate(values.reshape(1, -1, height, width), size, mode="area")
+    return cells.reshape(*channels, *size)
 
 
 def filled_range(inverse: Float[Tensor, " n"]) -> tuple[float, float]:
@@ -85,7 +86,7 @@ def _continued(
     0.04, and not at all into the sea, which is no surface. Three cells in a row lie on a line as far as both pairs
     conduct.
     """
-    color = np.stack([on_grid(channel).double().numpy() for channel in image.permute(2, 0, 1)])
+    color = on_grid(image.permute(2, 0, 1)).double().numpy()
     land, trust_of_cell = 1 - on_grid(sea).double().numpy(), on_grid(trust)
     weight = trust_of_cell.double().numpy()
     value = (on_grid(trust * inverse) / trust_of_cell.clamp(min=1e-9)).double().numpy()

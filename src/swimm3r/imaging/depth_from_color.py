@@ -12,6 +12,7 @@ regularization", is the bound of the same statement.
 """
 
 import math
+from dataclasses import dataclass
 
 import torch
 from jaxtyping import Bool, Float
@@ -44,7 +45,7 @@ def depth_from_color(
 
     `rays` are the pixels' directions with z = 1. How far colors are to be believed is measured on the frame itself:
     with r = spread of 1/z over the known cells / error of the 1/z that color tells there, cells weigh as r^4. Weight
-    and power are those that `benchmarks/guessed_depth.py` was best with over real clips.
+    and power were chosen on the clips of docs/experiments/medium.md.
     """
     known = (depth.z_depth > 0).float()
     share = on_grid(known)
@@ -53,8 +54,8 @@ def depth_from_color(
         return None
     unit = normalize(torch.nan_to_num(rays, nan=0.0), dim=-1)
     view = _Cells(
-        torch.stack([on_grid(I[..., k]) for k in range(3)], -1),
-        normalize(torch.stack([on_grid(unit[..., k]) for k in range(3)], -1), dim=-1),
+        on_grid(I.permute(2, 0, 1)).permute(1, 2, 0),
+        normalize(on_grid(unit.permute(2, 0, 1)).permute(1, 2, 0), dim=-1),
         on_grid(torch.nan_to_num(rays.norm(dim=-1), nan=1.0)),
         fit,
     )
@@ -81,17 +82,14 @@ def depth_from_color(
     return cue
 
 
+@dataclass(frozen=True)
 class _Cells:
     """A frame on the grid, under its water."""
 
-    def __init__(
-        self,
-        color: Float[Tensor, "r c 3"],
-        direction: Float[Tensor, "r c 3"],
-        per_z: Float[Tensor, "r c"],
-        fit: MediumFit,
-    ):
-        self.color, self.direction, self.per_z, self.fit = color, direction, per_z, fit
+    color: Float[Tensor, "r c 3"]
+    direction: Float[Tensor, "r c 3"]  # unit
+    per_z: Float[Tensor, "r c"]  # ray depth over z-depth
+    fit: MediumFit
 
     def water(
         self, z: Float[Tensor, " n"], where: Bool[Tensor, "r c"]

@@ -48,7 +48,7 @@ from swimm3r.sfm.settings import RestoreSettings
 
 _MAX_TINT = 1.0  # times the other channels, for blurred colors at a guessed distance
 _MAX_BRIGHTNESS = 0.9  # of blurred colors there, in any channel
-_STILL_DEPTH = 0.7  # of a guessed depth, down to which colors correct it; where they ask for less, the water is wrong
+_LEAST_CORRECTED = 0.7  # of a guessed depth, down to which colors correct it; beyond that it is the water that is wrong
 _LEVELS, _FEWEST = 20, 20  # levels of brightness from 0 to 1, and surfaces of a level that tell how bright it becomes
 _NEARLY_ALL = 0.95  # of the surfaces at known distance
 _SAMPLES = 20_000  # of them, which stand for all of an image
@@ -135,7 +135,7 @@ def restore_image(
     stored = srgb_from_linear(J.clamp(min=0)) if fit.encoding == "linear" else J
     clear = keep_open_water(stored, T_D, image, sea, settings).clamp(0, 1)
     shown = clear if gains is None else keep_open_water(stored * gains, T_D, image, sea, settings).clamp(0, 1)
-    surface = torch.where(path > _STILL_DEPTH * ray_depth, path, ray_depth)
+    surface = torch.where(path > _LEAST_CORRECTED * ray_depth, path, ray_depth)
     return RestoredImage(clear, shown, surface, sea)
 
 
