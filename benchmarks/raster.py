@@ -1,6 +1,6 @@
 """CPU time of the rasterizer: binning, forward, adjoint with all SGG buffers, on the three workloads of its design.
 
-    python benchmarks/raster.py [--sizes S M L] [--threads N] [--repeats N]
+    python benchmarks/raster.py [--sizes S M L] [--devices cpu cuda] [--threads N] [--repeats N]
 
 Prints CPU-ms (process CPU time summed over threads, median) beside a calibration, 1e9 float32 FMAs on one thread,
 measured before and after. "ratio" is CPU-ms / calibration, which compares across machines. The reference is dense
@@ -20,6 +20,8 @@ def main() -> None:
     """Print the table."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--sizes", nargs="+", default=["S", "M", "L"], choices=["S", "M", "L"])
+    here = ["cpu", "cuda"] if torch.cuda.is_available() else ["cpu"]
+    parser.add_argument("--devices", nargs="+", default=here, choices=here)
     parser.add_argument("--threads", type=int, default=torch.get_num_threads())
     parser.add_argument("--repeats", type=int, default=9)
     arguments = parser.parse_args()
@@ -28,12 +30,12 @@ def main() -> None:
     print(f"{arguments.threads} threads; calibration: 1e9 FMA in {calibration:.1f} CPU-ms")
     print("| size | back end | pairs tile x primitive | bins | forward | adjoint | sum CPU-ms | ratio | wall ms |")
     print("|---|---|---|---|---|---|---|---|---|")
-    plan: list[tuple[str, Backend]] = [("XS", "reference"), ("XS", "numba")]
-    for name in arguments.sizes:
-        plan.append((name, "numba"))
-    if torch.cuda.is_available():
-        for name in arguments.sizes:
-            plan.append((name, "warp"))
+    plan: list[tuple[str, Backend]] = []
+    if "cpu" in arguments.devices:
+        plan.append(("XS", "reference"))
+        plan.extend((name, "numba") for name in ("XS", *arguments.sizes))
+    if "cuda" in arguments.devices:
+        plan.extend((name, "warp") for name in arguments.sizes)
     for name, backend in plan:
         row, bins = measure(SIZES[name], backend, 1 if backend == "reference" else arguments.repeats)
         total = row.bins + row.forward + row.adjoint

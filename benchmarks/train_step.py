@@ -1,6 +1,7 @@
 """CPU time of a whole training step beside that of the rasterizer alone, part by part.
 
-    python benchmarks/train_step.py [--sizes XS S M L] [--lenses pinhole fisheye] [--threads N] [--repeats N]
+    python benchmarks/train_step.py [--sizes XS S M L] [--lenses pinhole fisheye] [--devices cpu cuda]
+        [--threads N] [--repeats N]
 
 The primitives are those of benchmarks/raster.py, lifted into space so that one camera sees them all, with conditioning
 that does something. A fisheye has 150 degrees across its diagonal, and primitives of about the same ellipses. CPU-ms
@@ -199,6 +200,8 @@ def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--sizes", nargs="+", default=["S", "M"], choices=["XS", "S", "M", "L"])
     parser.add_argument("--lenses", nargs="+", default=["pinhole"], choices=LENSES)
+    here = ["cpu", "cuda"] if torch.cuda.is_available() else ["cpu"]
+    parser.add_argument("--devices", nargs="+", default=here, choices=here)
     parser.add_argument("--threads", type=int, default=torch.get_num_threads())
     parser.add_argument("--repeats", type=int, default=7)
     arguments = parser.parse_args()
@@ -208,8 +211,7 @@ def main() -> None:
     columns += ["projection", "medium", "losses", "adam", "peak MB"]
     print(f"| {' | '.join(columns)} |")
     print("|---" * len(columns) + "|")
-    devices = ["cpu", "cuda"] if torch.cuda.is_available() else ["cpu"]
-    for kind, name, lens in product(devices, arguments.sizes, arguments.lenses):
+    for kind, name, lens in product(arguments.devices, arguments.sizes, arguments.lenses):
         device = torch.device(kind)
         if device.type == "cuda":
             torch.cuda.reset_peak_memory_stats()

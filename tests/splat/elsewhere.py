@@ -18,6 +18,7 @@ from torch.utils._pytree import tree_flatten, tree_map
 DEVICE = torch.device("meta")
 _MAY_MIX = {"aten::copy_", "aten::_to_copy"}  # what goes from one place to the other
 _INDICES_FROM_ANYWHERE = {"aten::index", "aten::index_put", "aten::index_put_"}
+_NO_SCALARS = {"aten::_fused_adam_"}  # elsewhere a number of the processor's may be mixed with the device's tensors
 _WAITS = {"aten::_local_scalar_dense", "aten::nonzero", "aten::_unique2", "aten::repeat_interleave", "aten::bincount"}
 waits: list[str] = []
 """Places in the package where the CPU has waited for the device, in order; a test that counts them empties it first."""
@@ -82,7 +83,8 @@ def _run(func: Callable[..., Any], args: Any, kwargs: dict[str, Any]) -> Any:
     away = any(isinstance(t, Elsewhere) for t in given)
     checked = [args[0], *args[2:3]] if name in _INDICES_FROM_ANYWHERE else given  # what is indexed, and what is put
     if away and name not in _MAY_MIX:
-        strangers = [t for t in checked if isinstance(t, Tensor) and not isinstance(t, Elsewhere) and t.dim()]
+        here = [t for t in checked if isinstance(t, Tensor) and not isinstance(t, Elsewhere)]
+        strangers = [t for t in here if t.dim() or name in _NO_SCALARS]
         assert not strangers, f"{name} of tensors on the device and on the processor"
     empty = [t for t in given if t.device.type == DEVICE.type and not isinstance(t, Elsewhere)]
     assert not empty, f"{name} of a tensor made with torch.tensor(..., device=): only .to(device) is seen here"

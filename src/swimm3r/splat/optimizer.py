@@ -23,7 +23,7 @@ class Moments:
 
 def fresh(parameter: Tensor) -> Moments:
     """Moments before the first step."""
-    return Moments(torch.zeros_like(parameter), torch.zeros_like(parameter), torch.zeros(()))
+    return Moments(torch.zeros_like(parameter), torch.zeros_like(parameter), torch.zeros((), device=parameter.device))
 
 
 def adam_step(
