@@ -55,7 +55,8 @@ def test_bins_of_the_gpu_back_end_are_refused_by_the_cpu_kernels(scene: Scene):
 
 def test_a_missing_warp_says_what_to_install(monkeypatch: pytest.MonkeyPatch, scene: Scene):
     p, medium = scene(5, 20, 20)
-    monkeypatch.delitem(sys.modules, "swimm3r.raster.cuda.backend")
+    for name in ("backend", "launch"):
+        monkeypatch.delitem(sys.modules, f"swimm3r.raster.cuda.{name}")
     monkeypatch.delattr(sys.modules["swimm3r.raster.cuda"], "backend")
     monkeypatch.setitem(sys.modules, "warp", None)
     with pytest.raises(DeviceError, match=r"swimm3r\[cuda\]"):

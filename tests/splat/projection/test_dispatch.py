@@ -6,6 +6,7 @@ from typing import Literal
 
 import pytest
 import torch
+from tests.splat.projection.forms import FORMS, form_called
 
 from swimm3r.cameras import Cameras
 from swimm3r.cameras import project as project_points
@@ -78,6 +79,7 @@ def test_what_is_behind_the_camera_is_not_drawn(primitives: Make, camera: Callab
         assert (form(behind, view_camera(camera()), RenderSettings()).primitives.depth == 0).all()
 
 
+@pytest.mark.parametrize("form", FORMS)
 @pytest.mark.parametrize("c", [3, 4])
 @pytest.mark.parametrize("antialiasing", ["mip", "dilation"])
 @pytest.mark.parametrize("covariance", ["symmetric", "upper"])
@@ -85,6 +87,7 @@ def test_the_fast_form_agrees_with_the_plain_one(
     c: int,
     covariance: Literal["symmetric", "upper"],
     antialiasing: Literal["mip", "dilation"],
+    form: str,
     primitives: Make,
     camera: Callable[..., Cameras],
 ):
@@ -97,7 +100,7 @@ def test_the_fast_form_agrees_with_the_plain_one(
         BetaPrimitives(*(t.float() for t in p)),
         replace(view, R=view.R.float(), t=view.t.float(), center=view.center.float()),
     )
-    seen = project(fast_p, fast_view, settings, time)
+    seen = form_called(form).project(fast_p, fast_view, settings, time)
     # nearly singular covariances amplify rounding beyond any tolerance
     tame = (oracle.primitives.conic.detach().abs().amax(-1) < 2) & (oracle.primitives.depth > 0.3)
     assert tame.sum() > 300

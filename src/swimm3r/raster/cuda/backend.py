@@ -1,15 +1,14 @@
 """The CUDA back end: NVIDIA Warp kernels on torch's tensors and current stream."""
 
-from contextlib import AbstractContextManager, nullcontext
 from typing import Any
 
 import torch
-import warp as wp
 from torch import Tensor
 
 from swimm3r.raster import pairmath
 from swimm3r.raster.cuda.bins import bin_primitives
 from swimm3r.raster.cuda.kernels import PASSES, VALUES
+from swimm3r.raster.cuda.launch import launch
 from swimm3r.raster.records import TILE, Bins, MediumMaps, Primitives2D, RasterOutput, SggBuffers
 
 __all__ = ["backward", "bin_primitives", "forward"]
@@ -58,15 +57,6 @@ def backward(
 
 
 def _launch(kernel: Any, bins: Bins, tensors: list[Tensor]) -> None:
-    """One thread per pixel of every tile, on torch's current stream."""
+    """One thread per pixel of every tile."""
     rows, columns = bins.tiles()
-    device = tensors[0].device
-    on_stream: AbstractContextManager[Any] = nullcontext()
-    if device.type == "cuda":
-        on_stream = wp.ScopedStream(wp.stream_from_torch(torch.cuda.current_stream(device)), sync_enter=False)
-    with on_stream:
-        arrays = [wp.from_torch(t.detach(), requires_grad=False) for t in tensors]
-        wp.launch(
-            kernel, dim=(rows * columns, TILE * TILE), inputs=arrays, device=wp.device_from_torch(device),
-            block_dim=TILE * TILE,
-        )  # fmt: skip
+    launch(kernel, (rows * columns, TILE * TILE), tensors, block_dim=TILE * TILE)

@@ -20,12 +20,6 @@ import warp as wp
 from swimm3r.raster import pairmath
 from swimm3r.raster.records import Kernel
 
-# No banner, no "module loaded" lines: they would land in the middle of the command line's progress. The first name is
-# Warp's before 1.19, the second since.
-setattr(wp.config, "quiet", True)  # noqa: B010
-wp.config.log_level = 30
-wp.init()
-
 VALUES = 20
 """Sums per primitive: mean 2, conic 3, color 3, opacity, beta, z through the water, z direct, geo 2, |geo| 2,
 |full| 2, depth branch 2."""

@@ -1,5 +1,7 @@
 """Primitives projected by the fast form where there is one, else by the plain one."""
 
+from types import ModuleType
+
 import torch
 from jaxtyping import Float
 from torch import Tensor
@@ -25,9 +27,8 @@ def project(
         assert isinstance(settings, GaussianRenderSettings)
         return project_gaussians(p, view, settings)
     assert isinstance(settings, RenderSettings)
-    if _has_fast_form(p, settings):
-        return cpu_project.project(p, view, settings, time)
-    return project_plainly(p, view, settings, time)
+    fast = _fast_form(p, settings)
+    return project_plainly(p, view, settings, time) if fast is None else fast.project(p, view, settings, time)
 
 
 def center_gradients(
@@ -41,8 +42,9 @@ def center_gradients(
 
     The direction that primitives are conditioned on follows xyz, as in `project`.
     """
-    if _has_fast_form(p, settings):
-        return cpu_project.center_gradients(p, view, settings, on_plane, time)
+    fast = _fast_form(p, settings)
+    if fast is not None:
+        return fast.center_gradients(p, view, settings, on_plane, time)
     with torch.enable_grad():
         xyz = p.xyz.detach().requires_grad_()
         seen = project_plainly(p._replace(xyz=xyz), view, settings, time).primitives
@@ -51,6 +53,12 @@ def center_gradients(
     return torch.stack(parts, 1)
 
 
-def _has_fast_form(p: BetaPrimitives, settings: RenderSettings) -> bool:
-    on_cpu = p.xyz.device.type == "cpu" and p.xyz.dtype == torch.float32
-    return on_cpu and settings.rotation == "first_order"
+def _fast_form(p: BetaPrimitives, settings: RenderSettings) -> ModuleType | None:
+    """The module that projects them in one pass on their device; None where only the plain form does."""
+    if p.xyz.dtype != torch.float32 or settings.rotation != "first_order":
+        return None
+    if p.xyz.device.type == "cuda":
+        from swimm3r.splat.projection import cuda_project  # needs Warp, as every map on a GPU
+
+        return cuda_project
+    return cpu_project if p.xyz.device.type == "cpu" else None

@@ -30,20 +30,33 @@ def photometric(
     render: Float[Tensor, "3 h w"], target: Float[Tensor, "3 h w"], seen: Bool[Tensor, "*c h w"], ssim_weight: float
 ) -> Photometric:
     """(1 - w) L1 + w (1 - SSIM) (Eq. 14), SSIM zero-padded; pixels or values not `seen` count as matched."""
-    if render.device.type != "cpu" or render.dtype != torch.float32:
-        still = render.detach()
-        target, render = torch.where(seen, target, still), torch.where(seen, render, still)
-        l1, ssim = (render - target).abs().mean(), mean_ssim(render, target)
-        loss = (1 - ssim_weight) * l1 + ssim_weight * (1 - ssim)
-        return Photometric(loss, l1.detach(), ssim.detach())
-    whole = bool(seen.all())  # most images are, and copies of them would take as long as a third of the loss
+    match render.device.type, render.dtype:
+        case "cpu", torch.float32:
+            known, whole = ssim_cpu.photometric, bool(seen.all())  # most are, and a copy takes a third of the time
+        case "cuda", torch.float32:
+            from swimm3r.splat.training import ssim_cuda
+
+            known, whole = ssim_cuda.photometric, False  # the CPU would have to wait for the device to learn it
+        case _:
+            return _photometric_plainly(render, target, seen, ssim_weight)
     if not whole:
         target = torch.where(seen, target, render.detach())
-    l1, ssim, gradient = ssim_cpu.photometric(render, target, ssim_weight)
-    value = torch.tensor((1 - ssim_weight) * l1 + ssim_weight * (1 - ssim))
+    l1, ssim, gradient = known(render, target, ssim_weight)
+    value = torch.as_tensor((1 - ssim_weight) * l1 + ssim_weight * (1 - ssim))
     if not whole:
         gradient = torch.where(seen, gradient, 0.0)
     return Photometric(_KnownGradient.apply(render, value, gradient), l1, ssim)
+
+
+def _photometric_plainly(
+    render: Float[Tensor, "3 h w"], target: Float[Tensor, "3 h w"], seen: Bool[Tensor, "*c h w"], ssim_weight: float
+) -> Photometric:
+    """`photometric` in torch operations, for other devices and precisions, and as the oracle of the fast forms."""
+    still = render.detach()
+    target, render = torch.where(seen, target, still), torch.where(seen, render, still)
+    l1, ssim = (render - target).abs().mean(), mean_ssim(render, target)
+    loss = (1 - ssim_weight) * l1 + ssim_weight * (1 - ssim)
+    return Photometric(loss, l1.detach(), ssim.detach())
 
 
 class _KnownGradient(torch.autograd.Function):
@@ -62,7 +75,7 @@ class _KnownGradient(torch.autograd.Function):
 
 
 def mean_ssim(x: Float[Tensor, "3 h w"], y: Float[Tensor, "3 h w"]) -> Float[Tensor, ""]:
-    """Mean SSIM, 11 x 11 Gaussian window of sigma 1.5, zero padding, in torch operations: the oracle of `ssim_cpu`."""
+    """Mean SSIM, 11 x 11 Gaussian window of sigma 1.5, zero padding, in torch operations."""
     offsets = torch.arange(ssim_cpu.WINDOW, dtype=x.dtype, device=x.device) - ssim_cpu.HALF
     weights = torch.exp(-0.5 * (offsets / ssim_cpu.SIGMA) ** 2)
     window = torch.outer(weights, weights)[None, None] / weights.sum() ** 2

@@ -14,7 +14,7 @@ import warp as wp
 
 from swimm3r.sfm.plane_sweep import pixel_math
 
-setattr(wp.config, "quiet", True)  # noqa: B010  as in raster/cuda/kernels: no banner in the middle of the progress
+setattr(wp.config, "quiet", True)  # noqa: B010  as in raster/cuda/launch: no banner in the middle of the progress
 wp.config.log_level = 30
 wp.init()
 

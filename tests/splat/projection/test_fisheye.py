@@ -1,14 +1,14 @@
-"""The fused projection through a fisheye against the plain one: values, gradients, and where the lens shows nothing."""
+"""The fast forms of the projection through a fisheye against the plain one: values, gradients, what is not shown."""
 
 from collections.abc import Callable
 from dataclasses import replace
 
 import pytest
 import torch
+from tests.splat.projection.forms import FORMS, form_called
 
 from swimm3r.splat.primitives.beta import BetaPrimitives
-from swimm3r.splat.projection import cpu_project
-from swimm3r.splat.projection.dispatch import center_gradients, project
+from swimm3r.splat.projection.dispatch import center_gradients
 from swimm3r.splat.projection.plain import project_plainly
 from swimm3r.splat.projection.view_camera import Projection, ViewCamera
 from swimm3r.splat.settings import RenderSettings
@@ -60,14 +60,15 @@ def gradients(seen: Projection, shown: torch.Tensor, of: list[torch.Tensor]) -> 
     return torch.autograd.grad(total, of, materialize_grads=True)
 
 
+@pytest.mark.parametrize("form", FORMS)
 @pytest.mark.parametrize("c", [3, 4])
 @pytest.mark.parametrize("settings", [RenderSettings(), RenderSettings(covariance="upper", antialiasing="dilation")])
-def test_the_fused_form_agrees_with_the_plain_one(c: int, settings: RenderSettings, primitives: Make):
+def test_the_fast_form_agrees_with_the_plain_one(c: int, settings: RenderSettings, form: str, primitives: Make):
     p, time = seen_all_over(primitives, 700, c), torch.tensor(0.4) if c == 4 else None
     exact_p, exact_view, exact = leaves(p, view())
     oracle = project_plainly(exact_p, exact_view, settings, None if time is None else time.double())
     fast_p, fast_view, fast = leaves(*single(p, view()))
-    seen = cpu_project.project(fast_p, fast_view, settings, time)
+    seen = form_called(form).project(fast_p, fast_view, settings, time)
     tame = (oracle.primitives.conic.detach().abs().amax(-1) < 2) & (oracle.primitives.depth > 0.3)
     assert tame.sum() > 600
     for name, a, b in zip(seen.primitives._fields, seen.primitives, oracle.primitives, strict=True):
@@ -79,16 +80,18 @@ def test_the_fused_form_agrees_with_the_plain_one(c: int, settings: RenderSettin
         assert (a - b).norm() <= 2e-4 * b.norm(), name
 
 
-def test_gradients_of_centers_agree_with_the_plain_ones(primitives: Make):
+@pytest.mark.parametrize("form", FORMS)
+def test_gradients_of_centers_agree_with_the_plain_ones(form: str, primitives: Make):
     p, settings = seen_all_over(primitives, 300), RenderSettings()
     on_plane = torch.randn(300, 2, 3, generator=torch.Generator().manual_seed(1), dtype=DOUBLE)
     expected = center_gradients(p, view(), settings, on_plane)
-    found = center_gradients(*single(p, view()), settings, on_plane.float())
+    found = form_called(form).center_gradients(*single(p, view()), settings, on_plane.float())
     assert (found - expected).norm() <= 1e-4 * expected.norm()
 
 
+@pytest.mark.parametrize("form", FORMS)
 @pytest.mark.parametrize("beside", [0.0, 1e-7, 1e-5, 1e-3, 0.0315, 0.0317, 0.3])
-def test_values_and_gradients_stay_exact_toward_the_axis(beside: float, primitives: Make):
+def test_values_and_gradients_stay_exact_toward_the_axis(beside: float, form: str, primitives: Make):
     cam = view()
     at = torch.tensor([[beside, -0.6 * beside, 1.0]], dtype=DOUBLE) * 2
     xyz = (at - cam.t) @ cam.R
@@ -96,7 +99,7 @@ def test_values_and_gradients_stay_exact_toward_the_axis(beside: float, primitiv
     exact_p, exact_view, exact = leaves(p, cam)
     oracle = project_plainly(exact_p, exact_view, RenderSettings())
     fast_p, fast_view, fast = leaves(*single(p, cam))
-    seen = project(fast_p, fast_view, RenderSettings())
+    seen = form_called(form).project(fast_p, fast_view, RenderSettings())
     for a, b in zip(seen.primitives, oracle.primitives, strict=True):
         torch.testing.assert_close(a, b.float(), rtol=1e-4, atol=1e-5)
     shown = torch.ones(1, dtype=torch.bool)
@@ -104,13 +107,14 @@ def test_values_and_gradients_stay_exact_toward_the_axis(beside: float, primitiv
         torch.testing.assert_close(a, b.float(), rtol=1e-3, atol=1e-3 * float(b.abs().max()) + 1e-6)
 
 
-def test_nothing_shows_beyond_the_angle_at_which_the_image_turns_back_nor_behind(primitives: Make):
+@pytest.mark.parametrize("form", FORMS)
+def test_nothing_shows_beyond_the_angle_at_which_the_image_turns_back_nor_behind(form: str, primitives: Make):
     p = seen_all_over(primitives, 400)
     behind = p.xyz[:100] - 6 * view().R[2]
     p = p._replace(xyz=torch.cat([behind, p.xyz[100:]]))
     hidden = project_plainly(p, view(FOLDING), RenderSettings()).primitives.depth == 0
     fast_p, fast_view, fast = leaves(*single(p, view(FOLDING)))
-    seen = project(fast_p, fast_view, RenderSettings())
+    seen = form_called(form).project(fast_p, fast_view, RenderSettings())
     assert 150 < hidden.sum() < 350
     assert torch.equal(seen.primitives.depth == 0, hidden)
     assert bool((seen.radius[hidden] == 0).all())
@@ -118,4 +122,5 @@ def test_nothing_shows_beyond_the_angle_at_which_the_image_turns_back_nor_behind
     total = sum((values[hidden].sum() for values in (drawn.mean2d, drawn.conic, drawn.depth)), torch.zeros(()))
     assert not any(bool(v.any()) for v in torch.autograd.grad(total, fast, materialize_grads=True))
     on_plane = torch.ones(400, 1, 3)
-    assert not bool(center_gradients(*single(p, view(FOLDING)), RenderSettings(), on_plane)[hidden].any())
+    on_centers = form_called(form).center_gradients(*single(p, view(FOLDING)), RenderSettings(), on_plane)
+    assert not bool(on_centers[hidden].any())
