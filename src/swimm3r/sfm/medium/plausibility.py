@@ -116,7 +116,7 @@ def _undetermined(fit: MediumFit, predicted: bool, linear: MediumFit | None) -> 
         )
     return QualityWarning(
         f"None of the water's coefficients is determined: restored colors (some {factor - 1:.0%} uncertain at the"
-        " middle distance) are not the true ones. The restored frames have more contrast and nearly the hues as filmed;"
+        " middle distance) are not the true ones. The restored frames have more contrast and less of the water's hue;"
         " they are not white-balanced.",
         advice,
     )
