@@ -319,6 +319,27 @@ def test_a_training_that_was_interrupted_goes_on(dive: Path, finished: tuple[Pat
     assert (steps[0], steps[-1]) == (36, 60)
 
 
+def test_a_folder_copied_to_another_computer_goes_on_without_its_input(finished: tuple[Path, dict], tmp_path: Path):
+    copy, gone = tmp_path / "run", tmp_path / "not mounted" / "dive"
+    shutil.copytree(finished[0], copy)
+    summary = json.loads((copy / "summary.json").read_text())
+    summary["input"]["path"] = str(gone)
+    (copy / "summary.json").write_text(json.dumps(summary))
+    longer = replace(TINY_MAP, splat=replace(TINY_MAP.splat, iterations=8))
+    made = run_pipeline(gone, copy, longer, redo=True, last_stage="splat")
+    assert made["stages"]["splat"]["status"] == "done"
+    assert made["input"] == summary["input"]
+    assert digests(copy / "sfm") == digests(finished[0] / "sfm")
+    before = digests(copy)
+    smaller = replace(longer, frames=replace(longer.frames, long_side=160))
+    with pytest.raises(InputError, match="there is no"):
+        run_pipeline(gone, copy, smaller, redo=True)
+    assert digests(copy / "prepare") == digests(finished[0] / "prepare")
+    assert before.keys() == digests(copy).keys()
+    with pytest.raises(InputError, match="there is no"):
+        run_pipeline(gone, tmp_path / "new")
+
+
 def test_another_input_is_refused(finished: tuple[Path, dict], tmp_path: Path):
     other = tmp_path / "other"
     write_dive(DiveSettings(frames=2, width=64, height=48), other)

@@ -117,5 +117,5 @@ def test_a_run_that_was_mapped_without_navigation_is_told_how_to_get_it(tmp_path
         key = stage_keys(record.fingerprint, plain, None)["sfm"]
         record.stage("sfm", key, make=lambda: None)
         with pytest.raises(UsageError, match="mapped with another navigation, or none") as refused:
-            record.make_room(given, None)
+            record.superseded(given, None)
     assert "swimm3r scale" in str(refused.value.hint)

@@ -6,7 +6,7 @@ matching is hard. Stages that a GPU or a network decides are not estimated.
 """
 
 import shutil
-from collections.abc import Iterable
+from collections.abc import Collection
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -14,7 +14,7 @@ from swimm3r.errors import InputError, StorageError
 from swimm3r.io.bags.bag import is_bag
 from swimm3r.io.images import image_size
 from swimm3r.pipeline.presets import RunSettings
-from swimm3r.prepare import check_source
+from swimm3r.prepare import check_source, load_frames
 from swimm3r.prepare.bag_rig import BagRig
 from swimm3r.prepare.clip import open_clip
 from swimm3r.prepare.image_folder import images_of
@@ -93,19 +93,24 @@ def estimate_run(
     source: Path,
     folder: Path,
     settings: RunSettings,
-    stages: Iterable[str] = STAGES,
+    stages: Collection[str] = STAGES,
     *,
     on_cpu: bool = True,
     cores: int | None = None,
 ) -> Estimate | None:
     """The time and disk of some stages of a run; None where the input does not tell how many frames there are.
 
-    `on_cpu` says where maps are trained. Raises InputError where the input cannot be used.
+    Where the frames are not among the stages, those that the folder holds count. `on_cpu` says where maps are trained.
+    Raises InputError where the input cannot be used.
     """
-    found = _frames_to_come(source, folder, settings.frames)
-    if found is None:
-        return None
-    count, (width, height), decoded = found
+    if "prepare" in stages:
+        found = _frames_to_come(source, folder, settings.frames)
+        if found is None:
+            return None
+        count, (width, height), decoded = found
+    else:
+        frames = load_frames(folder / "prepare")
+        count, width, height, decoded = len(frames), frames.width, frames.height, 0.0
     frame = width * height
     wall = 1 / (_PARALLEL * max(1.0, cores if cores is not None else thread_count()))
     tests = count * _TEST_SHARE

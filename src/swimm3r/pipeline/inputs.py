@@ -1,5 +1,6 @@
 """The files that a run is given, looked into before any work is done on them."""
 
+from collections.abc import Collection
 from pathlib import Path
 
 from swimm3r.errors import UsageError
@@ -11,21 +12,26 @@ from swimm3r.prepare.masks import check_masks
 from swimm3r.prepare.rig import NONE, check_rig
 from swimm3r.scale.sources import check_sources
 from swimm3r.scene.ground_truth import FOLDER, GroundTruth, read_ground_truth
+from swimm3r.scene.run_folder import STAGES
 from swimm3r.sfm import ColmapSettings, check_files
 
 
-def check_inputs(source: Path, settings: RunSettings, reference: Path | None = None) -> None:
-    """Raise the error of the first input that cannot be used: InputError, WeightsError or UsageError.
+def check_inputs(
+    source: Path, settings: RunSettings, reference: Path | None = None, stages: Collection[str] = STAGES
+) -> None:
+    """Raise the error of the first input of these stages that cannot be used: InputError, WeightsError or UsageError.
 
     A model is read whole, which takes seconds where preparing frames takes minutes.
     """
-    if is_bag(check_source(source)):
-        open_clip(source, settings.frames)  # its camera is chosen
-    check_masks(settings.frames)
-    check_rig(source, settings.frames)
+    if "prepare" in stages:
+        if is_bag(check_source(source)):
+            open_clip(source, settings.frames)  # its camera is chosen
+        check_masks(settings.frames)
+        check_rig(source, settings.frames)
     _check_adjusted(settings)
     truth_of(source, reference)
-    check_files(settings.sfm)
+    if "sfm" in stages:
+        check_files(settings.sfm)
     check_sources(settings.scale)
 
 

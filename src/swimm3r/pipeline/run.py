@@ -16,17 +16,16 @@ from pathlib import Path
 
 from swimm3r import devices
 from swimm3r.io.files.atomic import write_text
-from swimm3r.io.files.cache_key import sample_digest
 from swimm3r.pipeline import held_out
 from swimm3r.pipeline import summary as sections
 from swimm3r.pipeline.estimate import estimate_run
 from swimm3r.pipeline.inputs import check_inputs, truth_of
 from swimm3r.pipeline.presets import RunSettings, from_yaml, to_yaml
-from swimm3r.pipeline.run_record import RunRecord, open_record, stage_keys
+from swimm3r.pipeline.run_record import RunRecord, input_fingerprint, open_record, stage_keys
 from swimm3r.pipeline.run_settings import navigation_of_mapping
 from swimm3r.pipeline.scoring import MappedRun, Protocol, film_flight, score_map, score_restored_frames, start_poses
 from swimm3r.pipeline.stage_start import StageStart, ignore_stages
-from swimm3r.prepare import check_source, load_frames, read_frames
+from swimm3r.prepare import load_frames, read_frames
 from swimm3r.progress import Progress, silent, watched
 from swimm3r.report import write_report
 from swimm3r.scale.navigation.navigator import NavigationFile
@@ -79,6 +78,7 @@ def run_pipeline(
     `settings` are a preset's (`swimm3r.PRESETS["fast"]`), or changed from one. Without them the run goes by those that
     the folder holds, a new one by the defaults. Stages made with other settings are refused, or with `redo` moved to
     `folder`/old and made again. `reference` is a cameras.json to score against; a synthetic dive brings its own truth.
+    An input may be gone once its frames are prepared, as where the folder was copied to another computer.
     `map_device` is where the map is trained and rendered. A rough estimate of time and disk is logged first, and
     `on_stage` is told of every stage that starts, `observer` of every step of the map's training. A terminal or a
     notebook shows how far it is, unless `progress` is given (`swimm3r.silent`: nothing). `engine` can spread chunks of
@@ -89,17 +89,17 @@ def run_pipeline(
     far too small.
     """
     source, folder = Path(source), Path(folder)
-    check_source(source)
+    digest = input_fingerprint(source, folder)
     device = devices.for_maps(map_device)  # before there is a folder, and minutes of structure from motion
-    digest = sample_digest(source, leave_out=folder)
     with watched(progress) as told, open_record(folder, source, digest, redo=redo) as record:
         settings, reference = record.settle(settings, reference, last_stage)
-        check_inputs(source, settings, reference)
-        record.make_room(settings, reference)
+        superseded = record.superseded(settings, reference)
+        to_do = record.to_do(stage_keys(record.fingerprint, settings, reference))
+        check_inputs(source, settings, reference, to_do)
+        record.set_aside(superseded)
         record.write()
         write_text(folder / "settings.yaml", to_yaml(settings))
         write_text(folder / "versions.json", json.dumps(_versions(), indent=2) + "\n")
-        to_do = record.to_do(stage_keys(record.fingerprint, settings, reference))
         plan = estimate_run(source, folder, settings, to_do, on_cpu=device.type == "cpu")
         record.announce(plan, on_stage)
         _make_stages(record, source, settings, reference, last_stage, map_device, told, observer, engine)

@@ -16,7 +16,7 @@ from typing import Any, TypeVar
 
 from swimm3r.errors import DeviceError, InputError, StorageError, Swimm3rError, UsageError
 from swimm3r.io.files.atomic import remove_drafts, write_text
-from swimm3r.io.files.cache_key import cache_key
+from swimm3r.io.files.cache_key import cache_key, sample_digest
 from swimm3r.io.files.folder_lock import folder_lock
 from swimm3r.io.files.outputs import check_file, output_folder
 from swimm3r.memory import available_mb, peak_mb, return_freed
@@ -24,6 +24,7 @@ from swimm3r.pipeline.estimate import Estimate, check_disk, duration, size
 from swimm3r.pipeline.presets import RunSettings, from_yaml
 from swimm3r.pipeline.run_settings import differences, settings_by_stage, with_stages_of
 from swimm3r.pipeline.stage_start import StageStart, ignore_stages
+from swimm3r.prepare import check_source
 from swimm3r.products.record import summary_section
 from swimm3r.scale.rescale import finish_rescale
 from swimm3r.scene.run_folder import MARKERS, SCHEMA, STAGES, RunFolder, StageRecord, check_vacant, is_run, read_run
@@ -51,6 +52,21 @@ _TELLING_S = 20.0  # shorter stages say little about the speed of this computer
 _MOST_OFF = 4.0  # factor; one slow stage is not taken for all
 _SPARE_BYTES = 64 << 20  # below this a stage is not begun: COLMAP's database does not survive a full disk
 _SPARE_MB = 500.0  # of memory; with less, OpenBLAS ends the process, which nothing in it can catch
+
+
+def input_fingerprint(source: Path, folder: Path) -> str:
+    """Digest of an input's files.
+
+    Of an input that is not on this computer it is the one the folder holds, where the folder is a run of it whose
+    frames are prepared. Raises InputError where the input cannot be used.
+    """
+    if not source.exists() and is_run(folder):
+        run = read_run(folder)
+        if Path(run.input.path) == source and run.is_finished("prepare"):
+            log.info("%s is not on this computer: the run goes on with the frames of %s", source, folder / "prepare")
+            return run.input.fingerprint
+    check_source(source)
+    return sample_digest(source, leave_out=folder)
 
 
 @contextmanager
@@ -138,16 +154,16 @@ class RunRecord:
         if warning := check_disk(plan, self.folder):
             log.warning("%s", warning)
 
-    def make_room(self, settings: RunSettings, reference: Path | None) -> None:
-        """Have no stage in the folder that was made with other settings than these.
+    def superseded(self, settings: RunSettings, reference: Path | None) -> tuple[str, ...]:
+        """The stages in the folder that were made with other settings than these, and those made from them.
 
-        Raises UsageError where there is one and the record was not opened with `redo`, which moves it to old/.
+        Raises UsageError where there are some and the record was not opened with `redo`.
         """
         keys = stage_keys(self.fingerprint, settings, reference)
         made = {name: record for name in STAGES if (record := self._stage(name)) is not None}
         changed = [name for name, record in made.items() if record.key != keys[name]]
         if not changed:
-            return
+            return ()
         held = self._held(False)
         listed = [] if held is None else differences(held, settings, list(made))
         scored = made.get("eval")
@@ -158,13 +174,19 @@ class RunRecord:
             log.warning("%s was made by another version; its finished stages are kept", self.folder)
             for name in changed:
                 self.summary["stages"][name]["key"] = keys[name]
-            return
-        superseded = STAGES[STAGES.index(changed[0]) :]
+            return ()
+        found = STAGES[STAGES.index(changed[0]) :]
         if not self._redo:
-            raise _superseded(self.folder, [name for name in made if name in superseded], listed)
-        target = _set_aside(self.folder, superseded)
-        self._log("moved", stages=list(superseded), to=str(target.relative_to(self.folder)))
-        for stage in superseded:
+            raise _superseded(self.folder, [name for name in made if name in found], listed)
+        return found
+
+    def set_aside(self, stages: Sequence[str]) -> None:
+        """Move what these stages made to old/."""
+        if not stages:
+            return
+        target = _set_aside(self.folder, stages)
+        self._log("moved", stages=list(stages), to=str(target.relative_to(self.folder)))
+        for stage in stages:
             self.summary["stages"].pop(stage, None)
         self.summary.pop(_OTHERS, None)
         self.write()
