@@ -257,7 +257,7 @@ class _Project(torch.autograd.Function):
     def forward(
         ctx: Any, view: ViewCamera, settings: RenderSettings, moment: Tensor, *tensors: Tensor
     ) -> tuple[Tensor, ...]:
-        given, kernel, lens = _given(tensors, moment), _of(view), _lens(view, settings)
+        given, kernel, lens = _given(tensors, moment), _kernel_for(view), _lens(view, settings)
         xyz = given[0]
         out = [xyz.new_empty(len(xyz), *shape) for shape in ((2,), (3,), (), (), (), ())]
         with torch_stream(xyz.device):
@@ -292,7 +292,7 @@ def _adjoint(
         )  # fmt: skip
 
 
-def _of(view: ViewCamera) -> Any:
+def _kernel_for(view: ViewCamera) -> Any:
     return PINHOLE if view.fisheye is None else FISHEYE
 
 
@@ -346,7 +346,7 @@ def center_gradients(
 ) -> Float[Tensor, "n k 3"]:
     """`dispatch.center_gradients` for float32 on a GPU."""
     moment, tensors = _inputs(p, view, time)
-    given, kernel, lens = _given(tensors, moment), _of(view), _lens(view, settings)
+    given, kernel, lens = _given(tensors, moment), _kernel_for(view), _lens(view, settings)
     found = torch.zeros(on_plane.shape[1], *p.xyz.shape, device=p.xyz.device)
     for by_xyz, v in zip(found, on_plane.detach().unbind(1), strict=True):
         on_centers = [v[:, :2].contiguous(), None, None, None, v[:, 2].contiguous()]
