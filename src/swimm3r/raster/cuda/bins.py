@@ -8,7 +8,7 @@ from swimm3r.raster.records import TILE, Bins, Kernel, Primitives2D
 def bin_primitives(p: Primitives2D, height: int, width: int, alpha_min: float, kernel: Kernel) -> Bins:
     """Tile lists on the primitives' device: every tile of which an ellipse may cover a pixel.
 
-    They list some tiles in a thousand more than the CPU's, which asks strips of four rows (`raster.cpu.bins.span`).
+    They list a few in ten thousand more than the CPU's, which asks strips of four rows (`raster.cpu.bins.span`).
     The host waits twice: for the number of tiles around the primitives, and for that of those they touch.
     """
     n, device = len(p.depth), p.depth.device
