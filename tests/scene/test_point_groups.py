@@ -52,22 +52,8 @@ def test_the_nearest_point_of_each_square_of_pixels_gives_its_depth():
         assert torch.equal(found[rows::2, columns::2], expected)
 
 
-def test_the_nearest_point_of_each_square_of_pixels_gives_its_depth():
-    camera = camera_at(-9.0)
-    found = PointGroups(POINTS).z_depth(camera)
-    pixels, z, visible = project_visible(camera, POINTS[None].double())
-    expected = torch.full((120, 160), torch.inf)
-    for (x, y), depth in zip(pixels[visible].tolist(), z[visible].float().tolist(), strict=True):
-        expected[int(y / 2), int(x / 2)] = min(expected[int(y / 2), int(x / 2)], depth)
-    expected = torch.where(expected.isfinite(), expected, 0.0)
-    assert (expected > 0).sum() > 20
-    for rows, columns in ((0, 0), (0, 1), (1, 0), (1, 1)):
-        assert torch.equal(found[rows::2, columns::2], expected)
-
-
 def test_none_are_found_among_none():
     groups = PointGroups(torch.zeros(0, 3))
     assert groups.within(torch.zeros(3), 5.0).shape == (0, 3)
     assert groups.before(camera_at(0.0)).shape == (0, 3)
-    assert not groups.z_depth(camera_at(0.0)).any()
     assert not groups.z_depth(camera_at(0.0)).any()

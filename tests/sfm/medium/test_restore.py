@@ -131,28 +131,6 @@ def test_filling_follows_depth_that_other_images_measured():
     assert (alone / z).log().abs()[:, 52:].min() > 0.5
 
 
-def test_filling_goes_on_as_planes_beyond_the_nearest_and_the_farthest_known():
-    inverse = torch.linspace(0.2, 1.0, 72)[:, None].expand(72, 96)
-    known = (inverse > 0.4) & (inverse < 0.8)
-    depth = DepthMap(torch.where(known, 1 / inverse, 0.0), known.float())
-    filled = fill_z_depth(torch.full((72, 96, 3), 0.5), depth, torch.zeros(72, 96))
-    assert ((filled * inverse).log().abs()).max() < 0.1
-
-
-def test_filling_follows_depth_that_other_images_measured(dive):
-    z = torch.full((72, 96), 1.0)
-    z[:, 48:] = 3.0
-    known = torch.zeros(72, 96, dtype=torch.bool)
-    known[:, :32] = True
-    depth, image = DepthMap(torch.where(known, z, 0.0), known.float()), torch.full((72, 96, 3), 0.5)
-    image[:, 48:] = 0.2
-    elsewhere = torch.where(torch.rand(72, 96, generator=torch.Generator().manual_seed(1)) < 0.1, z, 0.0)
-    alone, told = (fill_z_depth(image, depth, torch.zeros(72, 96), hints) for hints in (None, elsewhere))
-    assert torch.equal(told[known], z[known])
-    assert (told / z).log().abs()[:, 52:].max() < 0.1
-    assert (alone / z).log().abs()[:, 52:].min() > 0.5
-
-
 def test_open_water_is_found_above_the_horizon_and_nowhere_else(teal):
     image, depth = horizon_image(teal)
     mask = open_water_mask(image, depth.z_depth)
