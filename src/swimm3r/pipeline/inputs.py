@@ -1,10 +1,12 @@
 """The files that a run is given, looked into before any work is done on them."""
 
+import logging
 from collections.abc import Collection
 from pathlib import Path
 
 from swimm3r.errors import UsageError
 from swimm3r.io.bags.bag import is_bag
+from swimm3r.io.files.cache_key import sample_digest
 from swimm3r.pipeline.presets import RunSettings
 from swimm3r.prepare import check_source
 from swimm3r.prepare.clip import open_clip
@@ -12,8 +14,25 @@ from swimm3r.prepare.masks import check_masks
 from swimm3r.prepare.rig import NONE, check_rig
 from swimm3r.scale.sources import check_sources
 from swimm3r.scene.ground_truth import FOLDER, GroundTruth, read_ground_truth
-from swimm3r.scene.run_folder import STAGES
+from swimm3r.scene.run_folder import STAGES, is_run, read_run
 from swimm3r.sfm import ColmapSettings, check_files
+
+log = logging.getLogger(__name__)
+
+
+def input_fingerprint(source: Path, folder: Path) -> str:
+    """Digest of an input's files.
+
+    Of an input that is not on this computer it is the one the folder holds, where the folder is a run of it whose
+    frames are prepared. Raises InputError where the input cannot be used.
+    """
+    if not source.exists() and is_run(folder):
+        run = read_run(folder)
+        if Path(run.input.path) == source and run.is_finished("prepare"):
+            log.info("%s is not on this computer: the run goes on with the frames of %s", source, folder / "prepare")
+            return run.input.fingerprint
+    check_source(source)
+    return sample_digest(source, leave_out=folder)
 
 
 def check_inputs(

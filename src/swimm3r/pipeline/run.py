@@ -19,9 +19,9 @@ from swimm3r.io.files.atomic import write_text
 from swimm3r.pipeline import held_out
 from swimm3r.pipeline import summary as sections
 from swimm3r.pipeline.estimate import estimate_run
-from swimm3r.pipeline.inputs import check_inputs, truth_of
+from swimm3r.pipeline.inputs import check_inputs, input_fingerprint, truth_of
 from swimm3r.pipeline.presets import RunSettings, from_yaml, to_yaml
-from swimm3r.pipeline.run_record import RunRecord, input_fingerprint, open_record, stage_keys
+from swimm3r.pipeline.run_record import RunRecord, open_record, stage_keys
 from swimm3r.pipeline.run_settings import navigation_of_mapping
 from swimm3r.pipeline.scoring import MappedRun, Protocol, film_flight, score_map, score_restored_frames, start_poses
 from swimm3r.pipeline.stage_start import StageStart, ignore_stages

@@ -16,7 +16,7 @@ from typing import Any, TypeVar
 
 from swimm3r.errors import DeviceError, InputError, StorageError, Swimm3rError, UsageError
 from swimm3r.io.files.atomic import remove_drafts, write_text
-from swimm3r.io.files.cache_key import cache_key, sample_digest
+from swimm3r.io.files.cache_key import cache_key
 from swimm3r.io.files.folder_lock import folder_lock
 from swimm3r.io.files.outputs import check_file, output_folder
 from swimm3r.memory import available_mb, peak_mb, return_freed
@@ -24,7 +24,6 @@ from swimm3r.pipeline.estimate import Estimate, check_disk, duration, size
 from swimm3r.pipeline.presets import RunSettings, from_yaml
 from swimm3r.pipeline.run_settings import differences, settings_by_stage, with_stages_of
 from swimm3r.pipeline.stage_start import StageStart, ignore_stages
-from swimm3r.prepare import check_source
 from swimm3r.products.record import summary_section
 from swimm3r.scale.rescale import finish_rescale
 from swimm3r.scene.run_folder import MARKERS, SCHEMA, STAGES, RunFolder, StageRecord, check_vacant, is_run, read_run
@@ -52,21 +51,6 @@ _TELLING_S = 20.0  # shorter stages say little about the speed of this computer
 _MOST_OFF = 4.0  # factor; one slow stage is not taken for all
 _SPARE_BYTES = 64 << 20  # below this a stage is not begun: COLMAP's database does not survive a full disk
 _SPARE_MB = 500.0  # of memory; with less, OpenBLAS ends the process, which nothing in it can catch
-
-
-def input_fingerprint(source: Path, folder: Path) -> str:
-    """Digest of an input's files.
-
-    Of an input that is not on this computer it is the one the folder holds, where the folder is a run of it whose
-    frames are prepared. Raises InputError where the input cannot be used.
-    """
-    if not source.exists() and is_run(folder):
-        run = read_run(folder)
-        if Path(run.input.path) == source and run.is_finished("prepare"):
-            log.info("%s is not on this computer: the run goes on with the frames of %s", source, folder / "prepare")
-            return run.input.fingerprint
-    check_source(source)
-    return sample_digest(source, leave_out=folder)
 
 
 @contextmanager

@@ -27,12 +27,23 @@ def test_the_kernels_compile_ahead_of_time_without_a_gpu(arch: int, tmp_path: Pa
     assert ".local" not in ptx
 
 
-def test_a_gradient_that_nobody_wants_is_not_made(primitives: Make, camera: Callable[..., Cameras]):
+def test_a_gradient_that_nobody_wants_is_not_made(
+    primitives: Make, camera: Callable[..., Cameras], monkeypatch: pytest.MonkeyPatch
+):
+    made: list[bool] = []
+    adjoint = cuda_project._adjoint
+
+    def seen_adjoint(kernel, lens, given, on_plane, found) -> None:
+        made.extend(values is not None for values in found)
+        adjoint(kernel, lens, given, on_plane, found)
+
+    monkeypatch.setattr(cuda_project, "_adjoint", seen_adjoint)
     p = BetaPrimitives(*(t.float() for t in primitives(40)))
     xyz = p.xyz.clone().requires_grad_()
     seen = cuda_project.project(p._replace(xyz=xyz), view_camera(camera()), RenderSettings())
     seen.primitives.depth.sum().backward()
     assert bool(xyz.grad.any())
+    assert made == [True] + [False] * 10
     assert not seen.radius.requires_grad
 
 
