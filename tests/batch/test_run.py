@@ -2,7 +2,6 @@
 
 import csv
 import json
-import os
 from collections.abc import Callable
 from dataclasses import replace
 from importlib.util import find_spec
@@ -186,5 +185,5 @@ def test_a_dive_is_finished_where_it_has_the_scale_of_its_sources(tapes: Path, t
     scale_run(run, given.settings.scale)
     assert is_finished(given, tmp_path, "sfm")
     assert is_finished(plain, tmp_path, "sfm")
-    os.utime(file, (1, 1))
+    file.write_text(file.read_text().replace("5", "6"))
     assert not is_finished(given, tmp_path, "sfm")

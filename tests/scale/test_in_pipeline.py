@@ -13,7 +13,7 @@ from tests.scale.test_rescale import write_run
 from swimm3r.errors import InputError, UsageError
 from swimm3r.io.images import write_rgb
 from swimm3r.pipeline.presets import PRESETS, RunSettings, from_yaml, to_yaml
-from swimm3r.pipeline.run import _scaled, run_pipeline
+from swimm3r.pipeline.run import _keeps_its_scale, _scaled, run_pipeline
 from swimm3r.pipeline.run_record import _set_aside, open_record, stage_keys
 from swimm3r.pipeline.run_settings import differences
 from swimm3r.progress import silent
@@ -55,12 +55,26 @@ def test_a_run_applies_its_sources_once_and_again_where_their_files_change(run, 
     assert record.metres_per_unit == pytest.approx(SCALE, rel=1e-6)
     local = survey.geodetic(survey.position * 1.02)
     write_csv(file, survey, latitude=local[:, 0], longitude=local[:, 1], depth=-local[:, 2])
-    os.utime(file, (1, 1))
     assert scaled(run, settings)
     assert read_record(run).metres_per_unit == pytest.approx(1.02 * SCALE, rel=1e-5)
     summary = json.loads((run / "summary.json").read_text())
     assert summary["scale"]["metres_per_unit"] == pytest.approx(1.02 * SCALE, rel=1e-5)
     assert summary["water"]["unit"] == "1/m"
+
+
+def test_a_scaled_run_keeps_its_scale_where_the_files_of_its_sources_are_not(run, survey, tmp_path):
+    file = write_csv(tmp_path / "nav.csv", survey)
+    settings = RunSettings(scale=ScaleSettings(nav=file, nav_offset=0.0))
+    assert not _keeps_its_scale(run, settings, ["splat"])
+    scaled(run, settings.scale)
+    os.utime(file, (1, 1))  # as a copy may have it
+    assert _keeps_its_scale(run, settings, ["splat"])
+    assert not _keeps_its_scale(run, settings, ["sfm", "splat"])
+    file.unlink()
+    assert _keeps_its_scale(run, settings, ["splat"])
+    assert not scaled(run, settings.scale)
+    other = replace(settings, scale=replace(settings.scale, nav=tmp_path / "other.csv"))
+    assert not _keeps_its_scale(run, other, ["splat"])
 
 
 def test_a_run_finishes_a_rescaling_that_was_interrupted(run):

@@ -36,11 +36,17 @@ def input_fingerprint(source: Path, folder: Path) -> str:
 
 
 def check_inputs(
-    source: Path, settings: RunSettings, reference: Path | None = None, stages: Collection[str] = STAGES
+    source: Path,
+    settings: RunSettings,
+    reference: Path | None = None,
+    stages: Collection[str] = STAGES,
+    *,
+    scaled: bool = False,
 ) -> None:
     """Raise the error of the first input of these stages that cannot be used: InputError, WeightsError or UsageError.
 
-    A model is read whole, which takes seconds where preparing frames takes minutes.
+    A model is read whole, which takes seconds where preparing frames takes minutes. Of a `scaled` run the files that
+    tell scale and place are not looked for.
     """
     if "prepare" in stages:
         if is_bag(check_source(source)):
@@ -51,7 +57,8 @@ def check_inputs(
     truth_of(source, reference)
     if "sfm" in stages:
         check_files(settings.sfm)
-    check_sources(settings.scale)
+    if not scaled:
+        check_sources(settings.scale)
 
 
 def _check_adjusted(settings: RunSettings) -> None:

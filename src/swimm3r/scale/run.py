@@ -6,14 +6,16 @@ all; the same sources again give a factor of 1, and nothing is written but the r
 
 import json
 import math
-from dataclasses import asdict, dataclass, replace
+from collections.abc import Mapping
+from dataclasses import asdict, dataclass, field, replace
 from pathlib import Path
+from types import MappingProxyType
 from typing import Any
 
 import numpy as np
 
 from swimm3r.errors import UsageError
-from swimm3r.io.files.cache_key import cache_key
+from swimm3r.io.files.cache_key import cache_key, content_digest, sample_digest
 from swimm3r.io.files.damage import Remedy
 from swimm3r.io.files.folder_lock import folder_lock
 from swimm3r.io.files.json_file import read_json
@@ -30,6 +32,8 @@ from swimm3r.sfm.rectified import run_frames
 
 SCALE = "scale.json"
 _SAME = 1e-9  # of a factor: the same sources again, by other roundings
+_FILES = ("points", "distances", "marker_file", "laser_dots", "nav", "control")  # settings that name a file
+_READ_WHOLE = 64 << 20  # bytes; bags, and folders of images, are told apart by samples
 _REMEDY = Remedy("swimm3r scale RUN with the sources it was made from writes it again")
 
 
@@ -40,6 +44,7 @@ class ScaleRecord:
     key: str
     metres_per_unit: float  # of the result of structure from motion
     section: dict[str, Any]
+    sources: dict[str, str] = field(default_factory=dict)  # a digest of each file, by the setting that names it
 
 
 def scale_run(folder: Path, settings: ScaleSettings, progress: Progress = silent) -> dict[str, Any]:
@@ -85,7 +90,8 @@ def scale_folder(folder: Path, run: RunFolder, settings: ScaleSettings, progress
     georeference = replace(found.georeference, scale=1.0)
     section = scale_section(found, georeference, factor, total)
     summary = _summary(run.sections, rec, factor, section)
-    new_record = ScaleRecord(source_key(run, settings), total, section)
+    digests = _digests(settings)
+    new_record = ScaleRecord(_key(run, settings, digests), total, section, digests)
     texts = {
         GEOREFERENCE: _json(asdict(georeference)),
         SCALE: _json(asdict(new_record)),
@@ -104,17 +110,31 @@ def read_record(folder: Path) -> ScaleRecord | None:
 
 
 def is_scaled(folder: Path, run: RunFolder, settings: ScaleSettings) -> bool:
-    """Return whether a run has the unit and the place that these sources give, whose files are as they were."""
+    """Return whether a run has the unit and the place that these sources give.
+
+    Their files are as they were, or not on this computer, as where the folder was copied to another.
+    """
     record = read_record(folder)
-    return record is not None and record.key == source_key(run, settings)
+    return record is not None and record.key == _key(run, settings, _digests(settings, record.sources))
 
 
-def source_key(run: RunFolder, settings: ScaleSettings) -> str:
-    """A digest of settings, of the files they name, and of what they are about."""
-    files = [getattr(settings, name) for name in ("points", "distances", "marker_file", "laser_dots", "nav", "control")]
-    stats = [(path.stat().st_size, path.stat().st_mtime_ns) for path in files if path is not None and path.exists()]
+def _key(run: RunFolder, settings: ScaleSettings, digests: Mapping[str, str]) -> str:
+    """A digest of settings, of the files they name, and of the result that they are about."""
     values = {name: str(value) for name, value in asdict(settings).items()}
-    return cache_key(values, stats, run.stages["sfm"].key)[:16]
+    return cache_key(values, dict(digests), run.stages["sfm"].key)[:16]
+
+
+def _digests(settings: ScaleSettings, missing: Mapping[str, str] = MappingProxyType({})) -> dict[str, str]:
+    """Of the content of each file that settings name; of those that are not on this computer, the given ones."""
+    found = {name: _digest(path) or missing.get(name) for name in _FILES if (path := getattr(settings, name))}
+    return {name: digest for name, digest in found.items() if digest is not None}
+
+
+def _digest(path: Path) -> str | None:
+    if not path.exists():
+        return None
+    whole = path.is_file() and path.stat().st_size <= _READ_WHOLE
+    return content_digest(path) if whole else sample_digest(path)
 
 
 def scale_sections(folder: Path, rec: Reconstruction) -> dict[str, Any]:
