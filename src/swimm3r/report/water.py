@@ -81,7 +81,8 @@ def restored_as(fit: MediumFit) -> str:
     """The difference between restored and filmed frames, which depends on the knowledge of the water."""
     if attenuation_is_a_guess(fit):
         return "left as filmed: the water is not determined"
-    return "without the water" + (", white-balanced for display" if any_determined(fit) else ", not white-balanced")
+    balance = "white-balanced for display" if any_determined(fit) else "of a hue between that as filmed and gray"
+    return f"without the water, {balance}"
 
 
 def _table(fit: MediumFit, metric: bool) -> Table:

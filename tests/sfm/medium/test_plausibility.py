@@ -22,7 +22,7 @@ from swimm3r.sfm.medium.plausibility import (
     water_warnings,
     with_like_channels,
 )
-from swimm3r.sfm.medium.restore import RestoredImage, display_gains, restore_image, white_balance
+from swimm3r.sfm.medium.restore import RestoredImage, display_gains, milder_gains, restore_image, white_balance
 from swimm3r.sfm.settings import ColmapSettings, RestoreSettings, TrackSettings
 
 TINT = torch.tensor([0.6, 1.0, 0.9])
@@ -125,7 +125,7 @@ def test_attenuation_that_is_a_guess_in_every_channel_is_said_with_its_size_and_
 def test_curves_without_a_determined_coefficient_are_said_to_give_no_true_colors(teal):
     fit = fit_of(teal, 0.1, known=False)
     assert not attenuation_is_a_guess(fit)
-    assert "not white-balanced" in said(fit)
+    assert "not balanced to gray" in said(fit)
     assert "11% uncertain" in said(fit)
     fit.identifiable["beta_D"][2] = True
     assert said(fit) == ""
@@ -201,10 +201,34 @@ def test_where_nothing_of_the_water_is_determined_frames_are_not_balanced_to_neu
     dive, tmp_path: Path, monkeypatch
 ):
     unsure = written(dive, fit_of(dive.medium, 0.1, known=False), tmp_path, monkeypatch)
-    assert abs(unsure["shown"] - unsure["physical"]).max() < 1 / 255
     assert abs(unsure["shown"] - unsure["filmed"]).mean() > 0.02
     sure = written(dive, fit_of(dive.medium, 0.1, known=True), tmp_path, monkeypatch)
-    assert (sure["shown"] - sure["physical"])[..., 0].mean() > 0.02
+    assert abs(sure["shown"] - unsure["shown"]).mean() > 0.01
+
+
+FILMED = torch.linspace(0.1, 0.5, 300)[:, None]
+
+
+@pytest.mark.parametrize(
+    ("filmed", "restored", "shown"),
+    [
+        ((1, 1, 1), (1.4, 1, 0.8), (1, 1, 1)),  # balanced for the water by the camera
+        ((1, 1, 1.2), (1.4, 1, 1), (1, 1, 1)),  # beyond gray, not on the way to it: checked below
+        ((0.6, 1, 1), (0.8, 1, 1), (0.8, 1, 1)),  # on its way to gray, as far as the water explains
+        ((0.6, 1, 1), (1.5, 1, 1), (1, 1, 1)),  # through gray
+        ((1, 1, 0.8), (1, 1, 0.6), (1, 1, 0.8)),  # away from gray
+    ],
+)
+def test_hues_of_undetermined_water_are_the_grayest_between_filmed_and_restored(filmed, restored, shown):
+    a, b, c = (torch.tensor(tint, dtype=torch.float32) for tint in (filmed, restored, shown))
+    found = b * milder_gains(FILMED * a, FILMED * b)
+    hue = [tint.log() - tint.log().mean() for tint in (a, b, found)]
+    assert hue[2].norm() <= min(hue[0].norm(), hue[1].norm()) + 1e-4
+    along = (hue[2] - hue[0]).norm() + (hue[1] - hue[2]).norm()
+    assert along == pytest.approx(float((hue[1] - hue[0]).norm()), abs=1e-4)  # on the line between the two
+    if filmed != (1, 1, 1.2):
+        torch.testing.assert_close(found / found.mean(), c / c.mean(), atol=2e-3, rtol=0)
+    torch.testing.assert_close(found.log().mean(), b.log().mean(), atol=1e-4, rtol=0)  # as bright
 
 
 def test_gains_need_water_that_is_determined_and_somebody_who_wants_them(dive):
@@ -214,7 +238,10 @@ def test_gains_need_water_that_is_determined_and_somebody_who_wants_them(dive):
     torch.testing.assert_close(white_balance(rec, RestoreSettings()).factors, display_gains(cloud.restored))
     assert white_balance(rec, RestoreSettings(white_balance=False)) == WhiteBalance()
     unsure = replace(rec, medium=fit_of(dive.medium, 0.1, known=False))
-    assert white_balance(unsure, RestoreSettings()) == WhiteBalance()
+    torch.testing.assert_close(
+        white_balance(unsure, RestoreSettings()).factors, milder_gains(cloud.raw, cloud.restored)
+    )
+    assert white_balance(unsure, RestoreSettings(white_balance=False)) == WhiteBalance()
     guessed = replace(rec, medium=fit_of(dive.medium, 0.9, known=False))
     assert white_balance(guessed, RestoreSettings()) == WhiteBalance(source="filmed")
 

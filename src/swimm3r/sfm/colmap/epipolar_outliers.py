@@ -21,14 +21,16 @@ if TYPE_CHECKING:
 
 _FEW = 15  # matches below which a pair is not asked; skerki_survey has wrong pairs with 15 to 26
 _SURE = 15  # matches beyond those, from which on a pair counts fully
-_AGREES = 2.0  # mean reprojection errors, a pixel at least: the median distance from the lines that a right pair keeps
+_AGREES = 2.0  # mean reprojection errors: the median distance from the lines that a right pair keeps
+_LEAST = 1 / 640  # of the longer side, granted as a pixel is: a lens not yet refined errs with the size of the image
 _MOST = 0.7  # share of a frame's pairs that must agree, by what they count
 _KEPT = 0.3  # share of the frames that must be left to build upon, else nothing is said
 
 
 def contradicting_frames(store: FeatureDatabase, model: "pycolmap.Reconstruction") -> list[int]:
     """Image ids of registered frames that stand against their own pairs; none where too few would be left."""
-    limit = max(1.0, _AGREES * model.compute_mean_reprojection_error())
+    camera = model.cameras[1]
+    limit = max(1.0, _LEAST * max(camera.width, camera.height), _AGREES * model.compute_mean_reprojection_error())
     partners: defaultdict[int, dict[int, _Verdict]] = defaultdict(dict)
     for (i, j), pair in checked_pairs(store, model).items():
         partners[i][j] = partners[j][i] = _Verdict(pair.distance < limit, pair.weight)

@@ -3,7 +3,8 @@
 Coefficients trade against each other where the depths span a short range, while T_D and B within that range may still
 be right. So images are judged by the standard deviation of the optical depth (beta_D z at the middle z of the fit),
 and true colors by whether any coefficient is identifiable at all. Where none is, the water acts on all channels alike
-as far as nothing tells them apart (`with_like_channels`), so that images keep the hues they were filmed in.
+as far as nothing tells them apart (`with_like_channels`), and images change their hue toward gray at most
+(`restore.milder_gains`).
 """
 
 from dataclasses import replace
@@ -116,8 +117,8 @@ def _undetermined(fit: MediumFit, predicted: bool, linear: MediumFit | None) -> 
         )
     return QualityWarning(
         f"None of the water's coefficients is determined: restored colors (some {factor - 1:.0%} uncertain at the"
-        " middle distance) are not the true ones. The restored frames have more contrast and less of the water's hue;"
-        " they are not white-balanced.",
+        " middle distance) are not the true ones. The restored frames have more contrast, and less of the water's hue"
+        " as far as that brings them nearer to gray; they are not balanced to gray.",
         advice,
     )
 

@@ -11,7 +11,7 @@ Where T_D is small the quotient is noise, so per channel with s = T_D:
 
 Under a lamp on the camera T_D is the share of its light that arrives (`MediumFit.at`), so that J is evenly lit. Near
 the camera all weights are 1 and J is the plain inverse. Nothing is stretched; white balance serves the eye alone, and
-only where the frames say which colors the water took (`plausibility`).
+leads less far where the frames do not say which colors the water took (`plausibility`).
 """
 
 from collections.abc import Callable, Iterator
@@ -140,32 +140,56 @@ def restore_image(
 
 
 def white_balance(rec: Reconstruction, settings: RestoreSettings) -> WhiteBalance:
-    """The one balance of a dive with a restored cloud (`display_gains`).
+    """The one balance of a dive with a restored cloud: gray on average (`display_gains`).
 
-    Gains are ones where nobody asked for any, and where the frames determine nothing of the water: neutral grays would
-    pass for the true colors of surfaces. Where the light lost on the way is a guess, colors are shown as filmed.
+    Where the frames determine nothing of the water, neutral grays would pass for the true colors of surfaces: what it
+    says of the hue is believed as far as it leads toward gray (`milder_gains`). Where the light lost on the way is a
+    guess, colors are shown as filmed. Gains are ones where nobody asked for any.
     """
     assert rec.cloud is not None
     assert rec.medium is not None
     source = "filmed" if attenuation_is_a_guess(rec.medium) else "restored"
-    if source == "filmed" or not settings.white_balance or not any_determined(rec.medium):
+    if source == "filmed" or not settings.white_balance:
         return WhiteBalance(source=source)
-    red, green, blue = display_gains(rec.cloud.restored).tolist()
+    known = any_determined(rec.medium)
+    gains = display_gains(rec.cloud.restored) if known else milder_gains(rec.cloud.raw, rec.cloud.restored)
+    red, green, blue = gains.tolist()
     return WhiteBalance((red, green, blue))
 
 
 def display_gains(restored: Float[Tensor, "n 3"]) -> Float[Tensor, "3"]:
     """Gains that make a dive's restored colors gray, between 0.5 and 2; brightness stays.
 
-    The inverse of the water gives surfaces under the light that reaches their depth, which is tinted. The tint is the
-    6-norm of the colors (Finlayson & Trezzi 2004): bright surfaces count most, weeds and shade hardly. This is for
+    The inverse of the water gives surfaces under the light that reaches their depth, which is tinted. This is for
     images to look at and nothing else: it is no part of J.
     """
-    seen = restored[(restored < 0.99).all(-1)].double()
-    if len(seen) == 0:
-        return torch.ones(3)
-    tint = (seen.clamp(min=0) ** 6).mean(0) ** (1 / 6)
-    return (tint.mean() / tint.clamp(min=0.01)).clamp(0.5, 2.0).float()
+    tint = _tint(restored[_unclipped(restored)])
+    return (tint.mean() / tint).clamp(0.5, 2.0).float()
+
+
+def milder_gains(filmed: Float[Tensor, "n 3"], restored: Float[Tensor, "n 3"]) -> Float[Tensor, "3"]:
+    """Gains of the colors of one cloud that take back what their restoration changes of the hue beyond gray.
+
+    With f and r the logarithms of both tints less their means, the gains are exp((t - 1) (r - f)) with t = 0..1 where
+    |f + t (r - f)| is least: of the hues between the filmed one and the restored one the nearest to gray. A camera that
+    was balanced for the water, or for its lamp, films grays as gray, and the whole correction would turn them orange.
+    """
+    seen = _unclipped(restored)
+    f, r = (tint.log() - tint.log().mean() for tint in (_tint(filmed[seen]), _tint(restored[seen])))
+    change = r - f
+    t = (-(f @ change) / (change @ change).clamp(min=1e-12)).clamp(0, 1)
+    return ((t - 1) * change).exp().clamp(0.5, 2.0).float()
+
+
+def _unclipped(colors: Float[Tensor, "n 3"]) -> Bool[Tensor, " n"]:
+    return (colors < 0.99).all(-1)
+
+
+def _tint(colors: Float[Tensor, "n 3"]) -> Float[Tensor, "3"]:
+    """The 6-norm of colors (Finlayson & Trezzi 2004), ones of none: bright surfaces count most, shade hardly."""
+    if len(colors) == 0:
+        return torch.ones(3, dtype=torch.float64)
+    return ((colors.double().clamp(min=0) ** 6).mean(0) ** (1 / 6)).clamp(min=0.01)
 
 
 def _not_beyond_white(

@@ -67,12 +67,11 @@ def agreement(q, others, H, e, H_back, e_back, tolerance, pose_error):
 
 @kernel
 @no_type_check
-def without_specks(q, similar, area):
-    """q without connected patches smaller than `area` pixels; neighbors connect where they differ by < `similar`."""
+def patches(q, similar):
+    """Connected patches of known q, numbered from 1; neighbors connect where they differ by < `similar` (relative)."""
     h, w = q.shape
     label = np.zeros((h, w), np.int32)
     stack = np.empty((h * w, 2), np.int32)
-    kept = q.copy()
     current = 0
     for y0 in range(h):
         for x0 in range(w):
@@ -92,10 +91,7 @@ def without_specks(q, similar, area):
                             label[j, i] = current
                             stack[size] = j, i
                             size += 1
-            if size < area:
-                for n in range(size):
-                    kept[stack[n, 0], stack[n, 1]] = 0
-    return kept
+    return label
 
 
 @kernel

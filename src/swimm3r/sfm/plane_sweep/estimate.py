@@ -34,6 +34,7 @@ from swimm3r.scene.reconstruction import DepthMap, DepthMaps, Reconstruction
 from swimm3r.scene.reconstruction_io import load_reconstruction
 from swimm3r.sfm.plane_sweep import consistency
 from swimm3r.sfm.plane_sweep.facets import facets_of, in_facets, merged
+from swimm3r.sfm.plane_sweep.specks import without_specks
 from swimm3r.sfm.plane_sweep.sweep import RawDepth, sweep, transfer
 from swimm3r.sfm.plane_sweep.views import (
     SweepView,
@@ -192,7 +193,7 @@ class _Passes:
 def consistent(
     raw: RawDepth, others: Sequence[RawDepth], cameras: Cameras, pose_error: float, settings: PlaneSweepSettings
 ) -> RawDepth:
-    """The depths that at least `settings.agreeing` other frames share, averaged with theirs; specks removed.
+    """The depths that at least `settings.agreeing` other frames share, averaged with theirs, `without_specks`.
 
     Of a point that fewer others have in their images, all of these must, one at least. `cameras` are the frame's own
     and then those of the others; `pose_error` is the usual reprojection error, pixels. The confidence, in place of
@@ -209,7 +210,7 @@ def consistent(
         np.stack([H for H, _ in back]), np.stack([e for _, e in back]), settings.tolerance, pose_error,
     )  # fmt: skip
     needed = np.minimum(settings.agreeing, np.maximum(possible, 1))
-    fused = consistency.without_specks(np.where(count >= needed, fused, 0), 0.03, settings.speck)
+    fused = without_specks(np.where(count >= needed, fused, 0), count > settings.agreeing, settings.speck)
     above = (raw.correlation.numpy() - settings.min_ncc) / (1 - settings.min_ncc)
     confidence = np.where(fused > 0, above.clip(0.05, 1) * np.minimum(count / 3, 1), 0).astype(np.float32)
     return RawDepth(torch.from_numpy(fused), torch.from_numpy(confidence))
