@@ -60,10 +60,10 @@ class FrameColors:
         """A frame's colors as the dive has them on average."""
         k = self.names.index(name)
         if self.shading is not None:
-            rgb = rgb / gains(self.shading[k], *rgb.shape[1:])
+            rgb = rgb / gains(self.shading[k].to(rgb.device), *rgb.shape[1:])
         M = self.maps[k]
-        inverse = torch.linalg.inv(M[:, :3].double()).float()
-        return torch.einsum("ij,jhw->ihw", inverse, rgb - M[:, 3, None, None])
+        inverse, offset = torch.linalg.inv(M[:, :3].double()).float(), M[:, 3, None, None]
+        return torch.einsum("ij,jhw->ihw", inverse.to(rgb.device), rgb - offset.to(rgb.device))
 
     def refitted(self, fits: Sequence[ColorFit]) -> "FrameColors":
         """The maps after `fits`, from what the map shows to each frame in the common colors of before.

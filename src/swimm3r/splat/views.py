@@ -16,6 +16,7 @@ from torch import Tensor
 from torch.nn.functional import interpolate, normalize
 
 from swimm3r.cameras import Cameras, image_directions, pixel_grid, resized, unproject
+from swimm3r.devices import CPU
 from swimm3r.errors import InputError
 from swimm3r.imaging.clipped import clipped
 from swimm3r.imaging.open_water import sea_share, without_fringe
@@ -58,18 +59,6 @@ class TrainingView:
         known = self.z_depth > 0
         return known | (self.seen & ~self.open_water & (known.float().mean() >= _MEASURED))
 
-    def to(self, device: torch.device) -> "TrainingView":
-        """The same image on a device; its camera stays with the poses."""
-        return replace(
-            self,
-            rgb=self.rgb.to(device),
-            seen=self.seen.to(device),
-            z_depth=self.z_depth.to(device),
-            open_water=self.open_water.to(device),
-            time=None if self.time is None else self.time.to(device),
-            clipped=None if self.clipped is None else self.clipped.to(device),
-        )
-
 
 class TrainingViews:
     """The registered training frames as views; images are made when asked for and kept in a bounded cache."""
@@ -111,6 +100,10 @@ class TrainingViews:
         return _in_working_units(lenses.drawn(self.settings.long_side), self.scale)
 
     def __getitem__(self, k: int) -> TrainingView:
+        return self.on(CPU, k)
+
+    def on(self, device: torch.device, k: int) -> TrainingView:
+        """A view whose image is on a device, made there from what is kept of it; its camera stays with the poses."""
         name = self.names[k]
         i = self.rec.index(name)
         lens = self.rec.cameras[i]
@@ -124,20 +117,21 @@ class TrainingViews:
             if self.window is not None:
                 inside = self._inside(self.window, canvas, z_depth) | open_water
                 seen, z_depth = seen & inside, torch.where(inside, z_depth, 0.0)
-            return stored, seen.numpy(), z_depth.half().numpy(), open_water.numpy()
+            full = np.asarray(bool(clipped(torch.from_numpy(stored) / 255).any()))
+            return stored, seen.numpy(), z_depth.half().numpy(), open_water.numpy(), full
 
-        stored, seen, z_depth, open_water = self._cache.get(name, make)
-        rgb = torch.from_numpy(stored.astype(np.float32)) / 255
-        full = clipped(rgb)
+        stored, *kept, full = self._cache.get(name, make)
+        stored, seen, z_depth, open_water = (torch.tensor(values, device=device) for values in (stored, *kept))
+        rgb = stored.float() / 255
         return TrainingView(
             name,
             _in_working_units(canvas, self.scale),
             rgb if self.colors is None else self.colors.common(name, rgb),
-            torch.from_numpy(seen.copy()),
-            torch.from_numpy(z_depth.astype(np.float32)),
-            torch.from_numpy(open_water.copy()),
-            self._times[name],
-            full if bool(full.any()) else None,
+            seen,
+            z_depth.float(),
+            open_water,
+            self._times[name].to(device),
+            clipped(rgb) if full else None,
         )
 
     def _depth(

@@ -51,7 +51,7 @@ class TrainingScene:
 
     def view(self, k: int) -> TrainingView:
         """The k-th training image, on the device."""
-        return self.views[k].to(self.device)
+        return self.views.on(self.device, k)
 
     def camera(self, view: TrainingView, codes: PoseMlp | None) -> Cameras:
         """A view's camera where training has moved it to."""
