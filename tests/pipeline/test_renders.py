@@ -131,8 +131,8 @@ def test_what_no_training_frame_saw_is_hatched_and_named(tmp_path):
     mask = cv2.imread(str(tmp_path / "a_observed.png"), cv2.IMREAD_UNCHANGED)
     assert (mask[:, :4] == 65535).all()
     assert (mask[:, 4:] == 0).all()
-    for kind, changed in (("rgb", True), ("clear", True), ("clear_physical", False), ("backscatter", False)):
+    for kind in ("rgb", "clear", "z_depth", "clear_physical", "backscatter"):
         marked_view, plain = (images.read_rgb(tmp_path / f"{stem}_{kind}.png").astype(int) for stem in "ab")
         assert (marked_view[:, :4] == plain[:, :4]).all()
-        assert (marked_view[:, 4:] != plain[:, 4:]).any() == changed
+        assert (marked_view[:, 4:] != plain[:, 4:]).any() == (kind in ("rgb", "clear", "z_depth"))
     assert torch.equal(marked(out.rgb, None), out.rgb)

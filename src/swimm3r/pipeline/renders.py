@@ -5,7 +5,8 @@ NAME_backscatter.png     the light of the water alone  NAME_clear_physical.png  
 NAME_z_depth.png         depth in colors               NAME_z_depth.tif          z_depth, scene units, 32-bit floats
 NAME_alpha.png           opacity, 16 bits                NAME_observed.png         white where a training frame saw it
 
-Surfaces that no training frame saw are hatched in NAME_rgb.png, NAME_clear.png and the flight: the map guesses.
+Surfaces that no training frame saw are hatched in NAME_rgb.png, NAME_clear.png, NAME_z_depth.png and the flight: the
+map guesses.
 """
 
 from collections.abc import Iterable, Sequence
@@ -96,13 +97,14 @@ def marked(image: Float[Tensor, "h w 3"], observed: Bool[Tensor, "h w"] | None) 
 
 def write_view(folder: Path, stem: str, out: RenderOutput, camera: Cameras, style: DisplayStyle) -> None:
     """The files of one view, as the head of this module lists them."""
-    shown = {"rgb": marked(out.rgb, out.observed), "clear": marked(shown_clear(out, camera, style), out.observed)}
+    in_colors = torch.from_numpy(depth_image(out.z_depth.numpy(), *style.near_far) / np.float32(255))
+    shown = {"rgb": out.rgb, "clear": shown_clear(out, camera, style), "z_depth": in_colors}
+    shown = {kind: marked(image, out.observed) for kind, image in shown.items()}
     if out.backscatter is not None:
         shown["backscatter"] = out.backscatter
     for kind, image in shown.items():
         images.write_rgb(folder / f"{stem}_{kind}.png", image.numpy())
     images.write_rgb_16(folder / f"{stem}_clear_physical.png", physical_clear(out, camera, style).numpy())
-    images.write_rgb(folder / f"{stem}_z_depth.png", depth_image(out.z_depth.numpy(), *style.near_far))
     write_depth(folder / f"{stem}_z_depth.tif", out.z_depth.numpy())
     if out.observed is not None:
         images.write_levels(folder / f"{stem}_observed.png", out.observed.numpy().astype(np.uint16) * 65535)
