@@ -13,6 +13,7 @@ from swimm3r.raster import Kernel, MediumMaps, Primitives2D, SggBuffers, bin_pri
 
 wp = pytest.importorskip("warp", reason="warp-lang is not installed: the GPU source was not compiled")
 from swimm3r.raster.cuda import backend as cuda_backend  # noqa: E402
+from swimm3r.raster.cuda import bins as cuda_bins  # noqa: E402
 from swimm3r.raster.cuda import kernels as cuda_kernels  # noqa: E402
 
 Scene = Callable[..., tuple[Primitives2D, MediumMaps]]
@@ -33,6 +34,33 @@ def test_the_kernels_compile_ahead_of_time_without_a_gpu(arch: int, tmp_path: Pa
         assert adjoint.count("shfl.sync.bfly") == 31  # fewer means loops that are not unrolled,
         assert ".local" not in adjoint  # and values in memory instead of registers
         assert len(re.findall(r"(?:red|atom)\.global\.add\.f32", adjoint)) == 1
+
+
+@pytest.mark.parametrize("arch", [80, 86, 90])
+def test_the_kernels_of_the_bins_compile_ahead_of_time_without_a_gpu(arch: int, tmp_path: Path):
+    ptx = Path(wp.compile_aot_module(cuda_bins, arch=arch, module_dir=tmp_path, use_ptx=True)[0]).read_text()
+    assert f".target sm_{arch}" in ptx
+    assert ptx.count(".visible .entry") == 2
+    assert ".local" not in ptx  # all values in registers
+
+
+@pytest.mark.parametrize("kernel", ["beta", "gaussian"])
+def test_device_binning_lists_nothing_of_primitives_that_are_none(kernel: Kernel, scene: Scene):
+    p, _ = scene(60, 70, 90)
+    p = Primitives2D(*(t.float() for t in p))
+    broken = {"depth": (-1.0, torch.nan, torch.inf), "mean2d": (torch.nan, torch.inf), "conic": (torch.nan, 0.0)}
+    broken |= {"opacity": (0.0, 1e-3, torch.nan), "beta": (0.0, -1.0, torch.nan)}
+    gone = []
+    for name, values in broken.items():
+        for value in values:
+            getattr(p, name)[len(gone)] = value
+            gone.append(len(gone))
+    bins = cuda_backend.bin_primitives(p, 70, 90, 1 / 255, kernel)
+    assert len(bins.ids) > 0
+    assert not set(bins.ids.tolist()) & set(gone)
+    none = cuda_backend.bin_primitives(Primitives2D(*(t[:0] for t in p)), 70, 90, 1 / 255, kernel)
+    assert len(none.ids) == 0
+    assert not none.tile_start.any()
 
 
 @pytest.mark.parametrize("kernel", ["beta", "gaussian"])

@@ -1,56 +1,186 @@
-"""Tile lists in torch, on the device of the primitives."""
+"""Tile lists by two Warp kernels of one thread per primitive, and a sort, on the device of the primitives.
+
+The first kernel counts the tiles that each ellipse may touch, the second lists them; both go through the ellipse's tile
+rows, in each of which it covers one interval of x (`raster.cpu.bins.span`). In float64, as thin ellipses cancel.
+"""
+
+from typing import Any, no_type_check
 
 import torch
+import warp as wp
 
+from swimm3r.raster.cuda.launch import launch
 from swimm3r.raster.records import TILE, Bins, Kernel, Primitives2D
+
+MARGIN = wp.constant(wp.float64(1e-3))  # px: rounding must never lose a pixel; the kernels test r2 exactly anyway
+SIDE = wp.constant(TILE)
+ZERO, HALF, ONE = (wp.constant(wp.float64(value)) for value in (0.0, 0.5, 1.0))
+
+
+class _Ellipse:
+    """The pixels in which a primitive may be opaque enough, by their bounds."""
+
+    seen: int  # 0: none
+    x: wp.float64  # of the center
+    y: wp.float64
+    a: wp.float64  # of the conic
+    b: wp.float64
+    determinant: wp.float64
+    r2_max: wp.float64
+    rightmost_y: wp.float64  # from the center
+    first_x: int
+    last_x: int
+    first_y: int
+    last_y: int
+
+
+Ellipse: Any = wp.struct(_Ellipse)
+
+
+@no_type_check
+@wp.func
+def first_pixel(x: wp.float64, size: int):
+    """Index of the first pixel whose center is at or right of x, within the image."""
+    return int(wp.ceil(wp.clamp(x - HALF, ZERO, wp.float64(size))))
+
+
+@no_type_check
+@wp.func
+def last_pixel(x: wp.float64, size: int):
+    """Index of the last pixel whose center is at or left of x; -1 if there is none."""
+    return int(wp.floor(wp.clamp(x - HALF, -ONE, wp.float64(size - 1))))
+
+
+@no_type_check
+@wp.func
+def ellipse_of(
+    i: int, width: int, height: int, alpha_min: wp.float64, gaussian: int,
+    mean2d: wp.array2d(dtype=float), conic: wp.array2d(dtype=float), opacity: wp.array(dtype=float),
+    beta: wp.array(dtype=float), depth: wp.array(dtype=float),
+):  # fmt: skip
+    """Of primitive i; not seen where a number of it is none."""
+    out = Ellipse()
+    out.x = wp.float64(mean2d[i, 0])
+    out.y = wp.float64(mean2d[i, 1])
+    out.a = wp.float64(conic[i, 0])
+    out.b = wp.float64(conic[i, 1])
+    c, o, exponent = wp.float64(conic[i, 2]), wp.float64(opacity[i]), wp.float64(beta[i])
+    out.determinant = out.a * c - out.b * out.b
+    finite = wp.isfinite(depth[i]) and wp.isfinite(out.x) and wp.isfinite(out.y)
+    finite = finite and wp.isfinite(out.a) and wp.isfinite(out.determinant)
+    positive = depth[i] > 0.0 and out.a > ZERO and out.determinant > ZERO and exponent > ZERO and o > ZERO
+    out.seen = 0
+    if finite and positive and o >= alpha_min:
+        if gaussian != 0:
+            out.r2_max = wp.log(o / alpha_min) / exponent
+        else:
+            out.r2_max = ONE - wp.pow(alpha_min / o, ONE / exponent)
+        half_width = wp.sqrt(wp.max(out.r2_max * c / out.determinant, ZERO)) + MARGIN
+        half_height = wp.sqrt(wp.max(out.r2_max * out.a / out.determinant, ZERO)) + MARGIN
+        out.rightmost_y = -out.b * half_width / c
+        out.first_x = first_pixel(out.x - half_width, width)
+        out.last_x = last_pixel(out.x + half_width, width)
+        out.first_y = first_pixel(out.y - half_height, height)
+        out.last_y = last_pixel(out.y + half_height, height)
+        if out.first_x <= out.last_x and out.first_y <= out.last_y:
+            out.seen = 1
+    return out
+
+
+@no_type_check
+@wp.func
+def tiles_of_row(e: Ellipse, row: int):
+    """First and last column of the tiles that an ellipse may touch in a row of tiles; where it touches none, the last
+    is before the first.
+
+    The right end of a row of pixels is a concave function of y, so the rightmost point lies where the whole ellipse's
+    does, moved into the row of tiles; the left end is the same mirrored.
+    """
+    low = wp.float64(wp.max(row * SIDE, e.first_y)) + HALF - e.y
+    high = wp.float64(wp.min(row * SIDE + SIDE - 1, e.last_y)) + HALF - e.y
+    reach = e.a * e.r2_max
+    y = wp.clamp(e.rightmost_y, low, high)
+    right = e.x + (-e.b * y + wp.sqrt(wp.max(reach - e.determinant * y * y, ZERO))) / e.a + MARGIN
+    y = wp.clamp(-e.rightmost_y, low, high)
+    left = e.x + (-e.b * y - wp.sqrt(wp.max(reach - e.determinant * y * y, ZERO))) / e.a - MARGIN
+    first = int(wp.max(wp.float64(e.first_x), wp.ceil(left - HALF))) // SIDE
+    last = int(wp.min(wp.float64(e.last_x), wp.floor(right - HALF))) // SIDE
+    return first, wp.max(last, first - 1)
+
+
+@no_type_check
+@wp.kernel(enable_backward=False)
+def count_tiles(
+    mean2d: wp.array2d(dtype=float), conic: wp.array2d(dtype=float), color: wp.array2d(dtype=float),
+    opacity: wp.array(dtype=float), beta: wp.array(dtype=float), depth: wp.array(dtype=float),
+    width: int, height: int, alpha_min: wp.float64, gaussian: int,
+    packed: wp.array2d(dtype=float), counts: wp.array(dtype=wp.int64),
+):  # fmt: skip
+    """The number of tiles of each primitive, and what the passes read of those that are seen."""
+    i = wp.tid()
+    e = ellipse_of(i, width, height, alpha_min, gaussian, mean2d, conic, opacity, beta, depth)
+    count = wp.int64(0)
+    if e.seen != 0:
+        for row in range(e.first_y // SIDE, e.last_y // SIDE + 1):
+            first, last = tiles_of_row(e, row)
+            count += wp.int64(last - first + 1)
+        for k in range(2):
+            packed[i, k] = mean2d[i, k]
+        for k in range(3):
+            packed[i, 2 + k] = conic[i, k]
+            packed[i, 9 + k] = color[i, k]
+        packed[i, 5] = wp.log2(opacity[i])
+        packed[i, 6] = beta[i]
+        packed[i, 7] = float(e.r2_max)
+        packed[i, 8] = depth[i]
+    counts[i] = count
+
+
+@no_type_check
+@wp.kernel(enable_backward=False)
+def list_tiles(
+    mean2d: wp.array2d(dtype=float), conic: wp.array2d(dtype=float), opacity: wp.array(dtype=float),
+    beta: wp.array(dtype=float), depth: wp.array(dtype=float), depth_bits: wp.array(dtype=int),
+    width: int, height: int, alpha_min: wp.float64, gaussian: int,
+    ends: wp.array(dtype=wp.int64), keys: wp.array(dtype=wp.int64), ids: wp.array(dtype=int),
+):  # fmt: skip
+    """Tile and depth of each pair, as one number to sort by, and its primitive; primitive i's end at ends[i]."""
+    i = wp.tid()
+    at = wp.int64(0)
+    if i > 0:
+        at = ends[i - 1]
+    if at < ends[i]:
+        e = ellipse_of(i, width, height, alpha_min, gaussian, mean2d, conic, opacity, beta, depth)
+        columns = (width + SIDE - 1) // SIDE
+        for row in range(e.first_y // SIDE, e.last_y // SIDE + 1):
+            first, last = tiles_of_row(e, row)
+            for column in range(first, last + 1):
+                tile = row * columns + column
+                keys[at] = (wp.int64(tile) << wp.int64(32)) | wp.int64(depth_bits[i])
+                ids[at] = i
+                at += wp.int64(1)
 
 
 def bin_primitives(p: Primitives2D, height: int, width: int, alpha_min: float, kernel: Kernel) -> Bins:
     """Tile lists on the primitives' device: every tile of which an ellipse may cover a pixel.
 
     They list a few in ten thousand more than the CPU's, which asks strips of four rows (`raster.cpu.bins.span`).
-    The host waits twice: for the number of tiles around the primitives, and for that of those they touch.
+    The host waits once, for the number of pairs.
     """
     n, device = len(p.depth), p.depth.device
-    A, B, C = p.conic.double().unbind(-1)
-    determinant = A * C - B * B
-    if kernel == "gaussian":
-        r2_max = (p.opacity.double() / alpha_min).log() / p.beta.double()
-    else:
-        r2_max = 1 - (alpha_min / p.opacity.double()) ** (1 / p.beta.double())
-    seen = (p.depth > 0) & p.depth.isfinite() & p.mean2d.isfinite().all(-1) & (A > 0) & (determinant > 0)
-    seen &= A.isfinite() & determinant.isfinite() & (p.beta > 0) & (p.opacity > 0) & (p.opacity >= alpha_min)
-    safe = torch.where(seen, determinant, 1.0)
-    half = torch.stack([r2_max * C / safe, r2_max * A / safe], -1).clamp(min=0).sqrt() + 1e-3
-    size = torch.tensor([width, height]).to(device)
-    mean = torch.where(seen[:, None], p.mean2d.double(), 0.0)
-    first = (mean - half - 0.5).ceil().clamp(min=0).minimum(size).nan_to_num(0).long()
-    last = (mean + half - 0.5).floor().clamp(min=-1).minimum(size - 1).nan_to_num(-1).long()
-    first_tile, last_tile = first // TILE, torch.div(last, TILE, rounding_mode="floor")
-    counts = (last_tile - first_tile + 1).clamp(min=0).prod(-1) * (seen & (first <= last).all(-1))
-    ids = torch.repeat_interleave(torch.arange(n, device=device), counts)
-    within = torch.arange(len(ids), device=device) - (counts.cumsum(0) - counts)[ids]
-    wide = (last_tile - first_tile + 1)[ids, 0]
-    column, row = first_tile[ids, 0] + within % wide, first_tile[ids, 1] + within // wide
-    # the interval of x that the ellipse covers in the tile's rows (bins.span)
-    a, b, d = A[ids], B[ids], determinant[ids]
-    low_y = torch.maximum(row * TILE, first[ids, 1]) + 0.5 - mean[ids, 1]
-    high_y = torch.minimum(row * TILE + TILE - 1, last[ids, 1]) + 0.5 - mean[ids, 1]
-    offset = -b * half[ids, 0] / C[ids]
-    reach = a * r2_max[ids]
-    y = offset.clamp(low_y, high_y)
-    right = mean[ids, 0] + (-b * y + (reach - d * y * y).clamp(min=0).sqrt()) / a + 1e-3
-    y = (-offset).clamp(low_y, high_y)
-    left = mean[ids, 0] + (-b * y - (reach - d * y * y).clamp(min=0).sqrt()) / a - 1e-3
-    kept = ((left <= column * TILE + TILE - 0.5) & (right >= column * TILE + 0.5)).nonzero()[:, 0]
-    ids, tile = ids[kept], (row * ((width + TILE - 1) // TILE) + column)[kept]
-    key = (tile << 32) | p.depth.float().view(torch.int32)[
-        ids
-    ].long()  # the bits of positive floats sort like the floats
-    order = torch.argsort(key, stable=True)
+    mean2d, conic, color, opacity, beta, depth = (values.detach().contiguous() for values in p)
+    packed, counts = torch.zeros(n, 16, device=device), torch.zeros(n, dtype=torch.int64, device=device)
+    size = (width, height, alpha_min, int(kernel == "gaussian"))
+    if n:
+        launch(count_tiles, (n,), [mean2d, conic, color, opacity, beta, depth, *size, packed, counts])
+    ends = counts.cumsum(0)
+    pairs = int(ends[-1]) if n else 0
+    keys = torch.empty(pairs, dtype=torch.int64, device=device)
+    ids = torch.empty(pairs, dtype=torch.int32, device=device)
+    if pairs:
+        bits = depth.view(torch.int32)  # those of positive floats sort like the floats
+        launch(list_tiles, (n,), [mean2d, conic, opacity, beta, depth, bits, *size, ends, keys, ids])
+    keys, order = torch.sort(keys, stable=True)
     tiles = ((height + TILE - 1) // TILE) * ((width + TILE - 1) // TILE)
-    tile_start = torch.searchsorted(tile[order], torch.arange(tiles + 1, device=device)).int()
-    record = torch.zeros(n, 16, device=device)
-    record[:, :2], record[:, 2:5], record[:, 5] = p.mean2d, p.conic, p.opacity.log2()
-    record[:, 6], record[:, 7], record[:, 8], record[:, 9:12] = p.beta, r2_max, p.depth, p.color
-    return Bins(height, width, alpha_min, kernel, record, tile_start, ids[order].int())
+    tile_start = torch.searchsorted(keys, torch.arange(tiles + 1, device=device) << 32).int()
+    return Bins(height, width, alpha_min, kernel, packed, tile_start, ids[order])
