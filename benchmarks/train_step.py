@@ -131,15 +131,15 @@ def measure(size: Size, lens: str, repeats: int, device: torch.device) -> dict[s
     recipe = uwbs.Uwbs(settings, TrainingScene(unread, 1.0, 1.0, unread, device=device))
     state = first_state(lifted(size, lens), initial_field(None, settings.medium, rng), None).to(device)
     p, field = state.primitives, state.field
-    prior = 1 + 9 * torch.rand(height, width, generator=rng)
+    prior = 1 + 9 * torch.rand(height, width, generator=rng).to(device)
     view = TrainingView(
         name="benchmark",
         camera=camera(size, lens),
-        rgb=torch.rand(3, height, width, generator=rng),
-        seen=torch.ones(height, width, dtype=torch.bool),
+        rgb=torch.rand(3, height, width, generator=rng).to(device),
+        seen=prior > 0,
         z_depth=prior,
         open_water=prior < 0,
-    ).to(device)
+    )
     sight = view_camera(view.camera).to(device)
     leaves = BetaPrimitives(*(t.clone().requires_grad_() for t in p))
 
