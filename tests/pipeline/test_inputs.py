@@ -1,4 +1,4 @@
-"""Inputs of a run are looked into before work begins: rigs that nothing would adjust as rigs."""
+"""Inputs of a run are looked into before work begins: rigs that nothing would adjust as rigs, sources of scale."""
 
 from dataclasses import replace
 from pathlib import Path
@@ -6,10 +6,11 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from swimm3r.errors import UsageError
+from swimm3r.errors import InputError, UsageError
 from swimm3r.io.images import write_rgb
 from swimm3r.pipeline.inputs import check_inputs
 from swimm3r.pipeline.presets import RunSettings
+from swimm3r.scale.settings import ScaleSettings
 from swimm3r.scene.settings import FrameSettings
 from swimm3r.sfm.settings import ColmapModelSettings, ColmapSettings, SfmSettings
 
@@ -42,3 +43,10 @@ def test_a_rig_that_nothing_would_adjust_is_refused(pair: Path, sfm: SfmSettings
 def test_one_camera_after_the_other_may_be_behind_a_port(pair: Path):
     check_inputs(pair, settings(ColmapSettings(housing="flat", focal=500.0), "none"))
     check_inputs(pair, settings(ColmapSettings(), "left", "right"))
+
+
+def test_files_that_tell_the_scale_are_looked_for_unless_the_run_has_it(pair: Path, tmp_path: Path):
+    lost = replace(RunSettings(), scale=ScaleSettings(points=tmp_path / "points.csv"))
+    with pytest.raises(InputError, match=r"there is no file .*points\.csv"):
+        check_inputs(pair, lost)
+    check_inputs(pair, lost, scaled=True)

@@ -13,15 +13,16 @@ from tests.scale.test_rescale import write_run
 from swimm3r.errors import InputError, UsageError
 from swimm3r.io.images import write_rgb
 from swimm3r.pipeline.presets import PRESETS, RunSettings, from_yaml, to_yaml
-from swimm3r.pipeline.run import _keeps_its_scale, _scaled, run_pipeline
+from swimm3r.pipeline.run import _scaled, run_pipeline
 from swimm3r.pipeline.run_record import _set_aside, open_record, stage_keys
 from swimm3r.pipeline.run_settings import differences
 from swimm3r.progress import silent
 from swimm3r.scale.rescale import RESCALING
-from swimm3r.scale.run import read_record, scale_sections
+from swimm3r.scale.run import is_scaled, read_record, scale_sections
 from swimm3r.scale.settings import ScaleSettings
 from swimm3r.scene.georeference import load_georeference
 from swimm3r.scene.reconstruction_io import load_reconstruction
+from swimm3r.scene.run_folder import open_run
 from swimm3r.sfm.settings import ColmapSettings
 
 
@@ -64,17 +65,16 @@ def test_a_run_applies_its_sources_once_and_again_where_their_files_change(run, 
 
 def test_a_scaled_run_keeps_its_scale_where_the_files_of_its_sources_are_not(run, survey, tmp_path):
     file = write_csv(tmp_path / "nav.csv", survey)
-    settings = RunSettings(scale=ScaleSettings(nav=file, nav_offset=0.0))
-    assert not _keeps_its_scale(run, settings, ["splat"])
-    scaled(run, settings.scale)
+    settings, key = ScaleSettings(nav=file, nav_offset=0.0), open_run(run, "sfm").stages["sfm"].key
+    assert not is_scaled(run, key, settings)
+    scaled(run, settings)
     os.utime(file, (1, 1))  # as a copy may have it
-    assert _keeps_its_scale(run, settings, ["splat"])
-    assert not _keeps_its_scale(run, settings, ["sfm", "splat"])
+    assert is_scaled(run, key, settings)
+    assert not is_scaled(run, "another", settings)
     file.unlink()
-    assert _keeps_its_scale(run, settings, ["splat"])
-    assert not scaled(run, settings.scale)
-    other = replace(settings, scale=replace(settings.scale, nav=tmp_path / "other.csv"))
-    assert not _keeps_its_scale(run, other, ["splat"])
+    assert is_scaled(run, key, settings)
+    assert not scaled(run, settings)
+    assert not is_scaled(run, key, replace(settings, nav=tmp_path / "other.csv"))
 
 
 def test_a_run_finishes_a_rescaling_that_was_interrupted(run):

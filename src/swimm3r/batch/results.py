@@ -67,7 +67,9 @@ def is_finished(dive: Dive, out: Path, last_stage: str) -> bool:
     known = dive.reference or (Path(scored.reference) if scored is not None and scored.reference else None)
     keys = stage_keys(run.input.fingerprint, settings, known)
     made = all(run.stages[stage].key == keys[stage] for stage in stages)
-    return made and ("sfm" not in stages or not settings.scale.has_sources or is_scaled(folder, run, settings.scale))
+    return made and (
+        "sfm" not in stages or not settings.scale.has_sources or is_scaled(folder, keys["sfm"], settings.scale)
+    )
 
 
 def row_of(dive: Dive, out: Path, status: Status, failure: Failure | None = None) -> Row:

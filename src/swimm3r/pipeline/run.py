@@ -8,7 +8,7 @@ short goes on from what it left on disk; one whose settings changed is refused o
 import json
 import logging
 import platform
-from collections.abc import Callable, Sequence
+from collections.abc import Callable
 from dataclasses import asdict, dataclass, replace
 from functools import partial
 from importlib.metadata import version
@@ -36,7 +36,7 @@ from swimm3r.scene.ground_truth import GroundTruth
 from swimm3r.scene.placement import Navigator
 from swimm3r.scene.reconstruction import Reconstruction
 from swimm3r.scene.reconstruction_io import load_reconstruction, unfiltered_matches
-from swimm3r.scene.run_folder import is_run, open_run, read_run
+from swimm3r.scene.run_folder import open_run
 from swimm3r.sfm import reconstruct
 from swimm3r.sfm.between import read_between
 from swimm3r.sfm.lens import known_lens
@@ -94,8 +94,11 @@ def run_pipeline(
     with watched(progress) as told, open_record(folder, source, digest, redo=redo) as record:
         settings, reference = record.settle(settings, reference, last_stage)
         superseded = record.superseded(settings, reference)
-        to_do = record.to_do(stage_keys(record.fingerprint, settings, reference))
-        check_inputs(source, settings, reference, to_do, scaled=_keeps_its_scale(folder, settings, to_do))
+        keys = stage_keys(record.fingerprint, settings, reference)
+        to_do = record.to_do(keys)
+        has_sfm = last_stage != "prepare" and "sfm" not in to_do
+        scaled = has_sfm and is_scaled(folder, keys["sfm"], settings.scale)
+        check_inputs(source, settings, reference, to_do, scaled=scaled)
         record.set_aside(superseded)
         record.write()
         write_text(folder / "settings.yaml", to_yaml(settings))
@@ -212,21 +215,13 @@ def _reconstruct(
     write_masks_as_filmed(prepared, folder)
 
 
-def _keeps_its_scale(folder: Path, settings: RunSettings, to_do: Sequence[str]) -> bool:
-    """Return whether a run has the unit and the place of its settings, and no stage that would change them is to do."""
-    if "sfm" in to_do or not is_run(folder):
-        return False
-    run = read_run(folder)
-    return run.is_finished("sfm") and is_scaled(folder, run, settings.scale)
-
-
 def _scaled(record: RunRecord, rec: Reconstruction, settings: RunSettings, progress: Progress) -> bool:
     """Give the run the unit and the place that its settings or its rig tell; return whether anything was to be done."""
     if not settings.scale.has_sources and not has_known_baseline(rec):
         return False
     record.write()
     run = open_run(record.folder, "sfm")
-    if is_scaled(record.folder, run, settings.scale):
+    if is_scaled(record.folder, run.stages["sfm"].key, settings.scale):
         return False
     scale_folder(record.folder, run, settings.scale, progress)
     return True

@@ -91,7 +91,7 @@ def scale_folder(folder: Path, run: RunFolder, settings: ScaleSettings, progress
     section = scale_section(found, georeference, factor, total)
     summary = _summary(run.sections, rec, factor, section)
     digests = _digests(settings)
-    new_record = ScaleRecord(_key(run, settings, digests), total, section, digests)
+    new_record = ScaleRecord(_key(run.stages["sfm"].key, settings, digests), total, section, digests)
     texts = {
         GEOREFERENCE: _json(asdict(georeference)),
         SCALE: _json(asdict(new_record)),
@@ -109,19 +109,19 @@ def read_record(folder: Path) -> ScaleRecord | None:
     return read_json(path, ScaleRecord, _REMEDY) if path.is_file() else None
 
 
-def is_scaled(folder: Path, run: RunFolder, settings: ScaleSettings) -> bool:
-    """Return whether a run has the unit and the place that these sources give.
+def is_scaled(folder: Path, sfm_key: str, settings: ScaleSettings) -> bool:
+    """Return whether a run, whose structure from motion has this key, has the unit and the place of these sources.
 
     Their files are as they were, or not on this computer, as where the folder was copied to another.
     """
     record = read_record(folder)
-    return record is not None and record.key == _key(run, settings, _digests(settings, record.sources))
+    return record is not None and record.key == _key(sfm_key, settings, _digests(settings, record.sources))
 
 
-def _key(run: RunFolder, settings: ScaleSettings, digests: Mapping[str, str]) -> str:
+def _key(sfm_key: str, settings: ScaleSettings, digests: Mapping[str, str]) -> str:
     """A digest of settings, of the files they name, and of the result that they are about."""
     values = {name: str(value) for name, value in asdict(settings).items()}
-    return cache_key(values, dict(digests), run.stages["sfm"].key)[:16]
+    return cache_key(values, dict(digests), sfm_key)[:16]
 
 
 def _digests(settings: ScaleSettings, missing: Mapping[str, str] = MappingProxyType({})) -> dict[str, str]:
