@@ -63,8 +63,8 @@ class PlaneSweepSettings(Settings):
     agreeing: Annotated[int, Range(0, 16)] = 2
     """Number of other frames that must agree with a depth; of ground that fewer of them see, all."""
     speck: CountOrZero = 48
-    """Size in working pixels below which connected patches of depth are dropped; up to eight times that, patches that few
-    frames share have to fit the depth around them."""
+    """Size in working pixels below which connected patches of depth are dropped; up to eight times that, patches that
+    few frames share have to fit the depth around them."""
     threads: Threads = 0
     """Number of frames computed at once; 0 uses all cores, at most 8."""
     device: Literal["auto", "cpu", "cuda"] = "auto"
