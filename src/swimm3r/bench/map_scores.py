@@ -67,7 +67,7 @@ def map_scores(
         "psnr_observed": observed.psnr,
         "sharpness_observed": observed.sharpness,
         **{name: getattr(covered, name) for name in ("psnr_affine", "flow_px", "flow_px_p90")},
-        "from_reference_pct": 100 * sum(view.source == "reference" for view in views) / len(views),
+        "from_reference_pct": 100 * sum(view.first.source == "reference" for view in views) / len(views),
         "train_cpu_seconds": _training_seconds(folder, scene.settings),
     }
     if sfm.truth is not None and sfm.truth.medium is not None:

@@ -39,10 +39,16 @@ class Landmarks:
 
 @dataclass(frozen=True)
 class Located:
-    """An image's pose and how many landmarks agree on it."""
+    """An image's pose and the landmarks that agree on it."""
 
     cam2world: Float[Tensor, "4 4"]
-    inliers: int
+    pixels: Float[Tensor, "k 2"]  # of the image's keypoints
+    points: Float[Tensor, "k 3"]  # where they are, world
+
+    @property
+    def inliers(self) -> int:
+        """Their number."""
+        return len(self.pixels)
 
 
 def landmarks_of(
@@ -91,4 +97,5 @@ def locate(
     estimate = absolute_pose(both[:, :2], both[:, 2:], lens, max_error)
     if estimate is None or int(estimate[1].sum()) < MIN_INLIERS:
         return None
-    return Located(estimate[0], int(estimate[1].sum()))
+    cam2world, agree = estimate
+    return Located(cam2world, both[agree, :2], both[agree, 2:])

@@ -12,6 +12,8 @@ from dataclasses import dataclass, fields, replace
 from pathlib import Path
 from typing import Literal, TypeVar
 
+import numpy as np
+import torch
 from jaxtyping import Bool, Float
 from torch import Tensor
 
@@ -22,6 +24,7 @@ from swimm3r.evaluate.images import ViewScores, as_8_bit, blur4_psnr, mean_view_
 from swimm3r.evaluate.lpips import Lpips, load_lpips
 from swimm3r.evaluate.registration import displacement, psnr_affine, recolored_by_halves, recolored_by_tiles
 from swimm3r.geometry import best_similarity
+from swimm3r.imaging.turned_rows import at_half_time, mask_at_half_time
 from swimm3r.imaging.undistortion import shown_pixels, undistorted
 from swimm3r.io.view_names import view_stems
 from swimm3r.localization.interpolation import neighbors, pose_from_neighbors
@@ -32,6 +35,7 @@ from swimm3r.scene.coverage import TrainingCoverage
 from swimm3r.scene.frames import Frames
 from swimm3r.scene.ground_truth import GroundTruth
 from swimm3r.scene.reconstruction import Reconstruction
+from swimm3r.sfm.colmap.turning import turned_pose
 from swimm3r.sfm.moving.find import still_scene
 from swimm3r.sfm.settings import FeatureSettings, RestoreSettings
 from swimm3r.splat.appearance import FrameColors
@@ -50,6 +54,7 @@ class FirstPose:
 
     cam2world: Float[Tensor, "4 4"]
     source: Source
+    turn: Float[np.ndarray, "3"] | None = None  # of the camera while rows were exposed, where training frames turned
 
 
 @dataclass(frozen=True)
@@ -61,7 +66,7 @@ class HeldOutView:
     lens: Cameras  # the frame's own camera, its pose refined
     canvas: Cameras  # its pinhole at the training size
     window: "Crop"  # of the canvas that was rendered and scored
-    source: Source
+    first: FirstPose
     scores: ViewScores
     covered: "CoveredScores"
     observed: "ObservedScores"
@@ -142,6 +147,10 @@ def first_poses(
         located = locate(frames.image(f), frames.mask(f), lens, [landmarks(name) for name in near], features)
         if located is None:
             poses[frame.name] = FirstPose(pose_from_neighbors(rec, frames, frame.name), "neighbors")
+        elif frames.rows_rectified:
+            placed = replace(lens, cam2world=located.cam2world[None])
+            cam2world, turn = turned_pose(placed, located.pixels, located.points)
+            poses[frame.name] = FirstPose(cam2world, "2D-3D matches", turn)
         else:
             poses[frame.name] = FirstPose(located.cam2world, "2D-3D matches")
     progress("placing test frames", len(frames.test), len(frames.test))
@@ -192,20 +201,21 @@ def score_views(
         f = frames.index(name)
         lens = rec.cameras[rec.index(neighbors(rec, frames, name, 1)[0])]
         lens = replace(lens, cam2world=first.cam2world[None].to(lens.cam2world))
-        time = frames.frames[f].time
-        lens = refine_pose(scene, lens, frames.image(f), frames.mask(f), settings, time=time).camera
+        time, image, mask = frames.frames[f].time, frames.image(f), frames.mask(f)
+        if first.turn is not None:
+            image = torch.from_numpy(at_half_time(image.numpy(), lens, first.turn)).clamp(0, 1)
+            mask = torch.from_numpy(mask_at_half_time(mask.numpy(), lens, first.turn))
+        lens = refine_pose(scene, lens, image, mask, settings, time=time).camera
         canvas = lens.drawn(scene.settings.long_side)
         window = visible_window(lens, canvas)
-        target, seen = (
-            part[window.rows, window.columns] for part in undistorted(frames.image(f), frames.mask(f), lens, canvas)
-        )
+        target, seen = (part[window.rows, window.columns] for part in undistorted(image, mask, lens, canvas))
         camera = cut(canvas, window)
         out = scene.render(camera, time)
         write_view(folder, stems[name], out, camera, style)
         known, quiet = coverage.of(camera), None
         if surfaces is not None:
-            unmoved = frames.mask(f) & ~surfaces.moving_in(lens, frames.image(f))
-            quiet = undistorted(frames.image(f), unmoved, lens, canvas)[1][window.rows, window.columns]
+            unmoved = mask & ~surfaces.moving_in(lens, image)
+            quiet = undistorted(image, unmoved, lens, canvas)[1][window.rows, window.columns]
         shown = out.rgb
         if scene.colors is not None:
             recolored = recolored_by_halves if scene.colors.shading is None else recolored_by_tiles
@@ -215,19 +225,20 @@ def score_views(
         covered = covered_scores(shown, target, seen, known if quiet is None else known & quiet)
         observed = observed_scores(shown, target, seen, out.observed)
         still = still_scores(shown, target, seen, quiet)
-        views.append(HeldOutView(name, time, lens, canvas, window, first.source, scores, covered, observed, still))
+        views.append(HeldOutView(name, time, lens, canvas, window, first, scores, covered, observed, still))
     progress("scoring test frames", len(poses), len(poses))
     return views
 
 
 def protocol(views: Sequence[HeldOutView], settings: PoseRefinementSettings, colors: FrameColors | None) -> str:
     """In words, how the poses of the scored frames, and the colors they are compared in, came about."""
-    counts = Counter(view.source for view in views)
+    counts = Counter(view.first.source for view in views)
     starts = ", ".join(f"{count} from {source}" for source, count in counts.items())
+    turned = "; rows rectified by the turn that the same matches tell" * any(v.first.turn is not None for v in views)
     fit = "; each half in colors fitted on the other half, as frames differ in exposure" if colors else ""
     if colors is not None and colors.shading is not None:
         fit += ", and in gains over the image: halves of a chessboard"
-    return f"every 8th frame; poses {starts}, refined {settings.steps} steps on the frozen map{fit}"
+    return f"every 8th frame; poses {starts}, refined {settings.steps} steps on the frozen map{turned}{fit}"
 
 
 def mean_scores(views: Sequence[HeldOutView]) -> ViewScores:

@@ -50,6 +50,7 @@ from swimm3r.sfm.rectified import (
     run_frames,
     write_masks_as_filmed,
 )
+from swimm3r.sfm.rectified_rows import RECTIFIED_ROWS, TurnedRowsError, has_rectified_rows, rectify_rows
 from swimm3r.splat import train
 from swimm3r.splat.map_file import load_map
 from swimm3r.splat.settings import MapDevice
@@ -165,6 +166,7 @@ def _make_stages(
         "width": frames.width,
         "height": frames.height,
         "rectified": is_rectified(folder),
+        "rows_rectified": has_rectified_rows(folder),
     }
     rec = load_reconstruction(folder / "sfm", frames)
     between = read_between(folder / "sfm")
@@ -200,19 +202,26 @@ def _reconstruct(
     engine: EngineSettings,
     navigator: Navigator | None,
 ) -> None:
-    """Structure from motion of a run, of rectified frames where no lens model explains the prepared ones."""
-    if not is_rectified(folder):
+    """Structure from motion of a run, of rectified frames where no lens model explains the prepared ones, or the camera
+    turned while their rows were exposed.
+    """
+    if not is_rectified(folder) and not has_rectified_rows(folder):
         rectification = given_rectification(settings.sfm, prepared)
-        if rectification is None:
-            try:
-                reconstruct(prepared, settings.sfm, folder / "sfm", progress, engine, navigator)
-                return
-            except BentImagesError as bent:
-                log.info("%s: they are rectified, and everything from here on works on the rectified ones", bent.what)
-                rectification = bent.rectification
-        rectify_frames(prepared, rectification, folder / RECTIFIED, progress)
-    reconstruct(run_frames(folder), settings.sfm, folder / "sfm", progress, engine, navigator)
-    write_masks_as_filmed(prepared, folder)
+        if rectification is not None:
+            rectify_frames(prepared, rectification, folder / RECTIFIED, progress)
+    while True:  # once as filmed, and once after each of the two rectifications
+        frames = run_frames(folder)
+        try:
+            reconstruct(frames, settings.sfm, folder / "sfm", progress, engine, navigator)
+            break
+        except BentImagesError as bent:
+            log.info("%s: they are rectified, and everything from here on works on the rectified ones", bent.what)
+            rectify_frames(frames, bent.rectification, folder / RECTIFIED, progress)
+        except TurnedRowsError as turned:
+            log.info("%s: their rows are rectified, and everything from here on works on these frames", turned.what)
+            rectify_rows(frames, turned.turns, folder / RECTIFIED_ROWS, progress)
+    if is_rectified(folder) or has_rectified_rows(folder):
+        write_masks_as_filmed(prepared, folder)
 
 
 def _scaled(record: RunRecord, rec: Reconstruction, settings: RunSettings, progress: Progress) -> bool:

@@ -120,6 +120,7 @@ class _Document:
     calibration: str | None = None
     rig: Rig | None = None
     development: str | None = None
+    rows_rectified: bool = False
 
     def __post_init__(self) -> None:
         if min(self.width, self.height) < 1:
@@ -168,6 +169,7 @@ def load_frames(folder: Path) -> Frames:
         calibration=calibration,
         rig=document.rig,
         development=document.development,
+        rows_rectified=document.rows_rectified,
     )
 
 

@@ -25,6 +25,7 @@ from swimm3r.scene.reconstruction import Reconstruction
 from swimm3r.scene.reconstruction_io import load_reconstruction
 from swimm3r.scene.run_folder import open_run
 from swimm3r.sfm.rectified import is_rectified, run_frames
+from swimm3r.sfm.rectified_rows import has_rectified_rows
 from swimm3r.weights.manifest import MANIFEST
 
 _EMBEDDED_BYTES = 6 << 20  # a video up to this size travels inside the page, a larger one lies beside it
@@ -83,10 +84,11 @@ def _of_summary(summary: dict[str, Any], folder: Path) -> dict[str, object]:
 
 def _of_dive(frames: Frames, rec: Reconstruction | None, folder: Path) -> dict[str, object]:
     """Fields of the frames and of what structure from motion made of them."""
-    rectified = is_rectified(folder)
+    rectified, rows_rectified = is_rectified(folder), has_rectified_rows(folder)
     found: dict[str, object] = {
-        "size_of_dive": head.size_of_dive(frames, rectified=rectified),
+        "size_of_dive": head.size_of_dive(frames, rectified=rectified or rows_rectified),
         "rectified": rectified,
+        "rows_rectified": rows_rectified,
         "dated": head.dated(frames, folder),
         "verdict": "The run has no structure from motion yet.",
         "restored_as": "",

@@ -67,6 +67,7 @@ class Frames:
     calibration: Path | None = None  # the lens as the source states it, a file beside the frames
     rig: Rig | None = None  # cameras that are fixed to each other; frames of one instant are neighbors in the list
     development: str | None = None  # how raw, linear or log values became sRGB's; None where frames are as stored
+    rows_rectified: bool = False  # rows that were exposed while the camera turned are drawn as at half time
 
     def __len__(self) -> int:
         return len(self.frames)
@@ -228,6 +229,7 @@ def write_index(folder: Path, frames: Frames, source: str = "") -> None:
         "calibration": None if frames.calibration is None else frames.calibration.relative_to(folder).as_posix(),
         "rig": None if frames.rig is None else asdict(frames.rig),
         "development": frames.development,
+        **({"rows_rectified": True} if frames.rows_rectified else {}),
         "frames": [
             {
                 "name": frame.name,

@@ -36,7 +36,8 @@ def reconstruct(
     of a long clip and dense depth over processes or a cluster. A `navigator` (`swimm3r.scale.navigation`)
     holds the path of COLMAP's mapping, and joins parts that share no ground; other back ends do without.
     Raises InputError for fewer than 2 frames, BentImagesError (`sfm.rectified`) where no lens model explains the images
-    and `settings.rectify` is "auto", and RegistrationError where too few can be placed.
+    and `settings.rectify` is "auto", TurnedRowsError (`sfm.rectified_rows`) where the camera turned while rows were
+    exposed and `settings.shutter` is "auto", and RegistrationError where too few can be placed.
     """
     settings = settings or ColmapSettings()
     used = frames.train

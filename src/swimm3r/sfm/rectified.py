@@ -1,7 +1,8 @@
 """The frames of a run whose lens no model of COLMAP's describes, drawn anew as a pinhole camera sees them.
 
 They lie in RUN/sfm/rectified, with the way there in rectification.json and the pinhole's lens as the one that their
-source states; prepared frames stay as they are. Everything after works on them, and `run_frames` finds them.
+source states; prepared frames stay as they are. Everything after works on them, or on what `rectified_rows` makes of
+them, and `run_frames` finds which.
 """
 
 import json
@@ -21,6 +22,13 @@ from swimm3r.prepare import load_frames
 from swimm3r.progress import Progress, silent
 from swimm3r.scene.frames import MASKS, Frame, Frames, write_index
 from swimm3r.scene.ground_truth import GroundTruth
+from swimm3r.sfm.rectified_rows import (
+    RECTIFIED_ROWS,
+    has_rectified_rows,
+    rectified_name,
+    rows_as_filmed,
+    run_turns,
+)
 from swimm3r.sfm.settings import LensSettings, SfmSettings
 
 RECTIFIED = Path("sfm") / "rectified"
@@ -67,6 +75,8 @@ def run_frames(run: Path) -> Frames:
 
     Raises InputError where they are incomplete.
     """
+    if has_rectified_rows(run):
+        return load_frames(run / RECTIFIED_ROWS)
     return load_frames(run / RECTIFIED if is_rectified(run) else run / "prepare")
 
 
@@ -90,12 +100,14 @@ def rectified_truth(run: Path, truth: GroundTruth | None) -> GroundTruth | None:
     Depth and images of the truth are of frames as filmed, and rectified ones go without.
     """
     rectification = run_rectification(run)
-    if truth is None or rectification is None:
+    if truth is None or (rectification is None and not has_rectified_rows(run)):
         return truth
-    turn = torch.eye(4, dtype=torch.float64)
-    turn[:3, :3] = rectification.turn
-    cameras = replace(rectification.pinhole[[0] * len(truth.names)], cam2world=truth.cameras.cam2world.double() @ turn)
-    names = tuple(_rectified_name(name) for name in truth.names)
+    cameras = truth.cameras
+    if rectification is not None:
+        turn = torch.eye(4, dtype=torch.float64)
+        turn[:3, :3] = rectification.turn
+        cameras = replace(rectification.pinhole[[0] * len(truth.names)], cam2world=cameras.cam2world.double() @ turn)
+    names = tuple(rectified_name(name) for name in truth.names)
     return replace(truth, names=names, cameras=cameras, folder=None)
 
 
@@ -152,24 +164,22 @@ def rectify_frames(
 
 def write_masks_as_filmed(prepared: Frames, run: Path) -> None:
     """The masks of moving objects of a rectified run as its prepared frames have them, for users to correct."""
-    rectification = run_rectification(run)
-    if rectification is None:
+    rectification, turns = run_rectification(run), run_turns(run)
+    if rectification is None and turns is None:
         raise ValueError(f"{run} works on frames as filmed")
     for frame in prepared.frames:
-        path = run / "sfm" / MASKS / f"{_rectified_name(frame.name)}.png"
+        name = rectified_name(frame.name)
+        path = run / "sfm" / MASKS / f"{name}.png"
         if path.is_file():
-            usable = rectification.mask_as_filmed(images.read_mask(path))
+            usable = rows_as_filmed(turns, name, images.read_mask(path))
+            if rectification is not None:
+                usable = rectification.mask_as_filmed(usable)
             images.write_mask(run / "sfm" / AS_FILMED / f"{frame.name}.png", usable)
-
-
-def _rectified_name(name: str) -> str:
-    """The name of a rectified frame: a PNG, whatever the prepared one is."""
-    return Path(name).with_suffix(".png").as_posix()
 
 
 def _drawn(frame: Frame, rectification: Rectification, folder: Path) -> Frame:
     """A frame with its image and mask rectified, in a folder."""
-    name = _rectified_name(frame.name)
+    name = rectified_name(frame.name)
     images.write_rgb(folder / name, rectification.image(images.read_rgb(frame.path)))
     mask = None
     if frame.mask is not None:

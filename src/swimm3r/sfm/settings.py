@@ -317,8 +317,9 @@ class ColmapSettings(LensSettings):
     rectify: RectifyChoice = "auto"
     """Images that no lens model explains, stretched by the camera or filmed through a curved window: drawn anew as a
     pinhole camera sees them (auto), or kept as filmed."""
-    shutter: Literal["global", "rolling"] = "global"
-    """Exposure of a frame's rows: all at once, or one after another as in most video cameras."""
+    shutter: Literal["auto", "global", "rolling"] = "auto"
+    """Exposure of a frame's rows: all at once (global), one after another along a smooth path (rolling), or in a camera
+    that turns anew in every frame, where the tracks show it: rows are then drawn as exposed at once (auto)."""
     readout: Annotated[float, Range(-1, 1)] | None = None
     """Seconds between the first and the last row of a rolling shutter, negative where a film was turned upside down;
     estimated without it. Of stills without times, in intervals between them."""

@@ -175,7 +175,7 @@ def print_summary(summary: dict) -> None:
     if "frames" in taken:
         masks = f", {taken['masks']['used']} with a mask" if taken.get("masks", {}).get("used") else ""
         between = f", {taken['between']} between keyframes" if taken.get("between") else ""
-        kind = "rectified frames" if taken.get("rectified") else "frames"
+        kind = "rectified frames" if taken.get("rectified") or taken.get("rows_rectified") else "frames"
         console.print(
             f"{taken['frames']} {kind} of {taken['width']}x{taken['height']} ({taken['train']} for training,"
             f" {taken['test']} for testing{between}{masks})"

@@ -46,9 +46,11 @@ from swimm3r.sfm.colmap.plausibility import depth_change, implausible
 from swimm3r.sfm.colmap.record import PARTS, record_of, write_parts
 from swimm3r.sfm.colmap.rig.lenses import RigLenses, lenses_of_rig
 from swimm3r.sfm.colmap.rolling_shutter import adjust_rolling
+from swimm3r.sfm.colmap.turning import turned_rows
 from swimm3r.sfm.features.database import FeatureDatabase, fill_features, match_pairs, start_database
 from swimm3r.sfm.lens import at_scale, behind_port, gives_lens, with_calibration
 from swimm3r.sfm.rectified import BentImagesError
+from swimm3r.sfm.rectified_rows import TurnedRowsError
 from swimm3r.sfm.settings import ColmapSettings
 from swimm3r.tasks.settings import EngineSettings
 from swimm3r.tasks.threads import thread_count
@@ -83,7 +85,8 @@ def reconstruct(
     `lens` (one camera, its pose unused) is held where it is given; else the settings say what is known of it, or the
     frames' source, which may know another one of each camera of a rig. A `navigator` joins what shares no ground, and
     holds long paths straight. Raises InputError for fewer than 2 frames or navigation that contradicts them,
-    BentImagesError where no lens model explains the images, and RegistrationError where too few can be placed.
+    BentImagesError where no lens model explains the images, TurnedRowsError where their rows show that the camera
+    turned, and RegistrationError where too few can be placed.
     """
 
     if len(frames) < 2:
@@ -115,8 +118,10 @@ def reconstruct(
         with _working_copy(store) as working:
             own = at_scale(settings, frames.width, frames.height, store.scale)
             mapped = _map(working, frames, pairs, own, progress, engine)
-            if _lens_is_open(settings, lenses):
+            if _lens_is_open(settings, lenses) and not frames.rows_rectified:
                 _check_lens(mapped.model, frames, progress)
+            if settings.shutter == "auto" and housed is None and frames.rig is None and not frames.rows_rectified:
+                _check_rows(record_of(mapped.model, working, frames, folder, lenses), progress)
             if navigator is not None:
                 mapped = _navigated(mapped, working, frames, folder, navigator, progress, lenses)
             _check_placed(mapped.model, frames, settings)
@@ -157,6 +162,15 @@ def _check_lens(model: "pycolmap.Reconstruction", frames: Frames, progress: Prog
         log.info("the polynomial is no lens, and the one that there is stays: %s", error)
         return
     raise BentImagesError(rectification)
+
+
+def _check_rows(rec: Reconstruction, progress: Progress) -> None:
+    """Raise TurnedRowsError where the camera turned while the rows of its frames were exposed."""
+    progress("rows of the frames", 0, 1)
+    found = turned_rows(rec)
+    progress("rows of the frames", 1, 1)
+    if found is not None:
+        raise TurnedRowsError(found)
 
 
 def _check_rolling(frames: Frames, navigator: Navigator | None) -> None:
