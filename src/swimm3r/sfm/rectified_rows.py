@@ -31,7 +31,7 @@ _STEP = "rectifying rows"
 
 @dataclass(frozen=True)
 class RowTurns:
-    """How far one camera turned while each of some frames was exposed."""
+    """The turns of one camera while each of some frames was exposed."""
 
     lens: Cameras  # one camera, its pose unused
     turns: dict[str, Float[np.ndarray, "3"]]  # rotation vectors, radians in the camera's axes, by frame

@@ -11,6 +11,7 @@ from tests.sfm.colmap.test_rolling_shutter import TIMES, degrees_off, filmed
 from swimm3r.cameras import Cameras, project
 from swimm3r.imaging.turned_rows import filmed_pixels, half_time_pixels
 from swimm3r.scene.reconstruction import Reconstruction
+from swimm3r.sfm.colmap import turning
 from swimm3r.sfm.colmap.adjustment import bundle_adjust
 from swimm3r.sfm.colmap.turning import turned_pose, turned_rows
 
@@ -47,6 +48,17 @@ def test_turns_of_single_frames_are_found_and_poses_with_them(shaken: Reconstruc
     straight = straightened(shaken, found.lens, found.turns)
     assert degrees_off(straight.cameras).median() < 0.5 * degrees_off(shaken.cameras).median()
     assert straight.points.error.median() < 0.5 * shaken.points.error.median()
+
+
+def test_stretches_of_a_long_clip_have_the_turns_of_the_whole(shaken: Reconstruction, monkeypatch: pytest.MonkeyPatch):
+    whole = turned_rows(shaken)
+    monkeypatch.setattr(turning, "_STRETCH", 12)
+    parts = turned_rows(shaken)
+    assert whole is not None
+    assert parts is not None
+    assert tuple(parts.turns) == shaken.names
+    off = np.diff(np.stack([parts.turns[name] - whole.turns[name] for name in shaken.names]), axis=0)
+    assert np.median(np.abs(off)) < 0.1 * TURNS.std()
 
 
 def test_a_rolling_shutter_on_a_smooth_path_is_one_of_them():

@@ -12,6 +12,7 @@ held out and judges: turns are believed where they bring these clearly closer.
 """
 
 import logging
+import math
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -33,16 +34,17 @@ _HELD_OUT = 0.2  # of the observations of points that enough others show
 _ENOUGH = 3  # observations of a point that are left
 _FEWEST = 500  # held-out observations that can judge
 _FEWEST_FRAMES = 6
-_MOST, _MOST_OF_FRAME = 40_000, 200  # observations looked at: of a clip, and of each frame of a long one
+_STRETCH, _MOST = 200, 40_000  # frames that are adjusted at once, and their observations that are looked at
 _STEPS, _SETTLED = 12, 1e-4  # of Levenberg-Marquardt, and the relative fall of the sum that ends it
 _WIDTHS = (0.05, 1.0)  # px, least and largest sigma
+_LEAST = 1e-9  # weight with which each unknown stays: that of frames and points without observations
 
 log = logging.getLogger(__name__)
 
 
 @dataclass(frozen=True)
 class _Observations:
-    """Rays of observations on the plane z = 1, with who sees which point in which row."""
+    """Rays of observations on the plane z = 1, with the points, frames and rows they are of."""
 
     point: Int[np.ndarray, " o"]
     frame: Int[np.ndarray, " o"]
@@ -55,7 +57,7 @@ class _Observations:
 
 @dataclass(frozen=True)
 class _State:
-    """What is adjusted."""
+    """The unknowns of the adjustment."""
 
     R: Float[np.ndarray, "n 3 3"]  # world to camera
     t: Float[np.ndarray, "n 3"]
@@ -86,26 +88,37 @@ class _Problem:
 def turned_rows(rec: Reconstruction) -> RowTurns | None:
     """The turns of a reconstruction's frames; None where held-out observations do not show that its camera turned.
 
-    All frames are of one lens, whose poses and points are as adjusted without turns.
+    All frames are of one lens, whose poses and points are as adjusted without turns. Of long clips stretches of frames
+    are adjusted one by one.
     """
-    if len(rec.names) < _FEWEST_FRAMES:
+    n = len(rec.names)
+    if n < _FEWEST_FRAMES:
         return None
-    observed = _some_tracks(_observations(rec), len(rec.names))
-    held_out = _held_out(observed.point)
-    if held_out.sum() < _FEWEST:
+    observed, start, focal, sigma = _observations(rec), _start(rec), rec.cameras.K[0, 0, 0].item(), _sigma(rec)
+    stretches = np.array_split(np.arange(n), math.ceil(n / _STRETCH))
+    parts = [_stretch(observed, start, int(frames[0]), int(frames[-1]) + 1) for frames in stretches]
+    errors: tuple[list[np.ndarray], list[np.ndarray]] = [], []
+    turning = []
+    for part, state in parts:
+        held_out = _held_out(part.point)
+        fitted, judge = (_Problem(part.some(which), focal, sigma) for which in (~held_out, held_out))
+        states = [_adjusted(fitted, state, turns=turns) for turns in (False, True)]
+        for found, off in zip(states, errors, strict=True):
+            off.append(np.linalg.norm(judge.errors(found)[0], axis=-1))
+        turning.append(states[1])
+    without, with_turns = (np.concatenate(off) for off in errors)
+    if len(without) < _FEWEST:
         return None
-    start, focal = _start(rec), rec.cameras.K[0, 0, 0].item()
-    sigma = _sigma(rec)
-    fitted = _Problem(observed.some(~held_out), focal, sigma)
-    judge = _Problem(observed.some(held_out), focal, sigma)
-    still, turning = (_adjusted(fitted, start, turns=turns) for turns in (False, True))
-    before, after = (float(np.median(np.linalg.norm(judge.errors(state)[0], axis=-1))) for state in (still, turning))
+    before, after = float(np.median(without)), float(np.median(with_turns))
     log.info("rows exposed while the camera turned: held-out observations %.3f px off, %.3f without", after, before)
     if after > _CLEARLY * before:
         return None
-    final = _adjusted(_Problem(observed, focal, sigma), turning, turns=True)
+    every = [
+        _adjusted(_Problem(part, focal, sigma), state, turns=True)
+        for (part, _), state in zip(parts, turning, strict=True)
+    ]
     lens = replace(rec.cameras[0], cam2world=torch.eye(4, dtype=torch.float64)[None])
-    return RowTurns(lens, dict(zip(rec.names, final.turn, strict=True)))
+    return RowTurns(lens, dict(zip(rec.names, np.concatenate([state.turn for state in every]), strict=True)))
 
 
 def turned_pose(
@@ -162,21 +175,23 @@ def _observations(rec: Reconstruction) -> _Observations:
     return found.some(np.asarray(np.isfinite(found.ray).all(-1)))
 
 
-def _some_tracks(observed: _Observations, frames: int) -> _Observations:
-    """All, or those of as many points as make few enough."""
-    most = max(_MOST, _MOST_OF_FRAME * frames)
-    if len(observed.point) <= most:
-        return observed
-    count = np.bincount(observed.point)
+def _stretch(observed: _Observations, state: _State, first: int, end: int) -> tuple[_Observations, _State]:
+    """Frames `first` to `end` - 1 alone, with the points that two of them show, or as many as make few enough."""
+    mine = observed.some((observed.frame >= first) & (observed.frame < end))
+    count = np.bincount(mine.point, minlength=len(state.xyz))
     order = np.random.default_rng(0).permutation(len(count))
-    kept = np.zeros(len(count), dtype=bool)
-    kept[order[: np.searchsorted(count[order].cumsum(), most)]] = True
-    return observed.some(kept[observed.point])
+    order = order[count[order] > 1]
+    chosen = np.zeros(len(count), dtype=bool)
+    chosen[order[: np.searchsorted(count[order].cumsum(), _MOST)]] = True
+    mine = mine.some(chosen[mine.point])
+    new = chosen.cumsum() - 1
+    own = _State(state.R[first:end], state.t[first:end], state.xyz[chosen], state.turn[first:end])
+    return replace(mine, point=new[mine.point], frame=mine.frame - first), own
 
 
 def _held_out(point: Int[np.ndarray, " o"]) -> Bool[np.ndarray, " o"]:
     chosen = np.random.default_rng(0).random(len(point)) < _HELD_OUT
-    left = np.bincount(point[~chosen], minlength=point.max() + 1)
+    left = np.bincount(point[~chosen], minlength=point.max(initial=0) + 1)
     return chosen & (left[point] >= _ENOUGH)
 
 
@@ -238,10 +253,10 @@ class _Equations:
         )
 
     def step(self, state: _State, damping: float) -> _State:
-        """The state where the damped equations lead, points eliminated first (Schur's complement)."""
+        """The state that the damped equations lead to, points eliminated first (Schur's complement)."""
         n, k = self.of_cameras.shape
-        A = self.A + damping * _diagonal(self.A)
-        C = np.linalg.inv(self.C + damping * _diagonal(self.C) + 1e-12 * np.eye(3))
+        A = self.A + damping * _diagonal(self.A) + _LEAST * np.eye(k)
+        C = np.linalg.inv(self.C + damping * _diagonal(self.C) + _LEAST * np.eye(3))
         frame, point = self.observed.frame, self.observed.point
         rows = np.broadcast_to(frame[:, None, None] * k + np.arange(k)[:, None], self.B.shape)
         columns = np.broadcast_to(point[:, None, None] * 3 + np.arange(3), self.B.shape)
