@@ -4,8 +4,9 @@
 
 Every dive is a synthetic loop (or transect) whose poses are known. Errors of the training frames' poses are the mean
 and the largest angle after the rotation that fits all orientations best, and the ATE after the similarity that fits the
-centers, as a share of the path. `global` takes all rows as exposed at once, `rolling` estimates the readout time,
-`stated` is told it. Features and matches are those of the first of them.
+centers, as a share of the path. `global` takes all rows as exposed at once, `auto` rectifies them where the tracks show
+that the camera turned, `rolling` estimates the readout time, `stated` is told it. Features and matches of frames as
+filmed are those of the first of them.
 """
 
 import argparse
@@ -22,6 +23,7 @@ from swimm3r.prepare import read_frames
 from swimm3r.scene.frames import Frames
 from swimm3r.scene.reconstruction import Reconstruction
 from swimm3r.sfm.colmap.poses import reconstruct
+from swimm3r.sfm.rectified_rows import TurnedRowsError, rectify_rows
 from swimm3r.sfm.settings import ColmapSettings
 from swimm3r.synthetic.dive import Dive, make_dive, write_dive
 from swimm3r.synthetic.settings import DiveSettings
@@ -43,12 +45,21 @@ def rows(name: str, settings: DiveSettings, folder: Path) -> Iterator[tuple[str,
     dive, frames = make_dive(settings), read_frames(folder / "dive", folder=folder / "prepare")
     timed = tuple(replace(frame, time=dive.seconds(dive.names.index(frame.name))) for frame in frames)
     train = replace(frames, frames=timed).train
-    shutters = {"global": ColmapSettings(threads=1)}
+    shutters = {"global": ColmapSettings(threads=1, shutter="global"), "auto": ColmapSettings(threads=1)}
     if settings.readout:
         shutters["rolling"] = replace(shutters["global"], shutter="rolling")
         shutters["stated"] = replace(shutters["rolling"], readout=settings.readout)
     for shutter, asked in shutters.items():
-        yield name, shutter, *errors(reconstruct(train, asked, folder / "sfm"), dive, train)
+        yield name, shutter, *errors(placed(train, asked, folder), dive, train)
+
+
+def placed(frames: Frames, settings: ColmapSettings, folder: Path) -> Reconstruction:
+    """The frames, or what their rows are rectified to where they show that the camera turned, in place."""
+    try:
+        return reconstruct(frames, settings, folder / "sfm")
+    except TurnedRowsError as error:
+        straight = rectify_rows(frames, error.turns, folder / "rows")
+        return reconstruct(straight, settings, folder / "straight")
 
 
 def errors(rec: Reconstruction, dive: Dive, frames: Frames) -> tuple[str, ...]:

@@ -1,16 +1,22 @@
 """Localization by keypoints."""
 
 from dataclasses import replace
+from pathlib import Path
 
+import cv2
+import numpy as np
 import pytest
 import torch
 
-from swimm3r.cameras import Cameras, image_directions, project
+from swimm3r.cameras import Cameras, image_directions, pixel_grid, project
 from swimm3r.geometry import pose_from, relative_poses, rotation_angle, so3_exp
+from swimm3r.imaging.turned_rows import half_time_pixels
 from swimm3r.io.images import write_rgb
 from swimm3r.localization.interpolation import between, neighbors, pose_from_neighbors
 from swimm3r.localization.landmarks import Landmarks, landmarks_of, locate
+from swimm3r.pipeline.held_out import first_poses
 from swimm3r.scene.frames import Frame, Frames
+from swimm3r.scene.ground_truth import GroundTruth
 from swimm3r.scene.reconstruction import DepthMap, DepthMaps, Matches, Points, Reconstruction, Tracks
 from swimm3r.sfm.features.sift import extract_features
 from swimm3r.sfm.settings import FeatureSettings
@@ -157,3 +163,28 @@ def test_a_frame_before_the_first_is_carried_on_backwards(plane):
     later = replace(rec, names=("1.png", "3.png"), cameras=cameras[[1, 3]])
     pose = pose_from_neighbors(later, frames, "0.png")
     torch.testing.assert_close(pose, between(cameras.cam2world[1], cameras.cam2world[3], -0.5))
+
+
+def test_a_test_frame_is_placed_with_the_turn_of_its_camera(plane, tmp_path: Path):
+    """The frame that is not registered, as filmed by a camera that turned while its rows were exposed."""
+    rec, frames, cameras = plane
+    turn, truth = np.array([0.012, -0.01, 0.02]), cameras[2]
+    grid = pixel_grid(180, 240).reshape(-1, 2).double()
+    column, row = (half_time_pixels(truth, grid, turn) - 0.5).float().reshape(180, 240, 2).unbind(-1)
+    filmed = cv2.remap(frames.image(2).numpy(), column.numpy(), row.numpy(), cv2.INTER_CUBIC)
+    write_rgb(tmp_path / "2.png", filmed.clip(0, 1))
+    held_back = replace(frames.frames[2], path=tmp_path / "2.png", split="test")
+    frames = replace(frames, frames=(*frames.frames[:2], held_back, frames.frames[3]))
+
+    at_once = first_poses(rec, frames, SETTINGS)["2.png"]
+    turned = first_poses(rec, replace(frames, rows_rectified=True), SETTINGS)["2.png"]
+    assert at_once.turn is None
+    assert turned.turn is not None
+    np.testing.assert_allclose(turned.turn, turn, atol=0.002)
+    off = [rotation_angle(truth.cam2world[0, :3, :3].mT @ p.cam2world[:3, :3]) for p in (at_once, turned)]
+    assert off[1] < 0.3 * off[0]
+    stated = GroundTruth(frames.names, cameras, metric=True)
+    known = first_poses(rec, replace(frames, rows_rectified=True), SETTINGS, stated)["2.png"]
+    assert known.source == "reference"
+    assert known.turn is not None
+    torch.testing.assert_close(known.cam2world, truth.cam2world[0], atol=1e-6, rtol=0)

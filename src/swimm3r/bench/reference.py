@@ -75,7 +75,7 @@ def whole_clip(
     if stored.get("key") == key:
         return NotComputed(stored["failed"]) if stored["failed"] else read_ground_truth(cameras)
     everything = replace(frames, frames=tuple(replace(frame, split="train") for frame in frames))
-    settings = replace(settings, rectify="keep", mapping=replace(settings.mapping, method="auto"))
+    settings = replace(settings.of_frames_as_filmed(), mapping=replace(settings.mapping, method="auto"))
     failed = ""
     try:
         found = poses.reconstruct(everything, settings, folder / "work", progress, lens)

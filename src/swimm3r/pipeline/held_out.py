@@ -28,7 +28,7 @@ from swimm3r.imaging.turned_rows import at_half_time, mask_at_half_time
 from swimm3r.imaging.undistortion import shown_pixels, undistorted
 from swimm3r.io.view_names import view_stems
 from swimm3r.localization.interpolation import neighbors, pose_from_neighbors
-from swimm3r.localization.landmarks import landmarks_of, locate
+from swimm3r.localization.landmarks import Located, landmarks_of, locate
 from swimm3r.pipeline.renders import display_style, write_view
 from swimm3r.progress import Progress, silent
 from swimm3r.scene.coverage import TrainingCoverage
@@ -139,22 +139,29 @@ def first_poses(
     poses = {}
     for done, frame in enumerate(frames.test):
         progress("placing test frames", done, len(frames.test))
-        if frame.name in known:
+        if frame.name in known and not frames.rows_rectified:
             poses[frame.name] = FirstPose(known[frame.name], "reference")
             continue
         near = neighbors(rec, frames, frame.name, _REFERENCES)
         f, lens = frames.index(frame.name), rec.cameras[rec.index(near[0])]
         located = locate(frames.image(f), frames.mask(f), lens, [landmarks(name) for name in near], features)
         if located is None:
-            poses[frame.name] = FirstPose(pose_from_neighbors(rec, frames, frame.name), "neighbors")
+            first = FirstPose(pose_from_neighbors(rec, frames, frame.name), "neighbors")
         elif frames.rows_rectified:
-            placed = replace(lens, cam2world=located.cam2world[None])
-            cam2world, turn = turned_pose(placed, located.pixels, located.points)
-            poses[frame.name] = FirstPose(cam2world, "2D-3D matches", turn)
+            first = _turned(replace(lens, cam2world=located.cam2world[None]), located)
         else:
-            poses[frame.name] = FirstPose(located.cam2world, "2D-3D matches")
+            first = FirstPose(located.cam2world, "2D-3D matches")
+        if frame.name in known:
+            first = replace(first, cam2world=known[frame.name], source="reference")
+        poses[frame.name] = first
     progress("placing test frames", len(frames.test), len(frames.test))
     return poses
+
+
+def _turned(camera: Cameras, located: Located) -> FirstPose:
+    """The pose of a camera that turned while its rows were exposed, near the one that it has without."""
+    cam2world, turn = turned_pose(camera, located.pixels, located.points)
+    return FirstPose(cam2world, "2D-3D matches", turn)
 
 
 def reference_poses(rec: Reconstruction, reference: GroundTruth) -> dict[str, Float[Tensor, "4 4"]]:

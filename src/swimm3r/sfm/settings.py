@@ -1,6 +1,6 @@
 """Every number of the structure-from-motion stage, with its reason; torch-free, so that --help is instant."""
 
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Annotated, Literal
 
@@ -362,6 +362,11 @@ class ColmapSettings(LensSettings):
                 cause="both move observations by the depth of what they show",
                 hint="the one of them that matters more: refraction in slow dives, the shutter in shaky ones",
             )
+
+    def of_frames_as_filmed(self) -> "ColmapSettings":
+        """The same for frames that are not to be redrawn, whatever their lens and shutter."""
+        shutter = "global" if self.shutter == "auto" else self.shutter
+        return replace(self, rectify="keep", shutter=shutter)
 
     @property
     def backend(self) -> BackendName:

@@ -180,6 +180,8 @@ def _scores(
     progress: Progress,
 ) -> Scores:
     rec = None
+    if isinstance(settings, ColmapSettings):
+        settings = settings.of_frames_as_filmed()  # as the depth is that they are compared with
     with suppress(RegistrationError):  # its row then says that nothing was registered
         rec = reconstruct(frames, settings, folder / "sfm", progress)
     placed = 0 if rec is None else len(rec.names)
