@@ -184,7 +184,7 @@ class SeathruSettings(Settings):
     """Initial standard deviation of exposure and white balance between frames, which is then estimated."""
     gain_evidence: Share = 0.85
     """Share of the residuals below which gains per frame must bring them to be used."""
-    lamp_explained: Share = 0.25
+    lamp_explained: Share = 0.4
     """Smallest share of the variance of points' light, after distance, that their places in the images explain under a
     lamp, with `light auto`."""
     lamp_change: NotNegative = 0.1
