@@ -11,7 +11,7 @@ at every distance. A move within T looks like a turn, too, but for differences o
 
 import numpy as np
 import torch
-from jaxtyping import Bool, Float
+from jaxtyping import Bool, Float, UInt8, UInt16
 from scipy.spatial.transform import Rotation
 from torch import Tensor
 
@@ -19,7 +19,7 @@ from swimm3r.cameras import Cameras, directions, pixel_grid, project
 
 _TURNS = 4  # in which the row of a pixel as filmed is found: a thousandth of a pixel after the third
 
-Image = Float[np.ndarray, "h w 3"] | np.ndarray
+Image = UInt8[np.ndarray, "h w 3"] | UInt16[np.ndarray, "h w 3"] | Float[np.ndarray, "h w 3"]
 
 
 def half_time_pixels(camera: Cameras, xy: Float[Tensor, "m 2"], turn: Float[np.ndarray, "3"]) -> Float[Tensor, "m 2"]:

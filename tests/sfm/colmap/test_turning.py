@@ -73,9 +73,11 @@ def test_frames_that_were_exposed_at_once_stay_as_filmed():
     assert turned_rows(bundle_adjust(filmed(0.0))) is None
 
 
-def test_few_frames_or_observations_say_nothing(shaken: Reconstruction):
+def test_few_frames_or_observations_or_a_fisheye_say_nothing(shaken: Reconstruction):
     few = replace(shaken, names=shaken.names[:5])
     assert turned_rows(few) is None
+    fisheye = replace(shaken.cameras, distortion=torch.zeros(len(shaken.names), 4), model="OPENCV_FISHEYE")
+    assert turned_rows(replace(shaken, cameras=fisheye)) is None
     rows = torch.arange(len(shaken.tracks.point))[::40]
     thin = replace(shaken.tracks, **{name: values[rows] for name, values in vars(shaken.tracks).items()})
     assert turned_rows(replace(shaken, tracks=thin)) is None

@@ -89,10 +89,10 @@ def turned_rows(rec: Reconstruction) -> RowTurns | None:
     """The turns of a reconstruction's frames; None where held-out observations do not show that its camera turned.
 
     All frames are of one lens, whose poses and points are as adjusted without turns. Of long clips stretches of frames
-    are adjusted one by one.
+    are adjusted one by one. A fisheye's rays have no places on a plane, and are not asked.
     """
     n = len(rec.names)
-    if n < _FEWEST_FRAMES:
+    if n < _FEWEST_FRAMES or rec.cameras.model == "OPENCV_FISHEYE":
         return None
     observed, start, focal, sigma = _observations(rec), _start(rec), rec.cameras.K[0, 0, 0].item(), _sigma(rec)
     stretches = np.array_split(np.arange(n), math.ceil(n / _STRETCH))
@@ -111,7 +111,7 @@ def turned_rows(rec: Reconstruction) -> RowTurns | None:
         return None
     before, after = float(np.median(without)), float(np.median(with_turns))
     log.info("rows exposed while the camera turned: held-out observations %.3f px off, %.3f without", after, before)
-    if after > _CLEARLY * before:
+    if not after <= _CLEARLY * before:  # also where one of them is no number
         return None
     every = [
         _adjusted(_Problem(part, focal, sigma), state, turns=True)
