@@ -120,16 +120,17 @@ def reconstruct(
             mapped = _map(working, frames, pairs, own, progress, engine)
             if _lens_is_open(settings, lenses) and not frames.rows_rectified:
                 _check_lens(mapped.model, frames, progress)
-            if settings.shutter == "auto" and housed is None and frames.rig is None and not frames.rows_rectified:
+            lens_told = mapped.lens_refined and settings.intrinsics != "fixed"  # turns would take up a wrong one
+            asked = settings.shutter == "auto" and housed is None and frames.rig is None
+            if asked and lens_told and not frames.rows_rectified:
                 _check_rows(record_of(mapped.model, working, frames, folder, lenses), progress)
             if navigator is not None:
                 mapped = _navigated(mapped, working, frames, folder, navigator, progress, lenses)
             _check_placed(mapped.model, frames, settings)
             rec = record_of(mapped.model, working, frames, folder, lenses)
             if settings.shutter == "rolling":
-                free = mapped.lens_refined and settings.intrinsics != "fixed"
                 times = frames.times_of(rec.names)
-                rolled = adjust_rolling(rec, times, settings.readout, lens=free, progress=progress)
+                rolled = adjust_rolling(rec, times, settings.readout, lens=lens_told, progress=progress)
                 rec, shutter = rolled.reconstruction, rolled.warning
             if housed is not None:
                 free = settings.intrinsics != "fixed"
