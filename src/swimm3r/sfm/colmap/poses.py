@@ -45,8 +45,8 @@ from swimm3r.sfm.colmap.pairs import choose_pairs
 from swimm3r.sfm.colmap.plausibility import depth_change, implausible
 from swimm3r.sfm.colmap.record import PARTS, record_of, write_parts
 from swimm3r.sfm.colmap.rig.lenses import RigLenses, lenses_of_rig
-from swimm3r.sfm.colmap.rolling_shutter import adjust_rolling
-from swimm3r.sfm.colmap.turning import turned_rows
+from swimm3r.sfm.colmap.shutter.readout import adjust_rolling
+from swimm3r.sfm.colmap.shutter.turning import turned_rows
 from swimm3r.sfm.features.database import FeatureDatabase, fill_features, match_pairs, start_database
 from swimm3r.sfm.lens import at_scale, behind_port, gives_lens, with_calibration
 from swimm3r.sfm.rectified import BentImagesError

@@ -1,13 +1,16 @@
 """The lens as a polynomial, where COLMAP's models do not explain the images: against lenses that are known."""
 
+from dataclasses import replace
+
 import numpy as np
 import pycolmap
 import pytest
 import torch
 from scipy.spatial.transform import Rotation
 from tests.imaging.test_rectification import stretching_lens
+from tests.sfm.colmap.test_extended_adjustment import assert_derivatives
 
-from swimm3r.cameras import Cameras, directions, distort
+from swimm3r.cameras import EXPONENTS, Cameras, directions, distort
 from swimm3r.progress import silent
 from swimm3r.sfm.colmap.calibration import polynomial
 from swimm3r.sfm.colmap.calibration.polynomial import bent_lens
@@ -95,58 +98,40 @@ def test_a_polynomial_begins_as_the_lens_that_there_is(camera: str):
     ]
     theirs = pycolmap.Camera(model=camera, width=WIDTH, height=HEIGHT, params=params, camera_id=1)
     model = scene(stretching_lens(WIDTH, HEIGHT), theirs)
-    state, seen = polynomial._start(model, 10**6)
-    assert state is not None
-    ids = sorted(model.reg_image_ids())
-    wanted = [
-        np.linalg.norm(
-            model.images[e.image_id].project_point(p.xyz) - model.images[e.image_id].points2D[e.point2D_idx].xy
-        )
-        for p in model.points3D.values()
-        for e in p.track.elements
-    ]
-    assert len(ids) == len(state.translation)
-    np.testing.assert_allclose(polynomial._errors(state, seen), wanted, atol=1e-6)
+    clip = polynomial._clip(model, 10**6)
+    assert clip is not None
+    wanted = []
+    for p in model.points3D.values():
+        for e in p.track.elements:
+            image = model.images[e.image_id]
+            wanted.append(np.linalg.norm(image.project_point(p.xyz) - image.points2D[e.point2D_idx].xy))
+    assert len(model.reg_image_ids()) == len(clip.start.R)
+    found = [np.linalg.norm(part.errors(clip.start), axis=1) for part in (clip.fitted, clip.judge)]
+    np.testing.assert_allclose(np.sort(np.concatenate(found)), np.sort(wanted), atol=1e-6)
 
 
-def test_steps_follow_the_derivatives():
-    model = scene(stretching_lens(WIDTH, HEIGHT), radial())
-    state, seen = polynomial._start(model, 2000)
-    assert state is not None
-    bend = np.random.default_rng(1).normal(scale=0.02, size=state.bend.shape)
-    state = polynomial.replace(state, bend=bend)
-    system = polynomial._System(state, seen, 5)
-    used = polynomial._Observations(*(part[~seen.held] for part in (seen.frame, seen.point, seen.xy, seen.held)))
-    by_pose, by_point, by_lens = system._jacobians(used, with_lens=True)
-    step, at = 1e-6, polynomial._residuals(state, used)
-
-    def change(**parts: object) -> np.ndarray:
-        return (polynomial._residuals(polynomial.replace(state, **parts), used) - at) / step
-
-    for axis in range(3):
-        turn = Rotation.from_rotvec(step * np.eye(3)[axis]).as_matrix()
-        turned = change(rotation=turn @ state.rotation, translation=state.translation @ turn.T)
-        np.testing.assert_allclose(by_pose[:, :, axis], turned, atol=2e-3)
-        moved = change(translation=state.translation + step * np.eye(3)[axis])
-        np.testing.assert_allclose(by_pose[:, :, 3 + axis], moved, atol=2e-3)
-        shifted = change(points=state.points + step * np.eye(3)[axis])
-        np.testing.assert_allclose(by_point[:, :, axis], shifted, atol=2e-3)
-    scale = state.K[:2].mean()
-    for k in range(4):
-        np.testing.assert_allclose(by_lens[:, :, k], change(K=state.K + step * scale * np.eye(4)[k]), atol=2e-3)
-    for axis in range(2):
-        for k in (0, 5, 17):
-            bent = state.bend.copy()
-            bent[axis, k] += step
-            np.testing.assert_allclose(by_lens[:, :, 4 + 18 * axis + k], change(bend=bent), atol=2e-3)
+def test_errors_have_the_derivatives_that_are_told():
+    clip = polynomial._clip(scene(stretching_lens(WIDTH, HEIGHT), radial()), 2000)
+    assert clip is not None
+    others = clip.start.others.copy()
+    others[4:] = np.random.default_rng(1).normal(scale=0.02, size=len(others) - 4)
+    assert_derivatives(replace(clip.start, others=others), replace(clip.fitted, degree=5))
 
 
-def test_held_out_observations_pull_on_nothing():
-    model = scene(stretching_lens(WIDTH, HEIGHT), radial())
-    state, seen = polynomial._start(model, 3000)
-    assert state is not None
-    assert seen.held.any()
-    astray = seen.xy + 50.0 * seen.held[:, None]
-    moved = polynomial.replace(seen, xy=astray)
-    one, other = (polynomial._adjusted(state, those, 3, 3) for those in (seen, moved))
-    np.testing.assert_array_equal(one.points, other.points)
+def test_a_lens_is_unknown_up_to_its_degree():
+    clip = polynomial._clip(scene(stretching_lens(WIDTH, HEIGHT), radial()), 2000)
+    assert clip is not None
+    degree = np.array(EXPONENTS).sum(1)
+    for most in (0, 3, 5):
+        unknown = np.abs(replace(clip.fitted, degree=most).by_others(clip.start).toarray()).sum(0) > 0
+        free = degree <= most if most else np.zeros(len(degree), bool)
+        np.testing.assert_array_equal(unknown, [most > 0] * 4 + [*free, *free])
+
+
+def test_observations_left_out_are_of_long_tracks_and_one_of_each():
+    clip = polynomial._clip(scene(stretching_lens(WIDTH, HEIGHT), radial()), 3000)
+    assert clip is not None
+    assert len(clip.judge.point)
+    assert len(np.unique(clip.judge.point)) == len(clip.judge.point)
+    length = np.bincount(clip.fitted.point)
+    assert length[clip.judge.point].min() >= 4

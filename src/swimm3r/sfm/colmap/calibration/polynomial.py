@@ -1,11 +1,8 @@
 """The lens of a clip as a polynomial, where no model of COLMAP's explains its images.
 
-Poses, points and the lens (`cameras`, POLYNOMIAL) are adjusted together by damped Gauss-Newton under a Soft-L1 loss,
-
-    sum 2 c^2 (sqrt(1 + |e|^2 / c^2) - 1),    c = 0.5 px,
-
-points eliminated as in any bundle adjustment (Triggs et al. 2000, section 6). COLMAP's adjustment has no such lens,
-and shifting observations in turn with it (`rolling_shutter`) does not get there: poses take up most of the bend.
+Poses, points and the lens (`cameras`, POLYNOMIAL) are adjusted together (`extended_adjustment`). COLMAP's adjustment
+has no such lens, and shifting observations in turn with it (`shutter.readout`) does not get there: poses take up most
+of the bend.
 
 A polynomial of 40 numbers fits its own observations better than a lens of 4. So one observation of each longer track is
 left out of all adjustments, and their median error decides, first against the lens that there is, then by degree.
@@ -19,52 +16,109 @@ import numpy as np
 import torch
 from jaxtyping import Bool, Float, Int
 from scipy import sparse
-from scipy.spatial.transform import Rotation
 
 from swimm3r.cameras import DISTORTION_PARAMETERS, EXPONENTS, Cameras
 from swimm3r.progress import Progress, silent
+from swimm3r.sfm.colmap.extended_adjustment import Bundle, adjusted, places
 
 if TYPE_CHECKING:
     import pycolmap
 
-_WIDTH = 0.5  # px, c above
+_WIDTH = 0.5  # px, of the loss
 _GOOD = 0.25  # px; where observations are off by less there is nothing to explain
 _LEAST_FRAMES = 6
 _LEAST_HELD = 100  # observations left out, below which their median says little
 _FEW, _MOST = 6_000, 30_000  # observations that are adjusted, on trial and then; of more, those of some points
 _LONG = 5  # observations of a track of which one is left out
 _TRIAL = 8  # steps on trial
-_TURNS = 60  # steps at most
+_STEPS = 60  # at most
 _TRIED = 0.8  # of the held-out error, to go on after the trial: models' clips have 0.94 to 1.08, bent ones 0.43 to 0.60
 _BETTER = 0.8  # of the held-out error, for the polynomial to be the lens
 _NEXT = 0.97  # of the held-out error, for its higher degree
-_CONVERGED = 1e-4  # share of the cost by which a step lowers it
-_DAMPING = 1e-3
 
-_STEP = "lens beyond models"
+_DEGREES = np.array(EXPONENTS).sum(1)
+
+_STAGE = "lens beyond models"
 
 log = logging.getLogger(__name__)
 
 
 @dataclass(frozen=True)
-class _Observations:
-    """Observed pixels of points in frames; those held out are adjusted to nothing."""
+class _Observed:
+    """Observed pixels of points in frames, and the degree up to which their lens is unknown (0: it is held)."""
 
     frame: Int[np.ndarray, " m"]
     point: Int[np.ndarray, " m"]
     xy: Float[np.ndarray, "m 2"]
-    held: Bool[np.ndarray, " m"]
+    degree: int = 0
+    width: float = _WIDTH
+    expected: float = np.inf
+
+    def some(self, chosen: Bool[np.ndarray, " m"]) -> "_Observed":
+        return replace(self, frame=self.frame[chosen], point=self.point[chosen], xy=self.xy[chosen])
+
+    def errors(self, bundle: Bundle) -> Float[np.ndarray, "m 2"]:
+        lens = _Lens.of(bundle)
+        return lens.distorted(self._plane(bundle)) * lens.K[:2] + lens.K[2:] - self.xy
+
+    def by_place(self, bundle: Bundle) -> Float[np.ndarray, "m 2 3"]:
+        lens, at = _Lens.of(bundle), places(bundle, self)
+        z = at[:, 2]
+        plane = at[:, :2] / z[:, None]
+        _, by_x, by_y = _monomials(plane)
+        bent = np.stack([by_x @ lens.bend.T, by_y @ lens.bend.T], 2) + np.eye(2)
+        onto = np.zeros((len(at), 2, 3))
+        onto[:, 0, 0] = onto[:, 1, 1] = 1 / z
+        onto[:, :, 2] = -plane / z[:, None]
+        return (bent * lens.K[:2, None]) @ onto
+
+    def by_others(self, bundle: Bundle) -> sparse.csr_array:
+        lens, plane = _Lens.of(bundle), self._plane(bundle)
+        J = np.zeros((len(plane), 2, len(bundle.others)))
+        if self.degree:
+            distorted, value = lens.distorted(plane), _monomials(plane)[0] * (self.degree >= _DEGREES)
+            for axis in range(2):
+                J[:, axis, axis] = distorted[:, axis]
+                J[:, axis, 2 + axis] = 1
+                first = 4 + axis * len(EXPONENTS)
+                J[:, axis, first : first + len(EXPONENTS)] = value * lens.K[axis]
+        return sparse.csr_array(J.reshape(-1, J.shape[2]))
+
+    def _plane(self, bundle: Bundle) -> Float[np.ndarray, "m 2"]:
+        at = places(bundle, self)
+        return at[:, :2] / at[:, 2:]
 
 
 @dataclass(frozen=True)
-class _State:
-    """Poses, points and lens: u = f (x + sum a_ij x^i y^j) + c, with (x, y) on the plane z = 1."""
+class _Clip:
+    """Poses, points and lens to begin with, and the observations that they are adjusted to and judged by."""
 
-    rotation: Float[np.ndarray, "n 3 3"]  # world to camera
-    translation: Float[np.ndarray, "n 3"]
-    points: Float[np.ndarray, "p 3"]
+    start: Bundle
+    fitted: _Observed
+    judge: _Observed
+
+    def adjusted(self, bundle: Bundle, degree: int, steps: int = _STEPS) -> Bundle:
+        """A bundle adjusted with its lens up to a degree, 0 to hold it."""
+        return adjusted(bundle, replace(self.fitted, degree=degree), steps)
+
+    def error(self, bundle: Bundle) -> float:
+        """Median error in pixels of the observations left out."""
+        return float(np.median(np.linalg.norm(self.judge.errors(bundle), axis=1)))
+
+
+@dataclass(frozen=True)
+class _Lens:
+    """u = f (x + sum a_ij x^i y^j) + c, with (x, y) on the plane z = 1: the other unknowns of a bundle."""
+
     K: Float[np.ndarray, "4"]  # fx, fy, cx, cy
     bend: Float[np.ndarray, "2 t"]
+
+    @classmethod
+    def of(cls, bundle: Bundle) -> "_Lens":
+        return cls(bundle.others[:4], bundle.others[4:].reshape(2, -1))
+
+    def distorted(self, plane: Float[np.ndarray, "m 2"]) -> Float[np.ndarray, "m 2"]:
+        return plane + _monomials(plane)[0] @ self.bend.T
 
 
 def bent_lens(model: "pycolmap.Reconstruction", progress: Progress) -> Cameras | None:
@@ -73,84 +127,81 @@ def bent_lens(model: "pycolmap.Reconstruction", progress: Progress) -> Cameras |
     """
     if len(model.reg_image_ids()) < _LEAST_FRAMES:
         return None
-    progress(_STEP, 0, 4)
-    start, seen = _start(model, _FEW)
-    hopeful = start is not None and seen.held.sum() >= _LEAST_HELD and _gains(start, seen)
-    progress(_STEP, 1, 4)
-    start, seen = _start(model, _MOST) if hopeful else (None, seen)
-    best = None if start is None else _fitted(start, seen, progress)
-    progress(_STEP, 4, 4)
-    return None if best is None else _lens_of(best, model)
-
-
-def _gains(start: _State, seen: _Observations) -> bool:
-    """Return whether a few steps with a polynomial explain observations left out that as many without do not."""
-    if np.median(_errors(start, seen)) < _GOOD:
-        return False
-    held, bent = (_adjusted(start, seen, degree, _TRIAL) for degree in (0, 3))
-    return _held_error(bent, seen) < _TRIED * _held_error(held, seen)
+    progress(_STAGE, 0, 4)
+    clip = _clip(model, _FEW)
+    hopeful = clip is not None and len(clip.judge.point) >= _LEAST_HELD and _gains(clip)
+    progress(_STAGE, 1, 4)
+    clip = _clip(model, _MOST) if hopeful else None
+    best = None if clip is None else _fitted(clip, progress)
+    progress(_STAGE, 4, 4)
+    return None if best is None else _camera_of(best, model)
 
 
 def errors_left_out(model: "pycolmap.Reconstruction", progress: Progress = silent) -> dict[int, float] | None:
     """Median error of observations left out, px, under a model's own lens (0) and polynomials by their degree; None of
     a fisheye.
     """
-    start, seen = _start(model, _MOST)
-    if start is None:
-        return None
-    return {degree: _held_error(state, seen) for degree, state in _by_degree(start, seen, progress).items()}
+    clip = _clip(model, _MOST)
+    return None if clip is None else {k: clip.error(found) for k, found in _by_degree(clip, progress).items()}
 
 
-def _by_degree(start: _State, seen: _Observations, progress: Progress) -> dict[int, _State]:
-    """The state with its lens held, and adjusted with polynomials of degree 3 and 5."""
-    states = {0: _adjusted(start, seen, 0)}
+def _gains(clip: _Clip) -> bool:
+    """Return whether a few steps with a polynomial explain observations left out that as many without do not."""
+    if clip.error(clip.start) < _GOOD:
+        return False
+    held, bent = (clip.error(clip.adjusted(clip.start, degree, _TRIAL)) for degree in (0, 3))
+    return bent < _TRIED * held
+
+
+def _by_degree(clip: _Clip, progress: Progress) -> dict[int, Bundle]:
+    """The clip adjusted with its lens held, and with polynomials of degree 3 and 5."""
+    found = {0: clip.adjusted(clip.start, 0)}
     for done, (before, degree) in enumerate(((0, 3), (3, 5)), 2):
-        states[degree] = _adjusted(states[before], seen, degree)
-        progress(_STEP, done, 4)
-    return states
+        found[degree] = clip.adjusted(found[before], degree)
+        progress(_STAGE, done, 4)
+    return found
 
 
-def _fitted(start: _State, seen: _Observations, progress: Progress) -> _State | None:
-    """The state with the lens that explains observations left out; None where that is the one that there is."""
-    states = _by_degree(start, seen, progress)
-    errors = {degree: _held_error(state, seen) for degree, state in states.items()}
+def _fitted(clip: _Clip, progress: Progress) -> Bundle | None:
+    """The bundle with the lens that explains observations left out; None where that is the one that there is."""
+    found = _by_degree(clip, progress)
+    errors = {degree: clip.error(bundle) for degree, bundle in found.items()}
     told = ", ".join(f"{error:.3f} px under degree {degree}" for degree, error in errors.items())
     log.info("error of observations left out, under the lens as degree 0: %s", told)
     best = 5 if errors[5] < _NEXT * errors[3] else 3
-    return states[best] if errors[best] < _BETTER * errors[0] else None
+    return found[best] if errors[best] < _BETTER * errors[0] else None
 
 
-def _start(model: "pycolmap.Reconstruction", most: int) -> tuple[_State | None, _Observations]:
-    """A model as it is adjusted, and its observations; no state of a fisheye."""
+def _clip(model: "pycolmap.Reconstruction", most: int) -> _Clip | None:
+    """A model as it is adjusted, of its observations about so many at most; None of a fisheye."""
     images = [model.images[i] for i in sorted(model.reg_image_ids())]
+    lens = _as_polynomial(model.cameras[images[0].camera_id])
+    if lens is None:
+        return None
     number = {image.image_id: k for k, image in enumerate(images)}
     rng = np.random.default_rng(0)
     tracks = [point.track.elements for point in model.points3D.values()]
     xyz = np.array([point.xyz for point in model.points3D.values()]).reshape(-1, 3)
     share = most / max(1, sum(len(track) for track in tracks))
     chosen = [k for k in range(len(tracks)) if len(tracks[k]) > 2 and rng.random() < share]
-    frame, point, xy, held = [], [], [], []
+    frame, point, xy, left_out = [], [], [], []
     for new, k in enumerate(chosen):
         out = rng.integers(len(tracks[k])) if len(tracks[k]) >= _LONG else -1
         for j, element in enumerate(tracks[k]):
             frame.append(number[element.image_id])
             point.append(new)
             xy.append(model.images[element.image_id].points2D[element.point2D_idx].xy)
-            held.append(j == out)
-    seen = _Observations(
-        np.array(frame, np.int64), np.array(point, np.int64), np.array(xy).reshape(-1, 2), np.array(held, bool)
-    )
-    lens = _as_polynomial(model.cameras[images[0].camera_id])
-    if lens is None:
-        return None, seen
+            left_out.append(j == out)
     poses = [image.cam_from_world() for image in images]
-    rotation = np.array([pose.rotation.matrix() for pose in poses])
-    translation = np.array([pose.translation for pose in poses])
-    return _State(rotation, translation, xyz[chosen], *lens), seen
+    R, t = (np.array(part) for part in zip(*((p.rotation.matrix(), p.translation) for p in poses), strict=True))
+    seen = _Observed(np.array(frame, np.int64), np.array(point, np.int64), np.array(xy).reshape(-1, 2))
+    judge = np.array(left_out, bool)
+    start = Bundle(R, t, xyz[chosen], np.concatenate([lens.K, lens.bend.ravel()]))
+    return _Clip(start, seen.some(~judge), seen.some(judge))
 
 
-def _as_polynomial(camera: "pycolmap.Camera") -> tuple[Float[np.ndarray, "4"], Float[np.ndarray, "2 t"]] | None:
-    """K and coefficients with which POLYNOMIAL is a lens of COLMAP's."""
+def _as_polynomial(camera: "pycolmap.Camera") -> _Lens | None:
+    """The polynomial that a lens of COLMAP's is; None of a fisheye."""
     params = list(camera.params)
     match camera.model.name:
         case "SIMPLE_RADIAL":
@@ -171,15 +222,16 @@ def _as_polynomial(camera: "pycolmap.Camera") -> tuple[Float[np.ndarray, "4"], F
         add(axis, i, j, value)
     for axis, i, j, value in ((1, 2, 0, p1), (1, 0, 2, 3 * p1), (1, 1, 1, 2 * p2)):
         add(axis, i, j, value)
-    return np.array(K), bend
+    return _Lens(np.array(K), bend)
 
 
-def _lens_of(state: _State, model: "pycolmap.Reconstruction") -> Cameras:
+def _camera_of(bundle: Bundle, model: "pycolmap.Reconstruction") -> Cameras:
     camera = model.cameras[next(iter(model.images.values())).camera_id]
-    fx, fy, cx, cy = state.K
+    lens = _Lens.of(bundle)
+    fx, fy, cx, cy = lens.K
     K = torch.tensor([[[fx, 0, cx], [0, fy, cy], [0, 0, 1]]], dtype=torch.float64)
-    assert state.bend.size == len(DISTORTION_PARAMETERS["POLYNOMIAL"])
-    distortion = torch.from_numpy(state.bend.reshape(1, -1))
+    assert lens.bend.size == len(DISTORTION_PARAMETERS["POLYNOMIAL"])
+    distortion = torch.from_numpy(lens.bend.reshape(1, -1))
     return Cameras(K, distortion, torch.eye(4, dtype=torch.float64)[None], camera.width, camera.height, "POLYNOMIAL")
 
 
@@ -192,145 +244,3 @@ def _monomials(x: Float[np.ndarray, "m 2"]) -> tuple[np.ndarray, np.ndarray, np.
     by_x = np.stack([i * powers[max(i - 1, 0)][:, 0] * powers[j][:, 1] for i, j in EXPONENTS], 1)
     by_y = np.stack([j * powers[i][:, 0] * powers[max(j - 1, 0)][:, 1] for i, j in EXPONENTS], 1)
     return value, by_x, by_y
-
-
-def _in_camera(state: _State, seen: _Observations) -> Float[np.ndarray, "m 3"]:
-    """Points in the axes of the cameras that observe them."""
-    turned = np.einsum("mij,mj->mi", state.rotation[seen.frame], state.points[seen.point])
-    return turned + state.translation[seen.frame]
-
-
-def _residuals(state: _State, seen: _Observations) -> Float[np.ndarray, "m 2"]:
-    at = _in_camera(state, seen)
-    plane = at[:, :2] / at[:, 2:]
-    value, _, _ = _monomials(plane)
-    return (plane + value @ state.bend.T) * state.K[:2] + state.K[2:] - seen.xy
-
-
-def _errors(state: _State, seen: _Observations) -> Float[np.ndarray, " m"]:
-    return np.linalg.norm(_residuals(state, seen), axis=1)
-
-
-def _held_error(state: _State, seen: _Observations) -> float:
-    return float(np.median(_errors(state, seen)[seen.held]))
-
-
-def _cost(state: _State, seen: _Observations) -> float:
-    error = _errors(state, seen)[~seen.held]
-    return float((2 * _WIDTH**2 * (np.sqrt(1 + (error / _WIDTH) ** 2) - 1)).sum())
-
-
-def _adjusted(state: _State, seen: _Observations, degree: int, turns: int = _TURNS) -> _State:
-    """A state adjusted with its lens up to a degree, 0 to hold it."""
-    damping, cost = _DAMPING, _cost(state, seen)
-    for _ in range(turns):
-        system = _System(state, seen, degree)
-        while True:
-            after = system.stepped(damping)
-            lower = _cost(after, seen)
-            if lower < cost:
-                break
-            damping *= 5
-            if damping > 1e6:
-                return state
-        gained, state, cost, damping = 1 - lower / cost, after, lower, max(damping / 5, 1e-9)
-        if gained < _CONVERGED:
-            break
-    return state
-
-
-class _System:
-    """The normal equations at a state: poses and lens dense, points eliminated."""
-
-    def __init__(self, state: _State, seen: _Observations, degree: int) -> None:
-        used = _Observations(*(part[~seen.held] for part in (seen.frame, seen.point, seen.xy, seen.held)))
-        self._state, self._n, self._p = state, len(state.translation), len(state.points)
-        self._terms = [k for k, (i, j) in enumerate(EXPONENTS) if i + j <= degree]
-        residual = _residuals(state, used)
-        root = (1 + (residual**2).sum(1) / _WIDTH**2) ** -0.25  # square root of the loss's weight
-        by_pose, by_point, by_lens = (J * root[:, None, None] for J in self._jacobians(used, with_lens=degree > 0))
-        residual = (residual * root[:, None]).reshape(-1)
-        J = sparse.hstack(
-            [
-                _blocks(by_pose, used.frame, self._n),
-                sparse.csr_array(by_lens.reshape(len(residual), by_lens.shape[2])),
-            ],
-            format="csr",
-        )
-        to_points = _blocks(by_point, used.point, self._p)
-        self._W = (J.T @ to_points).tocsr()
-        self._A = (J.T @ J).toarray()
-        self._b, self._b_points = J.T @ residual, to_points.T @ residual
-        self._V = np.zeros((self._p, 3, 3))
-        np.add.at(self._V, used.point, np.einsum("mij,mik->mjk", by_point, by_point))
-
-    def stepped(self, damping: float) -> _State:
-        """The state after a step, its diagonals enlarged by a share `damping`."""
-        diagonal = np.einsum("pii->pi", self._V)
-        V = self._V + (damping * diagonal + 1e-9)[:, :, None] * np.eye(3)
-        inverse = _diagonal(np.linalg.inv(V))
-        WV = self._W @ inverse
-        A = self._A + np.diag(damping * np.diag(self._A) + 1e-9) - (WV @ self._W.T).toarray()
-        step = np.linalg.solve(A, -(self._b - WV @ self._b_points))
-        points = -(inverse @ (self._b_points + self._W.T @ step)).reshape(-1, 3)
-        poses, lens = step[: 6 * self._n].reshape(-1, 6), step[6 * self._n :]
-        state, K, bend = self._state, self._state.K.copy(), self._state.bend.copy()
-        if len(lens):
-            K = K + lens[:4] * np.repeat(K[:2].mean(), 4)
-            for axis, part in enumerate(lens[4:].reshape(2, -1)):
-                bend[axis, self._terms] += part
-        turn = Rotation.from_rotvec(poses[:, :3]).as_matrix()
-        translation = np.einsum("nij,nj->ni", turn, state.translation) + poses[:, 3:]
-        return replace(
-            state,
-            rotation=turn @ state.rotation,
-            translation=translation,
-            points=state.points + points,
-            K=K,
-            bend=bend,
-        )
-
-    def _jacobians(self, used: _Observations, *, with_lens: bool) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-        """Of the residuals [m, 2, .] by turns and shifts of the cameras, by points, and by K in mean focal lengths
-        and the coefficients.
-        """
-        state = self._state
-        at = _in_camera(state, used)
-        z = at[:, 2]
-        plane = at[:, :2] / z[:, None]
-        value, by_x, by_y = _monomials(plane)
-        bent = np.stack([by_x @ state.bend.T, by_y @ state.bend.T], 2) + np.eye(2)  # m 2 2
-        focal = state.K[:2, None]
-        onto = np.zeros((len(at), 2, 3))
-        onto[:, 0, 0] = onto[:, 1, 1] = 1 / z
-        onto[:, :, 2] = -plane / z[:, None]
-        by_place = (bent * focal) @ onto  # by the point in the camera's axes
-        x, y = at[:, 0], at[:, 1]
-        zero = np.zeros_like(z)
-        turned = np.stack([zero, z, -y, -z, zero, x, y, -x, zero], 1).reshape(-1, 3, 3)  # -[at]x
-        by_pose = np.concatenate([by_place @ turned, by_place], 2)
-        by_point = by_place @ state.rotation[used.frame]
-        if not with_lens:
-            return by_pose, by_point, np.zeros((len(at), 2, 0))
-        terms = len(self._terms)
-        by_lens = np.zeros((len(at), 2, 4 + 2 * terms))
-        distorted = plane + value @ state.bend.T
-        scale = state.K[:2].mean()
-        for axis in range(2):
-            by_lens[:, axis, axis] = distorted[:, axis] * scale
-            by_lens[:, axis, 2 + axis] = scale
-            first = 4 + axis * terms
-            by_lens[:, axis, first : first + terms] = value[:, self._terms] * state.K[axis]
-        return by_pose, by_point, by_lens
-
-
-def _blocks(J: Float[np.ndarray, "m r k"], column: Int[np.ndarray, " m"], count: int) -> sparse.csr_array:
-    """Jacobians of single observations as one sparse matrix with `count` groups of columns."""
-    m, rows, k = J.shape
-    indices = np.repeat((column[:, None] * k + np.arange(k))[:, None], rows, 1).reshape(-1)
-    return sparse.csr_array((J.reshape(-1), indices, np.arange(m * rows + 1) * k), shape=(m * rows, count * k))
-
-
-def _diagonal(blocks: Float[np.ndarray, "p 3 3"]) -> sparse.csr_array:
-    """Blocks along a diagonal as one sparse matrix."""
-    return _blocks(blocks, np.arange(len(blocks)), len(blocks))

@@ -15,7 +15,7 @@ from swimm3r.geometry import rotation_angle
 from swimm3r.prepare import read_frames
 from swimm3r.scene.reconstruction import DepthMaps, Matches, Points, Reconstruction, Tracks
 from swimm3r.sfm.colmap.poses import reconstruct
-from swimm3r.sfm.colmap.rolling_shutter import adjust_rolling, motion_of
+from swimm3r.sfm.colmap.shutter.readout import adjust_rolling, motion_of
 from swimm3r.sfm.settings import ColmapSettings
 from swimm3r.synthetic import make_dive, write_dive
 from swimm3r.synthetic.settings import DiveSettings

@@ -6,14 +6,15 @@ import numpy as np
 import pytest
 import torch
 from scipy.spatial.transform import Rotation
-from tests.sfm.colmap.test_rolling_shutter import TIMES, degrees_off, filmed
+from tests.sfm.colmap.shutter.test_readout import TIMES, degrees_off, filmed
+from tests.sfm.colmap.test_extended_adjustment import assert_derivatives
 
 from swimm3r.cameras import Cameras, project
 from swimm3r.imaging.turned_rows import filmed_pixels, half_time_pixels
 from swimm3r.scene.reconstruction import Reconstruction
-from swimm3r.sfm.colmap import turning
 from swimm3r.sfm.colmap.adjustment import bundle_adjust
-from swimm3r.sfm.colmap.turning import turned_pose, turned_rows
+from swimm3r.sfm.colmap.shutter import turning
+from swimm3r.sfm.colmap.shutter.turning import turned_pose, turned_rows
 
 TURNS = np.random.default_rng(3).normal(0, 0.006, (len(TIMES), 3))  # rad; no two frames alike
 
@@ -81,6 +82,13 @@ def test_few_frames_or_observations_or_a_fisheye_say_nothing(shaken: Reconstruct
     rows = torch.arange(len(shaken.tracks.point))[::40]
     thin = replace(shaken.tracks, **{name: values[rows] for name, values in vars(shaken.tracks).items()})
     assert turned_rows(replace(shaken, tracks=thin)) is None
+
+
+def test_errors_of_rays_have_the_derivatives_that_are_told(shaken: Reconstruction):
+    observed, bundle = turning._stretch(turning._observed(shaken), turning._start(shaken), 0, 8)
+    assert_derivatives(bundle, observed)
+    turns = np.random.default_rng(0).normal(0, 0.01, 3 * len(bundle.R))
+    assert_derivatives(replace(bundle, others=turns), observed)
 
 
 def test_a_pose_is_found_with_its_turn():
