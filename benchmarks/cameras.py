@@ -23,7 +23,7 @@ from swimm3r.prepare import read_frames
 from swimm3r.scene.frames import Frames
 from swimm3r.scene.reconstruction import Reconstruction
 from swimm3r.sfm.colmap.poses import reconstruct
-from swimm3r.sfm.rectified_rows import TurnedRowsError, rectify_rows
+from swimm3r.sfm.rectified.frames import TurnedRowsError, rectify_frames
 from swimm3r.sfm.settings import ColmapSettings
 from swimm3r.synthetic.dive import Dive, make_dive, write_dive
 from swimm3r.synthetic.settings import DiveSettings
@@ -58,7 +58,7 @@ def placed(frames: Frames, settings: ColmapSettings, folder: Path) -> Reconstruc
     try:
         return reconstruct(frames, settings, folder / "sfm")
     except TurnedRowsError as error:
-        straight = rectify_rows(frames, error.turns, folder / "rows")
+        straight = rectify_frames(frames, error.rectification, folder / "rows")
         return reconstruct(straight, settings, folder / "straight")
 
 

@@ -38,7 +38,6 @@ ROWS = {  # by package: a room or module imports only rooms of rows before its o
     "swimm3r.sfm": [
         {"mast3r", "tracks", "imported", "rig_poses"},
         {"settings"},
-        {"rectified_rows"},
         {"rectified"},
         {"features", "lens", "plane_sweep"},
         {"alignment", "student", "colmap"},

@@ -36,8 +36,7 @@ if TYPE_CHECKING:
     from swimm3r.scene.reconstruction_io import load_reconstruction
     from swimm3r.scene.settings import FrameSettings
     from swimm3r.sfm import reconstruct
-    from swimm3r.sfm.rectified import rectify_frames
-    from swimm3r.sfm.rectified_rows import rectify_rows
+    from swimm3r.sfm.rectified.frames import rectify_frames
     from swimm3r.sfm.settings import ColmapSettings, Mast3rSettings
     from swimm3r.splat import train
     from swimm3r.splat.map_file import load_map
@@ -68,8 +67,7 @@ _HOME = {
     "Progress": "progress",
     "silent": "progress",
     "reconstruct": "sfm",
-    "rectify_frames": "sfm.rectified",
-    "rectify_rows": "sfm.rectified_rows",
+    "rectify_frames": "sfm.rectified.frames",
     "ColmapSettings": "sfm.settings",
     "Mast3rSettings": "sfm.settings",
     "SplatMap": "splat.rendering",
@@ -109,7 +107,6 @@ __all__ = [
     "read_frames",
     "reconstruct",
     "rectify_frames",
-    "rectify_rows",
     "remove_water",
     "run_pipeline",
     "silent",

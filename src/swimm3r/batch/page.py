@@ -18,7 +18,7 @@ from swimm3r.report.frames import filmed
 from swimm3r.report.head import clock
 from swimm3r.report.style import page_template, style_sheet
 from swimm3r.scene.run_folder import MARKERS, is_run, read_run
-from swimm3r.sfm.rectified import run_frames
+from swimm3r.sfm.rectified.run import run_frames
 
 _LONG_SIDE, _QUALITY = 320, 78  # of thumbnails: pixels, and JPEG's
 

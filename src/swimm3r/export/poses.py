@@ -8,7 +8,7 @@ from swimm3r.errors import InputError
 from swimm3r.io import cameras_json
 from swimm3r.io.files.damage import remake
 from swimm3r.scene.run_folder import open_run
-from swimm3r.sfm.rectified import run_frames
+from swimm3r.sfm.rectified.run import run_frames
 
 
 @dataclass(frozen=True)

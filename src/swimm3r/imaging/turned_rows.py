@@ -9,6 +9,8 @@ what it sees at half time along
 at every distance. A move within T looks like a turn, too, but for differences of depth, which stay.
 """
 
+from dataclasses import dataclass
+
 import numpy as np
 import torch
 from jaxtyping import Bool, Float, UInt8, UInt16
@@ -20,6 +22,19 @@ from swimm3r.cameras import Cameras, directions, pixel_grid, project
 _TURNS = 4  # in which the row of a pixel as filmed is found: a thousandth of a pixel after the third
 
 Image = UInt8[np.ndarray, "h w 3"] | UInt16[np.ndarray, "h w 3"] | Float[np.ndarray, "h w 3"]
+
+
+@dataclass(frozen=True)
+class RowTurns:
+    """The turns of one camera while each of some frames was exposed."""
+
+    lens: Cameras  # one camera, its pose unused
+    turns: dict[str, Float[np.ndarray, "3"]]  # rotation vectors, radians in the camera's axes, by frame
+
+    @property
+    def typical(self) -> float:
+        """Median angle in degrees."""
+        return float(np.degrees(np.median([np.linalg.norm(turn) for turn in self.turns.values()])))
 
 
 def half_time_pixels(camera: Cameras, xy: Float[Tensor, "m 2"], turn: Float[np.ndarray, "3"]) -> Float[Tensor, "m 2"]:

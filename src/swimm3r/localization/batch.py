@@ -28,7 +28,7 @@ from swimm3r.localization.settings import LocalizationSettings
 from swimm3r.progress import Progress, silent
 from swimm3r.scene.reconstruction_io import load_reconstruction
 from swimm3r.scene.run_folder import open_run
-from swimm3r.sfm.rectified import run_frames, run_rectification
+from swimm3r.sfm.rectified.run import run_frames, run_rectification
 from swimm3r.splat.map_file import load_map
 from swimm3r.splat.settings import MapDevice
 

@@ -40,17 +40,16 @@ from swimm3r.scene.run_folder import open_run
 from swimm3r.sfm import reconstruct
 from swimm3r.sfm.between import read_between
 from swimm3r.sfm.lens import known_lens
-from swimm3r.sfm.rectified import (
-    RECTIFIED,
-    BentImagesError,
+from swimm3r.sfm.rectified.frames import RectifiableError
+from swimm3r.sfm.rectified.run import (
     given_rectification,
+    has_rectified_rows,
     is_rectified,
     rectified_truth,
-    rectify_frames,
+    rectify_run,
     run_frames,
     write_masks_as_filmed,
 )
-from swimm3r.sfm.rectified_rows import RECTIFIED_ROWS, TurnedRowsError, has_rectified_rows, rectify_rows
 from swimm3r.splat import train
 from swimm3r.splat.map_file import load_map
 from swimm3r.splat.settings import MapDevice
@@ -208,18 +207,14 @@ def _reconstruct(
     if not is_rectified(folder) and not has_rectified_rows(folder):
         rectification = given_rectification(settings.sfm, prepared)
         if rectification is not None:
-            rectify_frames(prepared, rectification, folder / RECTIFIED, progress)
+            rectify_run(folder, rectification, progress)
     while True:  # once as filmed, and once after each of the two rectifications
-        frames = run_frames(folder)
         try:
-            reconstruct(frames, settings.sfm, folder / "sfm", progress, engine, navigator)
+            reconstruct(run_frames(folder), settings.sfm, folder / "sfm", progress, engine, navigator)
             break
-        except BentImagesError as bent:
-            log.info("%s: they are rectified, and everything from here on works on the rectified ones", bent.what)
-            rectify_frames(frames, bent.rectification, folder / RECTIFIED, progress)
-        except TurnedRowsError as turned:
-            log.info("%s: their rows are rectified, and everything from here on works on these frames", turned.what)
-            rectify_rows(frames, turned.turns, folder / RECTIFIED_ROWS, progress)
+        except RectifiableError as error:
+            log.info("%s: frames are rectified, and everything from here on works on the rectified ones", error.what)
+            rectify_run(folder, error.rectification, progress)
     if is_rectified(folder) or has_rectified_rows(folder):
         write_masks_as_filmed(prepared, folder)
 

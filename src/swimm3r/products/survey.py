@@ -19,7 +19,7 @@ from swimm3r.scene.georeference import Georeference, load_georeference, local_ge
 from swimm3r.scene.reconstruction import Reconstruction
 from swimm3r.scene.reconstruction_io import load_reconstruction
 from swimm3r.scene.run_folder import open_run
-from swimm3r.sfm.rectified import run_frames
+from swimm3r.sfm.rectified.run import run_frames
 
 Colors = Literal["filmed", "restored", "physical"]
 """As filmed; without the water, as shown; without the water, before the white balance."""

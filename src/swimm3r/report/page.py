@@ -24,8 +24,7 @@ from swimm3r.scene.frames import Frames
 from swimm3r.scene.reconstruction import Reconstruction
 from swimm3r.scene.reconstruction_io import load_reconstruction
 from swimm3r.scene.run_folder import open_run
-from swimm3r.sfm.rectified import is_rectified, run_frames
-from swimm3r.sfm.rectified_rows import has_rectified_rows
+from swimm3r.sfm.rectified.run import has_rectified_rows, is_rectified, run_frames
 from swimm3r.weights.manifest import MANIFEST
 
 _EMBEDDED_BYTES = 6 << 20  # a video up to this size travels inside the page, a larger one lies beside it

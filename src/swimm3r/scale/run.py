@@ -28,7 +28,7 @@ from swimm3r.scene.georeference import GEOREFERENCE, Georeference, load_georefer
 from swimm3r.scene.reconstruction import Reconstruction
 from swimm3r.scene.reconstruction_io import load_reconstruction
 from swimm3r.scene.run_folder import RunFolder, open_run
-from swimm3r.sfm.rectified import run_frames
+from swimm3r.sfm.rectified.run import run_frames
 
 SCALE = "scale.json"
 _SAME = 1e-9  # of a factor: the same sources again, by other roundings

@@ -35,9 +35,9 @@ def reconstruct(
     notebook shows how far it is, unless `progress` is given (`swimm3r.silent`: nothing). `engine` can spread the chunks
     of a long clip and dense depth over processes or a cluster. A `navigator` (`swimm3r.scale.navigation`)
     holds the path of COLMAP's mapping, and joins parts that share no ground; other back ends do without.
-    Raises InputError for fewer than 2 frames, BentImagesError (`sfm.rectified`) where no lens model explains the images
-    and `settings.rectify` is "auto", TurnedRowsError (`sfm.rectified_rows`) where the camera turned while rows were
-    exposed and `settings.shutter` is "auto", and RegistrationError where too few can be placed.
+    Raises InputError for fewer than 2 frames, RegistrationError where too few can be placed, and a RectifiableError
+    (`sfm.rectified.frames`): BentImagesError where no lens model explains the images and `settings.rectify` is "auto",
+    TurnedRowsError where the camera turned while rows were exposed and `settings.shutter` is "auto".
     """
     settings = settings or ColmapSettings()
     used = frames.train

@@ -18,7 +18,7 @@ from swimm3r.io.calibration.record import CalibratedLens, lens_at
 from swimm3r.io.calibration.run import calibration_of_run, run_with_lens
 from swimm3r.refraction.central import CameraInWater, camera_in_water
 from swimm3r.refraction.ports import port_of
-from swimm3r.sfm.rectified import run_rectification
+from swimm3r.sfm.rectified.run import run_rectification
 from swimm3r.sfm.settings import (
     LENS_NUMBERS,
     ColmapModelSettings,

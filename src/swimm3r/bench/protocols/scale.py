@@ -28,7 +28,7 @@ from swimm3r.scene.ground_truth import GroundTruth
 from swimm3r.scene.reconstruction import Reconstruction
 from swimm3r.scene.reconstruction_io import load_reconstruction
 from swimm3r.sfm.colmap import poses
-from swimm3r.sfm.rectified import run_frames
+from swimm3r.sfm.rectified.run import run_frames
 from swimm3r.sfm.settings import ColmapSettings
 from swimm3r.synthetic import DiveSettings, write_dive
 

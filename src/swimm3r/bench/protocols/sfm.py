@@ -31,7 +31,7 @@ from swimm3r.report.plan_view import plan_view
 from swimm3r.scene.ground_truth import GroundTruth
 from swimm3r.scene.reconstruction import Reconstruction
 from swimm3r.scene.reconstruction_io import load_reconstruction
-from swimm3r.sfm.rectified import rectified_truth, run_frames
+from swimm3r.sfm.rectified.run import rectified_truth, run_frames
 from swimm3r.sfm.settings import ColmapSettings, Mast3rSettings
 from swimm3r.tasks.settings import EngineSettings
 

@@ -11,7 +11,7 @@ from swimm3r.io.files.atomic import atomic_folder
 from swimm3r.io.files.outputs import check_empty
 from swimm3r.scene.reconstruction_io import load_reconstruction
 from swimm3r.scene.run_folder import open_run
-from swimm3r.sfm.rectified import run_frames
+from swimm3r.sfm.rectified.run import run_frames
 
 
 def export_run(folder: Path, path: Path, settings: ColmapExportSettings) -> Exported:

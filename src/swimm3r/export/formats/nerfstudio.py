@@ -20,7 +20,7 @@ from swimm3r.io.files.outputs import check_empty
 from swimm3r.io.ply import write_points
 from swimm3r.scene.reconstruction_io import load_reconstruction
 from swimm3r.scene.run_folder import open_run
-from swimm3r.sfm.rectified import run_frames
+from swimm3r.sfm.rectified.run import run_frames
 
 _APPLIED = np.array([[1.0, 0, 0, 0], [0, 0, 1, 0], [0, -1, 0, 0]])
 _OPENGL = np.diag([1.0, -1, -1, 1])

@@ -49,8 +49,7 @@ from swimm3r.sfm.colmap.shutter.readout import adjust_rolling
 from swimm3r.sfm.colmap.shutter.turning import turned_rows
 from swimm3r.sfm.features.database import FeatureDatabase, fill_features, match_pairs, start_database
 from swimm3r.sfm.lens import at_scale, behind_port, gives_lens, with_calibration
-from swimm3r.sfm.rectified import BentImagesError
-from swimm3r.sfm.rectified_rows import TurnedRowsError
+from swimm3r.sfm.rectified.frames import BentImagesError, TurnedRowsError
 from swimm3r.sfm.settings import ColmapSettings
 from swimm3r.tasks.settings import EngineSettings
 from swimm3r.tasks.threads import thread_count

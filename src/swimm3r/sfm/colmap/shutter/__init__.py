@@ -1,1 +1,1 @@
-"""Rows that were exposed one after another: along the path of a film (`readout`), or as each frame tells (`turning`)."""
+"""Rows exposed one after another: along the path of a film (`readout`), or as each frame tells (`turning`)."""

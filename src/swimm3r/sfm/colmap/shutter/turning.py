@@ -24,9 +24,9 @@ from scipy.spatial.transform import Rotation
 from torch import Tensor
 
 from swimm3r.cameras import Cameras, directions, rows_of_frames
+from swimm3r.imaging.turned_rows import RowTurns
 from swimm3r.scene.reconstruction import Reconstruction
 from swimm3r.sfm.colmap.extended_adjustment import Bundle, adjusted, blocks, cross, places
-from swimm3r.sfm.rectified_rows import RowTurns
 
 _STD = 0.002  # rad within a frame, of turns: 20 ms at 6 degrees per second
 _CLEARLY = 0.95  # of the median held-out error, below which turns are believed

@@ -12,28 +12,23 @@ import torch
 from swimm3r.cameras import Cameras
 from swimm3r.errors import InputError
 from swimm3r.imaging.rectification import Rectification
-from swimm3r.imaging.turned_rows import at_half_time
+from swimm3r.imaging.turned_rows import RowTurns, at_half_time
 from swimm3r.io import images
 from swimm3r.pipeline import run as pipeline
 from swimm3r.pipeline.presets import PRESETS
 from swimm3r.progress import silent
 from swimm3r.scene.frames import MASKS, Frame, Frames, write_index
 from swimm3r.scene.ground_truth import GroundTruth
-from swimm3r.sfm.rectified import (
+from swimm3r.sfm.rectified.frames import BentImagesError, TurnedRowsError, rectify_frames
+from swimm3r.sfm.rectified.run import (
     AS_FILMED,
-    BentImagesError,
+    RECTIFIED_ROWS,
+    has_rectified_rows,
     is_rectified,
     rectified_truth,
     run_frames,
-    write_masks_as_filmed,
-)
-from swimm3r.sfm.rectified_rows import (
-    RECTIFIED_ROWS,
-    RowTurns,
-    TurnedRowsError,
-    has_rectified_rows,
-    rectify_rows,
     run_turns,
+    write_masks_as_filmed,
 )
 from swimm3r.tasks.settings import EngineSettings
 
@@ -75,7 +70,7 @@ def test_later_stages_find_frames_with_rectified_rows(filmed: Frames, tmp_path: 
     run = tmp_path / "run"
     assert run_frames(run).names == filmed.names
     assert run_turns(run) is None
-    made = rectify_rows(filmed, TURNS, run / RECTIFIED_ROWS)
+    made = rectify_frames(filmed, TURNS, run / RECTIFIED_ROWS)
     again = run_frames(run)
     assert again == made
     assert again.rows_rectified
@@ -95,7 +90,7 @@ def test_later_stages_find_frames_with_rectified_rows(filmed: Frames, tmp_path: 
 
 
 def test_the_turns_are_read_back(filmed: Frames, tmp_path: Path):
-    rectify_rows(filmed, TURNS, tmp_path / "run" / RECTIFIED_ROWS)
+    rectify_frames(filmed, TURNS, tmp_path / "run" / RECTIFIED_ROWS)
     stored = run_turns(tmp_path / "run")
     assert stored is not None
     assert {name: turn.tolist() for name, turn in stored.turns.items()} == {
@@ -113,7 +108,7 @@ def test_the_turns_are_read_back(filmed: Frames, tmp_path: Path):
 
 def test_frames_of_another_size_are_refused(filmed: Frames, tmp_path: Path):
     with pytest.raises(InputError, match="80x60"):
-        rectify_rows(filmed, RowTurns(lens(160, 120), {}), tmp_path / "rows")
+        rectify_frames(filmed, RowTurns(lens(160, 120), {}), tmp_path / "rows")
     assert not (tmp_path / "rows").exists()
 
 
@@ -121,7 +116,7 @@ def test_masks_lead_back_to_the_frames_as_filmed(filmed: Frames, tmp_path: Path)
     run = tmp_path / "run"
     with pytest.raises(ValueError, match="as filmed"):
         write_masks_as_filmed(filmed, run)
-    rectify_rows(filmed, TURNS, run / RECTIFIED_ROWS)
+    rectify_frames(filmed, TURNS, run / RECTIFIED_ROWS)
     usable = np.ones((HEIGHT, WIDTH), bool)
     usable[4:20, 30:60] = False
     images.write_mask(run / "sfm" / MASKS / "0.png.png", usable)
@@ -136,7 +131,7 @@ def test_the_truth_has_the_frames_names(filmed: Frames, tmp_path: Path):
     cameras = replace(lens(), K=lens().K)[[0] * 3]
     stated = GroundTruth(filmed.names, cameras, metric=False, folder=tmp_path)
     assert rectified_truth(run, stated) is stated
-    rectify_rows(filmed, TURNS, run / RECTIFIED_ROWS)
+    rectify_frames(filmed, TURNS, run / RECTIFIED_ROWS)
     named = rectified_truth(run, stated)
     assert named is not None
     assert named.names == ("0.png", "1.png", "2.png")
@@ -149,7 +144,7 @@ def test_the_error_goes_from_process_to_process():
     again = pickle.loads(pickle.dumps(error))
     assert str(again) == str(error)
     assert "2.1 degrees" in str(again)
-    np.testing.assert_array_equal(again.turns.turns["2.jpg"], -TURN)
+    np.testing.assert_array_equal(again.rectification.turns["2.jpg"], -TURN)
 
 
 @pytest.mark.parametrize("bent", [False, True])

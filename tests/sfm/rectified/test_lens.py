@@ -24,12 +24,11 @@ from swimm3r.scene.frames import Frame, Frames, write_index
 from swimm3r.scene.ground_truth import GroundTruth
 from swimm3r.scene.reconstruction import Reconstruction
 from swimm3r.sfm.colmap import poses
-from swimm3r.sfm.rectified import (
+from swimm3r.sfm.rectified.frames import BentImagesError, rectify_frames
+from swimm3r.sfm.rectified.run import (
     RECTIFIED,
-    BentImagesError,
     given_rectification,
     rectified_truth,
-    rectify_frames,
     run_frames,
     run_rectification,
 )
@@ -75,6 +74,7 @@ def found(bent: Frames, tmp_path_factory: pytest.TempPathFactory) -> Rectificati
     """The way to images that COLMAP's lenses explain, from the images alone."""
     with pytest.raises(BentImagesError) as raised:
         poses.reconstruct(bent, SETTINGS, tmp_path_factory.mktemp("sfm"))
+    assert isinstance(raised.value.rectification, Rectification)
     return raised.value.rectification
 
 
@@ -163,10 +163,11 @@ def test_the_lens_of_a_run_brings_its_rectification(bent: Frames, truth: Cameras
 
 
 def test_the_error_goes_from_process_to_process():
-    error = BentImagesError(rectification_of(stretching_lens(WIDTH, HEIGHT)))
+    way = rectification_of(stretching_lens(WIDTH, HEIGHT))
+    error = BentImagesError(way)
     again = pickle.loads(pickle.dumps(error))
     assert str(again) == str(error)
-    assert again.rectification.key == error.rectification.key
+    assert again.rectification.key == way.key
 
 
 def test_reference_poses_turn_with_the_frames(bent: Frames, truth: Cameras, tmp_path: Path):
