@@ -6,7 +6,7 @@ ends where an undisturbed one does. Poses are free in scale and place: nothing h
 
 import logging
 import shutil
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass, replace
 from pathlib import Path
@@ -19,6 +19,7 @@ from swimm3r.io.colmap.cameras import to_pycolmap_camera
 from swimm3r.io.colmap.model import silence_log
 from swimm3r.io.files.atomic import atomic_path
 from swimm3r.progress import Progress, silent
+from swimm3r.refraction.central import CameraInWater
 from swimm3r.scene.frames import Frames
 from swimm3r.scene.placement import Navigator
 from swimm3r.scene.reconstruction import (
@@ -70,6 +71,20 @@ class _Mapped:
     warnings: list[QualityWarning]
 
 
+@dataclass(frozen=True)
+class _Known:
+    """Settings with the numbers of the clip's lens, the camera that mapping begins with, and its port or rig."""
+
+    settings: ColmapSettings
+    camera: "pycolmap.Camera"
+    housed: CameraInWater | None  # behind a port that is known
+    lenses: RigLenses | None  # of a calibrated rig whose lenses differ
+
+    def told_by_frames(self, mapped: _Mapped) -> bool:
+        """Return whether the lens is the one that the frames tell."""
+        return mapped.lens_refined and self.settings.intrinsics != "fixed"
+
+
 def reconstruct(
     frames: Frames,
     settings: ColmapSettings,
@@ -87,68 +102,103 @@ def reconstruct(
     BentImagesError where no lens model explains the images, TurnedRowsError where their rows show that the camera
     turned, and RegistrationError where too few can be placed.
     """
+    _check_input(frames, settings, navigator)
+    silence_log()
+    known, threads = _known(frames, settings, lens), settings.threads or thread_count()
+    with _full_disk_said_plainly(folder):
+        numbers, shared = ((), None) if known.lenses is None else (known.lenses.numbers, known.lenses.under_first)
+        store = start_database(folder, frames, known.camera, settings.features, numbers)
+        fill_features(store, frames, settings.features, threads, progress, shared)
+        pairs = choose_pairs(store, frames, known.settings)
+        match_pairs(store, pairs, settings.features, threads, progress)
+        with _working_copy(store) as working:
 
+            def recorded(model: "pycolmap.Reconstruction") -> Reconstruction:
+                return record_of(model, working, frames, folder, known.lenses)
+
+            scaled = at_scale(known.settings, frames.width, frames.height, store.scale)
+            mapped = _map(working, frames, pairs, scaled, progress, engine)
+            if not frames.rows_rectified:
+                _check_rectifiable(mapped, known, frames, recorded, progress)
+            if navigator is not None:
+                mapped = _navigated(mapped, working, frames, navigator, recorded, progress)
+            _check_placed(mapped.model, frames, known.settings)
+            rec, warnings = _adjusted(recorded(mapped.model), mapped, known, frames, progress)
+            parts = write_parts(mapped.model, mapped.others, working, frames, folder / PARTS, known.lenses)
+            if depth_change(rec) > LOST_SCALE:
+                raise scale_lost(len(rec.names), len(frames))
+            found = implausible(rec, working, frames)
+    registered = registration_warnings(len(rec.names), [mapped.model.num_reg_images(), *parts], frames)
+    return replace(rec, warnings=(*found, *mapped.warnings, *registered, *warnings))
+
+
+def _check_input(frames: Frames, settings: ColmapSettings, navigator: Navigator | None) -> None:
+    """Raise InputError for fewer than 2 frames, and UsageError where the exposure of rows cannot be corrected."""
     if len(frames) < 2:
         raise InputError(
             f"structure from motion needs at least 2 frames, got {len(frames)}",
             cause="the clip is too short or the sampling too coarse",
             hint="a longer clip or a higher --fps",
         )
-    silence_log()
-    threads = settings.threads or thread_count()
-    housed = lenses = shutter = None
-    if settings.shutter == "rolling":
-        _check_rolling(frames, navigator)
-    if lens is None:
-        given = settings
-        settings = with_calibration(settings, frames.width, frames.height, frames.calibration)
-        settings, housed = behind_port(settings, frames.width, frames.height)
-        camera = first_camera(frames.width, frames.height, settings)
-        lenses = lenses_of_rig(frames, given, camera)
-    else:
-        camera, settings = to_pycolmap_camera(lens), replace(settings, intrinsics="fixed")
+    other = "a rig's cameras" if frames.rig is not None else "--nav" if navigator is not None else None
+    if settings.shutter == "rolling" and other is not None:
+        raise UsageError(
+            f"--shutter rolling and {other} exclude each other",
+            cause="the adjustment with rows exposed one after another knows a single camera and its images alone",
+            hint="leave out one of them",
+        )
+
+
+def _known(frames: Frames, settings: ColmapSettings, lens: Cameras | None) -> _Known:
+    """The lens to hold where one is given, else as the settings or the frames' source tell."""
+    if lens is not None:
+        camera = to_pycolmap_camera(lens)
         camera.has_prior_focal_length = True
-    with _full_disk_said_plainly(folder):
-        numbers, shared = ((), None) if lenses is None else (lenses.numbers, lenses.under_first)
-        store = start_database(folder, frames, camera, settings.features, numbers)
-        fill_features(store, frames, settings.features, threads, progress, shared)
-        pairs = choose_pairs(store, frames, settings)
-        match_pairs(store, pairs, settings.features, threads, progress)
-        with _working_copy(store) as working:
-            own = at_scale(settings, frames.width, frames.height, store.scale)
-            mapped = _map(working, frames, pairs, own, progress, engine)
-            if _lens_is_open(settings, lenses) and not frames.rows_rectified:
-                _check_lens(mapped.model, frames, progress)
-            lens_told = mapped.lens_refined and settings.intrinsics != "fixed"  # turns would take up a wrong one
-            asked = settings.shutter == "auto" and housed is None and frames.rig is None
-            if asked and lens_told and not frames.rows_rectified:
-                _check_rows(record_of(mapped.model, working, frames, folder, lenses), progress)
-            if navigator is not None:
-                mapped = _navigated(mapped, working, frames, folder, navigator, progress, lenses)
-            _check_placed(mapped.model, frames, settings)
-            rec = record_of(mapped.model, working, frames, folder, lenses)
-            if settings.shutter == "rolling":
-                times = frames.times_of(rec.names)
-                rolled = adjust_rolling(rec, times, settings.readout, lens=lens_told, progress=progress)
-                rec, shutter = rolled.reconstruction, rolled.warning
-            if housed is not None:
-                free = settings.intrinsics != "fixed"
-                rec = adjust_through_port(rec, housed, settings.port.range, lens=free, progress=progress)
-            parts = write_parts(mapped.model, mapped.others, working, frames, folder / PARTS, lenses)
-            sizes = [mapped.model.num_reg_images(), *parts]
-            if depth_change(rec) > LOST_SCALE:
-                raise scale_lost(len(rec.names), len(frames))
-            found = implausible(rec, working, frames)
-    port = [unknown_port()] if settings.housing == "flat" and housed is None else []
-    shaken = [] if shutter is None else [shutter]
-    warnings = (*found, *mapped.warnings, *registration_warnings(len(rec.names), sizes, frames), *port, *shaken)
-    return replace(rec, warnings=warnings)
+        return _Known(replace(settings, intrinsics="fixed"), camera, None, None)
+    own = with_calibration(settings, frames.width, frames.height, frames.calibration)
+    own, housed = behind_port(own, frames.width, frames.height)
+    camera = first_camera(frames.width, frames.height, own)
+    return _Known(own, camera, housed, lenses_of_rig(frames, settings, camera))
 
 
-def _lens_is_open(settings: ColmapSettings, lenses: RigLenses | None) -> bool:
-    """Return whether the frames alone say which lens took them, and may be rectified."""
-    known = settings.intrinsics == "fixed" or settings.housing != "none" or gives_lens(settings)
-    return settings.rectify == "auto" and settings.camera == "auto" and not known and lenses is None
+def _check_rectifiable(
+    mapped: _Mapped,
+    known: _Known,
+    frames: Frames,
+    recorded: "Callable[[pycolmap.Reconstruction], Reconstruction]",
+    progress: Progress,
+) -> None:
+    """Raise a RectifiableError where a lens beyond models, or turns of the camera within frames, explain the images."""
+    settings = known.settings
+    given = settings.intrinsics == "fixed" or settings.housing != "none" or gives_lens(settings)
+    if settings.rectify == "auto" and settings.camera == "auto" and not given and known.lenses is None:
+        _check_lens(mapped.model, frames, progress)
+    alone = known.housed is None and frames.rig is None
+    if settings.shutter == "auto" and alone and known.told_by_frames(mapped):  # turns would take up a wrong lens
+        progress("rows of the frames", 0, 1)
+        turns = turned_rows(recorded(mapped.model))
+        progress("rows of the frames", 1, 1)
+        if turns is not None:
+            raise TurnedRowsError(turns)
+
+
+def _adjusted(
+    rec: Reconstruction, mapped: _Mapped, known: _Known, frames: Frames, progress: Progress
+) -> tuple[Reconstruction, list[QualityWarning]]:
+    """The reconstruction with rows exposed along its path, and behind its port; and warnings of what is not known."""
+    settings, warnings = known.settings, []
+    if settings.housing == "flat" and known.housed is None:
+        warnings.append(unknown_port())
+    if settings.shutter == "rolling":
+        times = frames.times_of(rec.names)
+        rolled = adjust_rolling(rec, times, settings.readout, lens=known.told_by_frames(mapped), progress=progress)
+        rec = rolled.reconstruction
+        if rolled.warning is not None:
+            warnings.append(rolled.warning)
+    if known.housed is not None:
+        free = settings.intrinsics != "fixed"
+        rec = adjust_through_port(rec, known.housed, settings.port.range, lens=free, progress=progress)
+    return rec, warnings
 
 
 def _check_lens(model: "pycolmap.Reconstruction", frames: Frames, progress: Progress) -> None:
@@ -162,26 +212,6 @@ def _check_lens(model: "pycolmap.Reconstruction", frames: Frames, progress: Prog
         log.info("the polynomial is no lens, and the one that there is stays: %s", error)
         return
     raise BentImagesError(rectification)
-
-
-def _check_rows(rec: Reconstruction, progress: Progress) -> None:
-    """Raise TurnedRowsError where the camera turned while the rows of its frames were exposed."""
-    progress("rows of the frames", 0, 1)
-    found = turned_rows(rec)
-    progress("rows of the frames", 1, 1)
-    if found is not None:
-        raise TurnedRowsError(found)
-
-
-def _check_rolling(frames: Frames, navigator: Navigator | None) -> None:
-    """Raise UsageError where the exposure of rows is not corrected."""
-    other = "a rig's cameras" if frames.rig is not None else "--nav" if navigator is not None else None
-    if other is not None:
-        raise UsageError(
-            f"--shutter rolling and {other} exclude each other",
-            cause="the adjustment with rows exposed one after another knows a single camera and its images alone",
-            hint="leave out one of them",
-        )
 
 
 @contextmanager
@@ -221,7 +251,7 @@ def _map(
     settings: ColmapSettings,
     progress: Progress,
     engine: EngineSettings,
-) -> "_Mapped":
+) -> _Mapped:
     """The largest model, its lens refined. Raises RegistrationError where no two frames can be placed."""
     n, threads = len(frames), settings.threads or thread_count()
     long = is_long(n, settings.mapping)
@@ -253,21 +283,20 @@ def _map(
 
 
 def _navigated(
-    mapped: "_Mapped",
+    mapped: _Mapped,
     store: FeatureDatabase,
     frames: Frames,
-    folder: Path,
     navigator: Navigator,
+    recorded: "Callable[[pycolmap.Reconstruction], Reconstruction]",
     progress: Progress,
-    lenses: RigLenses | None,
-) -> "_Mapped":
+) -> _Mapped:
     found = with_navigation(
         store,
         mapped.model,
         mapped.others,
         frames,
         navigator,
-        lambda model: record_of(model, store, frames, folder, lenses),
+        recorded,
         progress,
         lens=mapped.lens_refined,
     )
