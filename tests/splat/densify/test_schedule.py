@@ -9,7 +9,7 @@ import torch
 
 from swimm3r.splat import train
 from swimm3r.splat.densify import schedule
-from swimm3r.splat.primitives.start import voxel_sample
+from swimm3r.splat.primitives.thinning import voxel_sample
 from swimm3r.splat.settings import DensifySettings, InitialSettings, MoverSettings, UwbsSettings, with_recipe
 
 PAPER = DensifySettings()

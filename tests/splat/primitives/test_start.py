@@ -2,12 +2,15 @@
 
 from dataclasses import replace
 
+import numpy as np
 import pytest
 import torch
 
-from swimm3r.cameras import project_visible
+from swimm3r.cameras import project_visible, unproject
 from swimm3r.scene.reconstruction import DenseCloud, DepthMaps
-from swimm3r.splat.primitives.start import mean_directions, pixel_spacing, starting_points, voxel_sample
+from swimm3r.splat.primitives import thinning
+from swimm3r.splat.primitives.start import mean_directions, starting_points
+from swimm3r.splat.primitives.thinning import Shown, covering_sample, voxel_sample
 from swimm3r.splat.settings import InitialSettings
 
 
@@ -29,40 +32,49 @@ def test_few_points_are_all_kept():
     assert torch.equal(voxel_sample(torch.rand(10, 3).double(), 100), torch.arange(10))
 
 
-def test_voxels_are_as_large_as_the_spacing_asks():
-    points = torch.rand(40_000, 3, generator=torch.Generator().manual_seed(0)).double()
-    points[:, 2] = 0
-    coarse = points[:, 0] > 0.5
-    chosen = voxel_sample(points, 2000, torch.where(coarse, 2.0, 1.0).double())
-    assert len(chosen) == pytest.approx(2000, rel=0.01)
-    fine, few = float((~coarse[chosen]).sum()), float(coarse[chosen].sum())
-    assert fine / few == pytest.approx(4, rel=0.1)
-    assert torch.equal(voxel_sample(points, 2000, torch.full((40_000,), 7.0).double()), voxel_sample(points, 2000))
-
-
-def test_points_are_spaced_by_the_pixels_that_show_them(tiny_dive, tmp_path):
-    rec = replace(tiny_dive.rec, depth=DepthMaps(tmp_path))  # nothing hides anything
+def test_points_cover_the_frames_evenly(tiny_dive, tmp_path):
+    """A shell of points where depth is uncertain gets no more of them than a surface."""
+    rec = replace(tiny_dive.rec, depth=DepthMaps(tmp_path))
+    rng = torch.Generator().manual_seed(0)
     camera = rec.cameras[3]
-    center, ahead = camera.centers[0].double(), camera.cam2world[0, :3, 2].double()
-    points = torch.stack([center + t * ahead for t in (1.0, 1.5, 2.0)])
     one = replace(rec, names=rec.names[3:4], cameras=camera)
-    torch.testing.assert_close(pixel_spacing(points, one), torch.tensor([1.0, 1.5, 2.0]).double(), atol=1e-6, rtol=0)
+    pixels = torch.rand(60_000, 2, generator=rng).double() * torch.tensor([camera.width, camera.height])
+    near = pixels[:, 0] < camera.width / 2
+    depth = torch.where(near, 2 + 0.2 * torch.rand(60_000, generator=rng), 6.0).double()
+    points = unproject(camera, pixels[None], depth[None])[0].float()
+    cloud = replace(one, cloud=DenseCloud(points, points, points), backdrop=None)
+    start = starting_points(cloud, InitialSettings(primitives=2000))
+    assert len(start.xyz) == pytest.approx(2000, rel=0.02)
+    left = project_visible(camera, start.xyz[None])[0][0, :, 0] < camera.width / 2
+    assert left.double().mean() == pytest.approx(0.5, abs=0.03)
 
-    xyz = rec.points.xyz
-    seen = torch.stack([project_visible(camera, xyz[None])[2][0] for camera in (rec.cameras[k] for k in range(7))])
-    area = 1 / (xyz - rec.cameras.centers[:, None]).square().sum(-1)
-    expected = ((seen * area).sum(0) / seen.sum(0)) ** -0.5
-    middle = expected[seen.any(0)].median()
-    expected = torch.where(seen.any(0), expected, 3 * middle).clamp(middle / 3, 3 * middle)
-    spacing = pixel_spacing(xyz, rec)
-    torch.testing.assert_close(spacing, expected, atol=0, rtol=1e-9)
-    again = [0, *range(7), 0, 0]  # a camera that rests
-    rested = replace(rec, names=tuple(f"{i}.png" for i in range(10)), cameras=rec.cameras[again])
-    alone = seen[0] & (seen.sum(0) == 1)
-    assert alone.any()
-    torch.testing.assert_close(pixel_spacing(xyz, rested)[alone], spacing[alone], atol=0, rtol=0.2)
-    behind = pixel_spacing(torch.cat([rec.points.xyz, (center - 5 * ahead)[None]]), one)
-    assert behind[-1] == behind.amax()  # no frame sees it
+
+def test_cells_take_the_point_nearest_to_their_middle_and_one_image_after_the_other():
+    first = Shown(np.arange(4), np.array([[1.0, 1.0], [5.0, 5.2], [9.0, 1.0], [15.0, 5.0]]))
+    second = Shown(np.array([0, 1, 2, 3, 4]), np.array([[5.0, 5.0], [6.0, 6.0], [15.0, 5.0], [12.0, 9.0], [25.0, 5.0]]))
+    chosen = thinning._covering(6, [first, second], 10.0)
+    assert np.flatnonzero(chosen).tolist() == [1, 3, 4]
+
+
+def test_edges_are_bisected_until_the_wanted_number_of_points_is_left():
+    rng = np.random.default_rng(0)
+    images = [Shown(np.arange(5000), rng.uniform(0, 400, (5000, 2))) for _ in range(3)]
+    assert len(covering_sample(5000, 1200, images)) == pytest.approx(1200, rel=0.01)
+    assert len(covering_sample(6000, 10_000, images)) == 5000
+
+
+def test_points_that_no_frame_shows_are_thinned_as_much(tiny_dive, tmp_path):
+    rec = replace(tiny_dive.rec, depth=DepthMaps(tmp_path))
+    camera = rec.cameras[3]
+    one = replace(rec, names=rec.names[3:4], cameras=camera)
+    rng = torch.Generator().manual_seed(0)
+    pixels = torch.rand(20_000, 2, generator=rng).double() * torch.tensor([camera.width, camera.height])
+    seen = unproject(camera, pixels[None], torch.full((1, 20_000), 3.0).double())[0].float()
+    points = torch.cat([seen, 2 * camera.centers - seen])  # as many behind it
+    cloud = replace(one, cloud=DenseCloud(points, points, points), backdrop=None)
+    start = starting_points(cloud, InitialSettings(primitives=2000))
+    inside = project_visible(camera, start.xyz[None])[2][0]
+    assert inside.double().mean() == pytest.approx(0.5, abs=0.05)
 
 
 def test_the_mean_direction_is_that_of_the_frames_which_see_the_point(tiny_dive):
