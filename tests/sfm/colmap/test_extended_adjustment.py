@@ -21,7 +21,7 @@ class Stretched:
     point: np.ndarray
     xy: np.ndarray
     width: float = 0.5
-    expected: float = np.inf
+    prior_std: float = np.inf
 
     def errors(self, bundle: Bundle) -> np.ndarray:
         at = places(bundle, self)
@@ -83,9 +83,9 @@ def clip() -> tuple[Bundle, Stretched]:
     return near, observed
 
 
-@pytest.mark.parametrize("expected", [np.inf, 290.0])
-def test_the_sum_is_that_of_a_solver_without_blocks(clip: tuple[Bundle, Stretched], expected: float):
-    bundle, observed = clip[0], replace(clip[1], expected=expected)
+@pytest.mark.parametrize("std", [np.inf, 290.0])
+def test_the_sum_is_that_of_a_solver_without_blocks(clip: tuple[Bundle, Stretched], std: float):
+    bundle, observed = clip[0], replace(clip[1], prior_std=std)
 
     def moved(x: np.ndarray) -> Bundle:
         poses, points = x[: 6 * FRAMES].reshape(-1, 6), x[6 * FRAMES : -2].reshape(-1, 3)
@@ -97,7 +97,7 @@ def test_the_sum_is_that_of_a_solver_without_blocks(clip: tuple[Bundle, Stretche
         error = observed.errors(found) / observed.width
         squared = np.square(error).sum(-1, keepdims=True)
         robust = error * np.sqrt(2 * (np.sqrt(1 + squared) - 1) / squared)
-        return np.concatenate([robust.ravel(), found.others / expected])
+        return np.concatenate([robust.ravel(), found.others / std])
 
     wanted = total(
         moved(least_squares(residuals, np.zeros(6 * FRAMES + 3 * POINTS + 2), method="lm", max_nfev=20000).x), observed
@@ -122,6 +122,6 @@ def test_frames_and_points_without_observations_stay(clip: tuple[Bundle, Stretch
     assert np.abs(found.xyz - bundle.xyz).max() > 1e-3
 
 
-def test_unknowns_of_which_much_is_expected_are_held_back(clip: tuple[Bundle, Stretched]):
-    free, held = (adjusted(clip[0], replace(clip[1], expected=s), 50).others for s in (np.inf, 5.0))
+def test_a_prior_holds_unknowns_back(clip: tuple[Bundle, Stretched]):
+    free, held = (adjusted(clip[0], replace(clip[1], prior_std=s), 50).others for s in (np.inf, 5.0))
     assert (held < 0.97 * free).all()

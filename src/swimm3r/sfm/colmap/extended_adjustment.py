@@ -4,9 +4,9 @@ Poses, points and other unknowns u become those of the least
 
     sum 2 (sqrt(1 + |e_o|^2 / c^2) - 1) + sum (u_k / s)^2,
 
-e_o the reprojection error of observation o in pixels under COLMAP's soft L1 loss of width c, and s what is expected of
-the other unknowns, infinite where nothing is. Steps are Levenberg and Marquardt's, points eliminated first (Triggs et
-al. 2000, section 6).
+e_o the reprojection error of observation o in pixels under COLMAP's soft L1 loss of width c, and s the
+prior standard deviation of the other unknowns, infinite without a prior. Steps are Levenberg and Marquardt's, points
+eliminated first (Triggs et al. 2000, section 6).
 """
 
 from dataclasses import dataclass, replace
@@ -50,7 +50,7 @@ class Observed(Protocol):
         ...
 
     @property
-    def expected(self) -> float:
+    def prior_std(self) -> float:
         """s, in the units of the other unknowns."""
         ...
 
@@ -76,7 +76,7 @@ def places(bundle: Bundle, observed: Observed) -> Float[np.ndarray, "o 3"]:
 def total(bundle: Bundle, observed: Observed) -> float:
     """The sum that is to become least."""
     squared = np.square(observed.errors(bundle) / observed.width).sum(-1)
-    return float(2 * (np.sqrt(1 + squared) - 1).sum() + np.square(bundle.others / observed.expected).sum())
+    return float(2 * (np.sqrt(1 + squared) - 1).sum() + np.square(bundle.others / observed.prior_std).sum())
 
 
 def adjusted(bundle: Bundle, observed: Observed, steps: int) -> Bundle:
@@ -104,6 +104,15 @@ def blocks(J: Float[np.ndarray, "o r k"], column: Int[np.ndarray, " o"], count: 
     m, rows, k = J.shape
     indices = np.repeat((column[:, None] * k + np.arange(k))[:, None], rows, 1).reshape(-1)
     return sparse.csr_array((J.reshape(-1), indices, np.arange(m * rows + 1) * k), shape=(m * rows, count * k))
+
+
+def division_jacobian(place: Float[np.ndarray, "o 3"]) -> Float[np.ndarray, "o 2 3"]:
+    """Derivatives of (x / z, y / z)."""
+    z = place[:, 2]
+    out = np.zeros((len(z), 2, 3))
+    out[:, 0, 0] = out[:, 1, 1] = 1 / z
+    out[:, :, 2] = -place[:, :2] / z[:, None] ** 2
+    return out
 
 
 def pose_jacobian(place: Float[np.ndarray, "o 3"], by_place: Float[np.ndarray, "o 2 3"]) -> Float[np.ndarray, "o 2 6"]:
@@ -139,14 +148,15 @@ class _NormalEquations:
         to_points = blocks(by_point, observed.point, len(bundle.xyz))
         J = sparse.hstack([blocks(by_pose, observed.frame, len(bundle.R)), by_others], format="csr")
         error = (error * root[:, None]).reshape(-1)
-        expected = np.concatenate([np.zeros(6 * len(bundle.R)), np.full(len(bundle.others), observed.expected**-2.0)])
+        free = np.zeros(6 * len(bundle.R))
+        prior = np.concatenate([free, np.full(len(bundle.others), observed.prior_std**-2.0)])
         V = np.zeros((len(bundle.xyz), 3, 3))
         np.add.at(V, observed.point, np.einsum("oij,oik->ojk", by_point, by_point))
         return cls(
-            (J.T @ J + sparse.diags_array(expected)).tocsr(),
+            (J.T @ J + sparse.diags_array(prior)).tocsr(),
             (J.T @ to_points).tocsr(),
             V,
-            -J.T @ error - expected * np.concatenate([np.zeros(6 * len(bundle.R)), bundle.others]),
+            -J.T @ error - prior * np.concatenate([free, bundle.others]),
             -to_points.T @ error,
         )
 

@@ -19,7 +19,7 @@ from scipy import sparse
 
 from swimm3r.cameras import DISTORTION_PARAMETERS, EXPONENTS, Cameras
 from swimm3r.progress import Progress, silent
-from swimm3r.sfm.colmap.extended_adjustment import Bundle, adjusted, places
+from swimm3r.sfm.colmap.extended_adjustment import Bundle, adjusted, division_jacobian, places
 
 if TYPE_CHECKING:
     import pycolmap
@@ -52,7 +52,7 @@ class _Observed:
     xy: Float[np.ndarray, "m 2"]
     degree: int = 0
     width: float = _WIDTH
-    expected: float = np.inf
+    prior_std: float = np.inf
 
     def some(self, chosen: Bool[np.ndarray, " m"]) -> "_Observed":
         return replace(self, frame=self.frame[chosen], point=self.point[chosen], xy=self.xy[chosen])
@@ -63,14 +63,9 @@ class _Observed:
 
     def by_place(self, bundle: Bundle) -> Float[np.ndarray, "m 2 3"]:
         lens, at = _Lens.of(bundle), places(bundle, self)
-        z = at[:, 2]
-        plane = at[:, :2] / z[:, None]
-        _, by_x, by_y = _monomials(plane)
+        _, by_x, by_y = _monomials(at[:, :2] / at[:, 2:])
         bent = np.stack([by_x @ lens.bend.T, by_y @ lens.bend.T], 2) + np.eye(2)
-        onto = np.zeros((len(at), 2, 3))
-        onto[:, 0, 0] = onto[:, 1, 1] = 1 / z
-        onto[:, :, 2] = -plane / z[:, None]
-        return (bent * lens.K[:2, None]) @ onto
+        return (bent * lens.K[:2, None]) @ division_jacobian(at)
 
     def by_others(self, bundle: Bundle) -> sparse.csr_array:
         lens, plane = _Lens.of(bundle), self._plane(bundle)

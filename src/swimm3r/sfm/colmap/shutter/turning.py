@@ -26,7 +26,7 @@ from torch import Tensor
 from swimm3r.cameras import Cameras, directions, rows_of_frames
 from swimm3r.imaging.turned_rows import RowTurns
 from swimm3r.scene.reconstruction import Reconstruction
-from swimm3r.sfm.colmap.extended_adjustment import Bundle, adjusted, blocks, cross, places
+from swimm3r.sfm.colmap.extended_adjustment import Bundle, adjusted, blocks, cross, division_jacobian, places
 
 _STD = 0.002  # rad within a frame, of turns: 20 ms at 6 degrees per second
 _CLEARLY = 0.95  # of the median held-out error, below which turns are believed
@@ -51,7 +51,7 @@ class _Observed:
     row: Float[np.ndarray, " o"]  # y / H - 1/2
     focal: float  # px
     width: float  # px
-    expected: float = _STD
+    prior_std: float = _STD
 
     def some(self, chosen: Bool[np.ndarray, " o"]) -> "_Observed":
         point, frame, ray, row = (part[chosen] for part in (self.point, self.frame, self.ray, self.row))
@@ -62,14 +62,14 @@ class _Observed:
         return self.focal * (place[:, :2] / place[:, 2:] - ray[:, :2] / ray[:, 2:])
 
     def by_place(self, bundle: Bundle) -> Float[np.ndarray, "o 2 3"]:
-        return _divided(places(bundle, self), self.focal)
+        return self.focal * division_jacobian(places(bundle, self))
 
     def by_others(self, bundle: Bundle) -> sparse.csr_array:
         if not len(bundle.others):
             return sparse.csr_array((2 * len(self.point), 0))
         ray, turned = self._at_half_time(bundle), cross(self.row[:, None] * bundle.others.reshape(-1, 3)[self.frame])
         along = np.eye(3) + turned / 2 + turned @ turned / 6  # left Jacobian of small rotations
-        by_turn = self.row[:, None, None] * (_divided(ray, self.focal) @ cross(ray) @ along)
+        by_turn = self.row[:, None, None] * (self.focal * division_jacobian(ray) @ cross(ray) @ along)
         return blocks(by_turn, self.frame, len(bundle.R))
 
     def _at_half_time(self, bundle: Bundle) -> Float[np.ndarray, "o 3"]:
@@ -185,12 +185,3 @@ def _held_out(point: Int[np.ndarray, " o"]) -> Bool[np.ndarray, " o"]:
     chosen = np.random.default_rng(0).random(len(point)) < _HELD_OUT
     left = np.bincount(point[~chosen], minlength=point.max(initial=0) + 1)
     return chosen & (left[point] >= _ENOUGH)
-
-
-def _divided(seen: Float[np.ndarray, "o 3"], focal: float) -> Float[np.ndarray, "o 2 3"]:
-    """Derivative of focal (x / z, y / z)."""
-    z = seen[:, 2]
-    out = np.zeros((len(z), 2, 3))
-    out[:, 0, 0] = out[:, 1, 1] = focal / z
-    out[:, :, 2] = -focal * seen[:, :2] / z[:, None] ** 2
-    return out
