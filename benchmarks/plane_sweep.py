@@ -28,7 +28,8 @@ from swimm3r.scene.frames import Frame, Frames
 from swimm3r.scene.reconstruction import DepthMaps, Matches, Points, Reconstruction, Tracks
 from swimm3r.sfm.medium.apply import with_water
 from swimm3r.sfm.plane_sweep.estimate import estimate_depth
-from swimm3r.sfm.settings import ColmapSettings, PlaneSweepSettings
+from swimm3r.sfm.plane_sweep.settings import PlaneSweepSettings
+from swimm3r.sfm.settings import ColmapSettings
 
 
 def frames_of(clip: Path, names: tuple[str, ...]) -> Frames:

@@ -16,7 +16,7 @@ import torch
 from swimm3r.medium import Medium, add_water, backscatter, transmittances
 from swimm3r.sfm.medium.samples import WaterSamples
 from swimm3r.sfm.medium.seathru import fit_medium
-from swimm3r.sfm.settings import SeathruSettings
+from swimm3r.sfm.medium.settings import SeathruSettings
 
 FAMILIES = {  # the paper's intervals of Binf
     "cyan": ((0.02, 0.08), (0.30, 0.50), (0.30, 0.45)),

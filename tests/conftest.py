@@ -29,7 +29,7 @@ torch.set_num_threads(THREADS)
 
 LONG_FILES = (  # of more than 20 seconds: started first, so that no worker ends long after the other
     "visits/test_visits.py", "batch/test_run.py", "examples/test_examples.py", "splat/test_elsewhere.py",
-    "sfm/medium/test_lamp_fit.py", "sfm/colmap/chunks/test_long_clip.py", "visits/test_alignment.py",
+    "sfm/medium/least_squares/test_lamp_fit.py", "sfm/colmap/chunks/test_long_clip.py", "visits/test_alignment.py",
     "localization/test_online.py", "test_architecture.py", "synthetic/test_optics.py",
     "bench/protocols/test_localization.py", "synthetic/test_survey.py", "localization/test_localizer.py",
     "viewer/test_in_browser.py", "sfm/backends/test_imported.py", "raster/cpu/test_backend.py", "tasks/test_tasks.py",

@@ -37,6 +37,7 @@ ROWS = {  # by package: a room or module imports only rooms of rows before its o
     ],
     "swimm3r.sfm": [
         {"mast3r", "tracks", "imported", "rig_poses"},
+        {"features.settings", "plane_sweep.settings", "colmap.settings", "medium.settings"},
         {"settings"},
         {"rectified"},
         {"features", "lens", "plane_sweep"},

@@ -13,7 +13,7 @@ import torch
 
 import swimm3r
 from swimm3r.io.images import read_rgb
-from swimm3r.sfm.settings import PlaneSweepSettings
+from swimm3r.sfm.plane_sweep.settings import PlaneSweepSettings
 from swimm3r.splat.projection.view_camera import view_camera
 from swimm3r.splat.settings import DensifySettings, InitialSettings, MediumFieldSettings, UwbsSettings
 

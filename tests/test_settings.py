@@ -27,7 +27,9 @@ from swimm3r.scale.settings import ScaleSettings
 from swimm3r.scene.settings import FrameSettings
 from swimm3r.settings import NotEmpty, Positive, Range, SettingError, Settings, declarations, ranges_of
 from swimm3r.settings_document import from_document, to_document
-from swimm3r.sfm.settings import ColmapSettings, FeatureSettings, MappingSettings
+from swimm3r.sfm.colmap.settings import MappingSettings
+from swimm3r.sfm.features.settings import FeatureSettings
+from swimm3r.sfm.settings import ColmapSettings
 from swimm3r.splat.settings import LearningRates, UwbsSettings
 
 PACKAGE = Path(swimm3r.__file__).parent
@@ -202,7 +204,7 @@ def test_a_refusal_is_a_value_error_and_a_usage_error_and_crosses_processes():
 
 def test_python_calls_without_the_suites_type_checks_are_refused_too():
     code = """
-from swimm3r.sfm.settings import FeatureSettings
+from swimm3r.sfm.features.settings import FeatureSettings
 try:
     FeatureSettings(count="3")
 except ValueError as error:

@@ -47,7 +47,7 @@ from swimm3r.sfm.mast3r.network import Encoded, Mast3r
 from swimm3r.sfm.mast3r.preprocess import K_to_network, framing, to_network
 from swimm3r.sfm.medium.from_head import FrameReading, summed_up
 from swimm3r.sfm.medium.seathru import estimate_medium
-from swimm3r.sfm.settings import SeathruSettings
+from swimm3r.sfm.medium.settings import SeathruSettings
 from swimm3r.sfm.student import adapter_file
 from swimm3r.sfm.student.physics_head import PhysicsHead, ray_depth_of
 

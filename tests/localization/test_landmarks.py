@@ -18,8 +18,8 @@ from swimm3r.pipeline.held_out import first_poses
 from swimm3r.scene.frames import Frame, Frames
 from swimm3r.scene.ground_truth import GroundTruth
 from swimm3r.scene.reconstruction import DepthMap, DepthMaps, Matches, Points, Reconstruction, Tracks
+from swimm3r.sfm.features.settings import FeatureSettings
 from swimm3r.sfm.features.sift import extract_features
-from swimm3r.sfm.settings import FeatureSettings
 
 SETTINGS = FeatureSettings(count=600)
 

@@ -14,9 +14,10 @@ from swimm3r.localization.localizer import STAGES, Localizer
 from swimm3r.localization.matchers import Mast3rMatcher, SiftMatcher, matcher_for
 from swimm3r.localization.references import rendered
 from swimm3r.localization.settings import LocalizationSettings, with_checkpoint_of
+from swimm3r.sfm.features.settings import FeatureSettings
 from swimm3r.sfm.mast3r import checkpoint
 from swimm3r.sfm.mast3r.settings import MatchingSettings
-from swimm3r.sfm.settings import ColmapSettings, FeatureSettings, Mast3rSettings
+from swimm3r.sfm.settings import ColmapSettings, Mast3rSettings
 from swimm3r.splat.medium.field import initial_field
 from swimm3r.splat.primitives.beta import with_time
 from swimm3r.splat.settings import InitialSettings

@@ -9,8 +9,8 @@ from swimm3r.geometry import pose_from, so3_exp
 from swimm3r.io.images import write_rgb
 from swimm3r.scene.frames import Frame, Frames
 from swimm3r.scene.reconstruction import DepthMaps, Matches, Points, Reconstruction, Tracks
+from swimm3r.sfm.features.settings import FeatureSettings
 from swimm3r.sfm.features.sift import extract_features
-from swimm3r.sfm.settings import FeatureSettings
 
 WIDTH, HEIGHT = 480, 360
 FEATURES = FeatureSettings(count=1200)

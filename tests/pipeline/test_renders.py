@@ -18,7 +18,7 @@ from swimm3r.io.depth import read_depth
 from swimm3r.medium import Medium
 from swimm3r.pipeline.camera_paths import smooth_path
 from swimm3r.pipeline.renders import DisplayStyle, marked, shown_clear, write_view
-from swimm3r.sfm.settings import RestoreSettings
+from swimm3r.sfm.medium.settings import RestoreSettings
 from swimm3r.splat.rendering import RenderOutput
 
 H, W = 6, 8

@@ -32,7 +32,8 @@ from swimm3r.report.outputs import OUTPUTS, outputs_of
 from swimm3r.report.scores import TRUTH_LABELS, truth_rows
 from swimm3r.scene.ground_truth import read_ground_truth
 from swimm3r.scene.reconstruction_io import load_reconstruction
-from swimm3r.sfm.settings import ColmapModelSettings, ColmapSettings, SeathruSettings
+from swimm3r.sfm.medium.settings import SeathruSettings
+from swimm3r.sfm.settings import ColmapModelSettings, ColmapSettings
 from swimm3r.splat.settings import (
     DensifySettings,
     InitialSettings,

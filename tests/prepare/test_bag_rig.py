@@ -23,7 +23,8 @@ from swimm3r.scene.frames import Frames
 from swimm3r.scene.ground_truth import read_ground_truth
 from swimm3r.sfm.colmap.poses import reconstruct
 from swimm3r.sfm.colmap.rig.adjustment import as_rig
-from swimm3r.sfm.settings import ColmapSettings, FeatureSettings
+from swimm3r.sfm.features.settings import FeatureSettings
+from swimm3r.sfm.settings import ColmapSettings
 from swimm3r.synthetic import DiveSettings, write_dive
 
 TOPICS = ("/stereo/left/image_raw", "/stereo/right/image_raw")

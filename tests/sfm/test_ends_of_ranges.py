@@ -15,13 +15,15 @@ from swimm3r.imaging.undistortion import frame_rays
 from swimm3r.medium import MediumFit
 from swimm3r.scene.reconstruction import DepthMaps, Reconstruction
 from swimm3r.settings import Range, Settings, declarations, ranges_of
+from swimm3r.sfm.features.settings import FeatureSettings
 from swimm3r.sfm.features.sift import extract_features
 from swimm3r.sfm.medium.dense_cloud import dense_cloud
 from swimm3r.sfm.medium.dense_tracks import fuse_depth
 from swimm3r.sfm.medium.restore import restore_image
 from swimm3r.sfm.medium.seathru import estimate_medium
+from swimm3r.sfm.medium.settings import RestoreSettings, SeathruSettings, TrackSettings
 from swimm3r.sfm.plane_sweep.estimate import estimate_depth
-from swimm3r.sfm.settings import FeatureSettings, PlaneSweepSettings, RestoreSettings, SeathruSettings, TrackSettings
+from swimm3r.sfm.plane_sweep.settings import PlaneSweepSettings
 
 FEW = SeathruSettings(max_pixels=2000, max_observations=2000, start_observations=300, reweightings=1, min_samples=100)
 SMALL = PlaneSweepSettings(long_side=48, sources=2, planes=32, rounds=1, threads=1)

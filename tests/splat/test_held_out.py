@@ -20,7 +20,7 @@ from swimm3r.pipeline.held_out import (
 from swimm3r.scene.coverage import TrainingCoverage
 from swimm3r.scene.ground_truth import GroundTruth
 from swimm3r.scene.reconstruction import DenseCloud
-from swimm3r.sfm.settings import FeatureSettings
+from swimm3r.sfm.features.settings import FeatureSettings
 
 
 def lens(k1: float) -> Cameras:

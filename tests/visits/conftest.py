@@ -19,7 +19,7 @@ from swimm3r.scene.frames import Frame, Frames
 from swimm3r.scene.georeference import Georeference, save_georeference
 from swimm3r.scene.reconstruction import DepthMap, DepthMaps, Matches, Points, Reconstruction, Tracks
 from swimm3r.sfm.colmap.triangulation import triangulate
-from swimm3r.sfm.settings import FeatureSettings
+from swimm3r.sfm.features.settings import FeatureSettings
 
 WIDTH, HEIGHT, FOCAL = 240, 180, 220.0
 ALTITUDE = 1.0

@@ -9,7 +9,7 @@ from tests.visits.conftest import LATER_LIGHT, TRANSMITTED, Seabed, Visits
 
 from swimm3r.medium import AttenuationCurve, Encoding, Medium, MediumFit, add_water, linear_from_srgb, srgb_from_linear
 from swimm3r.progress import silent
-from swimm3r.sfm.settings import RestoreSettings
+from swimm3r.sfm.medium.settings import RestoreSettings
 from swimm3r.visits.alignment.place import place_visits
 from swimm3r.visits.color import linear
 from swimm3r.visits.ground import Ground, clear_light, common_grid, observe

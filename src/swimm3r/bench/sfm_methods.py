@@ -19,7 +19,8 @@ from swimm3r.scene.ground_truth import GroundTruth
 from swimm3r.scene.reconstruction import Matches, Reconstruction
 from swimm3r.scene.reconstruction_io import unfiltered_matches
 from swimm3r.sfm.medium.dense_tracks import count_tracks
-from swimm3r.sfm.settings import ColmapModelSettings, ColmapSettings, Mast3rSettings, SfmSettings, TrackSettings
+from swimm3r.sfm.medium.settings import TrackSettings
+from swimm3r.sfm.settings import ColmapModelSettings, ColmapSettings, Mast3rSettings, SfmSettings
 
 
 def settings_for(

@@ -20,8 +20,8 @@ from swimm3r.localization.keypoint_places import measured_depth, tracked_points
 from swimm3r.scene.frames import Frames
 from swimm3r.scene.reconstruction import Reconstruction
 from swimm3r.sfm.colmap.absolute_pose import absolute_pose
+from swimm3r.sfm.features.settings import FeatureSettings
 from swimm3r.sfm.features.sift import extract_features, match_descriptors, unit_descriptors
-from swimm3r.sfm.settings import FeatureSettings
 
 MIN_INLIERS = 12
 """Landmarks that agree on a pose before it is believed: 6 of them fix it, and wrong matches agree on a few more."""

@@ -15,8 +15,9 @@ from swimm3r.settings import (
     Settings,
     Share,
 )
+from swimm3r.sfm.features.settings import FeatureSettings
 from swimm3r.sfm.mast3r.settings import MatchingSettings
-from swimm3r.sfm.settings import FeatureSettings, Mast3rSettings, SfmSettings
+from swimm3r.sfm.settings import Mast3rSettings, SfmSettings
 
 
 @dataclass(frozen=True)

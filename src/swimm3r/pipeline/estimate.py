@@ -20,7 +20,8 @@ from swimm3r.prepare.clip import open_clip
 from swimm3r.prepare.image_folder import images_of
 from swimm3r.scene.run_folder import STAGES
 from swimm3r.scene.settings import FrameSettings
-from swimm3r.sfm.settings import ColmapModelSettings, ColmapSettings, Mast3rSettings, PlaneSweepSettings
+from swimm3r.sfm.plane_sweep.settings import PlaneSweepSettings
+from swimm3r.sfm.settings import ColmapModelSettings, ColmapSettings, Mast3rSettings
 from swimm3r.splat.settings import SplatSettings, UwbsSettings
 from swimm3r.tasks.threads import thread_count
 

@@ -10,15 +10,11 @@ from swimm3r.scale.settings import ScaleSettings
 from swimm3r.scene.settings import FrameSettings
 from swimm3r.settings import SettingError, Settings
 from swimm3r.settings_document import from_document, to_document
+from swimm3r.sfm.features.settings import FeatureSettings
 from swimm3r.sfm.mast3r.settings import AlignmentSettings
-from swimm3r.sfm.settings import (
-    ColmapSettings,
-    FeatureSettings,
-    Mast3rSettings,
-    PlaneSweepSettings,
-    RestoreSettings,
-    SfmSettings,
-)
+from swimm3r.sfm.medium.settings import RestoreSettings
+from swimm3r.sfm.plane_sweep.settings import PlaneSweepSettings
+from swimm3r.sfm.settings import ColmapSettings, Mast3rSettings, SfmSettings
 from swimm3r.splat.settings import (
     DensifySettings,
     InitialSettings,

@@ -38,8 +38,8 @@ from swimm3r.scene.reconstruction import Reconstruction
 from swimm3r.scene.reconstruction_io import load_reconstruction
 from swimm3r.scene.run_folder import open_run
 from swimm3r.sfm.medium.restore import keep_open_water
+from swimm3r.sfm.medium.settings import RestoreSettings
 from swimm3r.sfm.rectified.run import run_frames
-from swimm3r.sfm.settings import RestoreSettings
 from swimm3r.splat.map_file import load_map
 from swimm3r.splat.rendering import RenderOutput, SplatMap
 from swimm3r.splat.settings import MapDevice

@@ -21,9 +21,9 @@ from swimm3r.selftest.scenes import (
     overlapping,
     turned_camera,
 )
+from swimm3r.sfm.plane_sweep.settings import PlaneSweepSettings
 from swimm3r.sfm.plane_sweep.sweep import sweep
 from swimm3r.sfm.plane_sweep.views import make_view
-from swimm3r.sfm.settings import PlaneSweepSettings
 from swimm3r.splat.primitives.beta import BetaPrimitives, trained
 from swimm3r.splat.projection.dispatch import project
 from swimm3r.splat.projection.plain import project_plainly

@@ -1,4 +1,4 @@
-"""Every number of the structure-from-motion stage, with its reason; torch-free, so that --help is instant."""
+"""Settings of structure from motion, a type per back end; torch-free, so that --help is instant."""
 
 from dataclasses import dataclass, field, replace
 from pathlib import Path
@@ -10,244 +10,26 @@ from swimm3r.settings import (
     Count,
     CountOrZero,
     LensParameter,
-    LongSide,
     NetworkSide,
-    NotEmpty,
     NotNegative,
     Positive,
-    PositiveShare,
     Range,
     Settings,
     Share,
     Threads,
 )
+from swimm3r.sfm.colmap.settings import MappingSettings
+from swimm3r.sfm.features.settings import FeatureSettings
 from swimm3r.sfm.mast3r.settings import AlignmentSettings, MatchingSettings
+from swimm3r.sfm.medium.settings import MediumSettings
+from swimm3r.sfm.plane_sweep.settings import PlaneSweepSettings
 
 LENS_NUMBERS = ("focal", "fy", "cx", "cy", "k1", "k2", "k3", "k4", "p1", "p2")
 """Settings that give a lens number by number."""
 
 BackendName = Literal["colmap", "mast3r", "swimm3r"]
-
-
-@dataclass(frozen=True)
-class PlaneSweepSettings(Settings):
-    """Dense depth of posed frames (`sfm/plane_sweep/estimate.py`)."""
-
-    long_side: LongSide = 640
-    """Longer side in pixels at which depth is computed; for larger frames it is upsampled along image edges."""
-    sources: Annotated[int, Range(1, 16)] = 5
-    """Number of neighboring frames that each frame is compared with."""
-    angle_deg: Annotated[float, Range(above=0, most=90)] = 8.0
-    """Preferred triangulation angle in degrees: smaller angles are imprecise, larger ones hide surfaces."""
-    planes: Annotated[int, Range(32, 1024)] = 128
-    """Largest number of planes of the coarse sweep, uniform in inverse depth; close views use fewer, one per pixel of
-    motion."""
-    window: Annotated[int, Range(1, 16)] = 3
-    """Half width of the coarse sweep's NCC window, in pixels of the half-size image."""
-    noise: PositiveShare = 0.8 / 255
-    """Standard deviation of gray values below which a window is too uniform to be matched."""
-    smooth: NotNegative = 0.15
-    """Penalty for one plane of disagreement between neighboring pixels in the semi-global step; a jump costs eight
-    times as much."""
-    rounds: Annotated[int, Range(0, 32)] = 3
-    """Number of slanted-plane refinement rounds at full working size."""
-    smooth_fine: NotNegative = 0.05
-    """Penalty in the refinement for one source pixel of disagreement with neighboring pixels."""
-    min_ncc: Annotated[float, Range(0, below=1)] = 0.4
-    """Smallest correlation with the sources at which a depth is kept."""
-    min_peak: NotNegative = 0.12
-    """Smallest share by which 1 - NCC must rise 2.5 pixels beside a match; flatter peaks are dropped as undetermined.
-    """
-    tolerance: Share = 0.015
-    """Largest relative difference in depth at which two frames agree; the reprojection error may allow more."""
-    agreeing: Annotated[int, Range(0, 16)] = 2
-    """Number of other frames that must agree with a depth; of ground that fewer of them see, all."""
-    speck: CountOrZero = 48
-    """Size in working pixels below which connected patches of depth are dropped; up to eight times that, patches that
-    few frames share have to fit the depth around them."""
-    threads: Threads = 0
-    """Number of frames computed at once; 0 uses all cores, at most 8."""
-    device: Literal["auto", "cpu", "cuda"] = "auto"
-    """Processor of the sweep; "auto" uses a CUDA device where there is one."""
-
-
-@dataclass(frozen=True)
-class TrackSettings(Settings):
-    """Pixels of several depth maps grouped into surface points (`sfm/medium/dense_tracks.py`)."""
-
-    tolerance: Share = 0.02
-    """Largest relative difference in z depth at which two frames show the same point."""
-    max_color_change: Share = 0.3
-    """Largest change of a color channel between two observations of a point."""
-    max_views: Count = 12
-    """Number of other frames in which the points of one frame are looked up."""
-    min_overlap: Share = 0.1
-    """Overlap above which another frame is searched for the points of a frame."""
-    max_tracks: Count = 1_000_000
-    """Approximate largest number of surface points that the water is fitted to; more are thinned on a regular grid."""
-
-
-@dataclass(frozen=True)
-class RestoreSettings(Settings):
-    """Images and points with the water removed (`sfm/medium/restore.py`). Values are 0..1."""
-
-    noise: PositiveShare = 0.01
-    """Standard deviation of a pixel value caused by the sensor and compression."""
-    texture: PositiveShare = 0.1
-    """Standard deviation of clear colors within a small window."""
-    veil_error: PositiveShare = 0.006
-    """Assumed error of the backscatter B(z); where T_D is not clearly larger, color is taken from the other channels.
-    """
-    color_error: PositiveShare = 0.12
-    """Largest error of a clear color that is accepted."""
-    window: Annotated[float, Range(0.001, 0.25)] = 0.02
-    """Standard deviation of the local windows, as a share of the longer side."""
-    max_points: Annotated[int, Range(100)] = 500_000
-    """Largest number of points of the restored cloud, thinned by voxels, of a surface of `max_points_area`."""
-    max_points_area: Annotated[float, Range(0, 1e6)] = 12.0
-    """Area in images above which a surface has points in proportion to it; 0 keeps to `max_points`."""
-    white_balance: bool = True
-    """Apply gray-world gains, one triple per dive, to all that is shown: restored/, points.ply, clear views, exports.
-    The colors in restored_physical/ and points_physical.ply, and all scores, stay physical."""
-
-
-LightChoice = Literal["auto", "sun", "lamp"]
 MovingChoice = Literal["auto", "none"]
-FlickerChoice = Literal["auto", "keep"]
 RectifyChoice = Literal["auto", "keep"]
-
-
-@dataclass(frozen=True)
-class SeathruSettings(Settings):
-    """The water from images and depth (`sfm/medium/seathru.py`); values are 0..1, standard deviations without unit."""
-
-    tracks: TrackSettings = field(default_factory=TrackSettings)
-    max_pixels: Count = 300_000
-    """Number of single pixels drawn from all frames together."""
-    open_water_pixels: Count = 2_000
-    """Largest number of open-water pixels taken from one frame."""
-    patch_pixels: Positive = 12.0
-    """Edge length of a surface patch in pixels of its farthest observation; at most 1/32 of the longer side."""
-    patch_observations: Count = 6
-    """Smallest number of pixels of a patch in a frame."""
-    patch_offset: NotNegative = 0.15
-    """Largest distance, in edge lengths, between the centroid of a patch and that of its visible part."""
-    range_bins: Annotated[int, Range(1, 1000)] = 10
-    """Number of range bins that the darkest pixels are taken from."""
-    dark_fraction: PositiveShare = 0.01  # Sea-Thru: the darkest 1 % of each range bin
-    """Share of darkest pixels in each range bin that stand for backscatter (1 % in Sea-Thru)."""
-    min_bin_pixels: Count = 50
-    """Smallest number of pixels of a range bin that is used."""
-    dark_std: PositiveShare = 0.015
-    """Standard deviation of the dark envelope of one range bin."""
-    dark_reflectance: Share = 0.02
-    """Expected clear color of the darkest pixels, as black surfaces are rarely fully black."""
-    dark_reflectance_std: PositiveShare = 0.03
-    """Standard deviation of the clear color of the darkest pixels."""
-    lsac_f: Positive = 2.0
-    """Sea-Thru's f: the illuminant is f times the local average color, so that surfaces reflect 1/f on average."""
-    mean_reflectance_std: Positive = 0.5
-    """Standard deviation of ln(1/f) over a whole dive, which weights the gray-world assumption."""
-    average_std: Positive = 0.3
-    """Relative standard deviation of one range bin's average color."""
-    slope_std: Positive = 0.1
-    """Standard deviation of b times the median depth in beta_D(z) = a exp(b z)."""
-    open_water_std: PositiveShare = 0.01
-    """Standard deviation of Binf from open-water pixels, beyond their spread."""
-    far_color_std: PositiveShare = 0.2
-    """Standard deviation of Binf about the mean color of the farthest tenth, if no open water is visible."""
-    min_open_water: Count = 200
-    """Smallest number of open-water pixels that determine Binf."""
-    min_samples: Count = 500
-    """Smallest number of pixels with a depth that a fit needs."""
-    min_tracks: Count = 100
-    """Smallest number of surface points seen in several frames that a fit needs."""
-    min_depth_ratio: Annotated[float, Range(1)] = 1.05
-    """Smallest ratio of the farthest to the nearest observation of a point in the fit."""
-    black: Share = 0.002
-    """Pixel value at or below which a pixel counts as underexposed."""
-    saturated: Share = 0.98
-    """Pixel value from which a pixel counts as overexposed."""
-    max_observations: Count = 200_000
-    """Largest number of observations in the fit; points with the largest ratio of depths are kept."""
-    start_observations: Count = 5_000
-    """Number of observations in the search for the fit's initial values."""
-    min_redundancy: Positive = 3.0
-    """Smallest number of observations that share one error term."""
-    loss_scale: PositiveShare = 0.02
-    """Residual, in pixel values, beyond which observations count as outliers."""
-    reweightings: Annotated[int, Range(1, 100)] = 6
-    """Number of robust reweighting rounds of the fit."""
-    depth_error: Share = 0.01
-    """Relative error of one observation's ray depth, beyond the error that all observations of a point share."""
-    gain_std: Share = 0.1
-    """Initial standard deviation of exposure and white balance between frames, which is then estimated."""
-    gain_evidence: Share = 0.85
-    """Share of the residuals below which gains per frame must bring them to be used."""
-    lamp_explained: Share = 0.4
-    """Smallest share of the variance of points' light, after distance, that their places in the images explain under a
-    lamp, with `light auto`."""
-    lamp_change: NotNegative = 0.1
-    """Smallest standard deviation, over the images, of the logarithm of a lamp's light, with `light auto`."""
-    std_inflation: Positive = 2.0
-    """Factor on the standard deviations beyond that of the residuals (benchmarks/seathru_calibration.py)."""
-    identifiable_std: NotNegative = 0.065
-    """Relative standard deviation below which a coefficient counts as identifiable (benchmarks/seathru_calibration.py).
-    """
-
-
-@dataclass(frozen=True)
-class FeatureSettings(Settings):
-    """SIFT and its matching (`sfm/features/sift.py`)."""
-
-    count: Annotated[int, Range(1, 1_000_000)] = 2048
-    """Largest number of keypoints per frame; one with two orientations counts once."""
-    peak_threshold: PositiveShare = 0.003
-    """Smallest contrast of a keypoint, of 1; hazy images need less than COLMAP's 0.0067."""
-    faint_threshold: PositiveShare = 0.001
-    """Smallest contrast of a keypoint in frames that yield fewer than `count` with `peak_threshold`."""
-    equalize: Annotated[float, Range(0, 1000)] = 0.0
-    """Clip limit of the local contrast equalization (CLAHE) before detection; 0 leaves images unchanged."""
-    long_side: LongSide = 1000
-    """Longer side in pixels to which larger frames are reduced for detection."""
-    max_ratio: PositiveShare = 0.8
-    """Largest ratio of the nearest to the second nearest descriptor distance (angles) of a match."""
-
-
-@dataclass(frozen=True)
-class MappingSettings(Settings):
-    """From verified matches to cameras and points (`sfm/colmap/mapping.py`)."""
-
-    method: Literal["auto", "incremental", "global"] = "auto"
-    """Mapper of a clip or a chunk: incremental, global (GLOMAP), or both and the better result (auto)."""
-    chunk_frames: Annotated[int, Range(8)] = 48
-    """Largest number of frames of a chunk; `auto` maps clips with more than twice as many in chunks that are joined."""
-    chunk_overlap: Annotated[int, Range(2)] = 8
-    """Number of frames that neighboring chunks share."""
-    focal_ladder: Annotated[tuple[Annotated[float, Range(0.1, 20)], ...], NotEmpty()] = (0.75, 1.1, 0.6, 1.5)
-    """Focal lengths, as multiples of the image width, tried in turn if the lens is unknown and frames are not
-    registered."""
-    k1: Annotated[float, Range(-1, 1)] = 0.03
-    """Radial distortion that the trials of focal lengths start from."""
-    enough: Share = 1.0
-    """Share of registered frames at which no further focal lengths are tried."""
-    retry_ratio: PositiveShare = 0.9
-    """Ratio test of the second matching of frames that were not registered."""
-    navigation: bool = True
-    """Use the navigation that is given (`--nav`): its positions as priors of those of the cameras, and to join parts
-    that share no ground."""
-    min_frames: Annotated[int, Range(2)] = 3
-    """Smallest number of registered frames of a result."""
-    min_share: Share = 0.2
-    """Smallest share of registered frames of a result."""
-    thin_points: CountOrZero = 150
-    """Mean number of points per frame below which a model may be a passing animal; it is refused unless it holds
-    `thin_share` of the frames."""
-    thin_share: Share = 0.6
-    """Share of the frames from which a model with few points is accepted."""
-    opencv_gain: Share = 0.03
-    """Relative decrease of the reprojection error from which camera `auto` compares lenses on frames that they were not
-    fitted to, and by which one with more freedom must be better there."""
 
 
 @dataclass(frozen=True)
@@ -307,7 +89,7 @@ class LensSettings(Settings):
 
 
 @dataclass(frozen=True)
-class ColmapSettings(LensSettings):
+class ColmapSettings(MediumSettings, LensSettings):
     """Structure from motion without weights: pycolmap, plane sweep, Sea-Thru."""
 
     camera: Literal["auto", "SIMPLE_RADIAL", "OPENCV", "OPENCV_FISHEYE"] = "auto"
@@ -340,13 +122,6 @@ class ColmapSettings(LensSettings):
     depth: PlaneSweepSettings = field(default_factory=PlaneSweepSettings)
     moving: MovingChoice = "auto"
     """Masks of moving objects: found where they hide surfaces that other frames measured (auto), or none."""
-    light: LightChoice = "sun"
-    """Light of the dive: the sun, a lamp on the camera, or the one of them that the frames tell (auto)."""
-    flicker: FlickerChoice = "auto"
-    """Sunlight that flickers over the ground (caustics): evened out where the frames show it (auto), or kept as filmed.
-    """
-    water: SeathruSettings = field(default_factory=SeathruSettings)
-    restore: RestoreSettings = field(default_factory=RestoreSettings)
 
     def __post_init__(self) -> None:
         super().__post_init__()
@@ -375,7 +150,7 @@ class ColmapSettings(LensSettings):
 
 
 @dataclass(frozen=True)
-class Mast3rSettings(LensSettings):
+class Mast3rSettings(MediumSettings, LensSettings):
     """Structure from motion by the MASt3R network: pointmaps and matches of pairs of frames, aligned; Sea-Thru."""
 
     weights: Path | None = None
@@ -425,13 +200,6 @@ class Mast3rSettings(LensSettings):
     """By which held-out frames find their place beside a finished reconstruction."""
     moving: MovingChoice = "auto"
     """Masks of moving objects: found where they hide surfaces that other frames measured (auto), or none."""
-    light: LightChoice = "sun"
-    """Light of the dive: the sun, a lamp on the camera, or the one of them that the frames tell (auto)."""
-    flicker: FlickerChoice = "auto"
-    """Sunlight that flickers over the ground (caustics): evened out where the frames show it (auto), or kept as filmed.
-    """
-    water: SeathruSettings = field(default_factory=SeathruSettings)
-    restore: RestoreSettings = field(default_factory=RestoreSettings)
 
     @property
     def backend(self) -> BackendName:
@@ -440,7 +208,7 @@ class Mast3rSettings(LensSettings):
 
 
 @dataclass(frozen=True)
-class ColmapModelSettings(Settings):
+class ColmapModelSettings(MediumSettings):
     """Poses and points of a COLMAP model that exists; depth, water and cloud are found as without one."""
 
     model: Path
@@ -450,13 +218,6 @@ class ColmapModelSettings(Settings):
     depth: PlaneSweepSettings = field(default_factory=PlaneSweepSettings)
     moving: MovingChoice = "auto"
     """Masks of moving objects: found where they hide surfaces that other frames measured (auto), or none."""
-    light: LightChoice = "sun"
-    """Light of the dive: the sun, a lamp on the camera, or the one of them that the frames tell (auto)."""
-    flicker: FlickerChoice = "auto"
-    """Sunlight that flickers over the ground (caustics): evened out where the frames show it (auto), or kept as filmed.
-    """
-    water: SeathruSettings = field(default_factory=SeathruSettings)
-    restore: RestoreSettings = field(default_factory=RestoreSettings)
 
     @property
     def backend(self) -> BackendName:

@@ -25,7 +25,7 @@ from swimm3r.imaging.undistortion import undistorted
 from swimm3r.pipeline.held_out import first_poses
 from swimm3r.pipeline.renders import DisplayStyle, display_style
 from swimm3r.progress import Progress
-from swimm3r.sfm.settings import FeatureSettings
+from swimm3r.sfm.features.settings import FeatureSettings
 from swimm3r.splat.training.observer import TrainingStep
 from swimm3r.viewer.server import Viewer, address_lines, started_server
 from swimm3r.viewer.settings import ViewerSettings

@@ -26,7 +26,7 @@ from swimm3r.products.frame_colors import Points, shown_by
 from swimm3r.products.grid import Grid, Window, chosen_gsd, grid_of
 from swimm3r.products.survey import Survey
 from swimm3r.progress import Progress, silent
-from swimm3r.sfm.settings import RestoreSettings
+from swimm3r.sfm.medium.settings import RestoreSettings
 
 _TILE = 512  # cells along the side of the windows that are filled one after another
 _MOST_CELLS = 4e7  # of a comparison, whose grids are in memory: about 150 bytes each

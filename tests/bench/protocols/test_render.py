@@ -20,7 +20,8 @@ from swimm3r.io.images import read_rgb
 from swimm3r.pipeline import held_out
 from swimm3r.pipeline.presets import RunSettings
 from swimm3r.pipeline.run import open_finished_sfm
-from swimm3r.sfm.settings import ColmapSettings, PlaneSweepSettings
+from swimm3r.sfm.plane_sweep.settings import PlaneSweepSettings
+from swimm3r.sfm.settings import ColmapSettings
 from swimm3r.splat.settings import RECIPES, PoseRefinementSettings, UwbsSettings
 
 

@@ -28,7 +28,8 @@ from swimm3r.progress import silent
 from swimm3r.scene.reconstruction import DepthMaps, Matches, Reconstruction
 from swimm3r.scene.reconstruction_io import write_unfiltered_matches
 from swimm3r.sfm.medium.dense_tracks import count_tracks, fuse_depth
-from swimm3r.sfm.settings import ColmapModelSettings, ColmapSettings, Mast3rSettings, TrackSettings
+from swimm3r.sfm.medium.settings import TrackSettings
+from swimm3r.sfm.settings import ColmapModelSettings, ColmapSettings, Mast3rSettings
 
 
 @pytest.fixture

@@ -19,7 +19,8 @@ from swimm3r.io.image_folder import find_images
 from swimm3r.io.images import read_rgb, write_rgb
 from swimm3r.prepare import check_source, load_frames, read_frames
 from swimm3r.sfm.colmap.poses import reconstruct
-from swimm3r.sfm.settings import ColmapSettings, FeatureSettings
+from swimm3r.sfm.features.settings import FeatureSettings
+from swimm3r.sfm.settings import ColmapSettings
 
 K = (60.0, 0, 32, 0, 61, 24, 0, 0, 1)
 TEXTURE = np.random.default_rng(0).integers(0, 255, (12, 16, 3), dtype=np.uint8).repeat(4, 0).repeat(4, 1)

@@ -19,7 +19,8 @@ from swimm3r.scene.reconstruction import Tracks
 from swimm3r.scene.reconstruction_io import load_reconstruction
 from swimm3r.sfm.backends import imported as imported_backend
 from swimm3r.sfm.colmap.triangulation import triangulate
-from swimm3r.sfm.settings import ColmapModelSettings, FeatureSettings
+from swimm3r.sfm.features.settings import FeatureSettings
+from swimm3r.sfm.settings import ColmapModelSettings
 from swimm3r.synthetic import Coefficients, DiveSettings, make_dive
 
 

@@ -23,8 +23,9 @@ from swimm3r.sfm.colmap.adjustment import bundle_adjust
 from swimm3r.sfm.colmap.calibration.start import first_camera, is_lens
 from swimm3r.sfm.colmap.messages import too_few
 from swimm3r.sfm.colmap.pairs import choose_pairs
+from swimm3r.sfm.colmap.settings import MappingSettings
 from swimm3r.sfm.features import database as feature_database
-from swimm3r.sfm.settings import ColmapSettings, MappingSettings
+from swimm3r.sfm.settings import ColmapSettings
 from swimm3r.synthetic import write_dive
 from swimm3r.synthetic.settings import DiveSettings
 
@@ -353,8 +354,8 @@ def test_bundle_adjustment_mends_shaken_poses(rec: Reconstruction) -> None:
 
 
 def test_a_tiled_floor_has_twins_and_a_reef_has_none() -> None:
+    from swimm3r.sfm.features.settings import FeatureSettings
     from swimm3r.sfm.features.sift import extract_features, unit_descriptors
-    from swimm3r.sfm.settings import FeatureSettings
 
     usable = torch.ones(HEIGHT, WIDTH, dtype=torch.bool)
     tile = cv2.resize(_texture(3), (40, 40))

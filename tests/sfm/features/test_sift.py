@@ -4,8 +4,8 @@ import numpy as np
 import torch
 from torch.nn.functional import normalize
 
+from swimm3r.sfm.features.settings import FeatureSettings
 from swimm3r.sfm.features.sift import extract_features, match_descriptors, unit_descriptors
-from swimm3r.sfm.settings import FeatureSettings
 
 
 def _texture(height: int = 200, width: int = 260, seed: int = 0) -> torch.Tensor:

@@ -9,7 +9,7 @@ from swimm3r.cameras import project
 from swimm3r.scene.reconstruction import DenseCloud, DepthMap, DepthMaps
 from swimm3r.sfm.medium.backdrop import Backdrop
 from swimm3r.sfm.medium.restore import restored_images
-from swimm3r.sfm.settings import RestoreSettings
+from swimm3r.sfm.medium.settings import RestoreSettings
 
 from .test_restore import exact
 

@@ -10,7 +10,7 @@ from swimm3r.scene.reconstruction import DenseCloud
 from swimm3r.scene.surface import surface_of
 from swimm3r.sfm.medium.dense_cloud import dense_cloud, restored_points, thinned, times_as_many
 from swimm3r.sfm.medium.dense_tracks import fuse_depth, fuse_in_batches
-from swimm3r.sfm.settings import RestoreSettings, TrackSettings
+from swimm3r.sfm.medium.settings import RestoreSettings, TrackSettings
 
 FEW = TrackSettings(max_tracks=600)
 

@@ -6,7 +6,7 @@ import torch
 
 from swimm3r.scene.reconstruction import DepthMap, DepthMaps
 from swimm3r.sfm.medium.dense_tracks import Surfaces, cubes, fuse_depth
-from swimm3r.sfm.settings import TrackSettings
+from swimm3r.sfm.medium.settings import TrackSettings
 
 
 def test_tracks_of_a_flat_seafloor_lie_on_it(dive):

@@ -19,7 +19,8 @@ from swimm3r.scene.reconstruction import Reconstruction
 from swimm3r.scene.reconstruction_io import load_reconstruction
 from swimm3r.sfm.medium import apply
 from swimm3r.sfm.medium.flicker import with_steady
-from swimm3r.sfm.settings import ColmapSettings, RestoreSettings
+from swimm3r.sfm.medium.settings import RestoreSettings
+from swimm3r.sfm.settings import ColmapSettings
 
 COUNT = 12
 

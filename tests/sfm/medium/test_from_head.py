@@ -14,7 +14,8 @@ from swimm3r.sfm.mast3r_sfm.network_frames import NetworkImages, network_images
 from swimm3r.sfm.medium.dense_cloud import restored_points
 from swimm3r.sfm.medium.dense_tracks import fuse_depth
 from swimm3r.sfm.medium.from_head import PredictedWater, dive_fit, predicted_images, read, write
-from swimm3r.sfm.settings import Mast3rSettings, SeathruSettings
+from swimm3r.sfm.medium.settings import SeathruSettings
+from swimm3r.sfm.settings import Mast3rSettings
 from swimm3r.sfm.student.physics_head import HeadFacts, WaterMaps
 from swimm3r.splat.medium.prior import water_prior
 from swimm3r.splat.settings import MediumFieldSettings

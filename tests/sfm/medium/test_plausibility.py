@@ -23,7 +23,8 @@ from swimm3r.sfm.medium.plausibility import (
     with_like_channels,
 )
 from swimm3r.sfm.medium.restore import RestoredImage, display_gains, milder_gains, restore_image, white_balance
-from swimm3r.sfm.settings import ColmapSettings, RestoreSettings, TrackSettings
+from swimm3r.sfm.medium.settings import RestoreSettings, TrackSettings
+from swimm3r.sfm.settings import ColmapSettings
 
 TINT = torch.tensor([0.6, 1.0, 0.9])
 

@@ -10,10 +10,10 @@ import torch
 from swimm3r.errors import InputError
 from swimm3r.medium import Medium, add_water, backscatter, rescale, srgb_from_linear, transmittances
 from swimm3r.sfm.medium import seathru
-from swimm3r.sfm.medium.channel_fit import Pixels, daylight, evidence_of, fit_channel, prior_residuals
+from swimm3r.sfm.medium.least_squares.channel_fit import Pixels, daylight, evidence_of, fit_channel, prior_residuals
 from swimm3r.sfm.medium.samples import WaterSamples
 from swimm3r.sfm.medium.seathru import estimate_medium, fit_medium
-from swimm3r.sfm.settings import SeathruSettings
+from swimm3r.sfm.medium.settings import SeathruSettings
 
 SETTINGS = SeathruSettings()
 

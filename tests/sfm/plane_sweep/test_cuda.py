@@ -16,7 +16,7 @@ from swimm3r.sfm.plane_sweep.cuda import kernels as cuda_kernels  # noqa: E402
 from swimm3r.sfm.plane_sweep.kernels import SCALE, doubled, packed  # noqa: E402
 from swimm3r.sfm.plane_sweep.level import Level, Round, SweepNumbers  # noqa: E402
 from swimm3r.sfm.plane_sweep.refinement import window  # noqa: E402
-from swimm3r.sfm.settings import PlaneSweepSettings  # noqa: E402
+from swimm3r.sfm.plane_sweep.settings import PlaneSweepSettings  # noqa: E402
 
 HEIGHT, WIDTH = 24, 36
 NUMBERS = SweepNumbers(

@@ -17,9 +17,9 @@ from swimm3r.scene.reconstruction import DepthMaps, Matches, Points, Reconstruct
 from swimm3r.sfm.plane_sweep import estimate
 from swimm3r.sfm.plane_sweep import sweep as sweep_of_a_view
 from swimm3r.sfm.plane_sweep.estimate import consistent, estimate_depth
+from swimm3r.sfm.plane_sweep.settings import PlaneSweepSettings
 from swimm3r.sfm.plane_sweep.sweep import RawDepth, sweep
 from swimm3r.sfm.plane_sweep.views import SweepView, choose_sources, depth_range, make_view, points_by_frame
-from swimm3r.sfm.settings import PlaneSweepSettings
 from swimm3r.tasks import EngineSettings
 
 WIDTH, HEIGHT = 128, 96

@@ -13,8 +13,8 @@ from swimm3r.localization.online.landmark_map import LandmarkMap, landmark_map
 from swimm3r.progress import Progress, silent
 from swimm3r.scene.reconstruction import Reconstruction
 from swimm3r.scene.reconstruction_io import load_reconstruction
+from swimm3r.sfm.features.settings import FeatureSettings
 from swimm3r.sfm.rectified.run import run_frames, run_rectification
-from swimm3r.sfm.settings import FeatureSettings
 
 _ARRAYS = ("xyz", "point", "frame", "descriptors", "words", "looks")
 

@@ -22,8 +22,8 @@ from swimm3r.progress import Progress, silent
 from swimm3r.scene.frames import Frames
 from swimm3r.scene.reconstruction import Reconstruction
 from swimm3r.sfm.features import vlad
+from swimm3r.sfm.features.settings import FeatureSettings
 from swimm3r.sfm.features.sift import Features, extract_features, unit_descriptors
-from swimm3r.sfm.settings import FeatureSettings
 
 _LEAST_TRACKED = 50  # landmarks of a mean frame with tracks; below, depth maps take their place
 _TURNED_AWAY = 0.7  # cosine of the angle between two views of a point beyond which SIFT no longer finds it again

@@ -26,8 +26,8 @@ from swimm3r.localization.online.landmark_map import LandmarkMap
 from swimm3r.localization.pose_covariance import pose_covariance
 from swimm3r.localization.settings import TrackingSettings
 from swimm3r.sfm.colmap.absolute_pose import absolute_pose
+from swimm3r.sfm.features.settings import FeatureSettings
 from swimm3r.sfm.features.sift import extract_features, match_descriptors, match_nearby, unit_descriptors
-from swimm3r.sfm.settings import FeatureSettings
 
 Status = Literal["tracked", "relocalized", "lost"]
 

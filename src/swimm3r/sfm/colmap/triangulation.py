@@ -19,7 +19,8 @@ from swimm3r.scene.reconstruction import Points, Reconstruction, Tracks
 from swimm3r.sfm.colmap.pairs import choose_pairs
 from swimm3r.sfm.colmap.record import verified_matches
 from swimm3r.sfm.features.database import fill_features, match_pairs, scaled_camera, start_database
-from swimm3r.sfm.settings import ColmapSettings, FeatureSettings
+from swimm3r.sfm.features.settings import FeatureSettings
+from swimm3r.sfm.settings import ColmapSettings
 from swimm3r.sfm.tracks import MatchTracks, as_points
 from swimm3r.tasks.threads import thread_count
 

@@ -28,7 +28,7 @@ from swimm3r.progress import Progress, silent
 from swimm3r.sfm.distillation.water_augmentation import nearest_known
 from swimm3r.sfm.medium.samples import WaterSamples
 from swimm3r.sfm.medium.seathru import fit_medium
-from swimm3r.sfm.settings import SeathruSettings
+from swimm3r.sfm.medium.settings import SeathruSettings
 
 _MARK = "made.json"
 

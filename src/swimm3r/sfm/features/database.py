@@ -29,8 +29,8 @@ from torch import Tensor
 from swimm3r.io.files.atomic import write_text
 from swimm3r.progress import Progress, silent
 from swimm3r.scene.frames import Frames
+from swimm3r.sfm.features.settings import FeatureSettings
 from swimm3r.sfm.features.sift import Features, extract_features, match_descriptors, unit_descriptors
-from swimm3r.sfm.settings import FeatureSettings
 
 if TYPE_CHECKING:
     import pycolmap

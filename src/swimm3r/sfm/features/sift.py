@@ -15,7 +15,7 @@ from jaxtyping import Bool, Float, Int
 from torch import Tensor
 
 from swimm3r.imaging.filters import gray_levels
-from swimm3r.sfm.settings import FeatureSettings
+from swimm3r.sfm.features.settings import FeatureSettings
 
 if TYPE_CHECKING:
     import pycolmap

@@ -21,7 +21,7 @@ from swimm3r.sfm.medium.plausibility import water_warnings, with_like_channels
 from swimm3r.sfm.medium.restore import RestoredImage, restored_images, white_balance
 from swimm3r.sfm.medium.samples import WaterSamples, collect_samples
 from swimm3r.sfm.medium.seathru import fit_medium
-from swimm3r.sfm.settings import LightChoice, SeathruSettings, SfmSettings
+from swimm3r.sfm.medium.settings import LightChoice, MediumSettings, SeathruSettings
 
 log = logging.getLogger(__name__)
 
@@ -47,7 +47,7 @@ def fit_lit(samples: WaterSamples, settings: SeathruSettings, light: LightChoice
 def with_water(
     rec: Reconstruction,
     frames: Frames,
-    settings: SfmSettings,
+    settings: MediumSettings,
     folder: Path,
     progress: Progress = silent,
     predicted: PredictedWater | None = None,

@@ -26,7 +26,7 @@ from swimm3r.scene.frames import Frames
 from swimm3r.scene.reconstruction import DenseCloud, Reconstruction
 from swimm3r.scene.surface import surface_of
 from swimm3r.sfm.medium.dense_tracks import DenseTracks, cubes, fuse_in_batches
-from swimm3r.sfm.settings import RestoreSettings, TrackSettings
+from swimm3r.sfm.medium.settings import RestoreSettings, TrackSettings
 
 MediumOfPixels = Callable[[str, Int[Tensor, " n"], Float[Tensor, " n"]], Medium]  # frame, pixels, ray depth
 

@@ -19,7 +19,7 @@ from swimm3r.cameras import Cameras, project_visible, ray_depth_from_z, unprojec
 from swimm3r.progress import Progress, silent
 from swimm3r.scene.frames import Frames
 from swimm3r.scene.reconstruction import Reconstruction
-from swimm3r.sfm.settings import TrackSettings
+from swimm3r.sfm.medium.settings import TrackSettings
 
 _ROWS = 1_000_000  # points whose cubes are found at once
 _MOST_ASKED = 96  # frames that are asked whether they see a frame's surface

@@ -37,9 +37,9 @@ from swimm3r.scene.frames import Frames
 from swimm3r.scene.reconstruction import QualityWarning, Reconstruction
 from swimm3r.sfm.medium.dense_tracks import ray_depth_map
 from swimm3r.sfm.medium.restore import restore_image
+from swimm3r.sfm.medium.settings import RestoreSettings
 from swimm3r.sfm.medium.side_by_side import in_order
 from swimm3r.sfm.moving.find import StillScene, still_scene
-from swimm3r.sfm.settings import RestoreSettings
 
 log = logging.getLogger(__name__)
 

@@ -36,7 +36,7 @@ from swimm3r.scene.reconstruction import Reconstruction
 from swimm3r.sfm.mast3r_sfm.network_frames import NetworkImages
 from swimm3r.sfm.medium.dense_tracks import ray_depth_map
 from swimm3r.sfm.medium.restore import RestoredImage, told
-from swimm3r.sfm.settings import SeathruSettings
+from swimm3r.sfm.medium.settings import SeathruSettings
 from swimm3r.sfm.student.physics_head import HeadFacts, WaterMaps
 
 _CELL = 8  # network pixels; the head's maps are smooth over 16

@@ -18,7 +18,7 @@ from swimm3r.imaging.clipped import clipped
 from swimm3r.lamp import TERMS, LightEvidence, pattern
 from swimm3r.medium import MediumFit, backscatter, transmittances
 from swimm3r.sfm.medium.samples import WaterSamples
-from swimm3r.sfm.settings import SeathruSettings
+from swimm3r.sfm.medium.settings import SeathruSettings
 
 _LEAST_LIGHT, _LEAST_T_D = 0.02, 0.1  # direct light and T_D of channels whose logarithm tells something
 _MOST = 60_000  # observations

@@ -43,8 +43,8 @@ from swimm3r.scene.reconstruction import DepthMap, Reconstruction
 from swimm3r.scene.white_balance import WhiteBalance
 from swimm3r.sfm.medium.dense_tracks import ray_depth_map
 from swimm3r.sfm.medium.plausibility import any_determined, attenuation_is_a_guess
+from swimm3r.sfm.medium.settings import RestoreSettings
 from swimm3r.sfm.medium.side_by_side import in_order
-from swimm3r.sfm.settings import RestoreSettings
 
 _MAX_TINT = 1.0  # times the other channels, for blurred colors at a guessed distance
 _MAX_BRIGHTNESS = 0.9  # of blurred colors there, in any channel

@@ -21,8 +21,8 @@ from swimm3r.progress import Progress, silent
 from swimm3r.scene.frames import Frames
 from swimm3r.scene.reconstruction import DepthMap, Reconstruction
 from swimm3r.sfm.medium.dense_tracks import DenseTracks, cubes, ray_depth_map
+from swimm3r.sfm.medium.settings import SeathruSettings
 from swimm3r.sfm.medium.side_by_side import in_order
-from swimm3r.sfm.settings import SeathruSettings
 
 _ALONE = 240  # frames whose single pixels are sampled: more of a long dive tell nothing new
 

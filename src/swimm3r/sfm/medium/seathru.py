@@ -13,10 +13,11 @@ and one bounded least-squares problem finds Binf, beta_B and beta_D(z) = a exp(b
                 only what the tracks leave open
     open water  pixels that look past every surface show Binf; without any, Binf is not far from what is farthest
 
-Under a lamp on the camera (`lamp_fit.py`), J_t is multiplied by its light, and the way from the lamp attenuates, too.
+Under a lamp on the camera (`least_squares/lamp_fit.py`), J_t is multiplied by its light, and the way from the lamp
+attenuates, too.
 
-`channel_fit.py` holds the least squares. Depths enter in units of their median, so the fit commutes with any rescaling
-of the scene.
+`least_squares/channel_fit.py` holds the least squares. Depths enter in units of their median, so the fit commutes with
+any rescaling of the scene.
 """
 
 from dataclasses import replace
@@ -32,7 +33,8 @@ from swimm3r.medium import AttenuationCurve, Encoding, Medium, MediumFit, linear
 from swimm3r.progress import Progress, silent
 from swimm3r.scene.frames import Frames
 from swimm3r.scene.reconstruction import Reconstruction
-from swimm3r.sfm.medium.channel_fit import (
+from swimm3r.sfm.medium.dense_tracks import fuse_depth
+from swimm3r.sfm.medium.least_squares.channel_fit import (
     BINF,
     LOG_BETA_B,
     LOG_BETA_D,
@@ -44,10 +46,9 @@ from swimm3r.sfm.medium.channel_fit import (
     daylight,
     fit_channel,
 )
-from swimm3r.sfm.medium.dense_tracks import fuse_depth
-from swimm3r.sfm.medium.lamp_fit import LampPixels, exponential_backscatter, fit_lamp, seen_nearby
+from swimm3r.sfm.medium.least_squares.lamp_fit import LampPixels, exponential_backscatter, fit_lamp, seen_nearby
 from swimm3r.sfm.medium.samples import WaterSamples, collect_samples
-from swimm3r.sfm.settings import SeathruSettings
+from swimm3r.sfm.medium.settings import SeathruSettings
 
 _BACKSCATTER_FORM = 0.1  # standard deviation, relative, of beta_B under a lamp: maps' form of it is not exact
 

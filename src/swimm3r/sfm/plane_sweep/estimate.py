@@ -34,6 +34,7 @@ from swimm3r.scene.reconstruction import DepthMap, DepthMaps, Reconstruction
 from swimm3r.scene.reconstruction_io import load_reconstruction
 from swimm3r.sfm.plane_sweep import consistency
 from swimm3r.sfm.plane_sweep.facets import facets_of, in_facets, merged
+from swimm3r.sfm.plane_sweep.settings import PlaneSweepSettings
 from swimm3r.sfm.plane_sweep.specks import without_specks
 from swimm3r.sfm.plane_sweep.sweep import RawDepth, sweep, transfer
 from swimm3r.sfm.plane_sweep.views import (
@@ -44,7 +45,6 @@ from swimm3r.sfm.plane_sweep.views import (
     on_frame_grid,
     points_by_frame,
 )
-from swimm3r.sfm.settings import PlaneSweepSettings
 from swimm3r.tasks import run_tasks
 from swimm3r.tasks.settings import EngineSettings
 from swimm3r.tasks.threads import thread_count

@@ -19,8 +19,8 @@ from swimm3r.devices import CPU
 from swimm3r.sfm.plane_sweep import kernels, numba_backend
 from swimm3r.sfm.plane_sweep.level import Level, Round, SweepNumbers
 from swimm3r.sfm.plane_sweep.refinement import window
+from swimm3r.sfm.plane_sweep.settings import PlaneSweepSettings
 from swimm3r.sfm.plane_sweep.views import SweepView, halved, likely_edge
-from swimm3r.sfm.settings import PlaneSweepSettings
 
 _MOST_SOURCES = 16
 _REACH = np.arange(-3, 4)  # the slanted windows' pixels, along each axis

@@ -18,8 +18,8 @@ from swimm3r.io.colmap.model import silence_log
 from swimm3r.products.survey import Survey
 from swimm3r.progress import Progress, silent
 from swimm3r.sfm.features import vlad
+from swimm3r.sfm.features.settings import FeatureSettings
 from swimm3r.sfm.features.sift import extract_features, match_descriptors, unit_descriptors
-from swimm3r.sfm.settings import FeatureSettings
 from swimm3r.visits.settings import VisitSettings
 
 _SAME_KEYPOINT = 1.0  # pixels between an observation and the keypoint that it is

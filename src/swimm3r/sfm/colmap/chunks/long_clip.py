@@ -22,8 +22,9 @@ from swimm3r.sfm.colmap.chunks.parts import Part, coherent_parts, part_of, share
 from swimm3r.sfm.colmap.chunks.pilot import PILOT, PilotLens, pilot_lens
 from swimm3r.sfm.colmap.chunks.place import ChunkTask, place_chunks, placed_models, remove_stale
 from swimm3r.sfm.colmap.chunks.plan import order_by_matches, plan_chunks
+from swimm3r.sfm.colmap.settings import MappingSettings
 from swimm3r.sfm.features.database import MIN_INLIERS, FeatureDatabase
-from swimm3r.sfm.settings import ColmapSettings, MappingSettings
+from swimm3r.sfm.settings import ColmapSettings
 from swimm3r.tasks.settings import EngineSettings
 from swimm3r.tasks.threads import thread_count
 

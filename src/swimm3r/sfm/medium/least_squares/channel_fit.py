@@ -17,8 +17,8 @@ from functools import cached_property
 
 import numpy as np
 
-from swimm3r.sfm.medium import kernels
-from swimm3r.sfm.settings import SeathruSettings
+from swimm3r.sfm.medium.least_squares import kernels
+from swimm3r.sfm.medium.settings import SeathruSettings
 
 BINF, LOG_BETA_B, LOG_BETA_D, SLOPE, DARK, LOG_MEAN = range(6)  # the unknowns
 LOWER = np.array([0.0, np.log(0.01), np.log(0.01), -2.0, 0.0, np.log(0.02)])

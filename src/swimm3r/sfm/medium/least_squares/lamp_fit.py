@@ -32,8 +32,8 @@ from swimm3r.lamp import (
     share_scattered,
 )
 from swimm3r.medium import Encoding
-from swimm3r.sfm.medium import kernels
-from swimm3r.sfm.medium.channel_fit import (
+from swimm3r.sfm.medium.least_squares import kernels
+from swimm3r.sfm.medium.least_squares.channel_fit import (
     BINF,
     LOG_BETA_D,
     SLOPE,
@@ -48,7 +48,7 @@ from swimm3r.sfm.medium.channel_fit import (
     prior_residuals,
     thinned,
 )
-from swimm3r.sfm.settings import SeathruSettings
+from swimm3r.sfm.medium.settings import SeathruSettings
 
 _BEAM_STD, _STRENGTH_STD = 3.0, 1.0  # of the beam's coefficients, and of the strength's logarithm
 _OFFSET_STD = 0.2  # of the lamp's position beside the camera, in median depths

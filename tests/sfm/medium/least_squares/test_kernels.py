@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-from swimm3r.sfm.medium import kernels
+from swimm3r.sfm.medium.least_squares import kernels
 
 
 @pytest.fixture

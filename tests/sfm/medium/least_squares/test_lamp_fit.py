@@ -11,11 +11,11 @@ from swimm3r.errors import InputError
 from swimm3r.io.medium_json import load_medium
 from swimm3r.lamp import LightEvidence, log_light
 from swimm3r.medium import MediumFit, add_water, backscatter, remove_water, rescale, transmittances
-from swimm3r.sfm.medium.lamp_fit import seen_nearby
+from swimm3r.sfm.medium.least_squares.lamp_fit import seen_nearby
 from swimm3r.sfm.medium.light import judge_light
 from swimm3r.sfm.medium.samples import WaterSamples
 from swimm3r.sfm.medium.seathru import fit_medium
-from swimm3r.sfm.settings import SeathruSettings
+from swimm3r.sfm.medium.settings import SeathruSettings
 from swimm3r.synthetic.lamp_light import lamp_backscatter, lamp_of, light_on
 from swimm3r.synthetic.settings import LampSettings
 
