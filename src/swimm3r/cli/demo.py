@@ -6,8 +6,9 @@ from pathlib import Path
 from typing import Annotated
 
 from swimm3r.cli.pipeline.stages import RESULTS
-from swimm3r.cli.terminal.console import drawn_progress, print_next, print_results, print_summary
+from swimm3r.cli.terminal.console import drawn_progress, print_next, print_results
 from swimm3r.cli.terminal.options import FLAT, Out
+from swimm3r.cli.terminal.summary import print_summary
 from swimm3r.pipeline.presets import PRESETS
 from swimm3r.splat.settings import MapDevice, RecipeName, UwbsSettings, with_recipe
 from swimm3r.synthetic.settings import DiveSettings

@@ -3,8 +3,9 @@
 from pathlib import Path
 
 from swimm3r.cli.pipeline.stages import RESULTS
-from swimm3r.cli.terminal.console import drawn_progress, print_results, print_summary
+from swimm3r.cli.terminal.console import drawn_progress, print_results
 from swimm3r.cli.terminal.options import Run
+from swimm3r.cli.terminal.summary import print_summary
 from swimm3r.settings import CountOrZero
 from swimm3r.splat.settings import MapDevice
 

@@ -137,17 +137,7 @@ def _make_stages(
         ),
         reuse=lambda: load_frames(folder / "prepare"),
     )
-    record.summary["input"] |= {
-        "frames": len(frames),
-        "train": len(frames.train),
-        "test": len(frames.test),
-        "between": len(frames.between),
-        "width": frames.width,
-        "height": frames.height,
-        "gray": frames.gray,
-        "development": frames.development,
-        "masks": {"used": sum(frame.mask is not None for frame in frames), "unused": frames.unused_masks},
-    }
+    record.summary["input"] |= sections.frames_section(frames)
     record.add({"warnings": [{"what": what, "advice": ""} for what in frames.warnings]})
     if last_stage == "prepare":
         return

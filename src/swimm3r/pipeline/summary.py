@@ -24,6 +24,21 @@ from swimm3r.splat.settings import PoseRefinementSettings
 _ASKED = 16  # training views that the map's mean water is taken over
 
 
+def frames_section(frames: Frames) -> dict[str, object]:
+    """Of "input": the prepared frames."""
+    return {
+        "frames": len(frames),
+        "train": len(frames.train),
+        "test": len(frames.test),
+        "between": len(frames.between),
+        "width": frames.width,
+        "height": frames.height,
+        "gray": frames.gray,
+        "development": frames.development,
+        "masks": {"used": sum(frame.mask is not None for frame in frames), "unused": frames.unused_masks},
+    }
+
+
 def sfm_sections(
     rec: Reconstruction, frames: Frames, matches: Matches | None = None, placed_between: int = 0
 ) -> dict[str, object]:

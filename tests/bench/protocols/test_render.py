@@ -108,6 +108,15 @@ def test_a_clip_that_cannot_be_placed_as_a_whole_is_remembered(run: Path, tmp_pa
     assert reference.of_clip(replace(sfm, frames=few), tmp_path) == found
 
 
+def test_turned_test_frames_are_not_placed_as_if_exposed_at_once(run: Path, tmp_path: Path):
+    sfm = open_finished_sfm(run)
+    turned = replace(sfm.frames, rows_rectified=True)
+    found = reference.of_clip(replace(sfm, frames=turned), tmp_path)
+    assert isinstance(found, NotComputed)
+    assert "turned within exposures" in found.reason
+    assert list(tmp_path.iterdir()) == []  # which takes no structure from motion to find out
+
+
 @pytest.mark.parametrize(
     ("recipes", "seeds", "against"),
     [(("ubs",), 1, "uwbs-static"), ((), 1, None), (("ubs",), 0, None), (("ubs",), -1, None)],

@@ -11,7 +11,8 @@ from typing import Any
 
 from swimm3r.cli.pipeline.options import FolderOptions, ViewOptions
 from swimm3r.cli.terminal.arguments import named, values_of
-from swimm3r.cli.terminal.console import Drawn, drawn_progress, print_line, print_next, print_results, print_summary
+from swimm3r.cli.terminal.console import Drawn, drawn_progress, print_line, print_next, print_results
+from swimm3r.cli.terminal.summary import print_summary
 from swimm3r.errors import UsageError
 from swimm3r.pipeline.presets import PRESETS, RunSettings, from_yaml, read_config
 from swimm3r.pipeline.run_settings import starting_settings

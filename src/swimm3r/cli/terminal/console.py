@@ -12,7 +12,6 @@ from typing import Any
 from rich.console import Console
 from rich.progress import BarColumn, MofNCompleteColumn, TaskID, TextColumn, TimeElapsedColumn
 from rich.progress import Progress as Bars
-from rich.table import Table
 
 from swimm3r.cli.terminal.output_level import is_quiet
 from swimm3r.cli.terminal.pace import Clock, Countdown, Pace, WorkClock, compilation_watched
@@ -168,63 +167,6 @@ def outcome_console() -> Console:
     return console if console.is_terminal else Console(markup=False, highlight=False, width=_UNWRAPPED)
 
 
-def print_summary(summary: dict) -> None:
-    """The outcome of a run: registered frames, the water, scores, and warnings."""
-    console = outcome_console()
-    taken = summary.get("input", {})
-    if "frames" in taken:
-        masks = f", {taken['masks']['used']} with a mask" if taken.get("masks", {}).get("used") else ""
-        between = f", {taken['between']} between keyframes" if taken.get("between") else ""
-        kind = "rectified frames" if taken.get("rectified") or taken.get("rows_rectified") else "frames"
-        console.print(
-            f"{taken['frames']} {kind} of {taken['width']}x{taken['height']} ({taken['train']} for training,"
-            f" {taken['test']} for testing{between}{masks})"
-        )
-    sfm = summary.get("sfm")
-    if sfm:
-        console.print(
-            f"Registered {sfm['registered']} of {sfm['frames']} frames, {sfm['points']:,} points, "
-            + (f"{sfm['between_placed']} of {sfm['between']} between keyframes, " if sfm.get("between") else "")
-            + ("" if sfm["reprojection_px"] is None else f"reprojection error {sfm['reprojection_px']:.2f} px")
-        )
-    scale = summary.get("scale")
-    if scale:
-        by = ", ".join(each["source"] for each in scale["sources"] if not each["outlier"])
-        place = scale["georeference"]["crs"]
-        console.print(f"Lengths in metres, ± {100 * scale['std']:.2g}% by {by}; coordinates: {place}")
-        for note in scale["notes"]:
-            console.print("!", note, style="yellow")
-    water = summary.get("medium", {}).get("sfm")
-    if water:
-        table = Table("water", "R", "G", "B", title=f"betas {water['unit']}, {water['encoding']} values")
-        for name in ("Binf", "beta_D", "beta_B"):
-            cells = (
-                f"{value:.3f}" if known else f"({value:.3f})"
-                for value, known in zip(water[name], water["identifiable"][name], strict=True)
-            )
-            table.add_row(name, *cells)
-        console.print(table)
-        console.print("In brackets: not determined by these frames.", style="dim")
-    test = summary.get("test")
-    if test:
-        console.print(
-            f"{test['views']} test frames: PSNR {_shown(test['psnr'], 1)} dB"
-            f" (if blurred by 4 px: {_shown(test['blur4_psnr'], 1)}), SSIM {test['ssim']:.3f},"
-            f" sharpness {_shown(test['sharpness'], 2)}"
-        )
-        if "flow_px" in test:
-            console.print(
-                f"On measured ground: displacement {_shown(test['flow_px'], 2)} px (90 % below"
-                f" {_shown(test['flow_px_p90'], 2)}), PSNR {_shown(test['psnr_covered'], 1)} dB,"
-                f" {_shown(test['psnr_affine'], 1)} dB with each view's colors fitted to its frame"
-            )
-    for name, other in summary.get("other_protocols", {}).items():
-        scores = other["test"]
-        console.print(f"By the protocol {name}: PSNR {_shown(scores['psnr'], 1)} dB, SSIM {scores['ssim']:.3f}")
-    for warning in summary.get("warnings", []):
-        console.print("!", f"{warning['what']} {warning['advice']}".strip(), style="yellow")
-
-
 def print_results(folder: Path, files: Mapping[str, str]) -> None:
     """The files and folders of a result that exist, each with what it holds."""
     there = {name: what for name, what in files.items() if (folder / name).exists()}
@@ -240,7 +182,3 @@ def print_next(what: str, *command: object) -> None:
     if not is_quiet():
         told = f"Next, {what}: swimm3r {shlex.join(str(word) for word in command)}"
         outcome_console().print(told, soft_wrap=True)
-
-
-def _shown(value: float | None, digits: int) -> str:
-    return "-" if value is None else f"{value:.{digits}f}"
