@@ -3,12 +3,16 @@
 from dataclasses import replace
 from pathlib import Path
 
+import cv2
+import numpy as np
 import pytest
 import torch
 
 import swimm3r
+from swimm3r.cameras import pixel_grid
 from swimm3r.errors import InputError, RegistrationError, WeightsError
 from swimm3r.geometry import rotation_angle
+from swimm3r.imaging.turned_rows import half_time_pixels
 from swimm3r.localization.batch import Query, answer, match_image
 from swimm3r.localization.localizer import STAGES, Localizer
 from swimm3r.localization.matchers import Mast3rMatcher, SiftMatcher, matcher_for
@@ -49,6 +53,27 @@ def test_a_held_out_frame_is_placed(place, localizer: Localizer, i: int):
     assert found.reprojection_px < 0.5
     assert set(found.candidates) < set(place.rec.names)
     assert set(found.seconds) == set(STAGES)
+
+
+@pytest.mark.parametrize("i", [2, 4])
+def test_a_query_of_a_camera_that_turned_while_it_was_exposed_is_placed_with_its_turn(place, i: int):
+    turn = np.array([0.015, -0.02, 0.0])  # about the view axis, 5 pixels from edge to edge tell little
+    camera, image = place.cameras[i], place.frames.image(i).numpy()
+    pixels = half_time_pixels(camera, pixel_grid(camera.height, camera.width).reshape(-1, 2).double(), turn) - 0.5
+    column, row = pixels.float().reshape(camera.height, camera.width, 2).numpy().transpose(2, 0, 1)
+    filmed = torch.from_numpy(cv2.remap(image, column, row, cv2.INTER_CUBIC, borderMode=cv2.BORDER_REPLICATE))
+    at_rest = Localizer(place.scene, place.rec, place.frames, SETTINGS)
+    turning = Localizer(place.scene, place.rec, replace(place.frames, rows_rectified=True), SETTINGS)
+    found, still = turning.locate(filmed.clamp(0, 1)), at_rest.locate(filmed.clamp(0, 1))
+    degrees, distance = off(found.cam2world, place.cameras.cam2world[i])
+    degrees_still, distance_still = off(still.cam2world, place.cameras.cam2world[i])
+    assert degrees < 0.3 * degrees_still
+    assert distance < 0.3 * distance_still
+    assert found.stage == "refined"
+    assert found.turn is not None
+    np.testing.assert_allclose(found.turn[:2], turn[:2], atol=0.002)
+    assert still.turn is None
+    assert turning.locate(filmed.clamp(0, 1), lens=camera).turn is None  # of another camera, which may be still
 
 
 def test_the_reference_farthest_away_is_the_least_like(place, localizer: Localizer):

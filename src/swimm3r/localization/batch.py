@@ -179,4 +179,5 @@ def _described(a: Answer) -> dict[str, object]:
         "inliers": a.found.inliers,
         "reprojection_px": a.found.reprojection_px,
         "seconds": a.found.seconds,
+        **({} if a.found.turn is None else {"turn": a.found.turn.tolist()}),
     }

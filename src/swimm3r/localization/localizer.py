@@ -6,6 +6,10 @@
 4. match       the rendering with the query;
 5. refine      the rendering's pixels as points of the world: PnP with RANSAC again.
 
+A camera whose frames had their rows rectified (`sfm.rectified`) turned while they were exposed, and while a query was.
+The coarse matches tell its pose together with its turn; the query is redrawn as at half time before anything is
+compared with a rendering.
+
 The renderer is whatever map there is. The refined pose stands where enough of its inliers agree and, unless GS-CPR's
 own rule is asked for (`settings.accept`), where its standard error is smaller than that of the coarse one: a few dozen
 loose matches with a poor rendering must not replace a pose that hundreds of pixels agree on.
@@ -19,12 +23,14 @@ from functools import lru_cache
 from time import perf_counter
 from typing import Any, Literal
 
+import numpy as np
 import torch
 from jaxtyping import Bool, Float
 from torch import Tensor
 
 from swimm3r.cameras import Cameras, project, resized
 from swimm3r.errors import InputError, RegistrationError
+from swimm3r.imaging.turned_rows import at_half_time, half_time_pixels, mask_at_half_time
 from swimm3r.imaging.undistortion import undistorted
 from swimm3r.localization.matchers import Matcher, matcher_for
 from swimm3r.localization.pose_covariance import pose_jacobian
@@ -34,6 +40,7 @@ from swimm3r.progress import Progress, silent
 from swimm3r.scene.frames import Frames
 from swimm3r.scene.reconstruction import Reconstruction
 from swimm3r.sfm.colmap.absolute_pose import absolute_pose
+from swimm3r.sfm.colmap.shutter.turning import turned_pose
 from swimm3r.splat.rendering import SplatMap
 from swimm3r.splat.training_poses import as_mapped, axes_of_map
 
@@ -64,6 +71,7 @@ class Localization:
     reprojection_px: float | None  # median over the inliers, pixels of the query; None without a refined pose
     evidence: Evidence | None
     seconds: dict[str, float] = field(default_factory=dict)  # by stage
+    turn: Float[np.ndarray, "3"] | None = None  # radians, while rows were exposed; the pose is that of half time
 
 
 @dataclass(frozen=True)
@@ -125,6 +133,7 @@ class Localizer:
             if frames is None
             else FilmedReferences(rec, frames)
         )
+        self._turning = frames is not None and frames.rows_rectified
         self._reference = lru_cache(maxsize=64)(self._described_reference)
         described: set[str] = set()
 
@@ -157,6 +166,7 @@ class Localizer:
             query = self.matcher.describe(image, mask)
             likest = torch.argsort(self._likeness(query), descending=True, stable=True)[: s.candidates].tolist()
             candidates = tuple(self.rec.names[k] for k in likest)
+        turning = self._turning and lens is None
         lens = self._own_lens(likest[0], width, height) if lens is None else lens
         with _timed(seconds, "coarse"):
             coarse = self._coarse(query, candidates, lens)
@@ -166,8 +176,15 @@ class Localizer:
                 cause="it shows a place that the map does not, or too little of it, or through very different water",
                 hint="an image from nearer to the dive's path, or more --candidates",
             )
+        turn = None
+        if turning:
+            with _timed(seconds, "coarse"):
+                coarse, turn = self._at_half_time(coarse)
+                image = torch.from_numpy(at_half_time(image.numpy(), lens, turn)).clamp(0, 1)
+                mask = torch.from_numpy(mask_at_half_time(mask.numpy(), lens, turn))
+        assert coarse.cam2world is not None
         coarse_inliers = int(coarse.inlier.sum())
-        best = Localization(coarse.cam2world, "coarse", candidates, coarse_inliers, 0, 0, None, None, seconds)
+        best = Localization(coarse.cam2world, "coarse", candidates, coarse_inliers, 0, 0, None, None, seconds, turn)
         before = coarse
         for _ in range(s.rounds):
             there = replace(lens, cam2world=best.cam2world[None])
@@ -223,6 +240,16 @@ class Localizer:
             pixels.append(xy_query[known])
             points.append(xyz)
         return self._solved(torch.cat(pixels), torch.cat(points), lens, self.settings.max_error)
+
+    def _at_half_time(self, coarse: _Solved) -> tuple[_Solved, Float[np.ndarray, "3"]]:
+        """The coarse matches as seen by a camera that does not turn within an exposure, and the turn that they tell."""
+        assert coarse.cam2world is not None
+        there = replace(coarse.camera, cam2world=coarse.cam2world[None])
+        cam2world, turn = turned_pose(there, coarse.pixels[coarse.inlier], coarse.points[coarse.inlier])
+        pixels = half_time_pixels(coarse.camera, coarse.pixels, turn)
+        moved = replace(coarse, pixels=pixels, cam2world=cam2world)
+        inlier = moved.errors(cam2world) <= coarse.max_error
+        return replace(moved, inlier=inlier), turn
 
     def _against_rendering(
         self,
