@@ -75,54 +75,64 @@ def open_clip(source: Path, settings: FrameSettings) -> Clip:
     )
 
 
-def prepare_clip(source: Path, draft: Path, settings: FrameSettings, progress: Progress) -> SelectedImages:
-    """Write the frames of a clip into `draft`, in one pass. Raises InputError."""
-    video = open_clip(source, settings)
-    development = development_of(settings)
-    end = settings.end if settings.end is not None else inf
-    last = min(end, video.seconds if video.seconds is not None else inf)
-    rate = settings.fps or inf
-    if settings.max_frames and last < inf:
-        rate = min(rate, settings.max_frames / max(last - settings.start, 1e-3))
-    expected = ceil((last - settings.start) * video.rate) if last < inf else 0
-    seen = 0
-    reached = 0.0
+class _Reading:
+    """The frames of a clip within the seconds asked for, in bins of 1/fps, and how far they were read."""
 
-    def watched() -> Iterator[ClipFrame]:
-        nonlocal seen, reached
-        for frame in video.frames(settings.start, end):
-            progress(STEP, seen, max(expected, seen))
-            seen, reached = seen + 1, frame.time
+    def __init__(self, clip: Clip, settings: FrameSettings, progress: Progress) -> None:
+        self._clip, self._start, self._progress = clip, settings.start, progress
+        self._end = settings.end if settings.end is not None else inf
+        self.last = min(self._end, clip.seconds if clip.seconds is not None else inf)  # second; infinite if unknown
+        self._rate = settings.fps or inf
+        if settings.max_frames and self.last < inf:
+            self._rate = min(self._rate, settings.max_frames / max(self.last - self._start, 1e-3))
+        self._expected = ceil((self.last - self._start) * clip.rate) if self.last < inf else 0
+        self.seen = 0
+        self.reached = 0.0  # second of the last frame
+
+    def bins(self) -> Iterator[Iterator[ClipFrame]]:
+        """The frames of each bin that has any; every frame by itself at an unlimited rate."""
+        for _, frames in groupby(self._frames(), self._bin):
+            yield frames
+        self._progress(STEP, max(self.seen, 1), max(self.seen, 1))
+
+    def _frames(self) -> Iterator[ClipFrame]:
+        for frame in self._clip.frames(self._start, self._end):
+            self._progress(STEP, self.seen, max(self._expected, self.seen))
+            self.seen, self.reached = self.seen + 1, frame.time
             yield frame
 
-    def bin_of(frame: ClipFrame) -> int:
-        return int((frame.time - settings.start) * rate + 1e-6) if rate < inf else seen
+    def _bin(self, frame: ClipFrame) -> int:
+        return int((frame.time - self._start) * self._rate + 1e-6) if self._rate < inf else self.seen
 
+
+def prepare_clip(source: Path, draft: Path, settings: FrameSettings, progress: Progress) -> SelectedImages:
+    """Write the frames of a clip into `draft`, in one pass. Raises InputError."""
+    clip = open_clip(source, settings)
+    development = development_of(settings)
+    reading = _Reading(clip, settings, progress)
     instants: list[list[SourceImage]] = []
     blank = 0
-    for _, bin_frames in groupby(watched(), bin_of):
-        best = _best(bin_frames, settings.pick)
+    for frames in reading.bins():
+        best = _best(frames, settings.pick)
         if best is None:
             blank += 1
             continue
         views = _views(best[0], split=settings.rig == (SIDE_BY_SIDE,))
         instants.append([_written(view, best[1], len(instants), draft, settings, development) for view in views])
-    progress(STEP, max(seen, 1), max(seen, 1))
-
-    if not seen:
+    if not reading.seen:
         raise InputError(
             f"{source} has no frames from second {settings.start:g} on",
             cause="the video is shorter than that, or cut off",
             hint="a smaller start",
         )
     warnings = [blank_warning(blank, "times of the video")] if blank else []
-    warnings += _warnings(video, last, reached)
+    warnings += _warnings(clip, reading.last, reading.reached)
     mask_folders = [settings.masks] if settings.masks is not None else []
     kept = [image for views in thinned(instants, settings.max_frames) for image in views]
     originals = [image.original for views in instants for image in views]
     told = str(development) if development.changes else None
-    chosen = SelectedImages(kept, True, warnings, mask_folders, originals, recorded=video.recorded, development=told)
-    return _completed(chosen, video, draft, settings) if kept else chosen
+    chosen = SelectedImages(kept, True, warnings, mask_folders, originals, recorded=clip.recorded, development=told)
+    return _completed(chosen, clip, draft, settings) if kept else chosen
 
 
 def _completed(chosen: SelectedImages, clip: Clip, draft: Path, settings: FrameSettings) -> SelectedImages:

@@ -122,14 +122,7 @@ def write_lens(draft: Path, rig: Rig, settings: FrameSettings) -> Path | None:
 
 def pair_images(root: Path, paths: Sequence[Path], cameras: Sequence[str], settings: FrameSettings) -> RigImages:
     """The images of the cameras by instants. Raises InputError where too many have no partner."""
-    own = {name: [path for path in paths if path.is_relative_to(root / name)] for name in cameras}
-    for name, files in own.items():
-        if not files:
-            raise InputError(
-                f"{root / name} holds no images",
-                cause="the folder of that camera is empty, or holds another kind of files",
-                hint="--rig with the names of the sub-folders that hold images",
-            )
+    own = _by_camera(root, paths, cameras)
     found = [_images_of(root, name, files) for name, files in own.items()]
     clocked = all(camera.times is not None for camera in found)
     together = instants_of(found, settings)
@@ -151,6 +144,19 @@ def pair_images(root: Path, paths: Sequence[Path], cameras: Sequence[str], setti
     recorded = datetime.fromtimestamp(begin, UTC).strftime("%Y-%m-%dT%H:%M:%S") if clocked else None
     warnings = () if told is None else (f"{told} They are used as they are.",)
     return RigImages(tuple(images), clocked or numbered(own[cameras[0]]), recorded, warnings)
+
+
+def _by_camera(root: Path, paths: Sequence[Path], cameras: Sequence[str]) -> dict[str, list[Path]]:
+    """The images in the folder of each camera. Raises InputError where one has none."""
+    own = {name: [path for path in paths if path.is_relative_to(root / name)] for name in cameras}
+    for name, files in own.items():
+        if not files:
+            raise InputError(
+                f"{root / name} holds no images",
+                cause="the folder of that camera is empty, or holds another kind of files",
+                hint="--rig with the names of the sub-folders that hold images",
+            )
+    return own
 
 
 def _images_of(root: Path, name: str, paths: Sequence[Path]) -> CameraImages:
