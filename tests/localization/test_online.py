@@ -9,15 +9,18 @@ from dataclasses import replace
 from itertools import islice
 from pathlib import Path
 
+import cv2
 import numpy as np
 import pytest
 import torch
 from tests.bag_files import START, image, write_bag
 from tests.localization.textured_plane import FEATURES, HEIGHT, WIDTH, camera, photo, reconstruction, texture
 
+from swimm3r.cameras import pixel_grid
 from swimm3r.cli.main import main
 from swimm3r.errors import InputError, RegistrationError, UsageError
 from swimm3r.geometry import rotation_angle
+from swimm3r.imaging.turned_rows import half_time_pixels
 from swimm3r.io.images import write_rgb
 from swimm3r.localization.online.images import StreamImage, stream_images
 from swimm3r.localization.online.landmark_map import LandmarkMap, landmark_map
@@ -62,6 +65,35 @@ def test_the_first_image_is_relocalized_and_the_next_ones_are_tracked(tracker: T
         assert distance < 0.005
         assert found.covariance is not None
         assert distance < 6 * float(found.covariance.diagonal()[:3].sum().sqrt())
+
+
+def turned_photo(x: float, turn: np.ndarray) -> torch.Tensor:
+    """The plane from a camera that turns by `turn` while its rows are exposed."""
+    seen_by = camera(x)
+    pixels = half_time_pixels(seen_by, pixel_grid(HEIGHT, WIDTH).reshape(-1, 2).double(), turn)
+    column, row = (pixels - 0.5).float().reshape(HEIGHT, WIDTH, 2).numpy().transpose(2, 0, 1)
+    image = photo(seen_by, texture()).numpy()
+    filmed = cv2.remap(image, column, row, cv2.INTER_CUBIC, borderMode=cv2.BORDER_REPLICATE)
+    return torch.from_numpy(filmed).clamp(0, 1)
+
+
+def test_a_camera_that_turns_while_it_exposes_is_tracked_with_its_turn(mapped: LandmarkMap, tmp_path: Path):
+    turns = [np.array(turn) for turn in ([0.008, -0.012, 0.0], [-0.01, 0.006, 0.0], [0.0, 0.013, 0.0])]
+    shown = [turned_photo(0.1 * k, turn) for k, turn in enumerate(turns)]
+    still, turning = Tracker(mapped), Tracker(replace(mapped, rows_rectified=True))
+    for k, (seen, turn) in enumerate(zip(shown, turns, strict=True)):
+        worse, found = (one.locate(one.describe(seen), 0.2 * k) for one in (still, turning))
+        assert found.status == ("tracked" if k else "relocalized")
+        assert off(found, 0.1 * k)[0] < 0.3 * off(worse, 0.1 * k)[0]
+        assert off(found, 0.1 * k)[1] < 0.3 * off(worse, 0.1 * k)[1]
+        assert worse.turn is None
+        np.testing.assert_allclose(found.turn[:2], turn[:2], atol=0.001)
+        assert found.covariance is not None
+        assert off(found, 0.1 * k)[1] < 6 * float(found.covariance.diagonal()[:3].sum().sqrt())
+    assert turning.locate(turning.describe(shown[2], lens=camera(0.0)), 0.6).turn is None  # of another camera
+    values = (shown[0].numpy() * 255).astype(np.uint8)
+    localize_stream(turning, iter([StreamImage("a", 0.0, values)]), tmp_path)
+    np.testing.assert_allclose(lines(tmp_path)[0]["turn"][:2], turns[0][:2], atol=0.001)
 
 
 def test_no_pose_is_made_of_noise_or_of_another_place(tracker: Tracker):

@@ -7,8 +7,10 @@ import torch
 
 from swimm3r.cameras import Cameras, project
 from swimm3r.geometry import pose_from, so3_exp, so3_log
+from swimm3r.imaging.turned_rows import filmed_pixels, half_time_pixels
 from swimm3r.localization.pose_covariance import pose_covariance
 from swimm3r.sfm.colmap.absolute_pose import absolute_pose
+from swimm3r.sfm.colmap.shutter.turning import EXPECTED_TURN, turned_pose
 
 POSE = pose_from(
     so3_exp(torch.tensor([0.4, -0.9, 0.3], dtype=torch.float64)), torch.tensor([3.0, -2.0, 5.0], dtype=torch.float64)
@@ -65,6 +67,25 @@ def test_wrong_matches_do_not_change_that():
 def test_errors_that_neighbors_share_are_counted():
     """Twenty times as large as the noise of single points; counted as independent, the mean would be far above 20."""
     assert mean_squared_error(0.1, trials=60, count=600, shared=0.6) < 14
+
+
+def test_a_turn_while_rows_were_exposed_is_an_unknown_too():
+    """Turns are drawn as they are expected."""
+    rng = torch.Generator().manual_seed(4)
+    squared, without, trials = 0.0, 0.0, 100
+    for _ in range(trials):
+        points = scene(150, rng)
+        turn = EXPECTED_TURN * torch.randn(3, generator=rng, dtype=torch.float64).numpy()
+        pixels = filmed_pixels(camera(), project(camera(), points[None])[0][0], turn)
+        pixels = pixels + 0.5 * torch.randn(150, 2, generator=rng, dtype=torch.float64)
+        pose, found = turned_pose(camera(), pixels, points)
+        error = torch.cat([POSE[:3, 3] - pose[:3, 3], so3_log(POSE[:3, :3] @ pose[:3, :3].mT)])
+        covariance = pose_covariance(camera(), pose, points, pixels, found)
+        squared += float(error @ torch.linalg.solve(covariance, error))
+        known = pose_covariance(camera(), pose, points, half_time_pixels(camera(), pixels, found))
+        without += float(error @ torch.linalg.solve(known, error))
+    assert 4.0 < squared / trials < 7.2
+    assert without > 1.25 * squared
 
 
 def test_covariance_is_of_the_maps_axes():

@@ -35,7 +35,7 @@ def landmarks_of_run(folder: Path, settings: FeatureSettings, progress: Progress
         with atomic_path(path) as draft:
             arrays = {name: getattr(found, name).numpy() for name in _ARRAYS}
             np.savez(draft, key=np.array(key), distance=np.array(found.distance), **arrays)
-    return replace(found, rectification=run_rectification(folder))
+    return replace(found, rectification=run_rectification(folder), rows_rectified=frames.rows_rectified)
 
 
 def _read(path: Path, key: str, rec: Reconstruction) -> LandmarkMap | None:

@@ -43,6 +43,7 @@ class LandmarkMap:
     looks: Float[Tensor, "c d"]  # VLAD descriptors of the frames
     distance: float  # median z depth of landmarks in the frames that saw them
     rectification: Rectification | None = None  # of images as the camera takes them, where the run rectified its frames
+    rows_rectified: bool = False  # the camera turned while it exposed the frames' rows, which were redrawn
 
     def alike(self, descriptors: Float[Tensor, "m 128"], count: int) -> list[int]:
         """The frames that look most like an image with these descriptors, the likest first."""
@@ -121,6 +122,7 @@ def landmark_map(
         words=words,
         looks=torch.stack([vlad.summed(each, words) if len(each) else unlike for each in descriptors]),
         distance=_median_depth(rec.cameras, xyz, point, frame),
+        rows_rectified=frames.rows_rectified,
     )
 
 

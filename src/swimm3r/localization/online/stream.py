@@ -7,6 +7,8 @@ A JSON object per image, in the order of the images, on OUT/stream.jsonl as it i
     c2w              4x4, OpenCV camera axes, camera to world, in the axes and `unit` of sfm/cameras.json; null if lost
     covariance       6x6, as ROS's PoseWithCovariance: x, y, z, then turns about the map's axes (radians); null if lost
     inliers          landmarks that agree on the pose, of so many `matches`
+    turn             rotation vector of the camera while the image's rows were exposed, radians in its axes; the pose is
+                     that of half time. Only in runs whose rows are rectified
     seconds          from the image to the pose
     reason           why it is lost
 
@@ -151,6 +153,7 @@ def _entry(each: _Described, pose: TrackedPose, tracker: Tracker) -> dict[str, o
         "inliers": pose.inliers,
         "matches": pose.matches,
         "seconds": round(perf_counter() - each.begun, 4),
+        **({} if pose.turn is None else {"turn": pose.turn.tolist()}),
         **({"reason": pose.reason} if pose.reason else {}),
     }
 

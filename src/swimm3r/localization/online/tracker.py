@@ -6,26 +6,31 @@
 4. judge       inliers, their share, the pose's covariance and the motion since the last pose;
 5. relocalize  where no pose stands: the map frames that look most like the image, all their landmarks, and from 3 on.
 
-An image is lost unless a pose passes every test of step 4. No map is rendered.
+An image is lost unless a pose passes every test of step 4. No map is rendered. Of a camera that turned while it exposed
+the map's frames (`sfm.rectified`), each pose is told together with the turn within the exposure, from the inliers of
+PnP, and is that of half time.
 """
 
 import math
 from dataclasses import dataclass, replace
 from typing import Literal
 
+import numpy as np
 import torch
-from jaxtyping import Bool, Float
+from jaxtyping import Bool, Float, Int
 from torch import Tensor
 
 from swimm3r.cameras import Cameras, project, resized
 from swimm3r.errors import InputError
 from swimm3r.geometry import rotation_angle
+from swimm3r.imaging.turned_rows import half_time_pixels
 from swimm3r.io.colmap.model import silence_log
 from swimm3r.localization.interpolation import between
 from swimm3r.localization.online.landmark_map import LandmarkMap
 from swimm3r.localization.pose_covariance import pose_covariance
 from swimm3r.localization.settings import TrackingSettings
 from swimm3r.sfm.colmap.absolute_pose import absolute_pose
+from swimm3r.sfm.colmap.shutter.turning import turned_pose
 from swimm3r.sfm.features.settings import FeatureSettings
 from swimm3r.sfm.features.sift import extract_features, match_descriptors, match_nearby, unit_descriptors
 
@@ -49,20 +54,43 @@ class TrackedPose:
     inliers: int
     matches: int
     reason: str = ""  # why the image is lost
+    turn: Float[np.ndarray, "3"] | None = None  # radians, while rows were exposed; the pose is that of half time
 
 
 @dataclass(frozen=True)
 class Keypoints:
     """The keypoints of an image."""
 
-    xy: Float[Tensor, "n 2"]  # pixels
+    xy: Float[Tensor, "n 2"]  # pixels, as filmed
     descriptors: Float[Tensor, "n 128"]  # of unit length
     lens: Cameras  # of the image; its pose unused
+    turning: bool = False  # the camera may have turned while rows were exposed
+
+    def at_half_time(self, turn: Float[np.ndarray, "3"] | None) -> Float[Tensor, "n 2"]:
+        """Their pixels in an image exposed at once."""
+        return self.xy if turn is None else half_time_pixels(self.lens, self.xy, turn)
+
+
+@dataclass(frozen=True)
+class _Pose:
+    cam2world: Float[Tensor, "4 4"]
+    turn: Float[np.ndarray, "3"] | None  # None of an image that was exposed at once
+    inlier: Bool[Tensor, " m"]
+
+
+@dataclass(frozen=True)
+class _Matched:
+    """Keypoints and the points that they show."""
+
+    keypoint: Int[Tensor, " m"]
+    points: Float[Tensor, "m 3"]  # world
+    visible: int = 0  # landmarks that the camera should see
 
 
 @dataclass(frozen=True)
 class _Estimate:
     cam2world: Float[Tensor, "4 4"]
+    turn: Float[np.ndarray, "3"] | None
     covariance: Float[Tensor, "6 6"]
     inliers: int
     matches: int
@@ -97,10 +125,12 @@ class Tracker:
         if lens is None and mask is None and self.map.rectification is not None:
             image = torch.from_numpy(self.map.rectification.any_image(image.numpy()))
         height, width = image.shape[:2]
+        turning = self.map.rows_rectified and lens is None
         lens = _at_size(self.map.cameras[0] if lens is None else lens, width, height)
         usable = torch.ones(height, width, dtype=torch.bool) if mask is None else mask
         found = extract_features(image, usable, self._features, upsample=False)
-        return Keypoints(torch.from_numpy(found.keypoints[:, :2]).double(), unit_descriptors(found.descriptors), lens)
+        xy = torch.from_numpy(found.keypoints[:, :2]).double()
+        return Keypoints(xy, unit_descriptors(found.descriptors), lens, turning)
 
     def locate(self, seen: Keypoints, time: float) -> TrackedPose:
         """The pose of the next image, taken at `time`, seconds, by what `describe` found in it."""
@@ -114,7 +144,8 @@ class Tracker:
             return TrackedPose("lost", None, None, *counts, reason)
         self._before = self._last if status == "tracked" else None
         self._last = _Known(time, estimate.cam2world)
-        return TrackedPose(status, estimate.cam2world, estimate.covariance, estimate.inliers, estimate.matches)
+        counts = (estimate.inliers, estimate.matches)
+        return TrackedPose(status, estimate.cam2world, estimate.covariance, *counts, turn=estimate.turn)
 
     def _predicted(self, time: float) -> Float[Tensor, "4 4"]:
         """The last pose carried on at the speed and turn rate between the last two."""
@@ -127,54 +158,60 @@ class Tracker:
     def _tracked(self, seen: Keypoints, time: float) -> _Estimate | None:
         """From the landmarks near where the predicted pose sees them."""
         camera = replace(seen.lens, cam2world=self._predicted(time)[None])
-        pixels, points, _ = self._matches(seen, camera, self.settings.radius * max(camera.width, camera.height))
-        return self._solved(seen, pixels, points)
+        radius = self.settings.radius * max(camera.width, camera.height)
+        return self._solved(seen, self._matches(seen, seen.xy, camera, radius))
 
     def _relocalized(self, seen: Keypoints) -> _Estimate | None:
         """From the landmarks of the map frames that look most like the image, wherever they are."""
-        pixels, points = [], []
+        found = []
         for frame in self.map.alike(seen.descriptors, _RETRIEVED):
             rows = self.map.of_frame(frame)
             pairs = match_descriptors(seen.descriptors, self.map.described(rows), self._features.max_ratio)
-            pixels.append(seen.xy[pairs[:, 0]])
-            points.append(self.map.xyz[self.map.point[rows[pairs[:, 1]]]])
-        if not pixels:
+            found.append(torch.stack([pairs[:, 0], self.map.point[rows[pairs[:, 1]]]], -1))
+        if not found:
             return None
-        # one point seen by several frames counts once
-        both = torch.unique(torch.cat([torch.cat(pixels), torch.cat(points)], -1), dim=0)
-        return self._solved(seen, both[:, :2], both[:, 2:])
+        keypoint, point = torch.cat(found).unbind(-1)
+        shown = torch.cat([seen.xy[keypoint], point[:, None]], -1).numpy()
+        once = torch.from_numpy(np.unique(shown, axis=0, return_index=True)[1])  # a point that several frames saw
+        return self._solved(seen, _Matched(keypoint[once], self.map.xyz[point[once]]))
 
-    def _solved(self, seen: Keypoints, pixels: Float[Tensor, "m 2"], points: Float[Tensor, "m 3"]) -> _Estimate | None:
+    def _solved(self, seen: Keypoints, matched: _Matched) -> _Estimate | None:
         """The pose that most matches agree on, then that of all landmarks near their pixels from there."""
-        first = self._pose(seen, pixels, points)
+        first = self._pose(seen, seen.xy, matched)
         if first is None:
             return None
-        camera = replace(seen.lens, cam2world=first[0][None])
-        pixels, points, visible = self._matches(seen, camera, _NEAR_ENOUGH * self._agreement(camera))
-        final = self._pose(seen, pixels, points)
+        camera = replace(seen.lens, cam2world=first.cam2world[None])
+        upright = seen.at_half_time(first.turn)
+        matched = self._matches(seen, upright, camera, _NEAR_ENOUGH * self._agreement(camera))
+        final = self._pose(seen, upright, matched)
         if final is None:
             return None
-        cam2world, inlier = final
-        covariance = pose_covariance(camera, cam2world, points[inlier], pixels[inlier])
-        return _Estimate(cam2world, covariance, int(inlier.sum()), len(pixels), min(visible, len(seen.xy)))
+        pixels, points = seen.xy[matched.keypoint[final.inlier]], matched.points[final.inlier]
+        covariance = pose_covariance(camera, final.cam2world, points, pixels, final.turn)
+        most = min(matched.visible, len(seen.xy))
+        return _Estimate(final.cam2world, final.turn, covariance, len(points), len(matched.keypoint), most)
 
-    def _pose(
-        self, seen: Keypoints, pixels: Float[Tensor, "m 2"], points: Float[Tensor, "m 3"]
-    ) -> tuple[Float[Tensor, "4 4"], Bool[Tensor, " m"]] | None:
-        if len(pixels) < self.settings.least_inliers:
+    def _pose(self, seen: Keypoints, xy: Float[Tensor, "n 2"], matched: _Matched) -> _Pose | None:
+        """The pose that most matches agree on where keypoints are at `xy`, and the turn that these tell."""
+        least = self.settings.least_inliers
+        if len(matched.keypoint) < least:
             return None
-        return absolute_pose(pixels, points, seen.lens, self._agreement(seen.lens))
+        found = absolute_pose(xy[matched.keypoint], matched.points, seen.lens, self._agreement(seen.lens))
+        if found is None:
+            return None
+        cam2world, inlier = found
+        if not seen.turning or int(inlier.sum()) < least:
+            return _Pose(cam2world, None, inlier)
+        there = replace(seen.lens, cam2world=cam2world[None])
+        return _Pose(*turned_pose(there, seen.xy[matched.keypoint[inlier]], matched.points[inlier]), inlier)
 
-    def _matches(
-        self, seen: Keypoints, camera: Cameras, radius: float
-    ) -> tuple[Float[Tensor, "m 2"], Float[Tensor, "m 3"], int]:
-        """Keypoints and the landmarks that they show within `radius` of where the camera sees them, and how many it
-        should see."""
+    def _matches(self, seen: Keypoints, xy: Float[Tensor, "n 2"], camera: Cameras, radius: float) -> _Matched:
+        """Keypoints, taken to be at `xy`, and the landmarks within `radius` of which the camera sees them."""
         rows = self.map.visible(camera, self.settings.map_frames)
         points = self.map.xyz[self.map.point[rows]]
         there = project(camera, points[None])[0][0]
-        pairs = match_nearby(self.map.described(rows), seen.descriptors, there, seen.xy, radius, _MAX_RATIO)
-        return seen.xy[pairs[:, 1]], points[pairs[:, 0]], len(rows)
+        pairs = match_nearby(self.map.described(rows), seen.descriptors, there, xy, radius, _MAX_RATIO)
+        return _Matched(pairs[:, 1], points[pairs[:, 0]], len(rows))
 
     def _agreement(self, camera: Cameras) -> float:
         """Largest reprojection error of an inlier, in pixels of the image."""

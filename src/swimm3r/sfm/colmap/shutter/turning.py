@@ -28,7 +28,8 @@ from swimm3r.imaging.turned_rows import RowTurns
 from swimm3r.scene.reconstruction import Reconstruction
 from swimm3r.sfm.colmap.extended_adjustment import Bundle, adjusted, blocks, cross, division_jacobian, places
 
-_STD = 0.002  # rad within a frame, of turns: 20 ms at 6 degrees per second
+EXPECTED_TURN = 0.002
+"""Standard deviation of turns within a frame, radians: 20 ms at 6 degrees per second."""
 _CLEARLY = 0.95  # of the median held-out error, below which turns are believed
 _HELD_OUT = 0.2  # of the observations of points that enough others show
 _ENOUGH = 3  # observations of a point that are left
@@ -51,7 +52,7 @@ class _Observed:
     row: Float[np.ndarray, " o"]  # y / H - 1/2
     focal: float  # px
     width: float  # px
-    prior_std: float = _STD
+    prior_std: float = EXPECTED_TURN
 
     def some(self, chosen: Bool[np.ndarray, " o"]) -> "_Observed":
         point, frame, ray, row = (part[chosen] for part in (self.point, self.frame, self.ray, self.row))
@@ -129,8 +130,8 @@ def turned_pose(
 
     def residuals(change: np.ndarray) -> np.ndarray:
         errors = observed.errors(moved(change)) / observed.width
-        robust = np.sqrt(2 * (np.sqrt(1 + np.square(errors).sum(-1)) - 1))
-        return np.concatenate([robust, change[6:] / _STD])
+        shrunk = np.sqrt(2 / (1 + np.sqrt(1 + np.square(errors).sum(-1))))  # of length sqrt(2 (sqrt(1 + e^2) - 1))
+        return np.concatenate([(shrunk[:, None] * errors).ravel(), change[6:] / EXPECTED_TURN])
 
     change = np.zeros(9)
     for _ in range(2):  # the second time with the width of the errors that are left
