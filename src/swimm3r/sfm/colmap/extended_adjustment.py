@@ -79,13 +79,13 @@ def total(bundle: Bundle, observed: Observed) -> float:
     return float(2 * (np.sqrt(1 + squared) - 1).sum() + np.square(bundle.others / observed.prior_std).sum())
 
 
-def adjusted(bundle: Bundle, observed: Observed, steps: int) -> Bundle:
-    """The bundle of the least sum near this one, or that after so many steps."""
+def adjusted(bundle: Bundle, observed: Observed, steps: int, *, points_stay: bool = False) -> Bundle:
+    """The bundle of the least sum near this one, or that after so many steps; its points may be known and stay."""
     damping, before = _DAMPING, total(bundle, observed)
     for _ in range(steps):
         equations = _NormalEquations.of(bundle, observed)
         while True:
-            trial = equations.step(bundle, damping)
+            trial = equations.step(bundle, damping, points_stay)
             after = total(trial, observed)
             if after < before:
                 break
@@ -160,22 +160,28 @@ class _NormalEquations:
             -to_points.T @ error,
         )
 
-    def step(self, bundle: Bundle, damping: float) -> Bundle:
+    def step(self, bundle: Bundle, damping: float, points_stay: bool) -> Bundle:
         """The bundle that the damped equations lead to."""
+        A = self.A + sparse.diags_array(damping * self.A.diagonal() + _STAYING)
+        if points_stay:
+            return _moved(bundle, splu(A.tocsc()).solve(self.a), np.zeros_like(bundle.xyz))
         diagonal = np.einsum("pii->pi", self.V)
         V = self.V + (damping * diagonal + _STAYING)[:, :, None] * np.eye(3)
         inverse = blocks(np.linalg.inv(V), np.arange(len(V)), len(V))
         WV = self.W @ inverse
-        A = self.A + sparse.diags_array(damping * self.A.diagonal() + _STAYING) - WV @ self.W.T
-        x = splu(A.tocsc()).solve(self.a - WV @ self.v)
-        points = (inverse @ (self.v - self.W.T @ x)).reshape(-1, 3)
-        n = len(bundle.R)
-        poses = x[: 6 * n].reshape(n, 6)
-        turn = Rotation.from_rotvec(poses[:, :3]).as_matrix()
-        return replace(
-            bundle,
-            R=turn @ bundle.R,
-            t=np.einsum("nij,nj->ni", turn, bundle.t) + poses[:, 3:],
-            xyz=bundle.xyz + points,
-            others=bundle.others + x[6 * n :],
-        )
+        x = splu((A - WV @ self.W.T).tocsc()).solve(self.a - WV @ self.v)
+        return _moved(bundle, x, (inverse @ (self.v - self.W.T @ x)).reshape(-1, 3))
+
+
+def _moved(bundle: Bundle, x: Float[np.ndarray, " q"], points: Float[np.ndarray, "p 3"]) -> Bundle:
+    """A bundle by its poses' and other unknowns' steps x, and those of its points."""
+    n = len(bundle.R)
+    poses = x[: 6 * n].reshape(n, 6)
+    turn = Rotation.from_rotvec(poses[:, :3]).as_matrix()
+    return replace(
+        bundle,
+        R=turn @ bundle.R,
+        t=np.einsum("nij,nj->ni", turn, bundle.t) + poses[:, 3:],
+        xyz=bundle.xyz + points,
+        others=bundle.others + x[6 * n :],
+    )

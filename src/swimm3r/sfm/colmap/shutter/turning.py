@@ -19,7 +19,6 @@ import numpy as np
 import torch
 from jaxtyping import Bool, Float, Int
 from scipy import sparse
-from scipy.optimize import least_squares
 from scipy.spatial.transform import Rotation
 from torch import Tensor
 
@@ -121,24 +120,12 @@ def turned_pose(
     frame, point = np.zeros(len(rays), dtype=np.int64), np.arange(len(rays))
     row = (xy[:, 1].double() / camera.height - 0.5).numpy()
     world2cam = camera.world2cam[0].double().numpy()
-    start = Bundle(world2cam[None, :3, :3], world2cam[None, :3, 3], xyz.double().numpy(), np.zeros(3))
+    found = Bundle(world2cam[None, :3, :3], world2cam[None, :3, 3], xyz.double().numpy(), np.zeros(3))
     observed = _Observed(point, frame, rays, row, camera.K[0, 0, 0].item(), _WIDTHS[1])
-
-    def moved(change: np.ndarray) -> Bundle:
-        R = Rotation.from_rotvec(change[:3]).as_matrix() @ start.R
-        return replace(start, R=R, t=start.t + change[3:6], others=change[6:])
-
-    def residuals(change: np.ndarray) -> np.ndarray:
-        errors = observed.errors(moved(change)) / observed.width
-        shrunk = np.sqrt(2 / (1 + np.sqrt(1 + np.square(errors).sum(-1))))  # of length sqrt(2 (sqrt(1 + e^2) - 1))
-        return np.concatenate([(shrunk[:, None] * errors).ravel(), change[6:] / EXPECTED_TURN])
-
-    change = np.zeros(9)
     for _ in range(2):  # the second time with the width of the errors that are left
-        change = least_squares(residuals, change, method="lm").x
-        error = np.linalg.norm(observed.errors(moved(change)), axis=-1)
+        found = adjusted(found, observed, _STEPS, points_stay=True)
+        error = np.linalg.norm(observed.errors(found), axis=-1)
         observed = replace(observed, width=float(np.clip(np.median(error), *_WIDTHS)))
-    found = moved(change)
     cam2world = torch.eye(4, dtype=torch.float64)
     cam2world[:3, :3] = torch.from_numpy(found.R[0].T)
     cam2world[:3, 3] = torch.from_numpy(-found.R[0].T @ found.t[0])
