@@ -32,8 +32,8 @@ from swimm3r.cameras import Cameras, pixel_grid, project, unproject
 from swimm3r.evaluate.images import as_8_bit, psnr
 from swimm3r.evaluate.registration import fit_colors, flow_between
 from swimm3r.imaging.undistortion import undistorted
-from swimm3r.pipeline.held_out import HeldOutView, cut, in_axes_of, score_views
-from swimm3r.pipeline.run import FinishedSfm, open_finished_sfm
+from swimm3r.pipeline.finished_sfm import FinishedSfm, open_finished_sfm
+from swimm3r.pipeline.scores.held_out import HeldOutView, cut, in_axes_of, score_views
 from swimm3r.splat.map_file import load_map
 from swimm3r.splat.rendering import SplatMap
 

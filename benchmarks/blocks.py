@@ -23,8 +23,8 @@ from torch import Tensor
 from swimm3r.cameras import pixel_grid, unproject
 from swimm3r.imaging.undistortion import nearest_pixels, undistorted
 from swimm3r.io.images import write_rgb
+from swimm3r.pipeline.finished_sfm import FinishedSfm, open_finished_sfm
 from swimm3r.pipeline.presets import PRESETS
-from swimm3r.pipeline.run import FinishedSfm, open_finished_sfm
 from swimm3r.scene.frames import Frames
 from swimm3r.scene.surface import surface_of
 from swimm3r.splat import train

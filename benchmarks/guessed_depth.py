@@ -27,7 +27,7 @@ from swimm3r.imaging.depth_from_color import depth_from_color
 from swimm3r.imaging.open_water import sea_share, without_fringe
 from swimm3r.imaging.undistortion import frame_directions, frame_rays
 from swimm3r.medium import linear_from_srgb, srgb_from_linear
-from swimm3r.pipeline.run import FinishedSfm, open_finished_sfm
+from swimm3r.pipeline.finished_sfm import FinishedSfm, open_finished_sfm
 from swimm3r.scene.point_groups import PointGroups
 
 FRAMES = 8

@@ -22,7 +22,7 @@ import torch
 from swimm3r.cameras import Cameras, project_visible
 from swimm3r.geometry import align_similarity
 from swimm3r.pipeline.presets import PRESETS
-from swimm3r.pipeline.truth_summary import truth_section
+from swimm3r.pipeline.scores.truth import truth_section
 from swimm3r.prepare import read_frames
 from swimm3r.progress import silent
 from swimm3r.refraction.central import CameraInWater, camera_in_water

@@ -20,9 +20,9 @@ from swimm3r.bench.cells import Result, ResultKey, Scores, kept_cell
 from swimm3r.bench.map_scores import map_scores, trained
 from swimm3r.bench.protocols.ablation_uwbs import COLUMNS as OF_ABLATION
 from swimm3r.bench.scores import columns
-from swimm3r.pipeline.held_out import FirstPose
+from swimm3r.pipeline.finished_sfm import FinishedSfm, open_finished_sfm
 from swimm3r.pipeline.presets import PRESETS
-from swimm3r.pipeline.run import FinishedSfm, open_finished_sfm
+from swimm3r.pipeline.scores.held_out import FirstPose
 from swimm3r.splat.settings import PoseRefinementSettings, SggSettings, UwbsSettings
 
 COLUMNS = (*OF_ABLATION, *columns("T_D_abs", "B_abs"))  # the last two of synthetic dives

@@ -19,8 +19,8 @@ import torch
 from swimm3r.evaluate import NotComputed
 from swimm3r.evaluate.poses import absolute_pose_errors
 from swimm3r.geometry import pose_from, so3_exp
-from swimm3r.pipeline import held_out
 from swimm3r.pipeline.presets import PRESETS
+from swimm3r.pipeline.scores import held_out
 from swimm3r.prepare import load_frames
 from swimm3r.scene.ground_truth import FOLDER, GroundTruth, read_ground_truth
 from swimm3r.scene.reconstruction import Reconstruction

@@ -16,8 +16,8 @@ import torch
 
 from swimm3r.evaluate.images import psnr
 from swimm3r.imaging.undistortion import undistorted
+from swimm3r.pipeline.finished_sfm import FinishedSfm, open_finished_sfm
 from swimm3r.pipeline.presets import PRESETS
-from swimm3r.pipeline.run import FinishedSfm, open_finished_sfm
 from swimm3r.splat import train
 from swimm3r.splat.settings import (
     LearningRates,

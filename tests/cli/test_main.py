@@ -198,7 +198,7 @@ def test_a_wrong_path_is_noticed_before_frames_are_prepared(
     (tmp_path / "dive").mkdir()
     for i in range(3):
         write_rgb(tmp_path / "dive" / f"{i}.png", np.random.default_rng(i).random((24, 32, 3)))
-    monkeypatch.setattr("swimm3r.pipeline.run.read_frames", lambda *_, **__: pytest.fail("frames were prepared"))
+    monkeypatch.setattr("swimm3r.pipeline.stages.read_frames", lambda *_, **__: pytest.fail("frames were prepared"))
     command, expected = WRONG_PATHS[wrong]
     given = [word.format(dive=tmp_path / "dive", nowhere=tmp_path / "nowhere.json") for word in command]
     code, message = outcome(capsys, *given, "--out", str(tmp_path / "run"))

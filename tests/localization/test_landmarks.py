@@ -14,7 +14,7 @@ from swimm3r.imaging.turned_rows import half_time_pixels
 from swimm3r.io.images import write_rgb
 from swimm3r.localization.interpolation import between, neighbors, pose_from_neighbors
 from swimm3r.localization.landmarks import Landmarks, landmarks_of, locate
-from swimm3r.pipeline.held_out import first_poses
+from swimm3r.pipeline.scores.held_out import first_poses
 from swimm3r.scene.frames import Frame, Frames
 from swimm3r.scene.ground_truth import GroundTruth
 from swimm3r.scene.reconstruction import DepthMap, DepthMaps, Matches, Points, Reconstruction, Tracks

@@ -25,7 +25,8 @@ from swimm3r.localization.batch import localize_run
 from swimm3r.localization.settings import LocalizationSettings
 from swimm3r.pipeline.presets import MAST3R_PRESETS, PRESETS, RunSettings, from_yaml, to_yaml
 from swimm3r.pipeline.renders import KINDS, render_run
-from swimm3r.pipeline.run import evaluate_run, run_pipeline
+from swimm3r.pipeline.run import run_pipeline
+from swimm3r.pipeline.scores.evaluation import evaluate_run
 from swimm3r.pipeline.view_settings import ViewSettings
 from swimm3r.prepare import load_frames
 from swimm3r.report.outputs import OUTPUTS, outputs_of

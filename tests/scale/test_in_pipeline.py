@@ -13,9 +13,10 @@ from tests.scale.test_rescale import write_run
 from swimm3r.errors import InputError, UsageError
 from swimm3r.io.images import write_rgb
 from swimm3r.pipeline.presets import PRESETS, RunSettings, from_yaml, to_yaml
-from swimm3r.pipeline.run import _scaled, run_pipeline
+from swimm3r.pipeline.run import run_pipeline
 from swimm3r.pipeline.run_record import _set_aside, open_record, stage_keys
 from swimm3r.pipeline.run_settings import differences
+from swimm3r.pipeline.stages import _scaled
 from swimm3r.progress import silent
 from swimm3r.scale.rescale import RESCALING
 from swimm3r.scale.run import is_scaled, read_record, scale_sections

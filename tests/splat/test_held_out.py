@@ -9,7 +9,7 @@ from swimm3r.cameras import Cameras
 from swimm3r.evaluate import NotComputed
 from swimm3r.geometry import Similarity, align_similarity, best_similarity, pose_from, rotation_angle, so3_exp
 from swimm3r.pipeline.camera_paths import smooth_path
-from swimm3r.pipeline.held_out import (
+from swimm3r.pipeline.scores.held_out import (
     covered_scores,
     cut,
     first_poses,

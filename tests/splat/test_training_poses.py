@@ -10,7 +10,7 @@ from swimm3r.cameras import project
 from swimm3r.evaluate.poses import absolute_pose_errors
 from swimm3r.geometry import pose_from, so3_exp
 from swimm3r.io.cameras_json import read_cameras
-from swimm3r.pipeline.held_out import FirstPose, in_axes_of
+from swimm3r.pipeline.scores.held_out import FirstPose, in_axes_of
 from swimm3r.scene.reconstruction import Matches
 from swimm3r.splat import train, training_poses
 from swimm3r.splat.map_file import load_map

@@ -5,7 +5,7 @@ from pathlib import Path
 from swimm3r import weights
 from swimm3r.errors import WeightsError
 from swimm3r.io.files.cache_key import content_digest
-from swimm3r.pipeline.run import FinishedSfm
+from swimm3r.pipeline.finished_sfm import FinishedSfm
 from swimm3r.sfm.settings import ColmapModelSettings, Mast3rSettings, SfmSettings
 
 _RECONSTRUCTION = ("cameras.json", "medium.json", "reconstruction.json", "matches.npz")

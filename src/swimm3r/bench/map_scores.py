@@ -10,9 +10,9 @@ from swimm3r.imaging.undistortion import undistorted
 from swimm3r.io import images
 from swimm3r.io.files.metrics_log import read_rows
 from swimm3r.io.view_names import view_stems
-from swimm3r.pipeline import held_out
-from swimm3r.pipeline.run import FinishedSfm
-from swimm3r.pipeline.truth_summary import truth_section
+from swimm3r.pipeline.finished_sfm import FinishedSfm
+from swimm3r.pipeline.scores import held_out
+from swimm3r.pipeline.scores.truth import truth_section
 from swimm3r.progress import Progress, silent
 from swimm3r.splat import train
 from swimm3r.splat.map_file import load_map

@@ -24,7 +24,7 @@ from swimm3r.errors import InputError, RegistrationError
 from swimm3r.evaluate import NotComputed
 from swimm3r.io.files.atomic import write_text
 from swimm3r.io.files.cache_key import cache_key, code_version
-from swimm3r.pipeline.run import FinishedSfm
+from swimm3r.pipeline.finished_sfm import FinishedSfm
 from swimm3r.progress import Progress, silent
 from swimm3r.scene.frames import Frames
 from swimm3r.scene.ground_truth import GroundTruth, read_ground_truth

@@ -9,8 +9,9 @@ from swimm3r.datasets import layouts
 from swimm3r.errors import InputError
 from swimm3r.io.images import image_size
 from swimm3r.io.video import Video
+from swimm3r.pipeline.finished_sfm import FinishedSfm, open_finished_sfm
 from swimm3r.pipeline.presets import RunSettings
-from swimm3r.pipeline.run import FinishedSfm, open_finished_sfm, run_pipeline
+from swimm3r.pipeline.run import run_pipeline
 from swimm3r.pipeline.run_settings import with_poses_of
 from swimm3r.prepare import check_source
 from swimm3r.prepare.image_folder import images_of

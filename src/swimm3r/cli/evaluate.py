@@ -28,7 +28,7 @@ def evaluate(
         steps: Refinement steps for the pose of each test frame; those of the run by default.
         map_device: Device that renders the map; auto uses CUDA if a GPU and NVIDIA Warp are present.
     """
-    from swimm3r.pipeline.run import evaluate_run
+    from swimm3r.pipeline.scores.evaluation import evaluate_run
 
     with drawn_progress() as progress:
         summary = evaluate_run(run, steps=steps, reference=reference, map_device=map_device, progress=progress)

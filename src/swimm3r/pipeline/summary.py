@@ -14,7 +14,7 @@ from swimm3r.imaging.undistortion import undistorted_matches
 from swimm3r.io.files.metrics_log import read_rows
 from swimm3r.lamp import lamp_document
 from swimm3r.medium import Medium, MediumFit
-from swimm3r.pipeline.held_out import HeldOutView, mean_part, mean_scores, protocol
+from swimm3r.pipeline.scores.held_out import HeldOutView, mean_part, mean_scores, protocol
 from swimm3r.scene.frames import Frames
 from swimm3r.scene.reconstruction import Matches, Reconstruction
 from swimm3r.splat.appearance import FrameColors, read_decision

@@ -22,8 +22,8 @@ from torch import Tensor
 from swimm3r.cameras import Cameras
 from swimm3r.evaluate.images import psnr
 from swimm3r.imaging.undistortion import undistorted
-from swimm3r.pipeline.held_out import first_poses
 from swimm3r.pipeline.renders import DisplayStyle, display_style
+from swimm3r.pipeline.scores.held_out import first_poses
 from swimm3r.progress import Progress
 from swimm3r.sfm.features.settings import FeatureSettings
 from swimm3r.splat.training.observer import TrainingStep

@@ -15,7 +15,7 @@ from swimm3r.datasets import read_tree
 from swimm3r.errors import InputError, RegistrationError
 from swimm3r.evaluate import NotComputed
 from swimm3r.io.images import read_rgb
-from swimm3r.pipeline.run import open_finished_sfm
+from swimm3r.pipeline.finished_sfm import open_finished_sfm
 from swimm3r.prepare import load_frames
 from swimm3r.scene.frames import Frames
 from swimm3r.scene.ground_truth import FOLDER, GroundTruth, read_ground_truth

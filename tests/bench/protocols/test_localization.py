@@ -16,7 +16,7 @@ from swimm3r.geometry import pose_from, so3_exp
 from swimm3r.localization.batch import Answer
 from swimm3r.localization.localizer import Localization
 from swimm3r.localization.settings import LocalizationSettings
-from swimm3r.pipeline.run import open_finished_sfm
+from swimm3r.pipeline.finished_sfm import open_finished_sfm
 from swimm3r.sfm.colmap import poses as colmap
 from swimm3r.splat import train
 from swimm3r.splat.settings import UwbsSettings

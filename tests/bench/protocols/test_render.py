@@ -17,9 +17,9 @@ from swimm3r.bench.runs import clips_of, made_runs
 from swimm3r.errors import InputError, UsageError
 from swimm3r.evaluate import NotComputed
 from swimm3r.io.images import read_rgb
-from swimm3r.pipeline import held_out
+from swimm3r.pipeline.finished_sfm import open_finished_sfm
 from swimm3r.pipeline.presets import RunSettings
-from swimm3r.pipeline.run import open_finished_sfm
+from swimm3r.pipeline.scores import held_out
 from swimm3r.sfm.plane_sweep.settings import PlaneSweepSettings
 from swimm3r.sfm.settings import ColmapSettings
 from swimm3r.splat.settings import RECIPES, PoseRefinementSettings, UwbsSettings

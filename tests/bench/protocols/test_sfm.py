@@ -21,8 +21,8 @@ from swimm3r.evaluate import NotComputed
 from swimm3r.evaluate.underwater import URANKER, uciqe, uiqm
 from swimm3r.io.images import read_rgb, write_rgb, write_rgb_16
 from swimm3r.medium import AttenuationCurve, Estimator, Medium, MediumFit
+from swimm3r.pipeline.finished_sfm import open_finished_sfm
 from swimm3r.pipeline.presets import PRESETS, RunSettings
-from swimm3r.pipeline.run import open_finished_sfm
 from swimm3r.prepare import load_frames
 from swimm3r.progress import silent
 from swimm3r.scene.reconstruction import DepthMaps, Matches, Reconstruction

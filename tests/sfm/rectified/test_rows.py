@@ -14,7 +14,7 @@ from swimm3r.errors import InputError
 from swimm3r.imaging.rectification import Rectification
 from swimm3r.imaging.turned_rows import RowTurns, at_half_time
 from swimm3r.io import images
-from swimm3r.pipeline import run as pipeline
+from swimm3r.pipeline import stages
 from swimm3r.pipeline.presets import PRESETS
 from swimm3r.progress import silent
 from swimm3r.scene.frames import MASKS, Frame, Frames, write_index
@@ -163,14 +163,14 @@ def test_a_run_goes_on_with_rectified_rows(bent: bool, filmed: Frames, tmp_path:
         if not frames.rows_rectified:
             raise TurnedRowsError(RowTurns(lens(), {frames.names[0]: TURN, frames.names[2]: -TURN}))
 
-    monkeypatch.setattr(pipeline, "reconstruct", reconstruct)
+    monkeypatch.setattr(stages, "reconstruct", reconstruct)
     written = []
-    monkeypatch.setattr(pipeline, "write_masks_as_filmed", lambda *arguments: written.append(arguments))
-    pipeline._reconstruct(filmed, PRESETS["fast"], run, silent, EngineSettings(), None)
+    monkeypatch.setattr(stages, "write_masks_as_filmed", lambda *arguments: written.append(arguments))
+    stages._reconstruct(filmed, PRESETS["fast"], run, silent, EngineSettings(), None)
     assert seen == [("0.jpg", False), *[("0.png", False)] * bent, ("0.png", True)]
     assert has_rectified_rows(run)
     assert is_rectified(run) == bent
     assert len(written) == 1
     seen.clear()
-    pipeline._reconstruct(filmed, PRESETS["fast"], run, silent, EngineSettings(), None)
+    stages._reconstruct(filmed, PRESETS["fast"], run, silent, EngineSettings(), None)
     assert seen == [("0.png", True)]

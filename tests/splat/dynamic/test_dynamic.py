@@ -12,9 +12,9 @@ from swimm3r.errors import InputError
 from swimm3r.evaluate.images import psnr
 from swimm3r.io.cameras_json import CameraTable
 from swimm3r.io.images import read_rgb, write_rgb
-from swimm3r.pipeline.held_out import FirstPose, score_views
 from swimm3r.pipeline.renders import moments_of
-from swimm3r.pipeline.truth_summary import truth_section
+from swimm3r.pipeline.scores.held_out import FirstPose, score_views
+from swimm3r.pipeline.scores.truth import truth_section
 from swimm3r.scene.frames import Frames
 from swimm3r.scene.ground_truth import GroundTruth
 from swimm3r.splat import train

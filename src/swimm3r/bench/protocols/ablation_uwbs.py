@@ -17,8 +17,8 @@ from swimm3r.bench.scores import columns
 from swimm3r.bench.settings import Seeds
 from swimm3r.bench.tables import Table
 from swimm3r.errors import InputError
-from swimm3r.pipeline import held_out
-from swimm3r.pipeline.run import FinishedSfm, open_finished_sfm
+from swimm3r.pipeline.finished_sfm import FinishedSfm, open_finished_sfm
+from swimm3r.pipeline.scores import held_out
 from swimm3r.progress import Progress, silent
 from swimm3r.settings import accepted
 from swimm3r.splat.settings import PoseRefinementSettings, UwbsSettings

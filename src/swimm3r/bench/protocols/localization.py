@@ -35,7 +35,7 @@ from swimm3r.localization.batch import Answer, Query, answer, match_image
 from swimm3r.localization.localizer import STAGES, Localizer
 from swimm3r.localization.matchers import chosen_matcher
 from swimm3r.localization.settings import GS_CPR, LocalizationSettings, with_checkpoint_of
-from swimm3r.pipeline.run import FinishedSfm
+from swimm3r.pipeline.finished_sfm import FinishedSfm
 from swimm3r.progress import Progress, silent
 from swimm3r.scene.ground_truth import GroundTruth
 from swimm3r.scene.reconstruction import Reconstruction

@@ -21,9 +21,9 @@ from swimm3r.bench.settings import Seeds
 from swimm3r.bench.tables import Table
 from swimm3r.evaluate import NotComputed
 from swimm3r.io.view_names import view_stems
-from swimm3r.pipeline import held_out
+from swimm3r.pipeline.finished_sfm import FinishedSfm
 from swimm3r.pipeline.presets import RunSettings
-from swimm3r.pipeline.run import FinishedSfm
+from swimm3r.pipeline.scores import held_out
 from swimm3r.progress import Progress, silent
 from swimm3r.scene.ground_truth import GroundTruth
 from swimm3r.settings import accepted

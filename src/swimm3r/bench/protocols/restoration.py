@@ -18,7 +18,7 @@ from swimm3r.bench.runs import Clip, clips_of
 from swimm3r.bench.scores import columns
 from swimm3r.bench.tables import Table
 from swimm3r.io.files.cache_key import content_digest
-from swimm3r.pipeline.restored_scores import no_reference_scores
+from swimm3r.pipeline.scores.restored import no_reference_scores
 from swimm3r.progress import Progress, silent
 from swimm3r.scene.frames import Frames
 from swimm3r.tasks.settings import EngineSettings

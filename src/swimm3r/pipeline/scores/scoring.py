@@ -11,12 +11,12 @@ from pathlib import Path
 from swimm3r.io.files.cache_key import cache_key
 from swimm3r.io.imports.read import read_foreign
 from swimm3r.io.view_names import view_stems
-from swimm3r.pipeline import held_out
 from swimm3r.pipeline import summary as sections
 from swimm3r.pipeline.presets import RunSettings
 from swimm3r.pipeline.renders import display_style, write_flythrough
-from swimm3r.pipeline.restored_scores import restored_section
-from swimm3r.pipeline.truth_summary import truth_section
+from swimm3r.pipeline.scores import held_out
+from swimm3r.pipeline.scores.restored import restored_section
+from swimm3r.pipeline.scores.truth import truth_section
 from swimm3r.progress import Progress, silent
 from swimm3r.scene.frames import Frames
 from swimm3r.scene.ground_truth import GroundTruth

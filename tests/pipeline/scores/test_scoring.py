@@ -3,7 +3,7 @@
 from dataclasses import replace
 from pathlib import Path
 
-from swimm3r.pipeline.scoring import Protocol
+from swimm3r.pipeline.scores.scoring import Protocol
 from swimm3r.splat.settings import PoseRefinementSettings
 
 OWN = Protocol(PoseRefinementSettings(steps=300, long_side=320))

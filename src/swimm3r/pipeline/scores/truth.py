@@ -28,7 +28,7 @@ from swimm3r.evaluate.underwater import (
 from swimm3r.geometry import DegenerateAlignmentError, align_poses, align_similarity
 from swimm3r.imaging.undistortion import nearest_pixels, undistorted
 from swimm3r.medium import Medium, MediumFit, remove_water, rescale
-from swimm3r.pipeline.held_out import HeldOutView, cut
+from swimm3r.pipeline.scores.held_out import HeldOutView, cut
 from swimm3r.pipeline.summary import identifiable_coefficients, mean_medium
 from swimm3r.progress import Progress, silent
 from swimm3r.scene.frames import Frames
