@@ -53,6 +53,7 @@ class LightEvidence:
     explained: float  # share of the variance of points' light that places in the image explain beyond distance
     change: float  # standard deviation of its logarithm over the images
     points: int
+    fall_off: float | None = None  # power of the distance that the light falls with, of the median channel
 
 
 def pattern(direction: Float[Tensor, "*points 3"], coefficients: Float[Tensor, "6"]) -> Float[Tensor, "*points"]:

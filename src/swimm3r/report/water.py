@@ -74,6 +74,8 @@ def _light_note(fit: MediumFit) -> str:
     if (evidence := fit.light) is not None:
         told = f"{evidence.explained:.0%} of what distance leaves of the light of {evidence.points:,} points stays with"
         told += f" their place in the image, which changes it by {evidence.change:.0%}"
+        if evidence.fall_off is not None:
+            told += f"; it falls with distance to the power of {evidence.fall_off:.1f}"
     return f"The dive is lit by a lamp on the camera ({told}). Colors without the water are evenly lit."
 
 

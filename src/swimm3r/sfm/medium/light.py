@@ -7,8 +7,13 @@ on the camera its light changes with its place in the image,
 
 h being what the water's fit leaves over the distance z, and phi the pattern of `swimm3r.lamp`. Both models, with and
 without phi, are fitted to half of the points and judged on the others, points that none was fitted to. Frames whose
-exposure changes do not pass for either: they have gains of their own. A lens that darkens the corners looks the same as
-a lamp, but less so.
+exposure changes do not pass for either: they have gains of their own. A lens that darkens the corners, and local tone
+mapping, make a pattern as well. They leave the power n of the distance that the direct light falls with,
+
+    ln (I - B) = ln J_t - n ln z + g . phi(d),
+
+which is that of attenuation alone under the sun, and at least a small lamp's under a lamp. Over level ground seen from
+one height distances tell no power; there a pattern alone tells a lamp, if it is strong.
 """
 
 import numpy as np
@@ -23,6 +28,7 @@ from swimm3r.sfm.medium.settings import SeathruSettings
 _LEAST_LIGHT, _LEAST_T_D = 0.02, 0.1  # direct light and T_D of channels whose logarithm tells something
 _MOST = 60_000  # observations
 _ROUNDS = 3  # of reweighting
+_TELLING = 0.015  # spread of a point's distances over its frames, in logarithms, below which they tell no power
 
 
 def judge_light(samples: WaterSamples, fit: MediumFit, settings: SeathruSettings) -> LightEvidence | None:
@@ -40,12 +46,9 @@ def judge_light(samples: WaterSamples, fit: MediumFit, settings: SeathruSettings
     points = torch.unique(samples.track[rows])
     if len(points) < settings.min_tracks:
         return None
-    step = -(-len(rows) // _MOST)
-    rows = rows[samples.track[rows] % step == 0] if step > 1 else rows
-    light = logs[rows, channel].double().numpy()
-    point = np.unique(samples.track[rows].numpy(), return_inverse=True)[1]
-    frame = np.unique(samples.frame[rows].numpy(), return_inverse=True)[1]
-    patterns = pattern_terms(samples.direction[rows].double())
+    rows = _thinned(rows, samples.track)
+    light, patterns = logs[rows, channel].double().numpy(), pattern_terms(samples.direction[rows].double())
+    point, frame = (np.unique(of[rows].numpy(), return_inverse=True)[1] for of in (samples.track, samples.frame))
     unit = float(z[rows].median())
     far = (z[rows].double() / unit).numpy()
     distance = np.stack([far, np.log(far)], -1)
@@ -59,8 +62,37 @@ def judge_light(samples: WaterSamples, fit: MediumFit, settings: SeathruSettings
     everywhere = alone if len(alone) else samples.direction
     change = float((pattern(everywhere.double(), torch.from_numpy(found))).std())
     explained = 1 - spreads[1] / max(spreads[0], 1e-12)
-    lamp = explained >= settings.lamp_explained and change >= settings.lamp_change
-    return LightEvidence("lamp" if lamp else "sun", explained, change, len(points))
+    fall_off = _fall_off(samples, direct, exposed, settings)
+    falls = fall_off is None or fall_off >= settings.lamp_fall_off
+    enough = settings.lamp_alone if fall_off is None else settings.lamp_explained
+    lamp = falls and explained >= enough and change >= settings.lamp_change
+    return LightEvidence("lamp" if lamp else "sun", explained, change, len(points), fall_off)
+
+
+def _fall_off(
+    samples: WaterSamples, direct: torch.Tensor, exposed: torch.Tensor, settings: SeathruSettings
+) -> float | None:
+    """n of the median channel among those that enough points tell, seen from several distances; None without any."""
+    assert samples.direction is not None
+    powers = []
+    for c in range(direct.shape[-1]):
+        rows = torch.nonzero((samples.track >= 0) & exposed & (direct[:, c] > _LEAST_LIGHT))[:, 0]
+        if len(torch.unique(samples.track[rows])) < settings.min_tracks:
+            continue
+        rows = _thinned(rows, samples.track)
+        point, frame = (np.unique(of[rows].numpy(), return_inverse=True)[1] for of in (samples.track, samples.frame))
+        distance = samples.ray_depth[rows, None].double().log().numpy()
+        if _without_groups(distance, point, frame, np.ones(len(rows))).std() < _TELLING:
+            continue
+        terms = np.concatenate([distance, pattern_terms(samples.direction[rows].double())], -1)
+        powers.append(-float(_fitted(direct[rows, c].double().log().numpy(), terms, point, frame)[0]))
+    return float(np.median(powers)) if powers else None
+
+
+def _thinned(rows: torch.Tensor, track: torch.Tensor) -> torch.Tensor:
+    """The observations of some points, all of them of each."""
+    step = -(-len(rows) // _MOST)
+    return rows[track[rows] % step == 0] if step > 1 else rows
 
 
 def pattern_terms(direction: torch.Tensor) -> np.ndarray:

@@ -92,9 +92,15 @@ class SeathruSettings(Settings):
     """Initial standard deviation of exposure and white balance between frames, which is then estimated."""
     gain_evidence: Share = 0.85
     """Share of the residuals below which gains per frame must bring them to be used."""
-    lamp_explained: Share = 0.4
+    lamp_explained: Share = 0.25
     """Smallest share of the variance of points' light, after distance, that their places in the images explain under a
-    lamp, with `light auto`."""
+    lamp, with `light auto`; the light must fall with distance, too (`lamp_fall_off`)."""
+    lamp_fall_off: NotNegative = 0.7
+    """Smallest power of the distance that a lamp's light falls with, with `light auto`: 0.9 in clear water, more in
+    any other."""
+    lamp_alone: Share = 0.6
+    """Share explained from which a lamp is assumed where the points' distances do not tell that power, as over level
+    ground seen from one height, with `light auto`."""
     lamp_change: NotNegative = 0.1
     """Smallest standard deviation, over the images, of the logarithm of a lamp's light, with `light auto`."""
     std_inflation: Positive = 2.0

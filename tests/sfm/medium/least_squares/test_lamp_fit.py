@@ -23,8 +23,13 @@ SETTINGS = SeathruSettings()
 LAMP = lamp_of(LampSettings(strength=1.0))
 
 
-def lamp_samples(medium, *, points: int = 700, views: int = 8, open_water: int = 400) -> tuple[WaterSamples, dict]:
-    """Points seen `views` times each from 1 to 6 m at any place of the image, with pixel noise of 0.004."""
+def lamp_samples(
+    medium, *, points: int = 700, views: int = 8, open_water: int = 400, spread: float = 0.7
+) -> tuple[WaterSamples, dict]:
+    """Points seen `views` times each from 1 to 6 m at any place of the image, with pixel noise of 0.004.
+
+    `spread` is the logarithm of a point's largest distance over its least.
+    """
     g = torch.Generator().manual_seed(7)
     count = points * views
     track = torch.arange(points).repeat_interleave(views)
@@ -32,7 +37,7 @@ def lamp_samples(medium, *, points: int = 700, views: int = 8, open_water: int =
     place = 2 * torch.rand(count, 2, generator=g) - 1
     rays = torch.cat([place * torch.tensor([0.53, 0.36]), torch.ones(count, 1)], -1)
     near = 1.2 + 2.5 * torch.rand(points, generator=g)
-    z = near[track] * torch.exp(0.7 * torch.rand(count, generator=g))
+    z = near[track] * torch.exp(spread * torch.rand(count, generator=g))
     gray = 0.1 + 0.7 * torch.rand(points, 1, generator=g)
     gray[torch.rand(points, generator=g) < 0.03] = 0.0
     J = (gray * (0.8 + 0.4 * torch.rand(points, 3, generator=g)))[track]
@@ -164,10 +169,44 @@ def test_a_lamp_is_told_from_the_sun_by_the_light_of_points(drawn, water):
         assert evidence.light == light
 
 
-def test_the_corners_of_a_lens_are_not_taken_for_a_lamp(drawn, water):
-    samples, truth = drawn
-    sunlit = add_water(truth["J"], samples.ray_depth, water)
+def rough(samples: WaterSamples, share: float) -> WaterSamples:
+    """Samples whose colors are off by a share of themselves, as patches of ground seen from several places are."""
+    g = torch.Generator().manual_seed(3)
+    return replace(samples, I=(samples.I * (share * torch.randn(len(samples.I), 1, generator=g)).exp()).clamp(0, 1))
+
+
+def dark_corners(samples: WaterSamples, J: torch.Tensor, water, share: float) -> WaterSamples:
+    """The same ground in daylight, through a lens that takes a share of the light from the corners."""
+    sunlit = add_water(J, samples.ray_depth, water)
     corner = (samples.direction[:, :2] / samples.direction[:, 2:]).square().sum(-1) / (0.53**2 + 0.36**2)
-    darkened = sunlit * (1 - 0.25 * corner)[:, None]
-    samples = replace(samples, I=darkened, open_water=torch.zeros(0, 3), water_direction=torch.zeros(0, 3))
-    assert judge_light(samples, fit_medium(samples, SETTINGS, "srgb"), SETTINGS).light == "sun"
+    darkened = sunlit * (1 - share * corner)[:, None]
+    return replace(samples, I=darkened, open_water=torch.zeros(0, 3), water_direction=torch.zeros(0, 3))
+
+
+def judged(samples: WaterSamples) -> LightEvidence:
+    evidence = judge_light(samples, fit_medium(samples, SETTINGS, "srgb"), SETTINGS)
+    assert evidence is not None
+    return evidence
+
+
+@pytest.mark.parametrize("share", [0.25, 0.55])
+def test_the_corners_of_a_lens_are_not_taken_for_a_lamp(drawn, water, share: float):
+    samples, truth = drawn
+    assert judged(dark_corners(samples, truth["J"], water, share)).light == "sun"
+
+
+def test_a_pattern_that_explains_little_is_a_lamps_where_the_light_falls_with_distance(drawn, water):
+    samples, truth = drawn
+    lit, lens = (judged(rough(one, 0.15)) for one in (samples, dark_corners(samples, truth["J"], water, 0.55)))
+    assert SETTINGS.lamp_explained < lit.explained < SETTINGS.lamp_alone
+    assert lens.explained > SETTINGS.lamp_explained
+    assert (lit.light, lens.light) == ("lamp", "sun")
+    assert lens.fall_off < SETTINGS.lamp_fall_off < lit.fall_off
+
+
+def test_over_level_ground_a_pattern_alone_tells_a_lamp_if_it_is_strong(water):
+    samples, _ = lamp_samples(water, spread=0.0)
+    strong, weak = judged(samples), judged(rough(samples, 0.2))
+    assert (strong.fall_off, weak.fall_off) == (None, None)
+    assert strong.explained > SETTINGS.lamp_alone > weak.explained > SETTINGS.lamp_explained
+    assert (strong.light, weak.light) == ("lamp", "sun")
