@@ -201,6 +201,8 @@ def test_a_pattern_that_explains_little_is_a_lamps_where_the_light_falls_with_di
     assert SETTINGS.lamp_explained < lit.explained < SETTINGS.lamp_alone
     assert lens.explained > SETTINGS.lamp_explained
     assert (lit.light, lens.light) == ("lamp", "sun")
+    assert lens.fall_off is not None
+    assert lit.fall_off is not None
     assert lens.fall_off < SETTINGS.lamp_fall_off < lit.fall_off
 
 
