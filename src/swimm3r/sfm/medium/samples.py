@@ -1,9 +1,7 @@
 """The pixels from which the water is fitted: drawn from every training frame of a dive, with their ray depths.
 
-Single pixels serve the dark envelope and the averages. For the decay of color differences the dense tracks are grouped
-into patches, cubes some pixels wide as seen from afar, and an observation is the mean color of one patch in one frame.
-A patch is the same piece of surface from every distance and slant; a single pixel is not, and the contrast it loses by
-averaging over more surface would pass for attenuation.
+Single pixels serve the dark envelope and the averages; the decay of color differences is read from patches of surface
+(patches.py).
 """
 
 from dataclasses import dataclass
@@ -12,7 +10,6 @@ import torch
 from jaxtyping import Bool, Float, Int
 from torch import Tensor
 
-from swimm3r.imaging.clipped import clipped
 from swimm3r.imaging.depth_completion import fill_z_depth
 from swimm3r.imaging.filters import blur
 from swimm3r.imaging.open_water import open_water_mask
@@ -20,7 +17,8 @@ from swimm3r.imaging.undistortion import frame_directions, frame_rays
 from swimm3r.progress import Progress, silent
 from swimm3r.scene.frames import Frames
 from swimm3r.scene.reconstruction import DepthMap, Reconstruction
-from swimm3r.sfm.medium.dense_tracks import DenseTracks, cubes, ray_depth_map
+from swimm3r.sfm.medium.dense_tracks import DenseTracks, ray_depth_map
+from swimm3r.sfm.medium.patches import group_tracks, patches_seen
 from swimm3r.sfm.medium.settings import SeathruSettings
 from swimm3r.sfm.medium.side_by_side import in_order
 
@@ -48,7 +46,7 @@ def collect_samples(
 
     The frames whose pixels are taken lie evenly over the dive.
     """
-    patches = _patches(rec, tracks, settings)
+    patches = group_tracks(rec, tracks, settings)
     usable = [i for i, name in enumerate(rec.names) if name in rec.depth]
     alone = set(usable[:: max(1, -(-len(usable) // _ALONE))])
     per_frame = max(1, settings.max_pixels // max(1, len(alone)))
@@ -56,11 +54,10 @@ def collect_samples(
     bounds = torch.searchsorted(tracks.frame[order], torch.arange(len(rec.names) + 1))
 
     def sampled(i: int) -> list[tuple[Tensor, ...]]:
-        seen = order[bounds[i] : bounds[i + 1]]
-        colors = frames.colors(frames.index(rec.names[i]), tracks.pixel[seen])
-        direction = frame_directions(rec.cameras[i]).reshape(-1, 3)[tracks.pixel[seen]]
-        I, z, patch, toward = _patch_means(colors, direction, tracks, seen, patches, settings)
-        parts: list[tuple[Tensor, ...]] = [(I, z, torch.full_like(patch, i), patch, toward)]
+        seen = patches_seen(rec, frames, i, order[bounds[i] : bounds[i + 1]], patches, settings)
+        parts: list[tuple[Tensor, ...]] = [
+            (seen.I, seen.ray_depth, torch.full_like(seen.patch, i), seen.patch, seen.direction)
+        ]
         return [*_pixels_alone(rec, frames, i, per_frame, settings), *parts] if i in alone else parts
 
     parts: list[tuple[Tensor, ...]] = []
@@ -114,52 +111,6 @@ def _ray_depth_nearby(
     reach = 0.02 * max(image.shape[:2])
     near = (blur(known.float()[..., None], reach)[..., 0] > 0.1) & ~sea
     return torch.where(near, ray_depth_map(filled, rays), 0.0), sea
-
-
-@dataclass(frozen=True)
-class _Patches:
-    """Tracks grouped by the cube they lie in."""
-
-    of_track: Int[Tensor, " n"]
-    size: Float[Tensor, " p"]  # edge of the cube
-    middle: Float[Tensor, "p 3"]  # mean of the patch's tracks
-
-
-def _patches(rec: Reconstruction, tracks: DenseTracks, settings: SeathruSettings) -> _Patches:
-    """Cubes about `patch_pixels` wide for the farthest observation of a track, in steps of powers of two."""
-    n = len(tracks.xyz)
-    far = torch.zeros(n).scatter_reduce_(0, tracks.track, tracks.ray_depth, "amax")
-    focal = float(rec.cameras.K[:, 0, 0].median())
-    pixels = min(settings.patch_pixels, max(rec.cameras.width, rec.cameras.height) / 32)
-    size = 2.0 ** torch.round(torch.log2((pixels * far / focal).clamp(min=1e-12)))
-    of_track, count = cubes(tracks.xyz, size)
-    middle = torch.zeros(len(count), 3, dtype=torch.float64).index_add_(0, of_track, tracks.xyz.double())
-    edge = torch.zeros(len(count)).scatter_(0, of_track, size)
-    return _Patches(of_track, edge, (middle / count[:, None]).float())
-
-
-def _patch_means(
-    colors: Float[Tensor, "s 3"],
-    direction: Float[Tensor, "s 3"],
-    tracks: DenseTracks,
-    seen: Int[Tensor, " s"],
-    patches: _Patches,
-    settings: SeathruSettings,
-) -> tuple[Float[Tensor, "k 3"], Float[Tensor, " k"], Int[Tensor, " k"], Float[Tensor, "k 3"]]:
-    """Mean color and ray depth, number and direction of each patch one frame shows, without those shown in part or
-    clipped in part.
-    """
-    patch, which = torch.unique(patches.of_track[tracks.track[seen]], return_inverse=True)
-    count = torch.bincount(which, minlength=len(patch)).float()
-
-    def mean(x: Tensor) -> Tensor:
-        return torch.zeros(len(patch), x.shape[1]).index_add_(0, which, x) / count[:, None]
-
-    offset = (mean(tracks.xyz[tracks.track[seen]]) - patches.middle[patch]).norm(dim=-1) / patches.size[patch]
-    full = torch.zeros(len(patch)).index_add_(0, which, clipped(colors, settings.saturated).any(-1).float())
-    whole = (count >= settings.patch_observations) & (offset < settings.patch_offset) & (full == 0)
-    I, z = mean(colors), mean(tracks.ray_depth[seen, None])[:, 0]
-    return I[whole], z[whole], patch[whole], torch.nn.functional.normalize(mean(direction), dim=-1)[whole]
 
 
 def _plausible_water(

@@ -34,10 +34,12 @@ class SeathruSettings(Settings):
     """Number of single pixels drawn from all frames together."""
     open_water_pixels: Count = 2_000
     """Largest number of open-water pixels taken from one frame."""
-    patch_pixels: Positive = 12.0
-    """Edge length of a surface patch in pixels of its farthest observation; at most 1/32 of the longer side."""
+    patch_pixels: Positive = 20.0
+    """Edge length of a surface patch in pixels of its farthest observation; at most 1/16 of the longer side."""
     patch_observations: Count = 6
     """Smallest number of pixels of a patch in a frame."""
+    patch_share: Share = 0.8
+    """Smallest share of a patch's surface points that a frame must show."""
     patch_offset: NotNegative = 0.15
     """Largest distance, in edge lengths, between the centroid of a patch and that of its visible part."""
     range_bins: Annotated[int, Range(1, 1000)] = 10

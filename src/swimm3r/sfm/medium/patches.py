@@ -1,0 +1,104 @@
+"""Patches of surface, as frames show them: what the decay of color with distance is read from.
+
+A patch is a cube some pixels wide as seen from afar, and the dense tracks in it. Its color in a frame is the mean over
+all of its tracks, those included that the frame itself did not add to: where a frame looks from afar, one of its pixels
+shows several of them. The mean over a frame's own observations alone would be that of other parts of the patch in every
+frame, and contrast within the patch would pass for light and water (docs/experiments/medium.md). A single pixel would
+not do either: it shows more surface from afar, and the contrast that it loses would pass for attenuation.
+"""
+
+from dataclasses import dataclass
+
+import torch
+from jaxtyping import Float, Int
+from torch import Tensor
+
+from swimm3r.cameras import project_visible
+from swimm3r.imaging.clipped import clipped
+from swimm3r.imaging.undistortion import frame_directions
+from swimm3r.scene.frames import Frames
+from swimm3r.scene.reconstruction import Reconstruction
+from swimm3r.sfm.medium.dense_tracks import DenseTracks, cubes
+from swimm3r.sfm.medium.settings import SeathruSettings
+
+_SMALLEST_IMAGE = 16  # patches that the longer side of an image has room for, at least
+
+
+@dataclass(frozen=True)
+class Patches:
+    """p patches of the n dense tracks; the tracks of one patch stand together in `members`."""
+
+    tracks: DenseTracks
+    of_track: Int[Tensor, " n"]
+    size: Float[Tensor, " p"]  # edge of the cube
+    middle: Float[Tensor, "p 3"]  # mean of the patch's tracks, world
+    members: Int[Tensor, " n"]  # tracks, by patch
+    first: Int[Tensor, " p"]  # of each patch, in `members`
+    count: Int[Tensor, " p"]  # tracks of each patch
+
+    def tracks_of(self, patch: Int[Tensor, " k"]) -> Int[Tensor, " t"]:
+        """The tracks of some patches, one patch after another."""
+        count = self.count[patch]
+        start = self.first[patch] - (count.cumsum(0) - count)
+        return self.members[torch.repeat_interleave(start, count) + torch.arange(int(count.sum()))]
+
+
+@dataclass(frozen=True)
+class SeenPatches:
+    """Patches that one frame shows."""
+
+    I: Float[Tensor, "k 3"]  # mean colors, as stored
+    ray_depth: Float[Tensor, " k"]
+    patch: Int[Tensor, " k"]
+    direction: Float[Tensor, "k 3"]  # unit, camera axes
+
+
+def group_tracks(rec: Reconstruction, tracks: DenseTracks, settings: SeathruSettings) -> Patches:
+    """Cubes about `patch_pixels` wide for the farthest observation of a track, in steps of powers of two."""
+    n = len(tracks.xyz)
+    far = torch.zeros(n).scatter_reduce_(0, tracks.track, tracks.ray_depth, "amax")
+    focal = float(rec.cameras.K[:, 0, 0].median())
+    pixels = min(settings.patch_pixels, max(rec.cameras.width, rec.cameras.height) / _SMALLEST_IMAGE)
+    size = 2.0 ** torch.round(torch.log2((pixels * far / focal).clamp(min=1e-12)))
+    of_track, count = cubes(tracks.xyz, size)
+    middle = torch.zeros(len(count), 3, dtype=torch.float64).index_add_(0, of_track, tracks.xyz.double())
+    edge = torch.zeros(len(count)).scatter_(0, of_track, size)
+    members = torch.argsort(of_track, stable=True)
+    return Patches(tracks, of_track, edge, (middle / count[:, None]).float(), members, count.cumsum(0) - count, count)
+
+
+def patches_seen(
+    rec: Reconstruction,
+    frames: Frames,
+    i: int,
+    own: Int[Tensor, " s"],
+    patches: Patches,
+    settings: SeathruSettings,
+) -> SeenPatches:
+    """The patches that frame i of the reconstruction shows as a whole and without a clipped pixel.
+
+    Asked are those that enough of the frame's own observations (`own`, rows of the tracks) lie in. A track is seen
+    where the frame's depth map agrees with its place.
+    """
+    asked, observed = torch.unique(patches.of_track[patches.tracks.track[own]], return_counts=True)
+    tracks = patches.tracks_of(asked[observed >= settings.patch_observations])
+    camera, index = rec.cameras[i], frames.index(rec.names[i])
+    xyz = patches.tracks.xyz[tracks]
+    uv, z, visible = (values[0] for values in project_visible(camera, xyz.double()[None]))
+    pixel = torch.where(visible, uv[:, 1].long() * camera.width + uv[:, 0].long(), 0)
+    off = (rec.depth[rec.names[i]].z_depth.reshape(-1)[pixel] - z).abs()
+    seen = visible & (off <= settings.tracks.tolerance * z) & frames.mask(index).reshape(-1)[pixel]
+    xyz, pixel = xyz[seen], pixel[seen]
+    patch, which = torch.unique(patches.of_track[tracks[seen]], return_inverse=True)
+    count = torch.bincount(which, minlength=len(patch))
+
+    def mean(values: Float[Tensor, "t c"]) -> Float[Tensor, "k c"]:
+        return torch.zeros(len(patch), values.shape[1]).index_add_(0, which, values) / count[:, None]
+
+    colors = frames.colors(index, pixel)
+    full = torch.zeros(len(patch)).index_add_(0, which, clipped(colors, settings.saturated).any(-1).float())
+    offset = (mean(xyz) - patches.middle[patch]).norm(dim=-1) / patches.size[patch]
+    whole = (count >= settings.patch_share * patches.count[patch]) & (offset < settings.patch_offset) & (full == 0)
+    ray_depth = mean(torch.linalg.vector_norm(xyz - rec.cameras.centers[i].float(), dim=-1, keepdim=True))[:, 0]
+    direction = torch.nn.functional.normalize(mean(frame_directions(camera).reshape(-1, 3)[pixel]), dim=-1)
+    return SeenPatches(mean(colors)[whole], ray_depth[whole], patch[whole], direction[whole])
