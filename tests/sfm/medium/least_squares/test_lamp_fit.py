@@ -11,7 +11,7 @@ from swimm3r.errors import InputError
 from swimm3r.io.medium_json import load_medium
 from swimm3r.lamp import LightEvidence, log_light
 from swimm3r.medium import MediumFit, add_water, backscatter, remove_water, rescale, transmittances
-from swimm3r.sfm.medium.least_squares.lamp_fit import seen_nearby
+from swimm3r.sfm.medium.least_squares.lamp_fit import noise_by_light, seen_nearby
 from swimm3r.sfm.medium.light import judge_light
 from swimm3r.sfm.medium.samples import WaterSamples
 from swimm3r.sfm.medium.seathru import fit_medium
@@ -212,3 +212,18 @@ def test_over_level_ground_a_pattern_alone_tells_a_lamp_if_it_is_strong(water):
     assert (strong.fall_off, weak.fall_off) == (None, None)
     assert strong.explained > SETTINGS.lamp_alone > weak.explained > SETTINGS.lamp_explained
     assert (strong.light, weak.light) == ("lamp", "sun")
+
+
+def test_noise_is_told_apart_from_what_goes_with_the_light():
+    rng = np.random.default_rng(0)
+    light = np.exp(rng.uniform(np.log(1e-3), np.log(0.5), 20_000))
+    true = np.hypot(0.002, 0.03 * light)
+    found = noise_by_light(true * rng.standard_normal(len(light)), light, 0.02)
+    assert np.abs(np.log(found / true)).max() < 0.1
+    outliers = np.where(rng.random(len(light)) < 0.05, 0.3, 0.0)
+    assert (
+        np.abs(np.log(noise_by_light(true * rng.standard_normal(len(light)) + outliers, light, 0.02) / true)).max()
+        < 0.2
+    )
+    assert noise_by_light(100 * true, light, 0.02).max() == 0.02
+    assert noise_by_light(np.zeros_like(light), light, 0.02).min() > 0

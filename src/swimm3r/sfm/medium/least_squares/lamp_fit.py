@@ -18,7 +18,7 @@ from typing import Any, cast
 import numpy as np
 import torch
 from jaxtyping import Float
-from scipy.optimize import least_squares
+from scipy.optimize import least_squares, nnls
 from torch import Tensor
 
 from swimm3r.lamp import (
@@ -61,6 +61,8 @@ _STEPS = 25
 _ROUNDS = 8
 _START = 0.1  # offset of the lamp to either side, in median depths: at the camera the light scattered has no derivative
 _SETTLED = 0.01  # change of the lamp's unknowns in a round, in their standard deviations, that ends the rounds
+_NOISE_BINS = 10  # of brightness
+_LEAST_NOISE = 3e-4  # of the mean color of a patch: its pixels are rounded to 1/255
 _SHARED = 1 + TERMS + 2  # unknowns of the lamp
 _SCATTERING = 2000  # pixels that maps' form of the backscatter is fitted to
 _ARRIVING = 0.05  # share of light below which a surface tells little of its color
@@ -131,7 +133,7 @@ def fit_lamp(
     unknowns, beta_D = np.zeros(_SHARED), np.full(len(channels), _START_BETA)
     unknowns[-2:] = _START
     lamp = _lamp(unknowns, fall_off)
-    noise = np.full(len(channels), settings.loss_scale)
+    noise = np.full((len(channels), len(every.rows)), settings.loss_scale)
     for _ in range(_ROUNDS):  # range bins of the priors and noise are those of the light found so far
         whole = pixels.scatter(lamp, beta_D)
         priors = [evidence_of(pixels.of_channel(c, lamp, whole), settings) for c in channels]
@@ -181,6 +183,20 @@ def exponential_backscatter(
     return torch.from_numpy(found[:TERMS]), np.exp(found[TERMS:])
 
 
+def noise_by_light(off: np.ndarray, light: np.ndarray, most: float) -> np.ndarray:
+    """Standard deviation sqrt(a^2 + (b light)^2) of pixels about the model, from what they are off; at most `most`.
+
+    a is the noise of the camera; b is what frames show differently of a surface, in shares of its light. Under a lamp
+    light spans orders of magnitude: one standard deviation for all would be that of the dark far pixels, and the bright
+    near ones would decide by what their frames show differently.
+    """
+    bins = np.array_split(np.argsort(light, kind="stable"), _NOISE_BINS)
+    variance = np.array([max(1.4826 * float(np.median(np.abs(off[rows]))), _LEAST_NOISE) ** 2 for rows in bins])
+    square = np.array([np.mean(light[rows] ** 2) for rows in bins])
+    parts, _ = nnls(np.stack([np.ones(_NOISE_BINS), square], -1) / variance[:, None], np.ones(_NOISE_BINS))
+    return np.clip(np.sqrt(parts[0] + parts[1] * light**2), _LEAST_NOISE, most)
+
+
 def _lamp(shared: np.ndarray, fall_off: float) -> Lamp:
     values = torch.from_numpy(np.asarray(shared, dtype=np.float64))
     strength, beam, beside = values.split([1, TERMS, 2])
@@ -195,7 +211,7 @@ class _Problem:
     few: LampPixels  # that see the points
     point: np.ndarray
     priors: list[Evidence]  # of the channels
-    noise: np.ndarray  # of the channels' pixels
+    noise: np.ndarray  # of the channels' pixels, [c, n]
     fall_off: float
     settings: SeathruSettings
 
@@ -211,11 +227,11 @@ class _Problem:
         ).x  # fmt: skip
 
     def noise_at(self, unknowns: np.ndarray) -> np.ndarray:
-        """Robust spread of each channel's pixels about a solution."""
+        """Standard deviation of each channel's pixels about a solution."""
         lamp, waters = self._parts(unknowns)
         ways, (scatter, _) = self.few.ways(lamp), self.few.scatter(lamp, _beta_D(waters))
-        off = [np.median(np.abs(self._off(c, x, replace(ways, scatter=scatter[:, c])))) for c, x in enumerate(waters)]
-        return np.clip(1.4826 * np.array(off), 1e-3, self.settings.loss_scale)
+        parts = (self._direct(c, x, replace(ways, scatter=scatter[:, c])) for c, x in enumerate(waters))
+        return np.stack([noise_by_light(off, light, self.settings.loss_scale) for light, off in parts])
 
     def residuals(self, unknowns: np.ndarray) -> np.ndarray:
         """Everything in its own standard deviations: the lamp, then the channels one after another."""
@@ -247,18 +263,20 @@ class _Problem:
         """The lamp, and the unknowns of each channel's water."""
         return _lamp(unknowns[:_SHARED], self.fall_off), unknowns[_SHARED:].reshape(len(self.priors), -1)
 
-    def _off(self, c: int, x: np.ndarray, ways: Ways) -> np.ndarray:
-        """Pixels of a channel less what they should be, with the J of every point eliminated."""
+    def _direct(self, c: int, x: np.ndarray, ways: Ways) -> tuple[np.ndarray, np.ndarray]:
+        """J T_D of pixels with the J of every point eliminated, and what they show beyond it and B."""
         T_D, B = attenuations(x, ways)
         direct = self.few.color[:, c] - B
-        J = kernels.surface_colors(T_D, direct, np.ones(len(T_D)), self.point, int(self.point.max()) + 1)
-        return direct - J[self.point] * T_D
+        J = kernels.surface_colors(T_D, direct, self.noise[c] ** -2, self.point, int(self.point.max()) + 1)
+        light = J[self.point] * T_D
+        return light, direct - light
 
     def _of_channel(
         self, c: int, x: np.ndarray, ways: Ways, scatter: np.ndarray, scatter_of_water: np.ndarray
     ) -> np.ndarray:
         settings, water = self.settings, self.few.open_water[:, c]
-        off = self._off(c, x, replace(ways, scatter=scatter)) / (self.noise[c] * np.sqrt(settings.min_redundancy))
+        _, off = self._direct(c, x, replace(ways, scatter=scatter))
+        off = off / (self.noise[c] * np.sqrt(settings.min_redundancy))
         shared = settings.open_water_std * np.sqrt(max(1.0, len(water) / _WATER_SHARED))
         of_water = (water - x[BINF] * scatter_of_water) / shared
         return np.concatenate([off, of_water, prior_residuals(x, self.priors[c], settings)])
