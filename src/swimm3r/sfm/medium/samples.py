@@ -4,7 +4,7 @@ Single pixels serve the dark envelope and the averages; the decay of color diffe
 (patches.py).
 """
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import torch
 from jaxtyping import Bool, Float, Int
@@ -18,7 +18,7 @@ from swimm3r.progress import Progress, silent
 from swimm3r.scene.frames import Frames
 from swimm3r.scene.reconstruction import DepthMap, Reconstruction
 from swimm3r.sfm.medium.dense_tracks import DenseTracks, ray_depth_map
-from swimm3r.sfm.medium.patches import group_tracks, patches_seen
+from swimm3r.sfm.medium.patches import SeenPatches, group_tracks, patches_seen
 from swimm3r.sfm.medium.settings import SeathruSettings
 from swimm3r.sfm.medium.side_by_side import in_order
 
@@ -53,47 +53,54 @@ def collect_samples(
     order = torch.argsort(tracks.frame, stable=True)
     bounds = torch.searchsorted(tracks.frame[order], torch.arange(len(rec.names) + 1))
 
-    def sampled(i: int) -> list[tuple[Tensor, ...]]:
+    def of_frame(i: int) -> list[WaterSamples]:
         seen = patches_seen(rec, frames, i, order[bounds[i] : bounds[i + 1]], patches, settings)
-        parts: list[tuple[Tensor, ...]] = [
-            (seen.I, seen.ray_depth, torch.full_like(seen.patch, i), seen.patch, seen.direction)
-        ]
-        return [*_pixels_alone(rec, frames, i, per_frame, settings), *parts] if i in alone else parts
+        of_patches = _of_patches(i, seen, frames.gray)
+        return [_pixels_alone(rec, frames, i, per_frame, settings), of_patches] if i in alone else [of_patches]
 
-    parts: list[tuple[Tensor, ...]] = []
-    water: list[tuple[Tensor, ...]] = [(torch.zeros(0, 3), torch.zeros(0, 3))]
-    for done, of_frame in enumerate(in_order(sampled, usable)):
+    parts: list[WaterSamples] = []
+    for done, found in enumerate(in_order(of_frame, usable)):
         progress("sampling the water", done, len(usable))
-        parts += [part for part in of_frame if len(part) > 2]
-        water += [part for part in of_frame if len(part) == 2]
+        parts += found
     progress("sampling the water", len(usable), len(usable))
     if not parts:
         none = torch.zeros(0)
         return WaterSamples(none.reshape(0, 3), none, none.long(), none.long(), none.reshape(0, 3), frames.gray)
-    I, ray_depth, frame, track, direction = (torch.cat(p) for p in zip(*parts, strict=True))
-    open_water, toward = (torch.cat(p) for p in zip(*water, strict=True))
-    kept = _plausible_water(open_water, I, ray_depth)
-    return WaterSamples(I, ray_depth, frame, track, open_water[kept], frames.gray, direction, toward[kept])
+    every = _joined(parts)
+    kept = _plausible_water(every.open_water, every.I, every.ray_depth)
+    assert every.water_direction is not None
+    return replace(every, open_water=every.open_water[kept], water_direction=every.water_direction[kept])
 
 
-def _pixels_alone(
-    rec: Reconstruction, frames: Frames, i: int, count: int, settings: SeathruSettings
-) -> list[tuple[Tensor, ...]]:
-    """Color, ray depth, frame, patch (none) and direction of about `count` pixels of a frame; and color and direction
-    of open water, if it shows any.
-    """
+def _joined(parts: list[WaterSamples]) -> WaterSamples:
+    """The samples of all parts, all of which have directions."""
+    columns = [[value for name, value in vars(part).items() if name != "gray"] for part in parts]
+    I, ray_depth, frame, track, open_water, direction, water_direction = map(torch.cat, zip(*columns, strict=True))
+    return WaterSamples(I, ray_depth, frame, track, open_water, parts[0].gray, direction, water_direction)
+
+
+def _of_patches(i: int, seen: SeenPatches, gray: bool) -> WaterSamples:
+    """The patches that frame i shows."""
+    none = torch.zeros(0, 3)
+    frame = torch.full_like(seen.patch, i)
+    return WaterSamples(seen.I, seen.ray_depth, frame, seen.patch, none, gray, seen.direction, none)
+
+
+def _pixels_alone(rec: Reconstruction, frames: Frames, i: int, count: int, settings: SeathruSettings) -> WaterSamples:
+    """About `count` pixels of a frame on their own, and of open water, if it shows any."""
     index = frames.index(rec.names[i])
     image, mask = frames.image(index), frames.mask(index)
     ray_depth, sea = _ray_depth_nearby(image, rec.depth[rec.names[i]], frame_rays(rec.cameras[i]))
     pixels = torch.nonzero((ray_depth.reshape(-1) > 0) & mask.reshape(-1))[:, 0]
     pixels = pixels[:: max(1, len(pixels) // count)]
-    of_frame, no_patch = torch.full_like(pixels, i), torch.full_like(pixels, -1)
     direction = frame_directions(rec.cameras[i]).reshape(-1, 3)
     shown = torch.nonzero((sea & mask).reshape(-1))[:, 0]
     shown = shown[:: max(1, len(shown) // settings.open_water_pixels)]
     colors = image.reshape(-1, 3)
-    alone = (colors[pixels], ray_depth.reshape(-1)[pixels], of_frame, no_patch, direction[pixels])
-    return [alone, (colors[shown], direction[shown])]
+    return WaterSamples(
+        colors[pixels], ray_depth.reshape(-1)[pixels], torch.full_like(pixels, i), torch.full_like(pixels, -1),
+        colors[shown], frames.gray, direction[pixels], direction[shown],
+    )  # fmt: skip
 
 
 def _ray_depth_nearby(
