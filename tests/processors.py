@@ -17,6 +17,8 @@ ROOT = Path(__file__).parents[1]
 DELICATE = (  # chains of searches and optimizations, where the last digit can decide
     "tests/pipeline/test_run.py",
     "tests/localization",
+    "tests/sfm/colmap/test_adjustment.py",
+    "tests/sfm/colmap/test_plausibility.py",
     "tests/sfm/colmap/test_poses.py",
     "tests/sfm/plane_sweep/test_estimate.py",
     "tests/sfm/medium/test_seathru.py",

@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 import torch
 from tests.imaging.test_rectification import stretching_lens
-from tests.sfm.colmap.test_poses import _cameras, _render
+from tests.sfm.colmap.two_planes import camera_path, render
 
 from swimm3r.cameras import Cameras, image_directions
 from swimm3r.errors import InputError
@@ -42,7 +42,7 @@ SETTINGS = ColmapSettings(threads=2)
 @pytest.fixture(scope="module")
 def truth() -> Cameras:
     """The pinhole cameras of the clip, each wide enough for all that the bent lens shows."""
-    cameras = _cameras()
+    cameras = camera_path()
     K = cameras.K.clone()
     K[:, 0, 2], K[:, 1, 2] = 400, 400
     return replace(cameras, K=K, width=800, height=800)
@@ -53,9 +53,9 @@ def bent(truth: Cameras, tmp_path_factory: pytest.TempPathFactory) -> Frames:
     """A clip that was taken through a lens that stretches, as prepared frames on disk."""
     folder = tmp_path_factory.mktemp("bent")
     with pytest.MonkeyPatch.context() as patch:
-        patch.setattr("tests.sfm.colmap.test_poses.WIDTH", 800)
-        patch.setattr("tests.sfm.colmap.test_poses.HEIGHT", 800)
-        straight = _render(truth, folder / "straight")
+        patch.setattr("tests.sfm.colmap.two_planes.WIDTH", 800)
+        patch.setattr("tests.sfm.colmap.two_planes.HEIGHT", 800)
+        straight = render(truth, folder / "straight")
     rays = image_directions(stretching_lens(WIDTH, HEIGHT)).double()
     x, y = ((rays[..., k] / rays[..., 2] * truth.K[0, 0, 0] + 399.5).float().numpy() for k in (0, 1))
     frames = []
