@@ -1,4 +1,4 @@
-"""What is said of poses that cannot be right: twins, parts that do not join, turns on the spot, leaps, lost scale."""
+"""Warnings of poses that cannot be right: twins, parts that do not join, turns on the spot, leaps, lost scale."""
 
 import math
 from dataclasses import replace
