@@ -38,7 +38,7 @@ class SeathruSettings(Settings):
     """Edge length of a surface patch in pixels of its farthest observation; at most 1/16 of the longer side."""
     patch_observations: Count = 6
     """Smallest number of pixels of a patch in a frame."""
-    patch_share: Share = 0.8
+    patch_share: Share = 0.6
     """Smallest share of a patch's surface points that a frame must show."""
     patch_offset: NotNegative = 0.15
     """Largest distance, in edge lengths, between the centroid of a patch and that of its visible part."""
