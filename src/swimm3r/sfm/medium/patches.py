@@ -21,7 +21,7 @@ from swimm3r.scene.reconstruction import Reconstruction
 from swimm3r.sfm.medium.dense_tracks import DenseTracks, cubes
 from swimm3r.sfm.medium.settings import SeathruSettings
 
-_SMALLEST_IMAGE = 16  # patches that the longer side of an image has room for, at least
+_WIDEST = 1 / 16  # of the longer side of an image, an edge of a patch
 
 
 @dataclass(frozen=True)
@@ -58,7 +58,7 @@ def group_tracks(rec: Reconstruction, tracks: DenseTracks, settings: SeathruSett
     n = len(tracks.xyz)
     far = torch.zeros(n).scatter_reduce_(0, tracks.track, tracks.ray_depth, "amax")
     focal = float(rec.cameras.K[:, 0, 0].median())
-    pixels = min(settings.patch_pixels, max(rec.cameras.width, rec.cameras.height) / _SMALLEST_IMAGE)
+    pixels = min(settings.patch_pixels, _WIDEST * max(rec.cameras.width, rec.cameras.height))
     size = 2.0 ** torch.round(torch.log2((pixels * far / focal).clamp(min=1e-12)))
     of_track, count = cubes(tracks.xyz, size)
     middle = torch.zeros(len(count), 3, dtype=torch.float64).index_add_(0, of_track, tracks.xyz.double())
