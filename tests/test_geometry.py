@@ -10,6 +10,7 @@ from swimm3r.geometry import (
     Similarity,
     align_poses,
     align_similarity,
+    best_similarity,
     epipolar_distances,
     essential_from_poses,
     fundamental_from_poses,
@@ -162,6 +163,35 @@ def test_a_straight_track_is_refused_by_centers_and_aligned_by_orientations():
         align_similarity(poses[:, :3, 3], moved[:, :3, 3])
     found = align_poses(poses, moved)
     torch.testing.assert_close(found.poses(poses), moved)
+
+
+def test_a_track_that_bends_a_little_is_turned_by_its_orientations():
+    rng = torch.Generator().manual_seed(0)
+    R = so3_exp(0.3 * torch.randn(12, 3, generator=rng, dtype=torch.float64))
+    centers = torch.stack([torch.linspace(-3, 3, 12).double(), *0.05 * torch.randn(2, 12, generator=rng).double()], -1)
+    theirs = pose_from(R, centers)
+    bent = centers + 0.05 * torch.randn(12, 3, generator=rng).double()
+    truth = Similarity(torch.tensor(2.0).double(), R[0], torch.tensor([1.0, 2.0, 3.0]).double())
+    ours = truth.poses(pose_from(R, bent))
+    found = best_similarity(theirs, ours)
+    assert found is not None
+    assert rotation_angle(found.R @ truth.R.mT) < 1e-6
+    by_centers = align_similarity(theirs[:, :3, 3], ours[:, :3, 3])
+    assert rotation_angle(by_centers.R @ truth.R.mT).rad2deg() > 3  # the turn about the track is anybody's guess
+
+
+def test_orientations_that_contradict_the_track_leave_it_to_the_centers():
+    centers = torch.randn(6, 3, generator=torch.Generator().manual_seed(1)).double()
+    theirs = pose_from(torch.eye(3).double().expand(6, 3, 3), centers)
+    about = torch.diag(torch.tensor([-1.0, -1.0, 1.0])).double()
+    ours = pose_from(torch.eye(3).double().expand(6, 3, 3), centers @ about.mT)
+    ours[:, 2, 3] *= 0  # flat, and turned half round
+    theirs[:, 2, 3] *= 0
+    found = best_similarity(theirs, ours)
+    assert found is not None
+    torch.testing.assert_close(found.poses(theirs)[:, :3, 3], ours[:, :3, 3], atol=1e-9, rtol=0)
+    still = theirs[:1].expand(6, 4, 4)
+    assert best_similarity(still, ours) is None
 
 
 def test_what_holds_no_scale_is_refused():

@@ -9,7 +9,7 @@ import torch
 from swimm3r.cameras import Cameras, project
 from swimm3r.errors import InputError
 from swimm3r.geometry import Similarity, so3_exp
-from swimm3r.pipeline.camera_paths import CameraPath, Dive, camera_path, looking_at
+from swimm3r.pipeline.camera_paths import CameraPath, Dive, camera_path, looking_at, smooth_path
 from swimm3r.pipeline.view_settings import ViewSettings
 
 COUNT = 8
@@ -148,3 +148,17 @@ def test_a_slip_in_the_name_of_a_path_is_named_with_the_names_there_are(dive: Di
     with pytest.raises(InputError, match="there is no file orbti") as refused:
         camera_path(dive, ViewSettings(Path("orbti")))
     assert "orbit" in refused.value.hint
+
+
+def test_a_smooth_path_begins_and_ends_near_the_dive_and_holds_rotations():
+    rng = torch.Generator().manual_seed(0)
+    poses = torch.eye(4, dtype=torch.float64).repeat(12, 1, 1)
+    poses[:, 0, 3] = torch.arange(12)
+    poses[:, 1, 3] = 0.3 * torch.rand(12, generator=rng)
+    path = smooth_path(poses, 50)
+    assert path.shape == (50, 4, 4)
+    torch.testing.assert_close(path[:, :3, :3] @ path[:, :3, :3].mT, torch.eye(3).double().expand(50, 3, 3))
+    assert path[:, 0, 3].diff().min() > 0
+    assert path[:, 1, 3].diff().abs().max() < 0.1 * poses[:, 1, 3].diff().abs().max()
+    assert path[0, 0, 3] < 1.5
+    assert path[-1, 0, 3] > 9.5

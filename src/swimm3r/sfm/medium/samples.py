@@ -74,9 +74,14 @@ def collect_samples(
 
 def _joined(parts: list[WaterSamples]) -> WaterSamples:
     """The samples of all parts, all of which have directions."""
-    columns = [[value for name, value in vars(part).items() if name != "gray"] for part in parts]
-    I, ray_depth, frame, track, open_water, direction, water_direction = map(torch.cat, zip(*columns, strict=True))
-    return WaterSamples(I, ray_depth, frame, track, open_water, parts[0].gray, direction, water_direction)
+
+    def column(name: str) -> Tensor:
+        return torch.cat([getattr(part, name) for part in parts])
+
+    return WaterSamples(
+        column("I"), column("ray_depth"), column("frame"), column("track"), column("open_water"),
+        parts[0].gray, column("direction"), column("water_direction"),
+    )  # fmt: skip
 
 
 def _of_patches(i: int, seen: SeenPatches, gray: bool) -> WaterSamples:
