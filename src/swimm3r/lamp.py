@@ -15,6 +15,7 @@ known only as a product: an image does not tell a bright lamp from bright ground
 """
 
 from dataclasses import dataclass, replace
+from functools import lru_cache
 from typing import Literal
 
 import numpy as np
@@ -29,8 +30,10 @@ INVERSE_SQUARE = 2.0
 """q in linear light."""
 STORED = 2.2
 """Exponent between linear light and values as stored: there q is 2 / 2.2."""
-_NODES, _FEW_NODES = 48, 16  # of the integral along a ray: within 3e-4 of its limit, and within 0.01
-_FAR = 20.0  # reference distances, in the place of infinity
+NODES, FEW_NODES = 48, 16
+"""Nodes of the integral along a ray: within 3e-4 of its limit, and within 0.01."""
+FAR = 20.0
+"""Reference distances in the place of infinity."""
 
 
 @dataclass(frozen=True)
@@ -91,29 +94,35 @@ def scattered(
     ray_depth: Float[Tensor, "*pixels"],
     lamp: Lamp,
     beta_D: Float[Tensor, " c"],
-    nodes: int = _NODES,
+    nodes: int = NODES,
 ) -> Float[Tensor, "*pixels c"]:
     """G along unit directions, by Gauss and Legendre's rule on s = z t^3, whose nodes are dense near the camera."""
-    at, weights = np.polynomial.legendre.leggauss(nodes)
     beta = beta_D.to(direction)
     total = torch.zeros(*ray_depth.shape, len(beta_D)).to(direction)
-    for node, weight in zip((at + 1) / 2, weights / 2, strict=True):
-        s = ray_depth * node**3
+    for share, step in zip(*nodes_along(nodes), strict=True):
+        s = ray_depth * share
         points = s[..., None] * direction
         path = (lamp_distance(points, lamp) + s)[..., None]
-        step = 3 * weight * node**2 * ray_depth
-        total += (log_light(points, lamp)[..., None] - beta * path).exp() * step[..., None]
+        total += (log_light(points, lamp)[..., None] - beta * path).exp() * (step * ray_depth)[..., None]
     return total
+
+
+@lru_cache
+def nodes_along(nodes: int) -> tuple[Float[np.ndarray, " nodes"], Float[np.ndarray, " nodes"]]:
+    """s / z and ds / z at the nodes of the rule along a ray."""
+    at, weights = np.polynomial.legendre.leggauss(nodes)
+    t = (at + 1) / 2
+    return t**3, 3 * weights / 2 * t**2
 
 
 def share_scattered(
     direction: Float[Tensor, "*pixels 3"], ray_depth: Float[Tensor, "*pixels"], lamp: Lamp, beta_D: Float[Tensor, " c"]
 ) -> Float[Tensor, "*pixels c"]:
     """G(d, z) / G(axis, infinity): the share of the open water's light that the water before a surface sends."""
-    far = _FAR * lamp.reference
+    far = FAR * lamp.reference
     ahead = torch.tensor([0.0, 0.0, 1.0]).to(direction)
     whole = scattered(ahead, torch.tensor(far).to(direction), lamp, beta_D)
-    return scattered(direction, ray_depth.clamp(max=far), lamp, beta_D, _FEW_NODES) / whole
+    return scattered(direction, ray_depth.clamp(max=far), lamp, beta_D, FEW_NODES) / whole
 
 
 def rescaled_lamp(lamp: Lamp, scale: float) -> Lamp:

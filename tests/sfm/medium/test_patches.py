@@ -44,7 +44,8 @@ def own_means(dive: FlatDive, i: int, patches: Patches) -> tuple[torch.Tensor, t
     """The mean colors of what each frame itself observed of the patches: other parts of them in every frame."""
     tracks: DenseTracks = patches.tracks
     own = torch.nonzero(tracks.frame == i)[:, 0]
-    patch, which, count = torch.unique(patches.of_track[tracks.track[own]], return_inverse=True, return_counts=True)
+    of_first_grid = patches.of_track[0, tracks.track[own]]
+    patch, which, count = torch.unique(of_first_grid, return_inverse=True, return_counts=True)
     I = torch.zeros(len(patch), 3).index_add_(0, which, dive.frames.colors(i, tracks.pixel[own])) / count[:, None]
     enough = count >= SETTINGS.patch_observations
     return I[enough], patch[enough]
@@ -75,9 +76,21 @@ def test_the_tracks_of_patches_are_all_that_lie_in_them(dive: FlatDive):
     patches = grouped(dive)
     asked = torch.tensor([5, 2, len(patches.count) - 1])
     tracks = patches.tracks_of(asked)
-    expected = torch.cat([torch.nonzero(patches.of_track == p)[:, 0] for p in asked])
+    expected = torch.cat([torch.nonzero(patches.of_track == p)[:, 1] for p in asked])
     assert tracks.tolist() == expected.tolist()
     assert len(patches.tracks_of(asked[:0])) == 0
+
+
+def test_each_grid_holds_every_track_once_and_has_its_borders_elsewhere(dive: FlatDive):
+    patches = grouped(dive)
+    grids = SETTINGS.patch_grids
+    assert patches.of_track.shape == (grids, len(patches.tracks.xyz))
+    numbers = [set(of_grid.tolist()) for of_grid in patches.of_track]
+    assert sum(map(len, numbers)) == len(set().union(*numbers)) == len(patches.count)
+    assert int(patches.count.sum()) == grids * len(patches.tracks.xyz)
+    first, second = patches.of_track[:2]
+    split = torch.unique(torch.stack([first, second]), dim=1).shape[1]  # parts that both grids' borders cut
+    assert split > 1.5 * len(numbers[0])
 
 
 def test_a_patch_that_something_covers_in_part_is_not_seen(in_air: FlatDive, tmp_path: Path):

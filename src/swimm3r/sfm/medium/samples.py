@@ -37,6 +37,7 @@ class WaterSamples:
     gray: bool = False  # the three channels are one (`Frames.gray`)
     direction: Float[Tensor, "n 3"] | None = None  # unit, camera axes; without, no lamp can be told from the sun
     water_direction: Float[Tensor, "m 3"] | None = None  # of the open water's pixels
+    grids: int = 1  # of patches: so many patches show the same pixels
 
 
 def collect_samples(
@@ -69,7 +70,8 @@ def collect_samples(
     every = _joined(parts)
     kept = _plausible_water(every.open_water, every.I, every.ray_depth)
     assert every.water_direction is not None
-    return replace(every, open_water=every.open_water[kept], water_direction=every.water_direction[kept])
+    toward = every.water_direction[kept]
+    return replace(every, open_water=every.open_water[kept], water_direction=toward, grids=settings.patch_grids)
 
 
 def _joined(parts: list[WaterSamples]) -> WaterSamples:

@@ -78,6 +78,9 @@ def fit_medium(samples: WaterSamples, settings: SeathruSettings, encoding: Encod
             cause="the dense depth stage found almost no surface",
             hint=f"use clearer or slower footage; at least {settings.min_samples} pixels are needed",
         )
+    settings = replace(settings, min_redundancy=settings.min_redundancy * samples.grids)
+    if light == "lamp":
+        settings = replace(settings, slope_std=settings.lamp_slope_std)
     color, open_water = encoded(samples, encoding)
     ray_depth = samples.ray_depth.double().numpy()
     unit = float(np.median(ray_depth))

@@ -36,6 +36,8 @@ class SeathruSettings(Settings):
     """Largest number of open-water pixels taken from one frame."""
     patch_pixels: Positive = 20.0
     """Edge length of a surface patch in pixels of its farthest observation; at most 1/16 of the longer side."""
+    patch_grids: Count = 4
+    """Number of shifted grids of patches, each of which has every surface point in one of its patches."""
     patch_observations: Count = 6
     """Smallest number of pixels of a patch in a frame."""
     patch_share: Share = 0.6
@@ -62,6 +64,8 @@ class SeathruSettings(Settings):
     """Relative standard deviation of one range bin's average color."""
     slope_std: Positive = 0.1
     """Standard deviation of b times the median depth in beta_D(z) = a exp(b z)."""
+    lamp_slope_std: Positive = 0.01
+    """The same under a lamp, of whose fall-off with distance b is told by little."""
     open_water_std: PositiveShare = 0.01
     """Standard deviation of Binf from open-water pixels, beyond their spread."""
     far_color_std: PositiveShare = 0.2

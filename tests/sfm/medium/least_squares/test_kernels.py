@@ -2,7 +2,9 @@
 
 import numpy as np
 import pytest
+import torch
 
+from swimm3r.lamp import Lamp, nodes_along, scattered
 from swimm3r.sfm.medium.least_squares import kernels
 
 
@@ -47,3 +49,15 @@ def test_gains_of_frames_are_found_by_turns_with_the_colors(seen: dict[str, np.n
         gain /= np.exp(np.log(gain)[present].mean())
     found = kernels.frame_gains(T_D, B, I, weight, point, frame, 60, np.bincount(frame, minlength=12) > 0, 100.0, 5)
     np.testing.assert_allclose(found, gain, rtol=1e-10)
+
+
+def test_light_scattered_along_rays_is_that_of_the_lamp():
+    rng = np.random.default_rng(1)
+    direction = rng.normal([0, 0, 1], 0.4, (40, 3))
+    direction /= np.linalg.norm(direction, axis=1, keepdims=True)
+    z, beta = rng.uniform(0, 9, 40), np.array([1.1, 0.4, 0.1])
+    beam = torch.tensor([0.3, -0.2, -1.0, 0.1, 0.2, -0.1], dtype=torch.float64)
+    lamp = Lamp(torch.tensor([0.3, -0.2, 0.1], dtype=torch.float64), 2.0, 0.9, 1.0, beam, torch.zeros(6))
+    expected = scattered(torch.from_numpy(direction), torch.from_numpy(z), lamp, torch.from_numpy(beta), nodes=16)
+    found = kernels.scattered(direction, z, *nodes_along(16), lamp.position.numpy(), 2.0, 0.9, beam.numpy(), beta)
+    np.testing.assert_allclose(found, expected.numpy(), rtol=1e-12)

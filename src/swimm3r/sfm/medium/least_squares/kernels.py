@@ -1,4 +1,4 @@
-"""The sums over points and frames of the water's least squares, compiled by Numba: one pass where NumPy takes ten."""
+"""Sums over points, frames and rays in the water's fit, compiled by Numba: one pass where arrays take ten."""
 
 from typing import no_type_check
 
@@ -64,3 +64,24 @@ def frame_gains(T_D, B, I, weight, point, frame, points, present, stay, sweeps):
                 count += 1.0
         gain /= np.exp(logarithm / count)
     return gain
+
+
+@kernel
+@no_type_check
+def scattered(direction, z, share, step, position, reference, fall_off, beam, beta):
+    """G of `swimm3r.lamp` along unit directions up to z, [n, c], of a lamp of strength 1."""
+    origin = np.sqrt(position[0] ** 2 + position[1] ** 2 + (reference - position[2]) ** 2)
+    out = np.zeros((len(z), len(beta)))
+    for k in range(len(z)):
+        for m in range(len(share)):
+            s = share[m] * z[k]
+            x, y = s * direction[k, 0] - position[0], s * direction[k, 1] - position[1]
+            ahead = s * direction[k, 2] - position[2]
+            distance = max(np.sqrt(x * x + y * y + ahead * ahead), 1e-6 * reference)
+            x, y, ahead = x / distance, y / distance, ahead / distance
+            pattern = beam[0] * x + beam[1] * y + beam[2] * (1 - ahead)
+            pattern += beam[3] * x * x + beam[4] * x * y + beam[5] * y * y
+            log_light = pattern + fall_off * np.log(origin / distance)
+            for c in range(len(beta)):
+                out[k, c] += step[m] * z[k] * np.exp(log_light - beta[c] * (distance + s))
+    return out

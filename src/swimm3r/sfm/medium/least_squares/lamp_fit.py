@@ -9,7 +9,8 @@ and water in every step: held at that of the step before, it leads both to other
 Known is the light on the same point in several places of the image and at several distances. Its strength is known as a
 product with J alone: it is what makes surfaces reflect 1 / f on average. The power of its fall-off is not fitted, as
 attenuation looks much like it over the distances of a dive: it is that of a small lamp, 2 in linear light. For the same
-reason the lamp stands beside the camera, not ahead of it or behind.
+reason the lamp stands beside the camera, not ahead of it or behind, and beta_D changes little with distance
+(`lamp_slope_std`).
 """
 
 from dataclasses import dataclass, replace
@@ -22,14 +23,17 @@ from scipy.optimize import least_squares, nnls
 from torch import Tensor
 
 from swimm3r.lamp import (
+    FAR,
+    FEW_NODES,
     INVERSE_SQUARE,
+    NODES,
     STORED,
     TERMS,
     Lamp,
     lamp_distance,
     log_light,
+    nodes_along,
     pattern_terms,
-    share_scattered,
 )
 from swimm3r.medium import Encoding
 from swimm3r.sfm.medium.least_squares import kernels
@@ -54,7 +58,7 @@ _BEAM_STD, _STRENGTH_STD = 3.0, 1.0  # of the beam's coefficients, and of the st
 _OFFSET_STD = 0.2  # of the lamp's position beside the camera, in median depths
 _WIDEST = 3.0  # of these that an unknown may reach
 _NEAR = 1.4  # median depths within which a point is seen at least once
-_OBSERVATIONS = 9_000  # of the points, which stand for all
+_OBSERVATIONS = 30_000  # of the points, which stand for all
 _WATER = 200  # pixels of open water, likewise
 _WATER_SHARED = 20.0  # of them that share an error
 _STEPS = 25
@@ -85,10 +89,9 @@ class LampPixels:
 
     def scatter(self, lamp: Lamp, beta_D: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         """B over Binf of the pixels and of open water, [n, c] and [m, c]."""
-        direction, water, beta = (torch.from_numpy(v) for v in (self.direction, self.water_direction, beta_D))
-        far = torch.full((len(water),), torch.inf, dtype=torch.float64)
-        at_pixels = share_scattered(direction, torch.from_numpy(self.z), lamp, beta)
-        return at_pixels.numpy(), share_scattered(water, far, lamp, beta).numpy()
+        far = np.full(len(self.open_water), FAR * lamp.reference)
+        at_pixels = _share_scattered(self.direction, self.z, lamp, beta_D)
+        return at_pixels, _share_scattered(self.water_direction, far, lamp, beta_D)
 
     def ways(self, lamp: Lamp, scatter: np.ndarray | None = None) -> Ways:
         """Ways of the lamp's light; `scatter` is that of one channel."""
@@ -162,25 +165,34 @@ def exponential_backscatter(
     read as color; and in open water all around.
     """
     every = max(1, len(pixels.z) // _SCATTERING)
-    direction, z = torch.from_numpy(pixels.direction[::every]), torch.from_numpy(pixels.z[::every])
-    points, beta = direction * z[:, None], torch.from_numpy(beta_D)
-    arriving = (log_light(points, lamp)[:, None] - beta * (lamp_distance(points, lamp) + z)[:, None]).exp().numpy()
-    share = share_scattered(direction, z, lamp, beta).numpy()
+    direction, z = pixels.direction[::every], pixels.z[::every]
+    toward, points = torch.from_numpy(direction), torch.from_numpy(direction * z[:, None])
+    path = (lamp_distance(points, lamp).numpy() + z)[:, None]
+    arriving = np.exp(log_light(points, lamp).numpy()[:, None] - beta_D * path)
+    share = _share_scattered(direction, z, lamp, beta_D)
     around = torch.stack(torch.meshgrid(*(torch.linspace(-e, e, 9) for e in _WIDE), torch.ones(1), indexing="ij"), -1)
     around = torch.nn.functional.normalize(around.reshape(-1, 3).double(), dim=-1)
-    whole = share_scattered(around, torch.full((len(around),), torch.inf).double(), lamp, beta).numpy()
-    here, there = pattern_terms(direction).numpy(), pattern_terms(around).numpy()
+    whole = _share_scattered(around.numpy(), np.full(len(around), FAR * lamp.reference), lamp, beta_D)
+    here, there = pattern_terms(toward).numpy(), pattern_terms(around).numpy()
     weight = Binf / np.hypot(arriving, _ARRIVING) / len(z) ** 0.5
     of_water = Binf / _WATER_COLOR / len(around) ** 0.5
 
     def residuals(x: np.ndarray) -> np.ndarray:
         v, beta_B = x[:TERMS], np.exp(x[TERMS:])
-        near = np.exp(here @ v)[:, None] * -np.expm1(-beta_B * z.numpy()[:, None]) - share
+        near = np.exp(here @ v)[:, None] * -np.expm1(-beta_B * z[:, None]) - share
         far = np.exp(there @ v)[:, None] - whole
         return np.concatenate([(weight * near).ravel(), (of_water * far).ravel(), _HOLD * v])
 
     found = least_squares(residuals, np.zeros(TERMS + len(Binf)), max_nfev=_STEPS).x
     return torch.from_numpy(found[:TERMS]), np.exp(found[TERMS:])
+
+
+def _share_scattered(direction: np.ndarray, z: np.ndarray, lamp: Lamp, beta_D: np.ndarray) -> np.ndarray:
+    """`share_scattered` of `swimm3r.lamp` by a compiled kernel, [n, c]."""
+    of_lamp = lamp.position.numpy(), lamp.reference, lamp.fall_off, lamp.beam.numpy(), beta_D
+    far = FAR * lamp.reference
+    whole = kernels.scattered(np.array([[0.0, 0.0, 1.0]]), np.array([far]), *nodes_along(NODES), *of_lamp)
+    return kernels.scattered(direction, np.minimum(z, far), *nodes_along(FEW_NODES), *of_lamp) / whole
 
 
 def noise_by_light(off: np.ndarray, light: np.ndarray, most: float) -> np.ndarray:
