@@ -1,6 +1,6 @@
 """The water by the size of the patches of surface that its attenuation is read from, beside the truth.
 
-    python benchmarks/patches.py RUN[:TRUTH] ... --pixels 12 20 30 --share 0.6
+    python benchmarks/patches.py RUN[:TRUTH] ... --pixels 12 20 30 --share 0.6 --grids 4
 
 RUN are run folders of synthetic dives with finished structure from motion (the demo's TRUTH is found). The water of
 each is fitted again to patches of every size, under the light that it was made for, and compared on the test frames:
@@ -23,15 +23,15 @@ from swimm3r.sfm.medium.seathru import fit_medium
 from swimm3r.sfm.medium.settings import SeathruSettings
 
 
-def rows(sfm: FinishedSfm, sizes: list[float], share: float) -> Iterator[tuple[float, int, dict]]:
+def rows(sfm: FinishedSfm, sizes: list[float], like: SeathruSettings) -> Iterator[tuple[float, int, dict]]:
     """Size in pixels, number of observations, and errors of the water fitted to them."""
     rec, truth = sfm.rec, sfm.truth
     if truth is None or rec.medium is None:
         raise SystemExit("a dive without a known water tells nothing here")
-    frames, settings = rec.still(sfm.frames), SeathruSettings(patch_share=share)
-    tracks = fuse_depth(rec, frames, settings.tracks)
+    frames = rec.still(sfm.frames)
+    tracks = fuse_depth(rec, frames, like.tracks)
     for size in sizes:
-        of_size = replace(settings, patch_pixels=size)
+        of_size = replace(like, patch_pixels=size)
         samples = collect_samples(rec, frames, tracks, of_size)
         light = "sun" if rec.medium.lamp is None else "lamp"
         fit = fit_medium(samples, of_size, rec.medium.encoding, light)
@@ -45,13 +45,15 @@ def main() -> None:
     parser.add_argument("runs", nargs="+", metavar="RUN[:TRUTH]")
     parser.add_argument("--pixels", nargs="+", type=float, default=[12.0, 20.0, 30.0])
     parser.add_argument("--share", type=float, default=SeathruSettings().patch_share, help="of a patch, to be shown")
+    parser.add_argument("--grids", type=int, default=SeathruSettings().patch_grids, help="of patches")
     arguments = parser.parse_args()
+    like = SeathruSettings(patch_share=arguments.share, patch_grids=arguments.grids)
     print("| run | pixels | patches | T_D | B | clear |")
     print("| --- | --- | --- | --- | --- | --- |")
     for given in arguments.runs:
         run, _, truth = given.partition(":")
         sfm = open_finished_sfm(Path(run), Path(truth) if truth else None)
-        for size, count, errors in rows(sfm, arguments.pixels, arguments.share):
+        for size, count, errors in rows(sfm, arguments.pixels, like):
             T_D, B = (", ".join(f"{value:.3f}" for value in errors[key]) for key in ("T_D_abs", "B_abs"))
             print(f"| {Path(run).name} | {size:g} | {count} | {T_D} | {B} | {errors['clear_psnr']:.2f} |", flush=True)
 
