@@ -7,8 +7,9 @@ Poses that somebody else found of all frames can take the place of our own struc
 """
 
 from collections.abc import Mapping, Sequence
-from dataclasses import replace
+from dataclasses import dataclass, replace
 from functools import partial
+from itertools import product
 from pathlib import Path
 
 from swimm3r.bench import reference
@@ -16,7 +17,7 @@ from swimm3r.bench.cells import Result, ResultKey, Scores, check_choice, kept_ce
 from swimm3r.bench.images import Panel, stored, write_grid
 from swimm3r.bench.inputs import lpips_weights, reconstruction_of
 from swimm3r.bench.map_scores import COLUMNS, map_scores, trained
-from swimm3r.bench.runs import POSES_REFINED, Clip, clips_of, made_runs
+from swimm3r.bench.runs import POSES_REFINED, Clip, SfmRun, clips_of, made_runs
 from swimm3r.bench.settings import Seeds
 from swimm3r.bench.tables import Table
 from swimm3r.evaluate import NotComputed
@@ -66,10 +67,7 @@ def compare_renderers(
     work = partial(
         _cells_of_clip,
         out=out,
-        recipes=tuple(recipes),
-        base=base,
-        seeds=seeds,
-        blocks=(False, True) if poses else (False,),
+        trials=_trials(base, recipes, seeds, poses),
         test=test or PoseRefinementSettings(),
         references=references,
     )
@@ -107,15 +105,31 @@ def compare_on_clips(
     )
 
 
+@dataclass(frozen=True)
+class _Trial:
+    """A recipe to be trained on every reconstruction of a clip."""
+
+    recipe: RecipeName
+    refined: bool  # training poses, with the map
+    seed: int
+    settings: SplatSettings
+
+    def key(self, clip: Clip, run: SfmRun) -> ResultKey:
+        """The name of its result."""
+        return ResultKey(clip.name, f"{run.sfm}{POSES_REFINED if self.refined else ''} / {self.recipe}", self.seed)
+
+
+def _trials(base: UwbsSettings, recipes: Sequence[RecipeName], seeds: int, poses: bool) -> list[_Trial]:
+    every = product(range(seeds), (False, True) if poses else (False,), recipes)
+    return [_Trial(recipe, refined, seed, settings_for(base, recipe, refined, seed)) for seed, refined, recipe in every]
+
+
 def _cells_of_clip(
     clip: Clip,
     /,
     *,
     out: Path,
-    recipes: Sequence[RecipeName],
-    base: UwbsSettings,
-    seeds: int,
-    blocks: Sequence[bool],
+    trials: Sequence[_Trial],
     test: PoseRefinementSettings,
     references: Path | None,
     progress: Progress,
@@ -129,24 +143,18 @@ def _cells_of_clip(
     for run in clip.runs:
         sfm = run.open()
         start: dict[str, held_out.FirstPose] = {}
-        for seed in range(seeds):
-            as_it_comes: dict[SplatSettings, tuple[Result, Path]] = {}
-            for refined in blocks:
-                for recipe in recipes:
-                    settings = settings_for(base, recipe, refined, seed)
-                    place = ResultKey(clip.name, f"{run.sfm}{POSES_REFINED if refined else ''} / {recipe}", seed)
-                    if refined and settings in as_it_comes:  # it refines poses of its own accord
-                        cell, folder = as_it_comes[settings]
-                        cell = replace(cell, method=place.method)
-                    else:
-                        made_from = [reconstruction_of(run.folder, sfm), settings]
-                        scored_by = [test, reference.digest(truth), lpips_weights(), [c.score for c in COLUMNS]]
-                        make = partial(_scores, sfm=sfm, settings=settings, test=test, truth=truth, start=start)
-                        cell = kept_cell(out, place, made_from, partial(make, progress=progress), scored_by)
-                        folder = place.folder(out)
-                        as_it_comes[settings] = cell, folder
-                    cells.append(cell)
-                    shown.setdefault(place.method, folder / "test")
+        made: dict[SplatSettings, tuple[Result, Path]] = {}
+        for trial in trials:
+            key, settings = trial.key(clip, run), trial.settings
+            if settings not in made:  # some recipes refine poses of their own accord
+                made_from = [reconstruction_of(run.folder, sfm), settings]
+                scored_by = [test, reference.digest(truth), lpips_weights(), [c.score for c in COLUMNS]]
+                make = partial(_scores, sfm=sfm, settings=settings, test=test, truth=truth, start=start)
+                cell = kept_cell(out, key, made_from, partial(make, progress=progress), scored_by)
+                made[settings] = cell, key.folder(out)
+            cell, folder = made[settings]
+            cells.append(replace(cell, method=key.method))
+            shown.setdefault(key.method, folder / "test")
     stems = view_stems(first.frames.names)
     for name in first.frames.test.names:
         _side_by_side(out / "images" / clip.name, stems[name], shown)
