@@ -85,6 +85,17 @@ def test_the_light_is_recovered_up_to_its_strength(drawn, fit):
     assert off.std() < 0.005
 
 
+def test_surfaces_reflect_half_on_average_and_a_few_bright_ones_do_not_change_that(drawn, fit):
+    samples, _ = drawn
+    points = samples.direction * samples.ray_depth[:, None]
+    off = log_light(points, fit.lamp) - log_light(points, LAMP)
+    assert float(off.mean()) == pytest.approx(np.log(0.43 * SETTINGS.lsac_f), abs=0.15)  # 0.43 is the mean of J
+    bright = (samples.track < 7)[:, None]  # one of a hundred, of which many have J beyond 1
+    shining = replace(samples, I=torch.where(bright, (2.5 * samples.I).clamp(max=0.97), samples.I))
+    found = fit_medium(shining, SETTINGS, "srgb", "lamp")
+    assert abs(np.log(found.lamp.strength / fit.lamp.strength)) < 0.05
+
+
 def test_points_seen_from_afar_alone_are_left_out():
     rows, point = np.array([4, 1, 2, 0, 3]), np.array([0, 0, 1, 2, 2])
     z = np.array([0.5, 2.0, 1.8, 1.9, 1.0])

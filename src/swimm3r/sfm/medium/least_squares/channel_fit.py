@@ -82,6 +82,11 @@ class Observations:
         """One more than the last frame."""
         return int(self.frame.max()) + 1
 
+    @property
+    def brightest(self) -> float:
+        """Largest J: none under a lamp, of which J is known up to a factor."""
+        return 1.0 if self.ways.scatter is None else np.inf
+
 
 @dataclass(frozen=True)
 class ChannelFit:
@@ -108,6 +113,15 @@ class Evidence:
     alone: bool  # no observations
     lower: np.ndarray
     upper: np.ndarray
+
+    def lit(self, brighter: float) -> "Evidence":
+        """The evidence under a lamp whose strength has a logarithm that much larger."""
+
+        def changed(ways: Ways) -> Ways:
+            return replace(ways, log_gain=ways.log_gain + brighter)
+
+        bins = replace(self.bins, of_dark=changed(self.bins.of_dark), of_mean=changed(self.bins.of_mean))
+        return replace(self, bins=bins)
 
 
 @dataclass(frozen=True)
@@ -233,7 +247,8 @@ def _residuals(x: np.ndarray, seen: Observations, weight: np.ndarray) -> np.ndar
     """I - B - J T_D with the J of every point eliminated."""
     T_D, B = attenuations(x, seen.ways)
     direct = seen.I - B
-    return direct - kernels.surface_colors(T_D, direct, weight, seen.point, seen.points)[seen.point] * T_D
+    J = kernels.surface_colors(T_D, direct, weight, seen.point, seen.points, seen.brightest)
+    return direct - J[seen.point] * T_D
 
 
 def _whitened(x: np.ndarray, seen: Observations, noise: _Noise) -> np.ndarray:
@@ -249,7 +264,7 @@ def _gains(
     T_D, B = attenuations(x, seen.ways)
     present = np.bincount(seen.frame, minlength=frames) > 0
     gain = kernels.frame_gains(
-        T_D, B, seen.I, weight, seen.point, seen.frame, seen.points, present, 1 / gain_std**2, _SWEEPS
+        T_D, B, seen.I, weight, seen.point, seen.frame, seen.points, present, 1 / gain_std**2, _SWEEPS, seen.brightest
     )
     return gain, float(np.clip(np.sqrt(np.mean(np.log(gain[present]) ** 2)), 1e-3, 0.15))
 

@@ -10,15 +10,15 @@ kernel = njit(cache=True, nogil=True, error_model="numpy")
 
 @kernel
 @no_type_check
-def surface_colors(T_D, direct, weight, point, count):
-    """J of every point by weighted least squares, kept within 0..1."""
+def surface_colors(T_D, direct, weight, point, count, most=1.0):
+    """J of every point by weighted least squares, kept within 0..most."""
     above, below = np.zeros(count), np.zeros(count)
     for k in range(len(point)):
         weighted = weight[k] * T_D[k]
         above[point[k]] += weighted * direct[k]
         below[point[k]] += weighted * T_D[k]
     for n in range(count):
-        above[n] = min(max(above[n] / max(below[n], 1e-12), 0.0), 1.0)
+        above[n] = min(max(above[n] / max(below[n], 1e-12), 0.0), most)
     return above
 
 
@@ -43,14 +43,14 @@ def whitened(residuals, I, weight, frame, count, gain_std):
 
 @kernel
 @no_type_check
-def frame_gains(T_D, B, I, weight, point, frame, points, present, stay, sweeps):
+def frame_gains(T_D, B, I, weight, point, frame, points, present, stay, sweeps, most=1.0):
     """The gain of every frame by turns with the colors of the points; the mean logarithm of those present is 0."""
     gain = np.ones(len(present))
     direct = np.empty(len(I))
     for _ in range(sweeps):
         for k in range(len(I)):
             direct[k] = I[k] / gain[frame[k]] - B[k]
-        J = surface_colors(T_D, direct, weight, point, points)
+        J = surface_colors(T_D, direct, weight, point, points, most)
         above, below = np.full(len(present), stay), np.full(len(present), stay)
         for k in range(len(I)):
             p = J[point[k]] * T_D[k] + B[k]

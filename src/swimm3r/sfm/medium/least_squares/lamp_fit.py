@@ -7,7 +7,8 @@ share, with the water of each, which is then fitted again by itself. The colors 
 and water in every step: held at that of the step before, it leads both to others that explain less.
 
 Known is the light on the same point in several places of the image and at several distances. Its strength is known as a
-product with J alone: it is what makes surfaces reflect 1 / f on average. The power of its fall-off is not fitted, as
+product with J alone: it is what makes surfaces reflect 1 / f on average. J has no largest value here: one point with a
+wrong depth would set the strength by it. The power of its fall-off is not fitted, as
 attenuation looks much like it over the distances of a dive: it is that of a small lamp, 2 in linear light. For the same
 reason the lamp stands beside the camera, not ahead of it or behind, and beta_D changes little with distance
 (`lamp_slope_std`).
@@ -147,7 +148,9 @@ def fit_lamp(
                 seen = Observations(every.rows, ways, every.point, every.frame, few.color[:, c])
                 waters.append(best_start(priors[c], seen, 0.0, settings))
             unknowns = np.concatenate([unknowns, *waters])
-        problem = _Problem(few, every.point, priors, noise, fall_off, settings)
+        problem = _Problem(
+            few, every.point, [prior.lit(-np.log(lamp.strength)) for prior in priors], noise, fall_off, settings
+        )
         before, unknowns = unknowns[:_SHARED], problem.solved(unknowns)
         noise, lamp = problem.noise_at(unknowns), _lamp(unknowns[:_SHARED], fall_off)
         beta_D = _beta_D(unknowns[_SHARED:].reshape(len(priors), -1))
@@ -222,7 +225,7 @@ class _Problem:
 
     few: LampPixels  # that see the points
     point: np.ndarray
-    priors: list[Evidence]  # of the channels
+    priors: list[Evidence]  # of the channels, of a lamp of strength 1
     noise: np.ndarray  # of the channels' pixels, [c, n]
     fall_off: float
     settings: SeathruSettings
@@ -249,7 +252,7 @@ class _Problem:
         """Everything in its own standard deviations: the lamp, then the channels one after another."""
         lamp, waters = self._parts(unknowns)
         ways, scatter = self.few.ways(lamp), self.few.scatter(lamp, _beta_D(waters))
-        of_channels = [self._of_channel(c, x, ways, *(s[:, c] for s in scatter)) for c, x in enumerate(waters)]
+        of_channels = [self._of_channel(c, x, lamp, ways, *(s[:, c] for s in scatter)) for c, x in enumerate(waters)]
         return np.concatenate([unknowns[:_SHARED] / _std(), *of_channels])
 
     def jacobian(self, unknowns: np.ndarray) -> np.ndarray:
@@ -267,7 +270,7 @@ class _Problem:
                 moved, seen = x + 1e-6 * np.eye(len(x))[k], [s[:, c] for s in scatter]
                 if k in (LOG_BETA_D, SLOPE):
                     seen = [s[:, 0] for s in self.few.scatter(lamp, _beta_D(moved[None]))]
-                of_channel = self._of_channel(c, moved, ways, *seen)
+                of_channel = self._of_channel(c, moved, lamp, ways, *seen)
                 rows[mine, _SHARED + c * len(x) + k] = (of_channel - here[mine]) / 1e-6
         return rows
 
@@ -279,19 +282,20 @@ class _Problem:
         """J T_D of pixels with the J of every point eliminated, and what they show beyond it and B."""
         T_D, B = attenuations(x, ways)
         direct = self.few.color[:, c] - B
-        J = kernels.surface_colors(T_D, direct, self.noise[c] ** -2, self.point, int(self.point.max()) + 1)
+        J = kernels.surface_colors(T_D, direct, self.noise[c] ** -2, self.point, int(self.point.max()) + 1, np.inf)
         light = J[self.point] * T_D
         return light, direct - light
 
     def _of_channel(
-        self, c: int, x: np.ndarray, ways: Ways, scatter: np.ndarray, scatter_of_water: np.ndarray
+        self, c: int, x: np.ndarray, lamp: Lamp, ways: Ways, scatter: np.ndarray, scatter_of_water: np.ndarray
     ) -> np.ndarray:
         settings, water = self.settings, self.few.open_water[:, c]
         _, off = self._direct(c, x, replace(ways, scatter=scatter))
         off = off / (self.noise[c] * np.sqrt(settings.min_redundancy))
         shared = settings.open_water_std * np.sqrt(max(1.0, len(water) / _WATER_SHARED))
         of_water = (water - x[BINF] * scatter_of_water) / shared
-        return np.concatenate([off, of_water, prior_residuals(x, self.priors[c], settings)])
+        prior = self.priors[c].lit(np.log(lamp.strength))
+        return np.concatenate([off, of_water, prior_residuals(x, prior, settings)])
 
 
 def _beta_D(waters: np.ndarray) -> np.ndarray:
