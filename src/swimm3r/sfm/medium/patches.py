@@ -45,7 +45,7 @@ class Patches:
         """The tracks of some patches, one patch after another."""
         count = self.count[patch]
         start = self.first[patch] - (count.cumsum(0) - count)
-        return self.members[torch.repeat_interleave(start, count) + torch.arange(int(count.sum()))]
+        return self.members[torch.repeat_interleave(start, count) + torch.arange(int(count.sum()))].long()
 
 
 @dataclass(frozen=True)
@@ -65,20 +65,21 @@ def group_tracks(rec: Reconstruction, tracks: DenseTracks, settings: SeathruSett
     focal = float(rec.cameras.K[:, 0, 0].median())
     pixels = min(settings.patch_pixels, _WIDEST * max(rec.cameras.width, rec.cameras.height))
     size = 2.0 ** torch.round(torch.log2((pixels * far / focal).clamp(min=1e-12)))
-    of_track, counts, before = [], [], 0
+    of_track, members, counts, middles, edges, before = [], [], [], [], [], 0
     for k in range(grids):
         of_grid, count = cubes(tracks.xyz + (k * _STEP / grids).frac() * size[:, None], size)
-        of_track.append(of_grid + before)
+        total = torch.zeros(len(count), 3, dtype=torch.float64).index_add_(0, of_grid, tracks.xyz.double())
+        middles.append((total / count[:, None]).float())
+        edges.append(torch.zeros(len(count)).scatter_(0, of_grid, size))
+        of_track.append((of_grid + before).int())  # long dives have tens of millions of tracks
+        members.append(torch.argsort(of_grid, stable=True).int())
         counts.append(count)
         before += len(count)
-    of_tracks, count = torch.stack(of_track), torch.cat(counts)
-    middle, edge = torch.zeros(before, 3, dtype=torch.float64), torch.zeros(before)
-    for of_grid in of_track:
-        middle.index_add_(0, of_grid, tracks.xyz.double())
-        edge.scatter_(0, of_grid, size)
-    members = torch.argsort(of_tracks.reshape(-1), stable=True) % max(1, n)
+    count = torch.cat(counts)
     first = count.cumsum(0) - count
-    return Patches(tracks, of_tracks, edge, (middle / count[:, None]).float(), members, first, count)
+    return Patches(
+        tracks, torch.stack(of_track), torch.cat(edges), torch.cat(middles), torch.cat(members), first, count
+    )
 
 
 def patches_seen(
@@ -95,7 +96,7 @@ def patches_seen(
     where the frame's depth map agrees with its place.
     """
     asked, observed = torch.unique(patches.of_track[:, patches.tracks.track[own]], return_counts=True)
-    asked = asked[observed >= settings.patch_observations]
+    asked = asked[observed >= settings.patch_observations].long()
     tracks, again = torch.unique(patches.tracks_of(asked), return_inverse=True)  # one is in patches of several grids
     camera, index, xyz = rec.cameras[i], frames.index(rec.names[i]), patches.tracks.xyz[tracks]
     uv, z, visible = (values[0] for values in project_visible(camera, xyz.double()[None]))
