@@ -101,7 +101,7 @@ def test_matches_are_read_at_the_size_and_shape_of_the_training_images(tiny_dive
 
 
 REFINED = UwbsSettings(
-    iterations=200,
+    iterations=300,
     initial=InitialSettings(primitives=500, scale=2.0),
     densify=DensifySettings(cap_max=600, min_refine_every=20),
     poses=TrainingPoseSettings(epipolar_end=0.75),

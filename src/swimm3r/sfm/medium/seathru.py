@@ -78,7 +78,6 @@ def fit_medium(samples: WaterSamples, settings: SeathruSettings, encoding: Encod
             cause="the dense depth stage found almost no surface",
             hint=f"use clearer or slower footage; at least {settings.min_samples} pixels are needed",
         )
-    settings = replace(settings, min_redundancy=settings.min_redundancy * samples.grids)
     if light == "lamp":
         settings = replace(settings, slope_std=settings.lamp_slope_std)
     color, open_water = encoded(samples, encoding)
@@ -103,7 +102,7 @@ def fit_medium(samples: WaterSamples, settings: SeathruSettings, encoding: Encod
         observations = None
         if chosen is not None:
             rows, point = chosen
-            observations = Observations(rows, pixels.ways.rows(rows), point, frame[rows], pixels.I[rows])
+            observations = Observations(rows, pixels.ways.rows(rows), point, frame[rows], pixels.I[rows], samples.grids)
         channels.append(fit_channel(pixels, observations, settings))
     fit = _medium_fit(channels * (3 // len(channels)), unit, ray_depth, settings, encoding)
     if lamp is None:
@@ -132,7 +131,7 @@ def _lit(
         raise ValueError("a lamp's light is told by the directions of pixels, and these samples have none")
     directions = (values.double().numpy() for values in (samples.direction, samples.water_direction))
     direction, toward_water = directions
-    return LampPixels(color, z, direction, frame, open_water, toward_water)
+    return LampPixels(color, z, direction, frame, open_water, toward_water, samples.grids)
 
 
 def _too_little_for_a_lamp() -> InputError:

@@ -36,7 +36,7 @@ class SeathruSettings(Settings):
     """Largest number of open-water pixels taken from one frame."""
     patch_pixels: Positive = 20.0
     """Edge length of a surface patch in pixels of its farthest observation; at most 1/16 of the longer side."""
-    patch_grids: Count = 4
+    patch_grids: Annotated[int, Range(1, 16)] = 4
     """Number of shifted grids of patches, each of which has every surface point in one of its patches."""
     patch_observations: Count = 6
     """Smallest number of pixels of a patch in a frame."""
@@ -87,7 +87,7 @@ class SeathruSettings(Settings):
     start_observations: Count = 5_000
     """Number of observations in the search for the fit's initial values."""
     min_redundancy: Positive = 3.0
-    """Smallest number of observations that share one error term."""
+    """Smallest number of observations, for one grid of patches, that share one error term."""
     loss_scale: PositiveShare = 0.02
     """Residual, in pixel values, beyond which observations count as outliers."""
     reweightings: Annotated[int, Range(1, 100)] = 6

@@ -71,6 +71,7 @@ class Observations:
     point: np.ndarray
     frame: np.ndarray
     I: np.ndarray
+    grids: int = 1  # of patches, all of which show the same pixels
 
     @cached_property
     def points(self) -> int:
@@ -160,7 +161,8 @@ def _fit_observations(
     """
     evidence = evidence_of(pixels, settings)
     x = best_start(evidence, observations, gain_std, settings)
-    robust, redundancy = np.ones(len(observations.I)), settings.min_redundancy
+    least = settings.min_redundancy * observations.grids
+    robust, redundancy = np.ones(len(observations.I)), least
     gain, tau = np.ones(pixels.frame.max() + 1), gain_std
     seen, noise = observations, _Noise(robust, tau)
     for _ in range(settings.reweightings):
@@ -173,7 +175,7 @@ def _fit_observations(
             evidence = evidence_of(replace(pixels, I=pixels.I / gain[pixels.frame]), settings, tau)
         noise = _Noise(np.sqrt(robust / redundancy) / scale, tau)
         x = _solve(x, evidence, seen, noise, settings)
-        redundancy = max(settings.min_redundancy, _redundancy(x, seen, _Noise(np.sqrt(robust) / scale, tau)))
+        redundancy = max(least, _redundancy(x, seen, _Noise(np.sqrt(robust) / scale, tau)))
     spread = float(np.median(np.abs(_residuals(x, seen, robust))))
     return ChannelFit(x, _covariance(x, evidence, seen, noise, settings)), spread
 
@@ -365,7 +367,10 @@ def thinned(seen: Observations, count: int) -> Observations:
     """Every k-th point, so that about `count` observations remain."""
     step = max(1, int(np.ceil(len(seen.I) / count)))
     rows = np.flatnonzero(seen.point % step == 0)
-    return Observations(seen.rows[rows], seen.ways.rows(rows), seen.point[rows] // step, seen.frame[rows], seen.I[rows])
+    return replace(
+        seen, rows=seen.rows[rows], ways=seen.ways.rows(rows), point=seen.point[rows] // step, frame=seen.frame[rows],
+        I=seen.I[rows],
+    )  # fmt: skip
 
 
 def _jacobian(residuals: Callable[[np.ndarray], np.ndarray], x: np.ndarray, at_x: np.ndarray) -> np.ndarray:

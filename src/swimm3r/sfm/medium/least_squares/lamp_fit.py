@@ -87,6 +87,7 @@ class LampPixels:
     frame: np.ndarray
     open_water: np.ndarray  # [m, c]
     water_direction: np.ndarray
+    grids: int = 1  # of patches, all of which show the same pixels
 
     def scatter(self, lamp: Lamp, beta_D: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         """B over Binf of the pixels and of open water, [n, c] and [m, c]."""
@@ -133,6 +134,7 @@ def fit_lamp(
     few = LampPixels(
         pixels.color[every.rows], pixels.z[every.rows], pixels.direction[every.rows], every.frame,
         *(values[:: max(1, len(values) // _WATER)] for values in (pixels.open_water, pixels.water_direction)),
+        pixels.grids,
     )  # fmt: skip
     unknowns, beta_D = np.zeros(_SHARED), np.full(len(channels), _START_BETA)
     unknowns[-2:] = _START
@@ -291,7 +293,7 @@ class _Problem:
     ) -> np.ndarray:
         settings, water = self.settings, self.few.open_water[:, c]
         _, off = self._direct(c, x, replace(ways, scatter=scatter))
-        off = off / (self.noise[c] * np.sqrt(settings.min_redundancy))
+        off = off / (self.noise[c] * np.sqrt(settings.min_redundancy * self.few.grids))
         shared = settings.open_water_std * np.sqrt(max(1.0, len(water) / _WATER_SHARED))
         of_water = (water - x[BINF] * scatter_of_water) / shared
         prior = self.priors[c].lit(np.log(lamp.strength))
