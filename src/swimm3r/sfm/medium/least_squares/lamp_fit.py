@@ -134,7 +134,7 @@ def fit_lamp(
     few = LampPixels(
         pixels.color[every.rows], pixels.z[every.rows], pixels.direction[every.rows], every.frame,
         *(values[:: max(1, len(values) // _WATER)] for values in (pixels.open_water, pixels.water_direction)),
-        pixels.grids,
+        grids=pixels.grids,
     )  # fmt: skip
     unknowns, beta_D = np.zeros(_SHARED), np.full(len(channels), _START_BETA)
     unknowns[-2:] = _START
