@@ -27,22 +27,25 @@ from swimm3r.synthetic import dive as synthetic_dive
 THREADS = int(os.environ.get("SWIMM3R_TEST_THREADS", "1"))  # two xdist workers share two cores
 torch.set_num_threads(THREADS)
 
-LONG_FILES = (  # of more than 20 seconds: started first, so that no worker ends long after the other
+FIRST_FILES = (
+    "pipeline/test_run.py",  # compiles the kernels, while the other worker is at files that need none of them
+    "prepare/test_rotation.py", "tasks/test_tasks.py", "docs/test_site.py", "docs/test_settings.py",
+    "cli/test_help.py", "test_architecture.py", "test_words.py", "prepare/test_video.py", "scale/test_navigation.py",
+    # of more than 20 seconds: started early, so that no worker ends long after the other
     "visits/test_visits.py", "batch/test_run.py", "examples/test_examples.py", "splat/test_elsewhere.py",
-    "sfm/medium/least_squares/test_lamp_fit.py", "sfm/colmap/chunks/test_long_clip.py", "visits/test_alignment.py",
-    "localization/test_online.py", "test_architecture.py", "synthetic/test_optics.py",
-    "bench/protocols/test_localization.py", "synthetic/test_survey.py", "localization/test_localizer.py",
-    "viewer/test_in_browser.py", "sfm/backends/test_imported.py", "raster/cpu/test_backend.py", "tasks/test_tasks.py",
-    "test_readme.py",
+    "sfm/medium/least_squares/test_lamp_fit.py", "sfm/colmap/chunks/test_long_clip.py", "sfm/test_ends_of_ranges.py",
+    "sfm/colmap/test_poses.py", "visits/test_alignment.py", "localization/test_online.py",
+    "localization/test_localizer.py", "splat/recipes/test_recipes.py", "splat/blocks/test_block_training.py",
+    "viewer/test_in_browser.py", "test_readme.py",
 )  # fmt: skip
 
 SHARED = Path(os.environ.get("SWIMM3R_SHARED", Path(__file__).parents[2] / "shared"))
 
 
 def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
-    """Sort the tests of `LONG_FILES` before the others; each file's tests keep their order."""
-    first = {Path(__file__).parent / name for name in LONG_FILES}
-    items.sort(key=lambda item: item.path not in first)
+    """Sort the tests of `FIRST_FILES` before the others, in that order; each file's tests keep theirs."""
+    rank = {Path(__file__).parent / name: place for place, name in enumerate(FIRST_FILES)}
+    items.sort(key=lambda item: rank.get(item.path, len(rank)))
 
 
 @pytest.fixture(autouse=True)

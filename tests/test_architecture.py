@@ -5,7 +5,7 @@ import subprocess
 import sys
 from pathlib import Path
 
-from tests.conftest import LONG_FILES
+from tests.conftest import FIRST_FILES
 
 import swimm3r
 
@@ -180,7 +180,7 @@ def test_no_module_imports_itself_through_others():
 
 
 def test_files_that_are_started_first_exist():
-    assert [name for name in LONG_FILES if not (Path(__file__).parent / name).is_file()] == []
+    assert [name for name in FIRST_FILES if not (Path(__file__).parent / name).is_file()] == []
 
 
 def test_no_folder_is_a_heap():

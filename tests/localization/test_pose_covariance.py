@@ -69,6 +69,7 @@ def test_errors_that_neighbors_share_are_counted():
     assert mean_squared_error(0.1, trials=60, count=600, shared=0.6) < 14
 
 
+@pytest.mark.long
 def test_a_turn_while_rows_were_exposed_is_an_unknown_too():
     """Turns are drawn as they are expected."""
     rng = torch.Generator().manual_seed(4)

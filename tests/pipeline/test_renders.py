@@ -100,6 +100,7 @@ for again in range(3):
 """
 
 
+@pytest.mark.long
 def test_a_flight_has_the_same_bits_on_any_number_of_cores_and_whatever_freed_memory_holds(tmp_path: Path):
     for cores in ("1", "2"):
         subprocess.run([sys.executable, "-c", ENCODE, str(tmp_path), cores], check=True)

@@ -214,6 +214,7 @@ def test_a_settings_file_of_another_version_is_named(tmp_path: Path, text: str):
         from_yaml(tmp_path / "settings.yaml")
 
 
+@pytest.mark.long
 def test_a_map_is_trained_on_any_colmap_model(dive: Path, finished: tuple[Path, dict], tmp_path: Path):
     like = TINY_MAP.sfm
     assert isinstance(like, ColmapSettings)
@@ -321,6 +322,7 @@ def test_a_training_that_was_interrupted_goes_on(dive: Path, finished: tuple[Pat
     assert (steps[0], steps[-1]) == (36, 60)
 
 
+@pytest.mark.long
 def test_a_folder_copied_to_another_computer_goes_on_without_its_input(finished: tuple[Path, dict], tmp_path: Path):
     copy, gone = tmp_path / "run", tmp_path / "not mounted" / "dive"
     shutil.copytree(finished[0], copy)
@@ -385,7 +387,8 @@ def test_a_disk_that_fills_under_the_database_is_said_with_its_exit_code(dive: P
     assert list((tmp_path / "temporary").iterdir()) == []  # of no library
 
 
-@pytest.mark.parametrize("marker", [pytest.param("sfm/database.db", marks=pytest.mark.long), "sfm/reconstruction.json"])
+@pytest.mark.long
+@pytest.mark.parametrize("marker", ["sfm/database.db", "sfm/reconstruction.json"])
 def test_a_killed_run_goes_on(marker: str, dive: Path, finished: tuple[Path, dict], tmp_path: Path):
     folder = tmp_path / "run"
     command = [sys.executable, "-m", "swimm3r", "run", str(dive), "--out", str(folder), "--preset", "fast"]

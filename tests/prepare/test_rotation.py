@@ -103,6 +103,7 @@ def test_points_move_as_those_far_away_do(lens: Cameras):
     np.testing.assert_allclose(motion.moved(3, 9, here), there, atol=0.2)
 
 
+@pytest.mark.long
 def test_a_camera_that_only_turns_needs_few_keyframes_and_one_that_moves_as_many_as_before(
     views: Callable[[int], np.ndarray],
 ):
@@ -129,6 +130,7 @@ def test_a_gyroscope_of_something_else_is_not_used(views: Callable[[int], np.nda
     assert rotation_motion(noise, TIMES, views, calibrated()) is None
 
 
+@pytest.mark.long
 def test_a_camera_that_sways_as_it_turns_does_not_tell_its_focal_length(wall: np.ndarray):
     swaying = [view(wall, i, sway=0.7) for i in range(COUNT)]
     assert rotation_motion(gyroscope(), TIMES, swaying.__getitem__) is None

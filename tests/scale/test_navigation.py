@@ -55,6 +55,7 @@ def test_the_attitude_shows_the_mounting_of_the_camera(survey):
     assert found.attitude_residual_deg == pytest.approx(0, abs=1e-5)
 
 
+@pytest.mark.long
 @pytest.mark.parametrize("step", [1.0, 0.4])
 def test_the_standard_deviation_of_the_scale_is_that_of_repeated_dives(step):
     """By positions at the frames' times, and by ones between which positions are interpolated."""
@@ -246,7 +247,7 @@ def named(survey: Survey, latency: float, noise: float = 0.02, seed: int = 0) ->
     return path_of(survey.rec, matched, ScaleSettings()), survey.seconds
 
 
-@pytest.mark.parametrize("latency", [-0.6, 0.0, 0.45])
+@pytest.mark.parametrize("latency", [-0.6, *(pytest.param(each, marks=pytest.mark.long) for each in (0.0, 0.45))])
 def test_the_latency_of_named_positions_is_found_with_its_standard_deviation(latency):
     survey = heaving()
     found = [find_latency(*named(survey, latency, seed=seed), ScaleSettings()) for seed in range(2)]

@@ -126,6 +126,7 @@ def test_without_tracks_nothing_is_fitted(tiny_dive):
     assert "too few points" in decided.decision.reason
 
 
+@pytest.mark.long
 def test_a_map_of_relit_frames_is_that_of_steady_ones(tiny_dive, tracked, relit, tmp_path):
     own = {name: GAINS[tiny_dive.frames.index(name) % 5] for name in tracked.names}
     mean = torch.stack(list(own.values())).mean(0)
@@ -166,6 +167,7 @@ class StoppedError(Exception):
     pass
 
 
+@pytest.mark.long
 def test_an_interrupted_training_goes_on_with_its_colors(tracked, tone_mapped, tmp_path):
     short = replace(SETTINGS, iterations=40)
 
@@ -269,6 +271,7 @@ def test_common_colors_of_tone_mapped_frames_are_those_of_the_dive(tiny_dive, tr
     assert errors["auto"] < 0.6 * errors["off"]
 
 
+@pytest.mark.long
 def test_a_map_of_tone_mapped_frames_learns_from_common_colors(tiny_dive, tracked, tone_mapped, tmp_path):
     scenes = {
         shading: train(

@@ -50,6 +50,7 @@ def test_lines_lie_side_by_side_and_the_last_one_crosses_them_on_its_way_back():
     assert float(met_again.double().mean()) > 0.7
 
 
+@pytest.mark.long
 def test_neighboring_patches_are_one_ground_where_a_camera_may_look():
     left, right = Plain(3).around(0, 0), Plain(3).around(STEP * CELL, 0)
     assert left is not right

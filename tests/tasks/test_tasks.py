@@ -203,6 +203,7 @@ def test_a_cluster_gets_one_array_of_jobs(tmp_path: Path, monkeypatch: pytest.Mo
         assert f"#SBATCH --{asked}\n" in sent
 
 
+@pytest.mark.long
 @without_ray
 def test_ray_runs_the_same_tasks_in_processes_of_its_own(tmp_path: Path):
     engine = EngineSettings(engine="ray", jobs=2, cpus=1)

@@ -106,6 +106,7 @@ def test_changed_ground_does_not_pull_the_alignment(tmp_path):
     assert np.sqrt((off**2).sum(1).mean()) < 0.003 * unit
 
 
+@pytest.mark.long
 def test_the_stated_uncertainty_covers_the_error(tmp_path):
     ratios = []
     for seed in range(6):
@@ -244,6 +245,7 @@ def test_two_markers_align_visits_whose_images_do_not_match(tmp_path):
     assert apart(a, b, found) < 0.01
 
 
+@pytest.mark.long
 def test_real_features_align_visits_in_other_light_over_changed_ground(visits: Visits):
     a, b = visits.surveys()
     first, later = place_visits((a, b), NAMES, VisitSettings(), silent)

@@ -30,6 +30,7 @@ def grounds(visits: Visits) -> list[tuple[Ground, np.ndarray]]:
     return [(observe(each.survey, grid), color) for each, color in zip(placed, true, strict=True)]
 
 
+@pytest.mark.long
 def test_colors_that_the_water_takes_are_less_certain_at_both_visits(grounds: list[tuple[Ground, np.ndarray]]):
     """The runs have units of their own; the ground is seen from the altitude or, along slanted rays, from farther."""
     least = RestoreSettings().veil_error / torch.tensor(TRANSMITTED).double()

@@ -95,6 +95,7 @@ def shoelace(ring: np.ndarray) -> float:
     return float((x[:-1] * y[1:] - x[1:] * y[:-1]).sum() / 2)
 
 
+@pytest.mark.long
 def test_a_visit_compared_with_an_unchanged_one_shows_nothing(visits: Visits, tmp_path: Path):
     from tests.visits.conftest import Seabed, write_visit
 
@@ -123,6 +124,7 @@ def test_the_page_shows_both_visits_and_moves_its_slider(out: Path, open_page: A
     assert watched.overflow == 0
 
 
+@pytest.mark.long
 def test_dives_of_different_places_are_refused_with_advice(
     visits: Visits, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ):
@@ -144,12 +146,14 @@ def test_one_run_and_a_run_given_twice_are_refused(visits: Visits, tmp_path: Pat
         write_visits([visits.first, tmp_path], tmp_path / "out")
 
 
+@pytest.mark.long
 def test_a_cell_size_beyond_memory_is_refused_with_one_that_fits(visits: Visits, tmp_path: Path):
     with pytest.raises(UsageError, match="cells") as refused:
         write_visits([visits.first, visits.later], tmp_path / "out", VisitSettings(gsd=1e-5))
     assert "--gsd" in refused.value.hint
 
 
+@pytest.mark.long
 def test_runs_with_georeferences_are_placed_by_them_where_images_do_not_tell(visits: Visits, tmp_path: Path):
     from tests.visits.conftest import Seabed, write_visit
 

@@ -13,6 +13,7 @@ from swimm3r.evaluate import NotComputed
 from swimm3r.splat.settings import PoseRefinementSettings, UwbsSettings
 
 
+@pytest.mark.long
 def test_four_variants_are_trained_scored_and_not_made_again(
     run: Path, tmp_path: Path, tiny: UwbsSettings, quick: PoseRefinementSettings
 ):

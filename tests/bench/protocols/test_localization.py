@@ -76,6 +76,7 @@ def test_without_a_reference_poses_are_not_scored(run: Path):
     assert set(scores.values()) == {NotComputed("nobody knows")}
 
 
+@pytest.mark.long
 def test_runs_of_one_clip_are_rows_and_their_reference_is_made_once(
     run: Path, tmp_path: Path, tiny: UwbsSettings, monkeypatch: pytest.MonkeyPatch
 ):

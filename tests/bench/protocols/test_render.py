@@ -25,6 +25,7 @@ from swimm3r.sfm.settings import ColmapSettings
 from swimm3r.splat.settings import RECIPES, PoseRefinementSettings, UwbsSettings
 
 
+@pytest.mark.long
 def test_every_recipe_starts_from_the_same_poses_of_the_whole_clip(
     run: Path, tmp_path: Path, tiny: UwbsSettings, quick: PoseRefinementSettings, monkeypatch: pytest.MonkeyPatch
 ):

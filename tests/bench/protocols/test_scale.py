@@ -39,6 +39,7 @@ def test_the_parts_of_a_run_add_up_to_its_stages():
     assert sum(found.values()) == sum(stage["cpu_seconds"] for stage in stages.values())
 
 
+@pytest.mark.long
 def test_a_small_survey_is_made_mapped_and_scored(tmp_path: Path):
     (cell,) = scale_table(tmp_path, SMALL, PRESETS["fast"]).cells
     scores = {name: value for name, value in cell.scores.items() if not isinstance(value, NotComputed)}

@@ -144,6 +144,7 @@ def test_navigation_joins_two_parts_that_share_no_ground(two_parts, tmp_path):
     assert not (tmp_path / "joined" / "parts").exists()
 
 
+@pytest.mark.long
 def test_a_part_without_positions_stays_a_model_of_its_own(two_parts, tmp_path):
     frames, places = two_parts
     alone = poses.reconstruct(frames, SETTINGS, tmp_path / "alone")

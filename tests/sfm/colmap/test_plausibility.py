@@ -37,6 +37,7 @@ def test_a_tiled_floor_has_twins_and_a_reef_has_none() -> None:
     assert share(cv2.resize(texture(4), (WIDTH, HEIGHT))) < 0.05
 
 
+@pytest.mark.long
 def test_halves_that_share_no_points_are_called_badly_joined(rec, frames: Frames, folder: Path) -> None:
     camera = first_camera(WIDTH, HEIGHT, SETTINGS)
     store = feature_database.start_database(folder, frames, camera, SETTINGS.features)

@@ -77,6 +77,7 @@ def test_good_images_raise_no_warning(rec: Reconstruction) -> None:
     assert rec.warnings == ()
 
 
+@pytest.mark.long
 def test_a_second_run_goes_on_from_the_database_and_ends_in_the_same_poses(
     rec: Reconstruction, frames: Frames, folder: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
@@ -121,6 +122,7 @@ def test_other_settings_start_a_new_database(frames: Frames, tmp_path: Path) -> 
         assert not database.exists_keypoints(1)
 
 
+@pytest.mark.long
 def test_the_global_method_finds_the_same_cameras(frames: Frames, folder: Path, rec: Reconstruction) -> None:
     settings = replace(SETTINGS, mapping=MappingSettings(method="global"))
     found = colmap.reconstruct(frames, settings, folder)
@@ -136,11 +138,13 @@ def test_fixed_intrinsics_stay_as_given(frames: Frames, tmp_path: Path) -> None:
     assert found.cameras.distortion[0].tolist() == [0.01]
 
 
+@pytest.mark.long
 def test_a_flat_port_before_an_unknown_lens_is_confessed(frames: Frames, tmp_path: Path) -> None:
     found = colmap.reconstruct(frames, replace(SETTINGS, housing="flat"), tmp_path)
     assert any("flat port is not modeled" in warning.what for warning in found.warnings)
 
 
+@pytest.mark.long
 def test_the_lens_of_a_centered_dome_is_that_in_air(frames: Frames, tmp_path: Path) -> None:
     settings = replace(SETTINGS, focal=FOCAL, k1=0.01, housing="dome", intrinsics="fixed")
     found = colmap.reconstruct(frames, settings, tmp_path)
@@ -161,6 +165,7 @@ def test_a_lens_that_is_given_is_held(frames: Frames, folder: Path, tmp_path: Pa
     torch.testing.assert_close(rec.cameras.distortion, lens.distortion.expand(COUNT, 4))
 
 
+@pytest.mark.long
 def test_frames_of_another_place_are_left_out_and_said(frames: Frames, tmp_path: Path) -> None:
     path = tmp_path / "elsewhere.png"
     cv2.imwrite(str(path), cv2.resize(texture(9), (WIDTH, HEIGHT)))

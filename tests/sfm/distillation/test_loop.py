@@ -50,6 +50,7 @@ train(network, base, data, none, settings, Path(sys.argv[3]), lambda student, da
 """
 
 
+@pytest.mark.long
 def test_eight_pairs_can_be_learned_by_heart(network: Mast3r, eight: PairData, none: PairData, tmp_path: Path):
     settings = replace(SETTINGS, epochs=20, checkpoint_every=1000, water_probability=0.0)
     train(network, BASE, eight, none, settings, tmp_path, nothing)
@@ -150,6 +151,7 @@ def test_a_batch_may_mix_images_of_several_shapes(
     assert rows(tmp_path / "out")[0]["forward"] > 0
 
 
+@pytest.mark.long
 def test_two_processes_of_torchrun_have_the_loss_curve_of_one(network: Mast3r, dives: Path, tmp_path: Path):
     weights = tmp_path / "small.safetensors"
     checkpoint.save(network, weights)

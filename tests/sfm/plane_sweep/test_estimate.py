@@ -348,6 +348,7 @@ def test_progress_counts_every_frame_of_both_passes(tmp_path: Path):
     assert not (tmp_path / "z_depth" / ".raw").exists()
 
 
+@pytest.mark.long
 def test_several_processes_make_the_same_maps(tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
     monkeypatch.setattr(estimate, "_OF_A_TASK", 2)
     cameras = dive()

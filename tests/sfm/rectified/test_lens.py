@@ -85,6 +85,7 @@ def worst_turn(rec: Reconstruction, turn: torch.Tensor, truth: Cameras) -> float
     return math.degrees(rotation_angle(turned.mT @ truth.cam2world[:, :3, :3] @ turn).max().item())
 
 
+@pytest.mark.long
 def test_rectified_frames_are_placed_where_they_were_taken(
     bent: Frames, found: Rectification, truth: Cameras, tmp_path: Path
 ):

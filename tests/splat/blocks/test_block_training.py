@@ -142,11 +142,13 @@ def test_a_block_that_was_killed_goes_on_from_its_checkpoint(tiny_dive, trained,
     assert bits(tmp_path) == bits(trained)
 
 
+@pytest.mark.long
 def test_blocks_trained_in_processes_have_the_same_bits(tiny_dive, trained, tmp_path):
     train(tiny_dive.rec, tiny_dive.frames, FEW, tmp_path, engine=EngineSettings(jobs=2, cpus=1))
     assert bits(tmp_path) == bits(trained)
 
 
+@pytest.mark.long
 def test_other_settings_train_all_blocks_again(tiny_dive, trained, tmp_path):
     for path in trained.glob("blocks/*.safetensors"):
         target = tmp_path / "blocks" / path.name

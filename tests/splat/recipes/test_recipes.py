@@ -101,7 +101,9 @@ def stop_at(step: int):
 PEERS = [recipe for recipe in RECIPES if settings_of(recipe) is not UwbsSettings]
 
 
-@pytest.mark.parametrize("recipe", PEERS)
+@pytest.mark.parametrize(
+    "recipe", [each if each == "watersplatting" else pytest.param(each, marks=pytest.mark.long) for each in PEERS]
+)
 def test_every_peer_learns_is_kept_and_goes_on_to_the_bit(recipe, tiny_dive, tmp_path):
     settings = replace(with_recipe(FEW, recipe), iterations=80, checkpoint_every=0.25)
     whole = train(tiny_dive.rec, tiny_dive.frames, settings, tmp_path / "whole")

@@ -84,6 +84,7 @@ def test_an_interrupted_training_ends_with_the_bits_of_one_that_was_not(tiny_div
     assert steps[0] == steps[1] == [5, 10, 15, 20, 25, 30, 35, 40]
 
 
+@pytest.mark.long
 def test_the_number_of_threads_changes_no_bit_of_a_map(tiny_dive, tmp_path):
     maps = []
     for threads in (1, 2, 3):

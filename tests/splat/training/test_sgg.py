@@ -138,8 +138,12 @@ def test_no_water_no_cancellation_no_change(tiny_dive):
 
 @pytest.mark.parametrize(
     "sgg",
-    [SggSettings(), SggSettings(split="direct"), SggSettings(isolated="exact"), SggSettings(depth="apart")],
-    ids=["default", "direct", "exact", "apart"],
+    [
+        pytest.param(SggSettings(), id="default"),
+        pytest.param(SggSettings(split="direct"), id="direct", marks=pytest.mark.long),
+        pytest.param(SggSettings(isolated="exact"), id="exact", marks=pytest.mark.long),
+        pytest.param(SggSettings(depth="apart"), id="apart", marks=pytest.mark.long),
+    ],
 )
 def test_the_step_of_the_centers_is_that_of_the_float64_oracle(tiny_dive, sgg: SggSettings):
     """Every reading of Alg. 1 against images drawn one branch at a time, in torch and float64."""

@@ -58,6 +58,7 @@ def of_frames(model: pycolmap.Reconstruction, images: set[int]) -> pycolmap.Reco
     return out
 
 
+@pytest.mark.long
 def test_the_models_of_a_chunk_that_fell_apart_grow_and_those_taken_over_are_left_out(tmp_path: Path):
     write_dive(DiveSettings(frames=10, width=240, height=160), tmp_path / "dive")
     frames = read_frames(tmp_path / "dive", folder=tmp_path / "prepare").train

@@ -82,7 +82,10 @@ def degrees_off(cameras: Cameras, truth: np.ndarray | None = None) -> Float[torc
     return torch.rad2deg(rotation_angle(torch.from_numpy((true.inv() * best * found).as_matrix())))
 
 
-@pytest.mark.parametrize(("readout", "squeeze"), [(0.02, 1.0), (-0.02, 1.0), (0.01, 4 / 3)])
+@pytest.mark.parametrize(
+    ("readout", "squeeze"),
+    [(0.02, 1.0), pytest.param(-0.02, 1.0, marks=pytest.mark.long), pytest.param(0.01, 4 / 3, marks=pytest.mark.long)],
+)
 def test_readout_poses_and_lens_are_found_from_the_frames(readout: float, squeeze: float):
     film = filmed(readout, squeeze)
     at_once = adjust_rolling(film, TIMES.tolist(), 0.0, lens=True).reconstruction
