@@ -83,7 +83,6 @@ def test_localize_image_finds_a_test_frame(dive: Path, work: Path, example: Call
     assert torch.rad2deg(rotation_angle(true[:3, :3].mT @ pose[:3, :3])) < 2
 
 
-@pytest.mark.long
 def test_the_notebook_runs_cell_by_cell(tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
     notebook = json.loads((EXAMPLES / "synthetic_dive.ipynb").read_text(encoding="utf-8"))
     assert (notebook["nbformat"], notebook["nbformat_minor"]) == (4, 5)

@@ -387,8 +387,7 @@ def test_a_disk_that_fills_under_the_database_is_said_with_its_exit_code(dive: P
     assert list((tmp_path / "temporary").iterdir()) == []  # of no library
 
 
-@pytest.mark.long
-@pytest.mark.parametrize("marker", ["sfm/database.db", "sfm/reconstruction.json"])
+@pytest.mark.parametrize("marker", [pytest.param("sfm/database.db", marks=pytest.mark.long), "sfm/reconstruction.json"])
 def test_a_killed_run_goes_on(marker: str, dive: Path, finished: tuple[Path, dict], tmp_path: Path):
     folder = tmp_path / "run"
     command = [sys.executable, "-m", "swimm3r", "run", str(dive), "--out", str(folder), "--preset", "fast"]

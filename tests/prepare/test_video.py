@@ -151,7 +151,6 @@ def test_interruption_leaves_nothing(tmp_path, write_video):
     assert not (tmp_path / "run").exists()
 
 
-@pytest.mark.long
 @pytest.mark.skipif(not Path("/proc/self/statm").exists(), reason="resident memory is read from /proc")
 def test_memory_does_not_grow_with_the_length_of_a_video(tmp_path, write_video):
     """2,400 frames of 320x240 would take 550 MB as RGB and 275 MB as decoded."""
