@@ -72,6 +72,22 @@ def test_known_depth_and_open_water_leave_nothing_to_guess(dive, patchy):
     assert len(backdrop.points().xyz) == 0
 
 
+def test_a_frame_that_measured_little_guesses_where_the_cloud_shows_enough(patchy, dive, tmp_path):
+    little, spot = DepthMaps(tmp_path / "little"), torch.zeros(72, 96)
+    spot[30:42, 60:72] = 1
+    for name in dive.rec.names:
+        little.write(name, DepthMap(dive.rec.depth[name].z_depth * spot, spot))
+    rec = replace(patchy, depth=little)
+    found = gathered(rec, dive, 1)
+    assert len(found.xyz) > 200
+    true_z = float(dive.rec.depth[dive.rec.names[0]].z_depth[0, 0])
+    _, guessed_z = project(rec.cameras[0], found.xyz[None].double())
+    assert ((guessed_z[0] - true_z).abs() / true_z).median() < 0.1
+    assert rec.cloud is not None
+    few = DenseCloud(*(values[:100] for values in (rec.cloud.xyz, rec.cloud.raw, rec.cloud.restored)))
+    assert len(gathered(replace(rec, cloud=few), dive, 1).xyz) == 0
+
+
 def test_ground_too_white_for_its_guessed_distance_is_pulled_toward_the_camera_by_a_third_at_most(patchy, dive):
     """Its color is restored over a shorter path; a point there would hang before the lens where the water is wrong."""
     _, image = next(restored_images(patchy, dive.frames, RestoreSettings()))

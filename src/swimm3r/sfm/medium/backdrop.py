@@ -23,7 +23,7 @@ from swimm3r.sfm.medium.restore import RestoredImage
 _CELLS = 48  # cells along the long side of an image in which ground is looked for
 _POINTS = 3  # along each side of a cell
 _SURFACE = 0.5  # share of open water from which there is no ground
-_MEASURED = 0.1  # share of an image below which its known depth is too little to guess the rest from
+_MEASURED = 0.1  # share of an image below which depth known from any frame is too little to guess the rest from
 _NEIGHBORS = 8  # frames before and after that may contradict
 _IN_FRONT = 0.1  # share of a known depth by which a point in front of it hides it
 _BEHIND = 1.5  # times the farthest depth that is filled in: what lies beyond shows nothing of this ground
@@ -45,7 +45,7 @@ class Backdrop:
         camera, name = self.rec.cameras[i], self.rec.names[i]
         f = self.frames.index(name)
         unknown = self.rec.depth[name].z_depth == 0
-        if float(unknown.float().mean()) > 1 - _MEASURED:
+        if float(self._known_anywhere(camera, ~unknown).float().mean()) < _MEASURED:
             return
         guessed = unknown & (image.sea < _SURFACE) & self.frames.mask(f)
         edge = max(camera.width, camera.height) / _CELLS
@@ -76,6 +76,10 @@ class Backdrop:
         none = torch.zeros(0, 3)
         pieces = [vars(piece) for piece in self._pieces] or [{"xyz": none, "raw": none, "restored": none}]
         return DenseCloud(*(torch.cat([piece[key] for piece in pieces]) for key in ("xyz", "raw", "restored")))
+
+    def _known_anywhere(self, camera: Cameras, known: Bool[Tensor, "h w"]) -> Bool[Tensor, "h w"]:
+        """Pixels of a frame at known depth, and those that show points of the cloud."""
+        return known if float(known.float().mean()) >= _MEASURED else known | (self._known.z_depth(camera) > 0)
 
     def _contradicted(self, i: int, xyz: Float[Tensor, "n 3"], color: Float[Tensor, "n 3"]) -> Bool[Tensor, " n"]:
         """More of the neighboring frames that could see a point deny it than confirm it."""
