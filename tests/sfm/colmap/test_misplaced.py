@@ -131,6 +131,27 @@ def test_of_two_ways_to_place_a_small_clip_the_one_that_explains_more_is_kept(
         assert mapping.map_frames(store, settings, silent) == [kept]
 
 
+@pytest.mark.parametrize(("off", "kept_rough"), [(0.02, False), (0.0005, True)])
+def test_a_model_whose_errors_are_large_everywhere_is_compared_with_all_frames_at_once(
+    store: FeatureDatabase,
+    model: pycolmap.Reconstruction,
+    monkeypatch: pytest.MonkeyPatch,
+    off: float,
+    kept_rough: bool,
+):
+    """No frame stands against the others where the first pair's motion squeezed the whole scene."""
+    rough, rng = pycolmap.Reconstruction(model), np.random.default_rng(0)
+    for number, point in rough.points3D.items():
+        rough.points3D[number].xyz = point.xyz * (1 + off * rng.standard_normal(3))
+    rough.update_point_3d_errors()
+    monkeypatch.setattr(mapping, "_try_focal_lengths", lambda *_: [rough])
+    monkeypatch.setattr(mapping, "_map_globally", lambda *_: [model])
+    monkeypatch.setattr(mapping, "_replaced", lambda store, model, *_: (model, True))
+    monkeypatch.setattr(mapping, "flat_share", lambda _: 0.0)
+    settings = replace(SETTINGS, mapping=replace(SETTINGS.mapping, thin_points=1))
+    assert mapping.map_frames(store, settings, silent) == [rough if kept_rough else model]
+
+
 @pytest.mark.parametrize("share", [0.7, 1.3])
 def test_all_frames_at_once_stay_in_place_though_the_lens_was_far_off(
     store: FeatureDatabase, monkeypatch: pytest.MonkeyPatch, share: float

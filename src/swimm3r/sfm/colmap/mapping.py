@@ -2,8 +2,9 @@
 
 A short ladder of focal lengths is mapped until all frames are placed; then frames left over are tried again with looser
 limits, and frames that stand against their matches are placed anew. Flat or small hazy scenes allow more than one
-motion, and a mapper that begins with the wrong one ends with every frame in place, many of them tens of degrees off. So
-clips that leave a doubt are placed twice, frame by frame and all at once, and what explains more observations is kept.
+motion, and a mapper that begins with the wrong one ends with every frame in place, many of them tens of degrees off, or
+with the whole scene squeezed in depth. So clips that leave a doubt are placed twice, frame by frame and all at once,
+and what explains more observations is kept.
 Long clips are placed in chunks (`chunks.long_clip`).
 """
 
@@ -27,6 +28,7 @@ if TYPE_CHECKING:
     import pycolmap
 
 _CLEARLY = 1.1
+_ROUGH = 0.0025  # of an image's width: a mean reprojection error beyond that of most lenses that are yet to be refined
 _FLAT = 0.25  # share of pairs that see a plane, from which the lens and the motion of a pair are ambiguous
 _MAX_ERROR = 4.0  # pixels, where COLMAP drops observations
 _ROUNDS = 3
@@ -79,10 +81,13 @@ def _checked(
 
 
 def _leaves_doubt(store: FeatureDatabase, checked: _Checked, settings: ColmapSettings) -> bool:
-    """Return whether another mapper may do better: frames left over or misplaced, few points, or ground so flat that
-    two frames allow two motions while the lens is open, too.
+    """Return whether another mapper may do better: frames left over or misplaced, few points, large errors, or ground
+    so flat that two frames allow two motions while the lens is open, too.
     """
-    if not checked.clean or checked.models[0].num_reg_images() < store.frames or _is_thin(checked.models, settings):
+    model = checked.models[0]
+    if not checked.clean or model.num_reg_images() < store.frames or _is_thin(checked.models, settings):
+        return True
+    if model.compute_mean_reprojection_error() > _ROUGH * model.cameras[1].width:
         return True
     return settings.intrinsics != "fixed" and flat_share(store) > _FLAT
 
