@@ -18,9 +18,11 @@ from swimm3r.settings import Range, Settings, declarations, ranges_of
 from swimm3r.sfm.features.settings import FeatureSettings
 from swimm3r.sfm.features.sift import extract_features
 from swimm3r.sfm.medium.dense_cloud import dense_cloud
-from swimm3r.sfm.medium.dense_tracks import fuse_depth
+from swimm3r.sfm.medium.dense_tracks import DenseTracks, fuse_depth
+from swimm3r.sfm.medium.light import judge_light
 from swimm3r.sfm.medium.restore import restore_image
-from swimm3r.sfm.medium.seathru import estimate_medium
+from swimm3r.sfm.medium.samples import WaterSamples, collect_samples
+from swimm3r.sfm.medium.seathru import estimate_medium, fit_medium
 from swimm3r.sfm.medium.settings import RestoreSettings, SeathruSettings, TrackSettings
 from swimm3r.sfm.plane_sweep.estimate import estimate_depth
 from swimm3r.sfm.plane_sweep.settings import PlaneSweepSettings
@@ -71,13 +73,54 @@ def posed(dive, tmp_path: Path) -> Reconstruction:
     )
 
 
-@pytest.mark.parametrize(("name", "number"), ends(SeathruSettings))
-def test_the_water_is_fitted_or_the_pixels_are_too_few(name: str, number: float, dive):
+@pytest.fixture(scope="module")
+def tracks(dive) -> DenseTracks:
+    return fuse_depth(dive.rec, dive.frames, FEW.tracks)
+
+
+@pytest.fixture(scope="module")
+def samples(dive, tracks: DenseTracks) -> WaterSamples:
+    return collect_samples(dive.rec, dive.frames, tracks, FEW)
+
+
+@pytest.fixture(scope="module")
+def sampling(dive, tracks: DenseTracks) -> set[str]:
+    """Names of the settings that the collection of samples reads."""
+    read: set[str] = set()
+
+    class Recording(SeathruSettings):
+        def __getattribute__(self, name: str) -> Any:
+            read.add(name)
+            return super().__getattribute__(name)
+
+    collect_samples(dive.rec, dive.frames, tracks, Recording(**vars(FEW)))
+    return read & {*declarations(SeathruSettings)}
+
+
+@pytest.mark.parametrize(("name", "number"), [end for end in ends(SeathruSettings) if "lamp" not in str(end.id)])
+def test_the_water_is_fitted_or_the_pixels_are_too_few(
+    name: str, number: float, dive, tracks: DenseTracks, samples: WaterSamples, sampling: set[str]
+):
     settings = changed(FEW, name, number)
+    if name in sampling:
+        samples = collect_samples(dive.rec, dive.frames, tracks, settings)
     try:
-        assert finite(estimate_medium(dive.rec, dive.frames, settings, "srgb"))
+        assert finite(fit_medium(samples, settings, "srgb"))
     except InputError:
         assert name == "min_samples"
+
+
+@pytest.mark.long
+@pytest.mark.parametrize(("name", "number"), [end for end in ends(SeathruSettings) if "lamp_slope" in str(end.id)])
+def test_the_water_is_fitted_under_a_lamp(name: str, number: float, samples: WaterSamples):
+    assert finite(fit_medium(samples, changed(FEW, name, number), "srgb", "lamp"))
+
+
+@pytest.mark.parametrize(("name", "number"), [end for end in ends(SeathruSettings) if "lamp" in str(end.id)])
+def test_the_light_is_judged(name: str, number: float, samples: WaterSamples, known_water: MediumFit):
+    evidence = judge_light(samples, known_water, changed(FEW, name, number))
+    assert evidence is not None
+    assert evidence.light in ("sun", "lamp")
 
 
 @pytest.mark.parametrize(("name", "number"), ends(TrackSettings))
