@@ -48,6 +48,10 @@ def _ends(rule: Range) -> list[float]:
     return [low, high, *([0] if rule.or_zero else [])]
 
 
+LAMP = [end for end in ends(SeathruSettings) if "lamp" in str(end.id)]
+"""Of the settings that only a lamp's light asks for."""
+
+
 def changed(settings: Settings, name: str, number: float) -> Any:
     kind = int if type(getattr(settings, name)) is int else float
     return replace(settings, **{name: kind(number)})  # pyright: ignore[reportArgumentType]
@@ -97,7 +101,7 @@ def sampling(dive, tracks: DenseTracks) -> set[str]:
     return read & {*declarations(SeathruSettings)}
 
 
-@pytest.mark.parametrize(("name", "number"), [end for end in ends(SeathruSettings) if "lamp" not in str(end.id)])
+@pytest.mark.parametrize(("name", "number"), [end for end in ends(SeathruSettings) if end not in LAMP])
 def test_the_water_is_fitted_or_the_pixels_are_too_few(
     name: str, number: float, dive, tracks: DenseTracks, samples: WaterSamples, sampling: set[str]
 ):
@@ -111,16 +115,20 @@ def test_the_water_is_fitted_or_the_pixels_are_too_few(
 
 
 @pytest.mark.long
-@pytest.mark.parametrize(("name", "number"), [end for end in ends(SeathruSettings) if "lamp_slope" in str(end.id)])
+@pytest.mark.parametrize(("name", "number"), [end for end in LAMP if "slope" in str(end.id)])
 def test_the_water_is_fitted_under_a_lamp(name: str, number: float, samples: WaterSamples):
     assert finite(fit_medium(samples, changed(FEW, name, number), "srgb", "lamp"))
 
 
-@pytest.mark.parametrize(("name", "number"), [end for end in ends(SeathruSettings) if "lamp" in str(end.id)])
-def test_the_light_is_judged(name: str, number: float, samples: WaterSamples, known_water: MediumFit):
-    evidence = judge_light(samples, known_water, changed(FEW, name, number))
+@pytest.mark.parametrize(("name", "number"), [end for end in LAMP if "slope" not in str(end.id)])
+def test_the_light_is_a_lamps_unless_a_threshold_is_out_of_reach(
+    name: str, number: float, samples: WaterSamples, known_water: MediumFit
+):
+    within_reach = replace(FEW, lamp_explained=0.0, lamp_fall_off=0.0, lamp_alone=0.0, lamp_change=0.0)
+    evidence = judge_light(samples, known_water, changed(within_reach, name, number))
     assert evidence is not None
-    assert evidence.light in ("sun", "lamp")
+    assert evidence.fall_off is not None  # so that `lamp_alone` is not asked
+    assert evidence.light == ("lamp" if number == 0 or name == "lamp_alone" else "sun")
 
 
 @pytest.mark.parametrize(("name", "number"), ends(TrackSettings))

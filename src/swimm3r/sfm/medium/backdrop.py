@@ -45,7 +45,7 @@ class Backdrop:
         camera, name = self.rec.cameras[i], self.rec.names[i]
         f = self.frames.index(name)
         unknown = self.rec.depth[name].z_depth == 0
-        if float(self._known_anywhere(camera, ~unknown).float().mean()) < _MEASURED:
+        if not self._knows_enough(camera, ~unknown):
             return
         guessed = unknown & (image.sea < _SURFACE) & self.frames.mask(f)
         edge = max(camera.width, camera.height) / _CELLS
@@ -77,9 +77,11 @@ class Backdrop:
         pieces = [vars(piece) for piece in self._pieces] or [{"xyz": none, "raw": none, "restored": none}]
         return DenseCloud(*(torch.cat([piece[key] for piece in pieces]) for key in ("xyz", "raw", "restored")))
 
-    def _known_anywhere(self, camera: Cameras, known: Bool[Tensor, "h w"]) -> Bool[Tensor, "h w"]:
-        """Pixels of a frame at known depth, and those that show points of the cloud."""
-        return known if float(known.float().mean()) >= _MEASURED else known | (self._known.z_depth(camera) > 0)
+    def _knows_enough(self, camera: Cameras, known: Bool[Tensor, "h w"]) -> bool:
+        """Return whether enough of an image has known depth: of its own (`known`), or with the cloud's points."""
+        if float(known.float().mean()) >= _MEASURED:
+            return True
+        return float((known | (self._known.z_depth(camera) > 0)).float().mean()) >= _MEASURED
 
     def _contradicted(self, i: int, xyz: Float[Tensor, "n 3"], color: Float[Tensor, "n 3"]) -> Bool[Tensor, " n"]:
         """More of the neighboring frames that could see a point deny it than confirm it."""
