@@ -1,12 +1,13 @@
 """Ground without confirmed depth: points where the cloud shows nothing, and nowhere else."""
 
 from dataclasses import replace
+from pathlib import Path
 
 import pytest
 import torch
 
 from swimm3r.cameras import project
-from swimm3r.scene.reconstruction import DenseCloud, DepthMap, DepthMaps
+from swimm3r.scene.reconstruction import DenseCloud, DepthMap, DepthMaps, Reconstruction
 from swimm3r.sfm.medium.backdrop import Backdrop
 from swimm3r.sfm.medium.restore import restored_images
 from swimm3r.sfm.medium.settings import RestoreSettings
@@ -17,10 +18,15 @@ from .test_restore import exact
 @pytest.fixture
 def patchy(dive, tmp_path):
     """The dive with all depth of its left third unknown, in every frame and in the cloud."""
-    depth = DepthMaps(tmp_path / "z_depth")
+    return without_depth(dive, tmp_path / "z_depth", slice(0, 32))
+
+
+def without_depth(dive, folder: Path, columns: slice) -> Reconstruction:
+    """The dive with the depth of some columns unknown in every frame, and the first frame's surface as its cloud."""
+    depth = DepthMaps(folder)
     for name in dive.rec.names:
         z = dive.rec.depth[name].z_depth.clone()
-        z[:, :32] = 0
+        z[:, columns] = 0
         depth.write(name, DepthMap(z, (z > 0).float()))
     column = torch.arange(96).expand(72, 96).flatten()
     rec = replace(dive.rec, depth=depth, medium=exact(dive.medium))
@@ -61,6 +67,14 @@ def test_ground_that_an_earlier_frame_gave_is_not_taken_again(patchy, dive):
         after.add(i, images[i])
     first = len(gathered(patchy, dive, 1).xyz)
     assert first < len(after.points().xyz) < first + 0.7 * len(alone.points().xyz)
+
+
+def test_a_gap_of_the_cloud_narrower_than_a_cell_is_filled(dive, tmp_path):
+    """Cells are 2 px wide and begin at even columns here, so that each of the two that share this gap holds points."""
+    found = gathered(without_depth(dive, tmp_path / "gap", slice(63, 65)), dive, 1)
+    pixels, _ = project(dive.rec.cameras[0], found.xyz[None].double())
+    assert len(found.xyz) > 72
+    assert ((pixels[0, :, 0] > 62.9) & (pixels[0, :, 0] < 65.1)).all()
 
 
 def test_known_depth_and_open_water_leave_nothing_to_guess(dive, patchy):

@@ -62,10 +62,15 @@ def _water(console: Console, medium: dict) -> None:
 
 def _scores(console: Console, test: dict) -> None:
     console.print(
-        f"{test['views']} test frames: PSNR {_number(test['psnr'], 1)} dB"
+        f"{test['views']} test {'frame' if test['views'] == 1 else 'frames'}: PSNR {_number(test['psnr'], 1)} dB"
         f" (if blurred by 4 px: {_number(test['blur4_psnr'], 1)}), SSIM {test['ssim']:.3f},"
         f" sharpness {_number(test['sharpness'], 2)}"
     )
+    if test.get("psnr_observed") is not None and round(100 * test["observed"]) < 100:
+        console.print(
+            f"Of the test frames, training frames saw {_number(100 * test['observed'], 0)} %: PSNR"
+            f" {_number(test['psnr_observed'], 1)} dB, sharpness {_number(test['sharpness_observed'], 2)}"
+        )
     if "flow_px" in test:
         console.print(
             f"On measured ground: displacement {_number(test['flow_px'], 2)} px (90 % below"

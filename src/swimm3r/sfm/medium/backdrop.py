@@ -55,8 +55,7 @@ class Backdrop:
         if not len(row):
             return
         reach = _BEHIND * float(image.ray_depth[row, column].max())
-        shown = _shown_cells(camera, self._nearby(camera, reach), edge)
-        take = ~shown[(row / edge).long(), (column / edge).long()]
+        take = ~self._shown(camera, row, column, reach)
         row, column = row[take], column[take]
         if not len(row):
             return
@@ -101,12 +100,22 @@ class Backdrop:
             votes[at] += torch.where(visible, torch.where(denied, 1.0, -1.0), 0.0)
         return votes > 0
 
-    def _nearby(self, camera: Cameras, reach: float) -> Float[Tensor, "n 3"]:
-        """The cloud and the ground found so far, without what lies farther than `reach` from the camera."""
+    def _shown(
+        self, camera: Cameras, row: Int[Tensor, " n"], column: Int[Tensor, " n"], reach: float
+    ) -> Bool[Tensor, " n"]:
+        """Mask of the pixels at which the cloud or the ground found so far has a point closer than `reach`.
+
+        A point of the dense cloud stands for as much of the image as one point of the lattice. Ground of earlier frames
+        is as sparse as the lattice, so each of its points stands for a whole cell.
+        """
         center = camera.centers[0].float()
         found = torch.cat([torch.zeros(0, 3), *(piece.xyz for piece in self._pieces)])
         found = found[(found - center).square().sum(-1) < reach**2]
-        return torch.cat([self._known.within(center, reach), found]).double()
+        edge = max(camera.width, camera.height) / _CELLS
+        shown = torch.zeros(len(row), dtype=torch.bool)
+        for xyz, size in ((self._known.within(center, reach), edge / _POINTS), (found, edge)):
+            shown |= _cells(camera, xyz.double(), size)[(row / size).long(), (column / size).long()]
+        return shown
 
     def _blurred(self, i: int, row: Int[Tensor, " n"], column: Int[Tensor, " n"]) -> Float[Tensor, "n 3"]:
         """Pixels of a frame's image without what is smaller than the distance between two points."""
@@ -131,7 +140,7 @@ def _lattice(camera: Cameras, step: float) -> tuple[Tensor, Tensor]:
     return row.flatten(), column.flatten()
 
 
-def _shown_cells(camera: Cameras, xyz: Tensor, edge: float) -> Bool[Tensor, "rows columns"]:
+def _cells(camera: Cameras, xyz: Tensor, edge: float) -> Bool[Tensor, "rows columns"]:
     """Mask of the square cells of an image that hold a point."""
     pixels, _, visible = project_visible(camera, xyz[None])
     column, row = (pixels[visible] / edge).long().unbind(-1)
