@@ -18,10 +18,10 @@ from map_terms import scores
 from swimm3r.bench import tables
 from swimm3r.bench.cells import Result, ResultKey, kept_cell
 from swimm3r.bench.scores import columns
+from swimm3r.imaging.appearance import color_tracks
 from swimm3r.imaging.frame_colors import fit_frame_colors
 from swimm3r.pipeline.finished_sfm import open_finished_sfm
 from swimm3r.pipeline.presets import PRESETS
-from swimm3r.splat.appearance import color_tracks
 from swimm3r.splat.settings import UwbsSettings
 
 COLUMNS = columns("psnr_affine", "psnr_observed", "ssim_3dgs", "sharpness_observed", "flow_px")

@@ -14,7 +14,7 @@ ROWS = {  # by package: a room or module imports only rooms of rows before its o
     "swimm3r": [
         {"errors", "progress", "notebook", "rounding"},
         {"io.files", "lamp"},
-        {"medium", "geometry", "cameras", "sim3", "shading"},
+        {"medium", "geometry", "cameras", "sim3", "appearance"},
         {"settings", "water_types", "devices", "memory", "evaluate", "weights"},
         {"settings_document", "io", "raster", "refraction", "tasks"},
         {"scene"},

@@ -6,6 +6,7 @@ import pytest
 import torch
 from scipy.ndimage import gaussian_filter
 
+from swimm3r.appearance import ORDERS, shading_gains
 from swimm3r.evaluate import NotComputed
 from swimm3r.evaluate.images import psnr
 from swimm3r.evaluate.registration import (
@@ -16,7 +17,6 @@ from swimm3r.evaluate.registration import (
     recolored_by_halves,
     recolored_by_tiles,
 )
-from swimm3r.shading import ORDERS, gains
 
 HEIGHT, WIDTH = 180, 240
 INNER = torch.zeros(HEIGHT, WIDTH, dtype=torch.bool)
@@ -138,7 +138,7 @@ def test_a_half_that_nobody_trusts_recolors_nothing(ground):
 def test_recoloring_by_tiles_undoes_a_smooth_gain(ground):
     shading = 0.06 * torch.randn(len(ORDERS), 3, generator=torch.Generator().manual_seed(1))
     everywhere = torch.ones(HEIGHT, WIDTH, dtype=torch.bool)
-    target = (ground @ RECOLOR.mT + 0.05) * gains(shading, HEIGHT, WIDTH).permute(1, 2, 0)
+    target = (ground @ RECOLOR.mT + 0.05) * shading_gains(shading, HEIGHT, WIDTH).permute(1, 2, 0)
     after = recolored_by_tiles(ground, target, everywhere)
     assert psnr(after, target) > psnr(recolored_by_halves(ground, target, everywhere), target) + 6
     assert psnr(after, target) > 35

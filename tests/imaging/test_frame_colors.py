@@ -5,8 +5,8 @@ from dataclasses import replace
 import pytest
 import torch
 
-from swimm3r.imaging.frame_colors import ColorTracks, about_identity, fit_frame_colors, identity_maps
-from swimm3r.shading import ORDERS, cosines
+from swimm3r.appearance import ORDERS, about_identity, cosines, identity_maps
+from swimm3r.imaging.frame_colors import ColorTracks, fit_frame_colors
 
 FRAMES, POINTS = 24, 3000
 BINF, BETA_D, BETA_B = torch.tensor([0.1, 0.5, 0.5]), torch.tensor([0.4, 0.15, 0.12]), torch.tensor([0.3, 0.25, 0.2])

@@ -6,22 +6,16 @@ from pathlib import Path
 import pytest
 import torch
 
+from swimm3r.appearance import ORDERS, FrameColors, about_identity, identity_maps, shading_gains
 from swimm3r.cameras import project_visible
 from swimm3r.errors import InputError
 from swimm3r.evaluate.images import psnr
-from swimm3r.imaging.frame_colors import about_identity, identity_maps
+from swimm3r.imaging.appearance import decide_appearance
 from swimm3r.io.images import write_rgb
 from swimm3r.scene.frames import Frames
 from swimm3r.scene.reconstruction import Reconstruction, Tracks
-from swimm3r.shading import ORDERS, gains
 from swimm3r.splat import train
-from swimm3r.splat.appearance import (
-    FrameColors,
-    decide_appearance,
-    fit_to_view,
-    read_decision,
-    write_decision,
-)
+from swimm3r.splat.appearance import fit_to_view, read_decision, write_decision
 from swimm3r.splat.map_file import load_map
 from swimm3r.splat.pose_refinement import refine_pose
 from swimm3r.splat.settings import (
@@ -33,7 +27,7 @@ from swimm3r.splat.settings import (
     UwbsSettings,
     with_recipe,
 )
-from swimm3r.splat.shared_settings import AppearanceSettings
+from swimm3r.splat.shared_settings import MapAppearanceSettings
 from swimm3r.splat.training.loop import refit_steps
 from swimm3r.splat.views import TrainingViews
 
@@ -69,7 +63,7 @@ def relit(tiny_dive, tmp_path_factory) -> Frames:
 
 
 def test_steady_frames_need_no_colors_of_their_own(tiny_dive, tracked):
-    decided = decide_appearance(tracked, tiny_dive.frames, tracked.names, AppearanceSettings())
+    decided = decide_appearance(tracked, tiny_dive.frames, tracked.names, MapAppearanceSettings())
     assert not decided.decision.on
     assert decided.colors is None
     assert decided.decision.by_frames is not None
@@ -86,7 +80,7 @@ def test_a_record_of_small_changes_decides_where_the_images_alone_do_not(tiny_di
         listed.append(replace(frame, path=path, gains=gains[i]))
     told = replace(tiny_dive.frames, frames=tuple(listed))
     silent = replace(told, frames=tuple(replace(frame, gains=None) for frame in listed))
-    settings = AppearanceSettings(least_explained=0.9)
+    settings = MapAppearanceSettings(least_explained=0.9)
     assert not decide_appearance(tracked, silent, tracked.names, settings).decision.on
     decision = decide_appearance(tracked, told, tracked.names, settings).decision
     assert decision.on
@@ -97,7 +91,7 @@ def test_a_record_of_small_changes_decides_where_the_images_alone_do_not(tiny_di
 
 
 def test_frames_of_changing_exposure_get_colors_that_undo_it(tiny_dive, tracked, relit):
-    decided = decide_appearance(tracked, relit, tracked.names, AppearanceSettings())
+    decided = decide_appearance(tracked, relit, tracked.names, MapAppearanceSettings())
     assert decided.decision.on
     assert decided.decision.by_frames is not None
     assert decided.decision.by_frames > 0.5
@@ -115,13 +109,13 @@ def test_frames_of_changing_exposure_get_colors_that_undo_it(tiny_dive, tracked,
 
 @pytest.mark.parametrize(("mode", "on"), [("off", False), ("on", True)])
 def test_the_decision_can_be_made_by_hand(tiny_dive, tracked, mode, on):
-    decided = decide_appearance(tracked, tiny_dive.frames, tracked.names, AppearanceSettings(mode=mode))
+    decided = decide_appearance(tracked, tiny_dive.frames, tracked.names, MapAppearanceSettings(mode=mode))
     assert decided.decision.on == on
     assert (decided.colors is not None) == on
 
 
 def test_without_tracks_nothing_is_fitted(tiny_dive):
-    decided = decide_appearance(tiny_dive.rec, tiny_dive.frames, tiny_dive.rec.names, AppearanceSettings())
+    decided = decide_appearance(tiny_dive.rec, tiny_dive.frames, tiny_dive.rec.names, MapAppearanceSettings())
     assert not decided.decision.on
     assert "too few points" in decided.decision.reason
 
@@ -130,7 +124,7 @@ def test_without_tracks_nothing_is_fitted(tiny_dive):
 def test_a_map_of_relit_frames_is_that_of_steady_ones(tiny_dive, tracked, relit, tmp_path):
     own = {name: GAINS[tiny_dive.frames.index(name) % 5] for name in tracked.names}
     mean = torch.stack(list(own.values())).mean(0)
-    off = replace(SETTINGS, appearance=AppearanceSettings(mode="off"))
+    off = replace(SETTINGS, appearance=MapAppearanceSettings(mode="off"))
     scores = {}
     for name, frames, settings in (
         ("steady", tiny_dive.frames, SETTINGS),
@@ -193,8 +187,8 @@ def test_an_interrupted_training_goes_on_with_its_colors(tracked, tone_mapped, t
 
 
 def test_colors_are_fitted_again_in_the_second_part_of_a_run():
-    assert sorted(refit_steps(AppearanceSettings(refits=3), 2000)) == [800, 1200, 1600]
-    assert not refit_steps(AppearanceSettings(refits=0), 2000)
+    assert sorted(refit_steps(MapAppearanceSettings(refits=3), 2000)) == [800, 1200, 1600]
+    assert not refit_steps(MapAppearanceSettings(refits=0), 2000)
 
 
 def test_a_refit_composes_with_the_maps_of_before():
@@ -230,27 +224,27 @@ def tone_mapped(tiny_dive, tmp_path_factory) -> Frames:
     listed, shading = [], shadings(len(tiny_dive.frames), 0.08)
     for i, frame in enumerate(tiny_dive.frames):
         path, image = folder / frame.name, tiny_dive.frames.image(i)
-        image = image * GAINS[i % 5] * gains(shading[i], *image.shape[:2]).permute(1, 2, 0)
+        image = image * GAINS[i % 5] * shading_gains(shading[i], *image.shape[:2]).permute(1, 2, 0)
         write_rgb(path, image.clamp(0, 1).numpy())
         listed.append(replace(frame, path=path))
     return replace(tiny_dive.frames, frames=tuple(listed))
 
 
 def test_gains_that_change_over_frames_are_told_from_those_that_do_not(tiny_dive, tracked, relit, tone_mapped):
-    plain = decide_appearance(tracked, relit, tracked.names, AppearanceSettings())
+    plain = decide_appearance(tracked, relit, tracked.names, MapAppearanceSettings())
     assert plain.decision.on
     assert not plain.decision.shaded
     assert plain.colors is not None
     assert plain.colors.shading is None
-    local = decide_appearance(tracked, tone_mapped, tracked.names, AppearanceSettings())
+    local = decide_appearance(tracked, tone_mapped, tracked.names, MapAppearanceSettings())
     assert local.decision.shaded
     assert local.decision.by_shading is not None
     assert local.decision.by_shading > 0.4
     assert "smoothly over each frame" in local.decision.reason
-    for_these_alone = AppearanceSettings(least_explained=1.0, least_recorded=1.0)
+    for_these_alone = MapAppearanceSettings(least_explained=1.0, least_recorded=1.0)
     assert decide_appearance(tracked, tone_mapped, tracked.names, for_these_alone).decision.shaded
     assert not decide_appearance(tracked, relit, tracked.names, for_these_alone).decision.on
-    by_hand = decide_appearance(tracked, tone_mapped, tracked.names, AppearanceSettings(shading="off"))
+    by_hand = decide_appearance(tracked, tone_mapped, tracked.names, MapAppearanceSettings(shading="off"))
     assert by_hand.decision.on
     assert not by_hand.decision.shaded
 
@@ -259,7 +253,7 @@ def test_common_colors_of_tone_mapped_frames_are_those_of_the_dive(tiny_dive, tr
     mean = torch.stack([GAINS[tiny_dive.frames.index(name) % 5] for name in tracked.names]).mean(0)
     errors = {}
     for shading in ("auto", "off"):
-        settings = AppearanceSettings(shading=shading)
+        settings = MapAppearanceSettings(shading=shading)
         colors = decide_appearance(tracked, tone_mapped, tracked.names, settings).colors
         assert colors is not None
         off = []
@@ -275,7 +269,10 @@ def test_common_colors_of_tone_mapped_frames_are_those_of_the_dive(tiny_dive, tr
 def test_a_map_of_tone_mapped_frames_learns_from_common_colors(tiny_dive, tracked, tone_mapped, tmp_path):
     scenes = {
         shading: train(
-            tracked, tone_mapped, replace(SETTINGS, appearance=AppearanceSettings(shading=shading)), tmp_path / shading
+            tracked,
+            tone_mapped,
+            replace(SETTINGS, appearance=MapAppearanceSettings(shading=shading)),
+            tmp_path / shading,
         )
         for shading in ("auto", "off")
     }
@@ -297,7 +294,7 @@ def test_a_refit_finds_what_a_shading_leaves():
     filmed = {}
     for k, name in enumerate(true.names):
         affine = (true.maps[k, :, :3] @ scene.flatten(1) + true.maps[k, :, 3:]).reshape(scene.shape)
-        filmed[name] = affine * gains(true.shading[k], 40, 48)
+        filmed[name] = affine * shading_gains(true.shading[k], 40, 48)
     colors = FrameColors(true.names, identity_maps(3), torch.zeros(3, len(ORDERS), 3))
     off = []
     for _ in range(4):
@@ -324,7 +321,7 @@ def test_a_pose_is_refined_in_the_frames_own_colors(tiny_dive):
 
 
 def test_the_decision_comes_back_from_disk(tiny_dive, tracked, tmp_path):
-    decision = decide_appearance(tracked, tiny_dive.frames, tracked.names, AppearanceSettings()).decision
+    decision = decide_appearance(tracked, tiny_dive.frames, tracked.names, MapAppearanceSettings()).decision
     assert read_decision(tmp_path) is None
     write_decision(tmp_path, decision)
     assert read_decision(tmp_path) == decision

@@ -5,12 +5,12 @@ import numpy as np
 import pytest
 import torch
 
+from swimm3r.appearance import shading_gains
 from swimm3r.cameras import directions, pixel_grid, project, unproject
 from swimm3r.errors import InputError, UsageError
 from swimm3r.io import images
 from swimm3r.medium import add_water, linear_from_srgb
 from swimm3r.scene.ground_truth import read_ground_truth
-from swimm3r.shading import gains
 from swimm3r.synthetic import Coefficients, DiveSettings, make_dive, write_dive
 from swimm3r.synthetic.disturbances import swimming
 from swimm3r.synthetic.dive import water
@@ -241,10 +241,10 @@ def test_a_dive_that_is_there_already_is_left_alone(tmp_path):
 def test_a_camera_that_maps_tones_by_place_changes_gains_over_its_frames(dive, frames):
     mapped = replace(dive, settings=replace(QUIET, local_exposure=0.4))
     seen, still = linear_from_srgb(mapped.frame(0).raw), linear_from_srgb(frames[0].raw)
-    told = gains(mapped.shading(0), *seen.shape[:2]).permute(1, 2, 0)
+    told = shading_gains(mapped.shading(0), *seen.shape[:2]).permute(1, 2, 0)
     unclipped = (seen < 0.99).all(-1)
     torch.testing.assert_close(seen[unclipped], (still * told)[unclipped], atol=1e-5, rtol=1e-4)
-    stops = torch.stack([gains(mapped.shading(i), 60, 80).log2() for i in range(200)])
+    stops = torch.stack([shading_gains(mapped.shading(i), 60, 80).log2() for i in range(200)])
     assert float(stops.square().mean().sqrt()) == pytest.approx(0.4, rel=0.1)
     assert torch.equal(mapped.frame(0).clear, frames[0].clear)
 

@@ -18,9 +18,9 @@ import torch
 from jaxtyping import Bool, Float
 from torch import Tensor
 
+from swimm3r.appearance import image_cosines
 from swimm3r.evaluate import NotComputed
 from swimm3r.evaluate.images import as_8_bit, psnr
-from swimm3r.shading import image_cosines
 
 FLOW_SIDE = 480
 """Longer side in pixels of the images whose flow is taken; larger ones are reduced to it."""
@@ -94,8 +94,8 @@ def recolored_by_tiles(
 ) -> Float[Tensor, "h w 3"]:
     """A rendering in the colors of a frame whose gains change over the image, each half by the fit to the other half.
 
-    The fit is an affine map and a smooth gain (`swimm3r.shading`), A c + b + s(x, y) c. The halves are the dark and the
-    light fields of a chessboard, for a gain beyond the pixels that it was fitted to would be a guess.
+    The fit is an affine map and a smooth gain (`swimm3r.appearance`), A c + b + s(x, y) c. The halves are the dark and
+    the light fields of a chessboard, for a gain beyond the pixels that it was fitted to would be a guess.
     """
     height, width = render.shape[:2]
     side = max(1, round(max(height, width) / _TILES))

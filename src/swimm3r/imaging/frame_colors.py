@@ -16,7 +16,7 @@ exposure and white balance are; the others, and offsets, are held closer to 0, a
 resemble frames with an offset.
 
 Where the gains of a frame change over the image, as under local tone mapping, I_f = e^(s_f) (M_f S + b_f) with the
-shading s_f of `swimm3r.shading`, 0 on average over frames at every place. A further model has them, too.
+shading s_f of `swimm3r.appearance`, 0 on average over frames at every place. A further model has them, too.
 
 Where the camera recorded its gains g_f on linear light, they make a model of their own, whose one free number is the
 slope of the tone curve: M_f = diag(g_f^slope), about the identity. Maps of frames are then held to these, not to 1.
@@ -31,7 +31,7 @@ from jaxtyping import Float, Int
 from scipy.sparse import csr_matrix
 from torch import Tensor
 
-from swimm3r.shading import ORDERS
+from swimm3r.appearance import ORDERS, about_identity
 
 _ROUNDS = 8  # of alternating fits
 _GAIN_STD, _MIX_STD, _OFFSET_STD = 0.3, 0.05, 0.02  # of a frame's map about the identity, before anything is seen
@@ -58,7 +58,7 @@ class ColorTracks:
     T_D: Float[Tensor, "o 3"] | None = None  # of the measured water; None where none was
     backscatter: Float[Tensor, "o 3"] | None = None
     gains: Float[Tensor, "f 3"] | None = None  # of linear light, by the camera's record
-    cosines: Float[Tensor, "o k"] | None = None  # `swimm3r.shading`, at the places of the observations in their images
+    cosines: Float[Tensor, "o k"] | None = None  # of shadings, at the places of the observations in their images
 
 
 @dataclass(frozen=True)
@@ -137,19 +137,6 @@ def fit_frame_colors(tracks: ColorTracks) -> FrameColorFit | None:
         fit = _final(seen, center, shaded=True)
         with_shading = ShadedFit(torch.from_numpy(fit.maps).float(), torch.from_numpy(fit.shading).float())
     return FrameColorFit(torch.from_numpy(_final(seen, center).maps).float(), evidence, with_shading)
-
-
-def identity_maps(count: int) -> Float[Tensor, "f 3 4"]:
-    """The maps of frames whose colors do not change."""
-    return torch.eye(3, 4).repeat(count, 1, 1)
-
-
-def about_identity(maps: Float[Tensor, "f 3 4"]) -> Float[Tensor, "f 3 4"]:
-    """The same maps of other common colors: those of which they are the identity on average."""
-    mean = maps.double().mean(0)
-    matrix = maps[..., :3].double() @ torch.linalg.inv(mean[:, :3])
-    offset = maps[..., 3].double() - matrix @ mean[:, 3]
-    return torch.cat([matrix, offset[..., None]], -1).to(maps)
 
 
 @dataclass(frozen=True)

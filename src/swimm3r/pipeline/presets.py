@@ -29,7 +29,7 @@ from swimm3r.splat.settings import (
     TrainingPoseSettings,
     UwbsSettings,
 )
-from swimm3r.splat.shared_settings import AppearanceSettings
+from swimm3r.splat.shared_settings import MapAppearanceSettings
 
 _REMEDY = Remedy(
     cause="it was edited, or written by another version of swimm3r",
@@ -138,7 +138,7 @@ PAPER = UwbsSettings(  # Eq. 18 and nothing else; where the paper is silent UBS'
     ),
     densify=DensifySettings(noise_dynamic=1.0),
     movers=MoverSettings(at=0.0),
-    appearance=AppearanceSettings(mode="off"),
+    appearance=MapAppearanceSettings(mode="off"),
 )
 
 PRESETS: dict[Preset, RunSettings] = {

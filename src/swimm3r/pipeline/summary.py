@@ -8,6 +8,7 @@ import torch
 from jaxtyping import Bool, Float
 from torch import Tensor
 
+from swimm3r.appearance import FrameColors
 from swimm3r.evaluate import NotComputed, summary_entries
 from swimm3r.evaluate.matches import epipolar_errors, match_scores
 from swimm3r.imaging.undistortion import undistorted_matches
@@ -17,7 +18,7 @@ from swimm3r.medium import Medium, MediumFit
 from swimm3r.pipeline.scores.held_out import HeldOutView, mean_part, mean_scores, protocol
 from swimm3r.scene.frames import Frames
 from swimm3r.scene.reconstruction import Matches, Reconstruction
-from swimm3r.splat.appearance import FrameColors, read_decision
+from swimm3r.splat.appearance import read_decision
 from swimm3r.splat.rendering import SplatMap, mean_water
 from swimm3r.splat.settings import PoseRefinementSettings
 
@@ -74,6 +75,8 @@ def sfm_sections(
         sections["moving"] = {"frames": len(shares), **covered}
     if rec.steady is not None:
         sections["flicker"] = {"evened_frames": rec.steady.count(frames)}
+    if rec.own_colors is not None:
+        sections["exposure"] = {"evened_frames": len(rec.own_colors.names)}
     if rec.medium is not None:
         sections["medium"] = {"sfm": _medium_section(rec.medium, rec.metric)}
         if rec.medium_linear is not None:

@@ -1,14 +1,21 @@
-"""Changes of frames by structure from motion, on disk: one NAME.png for each frame that has any."""
+"""Changes of frames by structure from motion, on disk: one NAME.png for each frame that has any, or one color map."""
 
+import json
 import shutil
 from collections.abc import Iterator
 from dataclasses import dataclass, replace
 from pathlib import Path
 
-from swimm3r.io.files.atomic import atomic_folder
+import torch
+
+from swimm3r.appearance import FrameColors
+from swimm3r.io.files.atomic import atomic_folder, write_text
+from swimm3r.io.files.damage import Remedy, guard
+from swimm3r.io.files.json_file import read_json
 from swimm3r.scene.frames import Frames
 
 STEADY = "steady"  # the folder of frames in steady light, in that of a reconstruction
+OWN_COLORS = "frame_colors.json"  # the color maps of single frames, there
 
 
 @dataclass(frozen=True)
@@ -59,3 +66,31 @@ class SteadyFrames(_FrameFiles):
     def count(self, frames: Frames) -> int:
         """Number of the frames whose light was evened out."""
         return sum(frame.name in self for frame in frames)
+
+
+@dataclass(frozen=True)
+class _OwnColors:
+    """An entry of frame_colors.json: rows of (M, b) for red, green and blue, and a row of the shading per cosine."""
+
+    map: tuple[tuple[float, float, float, float], ...]
+    shading: tuple[tuple[float, float, float], ...] | None = None
+
+
+def save_own_colors(path: Path, colors: FrameColors) -> None:
+    """Write a frame_colors.json, whole or not at all: the map of each frame and, where there is one, its shading."""
+    frames = {name: {"map": own.tolist()} for name, own in zip(colors.names, colors.maps, strict=True)}
+    if colors.shading is not None:
+        for name, shading in zip(colors.names, colors.shading, strict=True):
+            frames[name]["shading"] = shading.tolist()
+    write_text(path, json.dumps(frames, indent=1) + "\n")
+
+
+def read_own_colors(path: Path, remedy: Remedy) -> FrameColors:
+    """Read what `save_own_colors` wrote. Raises the remedy's error, which names the file and the fault."""
+    stored = read_json(path, dict[str, _OwnColors], remedy)
+    with guard(path, remedy):
+        maps = torch.tensor([own.map for own in stored.values()])
+        shaded = [own.shading for own in stored.values() if own.shading is not None]
+        if maps.shape[1:] != (3, 4) or len(shaded) not in (0, len(stored)):
+            raise ValueError("every frame has a map of 3 rows, and all or none have a shading")
+        return FrameColors(tuple(stored), maps, torch.tensor(shaded) if shaded else None)

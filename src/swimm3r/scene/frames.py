@@ -18,6 +18,7 @@ from jaxtyping import Bool, Float, Int
 from torch import Tensor
 
 from swimm3r import notebook
+from swimm3r.appearance import FrameColors
 from swimm3r.errors import InputError
 from swimm3r.io import images
 from swimm3r.io.files.atomic import atomic_folder, write_text
@@ -68,6 +69,7 @@ class Frames:
     rig: Rig | None = None  # cameras that are fixed to each other; frames of one instant are neighbors in the list
     development: str | None = None  # how raw, linear or log values became sRGB's; None where frames are as stored
     rows_rectified: bool = False  # rows that were exposed while the camera turned are drawn as at half time
+    own_colors: FrameColors | None = None  # of frames that are given in the dive's common colors; None: all as stored
 
     def __len__(self) -> int:
         return len(self.frames)
@@ -154,11 +156,19 @@ class Frames:
         return tuple(times[name] for name in names)
 
     def image(self, i: int) -> Float[Tensor, "h w 3"]:
-        """Image i as stored (sRGB-encoded, raw and log inputs too), 0..1. Raises InputError on a damaged one."""
-        return _unit(self._stored(i))
+        """Image i as stored (sRGB-encoded, raw and log inputs too), 0..1. Raises InputError on a damaged one.
+
+        Of frames with `own_colors` it is in the colors that the dive has on average, which may leave 0..1 a little.
+        """
+        image, name = _unit(self._stored(i)), self.frames[i].name
+        if self.own_colors is None or name not in self.own_colors.names:
+            return image
+        return self.own_colors.common(name, image.permute(2, 0, 1)).permute(1, 2, 0)
 
     def colors(self, i: int, pixels: Int[Tensor, " n"]) -> Float[Tensor, "n 3"]:
         """Some pixels of image i, by their row-major index; cheaper than `image`, which converts all of it."""
+        if self.own_colors is not None:
+            return self.image(i).reshape(-1, 3)[pixels]
         return _unit(self._stored(i).reshape(-1, 3)[pixels.numpy()])
 
     def mask(self, i: int) -> Bool[Tensor, "h w"]:

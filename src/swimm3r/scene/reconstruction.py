@@ -2,14 +2,15 @@
 
 On disk (`Reconstruction.save`, `reconstruction_io.load_reconstruction`) it is a folder: sparse/ (COLMAP model),
 cameras.json, trajectory.tum, z_depth/NAME.npz, masks/NAME.png (0 at moving objects), steady/NAME.png (frames without
-the flicker of the sun), matches.npz, medium.json, white_balance.json, reconstruction.json (back end, metric flag,
-warnings, points found), and the dense cloud in three colors, points.ply (as shown: restored and white-balanced),
-points_physical.ply (restored) and points_raw.ply (as filmed); backdrop.ply and its two are ground at a guessed depth.
+the flicker of the sun), matches.npz, medium.json, white_balance.json, frame_colors.json (of frames in exposures of
+their own), reconstruction.json (back end, metric flag, warnings, points found), and the dense cloud in three colors,
+points.ply (as shown: restored and white-balanced), points_physical.ply (restored) and points_raw.ply (as filmed);
+backdrop.ply and its two are ground at a guessed depth.
 """
 
 import json
 import shutil
-from dataclasses import asdict, dataclass
+from dataclasses import asdict, dataclass, replace
 from pathlib import Path
 
 import numpy as np
@@ -18,6 +19,7 @@ from jaxtyping import Float, Int
 from torch import Tensor
 
 from swimm3r import notebook
+from swimm3r.appearance import FrameColors
 from swimm3r.cameras import Cameras, project, rows_of_frames
 from swimm3r.io import ply
 from swimm3r.io.colmap import model as colmap
@@ -29,7 +31,7 @@ from swimm3r.io.files.outputs import check_empty
 from swimm3r.io.trajectory import write_tum
 from swimm3r.lamp import Lamp, rescaled_lamp
 from swimm3r.medium import MediumFit, save_fits
-from swimm3r.scene.frame_changes import STEADY, MovingMasks, SteadyFrames
+from swimm3r.scene.frame_changes import OWN_COLORS, STEADY, MovingMasks, SteadyFrames, save_own_colors
 from swimm3r.scene.frames import MASKS, Frames
 from swimm3r.scene.rig import RigFit
 from swimm3r.scene.white_balance import UNBALANCED, WHITE_BALANCE, WhiteBalance
@@ -174,6 +176,7 @@ class Reconstruction:
     rig: RigFit | None = None  # of a clip of several cameras that are fixed to each other
     moving: MovingMasks | None = None  # None: moving objects were not looked for
     steady: SteadyFrames | None = None  # None: the light does not flicker, or was kept
+    own_colors: FrameColors | None = None  # None: one exposure and white balance, or frames were restored as filmed
 
     def __repr__(self) -> str:
         dense = "" if self.cloud is None else f", {len(self.cloud.xyz):,} dense points"
@@ -212,6 +215,10 @@ class Reconstruction:
         """The frames with masks of moving objects, where these were looked for, and in steady light."""
         masked = frames if self.moving is None else self.moving.on(frames)
         return masked if self.steady is None else self.steady.on(masked)
+
+    def evened(self, frames: Frames) -> Frames:
+        """The same in the dive's common exposure and white balance: the frames that restored ones are made from."""
+        return replace(self.still(frames), own_colors=self.own_colors)
 
     def index(self, name: str) -> int:
         """The position of a registered frame by its name."""
@@ -275,6 +282,8 @@ class Reconstruction:
                 for kind, rgb in colors.items():
                     ply.write_points(folder / f"{stem}{kind}.ply", cloud.xyz.numpy(), rgb.numpy())
         self.white_balance.save(folder / WHITE_BALANCE)
+        if self.own_colors is not None:
+            save_own_colors(folder / OWN_COLORS, self.own_colors)
         about = {"backend": self.backend, "metric": self.metric, "warnings": [vars(each) for each in self.warnings]}
         about["points_found"] = self.points_found
         about["up"] = self.up

@@ -16,7 +16,7 @@ from swimm3r.io.colmap import model as colmap
 from swimm3r.io.files.array_file import Layout, read_arrays
 from swimm3r.io.files.damage import guard, remake
 from swimm3r.io.files.json_file import read_json
-from swimm3r.scene.frame_changes import STEADY, MovingMasks, SteadyFrames
+from swimm3r.scene.frame_changes import OWN_COLORS, STEADY, MovingMasks, SteadyFrames, read_own_colors
 from swimm3r.scene.frames import MASKS, Frames
 from swimm3r.scene.reconstruction import DenseCloud, DepthMaps, Matches, Points, QualityWarning, Reconstruction, Tracks
 from swimm3r.scene.rig import RigFit
@@ -82,6 +82,7 @@ def load_reconstruction(folder: str | Path, frames: Frames | None = None) -> Rec
         rig=about.rig,
         moving=MovingMasks(folder / MASKS) if (folder / MASKS).is_dir() else None,
         steady=SteadyFrames(folder / STEADY) if (folder / STEADY).is_dir() else None,
+        own_colors=read_own_colors(folder / OWN_COLORS, remedy) if (folder / OWN_COLORS).is_file() else None,
     )
 
 

@@ -18,13 +18,12 @@ from typing import Any, cast
 
 from torch import Tensor
 
+from swimm3r.appearance import ORDERS, FrameColors
 from swimm3r.cameras import Cameras, check_cameras, check_poses
 from swimm3r.io.files.damage import Remedy, guard
 from swimm3r.io.files.safe_names import check_names
 from swimm3r.io.files.tensor_file import read_tensors
 from swimm3r.settings_document import from_document
-from swimm3r.shading import ORDERS
-from swimm3r.splat.appearance import FrameColors
 from swimm3r.splat.block_store import BlockEntry, StoredBlocks
 from swimm3r.splat.medium.lamp import NO_LIGHT
 from swimm3r.splat.primitives.kinds import primitives_from

@@ -12,13 +12,13 @@ from torch import Tensor
 from torch.nn.functional import relu
 
 from swimm3r import devices, notebook
+from swimm3r.appearance import FrameColors
 from swimm3r.cameras import Cameras
 from swimm3r.io.files.tensor_file import write_tensors
 from swimm3r.io.images import jpeg_uri
 from swimm3r.medium import Medium
 from swimm3r.raster import MediumMaps, RasterOutput, SggBuffers, rasterize
 from swimm3r.settings_document import to_document
-from swimm3r.splat.appearance import FrameColors
 from swimm3r.splat.block_store import StoredBlocks, joined
 from swimm3r.splat.gaussian_settings import GaussianSettings
 from swimm3r.splat.medium.field import (

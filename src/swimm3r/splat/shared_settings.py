@@ -3,6 +3,7 @@
 from dataclasses import dataclass, field
 from typing import Annotated, Literal
 
+from swimm3r.imaging.settings import AppearanceSettings
 from swimm3r.settings import Cadence, Count, LongSideOrOwn, NotNegative, Positive, Range, Rate, Seed, Settings, Share
 
 DILATION = 0.3
@@ -61,24 +62,9 @@ class TrainingPoseSettings(Settings):
 
 
 @dataclass(frozen=True)
-class AppearanceSettings(Settings):
-    """Exposure and white balance of single frames (`splat/appearance.py`)."""
+class MapAppearanceSettings(AppearanceSettings):
+    """Exposure and white balance of single frames in training (`splat/appearance.py`)."""
 
-    mode: Literal["auto", "on", "off"] = "auto"
-    """Give every frame an affine color map of its own, the identity on average: always, never, or where the sparse
-    points say that frames differ in more than their distances (auto)."""
-    least_explained: Share = 0.2
-    """Smallest share that frames must explain of the variation that the water leaves, with `auto`."""
-    least_recorded: Share = 0.05
-    """Share of that variation from which the exposure and white balance that the camera recorded are enough, with
-    `auto`: but for one slope of the tone curve, nothing is fitted to them."""
-    least_change: Share = 0.006
-    """Smallest change of colors, in pixel values, that frames must explain, with `auto`."""
-    shading: Literal["auto", "on", "off"] = "auto"
-    """Give every frame gains that change smoothly over the image beside its color map, which it then has in any case:
-    always, never, or where the sparse points say so (auto)."""
-    least_shading: Share = 0.5
-    """Smallest share that such gains must explain of the variation that water and color maps leave, with `auto`."""
     refits: Annotated[int, Range(0, 100)] = 3
     """Number of times that the maps are fitted again during training, evenly spaced over its second part."""
 
@@ -97,7 +83,7 @@ class MapSettings(Settings):
     """Ground that `initial.primitives` and `densify.cap_max` are for, in the area that one image shows at the median
     depth. More ground has primitives in proportion, up to that of a block (`blocks.largest`)."""
     poses: TrainingPoseSettings = field(default_factory=TrainingPoseSettings)
-    appearance: AppearanceSettings = field(default_factory=AppearanceSettings)
+    appearance: MapAppearanceSettings = field(default_factory=MapAppearanceSettings)
     seed: Seed = 0
     """Seed of the random number generator."""
     log_every: Cadence = 0.005

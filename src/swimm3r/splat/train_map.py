@@ -12,12 +12,13 @@ from swimm3r import devices
 from swimm3r.cameras import Cameras
 from swimm3r.devices import CPU
 from swimm3r.errors import UsageError
+from swimm3r.imaging.appearance import AppearanceDecision, decide_appearance
 from swimm3r.imaging.undistortion import nearest_pixels, shown_pixels
 from swimm3r.progress import Progress, silent
 from swimm3r.scene.frames import Frames
 from swimm3r.scene.reconstruction import Reconstruction
 from swimm3r.scene.surface import Surface, surface_of
-from swimm3r.splat.appearance import AppearanceDecision, decide_appearance, write_decision
+from swimm3r.splat.appearance import write_decision
 from swimm3r.splat.block_store import no_primitives
 from swimm3r.splat.blocks.plan import PlannedBlock, plan_blocks
 from swimm3r.splat.blocks.training import train_in_blocks
@@ -64,7 +65,9 @@ def train(
     settings = _for_ground(settings, float(surface.area.sum()))
     views = TrainingViews(rec, frames, settings, scale)
     appearance = decide_appearance(rec, frames, views.names, settings.appearance)
-    write_decision(folder, appearance.decision)
+    decided = appearance.decision
+    log.info("colors of single frames %s: %s", "fitted" if decided.on else "not fitted", decided.reason)
+    write_decision(folder, decided)
     views.colors = appearance.colors
     poses_in_training = training_poses_of(rec, views.names, views.cameras, scale) if settings.poses.enabled else None
     radius = path_radius(rec, scale, settings.working_depth)

@@ -15,6 +15,7 @@ from scipy.ndimage import distance_transform_edt
 from torch import Tensor
 from torch.nn.functional import interpolate, normalize
 
+from swimm3r.appearance import FrameColors
 from swimm3r.cameras import Cameras, image_directions, pixel_grid, resized, unproject
 from swimm3r.devices import CPU
 from swimm3r.errors import InputError
@@ -24,7 +25,6 @@ from swimm3r.imaging.undistortion import nearest_pixels, undistorted
 from swimm3r.io.files.cache import ArrayCache
 from swimm3r.scene.frames import Frames
 from swimm3r.scene.reconstruction import Reconstruction
-from swimm3r.splat.appearance import FrameColors
 from swimm3r.splat.ground import Window
 from swimm3r.splat.settings import SplatSettings
 
@@ -37,7 +37,7 @@ class TrainingView:
 
     name: str
     camera: Cameras  # one pinhole, working units
-    rgb: Float[Tensor, "3 h w"]  # in the colors that the dive has on average (`splat.appearance`)
+    rgb: Float[Tensor, "3 h w"]  # in the colors that the dive has on average (`swimm3r.appearance`)
     seen: Bool[Tensor, "h w"]
     z_depth: Float[Tensor, "h w"]  # working units, 0 = unknown or doubtful
     open_water: Bool[Tensor, "h w"]  # looks past every surface; nowhere where depth is not read

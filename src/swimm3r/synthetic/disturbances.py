@@ -8,9 +8,9 @@ import torch
 from jaxtyping import Bool, Float
 from torch import Tensor
 
+from swimm3r.appearance import ORDERS
 from swimm3r.cameras import Cameras, ray_depth_from_z
 from swimm3r.medium import Medium, add_water, linear_from_srgb, srgb_from_linear
-from swimm3r.shading import ORDERS
 from swimm3r.synthetic.seafloor import Seafloor, height_at
 
 _BODY = (0.19, 0.072, 0.04)  # m, half axes: along, up, across
@@ -160,7 +160,7 @@ def camera_gains(exposure: float, white_balance: float, rng: np.random.Generator
 
 
 def local_tones(stops: float, rng: np.random.Generator) -> Float[Tensor, "k 3"]:
-    """One frame's shading of linear light (`swimm3r.shading`), `stops` over the image; all channels have nearly one."""
+    """One frame's shading of linear light (`swimm3r.appearance`), `stops` over the image, alike in all channels."""
     shape = (len(ORDERS), 3)
     drawn = rng.standard_normal((shape[0], 1)) + 0.3 * rng.standard_normal(shape)
     each = stops * math.log(2) / math.sqrt(sum(0.5 ** ((i > 0) + (j > 0)) for i, j in ORDERS))

@@ -28,6 +28,7 @@ from jaxtyping import Bool, Float
 from torch import Tensor
 
 from swimm3r import water_types
+from swimm3r.appearance import shading_gains
 from swimm3r.cameras import Cameras
 from swimm3r.errors import InputError
 from swimm3r.io import images
@@ -38,7 +39,6 @@ from swimm3r.medium import Medium, add_water, srgb_from_linear, transmittances
 from swimm3r.progress import Progress, silent
 from swimm3r.refraction.central import CameraInWater
 from swimm3r.scene.ground_truth import FOLDER
-from swimm3r.shading import gains as shading_gains
 from swimm3r.synthetic import disturbances
 from swimm3r.synthetic.lamp_light import lamp_backscatter, lamp_of, light_on
 from swimm3r.synthetic.optics import PixelRays, behind_port, lens_of, rays_of, rolled
@@ -107,7 +107,7 @@ class Dive:
         return disturbances.camera_gains(self.settings.exposure, self.settings.white_balance, rng)
 
     def shading(self, i: int) -> Float[Tensor, "k 3"]:
-        """The shading of frame i on linear light (`swimm3r.shading`); 0 without changes over the image."""
+        """The shading of frame i on linear light (`swimm3r.appearance`); 0 without changes over the image."""
         rng = np.random.default_rng(self.settings.stream(7, i))
         return disturbances.local_tones(self.settings.local_exposure, rng)
 

@@ -12,7 +12,7 @@ def printed(capsys, **scores) -> str:
     return " ".join("".join(capsys.readouterr()).split())
 
 
-@pytest.mark.parametrize("views, said", [(1, "1 test frame: PSNR 12.6 dB"), (2, "2 test frames: PSNR 12.6 dB")])
+@pytest.mark.parametrize(("views", "said"), [(1, "1 test frame: PSNR 12.6 dB"), (2, "2 test frames: PSNR 12.6 dB")])
 def test_frames_are_counted(views, said, capsys):
     assert said in printed(capsys, views=views)
 

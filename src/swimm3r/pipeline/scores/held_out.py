@@ -18,6 +18,7 @@ from jaxtyping import Bool, Float
 from torch import Tensor
 
 from swimm3r import weights
+from swimm3r.appearance import FrameColors
 from swimm3r.cameras import Cameras
 from swimm3r.evaluate import NotComputed
 from swimm3r.evaluate.images import ViewScores, as_8_bit, blur4_psnr, mean_view_scores, psnr, sharpness, view_scores
@@ -39,7 +40,6 @@ from swimm3r.sfm.colmap.shutter.turning import turned_pose
 from swimm3r.sfm.features.settings import FeatureSettings
 from swimm3r.sfm.medium.settings import RestoreSettings
 from swimm3r.sfm.moving.find import still_scene
-from swimm3r.splat.appearance import FrameColors
 from swimm3r.splat.pose_refinement import refine_pose
 from swimm3r.splat.rendering import SplatMap
 from swimm3r.splat.settings import PoseRefinementSettings

@@ -5,6 +5,8 @@ from dataclasses import replace
 from pathlib import Path
 
 from swimm3r.errors import InputError
+from swimm3r.imaging.appearance import decide_appearance
+from swimm3r.imaging.settings import AppearanceSettings
 from swimm3r.io import images
 from swimm3r.medium import MediumFit
 from swimm3r.progress import Progress, silent
@@ -55,11 +57,12 @@ def with_water(
     """The reconstruction with its water, in both encodings, restored cloud and backdrop, and restored images on disk.
 
     The water is that of the frames as filmed; where the sunlight flickers, cloud and images are those of the frames in
-    steady light. Where depth is too scarce to tell the water, the poses and depth stand without it, under a warning.
-    `predicted` is the physics head's water, which then restores images and cloud, with the light as filmed; only the
-    fit in linear light is Sea-Thru's.
+    steady light, and where the camera exposed and balanced frames each by itself, in their common colors. Where depth
+    is too scarce to tell the water, the poses and depth stand without it, under a warning. `predicted` is the physics
+    head's water, which then restores images and cloud, with the light as filmed; only the fit in linear light is
+    Sea-Thru's.
     """
-    rec = replace(rec, steady=None)
+    rec = replace(rec, steady=None, own_colors=None)
     frames = rec.still(frames)
     tracks = fuse_depth(rec, frames, settings.water.tracks, progress)
     samples = collect_samples(rec, frames, tracks, settings.water, progress)
@@ -77,6 +80,9 @@ def with_water(
     if settings.flicker == "auto" and predicted is None:
         rec = with_steady(rec, frames, settings.restore, folder / STEADY, progress)
         frames = rec.still(frames)
+    if settings.exposure == "auto" and predicted is None:
+        rec = with_own_colors(rec, frames)
+        frames = rec.evened(frames)
     at, eps_inv = (None, MIN_TRANSMITTANCE) if predicted is None else (predicted.at, predicted.head.min_transmittance)
     fusion = settings.water.tracks
     cloud = dense_cloud(rec, frames, tracks, stored, settings.restore, fusion, progress, at, eps_inv)
@@ -98,3 +104,11 @@ def with_water(
     for i, image in restored:
         backdrop.add(i, image)
     return replace(rec, backdrop=backdrop.points())
+
+
+def with_own_colors(rec: Reconstruction, frames: Frames) -> Reconstruction:
+    """The reconstruction with the colors of single frames, where its points tell that exposure or balance changed."""
+    found = decide_appearance(rec, frames, rec.names, AppearanceSettings())
+    if found.colors is not None:
+        log.info("frames are restored in one exposure and white balance: %s", found.decision.reason)
+    return replace(rec, own_colors=found.colors)

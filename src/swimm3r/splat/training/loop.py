@@ -16,18 +16,19 @@ from typing import Any, Protocol, runtime_checkable
 import torch
 from torch import Tensor
 
+from swimm3r.appearance import ColorFit
 from swimm3r.io.files import metrics_log
 from swimm3r.io.files.cache_key import cache_key
 from swimm3r.io.files.damage import guard
 from swimm3r.progress import Progress
 from swimm3r.raster.cpu.threads import threads_for_kernels_alone
-from swimm3r.splat.appearance import ColorFit, fit_to_view
+from swimm3r.splat.appearance import fit_to_view
 from swimm3r.splat.medium.kinds import Water
 from swimm3r.splat.pose_mlp import PoseMlp
 from swimm3r.splat.primitives.kinds import Primitives
 from swimm3r.splat.rendering import images
 from swimm3r.splat.settings import SplatSettings
-from swimm3r.splat.shared_settings import AppearanceSettings
+from swimm3r.splat.shared_settings import MapAppearanceSettings
 from swimm3r.splat.training.checkpoint import StateHeader, read_state, state_remedy, write_state
 from swimm3r.splat.training.observer import Observer, TrainingStep
 from swimm3r.splat.training.scene import TrainingScene, with_footprints
@@ -158,7 +159,7 @@ def run(
     return state
 
 
-def refit_steps(settings: AppearanceSettings, iterations: int) -> frozenset[int]:
+def refit_steps(settings: MapAppearanceSettings, iterations: int) -> frozenset[int]:
     """The steps after which the frames' colors are fitted again, from `_FIRST_REFIT` of the run on."""
     shares = (_FIRST_REFIT + (1 - _FIRST_REFIT) * k / settings.refits for k in range(settings.refits))
     return frozenset(max(1, round(share * iterations)) for share in shares)
