@@ -46,6 +46,23 @@ def test_depth_that_ends_at_the_silhouette_stays(shore):
     assert torch.equal(kept[kept > 0], z_depth[kept > 0])
 
 
+def test_a_wedge_of_water_between_two_silhouettes_is_water_to_its_end(shore):
+    """A slope under the upper edge, and a rock at the end of the strip that it leaves: no part is free of both."""
+    row, column = torch.meshgrid(torch.arange(H), torch.arange(W), indexing="ij")
+    wedge = (row < 12) & (column >= 90) & (column < 140)
+    ground = ((row >= 12) & (column < 140)) | (column < 90) | surface()
+    rng = torch.Generator().manual_seed(4)
+    texture = 0.15 + 0.35 * torch.rand(H // 4, W // 4, 3, generator=rng)
+    image = VEIL + 0.004 * torch.randn(H, W, 3, generator=rng)
+    image[ground] = texture.repeat_interleave(4, 0).repeat_interleave(4, 1)[ground]
+    share = sea_share(image, torch.where(ground, 3.0, 0.0), VEIL)
+    assert share[wedge].mean() > 0.8
+    assert share[ground].max() == 0
+    apart = wedge & (column < 108)
+    image[(row < 12) & (column >= 112) & (column < 118)] = torch.tensor([0.3, 0.2, 0.2])  # a pole cuts it off
+    assert sea_share(image, torch.where(ground, 3.0, 0.0), VEIL)[apart].mean() < 0.1
+
+
 def test_without_open_water_nothing_changes(shore):
     everywhere = torch.full((H, W), 2.0)
     assert torch.equal(without_fringe(shore, everywhere, VEIL), everywhere)

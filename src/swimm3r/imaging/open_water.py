@@ -6,6 +6,8 @@ the darkest fifth of what has texture (veil only grows with distance; shadows an
 is small, than half of it, and the surfaces at its rim are among the far ones: smooth sand has no depth either.
 """
 
+from dataclasses import dataclass
+
 import numpy as np
 import torch
 from jaxtyping import Bool, Float
@@ -17,6 +19,9 @@ _WINDOW = 7
 _RIM = 9  # pixels around a region in which its neighbors are looked for
 _SAMPLES = 50_000  # pixels whose quantiles stand for all
 _SPILL = 0.02  # of the longer side, how far depth spills over silhouettes
+_NEARBY = 1e-3  # share of open water around a pixel, from which its own colors are the measure
+_WEDGE = 4  # times the distance of open water nearby, to which a wedge between silhouettes reaches
+_WEDGE_STD = 0.006  # of colors of open water there, at most: where they vary more, they tell nothing from afar
 _BRIGHT = 0.5  # open water under a lamp, in its brightest channel, from which colors count as in daylight
 _SEA_STD = 0.004  # of the colors of open water about their local mean, at least
 _WATER_STD, _SURFACE_STD = 0.01, 0.03  # of colors about their local mean, at least
@@ -82,24 +87,72 @@ def sea_share(
     """Probability that a pixel shows water only: open water, or unknown depth of the same color; soft where hazy.
 
     Colors are compared with those of the open water nearby in units of their spread there, channel by channel: far
-    rocks may stand out in one channel only.
+    rocks may stand out in one channel only. Farther from it, in wedges between silhouettes, pixels of the color of the
+    wider surroundings are water where they are joined to it.
     """
     water = open_water_mask(image, z_depth, veil).float()
     if not water.any():
         return water
     reach = 0.02 * max(image.shape[:2])
-    weight = water[..., None]
-    nearby = blur(weight, reach)
-    total = nearby.clamp(min=1e-6)
-    local = blur(weight * image, reach) / total
-    variance = (blur(weight * image**2, reach) / total - local**2).clamp(min=0) + _SEA_STD**2
-    difference = blur(image, 0.7) - local
-    alike = torch.exp(-(difference**2 / (2 * variance)).sum(-1))
-    hard = torch.maximum(alike * (nearby[..., 0] > 1e-3), water)
-    guide = difference.norm(dim=-1)
+    near, far = _Nearby.of(image, water, reach), _Nearby.of(image, water, reach, _WEDGE, _WEDGE_STD)
+    known = z_depth > 0
+    there = near.share > _NEARBY
+    hard = torch.maximum(near.alike * there, water)
+    wedge = _joined(hard > 0.5, ~there & ~known & (far.alike > 0.5))
+    hard = torch.maximum(hard, far.alike * wedge)
+    guide = torch.where(wedge, far.off, near.off)
     soft = local_linear(guide, hard[..., None], torch.ones_like(hard)[..., None], reach / 2, 2e-5)[..., 0]
     share = blur(torch.maximum(soft, hard)[..., None], reach / 5)[..., 0]
-    return torch.where(z_depth > 0, 0.0, share.clamp(0, 1))
+    return torch.where(known, 0.0, share.clamp(0, 1))
+
+
+@dataclass(frozen=True)
+class _Nearby:
+    """Open water around each pixel, and the pixel beside its colors."""
+
+    share: Float[Tensor, "h w"]  # of the surroundings
+    off: Float[Tensor, "h w"]  # distance of the pixel's color from the mean color there
+    alike: Float[Tensor, "h w"]  # 0..1, likelihood of the color over that of the mean color
+
+    @classmethod
+    def of(
+        cls,
+        image: Float[Tensor, "h w 3"],
+        water: Float[Tensor, "h w"],
+        reach: float,
+        step: int = 1,
+        most_std: float = np.inf,
+    ) -> "_Nearby":
+        """Within `step` times `reach`, by means over squares of `step` pixels; colors spread by `most_std` at most."""
+        weight = water[..., None]
+        share = _coarsely_blurred(weight, reach, step)
+        total = share.clamp(min=1e-6)
+        local = _coarsely_blurred(weight * image, reach, step) / total
+        square = _coarsely_blurred(weight * image**2, reach, step) / total
+        variance = ((square - local**2).clamp(min=0) + _SEA_STD**2).clamp(max=most_std**2)
+        difference = blur(image, 0.7) - local
+        alike = torch.exp(-(difference**2 / (2 * variance)).sum(-1))
+        return cls(share[..., 0], difference.norm(dim=-1), alike)
+
+
+def _coarsely_blurred(x: Float[Tensor, "h w c"], sigma: float, step: int) -> Float[Tensor, "h w c"]:
+    """Gaussian blur by `step` times `sigma` of means over squares of `step` pixels, at the size of `x`."""
+    import cv2
+
+    if step == 1:
+        return blur(x, sigma)
+    h, w = x.shape[:2]
+    small = cv2.resize(x.numpy(), (max(1, w // step), max(1, h // step)), interpolation=cv2.INTER_AREA)
+    blurred = blur(torch.from_numpy(small.reshape(*small.shape[:2], -1)), sigma).numpy()
+    return torch.from_numpy(cv2.resize(blurred, (w, h), interpolation=cv2.INTER_LINEAR).reshape(x.shape))
+
+
+def _joined(seeds: Bool[Tensor, "h w"], others: Bool[Tensor, "h w"]) -> Bool[Tensor, "h w"]:
+    """Those of the `others` that hang together with a seed."""
+    pieces = _pieces((seeds | others).numpy())
+    with_seed = np.zeros(pieces.max() + 1, dtype=bool)
+    with_seed[pieces[seeds.numpy()]] = True
+    return others & torch.from_numpy(with_seed[pieces])
 
 
 def without_fringe(
