@@ -49,6 +49,10 @@ class FrameColors:
         inverse, offset = torch.linalg.inv(M[:, :3].double()).float(), M[:, 3, None, None]
         return torch.einsum("ij,jhw->ihw", inverse.to(rgb.device), rgb - offset.to(rgb.device))
 
+    def tensors(self) -> tuple[Tensor, ...]:
+        """Maps, and shadings if there are any."""
+        return (self.maps,) if self.shading is None else (self.maps, self.shading)
+
     def refitted(self, fits: Sequence[ColorFit]) -> "FrameColors":
         """The maps after `fits`, from what the map shows to each frame in the common colors of before.
 

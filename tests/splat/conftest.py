@@ -1,13 +1,13 @@
 """Primitives, cameras and a tiny dive for the map's tests."""
 
 from collections.abc import Callable
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 
 import pytest
 import torch
 
-from swimm3r.cameras import Cameras
+from swimm3r.cameras import Cameras, project_visible
 from swimm3r.io.images import write_rgb
 from swimm3r.medium import AttenuationCurve, Medium, MediumFit
 from swimm3r.scene.frames import Frame, Frames
@@ -114,3 +114,28 @@ def tiny_dive(tmp_path_factory: pytest.TempPathFactory) -> TinyDive:
         cloud=DenseCloud(xyz, rgb, rgb),
     )  # fmt: skip
     return TinyDive(rec, frames, truth, cameras)
+
+
+GAINS = torch.tensor([[0.8, 0.9, 1.1], [1.2, 1.1, 0.85], [1.0, 0.8, 1.0], [0.9, 1.2, 1.15], [1.1, 1.0, 0.9]])
+"""Of frames of the tiny dive that were exposed and balanced each by itself, in turn."""
+
+
+@pytest.fixture(scope="session")
+def tracked(tiny_dive) -> Reconstruction:
+    """The tiny dive's reconstruction, the wall's points tracked by every frame that shows them."""
+    xyz = tiny_dive.rec.points.xyz.double().expand(len(tiny_dive.rec.names), -1, 3)
+    pixels, _, visible = project_visible(tiny_dive.rec.cameras, xyz)
+    frame, point = torch.nonzero(visible).unbind(-1)
+    return replace(tiny_dive.rec, tracks=Tracks(point, frame, pixels[visible].float()))
+
+
+@pytest.fixture(scope="session")
+def relit(tiny_dive, tmp_path_factory) -> Frames:
+    """The tiny dive's frames, each exposed and balanced by itself."""
+    folder: Path = tmp_path_factory.mktemp("relit")
+    listed = []
+    for i, frame in enumerate(tiny_dive.frames):
+        path = folder / frame.name
+        write_rgb(path, (tiny_dive.frames.image(i) * GAINS[i % 5]).clamp(0, 1).numpy())
+        listed.append(replace(frame, path=path))
+    return replace(tiny_dive.frames, frames=tuple(listed))

@@ -5,15 +5,14 @@ from pathlib import Path
 
 import pytest
 import torch
+from tests.splat.conftest import GAINS
 
 from swimm3r.appearance import ORDERS, FrameColors, about_identity, identity_maps, shading_gains
-from swimm3r.cameras import project_visible
 from swimm3r.errors import InputError
 from swimm3r.evaluate.images import psnr
 from swimm3r.imaging.appearance import decide_appearance
 from swimm3r.io.images import write_rgb
 from swimm3r.scene.frames import Frames
-from swimm3r.scene.reconstruction import Reconstruction, Tracks
 from swimm3r.splat import train
 from swimm3r.splat.appearance import fit_to_view, read_decision, write_decision
 from swimm3r.splat.map_file import load_map
@@ -38,28 +37,6 @@ SETTINGS = UwbsSettings(
     poses=TrainingPoseSettings(enabled=False),
     render=RenderSettings(),
 )
-GAINS = torch.tensor([[0.8, 0.9, 1.1], [1.2, 1.1, 0.85], [1.0, 0.8, 1.0], [0.9, 1.2, 1.15], [1.1, 1.0, 0.9]])
-
-
-@pytest.fixture(scope="module")
-def tracked(tiny_dive) -> Reconstruction:
-    """The tiny dive's reconstruction, the wall's points tracked by every frame that shows them."""
-    xyz = tiny_dive.rec.points.xyz.double().expand(len(tiny_dive.rec.names), -1, 3)
-    pixels, _, visible = project_visible(tiny_dive.rec.cameras, xyz)
-    frame, point = torch.nonzero(visible).unbind(-1)
-    return replace(tiny_dive.rec, tracks=Tracks(point, frame, pixels[visible].float()))
-
-
-@pytest.fixture(scope="module")
-def relit(tiny_dive, tmp_path_factory) -> Frames:
-    """The tiny dive's frames, each exposed and balanced by itself."""
-    folder: Path = tmp_path_factory.mktemp("relit")
-    listed = []
-    for i, frame in enumerate(tiny_dive.frames):
-        path = folder / frame.name
-        write_rgb(path, (tiny_dive.frames.image(i) * GAINS[i % 5]).clamp(0, 1).numpy())
-        listed.append(replace(frame, path=path))
-    return replace(tiny_dive.frames, frames=tuple(listed))
 
 
 def test_steady_frames_need_no_colors_of_their_own(tiny_dive, tracked):

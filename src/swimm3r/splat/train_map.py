@@ -9,10 +9,11 @@ from pathlib import Path
 import torch
 
 from swimm3r import devices
+from swimm3r.appearance import FrameColors
 from swimm3r.cameras import Cameras
 from swimm3r.devices import CPU
 from swimm3r.errors import UsageError
-from swimm3r.imaging.appearance import AppearanceDecision, decide_appearance
+from swimm3r.imaging.appearance import decide_appearance
 from swimm3r.imaging.undistortion import nearest_pixels, shown_pixels
 from swimm3r.progress import Progress, silent
 from swimm3r.scene.frames import Frames
@@ -60,15 +61,10 @@ def train(
     surface = surface_of(rec, depth)
     if plan := _plan(surface, depth, settings):
         assert isinstance(settings, UwbsSettings)
-        write_decision(folder, AppearanceDecision(False, "maps in blocks have no colors of single frames"))
         return _in_blocks(rec, frames, settings, plan, scale, folder, progress, device, observer, engine)
     settings = _for_ground(settings, float(surface.area.sum()))
     views = TrainingViews(rec, frames, settings, scale)
-    appearance = decide_appearance(rec, frames, views.names, settings.appearance)
-    decided = appearance.decision
-    log.info("colors of single frames %s: %s", "fitted" if decided.on else "not fitted", decided.reason)
-    write_decision(folder, decided)
-    views.colors = appearance.colors
+    views.colors = _own_colors(rec, frames, views.names, settings, folder)
     poses_in_training = training_poses_of(rec, views.names, views.cameras, scale) if settings.poses.enabled else None
     radius = path_radius(rec, scale, settings.working_depth)
     training_scene = TrainingScene(rec, scale, radius, views, poses_in_training, device)
@@ -89,6 +85,16 @@ def train(
     return scene
 
 
+def _own_colors(
+    rec: Reconstruction, frames: Frames, names: Sequence[str], settings: SplatSettings, folder: Path
+) -> FrameColors | None:
+    """The first colors of single frames, where they need any; the decision goes into the map's folder."""
+    found = decide_appearance(rec, frames, names, settings.appearance)
+    log.info("colors of single frames %s: %s", "fitted" if found.decision.on else "not fitted", found.decision.reason)
+    write_decision(folder, found.decision)
+    return found.colors
+
+
 def _in_blocks(
     rec: Reconstruction,
     frames: Frames,
@@ -102,14 +108,16 @@ def _in_blocks(
     engine: EngineSettings,
 ) -> SplatMap:
     """A map whose primitives stay on disk."""
-    trained = train_in_blocks(rec, frames, settings, plan, scale, folder, progress, device, observer, engine)
-    field = in_unit(copy.deepcopy(trained.water), 1 / scale)
     views = TrainingViews(rec, frames, settings, scale)
+    views.colors = _own_colors(rec, frames, views.names, settings, folder)
+    trained = train_in_blocks(views, plan, folder, progress, device, observer, engine)
+    field = in_unit(copy.deepcopy(trained.water), 1 / scale)
     viewpoint = _viewpoint(rec, views, None)
     blocks = trained.blocks
     scene = SplatMap(
-        no_primitives(), field, trained.settings, rec.metric, 1 / scale, frames.span, None, viewpoint, blocks
-    )
+        no_primitives(), field, trained.settings, rec.metric, 1 / scale, frames.span, None, viewpoint, blocks,
+        colors=views.colors,
+    )  # fmt: skip
     scene = replace(scene, coverage=seen_in_training(scene.to(device), rec, frames, views.names))
     scene.save(folder / "map.safetensors")
     return scene.to(device)
@@ -156,7 +164,7 @@ def _schedule(settings: SplatSettings, rec: Reconstruction, views: TrainingViews
         matches.append(float(rec.matches.xy_i.double().sum() + rec.matches.xy_j.double().sum()))
     colors = []
     if views.colors is not None:
-        colors = [part.tolist() for part in (views.colors.maps, views.colors.shading) if part is not None]
+        colors = [part.tolist() for part in views.colors.tensors()]
     return loop.schedule_of(settings, views.names, views.times, *cameras, *matches, *colors)
 
 

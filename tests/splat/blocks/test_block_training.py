@@ -1,5 +1,6 @@
 """A map trained in blocks: one water, blocks that join, and kills that cost one block."""
 
+import json
 from dataclasses import replace
 from pathlib import Path
 
@@ -9,12 +10,15 @@ from safetensors.torch import load_file
 
 from swimm3r.errors import InputError
 from swimm3r.evaluate.images import psnr
+from swimm3r.imaging.appearance import decide_appearance
 from swimm3r.scene.surface import surface_of
 from swimm3r.splat import train
+from swimm3r.splat.appearance import read_decision
 from swimm3r.splat.blocks.plan import plan_blocks
 from swimm3r.splat.ground import held_by_any
 from swimm3r.splat.map_file import load_map
 from swimm3r.splat.settings import BlockSettings, DensifySettings, InitialSettings, UwbsSettings, with_recipe
+from swimm3r.splat.shared_settings import MapAppearanceSettings
 from swimm3r.splat.training.checkpoint import read_state
 from swimm3r.splat.views import median_z_depth
 from swimm3r.tasks.settings import EngineSettings
@@ -58,6 +62,28 @@ def test_blocks_share_the_ground(tiny_dive, trained):
         assert block.window.holds(part.xyz).float().mean() > 0.9
     for part in scene.parts(coarse=True):
         assert 0 < len(part.xyz) < scene.count / 12
+
+
+def test_blocks_are_trained_in_the_colors_that_all_frames_have_in_common(tracked, relit, tmp_path):
+    """Held by all blocks as the sparse points tell them; the map keeps them, so that test frames are recolored."""
+    train(tracked, relit, FEW, tmp_path)
+    decision = read_decision(tmp_path)
+    assert decision is not None
+    assert decision.on
+    told = decide_appearance(tracked, relit, tracked.names, FEW.appearance).colors
+    kept = load_map(tmp_path / "map.safetensors").colors
+    assert told is not None
+    assert kept is not None
+    assert kept.names == told.names
+    assert torch.equal(kept.maps, told.maps)
+    train(tracked, relit, replace(FEW, appearance=MapAppearanceSettings(mode="off")), tmp_path / "off")
+    assert last_l1(tmp_path) < 0.8 * last_l1(tmp_path / "off")
+
+
+def last_l1(folder: Path) -> float:
+    """Mean difference of a block's renderings to the views they are compared with, at the end of its training."""
+    lines = [(path / "metrics.jsonl").read_text().splitlines()[-1] for path in sorted(folder.glob("blocks/????"))]
+    return sum(json.loads(line)["l1"] for line in lines) / len(lines)
 
 
 def test_a_map_in_blocks_looks_like_one_map_of_the_same_density(tiny_dive, trained, tmp_path):

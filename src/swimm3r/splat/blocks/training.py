@@ -16,6 +16,7 @@ from pathlib import Path
 import torch
 
 from swimm3r import devices
+from swimm3r.appearance import FrameColors
 from swimm3r.devices import CPU
 from swimm3r.errors import InputError
 from swimm3r.io.files.cache_key import cache_key
@@ -72,6 +73,7 @@ class BlockTask:
     closed: tuple[Window, ...]  # of the neighbors of earlier turns
     neighbors: tuple[str, ...]  # their files, relative to the map's folder
     scale: float  # working units per scene unit
+    colors: FrameColors | None  # of single frames, all of the map's
     water: MediumField  # per working unit
     device: str
 
@@ -96,11 +98,8 @@ class TrainedBlocks:
 
 
 def train_in_blocks(
-    rec: Reconstruction,
-    frames: Frames,
-    settings: UwbsSettings,
+    views: TrainingViews,
     plan: Sequence[PlannedBlock],
-    scale: float,
     folder: Path,
     progress: Progress = silent,
     device: torch.device = CPU,
@@ -109,14 +108,15 @@ def train_in_blocks(
 ) -> TrainedBlocks:
     """Train a map's parts in `folder`: checkpoint/ and metrics.jsonl of the water, blocks/ with those of each block.
 
-    Poses are held, as blocks have to agree on them. The observer sees the training of the water. Raises the error of
-    the first block that failed; those that are finished stay.
+    Poses and colors of single frames are held, as blocks have to agree on them. The observer sees the training of the
+    water. Raises the error of the first block that failed; those that are finished stay.
     """
-    settings = replace(settings, poses=replace(settings.poses, enabled=False))
-    views = TrainingViews(rec, frames, settings, scale)
-    key = _key(rec, settings, views, plan)
-    water = _train_water(rec, settings, views, scale, folder, key, progress, device, observer)
-    tasks = _tasks(rec, frames, settings, plan, views.names, scale, folder, key, water, device)
+    assert isinstance(views.settings, UwbsSettings)
+    poses, appearance = replace(views.settings.poses, enabled=False), replace(views.settings.appearance, refits=0)
+    settings = replace(views.settings, poses=poses, appearance=appearance)
+    key = _key(settings, views, plan)
+    water = _train_water(settings, views, folder, key, progress, device, observer)
+    tasks = _tasks(settings, views, plan, folder, key, water, device)
     steps = sum(task.settings.iterations for task in tasks)
     log.info("%d blocks are trained in %d steps in all", len(tasks), steps)
     here = engine.engine == "local" and engine.at_once(1) == 1  # one after another, each with its own progress
@@ -144,7 +144,8 @@ def train_block(task: BlockTask, progress: Progress = silent) -> None:
     if _is_finished(task):
         return
     device = torch.device(task.device)
-    views = TrainingViews(task.rec, task.frames, task.settings, task.scale, task.window.widened(task.margin))
+    around = task.window.widened(task.margin)
+    views = TrainingViews(task.rec, task.frames, task.settings, task.scale, around, task.colors)
     radius = path_radius(task.rec, task.scale, task.settings.working_depth)
     scene = TrainingScene(task.rec, task.scale, radius, views, None, device, surroundings_of(task, device))
     schedule = loop.schedule_of(task.settings, task.key, task.number)
@@ -196,10 +197,8 @@ def _is_finished(task: BlockTask) -> bool:
 
 
 def _train_water(
-    rec: Reconstruction,
     settings: UwbsSettings,
     views: TrainingViews,
-    scale: float,
     folder: Path,
     key: str,
     progress: Progress,
@@ -211,9 +210,10 @@ def _train_water(
     A map of all ground would be so coarse, and each primitive drawn so seldom, that the water, which is drawn in every
     step, would take the primitives' colors.
     """
+    rec, scale = views.rec, views.scale
     surface = surface_of(rec, median_z_depth(rec))
     part = stretches_of(rec, views.names, surface, settings.blocks.largest)
-    views = TrainingViews(part, views.frames, settings, scale)
+    views = TrainingViews(part, views.frames, settings, scale, colors=views.colors)
     short = replace(settings, iterations=max(1, round(settings.blocks.water_steps * settings.iterations)))
     radius = path_radius(rec, scale, settings.working_depth)
     scene = TrainingScene(views.rec, scale, radius, views, None, device)
@@ -226,12 +226,9 @@ def _train_water(
 
 
 def _tasks(
-    rec: Reconstruction,
-    frames: Frames,
     settings: UwbsSettings,
+    views: TrainingViews,
     plan: Sequence[PlannedBlock],
-    names: tuple[str, ...],
-    scale: float,
     folder: Path,
     key: str,
     water: MediumField,
@@ -239,20 +236,20 @@ def _tasks(
 ) -> list[BlockTask]:
     """A task for each block that a view sees."""
     tasks: dict[int, BlockTask] = {}
-    seen_by = views_of_blocks(rec, names, plan)
+    rec, seen_by = views.rec, views_of_blocks(views.rec, views.names, plan)
     for k in sorted(range(len(plan)), key=lambda k: plan[k].turn):
-        block, views = plan[k], seen_by[k]
+        block, seeing = plan[k], seen_by[k]
         before = [tasks[j] for j in block.before if j in tasks]
         closed = tuple(task.window for task in before)
         inner = [window.widened(-_STRIP * block.margin) for window in closed]
-        part = part_of(rec, views.names, block.window.widened(block.margin), inner)
+        part = part_of(rec, seeing.names, block.window.widened(block.margin), inner)
         points = part.points.xyz if part.cloud is None else part.cloud.xyz
-        if not views.names or len(points) < FEWEST_PRIMITIVES:
+        if not seeing.names or len(points) < FEWEST_PRIMITIVES:
             log.warning("block %d of %d is left empty: no training frame sees it", k + 1, len(plan))
             continue
         tasks[k] = BlockTask(
-            k, len(plan), block.turn, folder, key, part, frames, of_block(settings, block, views),
-            block.window, block.margin, closed, tuple(task.file for task in before), scale, water, str(device),
+            k, len(plan), block.turn, folder, key, part, views.frames, of_block(settings, block, seeing), block.window,
+            block.margin, closed, tuple(task.file for task in before), views.scale, views.colors, water, str(device),
         )  # fmt: skip
     return [tasks[k] for k in sorted(tasks)]
 
@@ -272,6 +269,7 @@ def of_block(settings: UwbsSettings, block: PlannedBlock, views: BlockViews) -> 
     return replace(dense, iterations=max(1, count), weights=weights)
 
 
-def _key(rec: Reconstruction, settings: UwbsSettings, views: TrainingViews, plan: Sequence[PlannedBlock]) -> str:
-    cameras = [rec.cameras.cam2world.tolist(), rec.cameras.K.tolist()]
-    return cache_key(asdict(settings), views.names, *cameras, [asdict(block) for block in plan])[:16]
+def _key(settings: UwbsSettings, views: TrainingViews, plan: Sequence[PlannedBlock]) -> str:
+    cameras = [views.rec.cameras.cam2world.tolist(), views.rec.cameras.K.tolist()]
+    colors = [] if views.colors is None else [each.tolist() for each in views.colors.tensors()]
+    return cache_key(asdict(settings), views.names, *cameras, *colors, [asdict(block) for block in plan])[:16]
