@@ -76,7 +76,7 @@ def sfm_sections(
     if rec.steady is not None:
         sections["flicker"] = {"evened_frames": rec.steady.count(frames)}
     if rec.own_colors is not None:
-        sections["exposure"] = {"evened_frames": len(rec.own_colors.names)}
+        sections["appearance"] = {"evened_frames": len(rec.own_colors.names)}
     if rec.medium is not None:
         sections["medium"] = {"sfm": _medium_section(rec.medium, rec.metric)}
         if rec.medium_linear is not None:

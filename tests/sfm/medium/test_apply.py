@@ -46,10 +46,10 @@ def relit(steady: FlatDive, tmp_path_factory: pytest.TempPathFactory) -> Frames:
 
 
 def restored(
-    steady: FlatDive, frames: Frames, water: MediumFit, folder: Path, monkeypatch: pytest.MonkeyPatch, exposure: str
+    steady: FlatDive, frames: Frames, water: MediumFit, folder: Path, monkeypatch: pytest.MonkeyPatch, appearance: str
 ) -> Reconstruction:
     monkeypatch.setattr(apply, "fit_medium", lambda *_: water)
-    return apply.with_water(steady.rec, frames, ColmapSettings(flicker="keep", exposure=exposure), folder)
+    return apply.with_water(steady.rec, frames, ColmapSettings(flicker="keep", appearance=appearance), folder)
 
 
 def errors(steady: FlatDive, folder: Path) -> np.ndarray:

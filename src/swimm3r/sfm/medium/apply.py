@@ -80,7 +80,7 @@ def with_water(
     if settings.flicker == "auto" and predicted is None:
         rec = with_steady(rec, frames, settings.restore, folder / STEADY, progress)
         frames = rec.still(frames)
-    if settings.exposure == "auto" and predicted is None:
+    if settings.appearance == "auto" and predicted is None:
         rec = with_own_colors(rec, frames)
         frames = rec.evened(frames)
     at, eps_inv = (None, MIN_TRANSMITTANCE) if predicted is None else (predicted.at, predicted.head.min_transmittance)

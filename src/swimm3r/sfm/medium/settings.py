@@ -7,7 +7,7 @@ from swimm3r.settings import Count, NotNegative, Positive, PositiveShare, Range,
 
 LightChoice = Literal["auto", "sun", "lamp"]
 FlickerChoice = Literal["auto", "keep"]
-ExposureChoice = Literal["auto", "keep"]
+AppearanceChoice = Literal["auto", "keep"]
 
 
 @dataclass(frozen=True)
@@ -150,7 +150,7 @@ class MediumSettings(Settings):
     flicker: FlickerChoice = "auto"
     """Sunlight that flickers over the ground (caustics): evened out where the frames show it (auto), or kept as filmed.
     """
-    exposure: ExposureChoice = "auto"
+    appearance: AppearanceChoice = "auto"
     """Exposure and white balance of single frames: restored frames and cloud as one exposure would show them where the
     frames tell that theirs differ (auto), or as filmed (keep)."""
     water: SeathruSettings = field(default_factory=SeathruSettings)
