@@ -8,7 +8,7 @@ from pathlib import Path
 
 import torch
 
-from swimm3r.appearance import FrameColors
+from swimm3r.appearance import ORDERS, FrameColors
 from swimm3r.io.files.atomic import atomic_folder, write_text
 from swimm3r.io.files.damage import Remedy, guard
 from swimm3r.io.files.json_file import read_json
@@ -16,6 +16,7 @@ from swimm3r.scene.frames import Frames
 
 STEADY = "steady"  # the folder of frames in steady light, in that of a reconstruction
 OWN_COLORS = "frame_colors.json"  # the color maps of single frames, there
+_LEAST_DETERMINANT = 1e-3  # of the matrix of a frame's colors: half the light of all channels, and more, leaves 0.1
 
 
 @dataclass(frozen=True)
@@ -90,7 +91,9 @@ def read_own_colors(path: Path, remedy: Remedy) -> FrameColors:
     stored = read_json(path, dict[str, _OwnColors], remedy)
     with guard(path, remedy):
         maps = torch.tensor([own.map for own in stored.values()])
-        shaded = [own.shading for own in stored.values() if own.shading is not None]
-        if maps.shape[1:] != (3, 4) or len(shaded) not in (0, len(stored)):
-            raise ValueError("every frame has a map of 3 rows, and all or none have a shading")
-        return FrameColors(tuple(stored), maps, torch.tensor(shaded) if shaded else None)
+        if maps.shape[1:] != (3, 4) or bool((torch.linalg.det(maps[..., :3]).abs() < _LEAST_DETERMINANT).any()):
+            raise ValueError("every frame has a map of 3 rows whose colors can be told apart")
+        shading = torch.tensor([own.shading for own in stored.values() if own.shading is not None])
+        if len(shading) and shading.shape != (len(stored), len(ORDERS), 3):
+            raise ValueError(f"all frames or none have a shading of {len(ORDERS)} rows")
+        return FrameColors(tuple(stored), maps, shading if len(shading) else None)

@@ -1,5 +1,6 @@
 """Frames that a camera exposed and balanced each by itself, restored as one exposure and white balance shows them."""
 
+import json
 from dataclasses import replace
 from pathlib import Path
 
@@ -11,11 +12,14 @@ from tests.sfm.conftest import FlatDive, flat_dive
 from swimm3r.cameras import project_visible
 from swimm3r.errors import InputError
 from swimm3r.io import images
+from swimm3r.io.files.damage import Remedy
 from swimm3r.medium import MediumFit
+from swimm3r.scene.frame_changes import read_own_colors
 from swimm3r.scene.frames import Frames
 from swimm3r.scene.reconstruction import Points, Reconstruction, Tracks
 from swimm3r.scene.reconstruction_io import load_reconstruction
 from swimm3r.sfm.medium import apply
+from swimm3r.sfm.medium.settings import AppearanceChoice
 from swimm3r.sfm.settings import ColmapSettings
 
 GAINS = torch.tensor([[0.8, 0.9, 1.1], [1.2, 1.1, 0.9], [1.0, 0.85, 1.05], [0.9, 1.2, 1.1], [1.1, 0.95, 0.85]])
@@ -46,7 +50,12 @@ def relit(steady: FlatDive, tmp_path_factory: pytest.TempPathFactory) -> Frames:
 
 
 def restored(
-    steady: FlatDive, frames: Frames, water: MediumFit, folder: Path, monkeypatch: pytest.MonkeyPatch, appearance: str
+    steady: FlatDive,
+    frames: Frames,
+    water: MediumFit,
+    folder: Path,
+    monkeypatch: pytest.MonkeyPatch,
+    appearance: AppearanceChoice,
 ) -> Reconstruction:
     monkeypatch.setattr(apply, "fit_medium", lambda *_: water)
     return apply.with_water(steady.rec, frames, ColmapSettings(flicker="keep", appearance=appearance), folder)
@@ -86,10 +95,23 @@ def test_colors_of_single_frames_are_kept_with_the_reconstruction(steady, relit,
         pixels = torch.tensor([0, 500, 96 * 72 - 1])
         assert torch.equal(rec.evened(relit).colors(k, pixels), even.reshape(-1, 3)[pixels])
         assert torch.equal(rec.still(relit).image(k), relit.image(k))  # maps fit colors of their own
+    assert rec.own_colors is not None
     rec = replace(rec, own_colors=replace(rec.own_colors, shading=0.05 * torch.ones(COUNT, 11, 3)))
     rec.save(tmp_path / "shaded")
     again = load_reconstruction(tmp_path / "shaded")
     assert torch.equal(again.evened(relit).image(1), rec.evened(relit).image(1))
-    (tmp_path / "shaded" / "frame_colors.json").write_text('{"0000.png": {"map": [[1, 0, 0, 0]]}}')
+
+
+@pytest.mark.parametrize(
+    "frame",
+    [
+        {"map": [[1, 0, 0, 0]]},
+        {"map": [[1, 0, 0, 0], [1, 0, 0, 0], [0, 0, 1, 0]]},  # red and green are one
+        {"map": [[1, 0, 0, 0], [0, 1, 0, 0], [0, 0, 1, 0]], "shading": [[0, 0, 0]]},
+    ],
+)
+def test_damaged_colors_of_frames_are_named(frame, tmp_path):
+    path = tmp_path / "frame_colors.json"
+    path.write_text(json.dumps({"0000.png": frame}))
     with pytest.raises(InputError, match=r"frame_colors\.json"):
-        load_reconstruction(tmp_path / "shaded")
+        read_own_colors(path, Remedy("make it again"))
