@@ -4,12 +4,13 @@ from dataclasses import dataclass
 
 import numpy as np
 import torch
-from jaxtyping import Float
+from jaxtyping import Bool, Float
+from scipy.ndimage import maximum_filter, minimum_filter
 from scipy.sparse import coo_array, csr_array, diags
 from scipy.sparse.linalg import spsolve
 from torch import Tensor
 
-from swimm3r.imaging.filters import LUMA, local_linear
+from swimm3r.imaging.filters import LUMA, blur, local_linear
 from swimm3r.scene.reconstruction import DepthMap
 
 _COARSE = 96  # long side of the grid on which unknown depth is filled
@@ -17,6 +18,11 @@ _NEARER, _FARTHER = 1.6, 2.5  # times as near as the nearest known, and as far a
 _LEAST_TRUST = 0.05  # in depth, as a confidence: that of an image's own, at least, and that of other images'
 _EDGE, _EDGES = 0.1, (0.008, 0.04)  # of brightness, and within which values, colors are others
 _SLOPE = 0.003  # weight of first differences of inverse depth beside second ones
+_STEP = 0.125  # of inverse depth, from which a surface is in front of another
+_REACH = 0.04  # of the long side: as far from a silhouette, gaps belong to what lies behind
+_HOLE = 0.015  # of the long side: gaps as narrow between parts of a surface in front are its own
+_IN_FRONT = 0.9  # as open water, that surfaces in front are for what lies behind: it hardly goes on from them
+_ALIKE = 0.5  # times as far from its colors as from those behind, within which a gap is its own, too
 
 
 @dataclass(frozen=True)
@@ -56,6 +62,9 @@ def fill_z_depth(
     farthest hundredth of what is known. `sea` (0..1) says where there is none; what is filled in there is no depth.
     `elsewhere` is the depth of points in this image that others have measured, 0 where there are none: what is filled
     in follows them, and the cue (`depth_from_color`) as far as it is to be trusted.
+
+    A surface in front hides from other frames what lies beside its silhouette, so that gaps there are no part of it,
+    unless their colors are: they continue what lies behind.
     """
     known = depth.z_depth > 0
     if not known.any():
@@ -65,12 +74,56 @@ def fill_z_depth(
     inverse = torch.where(measured > 0, middle / measured.clamp(min=1e-9), 0.0)
     trust = torch.where(known, depth.confidence, 0.0).clamp(min=_LEAST_TRUST) * (measured > 0)
     told = None if cue is None else DepthCue(middle * cue.inverse, cue.trust)
-    coarse = _continued(image, inverse, trust, sea, told)
-    guide = image @ LUMA
-    smooth = local_linear(guide, coarse[..., None], (1.001 - sea)[..., None], 0.01 * max(image.shape[:2]), 1e-3)[..., 0]
+
+    def continued(trust: Float[Tensor, "h w"], beyond: Float[Tensor, "h w"]) -> Float[Tensor, "h w"]:
+        coarse = _continued(image, inverse, trust, beyond, told)
+        sigma, weight = 0.01 * max(image.shape[:2]), (1.001 - beyond)[..., None]
+        return local_linear(image @ LUMA, coarse[..., None], weight, sigma, 1e-3)[..., 0]
+
+    filled = continued(trust, sea)
+    front, beside = _silhouettes(inverse, filled)
+    hidden = beside & ~known & (sea < 0.5) & ~_of_the_front(image, front & known, (inverse > 0) & ~front)
+    if hidden.any():
+        behind = continued(trust * ~front, torch.maximum(sea, _IN_FRONT * front))
+        filled = torch.where(hidden, torch.minimum(filled, behind), filled)
     nearest, farthest = filled_range(inverse[measured > 0])
-    filled = smooth.clamp(min=farthest, max=nearest)
-    return middle / torch.where(known, inverse, filled)
+    return middle / torch.where(known, inverse, filled.clamp(min=farthest, max=nearest))
+
+
+def _silhouettes(
+    inverse: Float[Tensor, "h w"], filled: Float[Tensor, "h w"]
+) -> tuple[Bool[Tensor, "h w"], Bool[Tensor, "h w"]]:
+    """Masks of the pixels of known inverse depth (0 where unknown) that lie in front of known ones close by, and of
+    all pixels that have known ones in front and behind close by."""
+    size = 2 * max(1, round(_REACH * max(inverse.shape))) + 1
+    known = inverse.numpy() > 0
+    behind = torch.from_numpy(minimum_filter(np.where(known, inverse.numpy(), np.inf), size))
+    nearest = torch.from_numpy(maximum_filter(inverse.numpy(), size))
+    front = (inverse > 0) & (inverse - behind > _STEP * inverse)
+    return front, behind.isfinite() & (nearest - behind > _STEP * filled)
+
+
+def _of_the_front(
+    image: Float[Tensor, "h w 3"], front: Bool[Tensor, "h w"], behind: Bool[Tensor, "h w"]
+) -> Bool[Tensor, "h w"]:
+    """Mask of holes within the surfaces in front, and of pixels of their colors rather than of those behind."""
+    import cv2
+
+    reach = 2 * max(1, round(_HOLE * max(front.shape) / 2)) + 1
+    disk = cv2.getStructuringElement(cv2.MORPH_ELLIPSE, (reach, reach))
+    closed = cv2.morphologyEx(
+        front.byte().numpy(), cv2.MORPH_CLOSE, disk, borderType=cv2.BORDER_CONSTANT, borderValue=0
+    )
+    color, sigma = on_grid(image.permute(2, 0, 1)).permute(1, 2, 0), _REACH * _COARSE / 2
+
+    def differs(surface: Bool[Tensor, "h w"]) -> Float[Tensor, "r c"]:
+        share = on_grid(surface.float())[..., None]
+        mean = on_grid((image * surface[..., None]).permute(2, 0, 1)).permute(1, 2, 0)
+        return (color - blur(mean, sigma) / blur(share, sigma).clamp(min=1e-6)).norm(dim=-1)
+
+    alike = (differs(front) < _ALIKE * differs(behind)).float()[None, None]
+    its_own = torch.nn.functional.interpolate(alike, front.shape, mode="nearest")[0, 0] > 0
+    return its_own | (torch.from_numpy(closed) > 0)
 
 
 def _continued(

@@ -5,7 +5,6 @@ from dataclasses import replace
 import torch
 
 from swimm3r.cameras import Cameras, image_directions, ray_depth_from_z
-from swimm3r.imaging.depth_completion import fill_z_depth
 from swimm3r.imaging.open_water import open_water_mask
 from swimm3r.medium import AttenuationCurve, Medium, MediumFit, add_water, linear_from_srgb, srgb_from_linear
 from swimm3r.scene.reconstruction import DepthMap
@@ -98,37 +97,6 @@ def test_a_linear_fit_restores_light_that_was_lost_in_linear_light(dive):
     ray_depth = ray_depth_from_z(z, image_directions(camera).float())
     raw = srgb_from_linear(add_water(linear_from_srgb(clear), ray_depth, dive.medium))
     assert psnr(restore_image(raw, DepthMap(z, near), rays_of(camera), linear).shown, clear) > 30
-
-
-def test_filling_keeps_what_is_known_and_stays_in_its_range(dive):
-    z = torch.linspace(1.0, 3.0, 96).expand(72, 96).clone()
-    holes = torch.rand(z.shape, generator=torch.Generator().manual_seed(1)) < 0.5
-    depth = DepthMap(torch.where(holes, 0.0, z), (~holes).float())
-    filled = fill_z_depth(dive.frames.image(0), depth, torch.zeros(72, 96))
-    torch.testing.assert_close(filled[~holes], z[~holes])
-    assert ((filled - z).abs() / z)[holes].median() < 0.05
-
-
-def test_filling_goes_on_as_planes_beyond_the_nearest_and_the_farthest_known():
-    inverse = torch.linspace(0.4, 1.0, 72)[:, None].expand(72, 96)
-    known = (inverse > 0.5) & (inverse < 0.8)
-    depth = DepthMap(torch.where(known, 1 / inverse, 0.0), known.float())
-    filled = fill_z_depth(torch.full((72, 96, 3), 0.5), depth, torch.zeros(72, 96))
-    assert (filled * inverse).log().abs().max() < 0.1  # 0.22 off if depth stayed what it is at the rim
-
-
-def test_filling_follows_depth_that_other_images_measured():
-    z = torch.full((72, 96), 1.0)
-    z[:, 48:] = 3.0
-    known = torch.zeros(72, 96, dtype=torch.bool)
-    known[:, :32] = True
-    depth, image = DepthMap(torch.where(known, z, 0.0), known.float()), torch.full((72, 96, 3), 0.5)
-    image[:, 48:] = 0.2
-    elsewhere = torch.where(torch.rand(72, 96, generator=torch.Generator().manual_seed(1)) < 0.1, z, 0.0)
-    alone, told = (fill_z_depth(image, depth, torch.zeros(72, 96), hints) for hints in (None, elsewhere))
-    assert torch.equal(told[known], z[known])
-    assert (told / z).log().abs()[:, 52:].max() < 0.1
-    assert (alone / z).log().abs()[:, 52:].min() > 0.5
 
 
 def test_open_water_is_found_above_the_horizon_and_nowhere_else(teal):
