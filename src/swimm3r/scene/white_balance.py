@@ -2,6 +2,7 @@
 
     shown = clip(gains * clear, 0, 1)    on pixel values as stored
 
+The gains hold a common one, too, by which bright surfaces stay below white (`sfm.medium.restore.within_white`).
 white_balance.json in RUN/sfm holds it. Scores and physics use the colors before it.
 """
 

@@ -8,6 +8,8 @@ import numpy as np
 import pytest
 import torch
 
+from swimm3r.appearance import FrameColors
+from swimm3r.cameras import image_directions
 from swimm3r.io import images
 from swimm3r.medium import AttenuationCurve, Medium, MediumFit, remove_water
 from swimm3r.scene.frames import Frames
@@ -22,7 +24,14 @@ from swimm3r.sfm.medium.plausibility import (
     water_warnings,
     with_like_channels,
 )
-from swimm3r.sfm.medium.restore import RestoredImage, display_gains, milder_gains, restore_image, white_balance
+from swimm3r.sfm.medium.restore import (
+    RestoredImage,
+    display_gains,
+    milder_gains,
+    restore_image,
+    white_balance,
+    within_white,
+)
 from swimm3r.sfm.medium.settings import RestoreSettings, TrackSettings
 from swimm3r.sfm.settings import ColmapSettings
 
@@ -263,3 +272,28 @@ def test_a_gray_clip_is_called_gray_and_stays_gray(dive, tmp_path: Path):
     torch.testing.assert_close(rec.cloud.restored[:, 0], rec.cloud.restored[:, 2])
     shown = images.read_rgb(tmp_path / "restored" / f"{rec.names[2]}.png").astype(int)
     assert abs(shown[..., 0] - shown[..., 2]).max() <= 1
+
+
+@pytest.mark.parametrize("times", [1.0, 3.0])
+def test_colors_brighter_than_white_in_a_common_exposure_get_one_common_gain(dive, times):
+    names = tuple(dive.rec.names)
+    colors = FrameColors(names, torch.eye(3, 4).repeat(len(names), 1, 1) / times)
+    rec = replace(dive.rec, medium=fit_of(dive.medium, 0.1, known=True), own_colors=colors)
+    frames, balance = rec.evened(dive.frames), WhiteBalance((0.8, 0.9, 0.85))
+    found = within_white(rec, frames, balance)
+    gain = found.factors / balance.factors
+    torch.testing.assert_close(gain, gain[:1].expand(3))
+
+    def beyond_white(balance: WhiteBalance) -> float:
+        rays = image_directions(rec.cameras[0]).float()
+        shown = restore_image(frames.image(0), rec.depth[names[0]], rays, rec.medium, gains=balance.factors).shown
+        return float((shown.amax(-1) > 0.999).float().mean())
+
+    assert (float(gain[0]) < 0.99) == (times > 1)
+    assert beyond_white(found) < 0.02
+    assert times == 1 or beyond_white(balance) > 3 * beyond_white(found)
+
+
+def test_colors_shown_as_filmed_get_no_common_gain(dive):
+    rec = replace(dive.rec, medium=fit_of(dive.medium, 0.1, known=True))
+    assert within_white(rec, dive.frames, WhiteBalance(source="filmed")) == WhiteBalance(source="filmed")

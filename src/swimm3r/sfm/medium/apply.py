@@ -20,7 +20,7 @@ from swimm3r.sfm.medium.flicker import with_steady
 from swimm3r.sfm.medium.from_head import PredictedWater, dive_fit, predicted_images
 from swimm3r.sfm.medium.light import judge_light
 from swimm3r.sfm.medium.plausibility import water_warnings, with_like_channels
-from swimm3r.sfm.medium.restore import RestoredImage, restored_images, white_balance
+from swimm3r.sfm.medium.restore import RestoredImage, restored_images, white_balance, within_white
 from swimm3r.sfm.medium.samples import WaterSamples, collect_samples
 from swimm3r.sfm.medium.seathru import fit_medium
 from swimm3r.sfm.medium.settings import LightChoice, MediumSettings, SeathruSettings
@@ -87,7 +87,10 @@ def with_water(
     fusion = settings.water.tracks
     cloud = dense_cloud(rec, frames, tracks, stored, settings.restore, fusion, progress, at, eps_inv)
     rec = replace(rec, cloud=cloud)
-    rec = replace(rec, white_balance=white_balance(rec, settings.restore))
+    balance = white_balance(rec, settings.restore)
+    if settings.restore.white_balance:
+        balance = within_white(rec, frames, balance)
+    rec = replace(rec, white_balance=balance)
     filmed = rec.white_balance.source == "filmed"
 
     def keep(i: int, image: RestoredImage) -> None:

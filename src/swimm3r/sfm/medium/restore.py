@@ -52,6 +52,9 @@ _LEAST_CORRECTED = 0.7  # of a guessed depth, down to which colors correct it; b
 _LEVELS, _FEWEST = 20, 20  # levels of brightness from 0 to 1, and surfaces of a level that tell how bright it becomes
 _NEARLY_ALL = 0.95  # of the surfaces at known distance
 _SAMPLES = 20_000  # of them, which stand for all of an image
+_VIEWS, _PIXELS = 12, 2_000  # frames, and pixels of each, that tell how bright the surfaces of a dive become
+_BEYOND_WHITE = 0.01  # of these pixels, at most
+_DARKEST = 0.5  # common gain, for them
 
 
 @dataclass(frozen=True)
@@ -155,6 +158,36 @@ def white_balance(rec: Reconstruction, settings: RestoreSettings) -> WhiteBalanc
     gains = display_gains(rec.cloud.restored) if known else milder_gains(rec.cloud.raw, rec.cloud.restored)
     red, green, blue = gains.tolist()
     return WhiteBalance((red, green, blue))
+
+
+def within_white(rec: Reconstruction, frames: Frames, balance: WhiteBalance) -> WhiteBalance:
+    """The balance with one common gain, 0.5 to 1, by which at most a hundredth of what the frames show is beyond white.
+
+    What the water takes from far surfaces makes them brighter than any filmed one once it is given back, and frames in
+    a common exposure may be brighter than they were taken. Pixels that are clipped as filmed tell nothing.
+    """
+    assert rec.medium is not None
+    if balance.source == "filmed":
+        return balance
+    as_filmed, brightness = replace(frames, own_colors=None), [torch.zeros(0)]
+    for i in range(0, len(rec.names), -(-len(rec.names) // _VIEWS)):
+        z_depth = rec.depth[rec.names[i]].z_depth
+        pixel = torch.nonzero(z_depth.flatten() > 0)[:, 0]
+        pixel = pixel[:: max(1, len(pixel) // _PIXELS)]
+        f = frames.index(rec.names[i])
+        pixel = pixel[_unclipped(as_filmed.colors(f, pixel))]
+        filmed = frames.colors(f, pixel)
+        rays = frame_rays(rec.cameras[i]).reshape(-1, 3)[pixel]
+        length = rays.norm(dim=-1)
+        path = z_depth.flatten()[pixel] * length
+        I = linear_from_srgb(filmed) if rec.medium.encoding == "linear" else filmed
+        J = remove_water(I, path, rec.medium.at(path, rays / length[:, None]))
+        stored = srgb_from_linear(J.clamp(min=0)) if rec.medium.encoding == "linear" else J
+        brightness.append((stored * balance.factors).amax(-1))
+    seen = torch.cat(brightness).numpy()
+    white = float(np.quantile(seen, 1 - _BEYOND_WHITE)) if len(seen) else 1.0
+    red, green, blue = (balance.factors / min(max(white, 1.0), 1 / _DARKEST)).tolist()
+    return replace(balance, gains=(red, green, blue))
 
 
 def display_gains(restored: Float[Tensor, "n 3"]) -> Float[Tensor, "3"]:
