@@ -10,6 +10,7 @@ each run:
     hidden   share of the pixels compared
     error    mean |ln(filled / true)|, without and with color
     far off  share of them that is off by more than a fifth
+    beside   error with color beside silhouettes: within 2 % of the long side of what is an eighth nearer
 """
 
 import argparse
@@ -19,6 +20,7 @@ from pathlib import Path
 import numpy as np
 import torch
 from jaxtyping import Float
+from scipy.ndimage import minimum_filter
 from torch import Tensor
 
 from swimm3r.geometry import align_poses
@@ -32,9 +34,10 @@ from swimm3r.scene.point_groups import PointGroups
 
 FRAMES = 8
 BORDER = 0.18  # of the long side
+BESIDE, NEARER = 0.02, 0.125  # of the long side; of the depth
 
 
-def errors(sfm: FinishedSfm) -> Float[np.ndarray, " 5"]:
+def errors(sfm: FinishedSfm) -> Float[np.ndarray, " 6"]:
     """The columns of the table, means over the frames."""
     rec, truth = sfm.rec, sfm.truth
     assert rec.medium is not None
@@ -68,8 +71,17 @@ def errors(sfm: FinishedSfm) -> Float[np.ndarray, " 5"]:
         depth = replace(depth, z_depth=known)
         cue = depth_from_color(linear_from_srgb(image) if linear else image, depth, sea, frame_rays(camera), rec.medium)
         off = [_off(fill_z_depth(image, depth, sea, elsewhere, told), true, asked) for told in (None, cue)]
-        rows.append([float(asked.float().mean()), *(float(e.mean()) for e in off), *(_far(e) for e in off)])
-    return np.mean(rows, axis=0)
+        beside = off[1][_beside_silhouettes(true)[asked]]
+        found = [*(float(e.mean()) for e in off), *(_far(e) for e in off)]
+        rows.append([float(asked.float().mean()), *found, float(beside.mean()) if len(beside) else np.nan])
+    return np.nanmean(rows, axis=0)
+
+
+def _beside_silhouettes(true: Tensor) -> Tensor:
+    """Mask of the pixels close to which a surface is nearer."""
+    depth = torch.where(true > 0, true, torch.inf)
+    nearest = minimum_filter(depth.numpy(), 2 * round(BESIDE * max(true.shape)) + 1)
+    return torch.from_numpy(nearest) < (1 - NEARER) * depth
 
 
 def _off(filled: Tensor, true: Tensor, asked: Tensor) -> Tensor:
@@ -83,8 +95,8 @@ def _far(off: Tensor) -> float:
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("runs", nargs="+", metavar="RUN[:TRUTH]")
-    print("| run | hidden | error | with color | far off | with color |")
-    print("| --- | --- | --- | --- | --- | --- |")
+    print("| run | hidden | error | with color | far off | with color | beside |")
+    print("| --- | --- | --- | --- | --- | --- | --- |")
     for given in parser.parse_args().runs:
         run, _, truth = given.partition(":")
         hidden, *rest = errors(open_finished_sfm(Path(run), Path(truth) if truth else None))
