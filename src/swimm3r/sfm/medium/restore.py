@@ -184,7 +184,8 @@ def within_white(rec: Reconstruction, frames: Frames, balance: WhiteBalance) -> 
         J = remove_water(I, path, rec.medium.at(path, rays / length[:, None]))
         stored = srgb_from_linear(J.clamp(min=0)) if rec.medium.encoding == "linear" else J
         brightness.append((stored * balance.factors).amax(-1))
-    seen = torch.cat(brightness).numpy()
+    seen = torch.cat(brightness)
+    seen = seen[seen.isfinite()].numpy()
     white = float(np.quantile(seen, 1 - _BEYOND_WHITE)) if len(seen) else 1.0
     red, green, blue = (balance.factors / min(max(white, 1.0), 1 / _DARKEST)).tolist()
     return replace(balance, gains=(red, green, blue))
