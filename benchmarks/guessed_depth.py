@@ -11,6 +11,7 @@ each run:
     error    mean |ln(filled / true)|, without and with color
     far off  share of them that is off by more than a fifth
     beside   error with color beside silhouettes: within 2 % of the long side of what is an eighth nearer
+    restored PSNR (dB) of the restored frames there against a TRUTH, times one gain per frame
 """
 
 import argparse
@@ -23,6 +24,7 @@ from jaxtyping import Float
 from scipy.ndimage import minimum_filter
 from torch import Tensor
 
+from swimm3r.evaluate.images import psnr
 from swimm3r.geometry import align_poses
 from swimm3r.imaging.depth_completion import fill_z_depth
 from swimm3r.imaging.depth_from_color import depth_from_color
@@ -31,13 +33,14 @@ from swimm3r.imaging.undistortion import frame_directions, frame_rays
 from swimm3r.medium import linear_from_srgb, srgb_from_linear
 from swimm3r.pipeline.finished_sfm import FinishedSfm, open_finished_sfm
 from swimm3r.scene.point_groups import PointGroups
+from swimm3r.sfm.medium.restore import restore_image
 
 FRAMES = 8
 BORDER = 0.18  # of the long side
 BESIDE, NEARER = 0.02, 0.125  # of the long side; of the depth
 
 
-def errors(sfm: FinishedSfm) -> Float[np.ndarray, " 6"]:
+def errors(sfm: FinishedSfm) -> Float[np.ndarray, " 7"]:
     """The columns of the table, means over the frames."""
     rec, truth = sfm.rec, sfm.truth
     assert rec.medium is not None
@@ -73,8 +76,16 @@ def errors(sfm: FinishedSfm) -> Float[np.ndarray, " 6"]:
         off = [_off(fill_z_depth(image, depth, sea, elsewhere, told), true, asked) for told in (None, cue)]
         beside = off[1][_beside_silhouettes(true)[asked]]
         found = [*(float(e.mean()) for e in off), *(_far(e) for e in off)]
-        rows.append([float(asked.float().mean()), *found, float(beside.mean()) if len(beside) else np.nan])
-    return np.nanmean(rows, axis=0)
+        found.append(float(beside.mean()) if len(beside) else np.nan)
+        clear = None if truth is None else truth.clear(name)
+        if clear is None:
+            found.append(np.nan)
+        else:
+            restored = restore_image(image, depth, frame_rays(camera), rec.medium, elsewhere=elsewhere).clear
+            gain = (restored * clear)[known > 0].sum() / restored[known > 0].square().sum()
+            found.append(float(psnr(gain * restored[asked], clear[asked])))
+        rows.append([float(asked.float().mean()), *found])
+    return np.ma.masked_invalid(rows).mean(axis=0).filled(np.nan)
 
 
 def _beside_silhouettes(true: Tensor) -> Tensor:
@@ -95,13 +106,14 @@ def _far(off: Tensor) -> float:
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("runs", nargs="+", metavar="RUN[:TRUTH]")
-    print("| run | hidden | error | with color | far off | with color | beside |")
-    print("| --- | --- | --- | --- | --- | --- | --- |")
+    print("| run | hidden | error | with color | far off | with color | beside | restored |")
+    print("| --- | --- | --- | --- | --- | --- | --- | --- |")
     for given in parser.parse_args().runs:
         run, _, truth = given.partition(":")
-        hidden, *rest = errors(open_finished_sfm(Path(run), Path(truth) if truth else None))
+        hidden, *rest, decibels = errors(open_finished_sfm(Path(run), Path(truth) if truth else None))
         shown = " | ".join([f"{100 * hidden:.0f} %", *(f"{100 * value:.1f} %" for value in rest)])
-        print(f"| {Path(run).name}{', truth' if truth else ''} | {shown} |", flush=True)
+        restored = f"{decibels:.1f} dB" if np.isfinite(decibels) else "-"
+        print(f"| {Path(run).name}{', truth' if truth else ''} | {shown} | {restored} |", flush=True)
 
 
 if __name__ == "__main__":

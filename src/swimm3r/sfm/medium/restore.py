@@ -22,6 +22,7 @@ import torch
 from jaxtyping import Bool, Float, Int
 from torch import Tensor
 
+from swimm3r.imaging.clipped import clipped
 from swimm3r.imaging.depth_completion import fill_z_depth
 from swimm3r.imaging.depth_from_color import depth_from_color
 from swimm3r.imaging.filters import LUMA, blur, local_linear
@@ -175,7 +176,7 @@ def within_white(rec: Reconstruction, frames: Frames, balance: WhiteBalance) -> 
         pixel = torch.nonzero(z_depth.flatten() > 0)[:, 0]
         pixel = pixel[:: max(1, len(pixel) // _PIXELS)]
         f = frames.index(rec.names[i])
-        pixel = pixel[_unclipped(as_filmed.colors(f, pixel))]
+        pixel = pixel[~clipped(as_filmed.colors(f, pixel)).any(-1)]
         filmed = frames.colors(f, pixel)
         rays = frame_rays(rec.cameras[i]).reshape(-1, 3)[pixel]
         length = rays.norm(dim=-1)
