@@ -13,6 +13,7 @@ import tifffile
 from jaxtyping import Float32
 
 from swimm3r.errors import InputError
+from swimm3r.io.files.array_file import read_npy, read_npz
 from swimm3r.io.files.atomic import atomic_path
 
 SUFFIXES = (".tif", ".tiff", ".png", ".npz", ".npy")
@@ -47,12 +48,11 @@ def write_depth(path: Path, depth: Float32[np.ndarray, "h w"]) -> None:
 def _decode(path: Path) -> np.ndarray:
     try:
         if path.suffix.lower() == ".npz":
-            with np.load(path, allow_pickle=False) as archive:
-                return archive["z_depth"]
+            return read_npz(path, "z_depth")["z_depth"]
         if path.suffix.lower() == ".npy":
-            return np.load(path, allow_pickle=False)
+            return read_npy(path)
         data = path.read_bytes()
-    except (OSError, ValueError, KeyError, EOFError, zipfile.BadZipFile, zlib.error) as error:
+    except (OSError, ValueError, EOFError, zipfile.BadZipFile, zlib.error) as error:
         raise _unreadable(path, error) from error
     import cv2
 

@@ -17,7 +17,7 @@ import torch
 
 from swimm3r.io import ply
 from swimm3r.io.depth import read_depth, write_depth
-from swimm3r.io.files.array_file import write_arrays
+from swimm3r.io.files.array_file import read_npz, write_arrays
 from swimm3r.io.files.atomic import atomic_path, write_text
 from swimm3r.io.files.damage import Remedy, guard, remake
 from swimm3r.io.files.json_file import read_json
@@ -145,8 +145,8 @@ def _trajectory(old: Path, new: Path, factor: float) -> None:
 
 
 def _depth(old: Path, new: Path, factor: float) -> None:
-    with guard(old, remake(old.parent)), np.load(old, allow_pickle=False) as stored:
-        arrays = {name: stored[name] for name in stored.files}
+    with guard(old, remake(old.parent)):
+        arrays = read_npz(old)
     arrays["z_depth"] = (arrays["z_depth"].astype(np.float64) * factor).astype(arrays["z_depth"].dtype)
     with atomic_path(new) as draft:
         write_arrays(draft, **arrays)
@@ -154,8 +154,8 @@ def _depth(old: Path, new: Path, factor: float) -> None:
 
 def _frame_water(old: Path, new: Path, factor: float) -> None:
     """The water that a network saw in a frame: every coefficient but the color is per length."""
-    with guard(old, remake(old.parent)), np.load(old, allow_pickle=False) as stored:
-        arrays = {name: stored[name] for name in stored.files}
+    with guard(old, remake(old.parent)):
+        arrays = read_npz(old)
     for name in ("beta_B", "curve"):
         arrays[name] = (arrays[name].astype(np.float64) / factor).astype(arrays[name].dtype)
     with atomic_path(new) as draft:

@@ -1,14 +1,17 @@
 """Arrays of an archive, as they were written or not at all."""
 
+import gc
 import io
+import time
 import zipfile
+from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
 
 import numpy as np
 import pytest
 
 from swimm3r.errors import InputError
-from swimm3r.io.files.array_file import Layout, read_arrays, write_arrays
+from swimm3r.io.files.array_file import Layout, read_arrays, read_npy, read_npz, write_arrays
 from swimm3r.io.files.damage import remake
 
 LAYOUTS = {"i": Layout("m", "int"), "xy": Layout("m 2"), "seen": Layout("m", finite=False)}
@@ -79,3 +82,51 @@ def test_any_flipped_byte_gives_the_arrays_or_an_error(tmp_path: Path):
         except InputError:
             continue
         np.testing.assert_array_equal(found["i"], GOOD["i"])  # a byte that nothing depends on
+
+
+def test_arrays_of_any_shape_keep_order_and_kind(tmp_path: Path):
+    columns = np.asfortranarray(np.arange(6.0).reshape(2, 3))
+    arrays = {"columns": columns, "none": np.ones((0, 3)), "text": np.array("a")}
+    np.savez(tmp_path / "a.npz", **arrays)
+    np.save(tmp_path / "a.npy", columns)
+    for found in (read_npz(tmp_path / "a.npz"), read_npz(tmp_path / "a.npz", *arrays)):
+        assert found.keys() == arrays.keys()
+        for name, values in arrays.items():
+            np.testing.assert_array_equal(found[name], values)
+            assert found[name].dtype == values.dtype
+            assert found[name].flags.writeable
+    np.testing.assert_array_equal(read_npy(tmp_path / "a.npy"), columns)
+    with pytest.raises(ValueError, match="it has no array depth"):
+        read_npz(tmp_path / "a.npz", "depth")
+
+
+class Garbage:
+    """Lets other threads run while it is collected, as tensors do."""
+
+    def __init__(self) -> None:
+        self.cycle = self
+
+    def __del__(self) -> None:
+        time.sleep(1e-5)
+
+
+@pytest.fixture
+def frequent_collection():
+    before = gc.get_threshold()
+    gc.set_threshold(20, 5, 5)
+    yield
+    gc.set_threshold(*before)
+
+
+@pytest.mark.usefixtures("frequent_collection")
+def test_threads_read_at_once(tmp_path: Path):
+    write_arrays(tmp_path / "a.npz", **GOOD)
+    np.save(tmp_path / "a.npy", GOOD["xy"])
+
+    def read(_: int) -> int:
+        Garbage()
+        read_npy(tmp_path / "a.npy")
+        return len(read_arrays(tmp_path / "a.npz", LAYOUTS, remake(tmp_path)))
+
+    with ThreadPoolExecutor(4) as pool:
+        assert set(pool.map(read, range(400))) == {3}

@@ -5,11 +5,16 @@ import zipfile
 from collections.abc import Mapping
 from dataclasses import dataclass
 from pathlib import Path
+from threading import RLock
 from typing import Literal
 
 import numpy as np
 
 from swimm3r.io.files.damage import Remedy, first_line, guard
+
+# NumPy parses the header of an array by `ast`. Its count of nested calls is one for all threads before CPython 3.11.8
+# and 3.12.2, and a thread that comes in between has it raise SystemError (python/cpython#106905).
+_one_parses = RLock()
 
 
 @dataclass(frozen=True)
@@ -26,6 +31,19 @@ def read_arrays(path: Path, layouts: Mapping[str, Layout], remedy: Remedy) -> di
     with guard(path, remedy), zipfile.ZipFile(path) as archive:
         lengths: dict[str, int] = {}
         return {name: _array(archive, name, layout, lengths) for name, layout in layouts.items()}
+
+
+def read_npz(path: Path, *names: str) -> dict[str, np.ndarray]:
+    """Arrays of an .npz by name, of any shape; all where none is named. Raises OSError, ValueError, BadZipFile."""
+    with zipfile.ZipFile(path) as archive:
+        wanted = names or [entry.removesuffix(".npy") for entry in archive.namelist()]
+        return {name: _decoded(archive, name) for name in wanted}
+
+
+def read_npy(path: Path) -> np.ndarray:
+    """The array of an .npy. Raises OSError, ValueError, EOFError."""
+    with _one_parses:
+        return np.load(path, allow_pickle=False)
 
 
 def write_arrays(path: Path, **arrays: np.ndarray) -> None:
@@ -61,12 +79,14 @@ def _decoded(archive: zipfile.ZipFile, name: str) -> np.ndarray:
         with archive.open(member) as file:
             if np.lib.format.read_magic(file) != (1, 0):
                 raise ValueError(f"{name} is not what savez writes")
-            shape, _, dtype = np.lib.format.read_array_header_1_0(file)
-        if dtype.hasobject:
-            raise ValueError(f"{name} holds pickled objects")
-        if math.prod(shape) * dtype.itemsize > archive.getinfo(member).file_size:
-            raise ValueError(f"{name} is cut off")
-        with archive.open(member) as file:
-            return np.lib.format.read_array(file, allow_pickle=False)
+            with _one_parses:
+                shape, by_column, dtype = np.lib.format.read_array_header_1_0(file)
+            if dtype.hasobject:
+                raise ValueError(f"{name} holds pickled objects")
+            count = math.prod(shape)
+            if count * dtype.itemsize > archive.getinfo(member).file_size:
+                raise ValueError(f"{name} is cut off")
+            values = np.frombuffer(bytearray(file.read()), dtype, count)
+        return values.reshape(shape, order="F" if by_column else "C")
     except RuntimeError as error:  # an entry that is encrypted or compressed in a way that zipfile does not know
         raise ValueError(first_line(error)) from error

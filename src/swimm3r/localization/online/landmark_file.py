@@ -6,6 +6,7 @@ from pathlib import Path
 import numpy as np
 import torch
 
+from swimm3r.io.files.array_file import read_npz
 from swimm3r.io.files.atomic import atomic_path
 from swimm3r.io.files.cache_key import cache_key, code_version, content_digest
 from swimm3r.io.files.damage import guard, remake
@@ -40,7 +41,8 @@ def landmarks_of_run(folder: Path, settings: FeatureSettings, progress: Progress
 
 def _read(path: Path, key: str, rec: Reconstruction) -> LandmarkMap | None:
     """The landmarks in the file; None where it was made from something else."""
-    with guard(path, remake(path)), np.load(path, allow_pickle=False) as stored:
+    with guard(path, remake(path)):
+        stored = read_npz(path)
         if str(stored["key"]) != key:
             return None
         xyz, point, frame, descriptors, words, looks = (torch.from_numpy(stored[name]) for name in _ARRAYS)

@@ -26,6 +26,7 @@ from swimm3r.errors import InputError
 from swimm3r.imaging.depth_completion import fill_z_depth
 from swimm3r.imaging.open_water import sea_share
 from swimm3r.imaging.undistortion import frame_rays
+from swimm3r.io.files.array_file import read_npz
 from swimm3r.io.files.atomic import atomic_path
 from swimm3r.io.files.damage import guard, remake
 from swimm3r.medium import AttenuationCurve, Medium, MediumFit, remove_water
@@ -82,8 +83,8 @@ class PredictedWater:
     def frame(self, name: str) -> FrameWater:
         """The water of a frame."""
         path = self.folder / f"{name}.npz"
-        with guard(path, remake(self.folder.parent)), np.load(path, allow_pickle=False) as stored:
-            return FrameWater(*(torch.from_numpy(stored[key]) for key in ("Binf", "beta_B", "curve")))
+        with guard(path, remake(self.folder.parent)):
+            return FrameWater(*map(torch.from_numpy, read_npz(path, "Binf", "beta_B", "curve").values()))
 
     def at(self, name: str, pixel: Int[Tensor, " n"], ray_depth: Float[Tensor, " n"]) -> Medium:
         """The medium of some pixels of a frame, row-major indices in the prepared frame."""
