@@ -169,6 +169,24 @@ def test_a_cloud_is_saved_as_shown_as_restored_and_as_filmed(rec: swimm3r.Recons
             assert np.abs(ply.read_points(folder / f"{stem}.ply")[1] - rgb.numpy()).max() <= 0.5 / 255 + 1e-6
 
 
+def test_points_brighter_than_white_keep_their_colors_where_they_are_shown_darker(
+    rec: swimm3r.Reconstruction, tmp_path: Path
+):
+    assert rec.cloud is not None
+    bright = torch.linspace(0.9, 1.9, len(rec.cloud.xyz))[:, None].expand(-1, 3).contiguous()
+    one = replace(rec, cloud=replace(rec.cloud, restored=bright), white_balance=WhiteBalance((0.6, 0.5, 0.8)))
+    one.save(tmp_path / "one")
+    again = swimm3r.load_reconstruction(tmp_path / "one")
+    assert again.cloud is not None
+    rounded = 0.51 / 255 / torch.tensor([0.6, 0.5, 0.8])
+    seen = bright * one.white_balance.factors <= 1
+    assert ((again.cloud.restored - bright).abs() < rounded)[seen].all()
+    again.save(tmp_path / "two")
+    for stem in ("points", "points_physical"):
+        assert (tmp_path / "one" / f"{stem}.ply").read_bytes() == (tmp_path / "two" / f"{stem}.ply").read_bytes()
+    assert ply.read_points(tmp_path / "one" / "points_physical.ply")[1].max() == 1
+
+
 @pytest.mark.parametrize("gains", ["[1, 1]", "[1, 0, 1]", "[1, -1, 1]", "[1, NaN, 1]", "[1, 1e9, 1]", '"gray"'])
 def test_a_white_balance_that_is_none_is_refused_by_name(gains: str, rec: swimm3r.Reconstruction, tmp_path: Path):
     rec.save(tmp_path / "one")

@@ -135,7 +135,7 @@ class DenseCloud:
 
     xyz: Float[Tensor, "n 3"]
     raw: Float[Tensor, "n 3"]  # 0..1
-    restored: Float[Tensor, "n 3"]  # physical, 0..1
+    restored: Float[Tensor, "n 3"]  # physical; beyond 1 where surfaces would be brighter than white without the water
 
     def shown(self, balance: WhiteBalance) -> Float[Tensor, "n 3"]:
         """The colors for people to look at, like the restored frames."""

@@ -23,6 +23,7 @@ from swimm3r.scene.rig import RigFit
 from swimm3r.scene.white_balance import UNBALANCED, WHITE_BALANCE, WhiteBalance, read_white_balance
 
 _UNFILTERED = "matches_unfiltered.npz"
+_ROUNDED_TO_WHITE = 254.5001 / 255  # the darkest color whose 8 bits are white
 _MATCHES = {
     "i": Layout("matches", "int"),
     "j": Layout("matches", "int"),
@@ -57,7 +58,7 @@ def load_reconstruction(folder: str | Path, frames: Frames | None = None) -> Rec
             _check_frames(sparse, frames)
     about = read_json(folder / "reconstruction.json", _About, remedy)
     fits = medium_json.read_fits(folder / "medium.json", remedy)
-    clear = "_physical" if _is_balanced(folder) else ""
+    balance = read_run_balance(folder) if _is_balanced(folder) else None
     return Reconstruction(
         names=sparse.names,
         cameras=_read_cameras(folder / "cameras.json", sparse.names),
@@ -73,10 +74,10 @@ def load_reconstruction(folder: str | Path, frames: Frames | None = None) -> Rec
         metric=about.metric,
         medium=fits.get("stored"),
         medium_linear=fits.get("linear"),
-        cloud=_load_cloud(folder, "points", clear),
-        backdrop=_load_cloud(folder, "backdrop", clear),
+        cloud=_load_cloud(folder, "points", balance),
+        backdrop=_load_cloud(folder, "backdrop", balance),
         warnings=about.warnings,
-        white_balance=read_run_balance(folder),
+        white_balance=UNBALANCED if balance is None else balance,
         points_found=about.points_found,
         up=about.up,
         rig=about.rig,
@@ -137,13 +138,25 @@ def _is_balanced(folder: Path) -> bool:
     return any((folder / name).exists() for name in (WHITE_BALANCE, "points_physical.ply"))
 
 
-def _load_cloud(folder: Path, stem: str, clear: str) -> DenseCloud | None:
+def _load_cloud(folder: Path, stem: str, balance: WhiteBalance | None) -> DenseCloud | None:
+    """A cloud with its colors; None where there is none. Without a balance it has physical colors in the first file."""
     if not (folder / f"{stem}.ply").is_file():
         return None
     remedy = remake(folder)
-    xyz, restored = ply.read_points(folder / f"{stem}{clear}.ply", remedy)
-    _, raw = ply.read_points(folder / f"{stem}_raw.ply", remedy)
-    with guard(folder / f"{stem}_raw.ply", remedy):
-        if len(raw) != len(xyz):
-            raise ValueError(f"it has {len(raw)} points, {stem}{clear}.ply {len(xyz)}")
+    xyz, shown = ply.read_points(folder / f"{stem}.ply", remedy)
+
+    def others(kind: str) -> np.ndarray:
+        path = folder / f"{stem}{kind}.ply"
+        _, rgb = ply.read_points(path, remedy)
+        with guard(path, remedy):
+            if len(rgb) != len(xyz):
+                raise ValueError(f"it has {len(rgb)} points, {stem}.ply {len(xyz)}")
+        return rgb
+
+    raw, restored = others("_raw"), shown
+    if balance is not None:
+        restored = others("_physical")
+        if balance.source == "restored":  # 8 bits end at white, which displayed colors have made darker
+            brighter = np.maximum(shown / balance.factors.numpy(), _ROUNDED_TO_WHITE)
+            restored = np.where(restored == 1, brighter, restored)
     return DenseCloud(torch.from_numpy(xyz), torch.from_numpy(raw), torch.from_numpy(restored))

@@ -20,6 +20,9 @@ from swimm3r.io.files.damage import Remedy
 from swimm3r.io.files.json_file import read_json
 
 WHITE_BALANCE = "white_balance.json"
+BRIGHTEST = 2.0
+"""Times white: clear colors up to it are told apart, as the common gain of a balance is 0.5 at least."""
+
 _MOST = 10.0  # gain; no balance of this package comes near it
 
 

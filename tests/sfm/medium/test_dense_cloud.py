@@ -5,6 +5,7 @@ from dataclasses import replace
 import pytest
 import torch
 
+from swimm3r.appearance import FrameColors
 from swimm3r.medium import MediumFit
 from swimm3r.scene.reconstruction import DenseCloud
 from swimm3r.scene.surface import surface_of
@@ -20,6 +21,18 @@ def test_restored_points_have_the_clear_colors_of_the_seafloor(dive, known_water
     cloud = restored_points(dive.rec, dive.frames, tracks, known_water)
     assert (cloud.restored - dive.seafloor(cloud.xyz[:, :2])).abs().mean() < 0.02
     assert (cloud.raw - cloud.restored).abs().mean() > 0.05
+
+
+def test_points_brighter_than_white_without_the_water_are_told_apart_to_twice_white(dive, known_water: MediumFit):
+    tracks = fuse_depth(dive.rec, dive.frames, FEW)
+    names, water = tuple(dive.rec.names), replace(known_water, Binf=torch.zeros(3))  # nothing to subtract
+    thrice = FrameColors(names, torch.eye(3, 4).repeat(len(names), 1, 1) / 3)
+    usual = restored_points(dive.rec, dive.frames, tracks, water).restored
+    brighter = restored_points(dive.rec, replace(dive.frames, own_colors=thrice), tracks, water).restored
+    assert (brighter.amax(-1) > 1.2).float().mean() > 0.05
+    assert brighter.max() == 2
+    seen = usual < 2 / 3
+    torch.testing.assert_close(brighter[seen], 3 * usual[seen], atol=0.02, rtol=0)  # hues of others count a little
 
 
 def test_far_points_have_the_hue_of_the_dive_in_channels_that_no_frame_shows(dive, known_water: MediumFit):

@@ -85,6 +85,6 @@ def _colors(rec: Reconstruction, cloud: DenseCloud, settings: GlbSettings) -> to
         case "shown":
             return cloud.shown(rec.white_balance)
         case "physical":
-            return cloud.restored
+            return cloud.restored.clamp(max=1)
         case "raw":
             return cloud.raw

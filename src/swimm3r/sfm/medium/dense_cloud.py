@@ -25,6 +25,7 @@ from swimm3r.progress import Progress, silent
 from swimm3r.scene.frames import Frames
 from swimm3r.scene.reconstruction import DenseCloud, Reconstruction
 from swimm3r.scene.surface import surface_of
+from swimm3r.scene.white_balance import BRIGHTEST
 from swimm3r.sfm.medium.dense_tracks import DenseTracks, cubes, fuse_in_batches
 from swimm3r.sfm.medium.settings import RestoreSettings, TrackSettings
 
@@ -114,11 +115,11 @@ def restored_points(
     if medium_at is None:
         T_D = (restored_weight / raw_weight.clamp(min=1e-12)).sqrt()
         known = T_D**2 / (T_D**2 + min_transmittance**2)
-        J = J.clamp(0, 1)
+        J = J.clamp(0, BRIGHTEST)
         J = known * J + (1 - known) * expected_colors(J, known)
     if fit.encoding == "linear":
         J = srgb_from_linear(J.clamp(min=0))
-    return DenseCloud(tracks.xyz, (raw / raw_weight.clamp(min=1e-12)).clamp(0, 1), J.clamp(0, 1))
+    return DenseCloud(tracks.xyz, (raw / raw_weight.clamp(min=1e-12)).clamp(0, 1), J.clamp(0, BRIGHTEST))
 
 
 def thinned(cloud: DenseCloud, count: int) -> DenseCloud:

@@ -41,7 +41,7 @@ from swimm3r.progress import Progress, silent
 from swimm3r.scene.frames import Frames
 from swimm3r.scene.point_groups import PointGroups
 from swimm3r.scene.reconstruction import DepthMap, Reconstruction
-from swimm3r.scene.white_balance import WhiteBalance
+from swimm3r.scene.white_balance import BRIGHTEST, WhiteBalance
 from swimm3r.sfm.medium.dense_tracks import ray_depth_map
 from swimm3r.sfm.medium.plausibility import any_determined, attenuation_is_a_guess
 from swimm3r.sfm.medium.settings import RestoreSettings
@@ -55,7 +55,6 @@ _NEARLY_ALL = 0.95  # of the surfaces at known distance
 _SAMPLES = 20_000  # of them, which stand for all of an image
 _VIEWS, _PIXELS = 12, 2_000  # frames, and pixels of each, that tell how bright the surfaces of a dive become
 _BEYOND_WHITE = 0.01  # of these pixels, at most
-_DARKEST = 0.5  # common gain, for them
 
 
 @dataclass(frozen=True)
@@ -188,7 +187,7 @@ def within_white(rec: Reconstruction, frames: Frames, balance: WhiteBalance) -> 
     seen = torch.cat(brightness)
     seen = seen[seen.isfinite()].numpy()
     white = float(np.quantile(seen, 1 - _BEYOND_WHITE)) if len(seen) else 1.0
-    red, green, blue = (balance.factors / min(max(white, 1.0), 1 / _DARKEST)).tolist()
+    red, green, blue = (balance.factors / min(max(white, 1.0), BRIGHTEST)).tolist()
     return replace(balance, gains=(red, green, blue))
 
 
