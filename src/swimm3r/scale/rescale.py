@@ -159,7 +159,7 @@ def _frame_water(old: Path, new: Path, factor: float) -> None:
     for name in ("beta_B", "curve"):
         arrays[name] = (arrays[name].astype(np.float64) / factor).astype(arrays[name].dtype)
     with atomic_path(new) as draft:
-        np.savez(draft, **arrays)
+        write_arrays(draft, **arrays)
 
 
 def _cloud(old: Path, new: Path, factor: float) -> None:
