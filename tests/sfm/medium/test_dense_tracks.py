@@ -88,6 +88,18 @@ def test_a_surface_that_hides_others_is_kept(dive, tmp_path):
     assert len(found.xyz) > 0.99 * len(every.xyz)
 
 
+def test_depth_that_is_noisy_everywhere_is_not_looked_through(dive, tmp_path):
+    depths, draw = DepthMaps(tmp_path), torch.Generator().manual_seed(0)
+    for name in dive.rec.names:
+        depth = dive.rec.depth[name]
+        noise = 0.04 * torch.randn(depth.z_depth.shape, generator=draw)
+        depths.write(name, DepthMap(depth.z_depth * (1 + noise), depth.confidence))
+    rec = replace(dive.rec, depth=depths)
+    found = fuse_depth(rec, dive.frames, TrackSettings())
+    every = fuse_depth(rec, dive.frames, TrackSettings(most_behind=1000))
+    assert len(found.xyz) > 0.99 * len(every.xyz)
+
+
 def test_fewer_tracks_are_started_where_memory_is_bounded(dive):
     every = fuse_depth(dive.rec, dive.frames, TrackSettings())
     few = fuse_depth(dive.rec, dive.frames, TrackSettings(max_tracks=2000))

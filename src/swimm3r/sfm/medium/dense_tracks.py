@@ -6,7 +6,8 @@ averages the positions its depth maps give, and the ray depths of its observatio
 centers to that one position: errors of single depth maps do not pass for differences in distance.
 
 Depth is a few pixels too wide around surfaces in front of others, in many frames alike. Frames that look past them
-measured what lies behind, through the points there: such points become no tracks.
+measured what lies behind, through the points there: such points become no tracks. Differences that are usual between
+two frames say nothing, as depth from a network may be off everywhere.
 """
 
 from collections.abc import Iterator
@@ -27,6 +28,7 @@ from swimm3r.sfm.medium.settings import TrackSettings
 _ROWS = 1_000_000  # points whose cubes are found at once
 _MOST_ASKED = 96  # frames that are asked whether they see a frame's surface
 _BEHIND = 0.07  # share of a depth, from which a surface behind a point is another one
+_USUAL = 5.0  # times the median difference between two frames' depths, which it must be, too
 
 
 @dataclass(frozen=True)
@@ -220,7 +222,8 @@ def _tracks_from(
         known = (z_other > 0) & frames.mask(index).reshape(-1)[pixel]
         agrees = known & (behind.abs() <= settings.tolerance)
         measured[candidates] += agrees
-        through[candidates] += known & (behind > _BEHIND)
+        usual = behind[known].abs().median() if known.any() else 0.0
+        through[candidates] += known & (behind > max(_BEHIND, _USUAL * float(usual)))
         agrees &= free.among(j, pixel) & (change < settings.max_color_change)
         candidates, pixel, z_other = candidates[agrees], pixel[agrees], z_other[agrees]
         alone = torch.from_numpy(np.unique(pixel.numpy(), return_index=True)[1])  # the first of two keeps the pixel
