@@ -32,6 +32,15 @@ def test_few_points_are_all_kept():
     assert torch.equal(voxel_sample(torch.rand(10, 3).double(), 100), torch.arange(10))
 
 
+def test_no_primitive_starts_brighter_than_white(tiny_dive):
+    cloud = tiny_dive.rec.cloud
+    bright = replace(tiny_dive.rec, cloud=replace(cloud, restored=2 * cloud.restored), backdrop=None)
+    plain = replace(tiny_dive.rec, backdrop=None)
+    start, usual = (starting_points(rec, InitialSettings(primitives=500)).rgb for rec in (bright, plain))
+    assert start.max() == 1
+    torch.testing.assert_close(start, (2 * usual).clamp(max=1))
+
+
 def test_points_cover_the_frames_evenly(tiny_dive, tmp_path):
     """A shell of points where depth is uncertain gets no more of them than a surface."""
     rec = replace(tiny_dive.rec, depth=DepthMaps(tmp_path))

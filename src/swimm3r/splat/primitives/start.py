@@ -63,7 +63,7 @@ def _sampled(
         measured = _thinned(points[:n], settings.primitives - len(behind), rec)
     colors = (getattr(cloud, settings.colors) for cloud in (rec.cloud, backdrop))
     chosen = torch.cat([measured, behind])
-    return points[chosen], torch.cat([*colors])[chosen].float()
+    return points[chosen], torch.cat([*colors])[chosen].float().clamp(max=1)  # as `weights.gamut` asks
 
 
 def _thinned(points: Float[Tensor, "p 3"], target: int, rec: Reconstruction) -> Int[Tensor, " n"]:
