@@ -52,10 +52,12 @@ def row(sfm: FinishedSfm, name: str, most_behind: float | None) -> str:
     kept = sfm.settings.sfm.water.tracks
     if most_behind is not None:
         kept = replace(kept, most_behind=most_behind)
-    frames = sfm.rec.evened(sfm.frames)
-    clouds = [fuse_depth(sfm.rec, frames, settings).xyz for settings in (replace(kept, most_behind=EVERY), kept)]
+    rec = replace(sfm.rec, steady=None)  # tracks are those of the frames as filmed
+    clouds = [
+        fuse_depth(rec, rec.still(sfm.frames), settings).xyz for settings in (replace(kept, most_behind=EVERY), kept)
+    ]
     truth = sfm.truth
-    shares = ["-", "-"] if truth is None else [f"{in_front(sfm.rec, truth, xyz):.2%}" for xyz in clouds]
+    shares = ["-", "-"] if truth is None else [f"{in_front(rec, truth, xyz):.2%}" for xyz in clouds]
     dropped = 1 - len(clouds[1]) / max(1, len(clouds[0]))
     return f"| {name} | {len(clouds[0]):,} | {dropped:.2%} | {' | '.join(shares)} |"
 

@@ -34,14 +34,14 @@ def read_arrays(path: Path, layouts: Mapping[str, Layout], remedy: Remedy) -> di
 
 
 def read_npz(path: Path, *names: str) -> dict[str, np.ndarray]:
-    """Arrays of an .npz by name, of any shape; all where none is named. Raises OSError, ValueError, BadZipFile."""
+    """Arrays of an .npz by name, of any shape; all where none is named. Raises what `guard` turns into one error."""
     with zipfile.ZipFile(path) as archive:
         wanted = names or [entry.removesuffix(".npy") for entry in archive.namelist()]
         return {name: _decoded(archive, name) for name in wanted}
 
 
 def read_npy(path: Path) -> np.ndarray:
-    """The array of an .npy. Raises OSError, ValueError, EOFError."""
+    """The array of an .npy. Raises what `guard` turns into one error."""
     with _one_parses:
         return np.load(path, allow_pickle=False)
 
