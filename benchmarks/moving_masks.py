@@ -36,7 +36,7 @@ def row(folder: Path) -> str:
     rec = load_reconstruction(folder / "sfm", frames)
     started = time.process_time()
     scene = still_scene(rec, frames)
-    found = [enlarged(scene.moving_in_frame(i), frames.height, frames.width).numpy() for i in range(len(rec.names))]
+    found = [enlarged(moving, frames.height, frames.width).numpy() for moving in scene.moving_in_frames()]
     seconds = time.process_time() - started
     truth = truth_of(Path(run.input.path), None)
     scores = "- | - | -" if truth is None else compared(found, [true_mask(truth, name) for name in rec.names])

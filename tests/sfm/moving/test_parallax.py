@@ -9,7 +9,8 @@ from jaxtyping import Float
 
 from swimm3r.cameras import Cameras, pixel_grid, project_visible, unproject
 from swimm3r.sfm.moving.comparison import SmallView, color_range, compared
-from swimm3r.sfm.moving.occluders import Layer, measured_range, moving_pixels, votes_on
+from swimm3r.sfm.moving.objects import color_models, color_samples, objects
+from swimm3r.sfm.moving.occluders import Layer, evidence_on, measured_range, votes_on
 from swimm3r.sfm.moving.parallax import explained
 
 HEIGHT, WIDTH, FOCAL = 72, 96, 90.0
@@ -91,7 +92,7 @@ def differs(mine: SmallView, layers: list[Layer]) -> np.ndarray:
 @pytest.mark.parametrize("pole_depth", [0.0, GROUND], ids=["absent", "wrong"])
 def test_a_standing_pole_without_its_depth_does_not_move(step: tuple[float, float], pole_depth: float) -> None:
     mine, layers = filmed(step, standing, pole_depth)
-    assert not moving_pixels(mine, layers).any()
+    assert not evidence_on(mine, layers).moving.any()
 
 
 @pytest.mark.parametrize("pole_depth", [0.0, GROUND], ids=["absent", "wrong"])
@@ -101,23 +102,29 @@ def test_only_its_parallax_keeps_the_standing_pole_from_moving(pole_depth: float
     assert found.sum() > 0.5 * pole(mine.camera, 0.0).sum()
 
 
+def moving_objects(mine: SmallView, layers: list[Layer]) -> np.ndarray:
+    """The objects in a frame, by its own colors alone."""
+    evidence = evidence_on(mine, layers)
+    return objects(mine.rgb, evidence, color_models([color_samples(mine.rgb, evidence)]))
+
+
 @pytest.mark.parametrize("pole_depth", [0.0, GROUND], ids=["absent", "wrong"])
 def test_the_pole_that_moves_across_epipolar_lines_is_found(pole_depth: float) -> None:
     mine, layers = filmed(ALONG_POLE, moving_sideways, pole_depth)
-    found, truth = moving_pixels(mine, layers), pole(mine.camera, 0.0)
+    found, truth = moving_objects(mine, layers), pole(mine.camera, 0.0)
     assert (found & truth).sum() > 0.9 * truth.sum()
     assert (found & ~truth).sum() < 0.4 * truth.sum()  # a pixel on both sides of six
 
 
 def test_the_pole_that_moves_with_the_camera_would_have_to_lie_behind_the_ground() -> None:
     mine, layers = filmed(ACROSS_POLE, lambda frame: STEP * (frame - NOW), 0.0)
-    found, truth = moving_pixels(mine, layers), pole(mine.camera, 0.0)
+    found, truth = moving_objects(mine, layers), pole(mine.camera, 0.0)
     assert (found & truth).sum() > 0.9 * truth.sum()
 
 
 def test_a_pole_put_up_for_a_few_frames_is_found() -> None:
     mine, layers = filmed(ACROSS_POLE, lambda frame: 0.0 if abs(frame - NOW) < 2 else 100.0, 0.0)
-    found, truth = moving_pixels(mine, layers), pole(mine.camera, 0.0)
+    found, truth = moving_objects(mine, layers), pole(mine.camera, 0.0)
     assert (found & truth).sum() > 0.9 * truth.sum()
 
 

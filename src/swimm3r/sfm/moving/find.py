@@ -4,7 +4,7 @@ Frames are compared at 256 pixels, each with up to 16 others that see the same s
 they do: an object that moves with the camera stands before the same ground in neighboring frames.
 """
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass, replace
 from functools import cached_property, lru_cache
@@ -24,7 +24,8 @@ from swimm3r.scene.frame_changes import MovingMasks
 from swimm3r.scene.frames import Frames
 from swimm3r.scene.reconstruction import DepthMap, QualityWarning, Reconstruction, Tracks
 from swimm3r.sfm.moving.comparison import SmallView
-from swimm3r.sfm.moving.occluders import Layer, measured_range, moving_pixels
+from swimm3r.sfm.moving.objects import ColorSamples, color_models, color_samples, objects
+from swimm3r.sfm.moving.occluders import Evidence, Layer, evidence_on, measured_range
 from swimm3r.tasks.threads import thread_count
 
 _LONG_SIDE = 256  # of the images that are compared, pixels
@@ -75,20 +76,55 @@ class StillScene:
         of = torch.repeat_interleave(torch.arange(len(points)), torch.tensor([len(few) for few in points]))
         return torch.cat(points), of
 
-    def moving_in_frame(self, i: int) -> Bool[np.ndarray, "h w"]:
-        """The pixels of the small image of frame `i` that show moving objects."""
-        return moving_pixels(self.view(i), self._layers(self.cameras[i], self.others(i)))
+    def moving_in_frames(self, progress: Progress = silent) -> Iterator[Bool[np.ndarray, "h w"]]:
+        """The pixels of the small image of each frame, in turn, that show moving objects."""
+        count = len(self.rec.names)
+        evidence, samples = [], []
+        with ThreadPoolExecutor(thread_count()) as pool:
+            for i, (found, colors) in enumerate(pool.map(self._evidence_and_colors, range(count))):
+                progress("moving objects", i, count)
+                evidence.append(found if found.moving.any() else None)
+                samples.append(colors)
+        models = color_models(samples)
+        for i, found in enumerate(evidence):
+            if found is None:
+                yield np.zeros((self.cameras.height, self.cameras.width), dtype=bool)
+            else:
+                view = self.view(i)
+                yield objects(view.rgb, found, models) & view.usable
+        progress("moving objects", count, count)
 
     def moving_in(self, lens: Cameras, image: Float[Tensor, "h w 3"]) -> Bool[Tensor, "h w"]:
         """The pixels of another image of the scene, of known pose, that show moving objects.
 
-        Its depth is the nearest that the frames measured on each pixel's ray.
+        Its depth is the nearest that the frames measured on each pixel's ray. Colors of moving objects are those under
+        the frames' masks and its own.
         """
         camera = resized(lens, self.cameras.width, self.cameras.height)
         layers = self._layers(camera, _spread(self._overlapping(camera)))
         z_depth = measured_range((camera.height, camera.width), layers).nearest
         view = SmallView(camera, _small(image, camera), z_depth, np.ones_like(z_depth, dtype=bool))
-        return enlarged(moving_pixels(view, layers), lens.height, lens.width)
+        found = evidence_on(view, layers)
+        models = color_models([*self._masked_colors, color_samples(view.rgb, found)])
+        return enlarged(objects(view.rgb, found, models), lens.height, lens.width)
+
+    @cached_property
+    def _masked_colors(self) -> list[ColorSamples]:
+        """Colors under the masks of frames, and of the surfaces that these frames measured beside them."""
+        if self.rec.moving is None:
+            return []
+        masked = [i for i, name in enumerate(self.rec.names) if name in self.rec.moving]
+        frames, samples = self.rec.still(self.frames), []
+        for i in _spread(masked):
+            view = self.view(i)
+            still = self._small_grid(frames.mask(frames.index(self.rec.names[i])).numpy())
+            samples.append(color_samples(view.rgb, Evidence(view.usable & ~still, still & (view.z_depth > 0))))
+        return samples
+
+    def _evidence_and_colors(self, i: int) -> tuple[Evidence, ColorSamples]:
+        view = self.view(i)
+        found = evidence_on(view, self._layers(self.cameras[i], self.others(i)))
+        return found, color_samples(view.rgb, found)
 
     def others(self, i: int) -> list[int]:
         """Up to 16 frames that see the same surfaces as frame `i`, spread over the time in which they do."""
@@ -160,15 +196,12 @@ def find_moving(rec: Reconstruction, frames: Frames, folder: Path, progress: Pro
     """Masks of moving objects in the registered frames, in a new folder; those of an earlier call are kept."""
     if folder.is_dir():
         return MovingMasks(folder)
-    scene = still_scene(rec, frames)
-    with atomic_folder(folder) as draft, ThreadPoolExecutor(thread_count()) as pool:
-        found = pool.map(scene.moving_in_frame, range(len(rec.names)))
-        for i, (name, moving) in enumerate(zip(rec.names, found, strict=True)):
-            progress("moving objects", i, len(rec.names))
+    found = still_scene(rec, frames).moving_in_frames(progress)
+    with atomic_folder(folder) as draft:
+        for name, moving in zip(rec.names, found, strict=True):
             if moving.any():
                 still = ~enlarged(moving, frames.height, frames.width)
                 images.write_mask(draft / f"{name}.png", (still & frames.mask(frames.index(name))).numpy())
-    progress("moving objects", len(rec.names), len(rec.names))
     return MovingMasks(folder)
 
 

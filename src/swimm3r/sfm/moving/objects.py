@@ -1,0 +1,99 @@
+"""Moving objects as far as they reach: from the pixels that surely show them, along colors that things that move have.
+
+Other frames decide on a pixel only if they measured what lies behind it, and an object that moves with the camera, as
+a gripper or a net does, hides much of that in all of them. Two mixtures of Gaussians tell colors apart, one of the
+pixels of all frames that surely move and one of those that surely show what others measured. By them a graph cut
+assigns the pixels that nothing decides (GrabCut; Rother et al. 2004, with models that all frames share); those that
+are connected with pixels that surely move are the object.
+"""
+
+from collections.abc import Iterable
+from dataclasses import dataclass
+
+import numpy as np
+from jaxtyping import Bool, Float, UInt8
+
+from swimm3r.sfm.moving.occluders import Evidence
+
+_PER_FRAME = 4000  # colors of either kind that a frame contributes, at most
+_COLORS = 20_000  # of either kind that the mixtures are fitted to, at most
+_SPECK = 0.001  # of the image; smaller objects are noise
+_MODEL = 65  # numbers of a mixture of cv2.grabCut: five weights, means and covariances
+
+
+@dataclass(frozen=True)
+class ColorSamples:
+    """Colors of pixels that surely move, and of pixels that surely do not."""
+
+    moving: UInt8[np.ndarray, "n 3"]
+    still: UInt8[np.ndarray, "m 3"]
+
+
+@dataclass(frozen=True)
+class ColorModels:
+    """Mixtures of Gaussians of these colors, as cv2.grabCut holds them."""
+
+    moving: Float[np.ndarray, "1 65"]
+    still: Float[np.ndarray, "1 65"]
+
+
+def color_samples(rgb: Float[np.ndarray, "h w 3"], evidence: Evidence) -> ColorSamples:
+    """Colors of a frame on which other frames decide."""
+    colors = _eight_bits(rgb)
+    return ColorSamples(*(_few(colors[of], _PER_FRAME) for of in (evidence.moving, evidence.still)))
+
+
+def color_models(samples: Iterable[ColorSamples]) -> ColorModels | None:
+    """The mixtures of several frames' colors; None where there are none of either kind."""
+    import cv2
+
+    pairs = [(few.moving, few.still) for few in samples]
+    if not pairs:
+        return None
+    moving, still = (_few(np.concatenate(colors), _COLORS) for colors in zip(*pairs, strict=True))
+    if not len(moving) or not len(still):
+        return None
+    row = np.concatenate([moving, still])[None]
+    label = np.repeat(np.array([[cv2.GC_FGD, cv2.GC_BGD]], np.uint8), [len(moving), len(still)], axis=1)
+    models = ColorModels(moving=np.zeros((1, _MODEL)), still=np.zeros((1, _MODEL)))
+    cv2.setRNGSeed(0)
+    cv2.grabCut(row, label, (0, 0, 0, 0), models.still, models.moving, 1, cv2.GC_INIT_WITH_MASK)
+    return models
+
+
+def objects(rgb: Float[np.ndarray, "h w 3"], evidence: Evidence, models: ColorModels | None) -> Bool[np.ndarray, "h w"]:
+    """The pixels of the objects that surely show somewhere in a frame; without models, only around those that do.
+
+    Pixels beside an object mix its color with that of the ground, and are its own unless they surely show the ground.
+    """
+    import cv2
+
+    if not evidence.moving.any():
+        return evidence.moving
+    region = evidence.moving.astype(np.uint8)
+    if models is not None:
+        label = np.where(evidence.still, cv2.GC_BGD, cv2.GC_PR_FGD).astype(np.uint8)
+        label[evidence.moving] = cv2.GC_FGD
+        still, moving = models.still.copy(), models.moving.copy()
+        cv2.grabCut(_eight_bits(rgb), label, (0, 0, 0, 0), still, moving, 1, cv2.GC_EVAL_FREEZE_MODEL)
+        region = ((label == cv2.GC_FGD) | (label == cv2.GC_PR_FGD)).astype(np.uint8)
+    region = cv2.morphologyEx(region, cv2.MORPH_CLOSE, np.ones((5, 5), np.uint8))
+    count, labels = cv2.connectedComponents(region)
+    part_of = labels.astype(np.int64)
+    sizes = np.bincount(part_of.reshape(-1), minlength=count)
+    sure = np.bincount(part_of[evidence.moving], minlength=count)
+    kept = (sure > 0) & (sizes >= _SPECK * region.size)
+    found = kept[part_of]
+    beside = cv2.dilate(found.astype(np.uint8), np.ones((3, 3), np.uint8)) > 0
+    return found | (beside & ~evidence.still)
+
+
+def _few(values: UInt8[np.ndarray, "n 3"], most: int) -> UInt8[np.ndarray, "m 3"]:
+    """At most so many of the rows, evenly spread."""
+    if len(values) <= most:
+        return values
+    return values[np.linspace(0, len(values) - 1, most).astype(int)]
+
+
+def _eight_bits(rgb: Float[np.ndarray, "h w 3"]) -> UInt8[np.ndarray, "h w 3"]:
+    return np.ascontiguousarray((rgb.clip(0, 1) * 255).round().astype(np.uint8))
