@@ -76,6 +76,22 @@ def test_colors_of_an_object_alone_make_nothing_move():
     assert not objects(apart, still_there, models)[45:55, 65:75].any()
 
 
+def test_what_moves_with_the_camera_is_found_where_nobody_measured_the_ground():
+    unsure = Evidence(moving=mask(), still=evidence().still)
+    models = models_of((frame(), evidence()), of_rock())
+    assert not objects(frame(), unsure, models).any()
+    found = objects(frame(), unsure, models, neighbors=mask(ARM))
+    assert (found & mask(ARM, HEAD)).sum() > 0.98 * mask(ARM, HEAD).sum()
+    assert not (found & ~grown(mask(ARM, HEAD))).any()
+
+
+def test_an_object_of_the_frames_before_and_after_may_have_left_the_place():
+    unsure = Evidence(moving=mask(), still=evidence().still)
+    models = models_of((frame(), evidence()), of_rock())
+    assert not objects(frame(arm=False), unsure, models, neighbors=mask(ARM)).any()
+    assert not objects(frame(), unsure, models, neighbors=mask((slice(10, 21), slice(0, 60)))).any()
+
+
 def test_pixels_that_surely_show_what_others_measured_stay():
     both = Evidence(evidence().moving, mask((slice(None), slice(0, 40))))
     models = models_of((frame(), evidence()), of_rock())

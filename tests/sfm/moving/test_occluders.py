@@ -100,3 +100,10 @@ def test_one_frame_alone_decides_nothing(with_object: np.ndarray) -> None:
 def test_pixels_that_are_not_to_be_used_are_no_objects(with_object: np.ndarray, truth: np.ndarray) -> None:
     unusable = SmallView(CAMERA, with_object, np.zeros((HEIGHT, WIDTH), np.float32), ~truth)
     assert not evidence_on(unusable, [layer(ground())] * 4).moving.any()
+
+
+def test_packed_evidence_is_the_same(with_object: np.ndarray) -> None:
+    found = evidence_on(view(with_object), [layer(ground())] * 4)
+    again = found.packed().unpacked()
+    assert np.array_equal(again.moving, found.moving)
+    assert np.array_equal(again.still, found.still)

@@ -83,15 +83,20 @@ class StillScene:
         with ThreadPoolExecutor(thread_count()) as pool:
             for i, (found, colors) in enumerate(pool.map(self._evidence_and_colors, range(count))):
                 progress("moving objects", i, count)
-                evidence.append(found if found.moving.any() else None)
+                evidence.append(found.packed())
                 samples.append(colors)
         models = color_models(samples)
-        for i, found in enumerate(evidence):
-            if found is None:
-                yield np.zeros((self.cameras.height, self.cameras.width), dtype=bool)
-            else:
-                view = self.view(i)
-                yield objects(view.rgb, found, models) & view.usable
+        nothing = np.zeros((self.cameras.height, self.cameras.width), dtype=bool)
+
+        def in_frame(i: int, neighbors: Bool[np.ndarray, "h w"] | None = None) -> Bool[np.ndarray, "h w"]:
+            view = self.view(i)
+            return objects(view.rgb, evidence[i].unpacked(), models, neighbors) & view.usable
+
+        before, here = nothing, in_frame(0)
+        for i in range(count):
+            after = in_frame(i + 1) if i + 1 < count else nothing
+            yield in_frame(i, before | after) if (before | after).any() else here
+            before, here = here, after
         progress("moving objects", count, count)
 
     def moving_in(self, lens: Cameras, image: Float[Tensor, "h w 3"]) -> Bool[Tensor, "h w"]:
@@ -122,6 +127,7 @@ class StillScene:
         return samples
 
     def _evidence_and_colors(self, i: int) -> tuple[Evidence, ColorSamples]:
+        """Pixels of a frame on which other frames decide, and some of their colors."""
         view = self.view(i)
         found = evidence_on(view, self._layers(self.cameras[i], self.others(i)))
         return found, color_samples(view.rgb, found)

@@ -3,8 +3,8 @@
 Other frames decide on a pixel only if they measured what lies behind it, and an object that moves with the camera, as
 a gripper or a net does, hides much of that in all of them. Two mixtures of Gaussians tell colors apart, one of the
 pixels of all frames that surely move and one of those that surely show what others measured. By them a graph cut
-assigns the pixels that nothing decides (GrabCut; Rother et al. 2004, with models that all frames share); those that
-are connected with pixels that surely move are the object.
+assigns the pixels that nothing decides (GrabCut; Rother et al. 2004, with models that all frames share). Regions with
+pixels that surely move are objects, and so are those that objects of the frames before and after cover in the image.
 """
 
 from collections.abc import Iterable
@@ -17,6 +17,7 @@ from swimm3r.sfm.moving.occluders import Evidence
 
 _PER_FRAME = 4000  # colors of either kind that a frame contributes, at most
 _COLORS = 20_000  # of either kind that the mixtures are fitted to, at most
+_STAYS = 0.3  # share of an object that lies where those of the frames before and after do, if it moves with the camera
 _SPECK = 0.001  # of the image; smaller objects are noise
 _MODEL = 65  # numbers of a mixture of cv2.grabCut: five weights, means and covariances
 
@@ -61,14 +62,21 @@ def color_models(samples: Iterable[ColorSamples]) -> ColorModels | None:
     return models
 
 
-def objects(rgb: Float[np.ndarray, "h w 3"], evidence: Evidence, models: ColorModels | None) -> Bool[np.ndarray, "h w"]:
-    """The pixels of the objects that surely show somewhere in a frame; without models, only around those that do.
+def objects(
+    rgb: Float[np.ndarray, "h w 3"],
+    evidence: Evidence,
+    models: ColorModels | None,
+    neighbors: Bool[np.ndarray, "h w"] | None = None,
+) -> Bool[np.ndarray, "h w"]:
+    """The pixels of the objects in a frame; without models, only those around pixels that surely move.
 
-    Pixels beside an object mix its color with that of the ground, and are its own unless they surely show the ground.
+    An object has a pixel that surely moves, or lies where objects of the frames before and after are in their images
+    (`neighbors`): what moves with the camera stays there. Pixels beside it mix its color with that of the ground, and
+    are its own unless they surely show the ground.
     """
     import cv2
 
-    if not evidence.moving.any():
+    if not evidence.moving.any() and (neighbors is None or not neighbors.any()):
         return evidence.moving
     region = evidence.moving.astype(np.uint8)
     if models is not None:
@@ -80,9 +88,12 @@ def objects(rgb: Float[np.ndarray, "h w 3"], evidence: Evidence, models: ColorMo
     region = cv2.morphologyEx(region, cv2.MORPH_CLOSE, np.ones((5, 5), np.uint8))
     count, labels = cv2.connectedComponents(region)
     part_of = labels.astype(np.int64)
-    sizes = np.bincount(part_of.reshape(-1), minlength=count)
-    sure = np.bincount(part_of[evidence.moving], minlength=count)
-    kept = (sure > 0) & (sizes >= _SPECK * region.size)
+    size = np.bincount(part_of.reshape(-1), minlength=count)
+    kept = np.bincount(part_of[evidence.moving], minlength=count) > 0
+    if neighbors is not None:
+        kept |= np.bincount(part_of[neighbors], minlength=count) >= _STAYS * size
+    kept &= size >= _SPECK * region.size
+    kept[0] = False
     found = kept[part_of]
     beside = cv2.dilate(found.astype(np.uint8), np.ones((3, 3), np.uint8)) > 0
     return found | (beside & ~evidence.still)
