@@ -222,7 +222,7 @@ def score_views(
         write_view(folder, stems[name], out, camera, style)
         known, quiet = coverage.of(camera), None
         if surfaces is not None:
-            unmoved = mask & ~surfaces.moving_in(lens, image)
+            unmoved = mask & ~surfaces.moving_in(lens, image, neighbors(rec, frames, name, 2))
             quiet = undistorted(image, unmoved, lens, canvas)[1][window.rows, window.columns]
         shown = out.rgb
         if scene.colors is not None:

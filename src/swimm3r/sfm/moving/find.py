@@ -99,11 +99,14 @@ class StillScene:
             before, here = here, after
         progress("moving objects", count, count)
 
-    def moving_in(self, lens: Cameras, image: Float[Tensor, "h w 3"]) -> Bool[Tensor, "h w"]:
+    def moving_in(
+        self, lens: Cameras, image: Float[Tensor, "h w 3"], neighbors: Sequence[str] = ()
+    ) -> Bool[Tensor, "h w"]:
         """The pixels of another image of the scene, of known pose, that show moving objects.
 
-        Its depth is the nearest that the frames measured on each pixel's ray. Colors of moving objects are those under
-        the frames' masks and its own.
+        Its depth is the nearest that the frames measured on each pixel's ray. Colors of moving objects are its own and
+        those under the frames' masks; `neighbors` names the frames before and after, whose masks tell what moves with
+        the camera.
         """
         camera = resized(lens, self.cameras.width, self.cameras.height)
         layers = self._layers(camera, _spread(self._overlapping(camera)))
@@ -111,20 +114,25 @@ class StillScene:
         view = SmallView(camera, _small(image, camera), z_depth, np.ones_like(z_depth, dtype=bool))
         found = evidence_on(view, layers)
         models = color_models([*self._masked_colors, color_samples(view.rgb, found)])
-        return enlarged(objects(view.rgb, found, models), lens.height, lens.width)
+        beside = [self._masked(self.rec.index(name)) for name in neighbors]
+        moving = objects(view.rgb, found, models, np.logical_or.reduce(beside) if beside else None)
+        return enlarged(moving, lens.height, lens.width)
 
     @cached_property
     def _masked_colors(self) -> list[ColorSamples]:
         """Colors under the masks of frames, and of the surfaces that these frames measured beside them."""
         if self.rec.moving is None:
             return []
-        masked = [i for i, name in enumerate(self.rec.names) if name in self.rec.moving]
-        frames, samples = self.rec.still(self.frames), []
-        for i in _spread(masked):
-            view = self.view(i)
-            still = self._small_grid(frames.mask(frames.index(self.rec.names[i])).numpy())
-            samples.append(color_samples(view.rgb, Evidence(view.usable & ~still, still & (view.z_depth > 0))))
+        samples = []
+        for i in _spread([i for i, name in enumerate(self.rec.names) if name in self.rec.moving]):
+            view, moving = self.view(i), self._masked(i)
+            samples.append(color_samples(view.rgb, Evidence(moving, ~moving & (view.z_depth > 0))))
         return samples
+
+    def _masked(self, i: int) -> Bool[np.ndarray, "h w"]:
+        """The pixels of the small image of frame `i` that its mask says to move."""
+        still = self._small_grid(self.rec.still(self.frames).mask(self.frames.index(self.rec.names[i])).numpy())
+        return self.view(i).usable & ~still
 
     def _evidence_and_colors(self, i: int) -> tuple[Evidence, ColorSamples]:
         """Pixels of a frame on which other frames decide, and some of their colors."""
