@@ -13,11 +13,11 @@ from pathlib import Path
 import numpy as np
 
 from swimm3r.pipeline.inputs import truth_of
-from swimm3r.prepare import load_frames
 from swimm3r.scene.ground_truth import GroundTruth
 from swimm3r.scene.reconstruction_io import load_reconstruction
 from swimm3r.scene.run_folder import open_run
 from swimm3r.sfm.moving.find import enlarged, still_scene
+from swimm3r.sfm.rectified.run import run_frames
 
 
 def main() -> None:
@@ -32,7 +32,7 @@ def main() -> None:
 def row(folder: Path) -> str:
     """The table's line of a run."""
     run = open_run(folder, "sfm")
-    frames = load_frames(folder / "prepare")
+    frames = run_frames(folder)
     rec = load_reconstruction(folder / "sfm", frames)
     started = time.process_time()
     scene = still_scene(rec, frames)
