@@ -1,5 +1,7 @@
 """Objects around the pixels that surely move, by colors that all frames of a dive share."""
 
+from dataclasses import replace
+
 import cv2
 import numpy as np
 
@@ -98,6 +100,30 @@ def test_pixels_that_surely_show_what_others_measured_stay():
     assert objects(frame(), both, models)[:, :38].mean() < 0.01
 
 
+def test_where_hardly_anything_moves_colors_have_to_be_clearer():
+    noise = np.random.default_rng(1).normal(0, 0.12, (HEIGHT, WIDTH, 3))
+    alike = frame(arm=False) + noise.astype(np.float32)
+    alike[ARM] = alike[ARM] - (0.12, 0.32, 0.28)
+    alike[HEAD] = noise[HEAD] + (0.05, 0.1, 0.1)
+    samples = color_samples(alike, evidence())
+    moving, still = samples.odds
+    often, seldom = (color_models([replace(samples, odds=(moving, k * still))]) for k in (1, 100_000))
+    assert often is not None
+    assert seldom is not None
+    unmeasured = mask((slice(20, 30), slice(25, 38)))
+    assert objects(alike, evidence(), often)[unmeasured].all()
+    assert not objects(alike, evidence(), seldom)[unmeasured].any()
+
+
+def test_a_few_sure_pixels_do_not_make_a_large_region_move():
+    few = Evidence(moving=mask((slice(22, 25), slice(50, 53))), still=evidence().still)
+    models = models_of((frame(), evidence()), of_rock())
+    alone = objects(frame(), few, models)
+    assert alone[few.moving].all()
+    assert not (alone & ~grown(few.moving)).any()
+    assert objects(frame(), few, models, neighbors=mask(ARM))[mask(ARM)].mean() > 0.98
+
+
 def test_pixels_that_mix_an_object_and_the_ground_are_the_objects():
     blurred = cv2.blur(frame(), (3, 3))
     sure = Evidence(evidence().moving, evidence().still & ~mask((slice(17, 33), slice(44, 61))))
@@ -108,8 +134,8 @@ def test_pixels_that_mix_an_object_and_the_ground_are_the_objects():
 
 def test_without_colors_of_both_kinds_only_pixels_beside_sure_ones_move():
     assert color_models([]) is None
-    assert color_models([ColorSamples(np.zeros((0, 3), np.uint8), np.zeros((9, 3), np.uint8))]) is None
-    assert color_models([ColorSamples(np.zeros((9, 3), np.uint8), np.zeros((0, 3), np.uint8))]) is None
+    assert color_models([ColorSamples(np.zeros((0, 3), np.uint8), np.zeros((9, 3), np.uint8), (0, 9))]) is None
+    assert color_models([ColorSamples(np.zeros((9, 3), np.uint8), np.zeros((0, 3), np.uint8), (9, 0))]) is None
     found = objects(frame(), evidence(), None)
     assert found[evidence().moving].all()
     assert not found[:, :43].any()
@@ -118,7 +144,7 @@ def test_without_colors_of_both_kinds_only_pixels_beside_sure_ones_move():
 def test_a_few_pixels_are_noise_and_few_colors_are_enough():
     speck = Evidence(moving=mask((slice(5, 7), slice(60, 62))), still=evidence().still)
     assert not objects(frame(), speck, None).any()
-    few = color_models([ColorSamples(np.full((1, 3), 9, np.uint8), np.full((1, 3), 200, np.uint8))])
+    few = color_models([ColorSamples(np.full((1, 3), 9, np.uint8), np.full((1, 3), 200, np.uint8), (1, 1))])
     assert few is not None
     assert objects(frame(), evidence(), few)[HEAD].all()
 
