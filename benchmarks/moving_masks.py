@@ -16,7 +16,7 @@ from swimm3r.pipeline.inputs import truth_of
 from swimm3r.scene.ground_truth import GroundTruth
 from swimm3r.scene.reconstruction_io import load_reconstruction
 from swimm3r.scene.run_folder import open_run
-from swimm3r.sfm.moving.find import enlarged, still_scene
+from swimm3r.sfm.moving.still_scene import enlarged, still_scene
 from swimm3r.sfm.rectified.run import run_frames
 
 

@@ -16,14 +16,8 @@ from swimm3r.scene.frames import Frames
 from swimm3r.scene.reconstruction import DepthMaps, Points, Reconstruction, Tracks
 from swimm3r.scene.reconstruction_io import load_reconstruction
 from swimm3r.scene.settings import FrameSettings
-from swimm3r.sfm.moving.find import (
-    beside_edges,
-    find_moving,
-    mask_depth,
-    still_scene,
-    with_moving,
-    without_moving_observations,
-)
+from swimm3r.sfm.moving.find import find_moving, mask_depth, with_moving, without_moving_observations
+from swimm3r.sfm.moving.still_scene import beside_edges, still_scene
 
 ROWS, COLUMNS = slice(24, 50), slice(30, 60)
 MOVED = 3  # the frame with the object

@@ -39,7 +39,7 @@ from swimm3r.scene.reconstruction import Reconstruction
 from swimm3r.sfm.colmap.shutter.turning import turned_pose
 from swimm3r.sfm.features.settings import FeatureSettings
 from swimm3r.sfm.medium.settings import RestoreSettings
-from swimm3r.sfm.moving.find import still_scene
+from swimm3r.sfm.moving.still_scene import still_scene
 from swimm3r.splat.pose_refinement import refine_pose
 from swimm3r.splat.rendering import SplatMap
 from swimm3r.splat.settings import PoseRefinementSettings

@@ -39,7 +39,7 @@ from swimm3r.sfm.medium.dense_tracks import ray_depth_map
 from swimm3r.sfm.medium.restore import restore_image
 from swimm3r.sfm.medium.settings import RestoreSettings
 from swimm3r.sfm.medium.side_by_side import in_order
-from swimm3r.sfm.moving.find import StillScene, still_scene
+from swimm3r.sfm.moving.still_scene import StillScene, still_scene
 
 log = logging.getLogger(__name__)
 
