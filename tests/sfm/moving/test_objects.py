@@ -106,8 +106,8 @@ def test_where_hardly_anything_moves_colors_have_to_be_clearer():
     alike[ARM] = alike[ARM] - (0.12, 0.32, 0.28)
     alike[HEAD] = noise[HEAD] + (0.05, 0.1, 0.1)
     samples = color_samples(alike, evidence())
-    moving, still = samples.odds
-    often, seldom = (color_models([replace(samples, odds=(moving, k * still))]) for k in (1, 100_000))
+    moving, still = samples.counts
+    often, seldom = (color_models([replace(samples, counts=(moving, k * still))]) for k in (1, 100_000))
     assert often is not None
     assert seldom is not None
     unmeasured = mask((slice(20, 30), slice(25, 38)))

@@ -31,12 +31,15 @@ class ColorSamples:
 
     moving: UInt8[np.ndarray, "n 3"]
     still: UInt8[np.ndarray, "m 3"]
-    odds: tuple[int, int]  # numbers of such pixels, of which the colors are a part
+    counts: tuple[int, int]  # of all such pixels, of which the colors are a part
 
 
 @dataclass(frozen=True)
 class ColorModels:
-    """Mixtures of Gaussians of these colors, as cv2.grabCut holds them; each kind's weights add up to its odds."""
+    """Mixtures of Gaussians of these colors, as cv2.grabCut holds them.
+
+    Weights of `moving` add up to 1, those of `still` to the odds against moving where nothing decides.
+    """
 
     moving: Float[np.ndarray, "1 65"]
     still: Float[np.ndarray, "1 65"]
@@ -54,7 +57,7 @@ def color_models(samples: Iterable[ColorSamples]) -> ColorModels | None:
     import cv2
 
     frames = list(samples)
-    moving_count, still_count = np.sum([few.odds for few in frames], axis=0, dtype=float) if frames else (0, 0)
+    moving_count, still_count = np.sum([few.counts for few in frames], axis=0, dtype=float) if frames else (0, 0)
     if not moving_count or not still_count:
         return None
     moving = _few(np.concatenate([few.moving for few in frames]), _COLORS)

@@ -65,7 +65,7 @@ class Evidence:
 
 @dataclass(frozen=True)
 class PackedEvidence:
-    """Evidence with eight pixels per byte, as many frames keep it."""
+    """Evidence with eight pixels per byte, to be kept of many frames."""
 
     shape: tuple[int, ...]
     moving: UInt8[np.ndarray, " n"]
