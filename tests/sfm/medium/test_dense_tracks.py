@@ -4,7 +4,6 @@ from dataclasses import replace
 
 import torch
 
-from swimm3r.cameras import pixel_grid, unproject
 from swimm3r.scene.reconstruction import DepthMap, DepthMaps
 from swimm3r.sfm.medium.dense_tracks import Surfaces, cubes, fuse_depth
 from swimm3r.sfm.medium.settings import TrackSettings
@@ -48,56 +47,6 @@ def test_depths_that_disagree_are_not_merged(dive, tmp_path):
         moved.write(name, DepthMap(depth.z_depth * 1.06**k, depth.confidence))
     tracks = fuse_depth(replace(dive.rec, depth=moved), dive.frames, TrackSettings(tolerance=0.02))
     assert torch.bincount(tracks.track).max() == 1
-
-
-def test_what_other_frames_look_through_is_no_point(dive, tmp_path):
-    """A patch that one frame puts too near, before ground that all others measured."""
-    name, patch = dive.rec.names[3], (slice(20, 40), slice(30, 60))
-    depths = DepthMaps(tmp_path)
-    for each in dive.rec.names:
-        depth = dive.rec.depth[each]
-        z_depth = depth.z_depth.clone()
-        if each == name:
-            z_depth[patch] *= 0.8
-        depths.write(each, DepthMap(z_depth, depth.confidence))
-    rec = replace(dive.rec, depth=depths)
-    every = fuse_depth(rec, dive.frames, TrackSettings(most_behind=1000))
-    found = fuse_depth(rec, dive.frames, TrackSettings())
-    assert int((every.xyz[:, 2].abs() > 0.1).sum()) == 20 * 30
-    assert found.xyz[:, 2].abs().max() < 1e-3
-    assert len(found.xyz) == len(every.xyz) - 20 * 30
-    assert torch.equal(found.track.unique(), torch.arange(len(found.xyz)))
-    torch.testing.assert_close(
-        found.ray_depth, (found.xyz[found.track] - rec.cameras.centers[found.frame].float()).norm(dim=-1)
-    )
-
-
-def test_a_surface_that_hides_others_is_kept(dive, tmp_path):
-    """A plate over the ground that all frames measured alike."""
-    depths = DepthMaps(tmp_path)
-    for i, name in enumerate(dive.rec.names):
-        depth, camera = dive.rec.depth[name], dive.rec.cameras[i]
-        pixels = pixel_grid(camera.height, camera.width).reshape(1, -1, 2).double()
-        near = depth.z_depth - 0.15
-        xyz = unproject(camera, pixels, near.reshape(1, -1).double())[0].reshape(camera.height, camera.width, 3)
-        on_plate = xyz[..., :2].abs().amax(-1) < 0.2
-        depths.write(name, DepthMap(torch.where(on_plate, near, depth.z_depth), depth.confidence))
-    rec = replace(dive.rec, depth=depths)
-    found = fuse_depth(rec, dive.frames, TrackSettings())
-    every = fuse_depth(rec, dive.frames, TrackSettings(most_behind=1000))
-    assert len(found.xyz) > 0.99 * len(every.xyz)
-
-
-def test_depth_that_is_noisy_everywhere_is_not_looked_through(dive, tmp_path):
-    depths, draw = DepthMaps(tmp_path), torch.Generator().manual_seed(0)
-    for name in dive.rec.names:
-        depth = dive.rec.depth[name]
-        noise = 0.04 * torch.randn(depth.z_depth.shape, generator=draw)
-        depths.write(name, DepthMap(depth.z_depth * (1 + noise), depth.confidence))
-    rec = replace(dive.rec, depth=depths)
-    found = fuse_depth(rec, dive.frames, TrackSettings())
-    every = fuse_depth(rec, dive.frames, TrackSettings(most_behind=1000))
-    assert len(found.xyz) > 0.99 * len(every.xyz)
 
 
 def test_fewer_tracks_are_started_where_memory_is_bounded(dive):

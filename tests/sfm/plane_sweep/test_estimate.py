@@ -2,6 +2,7 @@
 
 from dataclasses import replace
 from pathlib import Path
+from typing import get_args
 
 import numpy as np
 import pytest
@@ -23,6 +24,7 @@ from swimm3r.sfm.plane_sweep.views import SweepView, choose_sources, depth_range
 from swimm3r.tasks import EngineSettings
 
 WIDTH, HEIGHT = 128, 96
+STEPS = get_args(estimate.Step)
 MIDDLE = (slice(16, -16), slice(24, -24))  # what enough sources see
 SETTINGS = PlaneSweepSettings(sources=3, planes=48, threads=1, speck=16)
 FRONTAL, SLANTED = (0.0, 0.0, 4.0), (0.45, -0.3, 4.0)  # the plane Z = a X + b Y + c in world axes
@@ -293,7 +295,7 @@ def test_an_interrupted_sweep_goes_on_where_it_stopped(tmp_path: Path):
     whole = estimate_depth(reconstruction(cameras, FRONTAL, tmp_path / "whole"), frames, SETTINGS)
     rec = reconstruction(cameras, FRONTAL, tmp_path / "broken")
 
-    for stop_in, stop_at in (("depth", 2), ("depth agreement", 3)):
+    for stop_in, stop_at in (("depth", 2), ("depth agreement", 3), ("depth seen through", 2)):
 
         def power_cut(what: str, done: int, total: int, stop: tuple[str, int] = (stop_in, stop_at)) -> None:
             if (what, done) == stop:
@@ -303,7 +305,8 @@ def test_an_interrupted_sweep_goes_on_where_it_stopped(tmp_path: Path):
             estimate_depth(rec, frames, SETTINGS, power_cut)
     seen: list[tuple[str, int]] = []
     resumed = estimate_depth(rec, frames, SETTINGS, lambda what, done, total: seen.append((what, done)))
-    assert all(what == "depth agreement" and done > 3 for what, done in seen)
+    assert seen[-1] == ("depth seen through", 5)
+    assert all(what == "depth seen through" and done > 2 for what, done in seen)
     for name in rec.names:
         assert torch.equal(resumed[name].z_depth, whole[name].z_depth)
 
@@ -335,7 +338,7 @@ def test_maps_of_other_cameras_are_not_kept(tmp_path: Path):
         assert np.median(stored["z_depth"][stored["z_depth"] > 0]) == pytest.approx(8.0, rel=0.01)
 
 
-def test_progress_counts_every_frame_of_both_passes(tmp_path: Path):
+def test_progress_counts_every_frame_of_every_pass(tmp_path: Path):
     cameras = dive()
     told: list[tuple[str, int, int]] = []
     estimate_depth(
@@ -344,8 +347,8 @@ def test_progress_counts_every_frame_of_both_passes(tmp_path: Path):
         SETTINGS,
         lambda what, done, total: told.append((what, done, total)),
     )
-    assert told == [(what, k, 5) for what in ("depth", "depth agreement") for k in range(1, 6)]
-    assert not (tmp_path / "z_depth" / ".raw").exists()
+    assert told == [(what, k, 5) for what in STEPS for k in range(1, 6)]
+    assert {path.name for path in (tmp_path / "z_depth").iterdir() if path.is_dir()} == set()
 
 
 @pytest.mark.long
@@ -360,7 +363,7 @@ def test_several_processes_make_the_same_maps(tmp_path: Path, monkeypatch: pytes
     there = estimate_depth(rec, frames, SETTINGS, lambda *told: seen.append(told), EngineSettings(jobs=2))
     for name in rec.names:
         assert torch.equal(here[name].z_depth, there[name].z_depth)
-    assert seen == [(step, done, 3) for step in ("depth", "depth agreement") for done in range(4)]
+    assert seen == [(step, done, 3) for step in STEPS for done in range(4)]
 
 
 def test_points_of_a_frame_are_those_its_tracks_show(tmp_path: Path):

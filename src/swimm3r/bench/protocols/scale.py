@@ -8,6 +8,7 @@ import time
 from collections.abc import Mapping, Sequence
 from functools import partial
 from pathlib import Path
+from typing import get_args
 
 import torch
 
@@ -28,13 +29,14 @@ from swimm3r.scene.ground_truth import GroundTruth
 from swimm3r.scene.reconstruction import Reconstruction
 from swimm3r.scene.reconstruction_io import load_reconstruction
 from swimm3r.sfm.colmap import poses
+from swimm3r.sfm.plane_sweep.estimate import Step
 from swimm3r.sfm.rectified.run import run_frames
 from swimm3r.sfm.settings import ColmapSettings
 from swimm3r.synthetic import DiveSettings, write_dive
 
 SPACING = 0.1  # m between frames
 _SPEED, _FPS = 0.3, 3.0
-_DEPTH = ("depth", "depth agreement")  # steps of the plane sweep, as progress calls them
+_DEPTH = get_args(Step)  # steps of the plane sweep, as progress calls them
 
 COLUMNS = columns(
     "registered_pct", "ate_pct", "rotation_deg", "psnr", "cpu_prepare", "cpu_mapping", "cpu_depth", "cpu_water",

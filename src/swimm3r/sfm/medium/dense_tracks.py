@@ -4,10 +4,6 @@ A pixel's point is looked up in the other frames; it belongs to the same track w
 - z| <= tolerance * z) and the colors do not contradict. Every pixel is in at most one track. The position of a track
 averages the positions its depth maps give, and the ray depths of its observations are the distances from the camera
 centers to that one position: errors of single depth maps do not pass for differences in distance.
-
-Depth is a few pixels too wide around surfaces in front of others, in many frames alike. Frames that look past them
-measured what lies behind, through the points there: such points become no tracks. Differences that are usual between
-two frames say nothing, as depth from a network may be off everywhere.
 """
 
 from collections.abc import Iterator
@@ -27,8 +23,6 @@ from swimm3r.sfm.medium.settings import TrackSettings
 
 _ROWS = 1_000_000  # points whose cubes are found at once
 _MOST_ASKED = 96  # frames that are asked whether they see a frame's surface
-_BEHIND = 0.07  # share of a depth, from which a surface behind a point is another one
-_USUAL = 5.0  # times the median difference between two frames' depths, which it must be, too
 
 
 @dataclass(frozen=True)
@@ -190,10 +184,7 @@ def _tracks_from(
     stride: int,
     settings: TrackSettings,
 ) -> DenseTracks:
-    """The tracks that start at the free pixels of frame i; what they take is struck off `free`.
-
-    Points that frames look through are left out, and so are the pixels that show them.
-    """
+    """The tracks that start at the free pixels of frame i; what they take is struck off `free`."""
     cameras, names = rec.cameras, rec.names
     depth = rec.depth[names[i]]
     z_map = depth.z_depth.reshape(-1)
@@ -208,7 +199,6 @@ def _tracks_from(
     confidence = depth.confidence.reshape(-1)[seeds]
     weight = confidence.double().clamp(min=0.01)
     total, position = weight.clone(), start * weight[:, None]
-    measured, through = torch.ones(len(seeds)), torch.zeros(len(seeds))  # numbers of frames
     observations = [(torch.arange(len(seeds)), torch.full_like(seeds, i), seeds, confidence)]
     for j in neighbors if len(seeds) else []:
         uv, z, visible = (values[0] for values in project_visible(cameras[j], start[None]))
@@ -218,13 +208,8 @@ def _tracks_from(
         z_other = other.z_depth.reshape(-1)[pixel].double()
         index = frames.index(names[j])
         change = (frames.colors(index, pixel) - color[candidates]).abs().amax(-1)
-        behind = z_other / z[candidates] - 1
-        known = (z_other > 0) & frames.mask(index).reshape(-1)[pixel]
-        agrees = known & (behind.abs() <= settings.tolerance)
-        measured[candidates] += agrees
-        usual = behind[known].abs().median() if known.any() else 0.0
-        through[candidates] += known & (behind > max(_BEHIND, _USUAL * float(usual)))
-        agrees &= free.among(j, pixel) & (change < settings.max_color_change)
+        agrees = (z_other > 0) & ((z_other / z[candidates] - 1).abs() <= settings.tolerance)
+        agrees &= frames.mask(index).reshape(-1)[pixel] & free.among(j, pixel) & (change < settings.max_color_change)
         candidates, pixel, z_other = candidates[agrees], pixel[agrees], z_other[agrees]
         alone = torch.from_numpy(np.unique(pixel.numpy(), return_index=True)[1])  # the first of two keeps the pixel
         alone = alone.sort().values
@@ -237,10 +222,8 @@ def _tracks_from(
         total.index_add_(0, candidates, trust.double().clamp(min=0.01))
         observations.append((candidates, torch.full_like(pixel, j), pixel, trust))
     track, frame, pixel, confidence = (torch.cat(part) for part in zip(*observations, strict=True))
-    kept = through <= settings.most_behind * measured
     order = torch.argsort(track, stable=True)
-    order = order[kept[track[order]]]
-    xyz, track, frame = (position / total[:, None])[kept], (kept.cumsum(0) - 1)[track[order]], frame[order]
+    xyz, track, frame = position / total[:, None], track[order], frame[order]
     ray_depth = torch.linalg.vector_norm(xyz[track] - cameras.centers[frame], dim=-1)
     return DenseTracks(xyz.float(), track, frame, pixel[order], ray_depth.float(), confidence[order])
 

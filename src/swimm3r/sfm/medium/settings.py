@@ -22,9 +22,6 @@ class TrackSettings(Settings):
     """Number of other frames in which the points of one frame are looked up."""
     min_overlap: Share = 0.1
     """Overlap above which another frame is searched for the points of a frame."""
-    most_behind: Annotated[float, Range(0, 1000)] = 0.125
-    """Largest number of frames that measured a surface more than 7 % behind a point, per frame that measured the point:
-    they look through it, and it is dropped. Where frames usually differ by more than 1.4 %, five times that counts."""
     max_tracks: Count = 1_000_000
     """Approximate largest number of surface points that the water is fitted to; more are thinned on a regular grid."""
 

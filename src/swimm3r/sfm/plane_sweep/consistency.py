@@ -67,6 +67,30 @@ def agreement(q, others, H, e, H_back, e_back, tolerance, pose_error):
 
 @kernel
 @no_type_check
+def depth_beyond(q, other, H, e):
+    """The depth that another frame measured where each point falls, over the point's own depth there; 0 = unknown."""
+    h, w = q.shape
+    beyond = np.zeros((h, w), np.float32)
+    for y in range(h):
+        for x in range(w):
+            if q[y, x] <= 0:
+                continue
+            X = H[0, 0] * x + H[0, 1] * y + H[0, 2] + q[y, x] * e[0]
+            Y = H[1, 0] * x + H[1, 1] * y + H[1, 2] + q[y, x] * e[1]
+            Z = H[2, 0] * x + H[2, 1] * y + H[2, 2] + q[y, x] * e[2]
+            if Z <= 1e-9:
+                continue
+            u, v = X / Z, Y / Z
+            if not (-0.5 <= u < w - 0.5 and -0.5 <= v < h - 0.5):
+                continue
+            value = other[int(v + 0.5), int(u + 0.5)]
+            if value > 0:
+                beyond[y, x] = q[y, x] / Z / value
+    return beyond
+
+
+@kernel
+@no_type_check
 def patches(q, similar):
     """Connected patches of known q, numbered from 1; neighbors connect where they differ by < `similar` (relative)."""
     h, w = q.shape

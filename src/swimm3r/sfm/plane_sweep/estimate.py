@@ -3,8 +3,9 @@
 For every frame: source views by baseline and shared points; a cost volume over planes even in inverse depth (1 - NCC,
 which neither contrast lost with distance nor veil added changes); semi-global smoothing (Hirschmueller 2008); slanted
 windows refined from neighbor to neighbor (Bleyer et al. 2011) at full size. Then, over all frames, a depth stays
-where it is well correlated, where moving it makes it worse, and where other frames' depths agree; open water and bare
-sand come out unknown (0), not invented. The work is done on undistorted images, the result lies on the frame's grid.
+where it is well correlated, where moving it makes it worse, where other frames' depths agree, and where those that look
+from elsewhere do not see through it; open water and bare sand come out unknown (0), not invented. The work is done on
+undistorted images, the result lies on the frame's grid.
 """
 
 import shutil
@@ -34,6 +35,7 @@ from swimm3r.scene.reconstruction import DepthMap, DepthMaps, Reconstruction
 from swimm3r.scene.reconstruction_io import load_reconstruction
 from swimm3r.sfm.plane_sweep import consistency
 from swimm3r.sfm.plane_sweep.facets import facets_of, in_facets, merged
+from swimm3r.sfm.plane_sweep.seen_through import without_seen_through
 from swimm3r.sfm.plane_sweep.settings import PlaneSweepSettings
 from swimm3r.sfm.plane_sweep.specks import without_specks
 from swimm3r.sfm.plane_sweep.sweep import RawDepth, sweep, transfer
@@ -49,13 +51,16 @@ from swimm3r.tasks import run_tasks
 from swimm3r.tasks.settings import EngineSettings
 from swimm3r.tasks.threads import thread_count
 
-Step = Literal["depth", "depth agreement"]
+Step = Literal["depth", "depth agreement", "depth seen through"]
+"""Each view's own opinion, what other views share of it, and of each frame what no other view looks through."""
 
-_RAW = ".raw"  # beside the finished maps: each frame's own opinion, removed once every frame is finished
-_RAW_LAYOUTS = {"inverse_depth": Layout("h w"), "correlation": Layout("h w")}
+_DRAFTS: dict[Step, str] = {"depth": ".raw", "depth agreement": ".agreed"}
+"""Folders beside the finished maps, of what the first steps leave for the next; removed once every map is finished."""
+_LAYOUTS = {"inverse_depth": Layout("h w"), "correlation": Layout("h w")}
 _STAMP = ".made_from"  # of which cameras, points and settings the folder's maps were made
 _OF_A_TASK = 16  # frames
-_NEIGHBORS = 8  # frames asked whether they agree
+_NEIGHBORS = 8  # views asked whether they agree
+_WITNESSES = 24  # views asked whether they see through
 
 
 def estimate_depth(
@@ -75,44 +80,38 @@ def estimate_depth(
     folder = rec.depth.folder
     _claim(folder, _stamp(rec, frames, settings))
     passes = _Passes(rec, frames, settings)
-    todo = [i for i, name in enumerate(rec.names) if name not in rec.depth]
-    wanted = sorted({j for i in todo for view in passes.facets.of_frame(i) for j in (view, *passes.sources[view])})
-    missing = [i for i in wanted if not passes.raw_path(i).is_file()]
-    steps: tuple[tuple[Step, list[int], int], ...] = (
-        ("depth", missing, len(wanted)),
-        ("depth agreement", todo, len(rec.names)),
-    )
-    for name, left, total in steps:
+    for step, wanted in passes.wanted().items():
+        left = [k for k in wanted if not passes.is_done(step, k)]
         if engine.is_in_this_process:
-            _each(passes.step(name), left, total, settings.threads, partial(progress, name))
+            _each(passes.step(step), left, len(wanted), settings.threads, partial(progress, step))
             continue
         parts = [
             PartOfPass(
-                f"{name} of frames {k + 1} to {min(k + _OF_A_TASK, len(left))}", name, tuple(left[k : k + _OF_A_TASK])
+                f"{step} of frames {k + 1} to {min(k + _OF_A_TASK, len(left))}", step, tuple(left[k : k + _OF_A_TASK])
             )
             for k in range(0, len(left), _OF_A_TASK)
         ]
         work = partial(make_part, folder=folder.parent.resolve(), frames=frames, settings=settings)
-        if failures := run_tasks(work, parts, engine, progress, name, logs=folder.parent.resolve() / "logs"):
+        if failures := run_tasks(work, parts, engine, progress, step, logs=folder.parent.resolve() / "logs"):
             raise failures[0].error
-    shutil.rmtree(folder / _RAW, ignore_errors=True)
+    _remove_drafts(folder)
     return rec.depth
 
 
 @dataclass(frozen=True)
 class PartOfPass:
-    """Frames, by their index in the reconstruction, that one task sweeps or compares."""
+    """Views, or of the last step frames, by their index, that one task sweeps or compares."""
 
     name: str
     step: Step
-    frames: tuple[int, ...]
+    items: tuple[int, ...]
 
 
 def make_part(part: PartOfPass, *, folder: Path, frames: Frames, settings: PlaneSweepSettings) -> None:
     """The task of some frames, with the reconstruction that a folder holds; finished ones are left as they are."""
     passes = _passes_over(folder, frames, settings)
-    left = [i for i in part.frames if not passes.is_done(part.step, i)]
-    _each(passes.step(part.step), left, len(part.frames), settings.threads, lambda done, total: None)
+    left = [k for k in part.items if not passes.is_done(part.step, k)]
+    _each(passes.step(part.step), left, len(part.items), settings.threads, lambda done, total: None)
 
 
 @lru_cache(maxsize=1)  # several tasks in one process
@@ -121,73 +120,106 @@ def _passes_over(folder: Path, frames: Frames, settings: PlaneSweepSettings) -> 
 
 
 class _Passes:
-    """The two passes over the frames of a reconstruction, with the views and maps they read kept in memory."""
+    """The passes over the frames of a reconstruction, with the views and maps they read kept in memory."""
 
     def __init__(self, rec: Reconstruction, frames: Frames, settings: PlaneSweepSettings) -> None:
         self._rec, self._frames, self._settings = rec, frames, settings
         self._device = for_depth(settings.device)
-        self.facets = facets_of(rec.cameras, settings.long_side)
-        self._canvas, self._views_of = self.facets.cameras, in_facets(rec, self.facets)
-        self.sources = choose_sources(self._views_of, max(settings.sources, _NEIGHBORS), settings.angle_deg)
+        self._facets = facets_of(rec.cameras, settings.long_side)
+        self._canvas, self._views_of = self._facets.cameras, in_facets(rec, self._facets)
+        most = max(settings.sources, _NEIGHBORS, _WITNESSES)
+        self._sources = choose_sources(self._views_of, most, settings.angle_deg)
+        self._neighbors = [best[: max(settings.sources, _NEIGHBORS)] for best in self._sources]
         self._points, self._pose_error = points_by_frame(self._views_of), _pose_error(rec, self._canvas)
         self._position = {name: k for k, name in enumerate(frames.names)}
-        self._views, self._raws = ArrayCache(max_bytes=256 << 20), ArrayCache(max_bytes=256 << 20)
+        self._views = ArrayCache(max_bytes=256 << 20)
+        self._drafts: dict[Step, ArrayCache] = {step: ArrayCache(max_bytes=256 << 20) for step in _DRAFTS}
 
-    def raw_path(self, i: int) -> Path:
-        return self._rec.depth.folder / _RAW / f"{self._views_of.names[i]}.npz"
+    def wanted(self) -> dict[Step, list[int]]:
+        """The views that each step is for, and of the last step the frames, in order: what the unfinished ones need."""
+        names = self._rec.names
+        unfinished = [
+            view for i, name in enumerate(names) if name not in self._rec.depth for view in self._facets.of_frame(i)
+        ]
+        agreed = _with_their(self._sources, unfinished)
+        return {
+            "depth": _with_their(self._neighbors, agreed),
+            "depth agreement": agreed,
+            "depth seen through": list(range(len(names))),
+        }
 
-    def step(self, name: Step) -> Callable[[int], None]:
-        return self._sweep_one if name == "depth" else self._agree_one
+    def step(self, step: Step) -> Callable[[int], None]:
+        """The work of a step on one view, or of the last step on one frame."""
+        steps = {"depth": self._sweep, "depth agreement": self._agree, "depth seen through": self._finish}
+        return steps[step]
 
-    def is_done(self, name: Step, i: int) -> bool:
-        return self.raw_path(i).is_file() if name == "depth" else self._rec.names[i] in self._rec.depth
+    def is_done(self, step: Step, k: int) -> bool:
+        """True where the result of a step is there."""
+        return self._draft_path(step, k).is_file() if step in _DRAFTS else self._rec.names[k] in self._rec.depth
 
-    def _view(self, i: int) -> SweepView:
+    def _draft_path(self, step: Step, view: int) -> Path:
+        return self._rec.depth.folder / _DRAFTS[step] / f"{self._views_of.names[view]}.npz"
+
+    def _keep(self, step: Step, view: int, depth: RawDepth) -> None:
+        with atomic_path(self._draft_path(step, view)) as draft:
+            np.savez(draft, inverse_depth=depth.inverse_depth.numpy(), correlation=depth.correlation.numpy())
+
+    def _kept(self, step: Step, view: int) -> RawDepth:
         def load() -> tuple[np.ndarray, ...]:
-            frame = self.facets.frame_of(i)
-            k = self._position[self._rec.names[frame]]
-            image, mask = self._frames.image(k), self._frames.mask(k)
-            made = make_view(image, mask, self._rec.cameras[frame], self._canvas[i], self.facets.turn_of(i))
-            return made.gray.numpy(), made.detail.numpy(), made.seen.numpy()
-
-        gray, detail, seen = (torch.from_numpy(a.copy()) for a in self._views.get(i, load))
-        return SweepView(gray, detail, seen, self._canvas.K[i], self._canvas[i].world2cam[0])
-
-    def _raw_of(self, i: int) -> RawDepth:
-        def load() -> tuple[np.ndarray, ...]:
-            stored = read_arrays(self.raw_path(i), _RAW_LAYOUTS, remake(self._rec.depth.folder))
+            stored = read_arrays(self._draft_path(step, view), _LAYOUTS, remake(self._rec.depth.folder))
             return stored["inverse_depth"], stored["correlation"]
 
-        return RawDepth(*(torch.from_numpy(a.copy()) for a in self._raws.get(i, load)))
+        return RawDepth(*(torch.from_numpy(a.copy()) for a in self._drafts[step].get(view, load)))
 
-    def _sweep_one(self, i: int) -> None:
+    def _view(self, view: int) -> SweepView:
+        def load() -> tuple[np.ndarray, ...]:
+            frame = self._facets.frame_of(view)
+            k = self._position[self._rec.names[frame]]
+            image, mask, lens = self._frames.image(k), self._frames.mask(k), self._rec.cameras[frame]
+            made = make_view(image, mask, lens, self._canvas[view], self._facets.turn_of(view))
+            return made.gray.numpy(), made.detail.numpy(), made.seen.numpy()
+
+        gray, detail, seen = (torch.from_numpy(a.copy()) for a in self._views.get(view, load))
+        return SweepView(gray, detail, seen, self._canvas.K[view], self._canvas[view].world2cam[0])
+
+    def _sweep(self, view: int) -> None:
         canvas, settings = self._canvas, self._settings
-        span, compared = depth_range(self._views_of, i, self._points[i]), self.sources[i][: settings.sources]
+        compared = self._sources[view][: settings.sources]
+        span = depth_range(self._views_of, view, self._points[view])
         raw = RawDepth(torch.zeros(canvas.height, canvas.width), torch.zeros(canvas.height, canvas.width))
         if span is not None and compared:
-            raw = sweep(self._view(i), [self._view(j) for j in compared], span, settings, self._device)
-        with atomic_path(self.raw_path(i)) as draft:
-            np.savez(draft, inverse_depth=raw.inverse_depth.numpy(), correlation=raw.correlation.numpy())
+            raw = sweep(self._view(view), [self._view(j) for j in compared], span, settings, self._device)
+        self._keep("depth", view, raw)
 
-    def _agree_one(self, i: int) -> None:
-        rec, frames = self._rec, self._frames
+    def _agree(self, view: int) -> None:
+        others = self._neighbors[view]
+        raws, canvas = [self._kept("depth", j) for j in others], self._canvas[[view, *others]]
+        agreed = consistent(self._kept("depth", view), raws, canvas, self._pose_error, self._settings)
+        self._keep("depth agreement", view, agreed)
+
+    def _finish(self, i: int) -> None:
+        rec, lens = self._rec, self._rec.cameras[i]
         k = self._position[rec.names[i]]
-        on_grid = [self._agreed(view, frames.image(k), rec.cameras[i]) for view in self.facets.of_frame(i)]
-        rays = frame_rays(rec.cameras[i])
-        q, confidence = merged([q for q, _ in on_grid], [share for _, share in on_grid], rays, self.facets)
-        usable = (q > 0) & frames.mask(k)
+        on_grid = [self._on_grid(view, self._frames.image(k), lens) for view in self._facets.of_frame(i)]
+        q, confidence = merged([q for q, _ in on_grid], [share for _, share in on_grid], frame_rays(lens), self._facets)
+        usable = (q > 0) & self._frames.mask(k)
         z_depth = torch.where(usable, 1 / q.clamp(min=1e-12), 0.0)
         rec.depth.write(rec.names[i], DepthMap(z_depth, torch.where(usable, confidence, 0.0)))
 
-    def _agreed(
+    def _on_grid(
         self, view: int, image: Float[Tensor, "h w 3"], lens: Cameras
     ) -> tuple[Float[Tensor, "h w"], Float[Tensor, "h w"]]:
-        """Inverse depth along a view's axis that others share, and its confidence, on the grid of the view's frame."""
-        others, canvas = self.sources[view], self._canvas
-        raws = [self._raw_of(j) for j in others]
-        fused = consistent(self._raw_of(view), raws, canvas[[view, *others]], self._pose_error, self._settings)
-        gray, turn = self._view(view).gray, self.facets.turn_of(view)
-        return on_frame_grid(fused.inverse_depth, fused.correlation, gray, image, lens, canvas[view], turn)
+        """Inverse depth along a view's axis that none looks through, and its confidence, on its frame's grid."""
+        others, canvas = self._sources[view], self._canvas
+        agreed = (self._kept("depth agreement", j) for j in (view, *others))
+        kept = without_seen_through(next(agreed), agreed, canvas[[view, *others]], self._settings)
+        gray, turn = self._view(view).gray, self._facets.turn_of(view)
+        return on_frame_grid(kept.inverse_depth, kept.correlation, gray, image, lens, canvas[view], turn)
+
+
+def _with_their(others: list[list[int]], views: list[int]) -> list[int]:
+    """Views and the others of each, in order."""
+    return sorted({j for view in views for j in (view, *others[view])})
 
 
 def consistent(
@@ -237,10 +269,15 @@ def _claim(folder: Path, stamp: str) -> None:
     path = folder / _STAMP
     if path.is_file() and path.read_bytes() == stamp.encode():
         return
-    shutil.rmtree(folder / _RAW, ignore_errors=True)
+    _remove_drafts(folder)
     for stale in folder.rglob("*.npz"):
         stale.unlink()
     write_text(path, stamp)
+
+
+def _remove_drafts(folder: Path) -> None:
+    for name in _DRAFTS.values():
+        shutil.rmtree(folder / name, ignore_errors=True)
 
 
 def _each(

@@ -39,6 +39,10 @@ class PlaneSweepSettings(Settings):
     """Largest relative difference in depth at which two frames agree; the reprojection error may allow more."""
     agreeing: Annotated[int, Range(0, 16)] = 2
     """Number of other frames that must agree with a depth; of ground that fewer of them see, all."""
+    most_behind: Annotated[float, Range(0, 1000)] = 0.125
+    """Largest number of frames that measured a surface more than 7 % behind a point, per frame that measured the point:
+    they look through it, and its depth is dropped. Where frames usually differ by more than 1.4 %, five times that
+    counts."""
     speck: CountOrZero = 48
     """Size in working pixels below which connected patches of depth are dropped; up to eight times that, patches that
     few frames share have to fit the depth around them."""

@@ -1,0 +1,121 @@
+"""Depth, cloud and restored frames beside silhouettes, where windows put surfaces in front of others too far out.
+
+    python benchmarks/silhouettes.py RUN[:TRUTH] ...
+
+RUN are run folders with finished structure from motion. Beside a TRUTH (of a synthetic dive; the demo's is found), over
+its frames:
+
+    measured   share of the pixels with measured depth
+    before     share of the pixels whose depth is more than 7 % nearer than the true surface within a pixel ..
+    in water   .. and of those that show open water and have a depth
+    cloud      share of the points of the cloud that lie as far before the true surface in any frame, or in open water
+    restored   PSNR of the restored frames against the clear colors, dB, on surfaces ..
+    beside     .. and on those within 8 pixels of one that is an eighth nearer, or of what it hides
+"""
+
+import argparse
+import math
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+import torch
+from jaxtyping import Bool, Float
+from scipy.ndimage import maximum_filter, minimum_filter
+from torch import Tensor
+
+from swimm3r.cameras import project_visible
+from swimm3r.geometry import align_poses
+from swimm3r.io import images
+from swimm3r.pipeline.finished_sfm import FinishedSfm, open_finished_sfm
+
+BEFORE = 0.07  # of the depth
+STEP = 1 / 8  # of the depth, between two surfaces
+REACH = 8  # px
+
+
+@dataclass(frozen=True)
+class Sums:
+    """Of one frame: shares of its pixels, and mean squared errors."""
+
+    before: float
+    in_water: float
+    restored: float
+    beside: float
+
+
+def nearest_around(true: Float[Tensor, "h w"], size: int) -> Float[np.ndarray, "h w"]:
+    """The nearest true depth within a window, infinite where it shows open water alone."""
+    return minimum_filter(torch.where(true > 0, true, torch.inf).numpy(), size)
+
+
+def silhouettes(true: Float[Tensor, "h w"]) -> Bool[np.ndarray, "h w"]:
+    """Mask of the surfaces close to a step in depth."""
+    farthest = maximum_filter(true.numpy(), 2 * REACH + 1)
+    return (true.numpy() > 0) & (farthest > (1 + STEP) * nearest_around(true, 2 * REACH + 1))
+
+
+def of_frame(sfm: FinishedSfm, run: Path, name: str, per_unit: float) -> Sums | None:
+    """The figures of one frame; None where its truth is not known."""
+    truth = sfm.truth
+    assert truth is not None
+    true, clear = truth.z_depth(name), truth.clear(name)
+    path = run / "sfm" / "restored_physical" / f"{name}.png"
+    if true is None or clear is None or not path.is_file():
+        return None
+    z, surface = sfm.rec.depth[name].z_depth.numpy() * per_unit, true.numpy() > 0
+    restored = images.read_rgb(path).astype(np.float32) / np.iinfo(np.uint16).max
+    error = ((restored - clear.numpy()) ** 2).mean(-1)
+    return Sums(
+        float((surface & (z > 0) & (z < (1 - BEFORE) * nearest_around(true, 3))).mean()),
+        float((~surface & (z > 0)).mean()),
+        float(error[surface].mean()),
+        float(error[silhouettes(true)].mean()),
+    )
+
+
+def cloud_before(sfm: FinishedSfm, per_unit: float) -> float:
+    """Share of the cloud's points before the true surface."""
+    rec, truth = sfm.rec, sfm.truth
+    assert truth is not None
+    assert rec.cloud is not None
+    found = torch.zeros(len(rec.cloud.xyz), dtype=torch.bool)
+    for i, name in enumerate(rec.names):
+        true = truth.z_depth(name)
+        if true is None:
+            continue
+        pixels, z, visible = project_visible(rec.cameras[i], rec.cloud.xyz[None].double())
+        at = visible[0].nonzero()[:, 0]
+        column, row = pixels[0, at].long().unbind(-1)
+        found[at] |= z[0, at] * per_unit < (1 - BEFORE) * torch.from_numpy(nearest_around(true, 3))[row, column]
+    return float(found.float().mean())
+
+
+def row(sfm: FinishedSfm, run: Path) -> str:
+    """The table's line of a run."""
+    rec, truth = sfm.rec, sfm.truth
+    measured = np.mean([float((rec.depth[name].z_depth > 0).float().mean()) for name in rec.names])
+    cells = ["-"] * 5
+    if truth is not None:
+        there = truth.cameras.cam2world[[truth.names.index(name) for name in rec.names]]
+        per_unit = float(align_poses(rec.cameras.cam2world.double(), there.double()).scale)
+        sums = [found for name in rec.names if (found := of_frame(sfm, run, name, per_unit))]
+        before, in_water, restored, beside = np.mean([list(vars(frame).values()) for frame in sums], axis=0)
+        cells = [f"{before:.2%}", f"{in_water:.2%}", f"{cloud_before(sfm, per_unit):.2%}"]
+        cells += [f"{-10 * math.log10(error):.2f} dB" for error in (restored, beside)]
+    return f"| {run.name} | {measured:.2%} | {' | '.join(cells)} |"
+
+
+def main() -> None:
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("runs", nargs="+", metavar="RUN[:TRUTH]")
+    options = parser.parse_args()
+    print("| run | measured | before | in water | cloud | restored | beside |")
+    print("| --- | --- | --- | --- | --- | --- | --- |")
+    for given in options.runs:
+        run, _, truth = given.partition(":")
+        print(row(open_finished_sfm(Path(run), Path(truth) if truth else None), Path(run)), flush=True)
+
+
+if __name__ == "__main__":
+    main()
