@@ -69,6 +69,19 @@ def test_gaps_of_the_color_of_what_lies_in_front_are_part_of_it():
     assert (filled[gap] / NEAR).log().abs().max() < 0.15
 
 
+@pytest.mark.parametrize(("brightness", "z"), [(0.25, NEAR), (0.75, NEAR), (0.5, FAR)])
+def test_gaps_belong_to_the_surface_that_varies_as_far_as_their_colors(brightness: float, z: float):
+    """A mottled rock before even ground of the same color on average."""
+    draw = torch.Generator().manual_seed(0)
+    blotches = torch.rand(54, 72, generator=draw).repeat_interleave(4, 0).repeat_interleave(4, 1)
+    image = torch.where(ROCK, 0.2 + 0.6 * blotches, 0.5)[..., None].expand(-1, -1, 3).clone()
+    image += 0.01 * torch.randn(image.shape, generator=draw)
+    gap = gap_at(slice(60, 156), slice(183, 189))
+    image[gap] = brightness
+    filled = filled_around_rock(image, gap)
+    assert (filled[gap] / z).log().abs().median() < 0.25  # 0.69 on the other one
+
+
 def test_holes_in_what_lies_in_front_are_part_of_it():
     gap = gap_at(slice(90, 91), slice(180, 182)) | gap_at(slice(63, 65), slice(120, 121))
     filled = filled_around_rock(torch.full((216, 288, 3), 0.5), gap)

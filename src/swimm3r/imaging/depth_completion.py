@@ -22,7 +22,8 @@ _STEP = 0.125  # of inverse depth, from which a surface is in front of another
 _REACH = 0.04  # of the long side: as far from a silhouette, gaps belong to what lies behind
 _HOLE = 0.015  # of the long side: gaps as narrow between parts of a surface in front are its own
 _IN_FRONT = 0.9  # as open water, that surfaces in front are for what lies behind: it hardly goes on from them
-_ALIKE = 0.5  # times as far from its colors as from those behind, within which a gap is its own, too
+_LIKELIER = 1.0  # logarithm of the ratio of likelihoods above which a gap has the colors of the surface in front
+_COLOR_NOISE = 0.01  # standard deviation of colors of an even surface
 
 
 @dataclass(frozen=True)
@@ -82,7 +83,8 @@ def fill_z_depth(
 
     filled = continued(trust, sea)
     front, beside = _silhouettes(inverse, filled)
-    hidden = beside & ~known & (sea < 0.5) & ~_of_the_front(image, front & known, (inverse > 0) & ~front)
+    gaps = beside & ~known & (sea < 0.5)
+    hidden = gaps & ~_of_the_front(image, front & known, (inverse > 0) & ~front, gaps)
     if hidden.any():
         behind = continued(trust * ~front, torch.maximum(sea, _IN_FRONT * front))
         filled = torch.where(hidden, torch.minimum(filled, behind), filled)
@@ -104,9 +106,9 @@ def _silhouettes(
 
 
 def _of_the_front(
-    image: Float[Tensor, "h w 3"], front: Bool[Tensor, "h w"], behind: Bool[Tensor, "h w"]
+    image: Float[Tensor, "h w 3"], front: Bool[Tensor, "h w"], behind: Bool[Tensor, "h w"], gaps: Bool[Tensor, "h w"]
 ) -> Bool[Tensor, "h w"]:
-    """Mask of holes within the surfaces in front, and of pixels of their colors rather than of those behind."""
+    """Mask of gaps that are holes in the surfaces in front, or likelier of their colors than of those behind."""
     import cv2
 
     reach = 2 * max(1, round(_HOLE * max(front.shape) / 2)) + 1
@@ -114,16 +116,25 @@ def _of_the_front(
     closed = cv2.morphologyEx(
         front.byte().numpy(), cv2.MORPH_CLOSE, disk, borderType=cv2.BORDER_CONSTANT, borderValue=0
     )
-    color, sigma = on_grid(image.permute(2, 0, 1)).permute(1, 2, 0), _REACH * _COARSE / 2
+    its_own = gaps & (torch.from_numpy(closed) > 0)
+    its_own[gaps] |= _log_likelihood(image, front, gaps) - _log_likelihood(image, behind, gaps) > _LIKELIER
+    return its_own
 
-    def differs(surface: Bool[Tensor, "h w"]) -> Float[Tensor, "r c"]:
-        share = on_grid(surface.float())[..., None]
-        mean = on_grid((image * surface[..., None]).permute(2, 0, 1)).permute(1, 2, 0)
-        return (color - blur(mean, sigma) / blur(share, sigma).clamp(min=1e-6)).norm(dim=-1)
 
-    alike = (differs(front) < _ALIKE * differs(behind)).float()[None, None]
-    its_own = torch.nn.functional.interpolate(alike, front.shape, mode="nearest")[0, 0] > 0
-    return its_own | (torch.from_numpy(closed) > 0)
+def _log_likelihood(
+    image: Float[Tensor, "h w 3"], surface: Bool[Tensor, "h w"], asked: Bool[Tensor, "h w"]
+) -> Float[Tensor, " n"]:
+    """Logarithm of the likelihood of the asked pixels' colors, normally distributed as those of a surface close by."""
+    products = (image[..., :, None] * image[..., None, :]).flatten(2)
+    moments = torch.cat([torch.ones_like(image[..., :1]), image, products], -1) * surface[..., None]
+    cells = blur(on_grid(moments.permute(2, 0, 1)).permute(1, 2, 0), _REACH * _COARSE / 2).permute(2, 0, 1)
+    around = torch.nn.functional.interpolate(cells[None], surface.shape, mode="bilinear", align_corners=False)[0]
+    share, mean, square = around[:, asked].T.double().split([1, 3, 9], -1)
+    mean, square = mean / share.clamp(min=1e-9), (square / share.clamp(min=1e-9)).unflatten(-1, (3, 3))
+    covariance = square - mean[:, :, None] * mean[:, None, :] + _COLOR_NOISE**2 * torch.eye(3, dtype=torch.float64)
+    off = image[asked].double() - mean
+    whitened = torch.linalg.solve(covariance, off[:, :, None])[:, :, 0]
+    return -0.5 * (off * whitened).sum(-1) - 0.5 * torch.linalg.slogdet(covariance).logabsdet
 
 
 def _continued(
