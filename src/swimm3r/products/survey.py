@@ -22,7 +22,8 @@ from swimm3r.scene.run_folder import open_run
 from swimm3r.sfm.rectified.run import run_frames
 
 Colors = Literal["filmed", "restored", "physical"]
-"""As filmed; without the water, as shown; without the water, before the white balance."""
+"""With the water, in one exposure and white balance where frames were restored in one; without the water, as shown;
+without the water, before the white balance."""
 FOLDERS: dict[Colors, str] = {"restored": "restored", "physical": "restored_physical"}
 _FARTHEST = 4.0  # median depths of the dive beyond which depth is left out: it is as imprecise as its square
 _SAMPLED = 32  # pixels along the long side of a depth map that stand for it in an overview
@@ -133,12 +134,16 @@ class Survey:
     def image(self, colors: Colors, i: int) -> Float[np.ndarray, "h w 3"] | None:
         """The image of a frame, 0..1, float32; None where there is none of that kind."""
         if colors == "filmed":
-            return self.frames.image(self.frames.index(self.rec.names[i])).numpy()
+            return self._evened.image(self._evened.index(self.rec.names[i])).clamp(0, 1).numpy()
         path = self._path(colors, i)
         if not path.is_file():
             return None
         (stored,) = _CACHE.get((path, path.stat().st_mtime_ns), lambda: (images.read_rgb(path),))
         return stored.astype(np.float32) / (255 if stored.dtype == np.uint8 else 65535)
+
+    @cached_property
+    def _evened(self) -> Frames:
+        return self.rec.evened(self.frames)
 
     def usable(self, i: int) -> Bool[np.ndarray, "h w"]:
         """True where the image of a frame may be used."""
