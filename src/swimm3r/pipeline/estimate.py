@@ -47,7 +47,7 @@ _OVERHEAD_S = 5.0  # per stage: imports, kernels from the cache, reading back
 _PARALLEL = 0.75  # of the cores, on average over a run
 
 _FRAME_BYTES = 1.8  # per pixel of a prepared frame, a PNG
-_SFM_BYTES = 15.0  # per pixel of a frame: depth, confidence, the restored image at 8 and 16 bits
+_SFM_BYTES = 16.0  # per pixel of a frame: two passes of the plane sweep; later depth, confidence, restored images
 _AREA = 0.15  # of the surface, in images, that a frame adds: surveys of 100 and 1,000 frames
 _POINT_BYTES = 60.0  # of the restored and the raw cloud together
 _PRIMITIVE_BYTES = 600.0  # map, and checkpoint with the optimizer's state

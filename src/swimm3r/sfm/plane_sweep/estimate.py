@@ -55,7 +55,7 @@ Step = Literal["depth", "depth agreement", "depth seen through"]
 """Each view's own opinion, what other views share of it, and of each frame what no other view looks through."""
 
 _DRAFTS: dict[Step, str] = {"depth": ".raw", "depth agreement": ".agreed"}
-"""Folders beside the finished maps, of what the first steps leave for the next; removed once every map is finished."""
+"""Folders beside the finished maps, of what a step leaves for the next one, and removed after that."""
 _LAYOUTS = {"inverse_depth": Layout("h w"), "correlation": Layout("h w")}
 _STAMP = ".made_from"  # of which cameras, points and settings the folder's maps were made
 _OF_A_TASK = 16  # frames
@@ -80,21 +80,24 @@ def estimate_depth(
     folder = rec.depth.folder
     _claim(folder, _stamp(rec, frames, settings))
     passes = _Passes(rec, frames, settings)
+    before: Step | None = None
     for step, wanted in passes.wanted().items():
         left = [k for k in wanted if not passes.is_done(step, k)]
         if engine.is_in_this_process:
             _each(passes.step(step), left, len(wanted), settings.threads, partial(progress, step))
-            continue
-        parts = [
-            PartOfPass(
-                f"{step} of frames {k + 1} to {min(k + _OF_A_TASK, len(left))}", step, tuple(left[k : k + _OF_A_TASK])
-            )
-            for k in range(0, len(left), _OF_A_TASK)
-        ]
-        work = partial(make_part, folder=folder.parent.resolve(), frames=frames, settings=settings)
-        if failures := run_tasks(work, parts, engine, progress, step, logs=folder.parent.resolve() / "logs"):
-            raise failures[0].error
-    _remove_drafts(folder)
+        else:
+            parts = [
+                PartOfPass(
+                    f"{step} of frames {k + 1} to {min(k + _OF_A_TASK, len(left))}", step, tuple(left[k:][:_OF_A_TASK])
+                )
+                for k in range(0, len(left), _OF_A_TASK)
+            ]
+            work = partial(make_part, folder=folder.parent.resolve(), frames=frames, settings=settings)
+            if failures := run_tasks(work, parts, engine, progress, step, logs=folder.parent.resolve() / "logs"):
+                raise failures[0].error
+        if before is not None:
+            shutil.rmtree(folder / _DRAFTS[before], ignore_errors=True)
+        before = step
     return rec.depth
 
 
@@ -136,14 +139,14 @@ class _Passes:
         self._drafts: dict[Step, ArrayCache] = {step: ArrayCache(max_bytes=256 << 20) for step in _DRAFTS}
 
     def wanted(self) -> dict[Step, list[int]]:
-        """The views that each step is for, and of the last step the frames, in order: what the unfinished ones need."""
+        """The views that each step is for, and of the last step the frames, in order: what unfinished ones need."""
         names = self._rec.names
         unfinished = [
             view for i, name in enumerate(names) if name not in self._rec.depth for view in self._facets.of_frame(i)
         ]
         agreed = _with_their(self._sources, unfinished)
         return {
-            "depth": _with_their(self._neighbors, agreed),
+            "depth": _with_their(self._neighbors, [v for v in agreed if not self.is_done("depth agreement", v)]),
             "depth agreement": agreed,
             "depth seen through": list(range(len(names))),
         }
@@ -269,15 +272,11 @@ def _claim(folder: Path, stamp: str) -> None:
     path = folder / _STAMP
     if path.is_file() and path.read_bytes() == stamp.encode():
         return
-    _remove_drafts(folder)
+    for name in _DRAFTS.values():
+        shutil.rmtree(folder / name, ignore_errors=True)
     for stale in folder.rglob("*.npz"):
         stale.unlink()
     write_text(path, stamp)
-
-
-def _remove_drafts(folder: Path) -> None:
-    for name in _DRAFTS.values():
-        shutil.rmtree(folder / name, ignore_errors=True)
 
 
 def _each(
