@@ -6,9 +6,9 @@ RUN are run folders with finished structure from motion. Beside a TRUTH (of a sy
 its frames:
 
     measured   share of the pixels with measured depth
-    before     share of the pixels whose depth is more than 7 % nearer than the true surface within a pixel ..
+    in front   share of the pixels whose depth is more than 7 % nearer than the true surface within a pixel ..
     in water   .. and of those that show open water and have a depth
-    cloud      share of the points of the cloud that lie as far before the true surface in any frame, or in open water
+    cloud      share of the cloud's points that lie as far in front of the true surface in any frame, or in open water
     restored   PSNR of the restored frames against the clear colors, dB, on surfaces ..
     beside     .. and on those within 8 pixels of one that is an eighth nearer, or of what it hides
 """
@@ -29,7 +29,7 @@ from swimm3r.geometry import align_poses
 from swimm3r.io import images
 from swimm3r.pipeline.finished_sfm import FinishedSfm, open_finished_sfm
 
-BEFORE = 0.07  # of the depth
+IN_FRONT = 0.07  # of the depth
 STEP = 1 / 8  # of the depth, between two surfaces
 REACH = 8  # px
 
@@ -38,7 +38,7 @@ REACH = 8  # px
 class Sums:
     """Of one frame: shares of its pixels, and mean squared errors."""
 
-    before: float
+    in_front: float
     in_water: float
     restored: float
     beside: float
@@ -56,7 +56,7 @@ def silhouettes(true: Float[Tensor, "h w"]) -> Bool[np.ndarray, "h w"]:
 
 
 def of_frame(sfm: FinishedSfm, run: Path, name: str, per_unit: float) -> Sums | None:
-    """The figures of one frame; None where its truth is not known."""
+    """The figures of one frame; None where it was not restored, or its truth is not known."""
     truth = sfm.truth
     assert truth is not None
     true, clear = truth.z_depth(name), truth.clear(name)
@@ -67,15 +67,15 @@ def of_frame(sfm: FinishedSfm, run: Path, name: str, per_unit: float) -> Sums | 
     restored = images.read_rgb(path).astype(np.float32) / np.iinfo(np.uint16).max
     error = ((restored - clear.numpy()) ** 2).mean(-1)
     return Sums(
-        float((surface & (z > 0) & (z < (1 - BEFORE) * nearest_around(true, 3))).mean()),
+        float((surface & (z > 0) & (z < (1 - IN_FRONT) * nearest_around(true, 3))).mean()),
         float((~surface & (z > 0)).mean()),
         float(error[surface].mean()),
         float(error[silhouettes(true)].mean()),
     )
 
 
-def cloud_before(sfm: FinishedSfm, per_unit: float) -> float:
-    """Share of the cloud's points before the true surface."""
+def cloud_in_front(sfm: FinishedSfm, per_unit: float) -> float:
+    """Share of the cloud's points in front of the true surface."""
     rec, truth = sfm.rec, sfm.truth
     assert truth is not None
     assert rec.cloud is not None
@@ -87,7 +87,7 @@ def cloud_before(sfm: FinishedSfm, per_unit: float) -> float:
         pixels, z, visible = project_visible(rec.cameras[i], rec.cloud.xyz[None].double())
         at = visible[0].nonzero()[:, 0]
         column, row = pixels[0, at].long().unbind(-1)
-        found[at] |= z[0, at] * per_unit < (1 - BEFORE) * torch.from_numpy(nearest_around(true, 3))[row, column]
+        found[at] |= z[0, at] * per_unit < (1 - IN_FRONT) * torch.from_numpy(nearest_around(true, 3))[row, column]
     return float(found.float().mean())
 
 
@@ -100,8 +100,8 @@ def row(sfm: FinishedSfm, run: Path) -> str:
         there = truth.cameras.cam2world[[truth.names.index(name) for name in rec.names]]
         per_unit = float(align_poses(rec.cameras.cam2world.double(), there.double()).scale)
         sums = [found for name in rec.names if (found := of_frame(sfm, run, name, per_unit))]
-        before, in_water, restored, beside = np.mean([list(vars(frame).values()) for frame in sums], axis=0)
-        cells = [f"{before:.2%}", f"{in_water:.2%}", f"{cloud_before(sfm, per_unit):.2%}"]
+        in_front, in_water, restored, beside = np.mean([list(vars(frame).values()) for frame in sums], axis=0)
+        cells = [f"{in_front:.2%}", f"{in_water:.2%}", f"{cloud_in_front(sfm, per_unit):.2%}"]
         cells += [f"{-10 * math.log10(error):.2f} dB" for error in (restored, beside)]
     return f"| {run.name} | {measured:.2%} | {' | '.join(cells)} |"
 
@@ -110,7 +110,7 @@ def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("runs", nargs="+", metavar="RUN[:TRUTH]")
     options = parser.parse_args()
-    print("| run | measured | before | in water | cloud | restored | beside |")
+    print("| run | measured | in front | in water | cloud | restored | beside |")
     print("| --- | --- | --- | --- | --- | --- | --- |")
     for given in options.runs:
         run, _, truth = given.partition(":")

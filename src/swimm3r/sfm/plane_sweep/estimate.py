@@ -86,11 +86,11 @@ def estimate_depth(
         if engine.is_in_this_process:
             _each(passes.step(step), left, len(wanted), settings.threads, partial(progress, step))
         else:
+            firsts = range(0, len(left), _OF_A_TASK)
+            groups = [tuple(left[k : k + _OF_A_TASK]) for k in firsts]
             parts = [
-                PartOfPass(
-                    f"{step} of frames {k + 1} to {min(k + _OF_A_TASK, len(left))}", step, tuple(left[k:][:_OF_A_TASK])
-                )
-                for k in range(0, len(left), _OF_A_TASK)
+                PartOfPass(f"{step} of frames {k + 1} to {k + len(group)}", step, group)
+                for k, group in zip(firsts, groups, strict=True)
             ]
             work = partial(make_part, folder=folder.parent.resolve(), frames=frames, settings=settings)
             if failures := run_tasks(work, parts, engine, progress, step, logs=folder.parent.resolve() / "logs"):
