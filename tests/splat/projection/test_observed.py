@@ -75,6 +75,14 @@ def test_open_water_is_observed_where_a_frame_looked_into_it():
     assert not observed[HEIGHT // 2 + 4 :].any()  # a hole in the ground: the frame saw ground there
 
 
+def test_open_water_is_observed_up_to_the_edge_of_the_ground():
+    alpha = torch.ones(HEIGHT, WIDTH)
+    alpha[: HEIGHT // 2] = 0
+    assert torch.equal(coverage(WALL, alpha).z_depth.isinf()[0], alpha == 0)
+    shown = torch.where(alpha > 0, WALL, 0.0)
+    assert coverage(WALL, alpha).of_view(looking_ahead(), shown, alpha).all()
+
+
 def test_a_hole_of_a_pixel_in_the_map_is_no_open_water():
     alpha = torch.ones(HEIGHT, WIDTH)
     alpha[10, 20] = 0

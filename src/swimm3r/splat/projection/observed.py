@@ -117,11 +117,18 @@ def coverage_of(
 ) -> TrainingCoverage:
     """The record of small views as the map renders them: the farthest depth of a pixel and those around it.
 
-    Open water is where several pixels around show none: a hole in the map is no open water.
+    Open water is all of a window of `_HOLE` pixels that shows no surface (a morphological opening), up to its edge: a
+    smaller hole in the map is no open water.
     """
     z, cover = torch.stack(list(z_depth))[:, None], torch.stack(list(alpha))[:, None]
     surface = (cover > _COVERED) & (z > 0)
-    near_any = max_pool2d(surface.float(), _HOLE, stride=1, padding=_HOLE // 2) > 0
-    farthest = max_pool2d(torch.where(surface, z, 0.0), 3, stride=1, padding=1)
-    z = torch.where(near_any, farthest, torch.inf)[:, 0]
+    core = _spread(surface.float(), _HOLE) == 0
+    open_water = _spread(core.float(), _HOLE) > 0
+    farthest = _spread(torch.where(surface, z, 0.0), 3)
+    z = torch.where(open_water, torch.inf, farthest)[:, 0]
     return TrainingCoverage(cameras, torch.where(torch.stack(list(admitted)), z, 0.0).half().float())
+
+
+def _spread(image: Float[Tensor, "n 1 h w"], size: int) -> Float[Tensor, "n 1 h w"]:
+    """The largest value within a window of each pixel."""
+    return max_pool2d(image, size, stride=1, padding=size // 2)
