@@ -11,6 +11,7 @@ from dataclasses import dataclass, replace
 import torch
 from torch import Tensor
 
+from swimm3r.imaging.filters import LUMA
 from swimm3r.imaging.undistortion import covering_pinholes
 from swimm3r.raster import Backend, Kernel, MediumMaps, Primitives2D, SggBuffers, rasterize
 from swimm3r.selftest.scenes import (
@@ -135,7 +136,7 @@ def _plane_sweep(device: str) -> Check:
     cameras = cameras_before_plane()
     everywhere = torch.ones(cameras.height, cameras.width, dtype=torch.bool)
     canvas = covering_pinholes(cameras, 640)
-    views = [make_view(image_of_plane(cameras[i]), everywhere, cameras[i], canvas[i]) for i in range(5)]
+    views = [make_view(image_of_plane(cameras[i]) @ LUMA, everywhere, cameras[i], canvas[i]) for i in range(5)]
     settings = PlaneSweepSettings(sources=4, planes=48, threads=1)
     found = sweep(views[2], [views[i] for i in (0, 1, 3, 4)], (2.0, 9.0), settings, torch.device(device))
     middle = found.inverse_depth[16:-16, 24:-24]

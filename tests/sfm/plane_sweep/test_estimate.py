@@ -1,5 +1,6 @@
 """Depth by plane sweep on scenes whose depth is known in closed form: textured planes, pinhole and bent lenses."""
 
+from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
 from typing import get_args
@@ -11,6 +12,7 @@ from jaxtyping import Float
 from torch import Tensor
 
 from swimm3r.cameras import Cameras, image_directions, project, unproject
+from swimm3r.imaging.filters import LUMA
 from swimm3r.imaging.undistortion import covering_pinholes
 from swimm3r.io import images
 from swimm3r.scene.frames import Frame, Frames
@@ -20,7 +22,14 @@ from swimm3r.sfm.plane_sweep import sweep as sweep_of_a_view
 from swimm3r.sfm.plane_sweep.estimate import consistent, estimate_depth
 from swimm3r.sfm.plane_sweep.settings import PlaneSweepSettings
 from swimm3r.sfm.plane_sweep.sweep import RawDepth, sweep
-from swimm3r.sfm.plane_sweep.views import SweepView, choose_sources, depth_range, make_view, points_by_frame
+from swimm3r.sfm.plane_sweep.views import (
+    SweepView,
+    choose_sources,
+    depth_range,
+    gray_weights,
+    make_view,
+    points_by_frame,
+)
 from swimm3r.tasks import EngineSettings
 
 WIDTH, HEIGHT = 128, 96
@@ -71,7 +80,7 @@ def views_of(plane: tuple[float, float, float], change: tuple[float, float] = (1
     for i in range(5):
         gain, offset = (1.0, 0.0) if i == 2 else change
         image = gain * photograph(cameras[i], plane) + offset
-        views.append(make_view(image, everywhere, cameras[i], canvas[i]))
+        views.append(make_view(image @ LUMA, everywhere, cameras[i], canvas[i]))
     return views
 
 
@@ -99,11 +108,16 @@ def reconstruction(cameras: Cameras, plane: tuple[float, float, float], folder: 
     )
 
 
-def frames_on_disk(cameras: Cameras, plane: tuple[float, float, float], folder: Path) -> Frames:
+def frames_on_disk(
+    cameras: Cameras,
+    plane: tuple[float, float, float],
+    folder: Path,
+    change: Callable[[Float[Tensor, "h w 3"]], Float[Tensor, "h w 3"]] = torch.clone,
+) -> Frames:
     made = []
     for i in range(5):
         path = folder / f"{i}.png"
-        images.write_rgb(path, photograph(cameras[i], plane).numpy())
+        images.write_rgb(path, change(photograph(cameras[i], plane)).numpy())
         made.append(Frame(path.name, path, float(i), 0.0, "train"))
     return Frames(tuple(made), WIDTH, HEIGHT, ordered=True)
 
@@ -144,7 +158,7 @@ def test_wide_windows_tell_the_depth_of_a_texture_that_noise_hides_from_small_on
     def faint(i: int) -> SweepView:
         image = 0.3 + 0.05 * photograph(cameras[i], SLANTED)
         noise = 1.2 / 255 * torch.randn(HEIGHT, WIDTH, 1, generator=generator)
-        return make_view(image + noise, everywhere, cameras[i], canvas[i])
+        return make_view((image + noise) @ LUMA, everywhere, cameras[i], canvas[i])
 
     views = [faint(i) for i in range(5)]
     raw = middle_depth(views).inverse_depth
@@ -184,7 +198,7 @@ def test_ground_in_one_source_alone_is_judged_by_that_source():
     cameras.cam2world[:, 0, 3] *= 5  # 1.25 apart at a depth of 4: 34 pixels
     canvas = covering_pinholes(cameras, 640)
     everywhere = torch.ones(HEIGHT, WIDTH, dtype=torch.bool)
-    views = [make_view(photograph(cameras[i], FRONTAL), everywhere, cameras[i], canvas[i]) for i in (0, 1, 3, 4)]
+    views = [make_view(photograph(cameras[i], FRONTAL) @ LUMA, everywhere, cameras[i], canvas[i]) for i in (0, 1, 3, 4)]
     raw = sweep(views[0], views[1:], (3.0, 5.5), replace(SETTINGS, min_ncc=0.6))  # two of the three sources count
     q = raw.inverse_depth[12:-12, 45:95]
     assert (q > 0).double().mean() > 0.8
@@ -274,6 +288,43 @@ def test_depth_of_large_frames_is_computed_small_and_returned_large(tmp_path: Pa
     assert found.z_depth.shape == (HEIGHT, WIDTH)
     assert (found.z_depth > 0).double().mean() > 0.6
     assert error.median() < 0.01
+
+
+def under_a_blue_lamp(image: Tensor) -> Tensor:
+    """Texture in blue alone, which luma loses in the noise of the other channels."""
+    faint = torch.tensor([0.02, 0.1, 0.3]) + torch.tensor([0.0, 0.0, 0.08]) * image
+    noise = torch.randn(image.shape, generator=torch.Generator().manual_seed(int(1e6 * float(image.sum())) % 1000))
+    return faint + 1 / 255 * noise
+
+
+def test_the_depth_of_a_scene_in_blue_is_measured_in_blue(tmp_path: Path):
+    cameras = dive()
+    frames = frames_on_disk(cameras, SLANTED, tmp_path, under_a_blue_lamp)
+    depth = estimate_depth(reconstruction(cameras, SLANTED, tmp_path), frames, SETTINGS)["2.png"].z_depth
+    error = relative_error(depth, z_of_plane(cameras[2], SLANTED))
+    assert (depth > 0)[MIDDLE].double().mean() > 0.8
+    assert error.median() < 0.01
+
+
+def test_gray_has_the_channels_that_the_detail_is_in_and_the_noise_of_luma(tmp_path: Path):
+    names = tuple(f"{i}.png" for i in range(5))
+    even = gray_weights(frames_on_disk(dive(), SLANTED, tmp_path), names, 640)
+    blue = gray_weights(frames_on_disk(dive(), SLANTED, tmp_path, under_a_blue_lamp), names, 640)
+    small = gray_weights(
+        frames_on_disk(dive(), SLANTED, tmp_path, lambda image: image * torch.tensor([0, 1.0, 0])), names, 64
+    )
+    assert torch.allclose(even, LUMA.norm() * torch.ones(3) / 3**0.5, atol=1e-4)
+    assert blue[2] > 0.95 * LUMA.norm()
+    assert torch.allclose(small, LUMA.norm() * torch.tensor([0, 1.0, 0]), atol=1e-4)
+    assert torch.allclose(blue.norm(), LUMA.norm())
+
+
+def test_gray_of_frames_of_which_nothing_is_seen_is_luma(tmp_path: Path):
+    names = tuple(f"{i}.png" for i in range(5))
+    images.write_mask(tmp_path / "none.png", np.zeros((HEIGHT, WIDTH), bool))
+    hidden = frames_on_disk(dive(), SLANTED, tmp_path)
+    hidden = replace(hidden, frames=tuple(replace(f, mask=tmp_path / "none.png") for f in hidden))
+    assert torch.equal(gray_weights(hidden, names, 640), LUMA)
 
 
 def test_masked_pixels_have_no_depth(tmp_path: Path):

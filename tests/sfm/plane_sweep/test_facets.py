@@ -70,13 +70,13 @@ def test_depth_of_a_slanted_plane_comes_back_along_the_frame_s_axis():
     def inverse_depth(rays: torch.Tensor, turn: torch.Tensor) -> torch.Tensor:
         return (rays.double() @ (turn.T @ normal)).clamp(min=0)
 
-    image = torch.rand(192, 288, 3, generator=torch.Generator().manual_seed(0))
+    gray = torch.rand(192, 288, generator=torch.Generator().manual_seed(0))
     parts = []
     for view in facets.of_frame(0):
         camera, turn = facets.cameras[view], facets.turn_of(view)
         assert turn is not None
         q = inverse_depth(image_directions(camera), turn).float()
-        parts.append(on_frame_grid(q, torch.ones_like(q), torch.zeros_like(q), image, lens, camera, turn))
+        parts.append(on_frame_grid(q, torch.ones_like(q), torch.zeros_like(q), gray, lens, camera, turn))
     rays = image_directions(lens)
     q, confidence = merged([q for q, _ in parts], [share for _, share in parts], rays, facets)
     expected = inverse_depth(rays, torch.eye(3, dtype=torch.float64)).float()

@@ -16,6 +16,7 @@ import torch
 
 from swimm3r.cameras import Cameras, cameras_of
 from swimm3r.errors import InputError
+from swimm3r.imaging.filters import LUMA
 from swimm3r.io.colmap.model import ColmapModel
 from swimm3r.io.imports.read import read_foreign
 from swimm3r.io.imports.record import ForeignModel
@@ -138,8 +139,8 @@ def write_depth(rec: Reconstruction, frames: Frames, foreign: ForeignModel, prog
         progress("depth", k, len(rows))
         z_depth, share, gray = (torch.from_numpy(a[row]).float() for a in (dense.z_depth, dense.confidence, dense.gray))
         inverse = torch.where(z_depth > 0, 1 / z_depth.clamp(min=1e-12), 0.0)
-        image = frames.image(frames.index(name))
-        q, share = on_frame_grid(inverse, share, gray, image, rec.cameras[k], canvas[k])
+        wanted = frames.image(frames.index(name)) @ LUMA
+        q, share = on_frame_grid(inverse, share, gray, wanted, rec.cameras[k], canvas[k])
         known = (q > 0) & frames.mask(frames.index(name))
         z = torch.where(known, 1 / q.clamp(min=1e-12), 0.0)
         rec.depth.write(name, DepthMap(z, torch.where(known, share, 0.0)))

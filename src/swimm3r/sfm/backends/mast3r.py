@@ -332,7 +332,7 @@ def _write_depth(
         inverse = torch.where(usable, 1 / z_depth.clamp(min=1e-12), 0.0)
         share = torch.where(usable, depth_cleaning.confidence_share(confidence), 0.0)
         gray = (images.image(f).permute(1, 2, 0) / 2 + 0.5) @ LUMA
-        q, share = on_frame_grid(inverse, share, gray, images.frames.image(f), rec.cameras[k], canvas[k])
+        q, share = on_frame_grid(inverse, share, gray, images.frames.image(f) @ LUMA, rec.cameras[k], canvas[k])
         known = (q > 0) & images.frames.mask(f)
         z = torch.where(known, 1 / q.clamp(min=1e-12), 0.0)
         rec.depth.write(rec.names[k], DepthMap(z, torch.where(known, share, 0.0)))

@@ -43,6 +43,7 @@ from swimm3r.sfm.plane_sweep.views import (
     SweepView,
     choose_sources,
     depth_range,
+    gray_weights,
     make_view,
     on_frame_grid,
     points_by_frame,
@@ -135,6 +136,7 @@ class _Passes:
         self._neighbors = [best[: max(settings.sources, _NEIGHBORS)] for best in self._sources]
         self._points, self._pose_error = points_by_frame(self._views_of), _pose_error(rec, self._canvas)
         self._position = {name: k for k, name in enumerate(frames.names)}
+        self._gray = gray_weights(frames, rec.names, settings.long_side)
         self._views = ArrayCache(max_bytes=256 << 20)
         self._drafts: dict[Step, ArrayCache] = {step: ArrayCache(max_bytes=256 << 20) for step in _DRAFTS}
 
@@ -179,7 +181,7 @@ class _Passes:
             frame = self._facets.frame_of(view)
             k = self._position[self._rec.names[frame]]
             image, mask, lens = self._frames.image(k), self._frames.mask(k), self._rec.cameras[frame]
-            made = make_view(image, mask, lens, self._canvas[view], self._facets.turn_of(view))
+            made = make_view(image @ self._gray, mask, lens, self._canvas[view], self._facets.turn_of(view))
             return made.gray.numpy(), made.detail.numpy(), made.seen.numpy()
 
         gray, detail, seen = (torch.from_numpy(a.copy()) for a in self._views.get(view, load))
@@ -203,21 +205,21 @@ class _Passes:
     def _finish(self, i: int) -> None:
         rec, lens = self._rec, self._rec.cameras[i]
         k = self._position[rec.names[i]]
-        on_grid = [self._on_grid(view, self._frames.image(k), lens) for view in self._facets.of_frame(i)]
+        on_grid = [self._on_grid(view, self._frames.image(k) @ self._gray, lens) for view in self._facets.of_frame(i)]
         q, confidence = merged([q for q, _ in on_grid], [share for _, share in on_grid], frame_rays(lens), self._facets)
         usable = (q > 0) & self._frames.mask(k)
         z_depth = torch.where(usable, 1 / q.clamp(min=1e-12), 0.0)
         rec.depth.write(rec.names[i], DepthMap(z_depth, torch.where(usable, confidence, 0.0)))
 
     def _on_grid(
-        self, view: int, image: Float[Tensor, "h w 3"], lens: Cameras
+        self, view: int, wanted: Float[Tensor, "h w"], lens: Cameras
     ) -> tuple[Float[Tensor, "h w"], Float[Tensor, "h w"]]:
         """Inverse depth along a view's axis that none looks through, and its confidence, on its frame's grid."""
         others, canvas = self._sources[view], self._canvas
         agreed = (self._kept("depth agreement", j) for j in (view, *others))
         kept = without_seen_through(next(agreed), agreed, canvas[[view, *others]], self._settings)
         gray, turn = self._view(view).gray, self._facets.turn_of(view)
-        return on_frame_grid(kept.inverse_depth, kept.correlation, gray, image, lens, canvas[view], turn)
+        return on_frame_grid(kept.inverse_depth, kept.correlation, gray, wanted, lens, canvas[view], turn)
 
 
 def _with_their(others: list[list[int]], views: list[int]) -> list[int]:

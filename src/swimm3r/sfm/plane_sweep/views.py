@@ -4,6 +4,7 @@ Sweeping needs straight epipolar lines, so the work is done on a pinhole canvas 
 axis is the same number on both grids, and `on_frame_grid` reads it back at every pixel of the distorted frame.
 """
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -15,6 +16,7 @@ from torch import Tensor
 from swimm3r.cameras import Cameras, project, project_visible
 from swimm3r.imaging.filters import LUMA
 from swimm3r.imaging.undistortion import pinhole_grid, undistorted
+from swimm3r.scene.frames import Frames
 from swimm3r.scene.reconstruction import Reconstruction
 from swimm3r.sfm.plane_sweep import consistency
 
@@ -23,6 +25,7 @@ _CANDIDATES = 40  # frames sharing most points that are considered as sources
 _NO_ANGLE = 0.01  # degrees
 _SLOW = 12.0  # pixels at working size: what varies slower is no surface texture
 _FAST = 0.7  # pixels: what varies faster is noise, or the lines of interlaced video
+_WEIGHED = 8  # frames, of which the weights of the channels are taken
 
 
 @dataclass(frozen=True)
@@ -105,23 +108,54 @@ def depth_range(rec: Reconstruction, i: int, points: np.ndarray) -> tuple[float,
     return float(low) / 1.4, float(high) * 2.5
 
 
+def gray_weights(frames: Frames, names: Sequence[str], long_side: int) -> Float[Tensor, "3"]:
+    """Weights of red, green and blue for the gray images in which the detail of frames stands out most from noise.
+
+    They are the first principal component of the detail of a few frames at working size, and have the norm of those of
+    luma: noise that is independent and as strong in every channel is as strong in the gray image as in luma. A lamp in
+    deep water shows nearly all detail in blue, of which luma takes a ninth.
+    """
+    import cv2
+
+    moments = np.zeros((3, 3))
+    for name in names[:: -(-len(names) // _WEIGHED)]:
+        k = frames.index(name)
+        image, mask = frames.image(k).numpy(), frames.mask(k).numpy()
+        scale = min(1.0, long_side / max(mask.shape))
+        size = max(1, round(scale * mask.shape[1])), max(1, round(scale * mask.shape[0]))
+        image = cv2.resize(image, size, interpolation=cv2.INTER_AREA)
+        seen = cv2.resize(mask.astype(np.uint8), size, interpolation=cv2.INTER_NEAREST) > 0
+        detail = _detail(image, seen)[seen].astype(np.float64)
+        moments += detail.T @ detail
+    if not moments.any():
+        return LUMA
+    first = np.linalg.eigh(moments).eigenvectors[:, -1]
+    first = (first * np.sign(first.sum())).clip(0)
+    return torch.from_numpy(first / np.linalg.norm(first)).float() * LUMA.norm()
+
+
 def make_view(
-    image: Float[Tensor, "h w 3"],
+    gray: Float[Tensor, "h w"],
     mask: Bool[Tensor, "h w"],
     lens: Cameras,
     canvas: Cameras,
     turn: Float[Tensor, "3 3"] | None = None,
 ) -> SweepView:
     """A frame undistorted onto the canvas; `lens` is its own camera, `canvas` the pinhole one and `turn` its axes."""
+    values, shown = undistorted(gray, mask, lens, canvas, turn)
+    detail = torch.from_numpy(_detail(values.numpy(), shown.numpy()))
+    return SweepView(values, detail, shown, canvas.K[0], canvas.world2cam[0])
+
+
+def _detail(values: np.ndarray, seen: np.ndarray) -> np.ndarray:
+    """Images [h w] or [h w 3] without what varies slowly or faster than a surface's texture; 0 where not seen."""
     import cv2
 
-    values, shown = undistorted(image @ LUMA, mask, lens, canvas, turn)
-    gray, seen = values.numpy(), shown.numpy()
+    there = seen.reshape(seen.shape + (1,) * (values.ndim - 2))
     share = cv2.GaussianBlur(seen.astype(np.float32), (0, 0), _SLOW, borderType=cv2.BORDER_REFLECT)
-    slow = cv2.GaussianBlur(np.where(seen, gray, 0), (0, 0), _SLOW, borderType=cv2.BORDER_REFLECT)
-    fine = cv2.GaussianBlur(gray, (0, 0), _FAST)
-    detail = np.where(seen, fine - slow / np.maximum(share, 1e-6), 0).astype(np.float32)
-    return SweepView(values, torch.from_numpy(detail), shown, canvas.K[0], canvas.world2cam[0])
+    slow = cv2.GaussianBlur(np.where(there, values, 0), (0, 0), _SLOW, borderType=cv2.BORDER_REFLECT)
+    fine = cv2.GaussianBlur(values, (0, 0), _FAST)
+    return np.where(there, fine - slow / np.maximum(share, 1e-6).reshape(there.shape), 0).astype(np.float32)
 
 
 def halved(view: SweepView) -> SweepView:
@@ -145,14 +179,17 @@ def on_frame_grid(
     values: Float[Tensor, "h w"],
     also: Float[Tensor, "h w"],
     guide: Float[Tensor, "h w"],
-    image: Float[Tensor, "fh fw 3"],
+    wanted: Float[Tensor, "fh fw"],
     lens: Cameras,
     canvas: Cameras,
     turn: Float[Tensor, "3 3"] | None = None,
 ) -> tuple[Float[Tensor, "fh fw"], Float[Tensor, "fh fw"]]:
-    """`values` and `also` of the canvas at the pixels of the frame, along the edges of the image; 0 = unknown."""
+    """`values` and `also` of the canvas at the pixels of the frame, along edges of the gray image; 0 = unknown.
+
+    The gray image is `guide` on the canvas and `wanted` on the frame's own grid.
+    """
     u, v = pinhole_grid(lens, canvas, turn)
-    wanted = (image @ LUMA).numpy().ravel()
-    out, read = consistency.look_up(values.numpy(), also.numpy(), guide.numpy(), u, v, wanted, likely_edge(guide), 0.03)
-    shape = image.shape[:2]
-    return torch.from_numpy(out.reshape(shape)), torch.from_numpy(read.reshape(shape))
+    out, read = consistency.look_up(
+        values.numpy(), also.numpy(), guide.numpy(), u, v, wanted.numpy().ravel(), likely_edge(guide), 0.03
+    )
+    return torch.from_numpy(out.reshape(wanted.shape)), torch.from_numpy(read.reshape(wanted.shape))
