@@ -205,7 +205,8 @@ class _Passes:
     def _finish(self, i: int) -> None:
         rec, lens = self._rec, self._rec.cameras[i]
         k = self._position[rec.names[i]]
-        on_grid = [self._on_grid(view, self._frames.image(k) @ self._gray, lens) for view in self._facets.of_frame(i)]
+        wanted = self._frames.image(k) @ self._gray
+        on_grid = [self._on_grid(view, wanted, lens) for view in self._facets.of_frame(i)]
         q, confidence = merged([q for q, _ in on_grid], [share for _, share in on_grid], frame_rays(lens), self._facets)
         usable = (q > 0) & self._frames.mask(k)
         z_depth = torch.where(usable, 1 / q.clamp(min=1e-12), 0.0)

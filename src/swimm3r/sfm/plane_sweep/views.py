@@ -118,7 +118,7 @@ def gray_weights(frames: Frames, names: Sequence[str], long_side: int) -> Float[
     import cv2
 
     moments = np.zeros((3, 3))
-    for name in names[:: -(-len(names) // _WEIGHED)]:
+    for name in names[:: max(1, -(-len(names) // _WEIGHED))]:
         k = frames.index(name)
         image, mask = frames.image(k).numpy(), frames.mask(k).numpy()
         scale = min(1.0, long_side / max(mask.shape))
