@@ -111,9 +111,9 @@ def depth_range(rec: Reconstruction, i: int, points: np.ndarray) -> tuple[float,
 def gray_weights(frames: Frames, names: Sequence[str], long_side: int) -> Float[Tensor, "3"]:
     """Weights of red, green and blue for the gray images in which the detail of frames stands out most from noise.
 
-    They are the first principal component of the detail of a few frames at working size, and have the norm of those of
-    luma: noise that is independent and as strong in every channel is as strong in the gray image as in luma. A lamp in
-    deep water shows nearly all detail in blue, of which luma takes a ninth.
+    They are the first principal component of the detail of a few frames at working size, in which noise is as strong as
+    in luma at most, be it independent in the channels or common to them as in gray images. A lamp in deep water shows
+    nearly all detail in blue, of which luma takes a ninth.
     """
     import cv2
 
@@ -130,8 +130,8 @@ def gray_weights(frames: Frames, names: Sequence[str], long_side: int) -> Float[
     if not moments.any():
         return LUMA
     first = np.linalg.eigh(moments).eigenvectors[:, -1]
-    first = (first * np.sign(first.sum())).clip(0)
-    return torch.from_numpy(first / np.linalg.norm(first)).float() * LUMA.norm()
+    first = torch.from_numpy((first * np.sign(first.sum())).clip(0)).float()
+    return first / torch.maximum(first.norm() / LUMA.norm(), first.sum() / LUMA.sum())
 
 
 def make_view(
