@@ -51,6 +51,7 @@ class TrueFrames:
     z_depth: Float[Tensor, "n h w"]  # scene units; infinite in open water
 
     def see(self, points: Float[Tensor, "p 3"]) -> Bool[Tensor, " p"]:
+        """Mask of the points that some frame saw."""
         seen = torch.zeros(len(points), dtype=torch.bool)
         size = torch.tensor([self.cameras.width, self.cameras.height])
         for i, surface in enumerate(self.z_depth):
@@ -89,8 +90,9 @@ def rows(sfm: FinishedSfm, run: Path) -> Iterator[str]:
     assert truth is not None
     there = truth.cameras.cam2world[[truth.names.index(name) for name in rec.names]]
     to_truth = align_poses(rec.cameras.cam2world.double(), there.double())
-    depth = torch.stack([z for name in rec.names if (z := truth.z_depth(name)) is not None]).double() / to_truth.scale
-    frames = TrueFrames(rec.cameras, torch.where(depth > 0, depth, torch.inf))
+    depth = {i: z for i, name in enumerate(rec.names) if (z := truth.z_depth(name)) is not None}
+    true = torch.stack(list(depth.values())).double() / to_truth.scale
+    frames = TrueFrames(rec.cameras[list(depth)], torch.where(true > 0, true, torch.inf))
     scene = load_map(run / "splat" / "map.safetensors")
     scene = replace(scene, coverage=seen_in_training(scene, rec, sfm.frames, rec.names))
     unit = float(rec.point_depths().median())

@@ -290,16 +290,20 @@ def test_depth_of_large_frames_is_computed_small_and_returned_large(tmp_path: Pa
     assert error.median() < 0.01
 
 
-def under_a_blue_lamp(image: Tensor) -> Tensor:
-    """Texture in blue alone, which luma loses in the noise of the other channels."""
-    faint = torch.tensor([0.02, 0.1, 0.3]) + torch.tensor([0.0, 0.0, 0.08]) * image
-    noise = torch.randn(image.shape, generator=torch.Generator().manual_seed(int(1e6 * float(image.sum())) % 1000))
-    return faint + 1 / 255 * noise
+def blue_lamp() -> Callable[[Tensor], Tensor]:
+    """A camera whose images have texture in blue alone, which luma loses in the noise of the other channels."""
+    generator = torch.Generator().manual_seed(0)
+
+    def filmed(image: Tensor) -> Tensor:
+        lit = torch.tensor([0.02, 0.1, 0.3]) + torch.tensor([0.0, 0.0, 0.08]) * image
+        return lit + torch.randn(image.shape, generator=generator) / 255
+
+    return filmed
 
 
 def test_the_depth_of_a_scene_in_blue_is_measured_in_blue(tmp_path: Path):
     cameras = dive()
-    frames = frames_on_disk(cameras, SLANTED, tmp_path, under_a_blue_lamp)
+    frames = frames_on_disk(cameras, SLANTED, tmp_path, blue_lamp())
     depth = estimate_depth(reconstruction(cameras, SLANTED, tmp_path), frames, SETTINGS)["2.png"].z_depth
     error = relative_error(depth, z_of_plane(cameras[2], SLANTED))
     assert (depth > 0)[MIDDLE].double().mean() > 0.8
@@ -309,7 +313,7 @@ def test_the_depth_of_a_scene_in_blue_is_measured_in_blue(tmp_path: Path):
 def test_gray_has_the_channels_that_the_detail_is_in_and_no_more_noise_than_luma(tmp_path: Path):
     names = tuple(f"{i}.png" for i in range(5))
     even = gray_weights(frames_on_disk(dive(), SLANTED, tmp_path), names, 640)
-    blue = gray_weights(frames_on_disk(dive(), SLANTED, tmp_path, under_a_blue_lamp), names, 640)
+    blue = gray_weights(frames_on_disk(dive(), SLANTED, tmp_path, blue_lamp()), names, 640)
     small = gray_weights(
         frames_on_disk(dive(), SLANTED, tmp_path, lambda image: image * torch.tensor([0, 1.0, 0])), names, 64
     )

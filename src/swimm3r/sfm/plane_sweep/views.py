@@ -111,9 +111,9 @@ def depth_range(rec: Reconstruction, i: int, points: np.ndarray) -> tuple[float,
 def gray_weights(frames: Frames, names: Sequence[str], long_side: int) -> Float[Tensor, "3"]:
     """Weights of red, green and blue for the gray images in which the detail of frames stands out most from noise.
 
-    They are the first principal component of the detail of a few frames at working size, in which noise is as strong as
-    in luma at most, be it independent in the channels or common to them as in gray images. A lamp in deep water shows
-    nearly all detail in blue, of which luma takes a ninth.
+    They are the first principal component of the detail of a few frames at working size, scaled so that noise is no
+    stronger than in luma, be it independent in the channels or common to them as in gray images. A lamp in deep water
+    shows nearly all detail in blue, of which luma takes a ninth.
     """
     import cv2
 
