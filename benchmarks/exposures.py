@@ -11,15 +11,15 @@ its colors as filmed, and from those that the dive has on average where the run 
 """
 
 import argparse
-from pathlib import Path
 
 import torch
+from dive_runs import dive_run
 from jaxtyping import Float
 from torch import Tensor
 
 from swimm3r.evaluate.images import psnr
 from swimm3r.imaging.undistortion import frame_rays
-from swimm3r.pipeline.finished_sfm import FinishedSfm, open_finished_sfm
+from swimm3r.pipeline.finished_sfm import FinishedSfm
 from swimm3r.scene.frames import Frames
 from swimm3r.sfm.medium.restore import restore_image
 
@@ -46,14 +46,12 @@ def errors(sfm: FinishedSfm, frames: Frames) -> tuple[float, Float[Tensor, "3"]]
 
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument("runs", nargs="+", metavar="RUN:TRUTH")
+    parser.add_argument("runs", nargs="+", type=dive_run, metavar="RUN:TRUTH")
     print("| dive | filmed | common | spread as filmed | spread in common colors |\n| --- | --- | --- | --- | --- |")
-    for given in parser.parse_args().runs:
-        run, _, truth = given.partition(":")
-        sfm = open_finished_sfm(Path(run), Path(truth))
+    for sfm in parser.parse_args().runs:
         both = [errors(sfm, frames) for frames in (sfm.rec.still(sfm.frames), sfm.rec.evened(sfm.frames))]
         spreads = (", ".join(f"{value:.3f}" for value in spread.tolist()) for _, spread in both)
-        print(f"| {Path(run).name} | {both[0][0]:.1f} | {both[1][0]:.1f} | {' | '.join(spreads)} |")
+        print(f"| {sfm.folder.name} | {both[0][0]:.1f} | {both[1][0]:.1f} | {' | '.join(spreads)} |")
 
 
 if __name__ == "__main__":

@@ -16,22 +16,21 @@ each run:
 
 import argparse
 from dataclasses import replace
-from pathlib import Path
 
 import numpy as np
 import torch
+from dive_runs import dive_run, to_truth
 from jaxtyping import Float
 from scipy.ndimage import minimum_filter
 from torch import Tensor
 
 from swimm3r.evaluate.images import psnr
-from swimm3r.geometry import align_poses
 from swimm3r.imaging.depth_completion import fill_z_depth
 from swimm3r.imaging.depth_from_color import depth_from_color
 from swimm3r.imaging.open_water import sea_share, without_fringe
 from swimm3r.imaging.undistortion import frame_directions, frame_rays
 from swimm3r.medium import linear_from_srgb, srgb_from_linear
-from swimm3r.pipeline.finished_sfm import FinishedSfm, open_finished_sfm
+from swimm3r.pipeline.finished_sfm import FinishedSfm
 from swimm3r.scene.point_groups import PointGroups
 from swimm3r.sfm.medium.restore import restore_image
 
@@ -48,8 +47,7 @@ def errors(sfm: FinishedSfm) -> Float[np.ndarray, " 7"]:
     cloud, linear = PointGroups(rec.cloud.xyz), rec.medium.encoding == "linear"
     per_unit = 1.0  # of the run, of one of the truth
     if truth is not None:
-        there = truth.cameras.cam2world[[truth.names.index(name) for name in rec.names]]
-        per_unit = 1 / float(align_poses(rec.cameras.cam2world.double(), there.double()).scale)
+        per_unit = 1 / float(to_truth(sfm).scale)
     rows = []
     for i in range(0, len(rec.names), max(1, len(rec.names) // FRAMES)):
         camera, name = rec.cameras[i], rec.names[i]
@@ -105,15 +103,14 @@ def _far(off: Tensor) -> float:
 
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument("runs", nargs="+", metavar="RUN[:TRUTH]")
+    parser.add_argument("runs", nargs="+", type=dive_run, metavar="RUN[:TRUTH]")
     print("| run | hidden | error | with color | far off | with color | beside | restored |")
     print("| --- | --- | --- | --- | --- | --- | --- | --- |")
-    for given in parser.parse_args().runs:
-        run, _, truth = given.partition(":")
-        hidden, *rest, decibels = errors(open_finished_sfm(Path(run), Path(truth) if truth else None))
+    for sfm in parser.parse_args().runs:
+        hidden, *rest, decibels = errors(sfm)
         shown = " | ".join([f"{100 * hidden:.0f} %", *(f"{100 * value:.1f} %" for value in rest)])
         restored = f"{decibels:.1f} dB" if np.isfinite(decibels) else "-"
-        print(f"| {Path(run).name}{', truth' if truth else ''} | {shown} | {restored} |", flush=True)
+        print(f"| {sfm.folder.name}{', truth' if sfm.truth else ''} | {shown} | {restored} |", flush=True)
 
 
 if __name__ == "__main__":

@@ -16,16 +16,16 @@ The record of the map is made anew from its depth, so that it is of the code at 
 import argparse
 from collections.abc import Iterator
 from dataclasses import dataclass, replace
-from pathlib import Path
 
 import numpy as np
 import torch
+from dive_runs import dive_run, to_truth
 from jaxtyping import Bool, Float
 from torch import Tensor
 
 from swimm3r.cameras import Cameras, pixel_grid, project, unproject
-from swimm3r.geometry import align_poses, pose_from, so3_exp
-from swimm3r.pipeline.finished_sfm import FinishedSfm, open_finished_sfm
+from swimm3r.geometry import pose_from, so3_exp
+from swimm3r.pipeline.finished_sfm import FinishedSfm
 from swimm3r.splat.map_file import load_map
 from swimm3r.splat.rendering import SplatMap
 from swimm3r.splat.train_map import seen_in_training
@@ -84,36 +84,34 @@ def shares(scene: SplatMap, camera: Cameras, frames: TrueFrames) -> list[float]:
     return [float(part.float().mean()) for part in parts]
 
 
-def rows(sfm: FinishedSfm, run: Path) -> Iterator[str]:
+def rows(sfm: FinishedSfm) -> Iterator[str]:
     """The table's lines of a run."""
     rec, truth = sfm.rec, sfm.truth
     assert truth is not None
-    there = truth.cameras.cam2world[[truth.names.index(name) for name in rec.names]]
-    to_truth = align_poses(rec.cameras.cam2world.double(), there.double())
+    there = to_truth(sfm)
     depth = {i: z for i, name in enumerate(rec.names) if (z := truth.z_depth(name)) is not None}
-    true = torch.stack(list(depth.values())).double() / to_truth.scale
+    true = torch.stack(list(depth.values())).double() / there.scale
     frames = TrueFrames(rec.cameras[list(depth)], torch.where(true > 0, true, torch.inf))
-    scene = load_map(run / "splat" / "map.safetensors")
+    scene = load_map(sfm.folder / "splat" / "map.safetensors")
     scene = replace(scene, coverage=seen_in_training(scene, rec, sfm.frames, rec.names))
     unit = float(rec.point_depths().median())
     held_out = [i for i, name in enumerate(truth.names) if name not in rec.names]
-    poses = to_truth.inverse().poses(truth.cameras.cam2world[held_out].double())
+    poses = there.inverse().poses(truth.cameras.cam2world[held_out].double())
     for label, (aside, up, degrees) in MOVES.items():
         lens = rec.cameras[[0]].drawn(LONG_SIDE)
         views = [moved(replace(lens, cam2world=pose[None]), aside * unit, up * unit, degrees) for pose in poses]
         cells = np.mean([shares(scene, view, frames) for view in views], axis=0)
-        yield f"| {run.name}, {label} | {' | '.join(f'{cell:.2%}' for cell in cells)} |"
+        yield f"| {sfm.folder.name}, {label} | {' | '.join(f'{cell:.2%}' for cell in cells)} |"
 
 
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument("runs", nargs="+", metavar="RUN[:TRUTH]")
+    parser.add_argument("runs", nargs="+", type=dive_run, metavar="RUN[:TRUTH]")
     options = parser.parse_args()
     print("| views | seen | missed | in water | claimed | in water |")
     print("| --- | --- | --- | --- | --- | --- |")
-    for given in options.runs:
-        run, _, truth = given.partition(":")
-        for row in rows(open_finished_sfm(Path(run), Path(truth) if truth else None), Path(run)):
+    for sfm in options.runs:
+        for row in rows(sfm):
             print(row, flush=True)
 
 

@@ -13,9 +13,10 @@ each is fitted again to patches of every size, under the light that it was made 
 import argparse
 from collections.abc import Iterator
 from dataclasses import replace
-from pathlib import Path
 
-from swimm3r.pipeline.finished_sfm import FinishedSfm, open_finished_sfm
+from dive_runs import dive_run
+
+from swimm3r.pipeline.finished_sfm import FinishedSfm
 from swimm3r.pipeline.scores.truth import truth_section
 from swimm3r.sfm.medium.dense_tracks import fuse_depth
 from swimm3r.sfm.medium.samples import collect_samples
@@ -42,7 +43,7 @@ def rows(sfm: FinishedSfm, sizes: list[float], like: SeathruSettings) -> Iterato
 
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument("runs", nargs="+", metavar="RUN[:TRUTH]")
+    parser.add_argument("runs", nargs="+", type=dive_run, metavar="RUN[:TRUTH]")
     parser.add_argument("--pixels", nargs="+", type=float, default=[12.0, 20.0, 30.0])
     parser.add_argument("--share", type=float, default=SeathruSettings().patch_share, help="of a patch, to be shown")
     parser.add_argument("--grids", type=int, default=SeathruSettings().patch_grids, help="of patches")
@@ -50,12 +51,10 @@ def main() -> None:
     like = SeathruSettings(patch_share=arguments.share, patch_grids=arguments.grids)
     print("| run | pixels | patches | T_D | B | clear |")
     print("| --- | --- | --- | --- | --- | --- |")
-    for given in arguments.runs:
-        run, _, truth = given.partition(":")
-        sfm = open_finished_sfm(Path(run), Path(truth) if truth else None)
+    for sfm in arguments.runs:
         for size, count, errors in rows(sfm, arguments.pixels, like):
             T_D, B = (", ".join(f"{value:.3f}" for value in errors[key]) for key in ("T_D_abs", "B_abs"))
-            print(f"| {Path(run).name} | {size:g} | {count} | {T_D} | {B} | {errors['clear_psnr']:.2f} |", flush=True)
+            print(f"| {sfm.folder.name} | {size:g} | {count} | {T_D} | {B} | {errors['clear_psnr']:.2f} |", flush=True)
 
 
 if __name__ == "__main__":

@@ -16,18 +16,17 @@ its frames:
 import argparse
 import math
 from dataclasses import dataclass
-from pathlib import Path
 
 import numpy as np
 import torch
+from dive_runs import dive_run, to_truth
 from jaxtyping import Bool, Float
 from scipy.ndimage import maximum_filter, minimum_filter
 from torch import Tensor
 
 from swimm3r.cameras import project_visible
-from swimm3r.geometry import align_poses
 from swimm3r.io import images
-from swimm3r.pipeline.finished_sfm import FinishedSfm, open_finished_sfm
+from swimm3r.pipeline.finished_sfm import FinishedSfm
 
 IN_FRONT = 0.07  # of the depth
 STEP = 1 / 8  # of the depth, between two surfaces
@@ -55,12 +54,12 @@ def silhouettes(true: Float[Tensor, "h w"]) -> Bool[np.ndarray, "h w"]:
     return (true.numpy() > 0) & (farthest > (1 + STEP) * nearest_around(true, 2 * REACH + 1))
 
 
-def of_frame(sfm: FinishedSfm, run: Path, name: str, per_unit: float) -> Sums | None:
+def of_frame(sfm: FinishedSfm, name: str, per_unit: float) -> Sums | None:
     """The figures of one frame; None where it was not restored, or its truth is not known."""
     truth = sfm.truth
     assert truth is not None
     true, clear = truth.z_depth(name), truth.clear(name)
-    path = run / "sfm" / "restored_physical" / f"{name}.png"
+    path = sfm.folder / "sfm" / "restored_physical" / f"{name}.png"
     if true is None or clear is None or not path.is_file():
         return None
     z, surface = sfm.rec.depth[name].z_depth.numpy() * per_unit, true.numpy() > 0
@@ -91,30 +90,28 @@ def cloud_in_front(sfm: FinishedSfm, per_unit: float) -> float:
     return float(found.float().mean())
 
 
-def row(sfm: FinishedSfm, run: Path) -> str:
+def row(sfm: FinishedSfm) -> str:
     """The table's line of a run."""
     rec, truth = sfm.rec, sfm.truth
     measured = np.mean([float((rec.depth[name].z_depth > 0).float().mean()) for name in rec.names])
     cells = ["-"] * 5
     if truth is not None:
-        there = truth.cameras.cam2world[[truth.names.index(name) for name in rec.names]]
-        per_unit = float(align_poses(rec.cameras.cam2world.double(), there.double()).scale)
-        sums = [found for name in rec.names if (found := of_frame(sfm, run, name, per_unit))]
+        per_unit = float(to_truth(sfm).scale)
+        sums = [found for name in rec.names if (found := of_frame(sfm, name, per_unit))]
         in_front, in_water, restored, beside = np.mean([list(vars(frame).values()) for frame in sums], axis=0)
         cells = [f"{in_front:.2%}", f"{in_water:.2%}", f"{cloud_in_front(sfm, per_unit):.2%}"]
         cells += [f"{-10 * math.log10(error):.2f} dB" for error in (restored, beside)]
-    return f"| {run.name} | {measured:.2%} | {' | '.join(cells)} |"
+    return f"| {sfm.folder.name} | {measured:.2%} | {' | '.join(cells)} |"
 
 
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument("runs", nargs="+", metavar="RUN[:TRUTH]")
+    parser.add_argument("runs", nargs="+", type=dive_run, metavar="RUN[:TRUTH]")
     options = parser.parse_args()
     print("| run | measured | in front | in water | cloud | restored | beside |")
     print("| --- | --- | --- | --- | --- | --- | --- |")
-    for given in options.runs:
-        run, _, truth = given.partition(":")
-        print(row(open_finished_sfm(Path(run), Path(truth) if truth else None), Path(run)), flush=True)
+    for sfm in options.runs:
+        print(row(sfm), flush=True)
 
 
 if __name__ == "__main__":

@@ -20,6 +20,7 @@ from swimm3r.sfm.rectified.run import rectified_truth, run_frames
 class FinishedSfm:
     """A run folder as its map's training finds it."""
 
+    folder: Path
     frames: Frames
     rec: Reconstruction
     settings: RunSettings
@@ -36,6 +37,7 @@ def open_finished_sfm(folder: Path, reference: Path | None = None) -> FinishedSf
     run = open_run(folder, "sfm")
     frames = run_frames(folder)
     return FinishedSfm(
+        folder,
         frames,
         load_reconstruction(folder / "sfm", frames),
         from_yaml(folder / "settings.yaml"),
