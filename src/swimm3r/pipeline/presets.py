@@ -131,6 +131,7 @@ PAPER = UwbsSettings(  # Eq. 18 and nothing else; where the paper is silent UBS'
         depth_edges=1.0,  # DN-Splatter's edge-aware weight: no scale is printed
         max_radius_width=0,  # 256 pixels are printed, of no particular width
         medium_prior=0.0,
+        in_front=0.0,
         coverage=0.0,
         open_water=0.0,
         gamut=0.0,

@@ -104,9 +104,9 @@ class GaussianSettings(MapSettings):
     """Share of the run between two degrees of the colors' spherical harmonics."""
 
     @property
-    def depth_confidence(self) -> float | None:
-        """Least confidence of a depth that training reads; None reads no depth."""
-        return None
+    def reads_depth(self) -> bool:
+        """True where training reads measured depth."""
+        return False
 
 
 @dataclass(frozen=True)
@@ -381,8 +381,6 @@ class UirWeights(Settings):
     """Weight of the error of inverse depth at the end of the run; log-linear in between."""
     flat: NotNegative = 100.0  # after PGSR
     """Weight of the smallest scale of the Gaussians, in thirds of the scene's median depth."""
-    depth_confidence: NotNegative = 0.3  # that of UWBS
-    """Smallest confidence of a depth that Gaussians are supervised by."""
     depth_alpha: Share = 0.5
     """Smallest rendered alpha of a pixel whose depth is supervised."""
 
@@ -425,6 +423,6 @@ class UirSettings(GaussianSettings):
         return "3d-uir"
 
     @property
-    def depth_confidence(self) -> float | None:
-        """Least confidence of a depth that training reads."""
-        return self.weights.depth_confidence
+    def reads_depth(self) -> bool:
+        """True where training reads measured depth."""
+        return True

@@ -123,7 +123,7 @@ class LearningRates(Settings):
 
 @dataclass(frozen=True)
 class LossWeights(Settings):
-    """Weights of the objective (Eq. 18) and of four terms beyond it."""
+    """Weights of the objective (Eq. 18) and of six terms beyond it."""
 
     ssim: Share = 0.2
     """Weight of D-SSIM against L1 in the image loss (Eq. 14)."""
@@ -153,6 +153,8 @@ class LossWeights(Settings):
     """Projected radius beyond which a primitive is penalized, in pixels of an image `max_radius_width` wide."""
     max_radius_width: CountOrZero = 1280
     """Image width in pixels that `max_radius` refers to; 0 is that of the training images."""
+    in_front: NotNegative = 1.0
+    """Weight of the squared relative distance of the map in front of measured depth; 0 is the paper's objective."""
     coverage: NotNegative = 0.05
     """Weight of the light that passes a surface of known depth, which keeps surfaces opaque; 0 is the paper's
     objective."""
@@ -165,8 +167,6 @@ class LossWeights(Settings):
     0 is the paper's objective."""
     hidden_transmittance: PositiveShare = 0.01
     """T_D at which a channel's color is half hidden."""
-    depth_confidence: NotNegative = 0.3
-    """Smallest confidence of a depth that the regularizer uses."""
     depth_alpha: Share = 0.5
     """Smallest rendered alpha of a pixel whose depth is regularized."""
 
@@ -273,9 +273,9 @@ class UwbsSettings(MapSettings):
         return "uwbs-dynamic" if self.dynamic else "uwbs-static"
 
     @property
-    def depth_confidence(self) -> float | None:
-        """Least confidence of a depth that training reads; None reads no depth."""
-        return self.weights.depth_confidence
+    def reads_depth(self) -> bool:
+        """True where training reads measured depth."""
+        return True
 
 
 @dataclass(frozen=True)
@@ -373,7 +373,9 @@ def with_primitives(settings: OfRecipe, share: float) -> OfRecipe:
     return replace(settings, initial=initial, cap_max=part(settings.cap_max))
 
 
-_BEYOND_UBS = ("depth", "medium_smoothness", "medium_prior", "radius", "coverage", "open_water", "gamut", "hidden")
+_BEYOND_UBS = (
+    "depth", "medium_smoothness", "radius", "medium_prior", "in_front", "coverage", "open_water", "gamut", "hidden"
+)  # fmt: skip
 _SHORT = 10_000
 """Runs shorter than this give the peers what they would else lack the time for. WaterSplatting's Gaussians start at an
 opacity of 0.1 and are culled below 0.5: of 4,000 on ruie_green_rock (160 px) 724 were left after 400 steps, at 23.6 dB

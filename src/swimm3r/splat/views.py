@@ -39,7 +39,7 @@ class TrainingView:
     camera: Cameras  # one pinhole, working units
     rgb: Float[Tensor, "3 h w"]  # in the colors that the dive has on average (`swimm3r.appearance`)
     seen: Bool[Tensor, "h w"]
-    z_depth: Float[Tensor, "h w"]  # working units, 0 = unknown or doubtful
+    z_depth: Float[Tensor, "h w"]  # working units, 0 = unknown
     open_water: Bool[Tensor, "h w"]  # looks past every surface; nowhere where depth is not read
     time: Float[Tensor, ""] | None = None  # of the clip, 0..1; static maps do not ask
     clipped: Bool[Tensor, "3 h w"] | None = None  # None where no value is
@@ -138,14 +138,12 @@ class TrainingViews:
         self, name: str, lens: Cameras, canvas: Cameras, rgb: Float[Tensor, "h w 3"], seen: Bool[Tensor, "h w"]
     ) -> tuple[Float[Tensor, "h w"], Bool[Tensor, "h w"]]:
         """Depth, and where there is none to be known because the image shows open water."""
-        least = self.settings.depth_confidence
-        if least is None or name not in self.rec.depth:
+        if not self.settings.reads_depth or name not in self.rec.depth:
             nothing = torch.zeros(canvas.height, canvas.width)
             return nothing, nothing > 0
-        depth = self.rec.depth[name]
         row, column = nearest_pixels(lens, canvas)
-        z_depth, confidence = depth.z_depth[row, column], depth.confidence[row, column]
-        known = seen & z_depth.isfinite() & (z_depth > 0) & (confidence >= least)
+        z_depth = self.rec.depth[name].z_depth[row, column]
+        known = seen & z_depth.isfinite() & (z_depth > 0)
         z_depth = torch.where(known, z_depth * self.scale, 0.0)
         fit = self.rec.medium
         if fit is None:

@@ -110,6 +110,33 @@ def test_the_depth_gradient_agrees_with_finite_differences():
     assert torch.autograd.gradcheck(error, ((z * alpha).requires_grad_(), alpha.requires_grad_()))
 
 
+def test_a_map_counts_in_front_of_measured_depth_and_not_behind_it():
+    prior = torch.tensor([[4.0, 4.0, 4.0, 0.0, 4.0]])
+    z = torch.tensor([[2.0, 3.2, 6.0, 1.0, 1.0]])
+    alpha = torch.tensor([[0.8, 0.6, 0.9, 0.9, 0.2]])  # the last is hardly covered
+    weight = torch.tensor([[0.5, 1.0, 0.5, 1.0, 1.0]])
+    images = RasterOutput(torch.zeros(3, 1, 5), torch.zeros(3, 1, 5), (z * alpha).requires_grad_(), alpha)
+    found = losses.in_front(images, prior, weight, 0.5)
+    assert found.item() == pytest.approx((0.5 * 1.0 + 1.0 * 0.0625) / 2)
+    (slope,) = torch.autograd.grad(found, images.z_depth)
+    assert (slope[0, :2] < 0).all()  # farther is better
+    assert (slope[0, 2:] == 0).all()
+    assert losses.in_front(images, torch.zeros(1, 5), weight, 0.5) == 0
+
+
+def test_the_gradient_in_front_agrees_with_finite_differences():
+    rng = torch.Generator().manual_seed(1)
+    z, prior = (2 + torch.rand(4, 5, generator=rng, dtype=torch.float64) for _ in range(2))
+    alpha = 0.6 + 0.3 * torch.rand(4, 5, generator=rng, dtype=torch.float64)
+
+    def error(total: torch.Tensor, covered: torch.Tensor) -> torch.Tensor:
+        nothing = torch.zeros(3, 4, 5, dtype=torch.float64)
+        images = RasterOutput(nothing, nothing, total, covered)
+        return losses.in_front(images, prior, torch.ones(4, 5, dtype=torch.float64), 0.5)
+
+    assert torch.autograd.gradcheck(error, ((z * alpha).requires_grad_(), alpha.requires_grad_()))
+
+
 def test_a_surface_that_is_known_is_to_be_opaque_and_open_water_is_not():
     alpha = torch.tensor([[0.6, 1.0], [0.2, 0.0]], requires_grad=True)
     images = depth_images(torch.ones(2, 2), alpha)

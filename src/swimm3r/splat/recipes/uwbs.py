@@ -238,6 +238,7 @@ def objective(
     photo = losses.photometric(drawing.images.rgb, view.rgb, view.compared(drawing.images.rgb), w.ssim)
     edges = losses.edge_weight(view.rgb, w.depth_edges)
     depth_error = losses.depth_error(drawing.images, view.z_depth, edges, w.depth_alpha)
+    in_front = losses.in_front(drawing.images, view.z_depth, edges, w.depth_alpha)
     smooth = smoothness(drawing.grid)
     open_share = losses.uncovered(drawing.images, view.surface)
     on_water = losses.drawn_on_water(drawing.images, view.open_water)
@@ -247,10 +248,11 @@ def objective(
     large = losses.oversize(p, drawing.projection.radius, w.max_radius * shrunk)
     depth = w.depth * depth_error
     total = photo.loss + depth + w.medium_smoothness * smooth + w.radius * large
-    total = total + w.coverage * open_share + w.open_water * on_water
+    total = total + w.in_front * in_front + w.coverage * open_share + w.open_water * on_water
     total = total + w.gamut * outside + w.hidden * hidden
     numbers = {"l1": photo.l1, "ssim": photo.ssim, "depth": depth_error, "medium_smoothness": smooth, "radius": large}
-    numbers |= {"uncovered": open_share, "drawn_on_water": on_water, "outside_gamut": outside, "hidden": hidden}
+    numbers |= {"in_front": in_front, "uncovered": open_share, "drawn_on_water": on_water}
+    numbers |= {"outside_gamut": outside, "hidden": hidden}
     if prior is not None:
         off = deviation(drawing.grid, prior)
         total = total + w.medium_prior * off

@@ -141,6 +141,20 @@ def depth_error(
     return (w * off).sum() / w.sum().clamp(min=_LEAST_WEIGHT)
 
 
+def in_front(
+    images: RasterOutput, z_depth: Float[Tensor, "h w"], weight: Float[Tensor, "h w"], least_alpha: float
+) -> Float[Tensor, ""]:
+    """Weighted mean of max(D / D^ - 1, 0)^2 over the pixels of known depth D that the map covers; 0 for none.
+
+    It keeps the map from standing in front of measured surfaces, the more the farther it does. Depth behind them counts
+    nothing, for beside silhouettes measured depth is too small rather than too large.
+    """
+    counted = (z_depth > 0) & (images.alpha.detach() > least_alpha)
+    w = torch.where(counted, weight, 0.0)
+    nearer = z_depth * images.alpha / images.z_depth.clamp(min=_NEAREST * least_alpha) - 1
+    return (w * nearer.clamp(min=0).square()).sum() / w.sum().clamp(min=_LEAST_WEIGHT)
+
+
 def uncovered(images: RasterOutput, surface: Bool[Tensor, "h w"]) -> Float[Tensor, ""]:
     """Mean of 1 - alpha over the pixels that show a surface; 0 where none does."""
     return torch.where(surface, 1 - images.alpha, 0.0).sum() / surface.sum().clamp(min=1)
