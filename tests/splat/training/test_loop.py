@@ -154,7 +154,9 @@ def test_the_number_of_primitives_never_exceeds_the_cap(tiny_dive, tmp_path):
 
 
 def test_the_objective_is_the_papers_sum_with_the_papers_weights(tiny_dive):
-    paper = UwbsSettings(weights=LossWeights(coverage=0.0, open_water=0.0, gamut=0.0, hidden=0.0, max_radius=100.0))
+    paper = UwbsSettings(
+        weights=LossWeights(in_front=0.0, coverage=0.0, open_water=0.0, gamut=0.0, hidden=0.0, max_radius=100.0)
+    )
     view = TrainingViews(tiny_dive.rec, tiny_dive.frames, paper, 1.0)[3]
     p = tiny_dive.truth.primitives
     p = p._replace(xyz=p.xyz + 0.05, scale=p.scale.clone())
