@@ -38,12 +38,13 @@ def test_views_know_where_they_look_past_every_surface(tiny_dive, tmp_path):
     z_depth[48:] = 3.0
     write_rgb(tmp_path / "a.png", rgb.numpy())
     depth = DepthMaps(tmp_path / "z_depth")
-    depth.write("a.png", DepthMap(z_depth, torch.ones(96, 128)))
+    depth.write("a.png", DepthMap(z_depth, torch.full((96, 128), 0.02)))  # that one other frame agrees with
     frames = Frames((Frame("a.png", tmp_path / "a.png", 0.0, 1.0, "train"),), 128, 96, True)
     rec = replace(tiny_dive.rec, names=("a.png",), cameras=lens(128, 96, 0.0), depth=depth)
-    open_water = TrainingViews(rec, frames, UwbsSettings(), 1.0)[0].open_water
-    assert open_water[:40].float().mean() > 0.7
-    assert not open_water[48:].any()
+    view = TrainingViews(rec, frames, UwbsSettings(), 1.0)[0]
+    assert (view.z_depth[50:, 2:-2] > 0).all()
+    assert view.open_water[:40].float().mean() > 0.7
+    assert not view.open_water[48:].any()
 
 
 def test_what_is_not_open_water_is_a_surface_where_depth_tells_the_two_apart(tiny_dive):

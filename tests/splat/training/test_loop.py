@@ -172,6 +172,21 @@ def test_the_objective_is_the_papers_sum_with_the_papers_weights(tiny_dive):
     assert float(found.total - without.total) == pytest.approx(0.01 * (n["opacity"] + n["scale"]), rel=1e-3)
 
 
+def test_a_map_in_front_of_measured_depth_costs_its_weight(tiny_dive):
+    totals, found = [], {}
+    for weight in (0.0, 2.0):
+        settings = UwbsSettings(weights=LossWeights(in_front=weight))
+        view = TrainingViews(tiny_dive.rec, tiny_dive.frames, settings, 1.0)[3]
+        p = tiny_dive.truth.primitives
+        p = p._replace(xyz=p.xyz * 0.9)
+        drawing = draw(p, tiny_dive.truth.field, view_camera(view.camera), settings)
+        loss = uwbs.objective(p, drawing, view, settings, None, regularized=False)
+        found = loss.numbers
+        totals.append(float(loss.total))
+    assert float(found["in_front"]) == pytest.approx((1 / 0.9 - 1) ** 2, rel=0.3)
+    assert totals[1] - totals[0] == pytest.approx(2.0 * float(found["in_front"]), rel=1e-4)
+
+
 def test_mcmc_noise_comes_with_every_step_where_asked(tiny_dive):
     views = TrainingViews(tiny_dive.rec, tiny_dive.frames, SETTINGS, 1.0)
     moved = {}
