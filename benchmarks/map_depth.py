@@ -5,10 +5,10 @@
 RUN are run folders with a finished map. In every second training frame, where a surface was measured and the map is
 opaque:
 
-    well, weakly   share of these pixels whose depth the plane sweep is sure of (a confidence of 0.3 or more), and of
-                   those that few frames share or little texture determines
-    off            share whose depth in the map is off by more than 5 % of what was measured ..
-    true           .. and, beside a TRUTH (the demo's is found), of the true depth
+    confident, doubtful   share of these pixels whose depth has a confidence of 0.3 or more, and of the others, which
+                          few frames share or little texture determines
+    off                   share of them whose depth in the map is off by more than 5 % of what was measured ..
+    true                  .. and, beside a TRUTH (the demo's is found), of the true depth or before open water
 """
 
 import argparse
@@ -35,7 +35,7 @@ def off(z: Float[Tensor, " n"], than: Float[Tensor, " n"]) -> Bool[Tensor, " n"]
 
 
 def pixels(sfm: FinishedSfm) -> Iterator[Float[Tensor, "n 3"]]:
-    """Of every measured pixel of a frame: confidence, 1 where the map is off, 1 where it is off the truth."""
+    """Of a frame's measured pixels: confidence, 1 where the map is off, 1 where it is off the truth (NaN: unknown)."""
     rec, truth = sfm.rec, sfm.truth
     scene = load_map(sfm.folder / "splat" / "map.safetensors")
     unit = 1.0 if truth is None else float(to_truth(sfm).scale)
@@ -47,29 +47,28 @@ def pixels(sfm: FinishedSfm) -> Iterator[Float[Tensor, "n 3"]]:
         z, confidence = depth.z_depth[row, column], depth.confidence[row, column]
         out = scene.render(camera, sfm.frames.frames[sfm.frames.index(name)].time, backscatter=False, observed=False)
         at = (z > 0) & (out.alpha > OPAQUE)
-        wrong = torch.zeros(int(at.sum()), dtype=torch.bool)
+        wrong = torch.full((int(at.sum()),), torch.nan)
         if truth is not None and (true := truth.z_depth(name)) is not None:
-            wrong = off(out.z_depth[at], true[row, column][at] / unit)
-        yield torch.stack([confidence[at], off(out.z_depth[at], z[at]).float(), wrong.float()], 1)
+            wrong = off(out.z_depth[at], true[row, column][at] / unit).float()
+        yield torch.stack([confidence[at], off(out.z_depth[at], z[at]).float(), wrong], 1)
 
 
-def cells(found: Float[Tensor, "n 3"], true: bool) -> list[str]:
-    """Shares that are off, of pixels that were measured well or weakly."""
-    _, measured, wrong = found.mean(0).tolist() if len(found) else (0, 0, 0)
-    return [f"{measured:.1%}", f"{wrong:.1%}" if true else "-"]
+def cells(found: Float[Tensor, "n 3"]) -> list[str]:
+    """Shares of some pixels that are off what was measured, and off the truth; - where none is known."""
+    return ["-" if share.isnan() else f"{float(share):.1%}" for share in found[:, 1:].nanmean(0)]
 
 
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("runs", nargs="+", type=dive_run, metavar="RUN[:TRUTH]")
     options = parser.parse_args()
-    print("| run | well | off | true | weakly | off | true |\n| --- | --- | --- | --- | --- | --- | --- |")
+    print("| run | confident | off | true | doubtful | off | true |\n| --- | --- | --- | --- | --- | --- | --- |")
     for sfm in options.runs:
         found = torch.cat(list(pixels(sfm)))
         sure = found[:, 0] >= SURE
         row = []
         for part in (sure, ~sure):
-            row += [f"{float(part.float().mean()):.0%}", *cells(found[part], sfm.truth is not None)]
+            row += [f"{float(part.float().mean()):.0%}", *cells(found[part])]
         print(f"| {sfm.folder.name} | {' | '.join(row)} |", flush=True)
 
 

@@ -86,9 +86,8 @@ def shares(scene: SplatMap, camera: Cameras, frames: TrueFrames) -> list[float]:
 
 def rows(sfm: FinishedSfm) -> Iterator[str]:
     """The table's lines of a run."""
-    rec, truth = sfm.rec, sfm.truth
+    there, rec, truth = to_truth(sfm), sfm.rec, sfm.truth
     assert truth is not None
-    there = to_truth(sfm)
     depth = {i: z for i, name in enumerate(rec.names) if (z := truth.z_depth(name)) is not None}
     true = torch.stack(list(depth.values())).double() / there.scale
     frames = TrueFrames(rec.cameras[list(depth)], torch.where(true > 0, true, torch.inf))

@@ -47,7 +47,7 @@ def test_the_objective_is_the_literal_sum_of_eq_18(tiny_dive):
     scale, rgb = p.scale.clone(), p.rgb.clone()
     scale[:40, :3] = 20.0
     rgb[::7] = 1.8  # beyond what a clear color can be
-    p = p._replace(scale=scale, rgb=rgb, opacity=p.opacity - 5, xyz=p.xyz * 1.1)
+    p = p._replace(scale=scale, rgb=rgb, opacity=p.opacity - 5, xyz=p.xyz * 0.9)
     field = varied_field(tiny_dive, MAP)
     scene = TrainingScene(tiny_dive.rec, 1.0, 1.0, TrainingViews(tiny_dive.rec, tiny_dive.frames, MAP, 1.0))
     prior = uwbs.known_water(scene, MAP)
@@ -76,7 +76,7 @@ def test_the_objective_is_the_literal_sum_of_eq_18(tiny_dive):
     parts = [float(part) for part in (L_3dgs, L_mcmc, L_depth, L_smooth, L_rad)]
     assert min(parts) > 1e-3
     assert float(loss.total) == pytest.approx(float(expected), rel=1e-5)
-    beyond = ("uncovered", "drawn_on_water", "outside_gamut", "medium_prior")
+    beyond = ("in_front", "uncovered", "drawn_on_water", "outside_gamut", "medium_prior")
     assert all(float(loss.numbers[name]) > 1e-3 for name in beyond)  # they would show
 
 

@@ -134,11 +134,8 @@ def depth_error(
     D^ is the expected depth, `z_depth` D (0 = unknown). The weights are normalized to a sum of 1 over those pixels; the
     paper prints a sum beside means and so leaves their sum open.
     """
-    counted = (z_depth > 0) & (images.alpha.detach() > least_alpha)
-    w = torch.where(counted, weight, 0.0)
-    inverse = images.alpha / images.z_depth.clamp(min=_NEAREST * least_alpha)
-    off = torch.log1p((inverse - 1 / z_depth.clamp(min=_NEAREST)).abs())
-    return (w * off).sum() / w.sum().clamp(min=_LEAST_WEIGHT)
+    inverse, w = _where_known(images, z_depth, weight, least_alpha)
+    return (w * torch.log1p((inverse - 1 / z_depth.clamp(min=_NEAREST)).abs())).sum()
 
 
 def in_front(
@@ -149,10 +146,18 @@ def in_front(
     It keeps the map from standing in front of measured surfaces, the more the farther it does. Depth behind them counts
     nothing, for beside silhouettes measured depth is too small rather than too large.
     """
+    inverse, w = _where_known(images, z_depth, weight, least_alpha)
+    return (w * (z_depth * inverse - 1).clamp(min=0).square()).sum()
+
+
+def _where_known(
+    images: RasterOutput, z_depth: Float[Tensor, "h w"], weight: Float[Tensor, "h w"], least_alpha: float
+) -> tuple[Float[Tensor, "h w"], Float[Tensor, "h w"]]:
+    """1 / D^, and weights with a sum of 1 over the pixels of known depth that the map covers; 0 on others."""
     counted = (z_depth > 0) & (images.alpha.detach() > least_alpha)
     w = torch.where(counted, weight, 0.0)
-    nearer = z_depth * images.alpha / images.z_depth.clamp(min=_NEAREST * least_alpha) - 1
-    return (w * nearer.clamp(min=0).square()).sum() / w.sum().clamp(min=_LEAST_WEIGHT)
+    inverse = images.alpha / images.z_depth.clamp(min=_NEAREST * least_alpha)
+    return inverse, w / w.sum().clamp(min=_LEAST_WEIGHT)
 
 
 def uncovered(images: RasterOutput, surface: Bool[Tensor, "h w"]) -> Float[Tensor, ""]:
