@@ -3,9 +3,9 @@
 L = L_3DGS + lambda_opa L_opa + lambda_scale L_scale + lambda_depth L_depth + lambda_smooth L_smooth + lambda_rad L_rad
 
 and, beyond the paper, terms that hold the water to what structure from motion measured (`LossWeights.medium_prior`),
-the map behind what was measured (`in_front`), known surfaces opaque (`coverage`), open water empty (`open_water`),
-clear colors to those that there are (`gamut`) and, in channels that the water hides, to those that the others let
-expect (`hidden`).
+the map no nearer than what was measured (`in_front`), known surfaces opaque (`coverage`), open water empty
+(`open_water`), clear colors to those that there are (`gamut`) and, in channels that the water hides, to those that the
+others let expect (`hidden`).
 """
 
 import copy
