@@ -10,7 +10,8 @@ from scipy.sparse import coo_array, csr_array, diags
 from scipy.sparse.linalg import spsolve
 from torch import Tensor
 
-from swimm3r.imaging.filters import LUMA, blur, local_linear
+from swimm3r.imaging.filters import blur, local_linear
+from swimm3r.imaging.gray import LUMA
 from swimm3r.scene.reconstruction import DepthMap
 
 _COARSE = 96  # long side of the grid on which unknown depth is filled

@@ -1,16 +1,12 @@
-"""Images in gray, and smoothed: over all neighbors, or along those that look alike."""
+"""Images smoothed, over all neighbors or along those that look alike, and their texture."""
 
 import numpy as np
 import torch
-from jaxtyping import Float, UInt8
+from jaxtyping import Bool, Float
 from torch import Tensor
 
-LUMA = torch.tensor([0.299, 0.587, 0.114])  # ITU-R BT.601
-
-
-def gray_levels(image: Float[Tensor, "h w 3"]) -> UInt8[np.ndarray, "h w"]:
-    """Luma in 0..255, as OpenCV's detectors and trackers take images."""
-    return (image.numpy() @ LUMA.numpy() * 255).round().astype(np.uint8)
+_SLOW = 12.0  # pixels: what varies slower is no surface texture
+_FAST = 0.7  # pixels: what varies faster is noise, or the lines of interlaced video
 
 
 def blur(x: Float[Tensor, "h w c"], sigma: float) -> Float[Tensor, "h w c"]:
@@ -20,6 +16,17 @@ def blur(x: Float[Tensor, "h w c"], sigma: float) -> Float[Tensor, "h w c"]:
     size = 2 * round(2.5 * sigma) + 1
     blurred = cv2.GaussianBlur(x.numpy(), (size, size), sigma, borderType=cv2.BORDER_REFLECT)
     return torch.from_numpy(blurred.reshape(x.shape))
+
+
+def texture(values: Float[np.ndarray, "h w *c"], seen: Bool[np.ndarray, "h w"]) -> Float[np.ndarray, "h w *c"]:
+    """Images without slow changes, and without those faster than a surface's texture; 0 where not seen."""
+    import cv2
+
+    there = seen.reshape(seen.shape + (1,) * (values.ndim - 2))
+    share = cv2.GaussianBlur(seen.astype(np.float32), (0, 0), _SLOW, borderType=cv2.BORDER_REFLECT)
+    slow = cv2.GaussianBlur(np.where(there, values, 0), (0, 0), _SLOW, borderType=cv2.BORDER_REFLECT)
+    fine = cv2.GaussianBlur(values, (0, 0), _FAST)
+    return np.where(there, fine - slow / np.maximum(share, 1e-6).reshape(there.shape), 0).astype(np.float32)
 
 
 def local_linear(

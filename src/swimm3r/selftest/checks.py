@@ -11,7 +11,7 @@ from dataclasses import dataclass, replace
 import torch
 from torch import Tensor
 
-from swimm3r.imaging.filters import LUMA
+from swimm3r.imaging.gray import LUMA
 from swimm3r.imaging.undistortion import covering_pinholes
 from swimm3r.raster import Backend, Kernel, MediumMaps, Primitives2D, SggBuffers, rasterize
 from swimm3r.selftest.scenes import (

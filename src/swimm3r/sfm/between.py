@@ -15,7 +15,7 @@ from jaxtyping import Float
 from torch import Tensor
 
 from swimm3r.cameras import Cameras
-from swimm3r.imaging.filters import gray_levels
+from swimm3r.imaging.gray import gray_levels, weights_for_features
 from swimm3r.io.cameras_json import CameraTable, read_own_cameras
 from swimm3r.io.colmap.model import silence_log
 from swimm3r.io.files.damage import remake
@@ -90,12 +90,13 @@ def _place(
     observations: list[tuple[np.ndarray, np.ndarray]],
 ) -> Float[Tensor, "4 4"] | None:
     """cam2world of a frame from the registered ones before and after it; None where too few points agree."""
-    image = gray_levels(frames.image(i))
+    weights = weights_for_features(frames.image(i), frames.mask(i))
+    image = gray_levels(frames.image(i), weights)
     pixels, points = [], []
     for k, row in around:
         xy, xyz = observations[row]
         if len(xy):
-            there, found = tracked(gray_levels(frames.image(k)), image, xy)
+            there, found = tracked(gray_levels(frames.image(k), weights), image, xy)
             pixels.append(there[found])
             points.append(xyz[found])
     if sum(map(len, pixels)) < _FEWEST:

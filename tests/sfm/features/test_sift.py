@@ -4,6 +4,8 @@ import numpy as np
 import torch
 from torch.nn.functional import normalize
 
+from swimm3r.imaging.gray import LUMA
+from swimm3r.sfm.features import sift
 from swimm3r.sfm.features.settings import FeatureSettings
 from swimm3r.sfm.features.sift import extract_features, match_descriptors, unit_descriptors
 
@@ -48,6 +50,20 @@ def test_haze_costs_few_keypoints_where_faint_ones_count() -> None:
     strict = extract_features(hazy, usable, FeatureSettings(faint_threshold=0.003))
     assert len(faint.keypoints) > 5 * len(strict.keypoints)
     assert len(faint.keypoints) > 0.4 * len(extract_features(clear, usable, FeatureSettings()).keypoints)
+
+
+def test_features_of_a_scene_in_blue_are_found_in_blue(monkeypatch) -> None:
+    usable, rng = torch.ones(200, 260, dtype=torch.bool), torch.Generator().manual_seed(1)
+    filmed = torch.tensor([0.02, 0.1, 0.3]) + torch.tensor([0.0, 0.0, 0.1]) * _texture()
+    images = [filmed + torch.randn(filmed.shape, generator=rng) / 255 for _ in range(2)]
+
+    def matched() -> int:
+        a, b = (extract_features(image, usable, FeatureSettings()) for image in images)
+        return len(match_descriptors(unit_descriptors(a.descriptors), unit_descriptors(b.descriptors), 0.8))
+
+    in_blue = matched()
+    monkeypatch.setattr(sift, "weights_for_features", lambda *_: LUMA)
+    assert in_blue > 2 * matched()
 
 
 def test_each_descriptor_finds_itself_after_a_shuffle() -> None:

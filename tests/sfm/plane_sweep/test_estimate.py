@@ -12,7 +12,7 @@ from jaxtyping import Float
 from torch import Tensor
 
 from swimm3r.cameras import Cameras, image_directions, project, unproject
-from swimm3r.imaging.filters import LUMA
+from swimm3r.imaging.gray import LUMA
 from swimm3r.imaging.undistortion import covering_pinholes
 from swimm3r.io import images
 from swimm3r.scene.frames import Frame, Frames

@@ -16,7 +16,7 @@ import torch
 
 from swimm3r.cameras import Cameras, cameras_of
 from swimm3r.errors import InputError
-from swimm3r.imaging.filters import LUMA
+from swimm3r.imaging.gray import LUMA
 from swimm3r.io.colmap.model import ColmapModel
 from swimm3r.io.imports.read import read_foreign
 from swimm3r.io.imports.record import ForeignModel

@@ -16,7 +16,7 @@ from torch import Tensor
 from swimm3r import weights
 from swimm3r.cameras import Cameras, project_visible
 from swimm3r.errors import RegistrationError
-from swimm3r.imaging.filters import LUMA
+from swimm3r.imaging.gray import LUMA
 from swimm3r.progress import Progress, silent
 from swimm3r.scene.frames import MASKS, Frames
 from swimm3r.scene.gravity import with_measured_up

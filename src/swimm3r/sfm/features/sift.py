@@ -1,8 +1,9 @@
 """SIFT for hazy images: where the keypoints are, what they look like, and which of two images' keypoints agree.
 
-Haze lowers contrast, not shape, so the detector's threshold is lowered and, where asked, local contrast is equalized
-(CLAHE) before detection. Two keypoints match if each is the other's nearest in angle between descriptors, and nearer
-than `max_ratio` times the second nearest from both sides (Lowe 2004).
+It looks at luma, as is usual, or where the water leaves hardly any texture there, at the channels that show it
+(`imaging.gray`). Haze lowers contrast, not shape, so the detector's threshold is lowered and, where asked, local
+contrast is equalized (CLAHE) before detection. Two keypoints match if each is the other's nearest in angle between
+descriptors, and nearer than `max_ratio` times the second nearest from both sides (Lowe 2004).
 """
 
 from dataclasses import dataclass
@@ -14,7 +15,7 @@ import torch
 from jaxtyping import Bool, Float, Int
 from torch import Tensor
 
-from swimm3r.imaging.filters import gray_levels
+from swimm3r.imaging.gray import gray_levels, weights_for_features
 from swimm3r.sfm.features.settings import FeatureSettings
 
 if TYPE_CHECKING:
@@ -43,8 +44,7 @@ def extract_features(
     import cv2
     import pycolmap
 
-    # Rec. 601 luma, as every SIFT is fed
-    gray = gray_levels(image)
+    gray = gray_levels(image, weights_for_features(image, usable))
     height, width = gray.shape
     scale = min(1.0, settings.long_side / max(height, width))
     if scale < 1:

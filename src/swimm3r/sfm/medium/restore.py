@@ -25,7 +25,8 @@ from torch import Tensor
 from swimm3r.imaging.clipped import clipped
 from swimm3r.imaging.depth_completion import fill_z_depth
 from swimm3r.imaging.depth_from_color import depth_from_color
-from swimm3r.imaging.filters import LUMA, blur, local_linear
+from swimm3r.imaging.filters import blur, local_linear
+from swimm3r.imaging.gray import LUMA
 from swimm3r.imaging.open_water import sea_share, without_fringe
 from swimm3r.imaging.undistortion import frame_rays
 from swimm3r.medium import (

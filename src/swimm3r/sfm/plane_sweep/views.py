@@ -14,7 +14,8 @@ from scipy import sparse
 from torch import Tensor
 
 from swimm3r.cameras import Cameras, project, project_visible
-from swimm3r.imaging.filters import LUMA
+from swimm3r.imaging.filters import texture
+from swimm3r.imaging.gray import strongest, texture_moments
 from swimm3r.imaging.undistortion import pinhole_grid, undistorted
 from swimm3r.scene.frames import Frames
 from swimm3r.scene.reconstruction import Reconstruction
@@ -23,8 +24,6 @@ from swimm3r.sfm.plane_sweep import consistency
 _FEWEST_POINTS = 8  # in a frame, to know its depth range
 _CANDIDATES = 40  # frames sharing most points that are considered as sources
 _NO_ANGLE = 0.01  # degrees
-_SLOW = 12.0  # pixels at working size: what varies slower is no surface texture
-_FAST = 0.7  # pixels: what varies faster is noise, or the lines of interlaced video
 _WEIGHED = 8  # frames, of which the weights of the channels are taken
 
 
@@ -111,27 +110,13 @@ def depth_range(rec: Reconstruction, i: int, points: np.ndarray) -> tuple[float,
 def gray_weights(frames: Frames, names: Sequence[str], long_side: int) -> Float[Tensor, "3"]:
     """Weights of red, green and blue for the gray images in which the detail of frames stands out most from noise.
 
-    They are the first principal component of the detail of a few frames at working size, scaled so that noise is no
-    stronger than in luma, be it independent in the channels or common to them as in gray images. A lamp in deep water
-    shows nearly all detail in blue, of which luma takes a ninth.
+    A lamp in deep water shows nearly all detail in blue, of which luma takes a ninth.
     """
-    import cv2
-
     moments = np.zeros((3, 3))
     for name in names[:: max(1, -(-len(names) // _WEIGHED))]:
         k = frames.index(name)
-        image, mask = frames.image(k).numpy(), frames.mask(k).numpy()
-        scale = min(1.0, long_side / max(mask.shape))
-        size = max(1, round(scale * mask.shape[1])), max(1, round(scale * mask.shape[0]))
-        image = cv2.resize(image, size, interpolation=cv2.INTER_AREA)
-        seen = cv2.resize(mask.astype(np.uint8), size, interpolation=cv2.INTER_NEAREST) > 0
-        detail = _detail(image, seen)[seen].astype(np.float64)
-        moments += detail.T @ detail
-    if not moments.any():
-        return LUMA
-    first = np.linalg.eigh(moments).eigenvectors[:, -1]
-    first = torch.from_numpy((first * np.sign(first.sum())).clip(0)).float()
-    return first / torch.maximum(first.norm() / LUMA.norm(), first.sum() / LUMA.sum())
+        moments += texture_moments(frames.image(k), frames.mask(k), long_side)
+    return strongest(moments)
 
 
 def make_view(
@@ -143,19 +128,8 @@ def make_view(
 ) -> SweepView:
     """A frame undistorted onto the canvas; `lens` is its own camera, `canvas` the pinhole one and `turn` its axes."""
     values, shown = undistorted(gray, mask, lens, canvas, turn)
-    detail = torch.from_numpy(_detail(values.numpy(), shown.numpy()))
+    detail = torch.from_numpy(texture(values.numpy(), shown.numpy()))
     return SweepView(values, detail, shown, canvas.K[0], canvas.world2cam[0])
-
-
-def _detail(values: np.ndarray, seen: np.ndarray) -> np.ndarray:
-    """Images [h w] or [h w 3] without what varies slowly or faster than a surface's texture; 0 where not seen."""
-    import cv2
-
-    there = seen.reshape(seen.shape + (1,) * (values.ndim - 2))
-    share = cv2.GaussianBlur(seen.astype(np.float32), (0, 0), _SLOW, borderType=cv2.BORDER_REFLECT)
-    slow = cv2.GaussianBlur(np.where(there, values, 0), (0, 0), _SLOW, borderType=cv2.BORDER_REFLECT)
-    fine = cv2.GaussianBlur(values, (0, 0), _FAST)
-    return np.where(there, fine - slow / np.maximum(share, 1e-6).reshape(there.shape), 0).astype(np.float32)
 
 
 def halved(view: SweepView) -> SweepView:
