@@ -43,8 +43,8 @@ def matched(pair: list[Float[Tensor, "h w 3"]]) -> list[float]:
     """Keypoints of the first image, matches and inliers."""
     settings = FeatureSettings()
     a, b = (sift.extract_features(im, torch.ones(im.shape[:2], dtype=torch.bool), settings) for im in pair)
-    units = [sift.unit_descriptors(each.descriptors) for each in (a, b)]
-    rows = sift.match_descriptors(*units, settings.max_ratio).numpy()
+    there, here = (sift.unit_descriptors(each.descriptors) for each in (a, b))
+    rows = sift.match_descriptors(there, here, settings.max_ratio).numpy()
     if len(rows) < 8:
         return [len(a.keypoints), len(rows), 0]
     xy = a.keypoints[rows[:, 0], :2], b.keypoints[rows[:, 1], :2]

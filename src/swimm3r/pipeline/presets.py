@@ -151,8 +151,8 @@ PRESETS: dict[Preset, RunSettings] = {
             long_side=480,
             full_area=6.0,  # most clips have no more; twice as much shows sand in strokes
             coarse_until=0.4,  # a fifth of the training time for 0.07 dB of the demo
-            initial=InitialSettings(primitives=25_000),
-            densify=DensifySettings(cap_max=50_000),
+            initial=InitialSettings(primitives=40_000),  # docs/experiments/short-runs.md: dB against time
+            densify=DensifySettings(cap_max=80_000),
             # UBS's rates are made for ten times as many steps (docs/experiments/short-runs.md)
             rates=LearningRates(
                 xyz=1e-3, query_mean=3e-3, rgb=1e-2, beta=4e-3, scale=1e-2, lower=4e-3, final_rate_factor=0.1

@@ -36,7 +36,7 @@ class GaussianInitialSettings(Settings):
 
     primitives: MapSize = 400_000
     """Number of points of the cloud and its backdrop that become Gaussians, for as many pixels each."""
-    backdrop: Share = 0.4
+    backdrop: Share = 0.5
     """Largest share of the initial Gaussians on ground of guessed depth; 0 starts from measured points alone."""
     colors: Literal["restored", "raw"] = "raw"
     """Colors of the initial Gaussians: raw, or restored for maps with a medium."""

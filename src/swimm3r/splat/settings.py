@@ -70,7 +70,7 @@ class InitialSettings(Settings):
 
     primitives: MapSize = 400_000
     """Number of points of the restored cloud and its backdrop that become primitives, for as many pixels each."""
-    backdrop: Share = 0.4
+    backdrop: Share = 0.5
     """Largest share of the initial primitives on ground of guessed depth; 0 starts from measured points alone."""
     directions: Literal["mean", "uniform"] = "mean"
     """Mean of the conditioned direction: that of the frames that see the point, or uniform over a cube as in UBS."""

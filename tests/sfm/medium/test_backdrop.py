@@ -47,6 +47,11 @@ def gathered(rec, dive, count: int) -> DenseCloud:
     return backdrop.points()
 
 
+def test_no_pixel_gives_two_points(patchy, dive):
+    found = gathered(patchy, dive, 1)
+    assert len(found.xyz.unique(dim=0)) == len(found.xyz)
+
+
 def test_ground_without_depth_gets_points_with_its_clear_colors(patchy, dive):
     found = gathered(patchy, dive, 1)
     pixels, z = project(patchy.cameras[0], found.xyz[None].double())

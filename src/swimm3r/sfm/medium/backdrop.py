@@ -21,7 +21,8 @@ from swimm3r.scene.reconstruction import DenseCloud, Reconstruction
 from swimm3r.sfm.medium.restore import RestoredImage
 
 _CELLS = 48  # cells along the long side of an image in which ground is looked for
-_POINTS = 3  # along each side of a cell
+_POINTS = 6  # along each side of a cell: more of them than the primitives that maps start with
+_LOOKED = 3  # places along each side of a cell, of which the cloud shows those that hold one of its points
 _SURFACE = 0.5  # share of open water from which there is no ground
 _MEASURED = 0.1  # share of an image below which depth known from any frame is too little to guess the rest from
 _NEIGHBORS = 8  # frames before and after that may contradict
@@ -49,7 +50,7 @@ class Backdrop:
             return
         guessed = unknown & (image.sea < _SURFACE) & self.frames.mask(f)
         edge = max(camera.width, camera.height) / _CELLS
-        row, column = _lattice(camera, edge / _POINTS)
+        row, column = _lattice(camera, max(1.0, edge / _POINTS))
         take = guessed[row, column]
         row, column = row[take], column[take]
         if not len(row):
@@ -105,21 +106,21 @@ class Backdrop:
     ) -> Bool[Tensor, " n"]:
         """Mask of the pixels at which the cloud or the ground found so far has a point closer than `reach`.
 
-        A point of the dense cloud stands for as much of the image as one point of the lattice. Ground of earlier frames
-        is as sparse as the lattice, so each of its points stands for a whole cell.
+        A point of the dense cloud, which may be thinned, stands for a part of a cell; one of ground of earlier frames,
+        which may have been filmed from afar, for a whole one.
         """
         center = camera.centers[0].float()
         found = torch.cat([torch.zeros(0, 3), *(piece.xyz for piece in self._pieces)])
         found = found[(found - center).square().sum(-1) < reach**2]
         edge = max(camera.width, camera.height) / _CELLS
         shown = torch.zeros(len(row), dtype=torch.bool)
-        for xyz, size in ((self._known.within(center, reach), edge / _POINTS), (found, edge)):
+        for xyz, size in ((self._known.within(center, reach), edge / _LOOKED), (found, edge)):
             shown |= _cells(camera, xyz.double(), size)[(row / size).long(), (column / size).long()]
         return shown
 
     def _blurred(self, i: int, row: Int[Tensor, " n"], column: Int[Tensor, " n"]) -> Float[Tensor, "n 3"]:
-        """Pixels of a frame's image without what is smaller than the distance between two points."""
-        sigma = max(self.frames.width, self.frames.height) / _CELLS / _POINTS / 2
+        """Pixels of a frame's image without what is smaller than a part of a cell."""
+        sigma = max(self.frames.width, self.frames.height) / _CELLS / _LOOKED / 2
         step = max(1, int(sigma / 3))
 
         def load() -> tuple[np.ndarray]:
