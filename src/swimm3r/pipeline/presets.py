@@ -47,6 +47,7 @@ WITHOUT_SGG, HELD_POSES = SggSettings(enabled=False), TrainingPoseSettings(enabl
 LAPTOP = UwbsSettings(  # the paper's settings are made for a GPU
     iterations=5000,
     long_side=640,
+    full_area=6.0,  # most clips have no more ground; twice as much shows sand in strokes
     initial=InitialSettings(primitives=50_000),
     densify=DensifySettings(cap_max=100_000),
     sgg=WITHOUT_SGG,
@@ -149,7 +150,7 @@ PRESETS: dict[Preset, RunSettings] = {
         splat=UwbsSettings(
             iterations=2000,
             long_side=480,
-            full_area=6.0,  # most clips have no more; twice as much shows sand in strokes
+            full_area=LAPTOP.full_area,
             coarse_until=0.4,  # a fifth of the training time for 0.07 dB of the demo
             initial=InitialSettings(primitives=40_000),  # docs/experiments/short-runs.md: dB against time
             densify=DensifySettings(cap_max=80_000),
