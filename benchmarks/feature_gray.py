@@ -20,7 +20,7 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
-from swimm3r.imaging.gray import LUMA, strongest, texture_moments
+from swimm3r.imaging.gray import FEATURE_SIDE, LUMA, strongest, texture_moments, texture_shown
 from swimm3r.io.image_folder import find_images
 from swimm3r.io.images import read_rgb
 from swimm3r.sfm.features import sift
@@ -28,15 +28,12 @@ from swimm3r.sfm.features.settings import FeatureSettings
 
 PAIRS = 4
 FEW = 15  # images, below which neighbors are matched
-SIDE = 480  # px, of the copy whose texture is looked at
 
 
 def gain(image: Float[Tensor, "h w 3"]) -> float:
     """Texture in the gray that shows the most of it, noise being equal, over that in luma."""
-    moments = texture_moments(image, torch.ones(image.shape[:2], dtype=torch.bool), SIDE)
-    shown = [weights.double().numpy() for weights in (strongest(moments), LUMA)]
-    own, luma = (float(np.sqrt(weights @ moments @ weights)) for weights in shown)
-    return own / luma
+    moments = texture_moments(image, torch.ones(image.shape[:2], dtype=torch.bool), FEATURE_SIDE)
+    return texture_shown(moments, strongest(moments)) / texture_shown(moments, LUMA)
 
 
 def matched(pair: list[Float[Tensor, "h w 3"]]) -> list[float]:

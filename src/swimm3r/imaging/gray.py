@@ -13,7 +13,8 @@ from swimm3r.imaging.filters import texture
 
 LUMA = torch.tensor([0.299, 0.587, 0.114])
 """Weights of red, green and blue by ITU-R BT.601."""
-_SIDE = 480  # px, long side of the copy whose texture decides
+FEATURE_SIDE = 480
+"""Long side in pixels of the copy of an image whose texture decides which gray its features are looked for in."""
 _GAIN = 1.5  # times the texture that luma shows, from which on other weights pay: red and blue are the noisier channels
 
 
@@ -49,12 +50,17 @@ def strongest(moments: Float64[np.ndarray, "3 3"]) -> Float[Tensor, "3"]:
     return first / torch.maximum(first.norm() / LUMA.norm(), first.sum() / LUMA.sum())
 
 
+def texture_shown(moments: Float64[np.ndarray, "3 3"], weights: Float[Tensor, "3"]) -> float:
+    """Strength of texture of these moments in a gray, a root of summed squares."""
+    w = weights.double().numpy()
+    return float(np.sqrt(w @ moments @ w))
+
+
 def weights_for_features(image: Float[Tensor, "h w 3"], seen: Bool[Tensor, "h w"]) -> Float[Tensor, "3"]:
     """Luma, unless an image's texture is far stronger in other weights; with a sum of 1.
 
     Each image decides for itself, so that those of other dives, and of a vehicle at work, need nothing but themselves.
     """
-    moments = texture_moments(image, seen, _SIDE)
-    own, luma = strongest(moments), LUMA.double().numpy()
-    shown = float(np.sqrt(own.double().numpy() @ moments @ own.double().numpy()))
-    return own / own.sum() if shown > _GAIN * float(np.sqrt(luma @ moments @ luma)) else LUMA
+    moments = texture_moments(image, seen, FEATURE_SIDE)
+    own = strongest(moments)
+    return own / own.sum() if texture_shown(moments, own) > _GAIN * texture_shown(moments, LUMA) else LUMA
