@@ -30,9 +30,9 @@ from swimm3r.synthetic.settings import DiveSettings
 def test_every_frame_of_a_good_clip_is_placed_where_it_was_taken(rec: Reconstruction, frames: Frames) -> None:
     truth = camera_path()
     assert rec.names == frames.names
-    assert worst_rotation_deg(rec, truth) < 0.3
+    assert worst_rotation_deg(rec, truth) < 0.03
     fit = align_similarity(rec.cameras.centers, truth.centers)
-    assert (fit.points(rec.cameras.centers) - truth.centers).norm(dim=1).max() < 0.02
+    assert (fit.points(rec.cameras.centers) - truth.centers).norm(dim=1).max() < 0.002
     assert rec.backend == "colmap"
     assert not rec.metric
 

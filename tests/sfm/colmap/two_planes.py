@@ -14,6 +14,7 @@ from swimm3r.sfm.settings import ColmapSettings
 
 WIDTH, HEIGHT, FOCAL, COUNT = 320, 240, 260.0, 8
 SETTINGS = ColmapSettings(threads=2)
+_OPENCV_PIXELS = np.array([[1, 0, -0.5], [0, 1, -0.5], [0, 0, 1]])  # the center of the first pixel is (0, 0) there
 
 
 def texture(seed: int, size: int = 1024) -> np.ndarray:
@@ -39,7 +40,7 @@ def render(cameras: Cameras, folder: Path) -> Frames:
     far, near = texture(0), texture(1)
     frames = []
     for i in range(len(cameras)):
-        P = (cameras.K[i] @ cameras.world2cam[i, :3]).numpy()
+        P = _OPENCV_PIXELS @ (cameras.K[i] @ cameras.world2cam[i, :3]).numpy()
 
         def homography(origin: list[float], u: list[float], v: list[float], P: np.ndarray = P) -> np.ndarray:
             return P @ np.stack([[*u, 0], [*v, 0], [*origin, 1]], 1)

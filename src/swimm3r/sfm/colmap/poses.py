@@ -29,10 +29,11 @@ from swimm3r.scene.reconstruction import (
 from swimm3r.sfm.colmap import mapping
 from swimm3r.sfm.colmap.adjustment import adjust_through_port
 from swimm3r.sfm.colmap.calibration.polynomial import bent_lens
-from swimm3r.sfm.colmap.calibration.refinement import Calibrated, refine
+from swimm3r.sfm.colmap.calibration.refinement import Calibrated, adjust_lens, adjust_poses, refine, refine_again
 from swimm3r.sfm.colmap.calibration.start import first_camera
 from swimm3r.sfm.colmap.chunks.long_clip import is_long, map_long_clip
 from swimm3r.sfm.colmap.chunks.parts import without_jumps
+from swimm3r.sfm.colmap.keypoint_adjustment import adjust_keypoints
 from swimm3r.sfm.colmap.messages import (
     LOST_SCALE,
     assumed_lens,
@@ -117,7 +118,7 @@ def reconstruct(
                 return record_of(model, working, frames, folder, known.lenses)
 
             scaled = at_scale(known.settings, frames.width, frames.height, store.scale)
-            mapped = _map(working, frames, pairs, scaled, progress, engine)
+            mapped = _map(working, frames, pairs, scaled, progress, engine, known.lenses)
             if not frames.rows_rectified:
                 _check_rectifiable(mapped, known, frames, recorded, progress)
             if navigator is not None:
@@ -251,8 +252,12 @@ def _map(
     settings: ColmapSettings,
     progress: Progress,
     engine: EngineSettings,
+    lenses: RigLenses | None,
 ) -> _Mapped:
-    """The largest model, its lens refined. Raises RegistrationError where no two frames can be placed."""
+    """The largest model, its keypoints aligned and its lens refined.
+
+    Raises RegistrationError where no two frames can be placed.
+    """
     n, threads = len(frames), settings.threads or thread_count()
     long = is_long(n, settings.mapping)
     determined = False
@@ -276,6 +281,15 @@ def _map(
         more = without_jumps(more)
         model = more if more.num_reg_images() >= model.num_reg_images() else model
     calibrated = Calibrated(model, refined=determined) if long else refine(store, model, settings, progress)
+    if settings.mapping.align_keypoints:
+        model = adjust_keypoints(store, calibrated.model, frames, threads, progress, lenses)
+        calibrated = replace(calibrated, model=model)
+        if not long:
+            calibrated = refine_again(store, calibrated, progress)
+        elif determined:
+            calibrated = replace(calibrated, model=adjust_lens(store, model, settings, progress, is_large=True))
+        else:
+            calibrated = replace(calibrated, model=adjust_poses(store, model))
     warnings = []
     if not calibrated.refined and settings.intrinsics != "fixed":
         warnings.append(assumed_lens(calibrated.model.cameras[1].focal_length_x / store.scale))

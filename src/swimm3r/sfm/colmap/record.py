@@ -36,12 +36,11 @@ def record_of(
     It is in pixels of the frames. With `lenses` keypoints of the database and the model are as a rig's first lens has
     them.
     """
-    table = _in_pixels_of(frames, from_pycolmap(model), store.scale)
-    index = [int(name) for name in table.names]
-    table = replace(table, names=tuple(frames.names[i] for i in index))
+    table = table_of(model, store, frames, lenses)
+    index = frame_numbers(model)
     matches = verified_matches(store, index)
     if lenses is not None:
-        table, matches = lenses.own_model(table, index), lenses.own_matches(matches, index)
+        matches = lenses.own_matches(matches, index)
     return Reconstruction(
         names=table.names,
         cameras=cameras_of(table),
@@ -51,6 +50,21 @@ def record_of(
         depth=DepthMaps(folder / "z_depth"),
         backend="colmap",
     )
+
+
+def frame_numbers(model: "pycolmap.Reconstruction") -> list[int]:
+    """The number in the clip of each registered image of a model, in the order of its records."""
+    return [int(model.image(i).name) for i in sorted(model.reg_image_ids())]
+
+
+def table_of(
+    model: "pycolmap.Reconstruction", store: FeatureDatabase, frames: Frames, lenses: RigLenses | None = None
+) -> ColmapModel:
+    """The arrays of a model in pixels of the frames, under their names; with `lenses` under each camera's own lens."""
+    table, index = _in_pixels_of(frames, from_pycolmap(model), store.scale), frame_numbers(model)
+    if lenses is not None:
+        table = lenses.own_model(table, index)
+    return replace(table, names=tuple(frames.names[i] for i in index))
 
 
 def _in_pixels_of(frames: Frames, table: ColmapModel, scale: float) -> ColmapModel:
@@ -133,8 +147,5 @@ def write_parts(
             continue
         known |= own
         sizes.append(len(own))
-        table = _in_pixels_of(frames, from_pycolmap(other), store.scale)
-        if lenses is not None:
-            table = lenses.own_model(table, [int(name) for name in table.names])
-        write_model(folder / f"{len(sizes)}", replace(table, names=tuple(frames.names[int(n)] for n in table.names)))
+        write_model(folder / f"{len(sizes)}", table_of(other, store, frames, lenses))
     return sizes

@@ -25,6 +25,8 @@ class MappingSettings(Settings):
     """Share of registered frames at which no further focal lengths are tried."""
     retry_ratio: PositiveShare = 0.9
     """Ratio test of the second matching of frames that were not registered."""
+    align_keypoints: bool = True
+    """Move keypoints to where the patches of the images agree before the last adjustment."""
     navigation: bool = True
     """Use the navigation that is given (`--nav`): its positions as priors of those of the cameras, and to join parts
     that share no ground."""

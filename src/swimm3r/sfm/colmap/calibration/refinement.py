@@ -88,6 +88,23 @@ def refine(
     return Calibrated(kept, refined=True)
 
 
+def refine_again(store: FeatureDatabase, calibrated: Calibrated, progress: Progress) -> Calibrated:
+    """A refined model whose observations were moved after another adjustment, its kind of lens as it is."""
+    model = calibrated.model
+    if not calibrated.refined:
+        return Calibrated(_poses_alone(store, model), refined=False)
+    progress(_STEP, 0, 1)
+    family = family_of(model.cameras[1])
+    distortion = any(model.cameras[1].params[i] for i in model.cameras[1].extra_params_idxs())
+    kept = model
+    for _ in range(2):  # errors are smaller after the first, and the loss of the second is as wide as they are
+        found = _sharpened(store, kept, family, distortion=distortion)
+        kept = found if _is_sound(found, kept) else kept
+    progress(_STEP, 1, 1)
+    set_camera(store, kept.cameras[1])
+    return Calibrated(kept, refined=True)
+
+
 def _with_more_parameters(
     store: FeatureDatabase,
     model: "pycolmap.Reconstruction",

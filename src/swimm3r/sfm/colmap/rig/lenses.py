@@ -47,15 +47,19 @@ class RigLenses:
 
     def under_first(self, frame: int, found: Features) -> Features:
         """Features of a frame of the clip where the first lens has their rays; without those that it cannot have."""
-        own, first = self.lenses[self.camera[frame]], self.lenses[0]
-        if own is first:
+        if self.camera[frame] == 0:
             return found
         pixels = torch.from_numpy(found.keypoints[:, :2].astype(np.float64))
-        moved = _moved(pixels, own, first)
-        back = torch.linalg.vector_norm(_moved(moved, first, own) - pixels, dim=1)
+        moved = self.first_pixels(frame, pixels)
+        back = torch.linalg.vector_norm(self._own_pixels(moved, self.camera[frame]) - pixels, dim=1)
         held = (back < _LOST).numpy()
         keypoints = np.column_stack([moved.numpy(), found.keypoints[:, 2:]]).astype(np.float32)
         return Features(keypoints[held], found.descriptors[held])
+
+    def first_pixels(self, frame: int, pixels: Float[Tensor, "n 2"]) -> Float[Tensor, "n 2"]:
+        """Pixels of a frame of the clip where the first lens has their rays."""
+        own = self.camera[frame]
+        return pixels if own == 0 else _moved(pixels, self.lenses[own], self.lenses[0])
 
     def own_model(self, table: ColmapModel, frames: list[int]) -> ColmapModel:
         """A model of these frames of the clip with its observations in the images' pixels, and each frame's lens."""

@@ -30,6 +30,7 @@ from swimm3r.sfm.colmap.extended_adjustment import Bundle, adjusted, blocks, cro
 EXPECTED_TURN = 0.002
 """Standard deviation of turns within a frame, radians: 20 ms at 6 degrees per second."""
 _CLEARLY = 0.95  # of the median held-out error, below which turns are believed
+_NOTABLE = 0.01  # px by which it must fall, too: precise keypoints tell turns that no picture shows
 _HELD_OUT = 0.2  # of the observations of points that enough others show
 _ENOUGH = 3  # observations of a point that are left
 _FEWEST = 500  # held-out observations that can judge
@@ -105,7 +106,7 @@ def turned_rows(rec: Reconstruction) -> RowTurns | None:
         return None
     before, after = float(np.median(without)), float(np.median(with_turns))
     log.info("rows exposed while the camera turned: held-out observations %.3f px off, %.3f without", after, before)
-    if not after <= _CLEARLY * before:  # also where one of them is no number
+    if not after <= min(_CLEARLY * before, before - _NOTABLE):  # also where one of them is no number
         return None
     every = [adjusted(bundle, part, _STEPS).others for (part, _), bundle in zip(parts, turning, strict=True)]
     lens = replace(rec.cameras[0], cam2world=torch.eye(4, dtype=torch.float64)[None])
