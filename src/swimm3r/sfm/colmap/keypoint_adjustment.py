@@ -2,8 +2,8 @@
 
 Each point has a template: the patch around it in the image of its nearest camera. It is laid over the patches of its
 other images (`features.patch_alignment`), beginning with the map that a plane through the point has that faces its
-cameras. Keypoints of the same place disagree by 0.2 to 0.5 pixels, patches by a half to a third of that, which is known
-as keypoint adjustment (Lindenberger et al. 2021, who align features of a network).
+cameras. The error of observations falls by 40 % on synthetic dives (docs: Poses). This is known as keypoint adjustment
+(Lindenberger et al. 2021, who align features of a network).
 """
 
 import logging
