@@ -84,6 +84,10 @@ def test_patches_without_texture_or_beyond_the_border_stay_where_they_are():
         found, alike = align_patches(other, patches, places, _maps(len(places)))
         assert np.array_equal(found, places)
         assert np.isnan(alike).all()
+    no_map = np.full((4, 2, 2), np.nan)  # of a camera that looks along the surface
+    found, alike = align_patches(_turned(image), cut_patches(image, first), second, no_map)
+    assert np.array_equal(found, second)
+    assert np.isnan(alike).all()
 
 
 def test_other_ground_is_not_alike():

@@ -104,8 +104,7 @@ def _observations(
     nearest = np.lexsort((distance, point))
     template = nearest[np.searchsorted(point[nearest], np.arange(len(table.xyz)))][point]
     steps = reduced[:, None] * _steps_of_pixels(cameras, table.xyz, point, frame)
-    maps = steps @ np.linalg.inv(steps[template])
-    return _Observations(point, frame, keypoint, table.track_xy * reduced, template, maps)
+    return _Observations(point, frame, keypoint, table.track_xy * reduced, template, steps @ _inverse(steps)[template])
 
 
 def _steps_of_pixels(
@@ -126,6 +125,13 @@ def _steps_of_pixels(
             there, back = (project(cameras[i], torch.from_numpy(points)[None])[0][0].numpy() for points in beside)
             steps[rows.numpy(), :, k] = (there - back) / 2
     return steps
+
+
+def _inverse(steps: Float64[np.ndarray, "o 2 2"]) -> Float64[np.ndarray, "o 2 2"]:
+    """Inverse matrices; not finite, and so of no patch, where a camera looks along the plane."""
+    (a, b), (c, d) = np.moveaxis(steps, 0, -1)
+    with np.errstate(divide="ignore", invalid="ignore"):
+        return np.moveaxis(np.array([[d, -b], [-c, a]]) / (a * d - b * c), -1, 0)
 
 
 def _aligned(
