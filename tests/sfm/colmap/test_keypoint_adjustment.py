@@ -6,7 +6,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 import torch
-from tests.sfm.colmap.two_planes import COUNT, FOCAL, SETTINGS, camera_path, worst_rotation_deg
+from tests.sfm.colmap.two_planes import COUNT, SETTINGS, camera_path, off_true_lines, worst_rotation_deg
 
 from swimm3r.scene.frames import Frames
 from swimm3r.scene.reconstruction import Reconstruction
@@ -29,17 +29,12 @@ def as_found(frames: Frames, folder_as_found: Path) -> Reconstruction:
 
 def _off_true_lines(rec: Reconstruction) -> float:
     """Median distance of observations from the true epipolar lines of others of the same point in pixels."""
-    truth, tracks = camera_path(), rec.tracks
+    tracks = rec.tracks
     order = tracks.point.argsort(stable=True)
     same = (tracks.point[order].diff() == 0) & (tracks.frame[order].diff() != 0)
     first, second = order[:-1][same], order[1:][same]
-    i, j = tracks.frame[first], tracks.frame[second]
-    R = truth.world2cam[i, :3, :3] @ truth.cam2world[j, :3, :3]
-    t = (truth.world2cam[i, :3, :3] @ truth.cam2world[j, :3, 3:] + truth.world2cam[i, :3, 3:]).squeeze(-1)
-    homogeneous = torch.cat([tracks.xy.double(), torch.ones(len(tracks.xy), 1, dtype=torch.float64)], 1)
-    rays = homogeneous @ torch.linalg.inv(truth.K[0]).mT
-    line = torch.linalg.cross(t, (R @ rays[second][..., None]).squeeze(-1))
-    return float(((line * rays[first]).sum(1).abs() / line[:, :2].norm(dim=1) * FOCAL).median())
+    found = off_true_lines(tracks.frame[first], tracks.frame[second], tracks.xy[first], tracks.xy[second])
+    return float(found.median())
 
 
 def test_aligned_keypoints_are_nearer_to_the_truth_and_so_are_the_cameras(

@@ -8,7 +8,17 @@ import cv2
 import numpy as np
 import pytest
 import torch
-from tests.sfm.colmap.two_planes import COUNT, FOCAL, HEIGHT, SETTINGS, WIDTH, camera_path, texture, worst_rotation_deg
+from tests.sfm.colmap.two_planes import (
+    COUNT,
+    FOCAL,
+    HEIGHT,
+    SETTINGS,
+    WIDTH,
+    camera_path,
+    off_true_lines,
+    texture,
+    worst_rotation_deg,
+)
 
 from swimm3r.cameras import project
 from swimm3r.errors import InputError, RegistrationError, StorageError, UsageError
@@ -57,19 +67,10 @@ def test_points_have_the_color_of_the_image(rec: Reconstruction, frames: Frames)
 
 
 def test_matches_join_projections_of_one_surface_point(rec: Reconstruction) -> None:
-    truth = camera_path()
-    i, j = rec.matches.i, rec.matches.j
-    assert (i != j).all()
-    assert len(i) > 1000
-    R = truth.world2cam[i, :3, :3] @ truth.cam2world[j, :3, :3]
-    t = (truth.world2cam[i, :3, :3] @ truth.cam2world[j, :3, 3:] + truth.world2cam[i, :3, 3:]).squeeze(-1)
-    K_inverse = torch.linalg.inv(truth.K[0])
-    rays_i, rays_j = (
-        torch.cat([xy.double(), torch.ones(len(xy), 1, dtype=torch.float64)], 1) @ K_inverse.mT
-        for xy in (rec.matches.xy_i, rec.matches.xy_j)
-    )
-    line = torch.linalg.cross(t, (R @ rays_j[..., None]).squeeze(-1))
-    distance = (line * rays_i).sum(1).abs() / line[:, :2].norm(dim=1) * FOCAL
+    matches = rec.matches
+    assert (matches.i != matches.j).all()
+    assert len(matches.i) > 1000
+    distance = off_true_lines(matches.i, matches.j, matches.xy_i, matches.xy_j)
     assert (distance < 1.5).float().mean() > 0.95
 
 

@@ -62,3 +62,16 @@ def worst_rotation_deg(rec: Reconstruction, truth: Cameras) -> float:
     fit = align_similarity(rec.cameras.centers, truth.centers)
     turned = fit.poses(rec.cameras.cam2world)[:, :3, :3]
     return torch.rad2deg(rotation_angle(turned.mT @ truth.cam2world[:, :3, :3])).max().item()
+
+
+def off_true_lines(i: torch.Tensor, j: torch.Tensor, xy_i: torch.Tensor, xy_j: torch.Tensor) -> torch.Tensor:
+    """Distance in pixels of pixels in frames i from the true epipolar lines of those of the same points in frames j."""
+    truth = camera_path()
+    R = truth.world2cam[i, :3, :3] @ truth.cam2world[j, :3, :3]
+    t = (truth.world2cam[i, :3, :3] @ truth.cam2world[j, :3, 3:] + truth.world2cam[i, :3, 3:]).squeeze(-1)
+    K_inverse = torch.linalg.inv(truth.K[0])
+    rays_i, rays_j = (
+        torch.cat([xy.double(), torch.ones(len(xy), 1, dtype=torch.float64)], 1) @ K_inverse.mT for xy in (xy_i, xy_j)
+    )
+    line = torch.linalg.cross(t, (R @ rays_j[..., None]).squeeze(-1))
+    return (line * rays_i).sum(1).abs() / line[:, :2].norm(dim=1) * FOCAL
