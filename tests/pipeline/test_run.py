@@ -67,7 +67,7 @@ TINY_MAP = replace(
         densify=DensifySettings(cap_max=3000),
         medium=MediumFieldSettings(hidden=16),
     ),
-    test=PoseRefinementSettings(steps=4, long_side=80, least_gain=0.0),
+    test=PoseRefinementSettings(steps=4, long_side=80, min_gain=0.0),
 )
 
 

@@ -8,7 +8,7 @@ import torch
 from swimm3r.cameras import project
 from swimm3r.geometry import relative_poses, rotation_angle, so3_exp
 from swimm3r.splat.pose_mlp import moved
-from swimm3r.splat.pose_refinement import edges, ends, refine_pose, sizes
+from swimm3r.splat.pose_refinement import edges, ends, local_mean, refine_pose, sizes
 from swimm3r.splat.settings import PoseRefinementSettings
 
 SEEN = torch.ones(48, 64, dtype=torch.bool)
@@ -86,11 +86,47 @@ def test_no_motion_is_the_given_pose():
     assert moved(pose, torch.tensor([0.1, 0, 0, 0, 0, 0, 0, 0, 0]), 3.0)[0, 3] == pytest.approx(0.3)
 
 
-def test_a_flat_image_is_compared_everywhere():
+def test_light_that_changes_slowly_does_not_draw_a_pose_aside(tiny_dive):
+    start = disturbed(tiny_dive, (0.012, -0.01, 0.015), (0.02, -0.015, 0.02))
+    wedge = 0.3 * torch.linspace(-1, 1, 64)[:, None] * torch.tensor([0.3, 0.8, 1.0])
+    image, off = tiny_dive.frames.image(3) + wedge, {}
+    for pixels in ("all", "edges"):
+        settings = PoseRefinementSettings(steps=120, rate=2e-3, pixels=pixels, min_gain=0.0)
+        found = refine_pose(tiny_dive.truth, start, image, SEEN, settings)
+        off[pixels] = pixels_off(tiny_dive, found.camera)
+    print(off)
+    assert off["all"] < 0.1
+    assert off["all"] < 0.5 * off["edges"]
+
+
+def test_a_pose_stays_where_the_map_shows_nothing_of_the_frame(tiny_dive):
+    noise = torch.rand(48, 64, 3, generator=torch.Generator().manual_seed(0))
+    start = tiny_dive.cameras[3]
+    moved_by = {}
+    for gain in (0.0, 2.0):
+        found = refine_pose(tiny_dive.truth, start, noise, SEEN, PoseRefinementSettings(steps=20, min_gain=gain))
+        moved_by[gain] = pixels_off(tiny_dive, found.camera)
+    assert moved_by[0.0] > 0.1
+    assert moved_by[2.0] == 0
+
+
+def test_local_means_are_of_seen_pixels_alone():
+    values = torch.full((20, 30, 2), 0.3)
+    seen = torch.ones(20, 30, dtype=torch.bool)
+    seen[:, 15:] = False
+    values[:, 15:] = 7.0
+    mean = local_mean(values, seen, 2.0)
+    torch.testing.assert_close(mean[:, :15], values[:, :15])
+    torch.testing.assert_close(mean[:, 16], torch.full((20, 2), 0.3))
+    assert not mean[:, 22:].any()
+    assert local_mean(torch.rand(20, 30, 2), seen, 1.5).isfinite().all()
+
+
+def test_a_flat_image_has_edges_everywhere():
     flat = torch.full((48, 64, 3), 0.4)
-    assert edges(flat, SEEN, PoseRefinementSettings()).all()
+    assert edges(flat, SEEN).all()
     stepped = flat.clone()
     stepped[:, 32:] = 0.8
-    found = edges(stepped, SEEN, PoseRefinementSettings())
+    found = edges(stepped, SEEN)
     assert found[:, 31:33].all()
     assert not found[:, :30].any()

@@ -182,7 +182,7 @@ PRESETS: dict[Preset, RunSettings] = {
             restore=RestoreSettings(max_points=_PAPER_POINTS, max_points_area=0.0),
         ),
         splat=PAPER,
-        test=PoseRefinementSettings(long_side=0, halvings=0),
+        test=PoseRefinementSettings(long_side=0, halvings=0, pixels="edges", min_gain=0.0),
     ),
 }
 """Settings to start from: `PRESETS["fast"].frames`, `.sfm` and `.splat` are those of `read_frames`, `reconstruct` and

@@ -4,17 +4,25 @@ The protocol is that of 3R-GS (docs/derivations/compared-methods.md#3r-gs):
 
     cam2world' = cam2world [R(w) | length v]
 
-with a 9-vector (v, w), zero at first, w added to the 6D form of the identity. The loss is the mean absolute difference
-to the image over its edges: pixels whose Scharr gradient exceeds a few medians. It has a minimum within a few pixels
-only, so that smaller images are looked at first.
+with a 9-vector (v, w), zero at first, w added to the 6D form of the identity. The loss is a mean absolute difference
+to the image I, over all pixels x or over edges alone, as 3R-GS has it (pixels whose Scharr gradient exceeds four
+medians):
+
+    all      mean of |d(x) - (G * d)(x)|,    d = rendering - I, G a Gaussian as wide as an 80th of the image
+    edges    mean of |d(x)|
+
+Without its local mean, a difference says nothing of light, water and exposure, which change slowly over an image and
+draw poses aside. Either loss has a minimum within a few pixels only, so that smaller images are looked at first.
 """
 
+import math
 from dataclasses import dataclass, replace
 
 import numpy as np
 import torch
 from jaxtyping import Bool, Float
 from torch import Tensor
+from torch.nn.functional import avg_pool2d, conv2d
 
 from swimm3r.cameras import Cameras
 from swimm3r.evaluate.registration import fit_colors
@@ -30,7 +38,11 @@ from swimm3r.splat.projection.view_camera import view_camera
 from swimm3r.splat.rendering import SplatMap, expected_z_depth, images, memory_for_views, settings_in_scene_units
 from swimm3r.splat.settings import PoseRefinementSettings
 
-_DARK = 0.01  # sum of R, G, B below which a pixel is not looked at
+_DARK = 0.01  # sum of R, G, B below which a pixel is no edge
+_EDGE = 4.0  # medians of the image's gradient
+_FEW = 0.01  # of the image, fewer edges or observed pixels than which stand for none
+_SLOW = 1 / 80  # of the longer side: standard deviation of the window of local means
+_TILE = 16  # pixels, from which on differences are independent
 _SMALLEST = 60  # pixels of the longer side, below which an image no longer tells a pose
 _STAY = 1e-3  # hold of colors to the map's, `evaluate.registration.fit_colors`
 _MARGIN = 0.25  # of the image, within which primitives outside it are kept: the pose moves
@@ -41,7 +53,7 @@ class RefinedPose:
     """A camera after refinement, and how well it explains its image."""
 
     camera: Cameras  # as given, with another pose
-    start_loss: float  # mean absolute difference over the edges, 0..1
+    start_loss: float  # 0..1
     loss: float
 
 
@@ -56,7 +68,7 @@ def refine_pose(
     progress: Progress = silent,
     time: float | None = None,
 ) -> RefinedPose:
-    """The pose near `camera`'s from which the map looks most like the image; the given one where that gains little.
+    """The pose near `camera`'s from which the map looks most like the image; the given one where that gain is chance.
 
     `image` and `mask` are the frame as prepared, distortion included; `time` is when it was taken, seconds.
     """
@@ -65,9 +77,7 @@ def refine_pose(
     whole = camera.drawn(scene.settings.long_side)
     sides = sizes(settings, max(whole.width, whole.height))
     looks = [_Look(scene, camera, image, mask, settings, side, time) for side in sides]
-    with torch.no_grad():
-        start = float(looks[-1].loss(delta))
-    done = 0
+    done, first = 0, delta.detach().clone()
     for look, until in zip(looks, ends(settings.steps, len(looks)), strict=True):
         adam = torch.optim.Adam([delta], lr=settings.rate)
         for step in range(count := until - done):
@@ -78,9 +88,9 @@ def refine_pose(
         done = until
     progress("refining a pose", settings.steps, settings.steps)
     with torch.no_grad():
-        end, pose = float(looks[-1].loss(delta)), looks[-1].pose(delta)
-    if end < (1 - settings.least_gain) * start:
-        return RefinedPose(replace(camera, cam2world=pose[None]), start, end)
+        start, end = (float(looks[-1].loss(d)) for d in (first, delta))
+        if looks[-1].gain(first, delta) > settings.min_gain:
+            return RefinedPose(replace(camera, cam2world=looks[-1].pose(delta)[None]), start, end)
     return RefinedPose(camera, start, start)
 
 
@@ -100,12 +110,13 @@ class _Look:
         self._scene, self._now = scene, scene.normalized_time(time)
         self._canvas = camera.drawn(long_side)
         target, seen = undistorted(image, mask, camera, self._canvas)
-        self._target, self._wanted = target.to(scene.device), edges(target, seen, settings).to(scene.device)
-        self._seen = seen.to(scene.device)
+        self._whole = settings.pixels == "all"
+        wanted = seen if self._whole else edges(target, seen)
+        self._target, self._seen, self._wanted = (x.to(scene.device) for x in (target, seen, wanted))
         self._units = settings_in_scene_units(scene.settings, scene.length)
         self._primitives = in_sight(scene, self._canvas, self._now)
         if scene.coverage is not None:
-            self._leave_out(~self._observed(scene.coverage), settings.min_edges)
+            self._leave_out(~self._observed(scene.coverage))
 
     def _observed(self, coverage: TrainingCoverage) -> Bool[Tensor, "h w"]:
         """Mask of what training frames saw of the first pose's view."""
@@ -114,10 +125,10 @@ class _Look:
             shown = images(self._primitives, self._scene.field, view, self._units, self._now)
         return coverage.of_view(self._canvas, expected_z_depth(shown), shown.alpha).to(self._scene.device)
 
-    def _leave_out(self, unknown: Bool[Tensor, "h w"], least: float) -> None:
+    def _leave_out(self, unknown: Bool[Tensor, "h w"]) -> None:
         """Take no account of pixels that the map cannot know, unless hardly any is left."""
         known = self._wanted & ~unknown
-        if int(known.sum()) >= least * known.numel():
+        if int(known.sum()) >= _FEW * known.numel():
             self._wanted, self._seen = known, self._seen & ~unknown
 
     def pose(self, delta: Float[Tensor, "9"]) -> Float[Tensor, "4 4"]:
@@ -125,14 +136,42 @@ class _Look:
         return moved(self._canvas.cam2world[0], delta, self._scene.length)
 
     def loss(self, delta: Float[Tensor, "9"]) -> Float[Tensor, ""]:
-        """Mean absolute difference over the edges."""
+        """Mean absolute difference over the pixels that count."""
+        return self._differences(delta).sum() / self._wanted.sum()
+
+    def gain(self, first: Float[Tensor, "9"], refined: Float[Tensor, "9"]) -> float:
+        """Fall of the loss in its standard errors, tiles of the image being independent."""
+        less = self._differences(first) - self._differences(refined)
+        less, count = (
+            avg_pool2d(x[None].float(), _TILE, ceil_mode=True, divisor_override=1) for x in (less, self._wanted)
+        )
+        mean = less.sum() / count.sum()
+        error = (less - mean * count).norm() / count.sum()
+        return float(mean / error) if error > 0 else 0.0
+
+    def _differences(self, delta: Float[Tensor, "9"]) -> Float[Tensor, "h w"]:
+        """Absolute difference at each pixel that counts, 0 elsewhere."""
         view = view_camera(replace(self._canvas, cam2world=self.pose(delta)[None])).to(self._scene.device)
         rgb = images(self._primitives, self._scene.field, view, self._units, self._now).rgb
         rgb = rgb.permute(1, 2, 0)
         if self._scene.colors is not None:  # the frame has colors of its own: they say nothing about the pose
             rgb = fit_colors(rgb.detach()[self._seen], self._target[self._seen], _STAY)(rgb)
-        off = (rgb - self._target).abs().mean(-1)
-        return (off * self._wanted).sum() / self._wanted.sum()
+        off = rgb - self._target
+        if self._whole:
+            off = off - local_mean(off, self._seen, max(1.0, _SLOW * max(self._wanted.shape)))
+        return off.abs().mean(-1) * self._wanted
+
+
+def local_mean(values: Float[Tensor, "h w c"], seen: Bool[Tensor, "h w"], sigma: float) -> Float[Tensor, "h w c"]:
+    """Mean of the seen values around each pixel, in a Gaussian window of `sigma` pixels; 0 where none is near."""
+    reach = math.ceil(3 * sigma)
+    weights = torch.exp(-0.5 * (torch.arange(-reach, reach + 1, device=values.device) / sigma) ** 2)
+    weights = (weights / weights.sum()).to(values)
+    there = seen.to(values)[..., None]
+    sums = torch.cat([values * there, there], -1).permute(2, 0, 1)[:, None]
+    sums = conv2d(sums, weights[None, None, None], padding=(0, reach))
+    sums = conv2d(sums, weights[None, None, :, None], padding=(reach, 0))[:, 0].permute(1, 2, 0)
+    return sums[..., :-1] / sums[..., -1:].clamp(min=1e-6)
 
 
 def sizes(settings: PoseRefinementSettings, long_side: int) -> list[int]:
@@ -146,17 +185,15 @@ def ends(steps: int, count: int) -> list[int]:
     return [steps * k // (2 * (count - 1)) for k in range(1, count)] + [steps]
 
 
-def edges(
-    target: Float[Tensor, "h w 3"], seen: Bool[Tensor, "h w"], settings: PoseRefinementSettings
-) -> Bool[Tensor, "h w"]:
-    """The pixels that tell a pose: strong gradients; every pixel where the image has too few of them."""
+def edges(target: Float[Tensor, "h w 3"], seen: Bool[Tensor, "h w"]) -> Bool[Tensor, "h w"]:
+    """The pixels of strong gradients; every pixel where the image has too few of them."""
     import cv2
 
     gray = target.mean(-1).numpy()
     gradient = np.hypot(cv2.Scharr(gray, cv2.CV_32F, 1, 0), cv2.Scharr(gray, cv2.CV_32F, 0, 1))
     usable = seen & (target.sum(-1) > _DARK)
-    strong = usable & torch.from_numpy(gradient > settings.edge * np.median(gradient))
-    return strong if int(strong.sum()) >= settings.min_edges * strong.numel() else usable
+    strong = usable & torch.from_numpy(gradient > _EDGE * np.median(gradient))
+    return strong if int(strong.sum()) >= _FEW * strong.numel() else usable
 
 
 def in_sight(scene: SplatMap, canvas: Cameras, now: Float[Tensor, ""] | None = None) -> Primitives:

@@ -292,13 +292,12 @@ class PoseRefinementSettings(Settings):
     halvings: Annotated[int, Range(0, 16)] = 2
     """Number of times that the image is halved at first; the smaller sizes share half of the steps and find poses that
     start several pixels off."""
-    edge: NotNegative = 4.0
-    """Image gradient, in medians, above which pixels count."""
-    min_edges: Share = 0.01
-    """Share of the image below which all pixels count instead of those at edges."""
-    least_gain: Share = 0.02
-    """Share of its loss that a refined pose must save to replace the first one; less says that the map hardly shows
-    what the frame shows."""
+    pixels: Literal["all", "edges"] = "all"
+    """Pixels that tell the pose: all that training frames observed, in colors less their local mean, or those at edges,
+    in colors as they are (3R-GS)."""
+    min_gain: NotNegative = 2.0
+    """Fall of the loss, in its standard errors, above which a refined pose replaces the first one; less is chance, and
+    the map may hardly show what the frame shows."""
 
 
 SplatSettings = (
