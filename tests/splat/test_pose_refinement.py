@@ -94,7 +94,6 @@ def test_light_that_changes_slowly_does_not_draw_a_pose_aside(tiny_dive):
         settings = PoseRefinementSettings(steps=120, rate=2e-3, pixels=pixels, min_gain=0.0)
         found = refine_pose(tiny_dive.truth, start, image, SEEN, settings)
         off[pixels] = pixels_off(tiny_dive, found.camera)
-    print(off)
     assert off["all"] < 0.1
     assert off["all"] < 0.5 * off["edges"]
 

@@ -87,10 +87,12 @@ def refine_pose(
             adam.step()
         done = until
     progress("refining a pose", settings.steps, settings.steps)
+    last = looks[-1]
     with torch.no_grad():
-        start, end = (float(looks[-1].loss(d)) for d in (first, delta))
-        if looks[-1].gain(first, delta) > settings.min_gain:
-            return RefinedPose(replace(camera, cam2world=looks[-1].pose(delta)[None]), start, end)
+        before, after, pose = last.differences(first), last.differences(delta), last.pose(delta)
+    start, end = float(last.mean(before)), float(last.mean(after))
+    if last.standard_errors(before - after) > settings.min_gain:
+        return RefinedPose(replace(camera, cam2world=pose[None]), start, end)
     return RefinedPose(camera, start, start)
 
 
@@ -110,8 +112,8 @@ class _Look:
         self._scene, self._now = scene, scene.normalized_time(time)
         self._canvas = camera.drawn(long_side)
         target, seen = undistorted(image, mask, camera, self._canvas)
-        self._whole = settings.pixels == "all"
-        wanted = seen if self._whole else edges(target, seen)
+        self._local = settings.pixels == "all"
+        wanted = seen if self._local else edges(target, seen)
         self._target, self._seen, self._wanted = (x.to(scene.device) for x in (target, seen, wanted))
         self._units = settings_in_scene_units(scene.settings, scene.length)
         self._primitives = in_sight(scene, self._canvas, self._now)
@@ -136,20 +138,10 @@ class _Look:
         return moved(self._canvas.cam2world[0], delta, self._scene.length)
 
     def loss(self, delta: Float[Tensor, "9"]) -> Float[Tensor, ""]:
-        """Mean absolute difference over the pixels that count."""
-        return self._differences(delta).sum() / self._wanted.sum()
+        """Mean absolute difference."""
+        return self.mean(self.differences(delta))
 
-    def gain(self, first: Float[Tensor, "9"], refined: Float[Tensor, "9"]) -> float:
-        """Fall of the loss in its standard errors, tiles of the image being independent."""
-        less = self._differences(first) - self._differences(refined)
-        less, count = (
-            avg_pool2d(x[None].float(), _TILE, ceil_mode=True, divisor_override=1) for x in (less, self._wanted)
-        )
-        mean = less.sum() / count.sum()
-        error = (less - mean * count).norm() / count.sum()
-        return float(mean / error) if error > 0 else 0.0
-
-    def _differences(self, delta: Float[Tensor, "9"]) -> Float[Tensor, "h w"]:
+    def differences(self, delta: Float[Tensor, "9"]) -> Float[Tensor, "h w"]:
         """Absolute difference at each pixel that counts, 0 elsewhere."""
         view = view_camera(replace(self._canvas, cam2world=self.pose(delta)[None])).to(self._scene.device)
         rgb = images(self._primitives, self._scene.field, view, self._units, self._now).rgb
@@ -157,9 +149,22 @@ class _Look:
         if self._scene.colors is not None:  # the frame has colors of its own: they say nothing about the pose
             rgb = fit_colors(rgb.detach()[self._seen], self._target[self._seen], _STAY)(rgb)
         off = rgb - self._target
-        if self._whole:
-            off = off - local_mean(off, self._seen, max(1.0, _SLOW * max(self._wanted.shape)))
+        if self._local:
+            off = off - local_mean(off, self._seen, max(1.0, _SLOW * max(self._seen.shape)))
         return off.abs().mean(-1) * self._wanted
+
+    def mean(self, values: Float[Tensor, "h w"]) -> Float[Tensor, ""]:
+        """Mean over the pixels that count."""
+        return values.sum() / self._wanted.sum()
+
+    def standard_errors(self, values: Float[Tensor, "h w"]) -> float:
+        """Mean over the pixels that count, in its standard errors as tiles of the image tell them; 0 of zeros."""
+        sums, counts = (
+            avg_pool2d(x[None].float(), _TILE, ceil_mode=True, divisor_override=1) for x in (values, self._wanted)
+        )
+        mean = self.mean(values)
+        error = (sums - mean * counts).norm() / self._wanted.sum()
+        return float(mean / error) if error > 0 else 0.0
 
 
 def local_mean(values: Float[Tensor, "h w c"], seen: Bool[Tensor, "h w"], sigma: float) -> Float[Tensor, "h w c"]:
