@@ -3,9 +3,9 @@
     python benchmarks/held_out_poses.py RUN...
 
 RUN is a finished run. Printed are means over its test frames, on measured ground: the median displacement between
-rendering and frame, and the PSNR after an affine map of colors; with the poses that refinement starts from, and
-refined on edges as 3R-GS has it, and on all pixels (`test.pixels`, of which refined poses that gain nothing are not
-taken).
+rendering and frame, and the PSNR after an affine map of colors; "-" where they have none. Poses are those that
+refinement starts from; refined on edges, whatever they gain, as in 3R-GS; and as the run's settings have it on all
+pixels.
 """
 
 import argparse
@@ -13,9 +13,14 @@ import tempfile
 from dataclasses import replace
 from pathlib import Path
 
+from swimm3r.evaluate import NotComputed
 from swimm3r.pipeline.finished_sfm import open_finished_sfm
 from swimm3r.pipeline.scores import held_out
 from swimm3r.splat.map_file import load_map
+
+
+def _number(value: float | NotComputed, digits: int) -> str:
+    return "-" if isinstance(value, NotComputed) else f"{value:.{digits}f}"
 
 
 def main() -> None:
@@ -23,7 +28,7 @@ def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("runs", nargs="+", type=Path)
     args = parser.parse_args()
-    print("| run | first poses: px, dB | edges: px, dB | all pixels: px, dB |")
+    print("| run | first poses: px, dB | edges, every gain: px, dB | all pixels: px, dB |")
     print("| --- | --- | --- | --- |", flush=True)
     for folder in args.runs:
         run = open_finished_sfm(folder)
@@ -39,7 +44,7 @@ def main() -> None:
             with tempfile.TemporaryDirectory() as views:
                 scored = held_out.score_views(scene, run.rec, run.frames, poses, Path(views), settings)
             covered = held_out.mean_part([view.covered for view in scored])
-            cells.append(f"{covered.flow_px:.3f}, {covered.psnr_affine:.2f}")
+            cells.append(f"{_number(covered.flow_px, 3)}, {_number(covered.psnr_affine, 2)}")
         print(f"| {folder.name} | {' | '.join(cells)} |", flush=True)
 
 

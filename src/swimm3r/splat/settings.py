@@ -280,7 +280,10 @@ class UwbsSettings(MapSettings):
 
 @dataclass(frozen=True)
 class PoseRefinementSettings(Settings):
-    """A camera refined against a frozen map (3R-GS's protocol for test frames, with the paper's 300 steps)."""
+    """A camera refined against a frozen map, by as many steps as the paper's test frames.
+
+    The protocol of 3R-GS, which the paper follows, has `pixels` "edges" and `min_gain` 0.
+    """
 
     steps: CountOrZero = 300
     """Number of refinement steps for the pose of each test frame; 0 keeps the first pose."""

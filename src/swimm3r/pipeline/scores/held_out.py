@@ -246,7 +246,8 @@ def protocol(views: Sequence[HeldOutView], settings: PoseRefinementSettings, col
     fit = "; each half in colors fitted on the other half, as frames differ in exposure" if colors else ""
     if colors is not None and colors.shading is not None:
         fit += ", and in gains over the image: halves of a chessboard"
-    return f"every 8th frame; poses {starts}, refined {settings.steps} steps on the frozen map{turned}{fit}"
+    by = "local differences of all pixels" if settings.pixels == "all" else "edges"
+    return f"every 8th frame; poses {starts}, refined {settings.steps} steps on the frozen map by {by}{turned}{fit}"
 
 
 def mean_scores(views: Sequence[HeldOutView]) -> ViewScores:
