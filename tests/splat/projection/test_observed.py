@@ -5,7 +5,7 @@ from dataclasses import replace
 import pytest
 import torch
 
-from swimm3r.cameras import Cameras
+from swimm3r.cameras import Cameras, resized
 from swimm3r.splat.map_file import load_map
 from swimm3r.splat.projection.observed import TrainingCoverage, coverage_from, coverage_of
 from swimm3r.splat.rendering import SplatMap
@@ -65,6 +65,23 @@ def test_what_a_mask_excludes_is_not_observed():
     observed = coverage(WALL, seen=admitted).of_view(looking_ahead(), WALL, torch.ones(HEIGHT, WIDTH))
     assert not observed[:, : WIDTH // 2 - 4].any()
     assert observed[:, WIDTH // 2 + 4 :].all()
+
+
+def test_a_hole_counts_from_two_and_a_half_pixels_of_the_small_images_on():
+    def holes(*corners: tuple[int, int], side: int) -> torch.Tensor:
+        """Pixels of ten times as fine a view that are unseen where squares of the small images were excluded."""
+        admitted = torch.ones(HEIGHT, WIDTH, dtype=torch.bool)
+        for row, column in corners:
+            admitted[row : row + side, column : column + side] = False
+        fine = resized(looking_ahead(), 10 * WIDTH, 10 * HEIGHT)
+        shape = (10 * HEIGHT, 10 * WIDTH)
+        return ~coverage(WALL, seen=admitted).of_view(fine, torch.full(shape, 3.0), torch.ones(shape))
+
+    assert not holes((10, 20), side=1).any()
+    large = holes((10, 20), side=4)
+    assert large[105:135, 205:235].all()
+    assert not large[:, :190].any()
+    assert holes((0, 20), side=2)[:12, 205:215].all()  # the border cuts it: it may go on
 
 
 def test_open_water_is_observed_where_a_frame_looked_into_it():

@@ -24,6 +24,7 @@ _DEEP, _BESIDE = 1.3, 0.15  # of depth and of the image, how far primitives may 
 _FAR = 8.0  # largest depths, where open water is asked for
 _AT_ONCE = 32  # frames
 _STRIDE = 4  # pixels between the rays that are asked
+_SMALL = 0.0015  # of the image, below which a hole is none in what frames saw: 2.5 pixels of the small images across
 
 
 @dataclass(frozen=True)
@@ -81,8 +82,9 @@ class TrainingCoverage:
         grid = pixel_grid(height, width)[few, few].reshape(1, -1, 2).double()
         here = replace(camera, cam2world=camera.cam2world.double().cpu(), K=camera.K.double().cpu())
         seen = self.sees(unproject(here, grid, z)[0], here.centers[0]).reshape(near.shape)
-        most = avg_pool2d(seen[None, None].float(), 3, stride=1, padding=1, count_include_pad=False)
-        return interpolate(most, (height, width), mode="nearest")[0, 0] > 0.5
+        most = avg_pool2d(seen[None, None].float(), 3, stride=1, padding=1, count_include_pad=False)[0, 0] > 0.5
+        whole = _without_small_holes(most)
+        return interpolate(whole[None, None].float(), (height, width), mode="nearest")[0, 0] > 0.5
 
     def tensors(self) -> dict[str, Tensor]:
         """The record as a map's file keeps it: -1 in open water, as files hold finite numbers only."""
@@ -127,6 +129,17 @@ def coverage_of(
     farthest = _spread(torch.where(surface, z, 0.0), 3)
     z = torch.where(open_water, torch.inf, farthest)[:, 0]
     return TrainingCoverage(cameras, torch.where(torch.stack(list(admitted)), z, 0.0).half().float())
+
+
+def _without_small_holes(seen: Bool[Tensor, "h w"]) -> Bool[Tensor, "h w"]:
+    """The mask with small holes filled: a mean over depths, as before open water, is beside what frames saw."""
+    import cv2
+
+    height, width = seen.shape
+    _, groups, boxes, _ = cv2.connectedComponentsWithStats((~seen).byte().numpy(), connectivity=4)
+    left, top, across, down, size = boxes.T
+    cut = (left == 0) | (top == 0) | (left + across == width) | (top + down == height)  # they may go on
+    return seen | torch.from_numpy((~cut & (size < _SMALL * seen.numel()))[groups])
 
 
 def _spread(image: Float[Tensor, "n 1 h w"], size: int) -> Float[Tensor, "n 1 h w"]:
