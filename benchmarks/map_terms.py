@@ -26,7 +26,7 @@ from swimm3r.pipeline.scores.held_out import FirstPose
 from swimm3r.splat.settings import PoseRefinementSettings, SggSettings, UwbsSettings
 
 COLUMNS = (*OF_ABLATION, *columns("T_D_abs", "B_abs"))  # the last two of synthetic dives
-TERMS = ("medium_prior", "in_front", "coverage", "open_water", "gamut")
+TERMS = ("medium_prior", "in_front", "guess", "coverage", "open_water", "gamut")
 _SEEDS_APART = 1_000
 
 

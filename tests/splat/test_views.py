@@ -10,7 +10,7 @@ from swimm3r.errors import InputError
 from swimm3r.io.images import write_rgb
 from swimm3r.scene.frames import Frame, Frames
 from swimm3r.scene.reconstruction import DepthMap, DepthMaps
-from swimm3r.splat.settings import UwbsSettings
+from swimm3r.splat.settings import LossWeights, UwbsSettings
 from swimm3r.splat.views import TrainingViews, median_z_depth, smaller, working_scale
 
 
@@ -61,6 +61,31 @@ def test_what_is_not_open_water_is_a_surface_where_depth_tells_the_two_apart(tin
     assert torch.equal(measured.surface, surface)
     hardly = replace(measured, z_depth=torch.where(rows < h // 20, 2.0, 0.0))
     assert torch.equal(hardly.surface, rows < h // 20)
+
+
+def test_depth_is_guessed_where_a_surface_has_none_and_only_if_asked_for(tiny_dive, tmp_path):
+    """A plane, seen at a slant: what is filled in lies on it."""
+    rng = torch.Generator().manual_seed(0)
+    write_rgb(tmp_path / "a.png", (0.3 + 0.05 * torch.rand(64, 96, 3, generator=rng)).numpy())
+    plane = 1 / (0.2 + 0.002 * torch.arange(96.0)).expand(64, 96)
+    gap = torch.zeros(64, 96, dtype=torch.bool)
+    gap[20:44, 30:60] = True
+    depth = DepthMaps(tmp_path / "z_depth")
+    depth.write("a.png", DepthMap(torch.where(gap, 0.0, plane), torch.ones(64, 96)))
+    frames = Frames((Frame("a.png", tmp_path / "a.png", 0.0, 1.0, "train"),), 96, 64, True)
+    rec = replace(tiny_dive.rec, names=("a.png",), cameras=lens(96, 64, 0.0), depth=depth, cloud=None, medium=None)
+    view = TrainingViews(rec, frames, UwbsSettings(), 2.0)[0]
+    assert view.guessed_z_depth is not None
+    surface = gap & ~view.open_water
+    assert surface[gap].float().mean() > 0.9
+    assert torch.equal(view.guessed_z_depth > 0, surface)
+    ratio = view.guessed_z_depth[surface] / (2 * plane[surface])
+    assert (ratio.log().abs() < 0.05).all()
+    guessed = smaller(view, 2).guessed_z_depth
+    assert guessed is not None
+    assert guessed.shape == (32, 48)
+    unasked = UwbsSettings(weights=LossWeights(guess=0.0))
+    assert TrainingViews(rec, frames, unasked, 2.0)[0].guessed_z_depth is None
 
 
 def test_a_rendering_may_be_brighter_than_values_that_are_clipped(tiny_dive, tmp_path):

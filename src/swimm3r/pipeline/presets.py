@@ -133,6 +133,7 @@ PAPER = UwbsSettings(  # Eq. 18 and nothing else; where the paper is silent UBS'
         max_radius_width=0,  # 256 pixels are printed, of no particular width
         medium_prior=0.0,
         in_front=0.0,
+        guess=0.0,
         coverage=0.0,
         open_water=0.0,
         gamut=0.0,

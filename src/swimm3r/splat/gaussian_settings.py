@@ -108,6 +108,11 @@ class GaussianSettings(MapSettings):
         """True where training reads measured depth."""
         return False
 
+    @property
+    def guesses_depth(self) -> bool:
+        """True where training asks for a guess at depth that was not measured."""
+        return False
+
 
 @dataclass(frozen=True)
 class McmcSettings(RefineSettings):

@@ -123,7 +123,7 @@ class LearningRates(Settings):
 
 @dataclass(frozen=True)
 class LossWeights(Settings):
-    """Weights of the objective (Eq. 18) and of six terms beyond it."""
+    """Weights of the objective (Eq. 18) and of seven terms beyond it."""
 
     ssim: Share = 0.2
     """Weight of D-SSIM against L1 in the image loss (Eq. 14)."""
@@ -155,6 +155,10 @@ class LossWeights(Settings):
     """Image width in pixels that `max_radius` refers to; 0 is that of the training images."""
     in_front: NotNegative = 1.0
     """Weight of the squared relative distance of the map in front of measured depth; 0 is the paper's objective."""
+    guess: NotNegative = 1.0
+    """Weight of the map's distance from depth that is guessed where none is known; 0 is the paper's objective."""
+    guess_slack: Annotated[float, Range(1, 10)] = 1.1
+    """Factor by which the map may be off guessed depth at no cost."""
     coverage: NotNegative = 0.05
     """Weight of the light that passes a surface of known depth, which keeps surfaces opaque; 0 is the paper's
     objective."""
@@ -277,6 +281,11 @@ class UwbsSettings(MapSettings):
         """True where training reads measured depth."""
         return True
 
+    @property
+    def guesses_depth(self) -> bool:
+        """True where training asks for a guess at depth that was not measured."""
+        return self.weights.guess > 0
+
 
 @dataclass(frozen=True)
 class PoseRefinementSettings(Settings):
@@ -376,7 +385,8 @@ def with_primitives(settings: OfRecipe, share: float) -> OfRecipe:
 
 
 _BEYOND_UBS = (
-    "depth", "medium_smoothness", "radius", "medium_prior", "in_front", "coverage", "open_water", "gamut", "hidden"
+    "depth", "medium_smoothness", "radius",
+    "medium_prior", "in_front", "guess", "coverage", "open_water", "gamut", "hidden",
 )  # fmt: skip
 _SHORT = 10_000
 """Runs shorter than this give the peers what they would else lack the time for. WaterSplatting's Gaussians start at an

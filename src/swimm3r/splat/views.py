@@ -1,12 +1,14 @@
 """Training views of a map: undistorted images of one size, their masks and depth, in working units.
 
 Every frame becomes a pinhole image with its own K at the training size. Depth along the optical axis is the same
-number on both grids. Time runs from 0 at the clip's first frame to 1 at its last, test frames included. Pixels
+number on both grids. Where it is unknown and a surface is shown, it is guessed from its surroundings, if training asks
+for that. Time runs from 0 at the clip's first frame to 1 at its last, test frames included. Pixels
 that the frame does not show, or its mask excludes, are not `seen` and take no part in any loss; of values that are
 clipped a rendering may be brighter.
 """
 
 from dataclasses import dataclass, replace
+from functools import cached_property
 
 import numpy as np
 import torch
@@ -20,15 +22,19 @@ from swimm3r.cameras import Cameras, image_directions, pixel_grid, resized, unpr
 from swimm3r.devices import CPU
 from swimm3r.errors import InputError
 from swimm3r.imaging.clipped import clipped
+from swimm3r.imaging.depth_completion import fill_z_depth
 from swimm3r.imaging.open_water import sea_share, without_fringe
 from swimm3r.imaging.undistortion import nearest_pixels, undistorted
 from swimm3r.io.files.cache import ArrayCache
 from swimm3r.scene.frames import Frames
-from swimm3r.scene.reconstruction import Reconstruction
+from swimm3r.scene.point_groups import PointGroups
+from swimm3r.scene.reconstruction import DepthMap, Reconstruction
 from swimm3r.splat.ground import Window
 from swimm3r.splat.settings import SplatSettings
 
 _MEASURED = 0.1  # share of an image below which its known depth is too little to tell water from the rest
+_STEP = 4  # pixels between those of which filled-in depth is kept
+_CONFIDENCE = 0.5  # of known depth beside that of other images, where unknown depth is guessed
 
 
 @dataclass(frozen=True)
@@ -43,6 +49,7 @@ class TrainingView:
     open_water: Bool[Tensor, "h w"]  # looks past every surface; nowhere where depth is not read
     time: Float[Tensor, ""] | None = None  # of the clip, 0..1; static maps do not ask
     clipped: Bool[Tensor, "3 h w"] | None = None  # None where no value is
+    guessed_z_depth: Float[Tensor, "h w"] | None = None  # working units, 0 where depth is known or none; None unasked
 
     def compared(self, render: Float[Tensor, "3 h w"]) -> Bool[Tensor, "h w"] | Bool[Tensor, "3 h w"]:
         """Mask of the values that a rendering has to match: those seen, but clipped ones that it exceeds."""
@@ -84,6 +91,7 @@ class TrainingViews:
                 hint="the folder of images the reconstruction was made of",
             )
         self._cache = ArrayCache(max_bytes=768 << 20)
+        self._filled: dict[str, Tensor] = {}  # small, and takes longer to make than all else of a view
 
     @property
     def times(self) -> list[float]:
@@ -118,11 +126,17 @@ class TrainingViews:
                 inside = self._inside(self.window, canvas, z_depth) | open_water
                 seen, z_depth = seen & inside, torch.where(inside, z_depth, 0.0)
             full = np.asarray(bool(clipped(torch.from_numpy(stored) / 255).any()))
+            if self.settings.guesses_depth and name not in self._filled:
+                self._filled[name] = self._filled_in(canvas, rgb, seen & ~open_water, z_depth)
             return stored, seen.numpy(), z_depth.half().numpy(), open_water.numpy(), full
 
-        stored, *kept, full = self._cache.get(name, make)
-        stored, seen, z_depth, open_water = (torch.tensor(values, device=device) for values in (stored, *kept))
+        *kept, full = self._cache.get(name, make)
+        stored, seen, z_depth, open_water = (torch.tensor(values, device=device) for values in kept)
         rgb = stored.float() / 255
+        guessed = None
+        if self.settings.guesses_depth:
+            everywhere = _enlarged(self._filled[name].to(device).float(), *z_depth.shape)
+            guessed = torch.where(seen & ~open_water & (z_depth == 0), everywhere, 0.0)
         return TrainingView(
             name,
             _in_working_units(canvas, self.scale),
@@ -132,7 +146,26 @@ class TrainingViews:
             open_water,
             self._times[name].to(device),
             clipped(rgb) if full else None,
+            guessed,
         )
+
+    def _filled_in(
+        self, canvas: Cameras, rgb: Float[Tensor, "h w 3"], surface: Bool[Tensor, "h w"], z_depth: Float[Tensor, "h w"]
+    ) -> Float[Tensor, "rows columns"]:
+        """Depth from what is known beside a pixel and from what other images measured, of every `_STEP`-th pixel; 0
+        where too little is known."""
+        few = [(torch.arange(0, size, _STEP) + _STEP // 2).clamp(max=size - 1) for size in z_depth.shape]
+        known = z_depth > 0
+        if float(known.float().mean()) < _MEASURED:
+            return torch.zeros(len(few[0]), len(few[1]), dtype=torch.float16)
+        depth = DepthMap(z_depth, _CONFIDENCE * known.float())
+        elsewhere = None if self._cloud is None else self._cloud.z_depth(canvas) * self.scale
+        return fill_z_depth(rgb, depth, 1 - surface.float(), elsewhere)[few[0][:, None], few[1]].half()
+
+    @cached_property
+    def _cloud(self) -> PointGroups | None:
+        """Points that any image measured; None of a reconstruction without a dense cloud."""
+        return None if self.rec.cloud is None else PointGroups(self.rec.cloud.xyz)
 
     def _depth(
         self, name: str, lens: Cameras, canvas: Cameras, rgb: Float[Tensor, "h w 3"], seen: Bool[Tensor, "h w"]
@@ -190,7 +223,13 @@ def smaller(view: TrainingView, divisor: int) -> TrainingView:
     if view.clipped is not None:
         full = interpolate(view.clipped[None].float(), (height, width), mode="area")[0] > 0
     camera = resized(view.camera, width, height)
-    return TrainingView(view.name, camera, rgb, seen, z_depth, open_water, view.time, full)
+    guessed = None if view.guessed_z_depth is None else view.guessed_z_depth[row[:, None], column]
+    return TrainingView(view.name, camera, rgb, seen, z_depth, open_water, view.time, full, guessed)
+
+
+def _enlarged(small: Float[Tensor, "rows columns"], height: int, width: int) -> Float[Tensor, "h w"]:
+    """An image of every `_STEP`-th pixel at the size that it was taken from."""
+    return small.repeat_interleave(_STEP, 0).repeat_interleave(_STEP, 1)[:height, :width]
 
 
 def _in_working_units(cameras: Cameras, scale: float) -> Cameras:

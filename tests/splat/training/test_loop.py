@@ -2,6 +2,7 @@
 
 import copy
 import json
+import math
 from dataclasses import replace
 from pathlib import Path
 
@@ -155,7 +156,9 @@ def test_the_number_of_primitives_never_exceeds_the_cap(tiny_dive, tmp_path):
 
 def test_the_objective_is_the_papers_sum_with_the_papers_weights(tiny_dive):
     paper = UwbsSettings(
-        weights=LossWeights(in_front=0.0, coverage=0.0, open_water=0.0, gamut=0.0, hidden=0.0, max_radius=100.0)
+        weights=LossWeights(
+            in_front=0.0, guess=0.0, coverage=0.0, open_water=0.0, gamut=0.0, hidden=0.0, max_radius=100.0
+        )
     )
     view = TrainingViews(tiny_dive.rec, tiny_dive.frames, paper, 1.0)[3]
     p = tiny_dive.truth.primitives
@@ -185,6 +188,22 @@ def test_a_map_in_front_of_measured_depth_costs_its_weight(tiny_dive):
         totals.append(float(loss.total))
     assert float(found["in_front"]) == pytest.approx((1 / 0.9 - 1) ** 2, rel=0.3)
     assert totals[1] - totals[0] == pytest.approx(2.0 * float(found["in_front"]), rel=1e-4)
+
+
+def test_a_map_off_guessed_depth_costs_its_weight(tiny_dive):
+    totals, found = [], {}
+    for weight in (1.0, 3.0):
+        settings = UwbsSettings(weights=LossWeights(guess=weight))
+        view = TrainingViews(tiny_dive.rec, tiny_dive.frames, settings, 1.0)[3]
+        known = view.z_depth.clone()
+        known[:, : known.shape[1] // 2] = 0  # the map is as far as they were; the guess is twice as far
+        view = replace(view, z_depth=known, guessed_z_depth=torch.where(known > 0, 0.0, 2 * view.z_depth))
+        drawing = draw(tiny_dive.truth.primitives, tiny_dive.truth.field, view_camera(view.camera), settings)
+        loss = uwbs.objective(tiny_dive.truth.primitives, drawing, view, settings, None, regularized=False)
+        found = loss.numbers
+        totals.append(float(loss.total))
+    assert float(found["off_guess"]) == pytest.approx(math.log(2 / 1.1) ** 2 / 2, rel=0.2)
+    assert totals[1] - totals[0] == pytest.approx(2.0 * float(found["off_guess"]), rel=1e-4)
 
 
 def test_mcmc_noise_comes_with_every_step_where_asked(tiny_dive):

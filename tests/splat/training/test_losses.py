@@ -97,7 +97,11 @@ def test_a_image_without_known_depth_has_no_depth_error():
     assert losses.depth_error(images, z + 1, torch.zeros(2, 2), 0.5) == 0  # every weight underflows
 
 
-@pytest.mark.parametrize("loss", [losses.depth_error, losses.in_front])
+def off_guess(images: RasterOutput, z_depth: torch.Tensor, weight: torch.Tensor, least_alpha: float) -> torch.Tensor:
+    return losses.off_guess(images, z_depth * weight, 1.05, least_alpha)
+
+
+@pytest.mark.parametrize("loss", [losses.depth_error, losses.in_front, off_guess])
 def test_the_depth_gradients_agree_with_finite_differences(loss):
     rng = torch.Generator().manual_seed(0)
     z, prior = (2 + torch.rand(4, 5, generator=rng, dtype=torch.float64) for _ in range(2))
@@ -123,6 +127,19 @@ def test_a_map_counts_in_front_of_measured_depth_and_not_behind_it():
     assert (slope[0, :2] < 0).all()  # farther is better
     assert (slope[0, 2:] == 0).all()
     assert losses.in_front(images, torch.zeros(1, 5), weight, 0.5) == 0
+
+
+def test_a_map_is_held_to_a_guess_from_both_sides_and_with_slack():
+    guess = torch.tensor([[4.0, 4.0, 4.0, 4.0, 0.0, 4.0]])
+    z = torch.tensor([[2.0, 3.8, 4.2, 8.0, 1.0, 1.0]])
+    alpha = torch.tensor([[0.8, 0.6, 0.9, 0.7, 0.9, 0.2]])  # the last is hardly covered
+    images = RasterOutput(torch.zeros(3, 1, 6), torch.zeros(3, 1, 6), (z * alpha).requires_grad_(), alpha)
+    found = losses.off_guess(images, guess, 1.1, 0.5)
+    assert found.item() == pytest.approx(2 * math.log(2 / 1.1) ** 2 / 6, rel=1e-5)  # of the whole image
+    (slope,) = torch.autograd.grad(found, images.z_depth)
+    assert slope[0, 0] < 0 < slope[0, 3]
+    assert (slope[0, [1, 2, 4, 5]] == 0).all()
+    assert losses.off_guess(images, torch.zeros(1, 6), 1.1, 0.5) == 0
 
 
 def test_a_surface_that_is_known_is_to_be_opaque_and_open_water_is_not():

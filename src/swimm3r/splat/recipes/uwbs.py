@@ -3,9 +3,9 @@
 L = L_3DGS + lambda_opa L_opa + lambda_scale L_scale + lambda_depth L_depth + lambda_smooth L_smooth + lambda_rad L_rad
 
 and, beyond the paper, terms that hold the water to what structure from motion measured (`LossWeights.medium_prior`),
-the map no nearer than what was measured (`in_front`), known surfaces opaque (`coverage`), open water empty
-(`open_water`), clear colors to those that there are (`gamut`) and, in channels that the water hides, to those that the
-others let expect (`hidden`).
+the map no nearer than what was measured (`in_front`) and near what was guessed (`guess`), known surfaces opaque
+(`coverage`), open water empty (`open_water`), clear colors to those that there are (`gamut`) and, in channels that the
+water hides, to those that the others let expect (`hidden`).
 """
 
 import copy
@@ -252,6 +252,10 @@ def objective(
     total = total + w.in_front * in_front + w.coverage * open_share + w.open_water * on_water
     total = total + w.gamut * outside + w.hidden * hidden
     numbers = {"l1": photo.l1, "ssim": photo.ssim, "depth": depth_error, "medium_smoothness": smooth, "radius": large}
+    if view.guessed_z_depth is not None:
+        off_guess = losses.off_guess(drawing.images, view.guessed_z_depth, w.guess_slack, w.depth_alpha)
+        total = total + w.guess * off_guess
+        numbers |= {"off_guess": off_guess}
     numbers |= {"in_front": in_front, "uncovered": open_share, "drawn_on_water": on_water}
     numbers |= {"outside_gamut": outside, "hidden": hidden}
     if prior is not None:

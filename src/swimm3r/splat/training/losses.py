@@ -1,5 +1,6 @@
 """The terms of Eq. 18, each a mean; `recipes.uwbs` weighs and adds them. Images are channels first."""
 
+import math
 from dataclasses import dataclass
 from typing import Any
 
@@ -148,6 +149,20 @@ def in_front(
     """
     inverse, w = _where_known(images, z_depth, weight, least_alpha)
     return (w * (z_depth * inverse - 1).clamp(min=0).square()).sum()
+
+
+def off_guess(
+    images: RasterOutput, z_depth: Float[Tensor, "h w"], slack: float, least_alpha: float
+) -> Float[Tensor, ""]:
+    """Mean over the image of max(|ln(D^ / D)| - ln slack, 0)^2, D a guessed depth, 0 where there is none.
+
+    A guess is no measurement: off by the factor `slack` at most, it costs nothing. Where few pixels are guessed, few
+    count, as what they show is seen by hardly any image and has little else to hold it.
+    """
+    counted = (z_depth > 0) & (images.alpha.detach() > least_alpha)
+    nearness = z_depth * images.alpha / images.z_depth.clamp(min=_NEAREST * least_alpha)
+    off = torch.where(counted, nearness, 1.0).log().abs() - math.log(slack)
+    return off.clamp(min=0).square().mean()
 
 
 def _where_known(
