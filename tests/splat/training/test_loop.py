@@ -190,6 +190,19 @@ def test_a_map_in_front_of_measured_depth_costs_its_weight(tiny_dive):
     assert totals[1] - totals[0] == pytest.approx(2.0 * float(found["in_front"]), rel=1e-4)
 
 
+def test_maps_of_gray_frames_are_gray(tiny_dive, tmp_path):
+    rendered = {}
+    for gray in (True, False):
+        frames = replace(tiny_dive.frames, gray=gray)
+        scene = train(tiny_dive.rec, frames, SETTINGS, tmp_path / str(gray))
+        out = scene.render(tiny_dive.rec.cameras[3])
+        rendered[gray] = torch.cat([out.rgb, out.clear], -1).unflatten(-1, (2, 3))
+    apart = {gray: float((image - image.mean(-1, keepdim=True)).abs().max()) for gray, image in rendered.items()}
+    assert apart[True] < 1e-6
+    assert apart[False] > 0.01
+    assert rendered[True].std() > 0.01
+
+
 def test_a_map_off_guessed_depth_costs_its_weight(tiny_dive):
     totals, found = [], {}
     for weight in (1.0, 3.0):

@@ -73,6 +73,18 @@ class MediumField(nn.Module):
         raw = self.network(features)
         return torch.cat([sigmoid(raw[..., :3]), softplus(raw[..., 3:]) / self.length], -1).permute(2, 0, 1)
 
+    @torch.no_grad()
+    def keep_gray(self) -> None:
+        """Make the channels alike, in place, as the mean of them."""
+        if self.is_clear:
+            return
+        last = self.network[-1]
+        assert isinstance(last, nn.Linear)
+        for values in (last.weight, last.bias):
+            if values is not None:
+                channels = values.unflatten(0, (3, 3))  # of Binf, beta_B and beta_D
+                channels.copy_(channels.mean(1, keepdim=True).expand_as(channels))
+
 
 def medium_network(settings: MediumFieldSettings, outputs: int, inputs: int = HARMONICS) -> nn.Sequential:
     """The layers that settings ask for."""

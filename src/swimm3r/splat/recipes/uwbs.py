@@ -131,7 +131,10 @@ class Uwbs:
 
     @torch.no_grad()
     def _descend(self, state: State, adjoint: _Adjoint, rates: dict[str, float], step: int) -> None:
-        """Adam's step in place, the centers' displacement multiplied (Alg. 1), and noise where every step has it."""
+        """Adam's step in place, the centers' displacement multiplied (Alg. 1), and noise where every step has it.
+
+        What the images leave open drifts apart in the channels of gray frames, so that these are kept alike.
+        """
         parameters = parameters_of(state.primitives, state.field, state.poses)
         xyz, multiplier = parameters["xyz"], adjoint.multiplier
         before = None if multiplier is None else xyz.clone()
@@ -142,6 +145,9 @@ class Uwbs:
                 parameters[name][held.rows] = values
         if multiplier is not None and before is not None:
             xyz.sub_(before).mul_(multiplier[:, None]).add_(before)
+        if self.scene.views.frames.gray:
+            state.primitives.rgb.copy_(state.primitives.rgb.mean(-1, keepdim=True).expand(-1, 3))
+            state.field.keep_gray()
         if self.settings.densify.noise_cadence == "step":
             rng = loop.generator(self.settings.seed, step, 8)
             xyz.add_(self._noise(state.primitives, rates["xyz"], rng))
