@@ -5,7 +5,7 @@ import torch
 from jaxtyping import Bool, Float
 from torch import Tensor
 
-from swimm3r.imaging.depth_completion import fill_z_depth
+from swimm3r.imaging.depth_completion import fill_z_depth, unlike
 from swimm3r.scene.reconstruction import DepthMap
 
 GRAY = torch.full((72, 96, 3), 0.5)
@@ -86,3 +86,18 @@ def test_holes_in_what_lies_in_front_are_part_of_it():
     gap = gap_at(slice(90, 91), slice(180, 182)) | gap_at(slice(63, 65), slice(120, 121))
     filled = filled_around_rock(torch.full((216, 288, 3), 0.5), gap)
     assert (filled[gap] / NEAR).log().abs().max() < 0.1
+
+
+def test_a_rod_before_mottled_sand_is_another_thing_and_more_sand_is_none():
+    draw = torch.Generator().manual_seed(0)
+    image = torch.tensor([0.4, 0.5, 0.45]) + 0.05 * torch.randn(120, 160, 3, generator=draw)
+    image[:, :80] += 0.1  # lit more brightly: the surroundings decide
+    rod = torch.zeros(120, 160, dtype=torch.bool)
+    rod[50:60, 30:130] = True
+    image[rod] = 0.08
+    known = torch.ones(120, 160, dtype=torch.bool)
+    known[40:70] = False
+    odd = unlike(image, known, ~known)
+    assert odd[rod].float().mean() > 0.95
+    assert odd[~known & ~rod].float().mean() < 0.03
+    assert not odd[known].any()

@@ -25,6 +25,8 @@ _HOLE = 0.015  # of the long side: gaps as narrow between parts of a surface in 
 _IN_FRONT = 0.9  # as open water, that surfaces in front are for what lies behind: it hardly goes on from them
 _LIKELIER = 1.0  # logarithm of the ratio of likelihoods above which a gap has the colors of the surface in front
 _COLOR_NOISE = 0.01  # standard deviation of colors of an even surface
+_AROUND = 0.1  # of the long side, the standard deviation of the window in which colors are like those of a surface
+_CHI_SQUARED_99 = 11.34  # of three channels
 
 
 @dataclass(frozen=True)
@@ -126,16 +128,40 @@ def _log_likelihood(
     image: Float[Tensor, "h w 3"], surface: Bool[Tensor, "h w"], asked: Bool[Tensor, "h w"]
 ) -> Float[Tensor, " n"]:
     """Logarithm of the likelihood of the asked pixels' colors, normally distributed as those of a surface close by."""
+    off, covariance = _beside_colors(image, surface, asked, _REACH / 2)
+    return -0.5 * _squared(off, covariance) - 0.5 * torch.linalg.slogdet(covariance).logabsdet
+
+
+def unlike(
+    image: Float[Tensor, "h w 3"], surface: Bool[Tensor, "h w"], asked: Bool[Tensor, "h w"]
+) -> Bool[Tensor, "h w"]:
+    """Mask of the asked pixels whose colors hardly any pixel of a surface around them has (1 in 100 at most).
+
+    They show another thing, as a rod in front of sand does. Colors are taken to be normally distributed.
+    """
+    found = torch.zeros_like(asked)
+    found[asked] = _squared(*_beside_colors(image, surface, asked, _AROUND)) > _CHI_SQUARED_99
+    return found
+
+
+def _beside_colors(
+    image: Float[Tensor, "h w 3"], surface: Bool[Tensor, "h w"], asked: Bool[Tensor, "h w"], reach: float
+) -> tuple[Float[Tensor, "n 3"], Float[Tensor, "n 3 3"]]:
+    """Colors of the asked pixels less the mean of a surface's around them, and the covariance of these; `reach` is the
+    standard deviation of the window, a share of the long side."""
     products = (image[..., :, None] * image[..., None, :]).flatten(2)
     moments = torch.cat([torch.ones_like(image[..., :1]), image, products], -1) * surface[..., None]
-    cells = blur(on_grid(moments.permute(2, 0, 1)).permute(1, 2, 0), _REACH * _COARSE / 2).permute(2, 0, 1)
+    cells = blur(on_grid(moments.permute(2, 0, 1)).permute(1, 2, 0), reach * _COARSE).permute(2, 0, 1)
     around = torch.nn.functional.interpolate(cells[None], surface.shape, mode="bilinear", align_corners=False)[0]
     share, mean, square = around[:, asked].T.double().split([1, 3, 9], -1)
     mean, square = mean / share.clamp(min=1e-9), (square / share.clamp(min=1e-9)).unflatten(-1, (3, 3))
     covariance = square - mean[:, :, None] * mean[:, None, :] + _COLOR_NOISE**2 * torch.eye(3, dtype=torch.float64)
-    off = image[asked].double() - mean
-    whitened = torch.linalg.solve(covariance, off[:, :, None])[:, :, 0]
-    return -0.5 * (off * whitened).sum(-1) - 0.5 * torch.linalg.slogdet(covariance).logabsdet
+    return image[asked].double() - mean, covariance
+
+
+def _squared(off: Float[Tensor, "n 3"], covariance: Float[Tensor, "n 3 3"]) -> Float[Tensor, " n"]:
+    """Squared Mahalanobis distance."""
+    return (off * torch.linalg.solve(covariance, off[:, :, None])[:, :, 0]).sum(-1)
 
 
 def _continued(

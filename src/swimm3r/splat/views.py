@@ -22,7 +22,7 @@ from swimm3r.cameras import Cameras, image_directions, pixel_grid, resized, unpr
 from swimm3r.devices import CPU
 from swimm3r.errors import InputError
 from swimm3r.imaging.clipped import clipped
-from swimm3r.imaging.depth_completion import fill_z_depth
+from swimm3r.imaging.depth_completion import fill_z_depth, unlike
 from swimm3r.imaging.open_water import sea_share, without_fringe
 from swimm3r.imaging.undistortion import nearest_pixels, undistorted
 from swimm3r.io.files.cache import ArrayCache
@@ -153,14 +153,16 @@ class TrainingViews:
         self, canvas: Cameras, rgb: Float[Tensor, "h w 3"], surface: Bool[Tensor, "h w"], z_depth: Float[Tensor, "h w"]
     ) -> Float[Tensor, "rows columns"]:
         """Depth from what is known beside a pixel and from what other images measured, of every `_STEP`-th pixel; 0
-        where too little is known."""
+        where too little is known, and where colors are of another thing than what is known around them."""
         few = [(torch.arange(0, size, _STEP) + _STEP // 2).clamp(max=size - 1) for size in z_depth.shape]
         known = z_depth > 0
         if float(known.float().mean()) < _MEASURED:
             return torch.zeros(len(few[0]), len(few[1]), dtype=torch.float16)
         depth = DepthMap(z_depth, _CONFIDENCE * known.float())
         elsewhere = None if self._cloud is None else self._cloud.z_depth(canvas) * self.scale
-        return fill_z_depth(rgb, depth, 1 - surface.float(), elsewhere)[few[0][:, None], few[1]].half()
+        filled = fill_z_depth(rgb, depth, 1 - surface.float(), elsewhere)
+        told = surface & ~unlike(rgb, known, surface & ~known)
+        return torch.where(told, filled, 0.0)[few[0][:, None], few[1]].half()
 
     @cached_property
     def _cloud(self) -> PointGroups | None:
