@@ -2,12 +2,14 @@
 
 from dataclasses import replace
 
+import numpy as np
 import pytest
 import torch
 
 from swimm3r.cameras import Cameras
 from swimm3r.errors import InputError
-from swimm3r.io.images import write_rgb
+from swimm3r.io.images import write_levels, write_rgb
+from swimm3r.scene.frame_changes import MovingMasks
 from swimm3r.scene.frames import Frame, Frames
 from swimm3r.scene.reconstruction import DepthMap, DepthMaps
 from swimm3r.splat.settings import LossWeights, UwbsSettings
@@ -84,6 +86,16 @@ def test_depth_is_guessed_where_a_surface_has_none_and_only_if_asked_for(tiny_di
     guessed = smaller(view, 2).guessed_z_depth
     assert guessed is not None
     assert guessed.shape == (32, 48)
+    moving = MovingMasks(tmp_path / "masks")
+    moving.folder.mkdir()
+    still = torch.ones(64, 96)
+    still[20:44, 30:45] = 0
+    write_levels(moving.path("a.png"), (still * 65535).numpy().astype(np.uint16))
+    shown = TrainingViews(replace(rec, moving=moving), frames, UwbsSettings(), 2.0)[0]  # by a dynamic map
+    assert shown.seen.all()
+    assert shown.guessed_z_depth is not None
+    assert not shown.guessed_z_depth[20:44, 30:44].any()
+    assert (shown.guessed_z_depth[20:44, 48:60] > 0).float().mean() > 0.9
     unasked = UwbsSettings(weights=LossWeights(guess=0.0))
     assert TrainingViews(rec, frames, unasked, 2.0)[0].guessed_z_depth is None
 

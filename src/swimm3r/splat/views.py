@@ -127,7 +127,9 @@ class TrainingViews:
                 seen, z_depth = seen & inside, torch.where(inside, z_depth, 0.0)
             full = np.asarray(bool(clipped(torch.from_numpy(stored) / 255).any()))
             if self.settings.guesses_depth and name not in self._filled:
-                self._filled[name] = self._filled_in(canvas, rgb, seen & ~open_water, z_depth)
+                row, column = nearest_pixels(lens, canvas)
+                ground = seen & ~open_water & self._still.mask(f)[row, column]
+                self._filled[name] = self._filled_in(canvas, rgb, ground, z_depth)
             return stored, seen.numpy(), z_depth.half().numpy(), open_water.numpy(), full
 
         *kept, full = self._cache.get(name, make)
@@ -150,19 +152,25 @@ class TrainingViews:
         )
 
     def _filled_in(
-        self, canvas: Cameras, rgb: Float[Tensor, "h w 3"], surface: Bool[Tensor, "h w"], z_depth: Float[Tensor, "h w"]
+        self, canvas: Cameras, rgb: Float[Tensor, "h w 3"], ground: Bool[Tensor, "h w"], z_depth: Float[Tensor, "h w"]
     ) -> Float[Tensor, "rows columns"]:
-        """Depth from what is known beside a pixel and from what other images measured, of every `_STEP`-th pixel; 0
-        where too little is known, and where colors are of another thing than what is known around them."""
+        """Depth of ground from what is known beside it and from what other images measured, at every `_STEP`-th pixel;
+        0 elsewhere, where too little is known, and where colors are of another thing than what is known around them.
+        """
         few = [(torch.arange(0, size, _STEP) + _STEP // 2).clamp(max=size - 1) for size in z_depth.shape]
         known = z_depth > 0
         if float(known.float().mean()) < _MEASURED:
             return torch.zeros(len(few[0]), len(few[1]), dtype=torch.float16)
         depth = DepthMap(z_depth, _CONFIDENCE * known.float())
         elsewhere = None if self._cloud is None else self._cloud.z_depth(canvas) * self.scale
-        filled = fill_z_depth(rgb, depth, 1 - surface.float(), elsewhere)
-        told = surface & ~unlike(rgb, known, surface & ~known)
+        filled = fill_z_depth(rgb, depth, 1 - ground.float(), elsewhere)
+        told = ground & ~unlike(rgb, known, ground & ~known)
         return torch.where(told, filled, 0.0)[few[0][:, None], few[1]].half()
+
+    @cached_property
+    def _still(self) -> Frames:
+        """The frames with masks of what moves, which dynamic maps show."""
+        return self.rec.still(self.frames)
 
     @cached_property
     def _cloud(self) -> PointGroups | None:

@@ -156,8 +156,8 @@ def off_guess(
 ) -> Float[Tensor, ""]:
     """Mean over the image of max(|ln(D^ / D)| - ln slack, 0)^2, D a guessed depth, 0 where there is none.
 
-    A guess is no measurement: off by the factor `slack` at most, it costs nothing. Where few pixels are guessed, few
-    count, as what they show is seen by hardly any image and has little else to hold it.
+    A guess is no measurement: off by the factor `slack` at most, the map is at no cost. As a mean over the image it
+    decides where images leave depth open, and gives way where several of them show it.
     """
     counted = (z_depth > 0) & (images.alpha.detach() > least_alpha)
     nearness = z_depth * images.alpha / images.z_depth.clamp(min=_NEAREST * least_alpha)
