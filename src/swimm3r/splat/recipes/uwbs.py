@@ -58,6 +58,7 @@ class Uwbs:
     settings: UwbsSettings
     scene: TrainingScene
     prior: WaterPrior | None = None  # None where the reconstruction has no water
+    gray: bool = False  # frames whose three channels are equal
 
     def start(self) -> State:
         """Primitives on the cloud, and the reconstruction's water in every direction."""
@@ -145,7 +146,7 @@ class Uwbs:
                 parameters[name][held.rows] = values
         if multiplier is not None and before is not None:
             xyz.sub_(before).mul_(multiplier[:, None]).add_(before)
-        if self.scene.views.frames.gray:
+        if self.gray:
             state.primitives.rgb.copy_(state.primitives.rgb.mean(-1, keepdim=True).expand(-1, 3))
             state.field.keep_gray()
         if self.settings.densify.noise_cadence == "step":
@@ -220,7 +221,7 @@ class Uwbs:
 
 def recipe(settings: UwbsSettings, scene: TrainingScene) -> Uwbs:
     """The recipe for one scene, held to the water that structure from motion measured."""
-    return Uwbs(settings, scene, known_water(scene, settings))
+    return Uwbs(settings, scene, known_water(scene, settings), scene.views.frames.gray)
 
 
 @dataclass(frozen=True)
