@@ -48,12 +48,21 @@ def test_what_the_water_lets_through_is_white_balanced():
 
 @pytest.mark.parametrize(
     "unseen",
-    [dict(z=0.0, alpha=0.0, beta_D=0.1), dict(z=50.0, alpha=1.0, beta_D=0.5)],
-    ids=["open water", "too far for any channel"],
+    [
+        dict(z=0.0, alpha=0.0, beta_D=0.1),
+        dict(z=0.01, alpha=0.5, beta_D=0.1),
+        dict(z=50.0, alpha=1.0, beta_D=0.5),
+    ],
+    ids=["open water", "half covered", "too far for any channel"],
 )
 def test_the_horizon_keeps_the_color_it_has(unseen: dict[str, float]):
     out = view(**unseen)
     assert (shown_clear(out, CAMERA, LOOK) - out.rgb).abs().max() < 1e-6
+
+
+def test_surfaces_fade_into_open_water_as_they_cover_less():
+    out = view(z=0.01, alpha=0.75, beta_D=0.1)
+    assert (shown_clear(out, CAMERA, LOOK) - (0.4 * GAINS + out.rgb) / 2).abs().max() < 2e-3
 
 
 def test_one_channel_that_sees_is_enough():

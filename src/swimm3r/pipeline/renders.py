@@ -47,6 +47,7 @@ from swimm3r.splat.training_poses import axes_of_map
 
 KINDS = ("rgb", "clear", "clear_physical", "backscatter", "z_depth")
 """The PNG files of one view, NAME_KIND.png."""
+_SURFACE = 0.5  # alpha from which on a pixel shows a surface
 _HATCH = 16  # pixels between the lines over what no training frame saw
 _RATE = 15  # images per second of the flight
 _X264 = {"crf": "23", "preset": "medium", "x264-params": "mbtree=0"}
@@ -73,12 +74,15 @@ def shown_clear(out: RenderOutput, camera: Cameras, style: DisplayStyle) -> Floa
     """A map's clear view as the restored frames are shown, white-balanced; open water keeps the color it has.
 
     So does what the water lets no channel see: the clear color of such a surface is noise. `out.clear` itself is
-    physical, and what scores are taken of.
+    physical, and what scores are taken of. Pixels that primitives cover by less than half are open water, and
+    from there on the surface counts 2 alpha - 1: faint primitives that draw the nuances of open water may be brighter
+    than any surface, and would shine along silhouettes.
     """
     rays = image_directions(camera).nan_to_num(nan=0.0).to(out.z_depth)  # 0 of a fisheye's pixels without a ray
     ray_depth = ray_depth_from_z(out.z_depth, rays)
     T_D, _ = transmittances(ray_depth, out.medium)
-    return keep_open_water(out.clear * style.gains, T_D, out.rgb, 1 - out.alpha, style.restore)
+    sea = ((1 - out.alpha) / (1 - _SURFACE)).clamp(max=1)
+    return keep_open_water(out.clear * style.gains, T_D, out.rgb, sea, style.restore)
 
 
 def physical_clear(out: RenderOutput, camera: Cameras, style: DisplayStyle) -> Float[Tensor, "h w 3"]:
