@@ -69,7 +69,7 @@ def fit_medium(samples: WaterSamples, settings: SeathruSettings, encoding: Encod
     """The water that explains the samples, on values as stored ("srgb") or in linear light, under the sun or a lamp.
 
     Gray samples are one channel, which is fitted once and stands for all three. Raises InputError where fewer than
-    `settings.min_samples` pixels have a depth, and under a lamp where no point is seen from several distances.
+    `settings.min_samples` pixels have a depth, and under a lamp where too few points are seen by several frames.
     """
     n = len(samples.ray_depth)
     if n < settings.min_samples:
@@ -85,10 +85,9 @@ def fit_medium(samples: WaterSamples, settings: SeathruSettings, encoding: Encod
     unit = float(np.median(ray_depth))
     z = ray_depth / unit
     frame = np.unique(samples.frame.numpy(), return_inverse=True)[1]
-    chosen = telling_rows(samples, z, settings)
+    chosen = telling_rows(samples, z, settings) if light == "sun" else _lit_rows(samples, z, settings)
     if light == "lamp":
-        chosen = None if chosen is None else seen_nearby(*chosen, z)
-        if chosen is None or len(np.unique(chosen[1])) < settings.min_tracks:
+        if chosen is None:
             raise _too_little_for_a_lamp()
         lit = _lit(samples, color, z, frame, open_water)
         lamp, beta_D = fit_lamp(lit, *chosen, settings, encoding)
@@ -134,10 +133,24 @@ def _lit(
     return LampPixels(color, z, direction, frame, open_water, toward_water, samples.grids)
 
 
+def _lit_rows(samples: WaterSamples, z: np.ndarray, settings: SeathruSettings) -> tuple[np.ndarray, np.ndarray] | None:
+    """Rows and point numbers of what tells of a lamp: points that a frame sees from near; None for too few.
+
+    Level ground filmed from one height has hardly any point with distances that differ. Its points move through the
+    beam all the same, and then all of them count: the beam is known, and attenuation hardly.
+    """
+    for least in (settings.min_depth_ratio, 1.0):
+        chosen = telling_rows(samples, z, replace(settings, min_depth_ratio=least))
+        near = None if chosen is None else seen_nearby(*chosen, z)
+        if near is not None and len(np.unique(near[1])) >= settings.min_tracks:
+            return near
+    return None
+
+
 def _too_little_for_a_lamp() -> InputError:
     return InputError(
         "the light of a lamp cannot be told from these frames",
-        cause="too few points of the scene are seen from several distances and from nearby",
+        cause="too few points of the scene are seen by several frames and from nearby",
         hint="footage that comes nearer to what it shows; or --light sun",
     )
 

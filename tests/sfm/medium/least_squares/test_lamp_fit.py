@@ -24,11 +24,17 @@ LAMP = lamp_of(LampSettings(strength=1.0))
 
 
 def lamp_samples(
-    medium, *, points: int = 700, views: int = 8, open_water: int = 400, spread: float = 0.7
+    medium,
+    *,
+    points: int = 700,
+    views: int = 8,
+    open_water: int = 400,
+    nearest: tuple[float, float] = (1.2, 3.7),
+    spread: float = 0.7,
 ) -> tuple[WaterSamples, dict]:
     """Points seen `views` times each from 1 to 6 m at any place of the image, with pixel noise of 0.004.
 
-    `spread` is the logarithm of a point's largest distance over its least.
+    `nearest` is the range of the points' least distances, `spread` the logarithm of a point's largest over its least.
     """
     g = torch.Generator().manual_seed(7)
     count = points * views
@@ -36,7 +42,7 @@ def lamp_samples(
     frame = torch.randint(0, 32, (count,), generator=g)
     place = 2 * torch.rand(count, 2, generator=g) - 1
     rays = torch.cat([place * torch.tensor([0.53, 0.36]), torch.ones(count, 1)], -1)
-    near = 1.2 + 2.5 * torch.rand(points, generator=g)
+    near = nearest[0] + (nearest[1] - nearest[0]) * torch.rand(points, generator=g)
     z = near[track] * torch.exp(spread * torch.rand(count, generator=g))
     gray = 0.1 + 0.7 * torch.rand(points, 1, generator=g)
     gray[torch.rand(points, generator=g) < 0.03] = 0.0
@@ -113,6 +119,16 @@ def test_colors_are_restored_evenly_lit(drawn, fit):
     assert (gain * J - truth["J"])[told].abs().mean() < 0.03
     torch.testing.assert_close(add_water(J, samples.ray_depth, medium)[told], samples.I[told], rtol=0, atol=1e-4)
     assert float(np.quantile(J[told], 0.98)) < 1.05
+
+
+def test_level_ground_seen_from_one_height_is_restored_evenly_lit(water):
+    samples, truth = lamp_samples(water, open_water=0, nearest=(2.0, 2.0), spread=0.03)
+    fit = fit_medium(samples, SETTINGS, "srgb", "lamp")
+    told = truth["light"].amin(-1) > 0.1
+    J = remove_water(samples.I, samples.ray_depth, fit.at(samples.ray_depth, samples.direction))
+    gain = (J * truth["J"])[told].sum(0) / J[told].square().sum(0)
+    assert (gain * J - truth["J"])[told].abs().mean() < 0.03
+    assert not fit.identifiable["beta_D"].any()
 
 
 def test_the_reference_point_has_the_lamps_light_and_far_water_on_the_axis_the_veiling_light(fit):
