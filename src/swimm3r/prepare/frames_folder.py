@@ -230,12 +230,6 @@ def _write_frames(
             cause=" ".join(warnings) or "the clip is too short, or the images are too few",
             hint="more images with overlap, a longer clip, or a larger fps",
         )
-    gray = all(image.gray for image in kept)
-    if gray:
-        warnings.append(
-            "The frames are gray: their three channels are equal. The water's coefficients are those of one channel, "
-            "and removing the water restores contrast, not color."
-        )
     known = None if lens is None else partial(lens, *size, dive.calibration)
     parts = _parts(replace(dive, images=kept), draft, settings, progress, known)
     listed = tuple(
@@ -259,7 +253,7 @@ def _write_frames(
         *size,
         dive.ordered,
         tuple(warnings),
-        gray=gray,
+        gray=all(image.gray for image in kept),
         unused_masks=masks.unused,
         recorded=dive.recorded,
         start_ns=dive.start_ns,
