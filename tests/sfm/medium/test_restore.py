@@ -2,6 +2,7 @@
 
 from dataclasses import replace
 
+import pytest
 import torch
 
 from swimm3r.cameras import Cameras, image_directions, ray_depth_from_z
@@ -69,6 +70,26 @@ def test_surfaces_of_unknown_depth_in_green_water_look_like_those_of_known_depth
     z[20:50, 50:] = 0
     restored = restore_image(raw, DepthMap(z, (z > 0).float()), rays_of(camera), exact(green)).clear
     assert psnr(restored[25:45, 60:], J[25:45, 60:]) > 28
+
+
+def test_colors_correct_guessed_depth_only_where_the_water_is_no_guess(dive):
+    """Ground recedes to the right and ends at a wall, of which nothing was measured."""
+    g = torch.Generator().manual_seed(1)
+    beta = torch.tensor([0.30, 0.12, 0.15])
+    water = Medium(torch.tensor([0.05, 0.25, 0.30]), beta, beta)
+    z = (1 / torch.linspace(1 / 1.5, 1 / 4.5, 96).expand(72, 96)).clamp(max=3.0)
+    J = (0.4 + 0.08 * torch.randn(12, 16, 1, generator=g)).repeat_interleave(6, 0).repeat_interleave(6, 1)
+    rays = rays_of(dive.rec.cameras[0])
+    raw = add_water(J.expand(-1, -1, 3), z * rays.norm(dim=-1), water)
+    measured = torch.where(torch.arange(96) < 48, z, 0.0)
+    fit = exact(water)
+    guess = replace(fit, std=replace(fit.std, beta_D=torch.ones(3)))
+    told, gone_on = (
+        restore_image(raw, DepthMap(measured, (measured > 0).float()), rays, of).ray_depth / rays.norm(dim=-1)
+        for of in (fit, guess)
+    )
+    assert float(told[:, 84:].mean()) == pytest.approx(3.0, rel=0.1)
+    assert float(gone_on[:, 84:].mean()) < 2.6
 
 
 def test_bright_sand_has_no_seam_where_its_depth_is_guessed(dive):

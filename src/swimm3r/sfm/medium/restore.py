@@ -117,7 +117,7 @@ def restore_image(
     elsewhere: Float[Tensor, "h w"] | None = None,
 ) -> RestoredImage:
     """The whole image without its water; unknown depth is filled in along the edges, and from z-depth `elsewhere`
-    measured (`fill_z_depth`).
+    measured (`fill_z_depth`). Colors correct what is filled in, unless the light lost on the way is itself a guess.
 
     `rays` are the directions of the pixels with z = 1 (`cameras.image_directions`). `gains` (`display_gains`) color
     surfaces and not the open water behind them, which keeps the color the diver saw.
@@ -129,9 +129,10 @@ def restore_image(
     depth = replace(depth, z_depth=without_fringe(image, depth.z_depth, veil))
     sea = sea_share(image, depth.z_depth, veil)
     I = linear_from_srgb(image) if fit.encoding == "linear" else image
-    z_depth = fill_z_depth(image, depth, sea, elsewhere, depth_from_color(I, depth, sea, rays, fit))
+    tells = not attenuation_is_a_guess(fit)  # colors tell distances
+    z_depth = fill_z_depth(image, depth, sea, elsewhere, depth_from_color(I, depth, sea, rays, fit) if tells else None)
     ray_depth = ray_depth_map(z_depth, rays)
-    path = _not_beyond_white(I, ray_depth, direction, depth.z_depth == 0, fit)
+    path = _not_beyond_white(I, ray_depth, direction, depth.z_depth == 0, fit) if tells else ray_depth
     medium = fit.at(path, direction)
     T_D, _ = transmittances(path, medium)
     direct = I - backscatter(path, medium)
