@@ -7,6 +7,7 @@ import torch
 
 from swimm3r.cameras import Cameras, image_directions, ray_depth_from_z
 from swimm3r.imaging.open_water import open_water_mask
+from swimm3r.lamp import Lamp
 from swimm3r.medium import AttenuationCurve, Medium, MediumFit, add_water, linear_from_srgb, srgb_from_linear
 from swimm3r.scene.reconstruction import DepthMap
 from swimm3r.sfm.medium.restore import display_gains, restore_image
@@ -90,6 +91,22 @@ def test_colors_correct_guessed_depth_only_where_the_water_is_no_guess(dive):
     )
     assert float(told[:, 84:].mean()) == pytest.approx(3.0, rel=0.1)
     assert float(gone_on[:, 84:].mean()) < 2.6
+
+
+def test_red_ground_of_guessed_depth_under_a_lamp_stays_red(dive):
+    """No distance makes it gray, and the lamp is not held to stand right before it for that."""
+    beta = torch.full((3,), 0.02)
+    lamp = Lamp(torch.tensor([0.2, -0.1, 0.0]), 2.0, 2 / 2.2, 1.0, torch.zeros(6), torch.zeros(6))
+    fit = replace(exact(Medium(torch.zeros(3), beta, beta)), lamp=lamp)
+    rays = rays_of(dive.rec.cameras[0])
+    path = 2.0 * rays.norm(dim=-1)
+    J = torch.tensor([0.45, 0.5, 0.45]).expand(72, 96, 3).clone()
+    J[20:50, 50:80] = torch.tensor([0.5, 0.35, 0.3])
+    raw = add_water(J, path, fit.at(path, torch.nn.functional.normalize(rays, dim=-1)))
+    measured = torch.full((72, 96), 2.0)
+    measured[25:45, 55:75] = 0
+    restored = restore_image(raw, DepthMap(measured, (measured > 0).float()), rays, fit).clear
+    torch.testing.assert_close(restored[27:43, 57:73], J[27:43, 57:73], atol=0.02, rtol=0)
 
 
 def test_bright_sand_has_no_seam_where_its_depth_is_guessed(dive):

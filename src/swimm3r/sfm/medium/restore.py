@@ -240,6 +240,9 @@ def _not_beyond_white(
     That is below 0.9, or no more times as bright as filmed than nearly all surfaces of known depth that were filmed as
     bright, and in the channel that the water takes first not far above the others (nor more than nearly all surfaces of
     known depth are): too long a path shows as a glare of that channel first, mostly red.
+
+    In daylight down to nothing, where the color as filmed is left. Under a lamp by 30 % at most, and not at all where
+    that does not help: its light grows so fast toward it that a surface right before it could have any color.
     """
     if not guessed.any():
         return ray_depth
@@ -260,9 +263,10 @@ def _not_beyond_white(
     gain = _brightening(filmed.amax(-1), J.amax(-1))
     cell, pixel = _cells(guessed, max(1, round(reach / 3)))  # the blurred image is the same within a cell
     smooth, far = blurred.reshape(-1, 3)[pixel], ray_depth.flatten()[pixel]
-    shortened = torch.zeros_like(far)
+    lit = fit.lamp is not None
+    least, shortened = (_LEAST_CORRECTED, torch.ones_like(far)) if lit else (0.05, torch.zeros_like(far))
     bright = (gain[_level(smooth.amax(-1))] * smooth.amax(-1)).clamp(min=_MAX_BRIGHTNESS)
-    for trial in torch.linspace(0.05, 1.0, 20):
+    for trial in torch.linspace(least, 1.0, 20):
         J = remove_water(smooth, trial * far, fit.at(trial * far, toward[pixel]))
         shortened = torch.where((J.amax(-1) < bright) & (tint(J) < most), trial, shortened)
     share = torch.ones_like(ray_depth)
