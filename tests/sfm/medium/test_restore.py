@@ -93,6 +93,16 @@ def test_colors_correct_guessed_depth_only_where_the_water_is_no_guess(dive):
     assert float(gone_on[:, 84:].mean()) < 2.6
 
 
+def test_gray_ground_of_guessed_depth_is_restored_as_that_around_it(dive):
+    gray = Medium(torch.full((3,), 0.5), torch.full((3,), 0.3), torch.full((3,), 0.3))
+    rays = rays_of(dive.rec.cameras[0])
+    raw = add_water(torch.full((72, 96, 3), 0.4), 2.0 * rays.norm(dim=-1), gray)
+    measured = torch.full((72, 96), 2.0)
+    measured[25:45, 55:75] = 0
+    restored = restore_image(raw, DepthMap(measured, (measured > 0).float()), rays, exact(gray)).clear
+    torch.testing.assert_close(restored[25:45, 55:75], torch.full((20, 20, 3), 0.4), atol=0.01, rtol=0)
+
+
 def test_red_ground_of_guessed_depth_under_a_lamp_stays_red(dive):
     """No distance makes it gray, and the lamp is not held to stand right before it for that."""
     beta = torch.full((3,), 0.02)

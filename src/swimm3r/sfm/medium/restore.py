@@ -48,7 +48,7 @@ from swimm3r.sfm.medium.plausibility import any_determined, attenuation_is_a_gue
 from swimm3r.sfm.medium.settings import RestoreSettings
 from swimm3r.sfm.medium.side_by_side import in_order
 
-_MAX_TINT = 1.0  # times the other channels, for blurred colors at a guessed distance
+_MAX_TINT = 1.001  # times the other channels, for blurred colors at a guessed distance; gray is 1
 _MAX_BRIGHTNESS = 0.9  # of blurred colors there, in any channel
 _LEAST_CORRECTED = 0.7  # of a guessed depth, down to which colors correct it; beyond that it is the water that is wrong
 _LEVELS, _FEWEST = 20, 20  # levels of brightness from 0 to 1, and surfaces of a level that tell how bright it becomes
@@ -268,7 +268,7 @@ def _not_beyond_white(
     bright = (gain[_level(smooth.amax(-1))] * smooth.amax(-1)).clamp(min=_MAX_BRIGHTNESS)
     for trial in torch.linspace(least, 1.0, 20):
         J = remove_water(smooth, trial * far, fit.at(trial * far, toward[pixel]))
-        shortened = torch.where((J.amax(-1) < bright) & (tint(J) < most), trial, shortened)
+        shortened = torch.where((J.amax(-1) < bright) & (tint(J) <= most), trial, shortened)
     share = torch.ones_like(ray_depth)
     share[guessed] = shortened[cell]
     return torch.where(guessed, ray_depth * blur(share[..., None], reach)[..., 0], ray_depth)

@@ -105,7 +105,7 @@ class SeathruSettings(Settings):
     lamp_fall_off: NotNegative = 0.7
     """Smallest power of the distance that a lamp's light falls with, with `light auto`: 0.9 in clear water, more in
     any other."""
-    lamp_alone: Share = 0.45
+    lamp_alone: Share = 0.6
     """Share explained from which a lamp is assumed where the points' distances do not tell that power, as over level
     ground seen from one height, with `light auto`."""
     lamp_change: NotNegative = 0.1
