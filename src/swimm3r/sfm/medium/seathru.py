@@ -43,14 +43,22 @@ from swimm3r.sfm.medium.least_squares.channel_fit import (
     ChannelFit,
     Observations,
     Pixels,
+    attenuations,
     daylight,
     fit_channel,
 )
-from swimm3r.sfm.medium.least_squares.lamp_fit import LampPixels, exponential_backscatter, fit_lamp, seen_nearby
+from swimm3r.sfm.medium.least_squares.lamp_fit import (
+    LampPixels,
+    exponential_backscatter,
+    fit_lamp,
+    of_average_color,
+    seen_nearby,
+)
 from swimm3r.sfm.medium.samples import WaterSamples, collect_samples
 from swimm3r.sfm.medium.settings import SeathruSettings
 
 _BACKSCATTER_FORM = 0.1  # standard deviation, relative, of beta_B under a lamp: maps' form of it is not exact
+_DARKEST = 1e-3  # mean light of a channel: less says nothing of colors
 
 
 def estimate_medium(
@@ -106,11 +114,19 @@ def fit_medium(samples: WaterSamples, settings: SeathruSettings, encoding: Encod
     fit = _medium_fit(channels * (3 // len(channels)), unit, ray_depth, settings, encoding)
     if lamp is None:
         return fit
+    log_means = np.array([_log_mean_color(c, pixels) for c, pixels in zip(channels, every, strict=True)])
+    lamp = of_average_color(lamp, log_means, settings)
     Binf, beta_D = fit.Binf.double().numpy(), fit.beta_D.double().numpy() * unit
     veil, beta_B = exponential_backscatter(lit, lamp, Binf, beta_D)
     beta = torch.from_numpy(beta_B / unit).float()
     std = replace(fit.std, beta_B=_BACKSCATTER_FORM * beta)
     return replace(fit, beta_B=beta, std=std, lamp=rescaled_lamp(replace(lamp, veil=veil), unit))
+
+
+def _log_mean_color(fit: ChannelFit, pixels: Pixels) -> float:
+    """Logarithm of a channel's mean clear color over the pixels, weighted by the share of light that arrives."""
+    T_D, B = attenuations(fit.x, pixels.ways)
+    return float(np.log(max(np.mean(pixels.I - B), _DARKEST) / np.mean(T_D)))
 
 
 def encoded(samples: WaterSamples, encoding: Encoding) -> tuple[np.ndarray, np.ndarray]:

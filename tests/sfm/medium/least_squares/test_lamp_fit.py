@@ -11,7 +11,7 @@ from swimm3r.errors import InputError
 from swimm3r.io.medium_json import load_medium
 from swimm3r.lamp import LightEvidence, log_light
 from swimm3r.medium import MediumFit, add_water, backscatter, remove_water, rescale, transmittances
-from swimm3r.sfm.medium.least_squares.lamp_fit import noise_by_light, seen_nearby
+from swimm3r.sfm.medium.least_squares.lamp_fit import noise_by_light, of_average_color, seen_nearby
 from swimm3r.sfm.medium.light import judge_light
 from swimm3r.sfm.medium.samples import WaterSamples
 from swimm3r.sfm.medium.seathru import fit_medium
@@ -100,6 +100,20 @@ def test_surfaces_reflect_half_on_average_and_a_few_bright_ones_do_not_change_th
     shining = replace(samples, I=torch.where(bright, (2.5 * samples.I).clamp(max=0.97), samples.I))
     found = fit_medium(shining, SETTINGS, "srgb", "lamp")
     assert abs(np.log(found.lamp.strength / fit.lamp.strength)) < 0.05
+
+
+def test_a_strength_that_went_astray_follows_the_average_color(fit):
+    log_means = np.log([0.02, 0.025, 0.02])  # of a lamp e^3 times as strong, of clear colors around 0.5
+    found = of_average_color(replace(fit.lamp, strength=float(np.exp(3.0))), log_means, SETTINGS)
+    change = np.log(found.strength) - 3.0
+    assert np.log(found.strength) == pytest.approx(0.0, abs=0.2)
+    assert np.exp(log_means - change).mean() == pytest.approx(1 / SETTINGS.lsac_f, rel=0.15)
+    off = [
+        (np.log(found.strength) + d) ** 2
+        + np.sum((log_means - change - d + np.log(SETTINGS.lsac_f)) ** 2) / SETTINGS.mean_reflectance_std**2
+        for d in (-0.05, 0.0, 0.05)
+    ]
+    assert off[1] < min(off[0], off[2])
 
 
 def test_points_seen_from_afar_alone_are_left_out():

@@ -7,8 +7,8 @@ share, with the water of each, which is then fitted again by itself. The colors 
 and water in every step: held at that of the step before, it leads both to others that explain less.
 
 Known is the light on the same point in several places of the image and at several distances. Its strength is known as a
-product with J alone: it is what makes surfaces reflect 1 / f on average. J has no largest value here: one point with a
-wrong depth would set the strength by it. The power of its fall-off is not fitted, as
+product with J alone: it is what makes surfaces reflect 1 / f on average, in the water that the channels have in the end
+(`of_average_color`). J has no largest value here: one point with a wrong depth would set the strength by it. The power of its fall-off is not fitted, as
 attenuation looks much like it over the distances of a dive: it is that of a small lamp, 2 in linear light. For the same
 reason the lamp stands beside the camera, not ahead of it or behind, and beta_D changes little with distance
 (`lamp_slope_std`).
@@ -159,6 +159,19 @@ def fit_lamp(
         if np.all(np.abs(unknowns[:_SHARED] - before) < _SETTLED * _std()):
             break
     return lamp, beta_D
+
+
+def of_average_color(lamp: Lamp, log_means: np.ndarray, settings: SeathruSettings) -> Lamp:
+    """The lamp as strong as the average color of the dive asks, in water that was fitted after it.
+
+    Images determine the product of light and clear colors alone. With s the logarithm of the strength and m_c those of
+    the mean clear colors of the channels (`log_means`), s + m_c stays, and
+    s^2 / std_s^2 + sum_c (m_c + ln f)^2 / std_m^2 is least.
+    """
+    s, above = np.log(lamp.strength), log_means + np.log(settings.lsac_f)
+    of_strength, of_mean = _STRENGTH_STD**-2, settings.mean_reflectance_std**-2
+    stronger = (of_mean * above.sum() - of_strength * s) / (of_strength + len(above) * of_mean)
+    return replace(lamp, strength=float(np.exp(s + stronger)))
 
 
 def exponential_backscatter(
