@@ -8,10 +8,10 @@ and water in every step: held at that of the step before, it leads both to other
 
 Known is the light on the same point in several places of the image and at several distances. Its strength is known as a
 product with J alone: it is what makes surfaces reflect 1 / f on average, in the water that the channels have in the end
-(`of_average_color`). J has no largest value here: one point with a wrong depth would set the strength by it. The power of its fall-off is not fitted, as
-attenuation looks much like it over the distances of a dive: it is that of a small lamp, 2 in linear light. For the same
-reason the lamp stands beside the camera, not ahead of it or behind, and beta_D changes little with distance
-(`lamp_slope_std`).
+(`of_average_color`). J has no largest value here: one point with a wrong depth would set the strength by it. The power
+of its fall-off is not fitted, as attenuation looks much like it over the distances of a dive: it is that of a small
+lamp, 2 in linear light. For the same reason the lamp stands beside the camera, not ahead of it or behind, and beta_D
+changes little with distance (`lamp_slope_std`).
 """
 
 from dataclasses import dataclass, replace
