@@ -41,13 +41,13 @@ from swimm3r.sfm.medium.restore import keep_open_water
 from swimm3r.sfm.medium.settings import RestoreSettings
 from swimm3r.sfm.rectified.run import run_frames
 from swimm3r.splat.map_file import load_map
+from swimm3r.splat.projection.observed import COVERED
 from swimm3r.splat.rendering import RenderOutput, SplatMap
 from swimm3r.splat.settings import MapDevice
 from swimm3r.splat.training_poses import axes_of_map
 
 KINDS = ("rgb", "clear", "clear_physical", "backscatter", "z_depth")
 """The PNG files of one view, NAME_KIND.png."""
-_SURFACE = 0.5  # alpha from which on a pixel shows a surface
 _HATCH = 16  # pixels between the lines over what no training frame saw
 _RATE = 15  # images per second of the flight
 _X264 = {"crf": "23", "preset": "medium", "x264-params": "mbtree=0"}
@@ -81,7 +81,7 @@ def shown_clear(out: RenderOutput, camera: Cameras, style: DisplayStyle) -> Floa
     rays = image_directions(camera).nan_to_num(nan=0.0).to(out.z_depth)  # 0 of a fisheye's pixels without a ray
     ray_depth = ray_depth_from_z(out.z_depth, rays)
     T_D, _ = transmittances(ray_depth, out.medium)
-    sea = ((1 - out.alpha) / (1 - _SURFACE)).clamp(max=1)
+    sea = ((1 - out.alpha) / (1 - COVERED)).clamp(max=1)
     return keep_open_water(out.clear * style.gains, T_D, out.rgb, sea, style.restore)
 
 

@@ -36,7 +36,7 @@ from swimm3r.splat.primitives.beta import BetaPrimitives, select
 from swimm3r.splat.primitives.gaussian import GaussianPrimitives, mean_color
 from swimm3r.splat.primitives.kinds import Primitives
 from swimm3r.splat.projection.dispatch import project
-from swimm3r.splat.projection.observed import TrainingCoverage
+from swimm3r.splat.projection.observed import COVERED, TrainingCoverage
 from swimm3r.splat.projection.view_camera import Projection, ViewCamera, view_camera
 from swimm3r.splat.settings import SplatSettings, UwbsSettings
 from swimm3r.splat.training_poses import RefinedPoses
@@ -46,7 +46,6 @@ SCHEMA = 6  # of a map's file (earlier ones: `splat.map_file`)
 SCHEMA_IN_BLOCKS = 7  # of one that lists blocks, which a version that knows none would leave out
 _SHOWN_SIDE = 320  # pixels of a view in a notebook
 _SEEN = 1e-3  # alpha below which a pixel has no depth
-_COVERED = 0.5  # alpha from which on a pixel's clear color is that of a surface
 
 
 @dataclass(frozen=True)
@@ -303,7 +302,7 @@ def surface_color(images: RasterOutput) -> Float[Tensor, "3 h w"]:
 
     The blended clear color itself is as dark as the pixel is transparent: the light of what lies behind is missing.
     """
-    return images.clear / images.alpha.clamp(min=_COVERED)
+    return images.clear / images.alpha.clamp(min=COVERED)
 
 
 def _uri(image: Float[Tensor, "h w 3"]) -> str:

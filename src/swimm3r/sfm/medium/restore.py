@@ -51,6 +51,7 @@ from swimm3r.sfm.medium.side_by_side import in_order
 _MAX_TINT = 1.001  # times the other channels, for blurred colors at a guessed distance; gray is 1
 _MAX_BRIGHTNESS = 0.9  # of blurred colors there, in any channel
 _LEAST_CORRECTED = 0.7  # of a guessed depth, down to which colors correct it; beyond that it is the water that is wrong
+_LEAST_TRIED = 0.05  # of a guessed depth in daylight, where colors stand in for what is wrong with the water
 _LEVELS, _FEWEST = 20, 20  # levels of brightness from 0 to 1, and surfaces of a level that tell how bright it becomes
 _NEARLY_ALL = 0.95  # of the surfaces at known distance
 _SAMPLES = 20_000  # of them, which stand for all of an image
@@ -263,8 +264,10 @@ def _not_beyond_white(
     gain = _brightening(filmed.amax(-1), J.amax(-1))
     cell, pixel = _cells(guessed, max(1, round(reach / 3)))  # the blurred image is the same within a cell
     smooth, far = blurred.reshape(-1, 3)[pixel], ray_depth.flatten()[pixel]
-    lit = fit.lamp is not None
-    least, shortened = (_LEAST_CORRECTED, torch.ones_like(far)) if lit else (0.05, torch.zeros_like(far))
+    if fit.lamp is None:
+        least, shortened = _LEAST_TRIED, torch.zeros_like(far)
+    else:
+        least, shortened = _LEAST_CORRECTED, torch.ones_like(far)
     bright = (gain[_level(smooth.amax(-1))] * smooth.amax(-1)).clamp(min=_MAX_BRIGHTNESS)
     for trial in torch.linspace(least, 1.0, 20):
         J = remove_water(smooth, trial * far, fit.at(trial * far, toward[pixel]))

@@ -17,7 +17,7 @@ from swimm3r.cameras import Cameras, check_cameras, pixel_grid, project, unproje
 
 SIDE = 64  # pixels of the longer side of the small images
 MOST = 600  # of them: of longer dives every k-th frame, which sees what its neighbors see
-_COVERED = 0.5  # alpha from which on a pixel shows a surface
+COVERED = 0.5  # alpha from which on a pixel shows a surface
 _BEHIND = 1.05  # of the depth, up to where a point counts as the surface: depth has errors, and pixels extent
 _HOLE = 5  # pixels of the small images, the least extent of open water
 _DEEP, _BESIDE = 1.3, 0.15  # of depth and of the image, how far primitives may lie off what a frame shows
@@ -75,7 +75,7 @@ class TrainingCoverage:
         height, width = z_depth.shape
         few = slice(_STRIDE // 2, None, _STRIDE) if min(height, width) > 4 * _STRIDE else slice(None)
         near = z_depth.cpu()[few, few]
-        surface = (alpha.cpu()[few, few] > _COVERED) & (near > 0)
+        surface = (alpha.cpu()[few, few] > COVERED) & (near > 0)
         known = self.z_depth[self.z_depth.isfinite()]
         far = _FAR * float(torch.cat([known, near.reshape(-1)]).max().clamp(min=1e-6))
         z = torch.where(surface, near, far).reshape(1, -1).double()
@@ -123,7 +123,7 @@ def coverage_of(
     smaller hole in the map is no open water.
     """
     z, cover = torch.stack(list(z_depth))[:, None], torch.stack(list(alpha))[:, None]
-    surface = (cover > _COVERED) & (z > 0)
+    surface = (cover > COVERED) & (z > 0)
     core = _spread(surface.float(), _HOLE) == 0
     open_water = _spread(core.float(), _HOLE) > 0
     farthest = _spread(torch.where(surface, z, 0.0), 3)
