@@ -180,6 +180,7 @@ PRESETS: dict[Preset, RunSettings] = {
         sfm=ColmapSettings(
             features=FeatureSettings(count=4096, long_side=1600),
             depth=PlaneSweepSettings(long_side=1280, sources=8),
+            light="sun",
             restore=RestoreSettings(max_points=_PAPER_POINTS, max_points_area=0.0),
         ),
         splat=PAPER,
@@ -197,5 +198,5 @@ MAST3R_PRESETS: dict[Preset, Mast3rSettings] = {  # the same aims with --backend
     ),
     "default": Mast3rSettings(),
     "best": Mast3rSettings(graph="video-6-4", bundle_adjustment=True, restore=RestoreSettings(max_points=2_000_000)),
-    "paper": Mast3rSettings(restore=RestoreSettings(max_points=_PAPER_POINTS, max_points_area=0.0)),
+    "paper": Mast3rSettings(light="sun", restore=RestoreSettings(max_points=_PAPER_POINTS, max_points_area=0.0)),
 }

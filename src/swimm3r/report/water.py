@@ -76,6 +76,7 @@ def _light_note(fit: MediumFit) -> str:
         told += f" their place in the image, which changes it by {evidence.change:.0%}"
         if evidence.fall_off is not None:
             told += f"; it falls with distance to the power of {evidence.fall_off:.1f}"
+            told += "" if evidence.fall_off_std is None else f" ± {evidence.fall_off_std:.1f}"
     return f"The dive is lit by a lamp on the camera ({told}). Colors without the water are evenly lit."
 
 

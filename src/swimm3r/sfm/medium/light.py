@@ -13,7 +13,8 @@ mapping, make a pattern as well. They leave the power n of the distance that the
     ln (I - B) = ln J_t - n ln z + g . phi(d),
 
 which is that of attenuation alone under the sun, and at least a small lamp's under a lamp. Over level ground seen from
-one height distances tell no power; there a pattern alone tells a lamp, if it is strong.
+one height distances tell no power, or one that a few frames less change; there a pattern alone tells a lamp, if it is
+strong.
 """
 
 import numpy as np
@@ -28,7 +29,8 @@ from swimm3r.sfm.medium.settings import SeathruSettings
 _LEAST_LIGHT, _LEAST_T_D = 0.02, 0.1  # direct light and T_D of channels whose logarithm tells something
 _MOST = 60_000  # observations
 _ROUNDS = 3  # of reweighting
-_TELLING = 0.015  # spread of a point's distances over its frames, in logarithms, below which they tell no power
+_TELLING = 0.005  # spread of a point's distances over its frames, in logarithms, below which they tell no power
+_GROUPS = 8  # of frames, each left out once for the standard error of the power
 
 
 def judge_light(samples: WaterSamples, fit: MediumFit, settings: SeathruSettings) -> LightEvidence | None:
@@ -62,20 +64,31 @@ def judge_light(samples: WaterSamples, fit: MediumFit, settings: SeathruSettings
     everywhere = alone if len(alone) else samples.direction
     change = float((pattern(everywhere.double(), torch.from_numpy(found))).std())
     explained = 1 - spreads[1] / max(spreads[0], 1e-12)
-    fall_off = _fall_off(samples, direct, exposed, settings)
-    falls = fall_off is None or fall_off >= settings.lamp_fall_off
-    enough = settings.lamp_alone if fall_off is None else settings.lamp_explained
-    lamp = falls and explained >= enough and change >= settings.lamp_change
-    return LightEvidence("lamp" if lamp else "sun", explained, change, len(points), fall_off)
+    fall_off, std = _fall_off(samples, direct, exposed, settings) or (None, None)
+    lamp = explained >= share_to_explain(fall_off, std, settings) and change >= settings.lamp_change
+    return LightEvidence("lamp" if lamp else "sun", explained, change, len(points), fall_off, std)
+
+
+def share_to_explain(fall_off: float | None, std: float | None, settings: SeathruSettings) -> float:
+    """Least share of variance that a pattern explains under a lamp, given the power of the distance and its error.
+
+    A pattern alone tells a lamp where the power does not tell; infinite where the power is that of daylight.
+    """
+    if fall_off is None or std is None or abs(fall_off - settings.lamp_fall_off) < std:
+        return settings.lamp_alone
+    return settings.lamp_explained if fall_off > settings.lamp_fall_off else np.inf
 
 
 def _fall_off(
     samples: WaterSamples, direct: torch.Tensor, exposed: torch.Tensor, settings: SeathruSettings
-) -> float | None:
-    """n of the median channel among those that enough points tell, seen from several distances; None without any."""
+) -> tuple[float, float] | None:
+    """n of the median channel among those that enough points tell, seen from several distances; None without any.
+
+    With it comes its standard error, by a jackknife over groups of frames.
+    """
     assert samples.direction is not None
     powers = []
-    for c in range(direct.shape[-1]):
+    for c in range(1 if samples.gray else direct.shape[-1]):
         rows = torch.nonzero((samples.track >= 0) & exposed & (direct[:, c] > _LEAST_LIGHT))[:, 0]
         if len(torch.unique(samples.track[rows])) < settings.min_tracks:
             continue
@@ -85,8 +98,14 @@ def _fall_off(
         if _without_groups(distance, point, frame, np.ones(len(rows))).std() < _TELLING:
             continue
         terms = np.concatenate([distance, pattern_terms(samples.direction[rows].double())], -1)
-        powers.append(-float(_fitted(direct[rows, c].double().log().numpy(), terms, point, frame)[0]))
-    return float(np.median(powers)) if powers else None
+        light = direct[rows, c].double().log().numpy()
+        without = []
+        for group in range(groups := min(_GROUPS, int(frame.max()) + 1)):
+            kept = frame % groups != group
+            without.append(_fitted(light[kept], terms[kept], point[kept], frame[kept])[0])
+        std = float(np.std(without)) * (groups - 1) ** 0.5
+        powers.append((-float(_fitted(light, terms, point, frame)[0]), std))
+    return sorted(powers)[(len(powers) - 1) // 2] if powers else None
 
 
 def _thinned(rows: torch.Tensor, track: torch.Tensor) -> torch.Tensor:

@@ -105,9 +105,9 @@ class SeathruSettings(Settings):
     lamp_fall_off: NotNegative = 0.7
     """Smallest power of the distance that a lamp's light falls with, with `light auto`: 0.9 in clear water, more in
     any other."""
-    lamp_alone: Share = 0.6
-    """Share explained from which a lamp is assumed where the points' distances do not tell that power, as over level
-    ground seen from one height, with `light auto`."""
+    lamp_alone: Share = 0.45
+    """Share explained from which a lamp is assumed where the points' distances do not tell whether the power is larger
+    or smaller than that, as over level ground seen from one height, with `light auto`."""
     lamp_change: NotNegative = 0.1
     """Smallest standard deviation, over the images, of the logarithm of a lamp's light, with `light auto`."""
     std_inflation: Positive = 2.0
@@ -145,7 +145,7 @@ class RestoreSettings(Settings):
 class MediumSettings(Settings):
     """The light, the water and all that is restored with them (`sfm/medium/apply.py`), the same for each back end."""
 
-    light: LightChoice = "sun"
+    light: LightChoice = "auto"
     """Light of the dive: the sun, a lamp on the camera, or the one of them that the frames tell (auto)."""
     flicker: FlickerChoice = "auto"
     """Sunlight that flickers over the ground (caustics): evened out where the frames show it (auto), or kept as filmed.

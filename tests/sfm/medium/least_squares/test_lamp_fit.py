@@ -11,8 +11,8 @@ from swimm3r.errors import InputError
 from swimm3r.io.medium_json import load_medium
 from swimm3r.lamp import LightEvidence, log_light
 from swimm3r.medium import MediumFit, add_water, backscatter, remove_water, rescale, transmittances
-from swimm3r.sfm.medium.least_squares.lamp_fit import noise_by_light, of_average_color, seen_nearby
-from swimm3r.sfm.medium.light import judge_light
+from swimm3r.sfm.medium.least_squares.lamp_fit import image_parts, noise_by_light, of_average_color, seen_nearby
+from swimm3r.sfm.medium.light import judge_light, share_to_explain
 from swimm3r.sfm.medium.samples import WaterSamples
 from swimm3r.sfm.medium.seathru import fit_medium
 from swimm3r.sfm.medium.settings import SeathruSettings
@@ -31,16 +31,21 @@ def lamp_samples(
     open_water: int = 400,
     nearest: tuple[float, float] = (1.2, 3.7),
     spread: float = 0.7,
+    across: float = 2.0,
 ) -> tuple[WaterSamples, dict]:
     """Points seen `views` times each from 1 to 6 m at any place of the image, with pixel noise of 0.004.
 
-    `nearest` is the range of the points' least distances, `spread` the logarithm of a point's largest over its least.
+    `nearest` is the range of the points' least distances, `spread` the logarithm of a point's largest over its least,
+    `across` the part of the image's width, which is 2, that points move over as their frames sway.
     """
     g = torch.Generator().manual_seed(7)
     count = points * views
     track = torch.arange(points).repeat_interleave(views)
     frame = torch.randint(0, 32, (count,), generator=g)
     place = 2 * torch.rand(count, 2, generator=g) - 1
+    if across < 2:
+        column = (2 - across) * (torch.rand(points, generator=g) - 0.5)
+        place[:, 0] = column[track] + (across * (torch.rand(32, generator=g) - 0.5))[frame]
     rays = torch.cat([place * torch.tensor([0.53, 0.36]), torch.ones(count, 1)], -1)
     near = nearest[0] + (nearest[1] - nearest[0]) * torch.rand(points, generator=g)
     z = near[track] * torch.exp(spread * torch.rand(count, generator=g))
@@ -145,6 +150,24 @@ def test_level_ground_seen_from_one_height_is_restored_evenly_lit(water):
     assert not fit.identifiable["beta_D"].any()
 
 
+def evenness(samples: WaterSamples, J_true: torch.Tensor) -> float:
+    """Largest over least share of the true clear colors in columns of the images."""
+    fit = fit_medium(samples, SETTINGS, "srgb", "lamp")
+    J = remove_water(samples.I, samples.ray_depth, fit.at(samples.ray_depth, samples.direction))
+    column = (samples.direction[:, 0] / samples.direction[:, 2] / 0.53 * 3 + 3).long().clamp(0, 5)
+    shares = torch.stack([(J / J_true)[(column == k) & (J_true.amin(-1) > 0.1)].median() for k in range(6)])
+    return float(shares.max() / shares.min())
+
+
+@pytest.mark.parametrize("change", [0.0, 0.05])
+def test_a_strip_along_one_axis_is_restored_evenly_lit_whatever_beam_its_exposures_tell_of(water, change: float):
+    """Exposures that change by 5 % had led to clear colors 8 times as bright at one side as at the other."""
+    level = {"open_water": 0, "nearest": (2.0, 2.0), "spread": 0.03}
+    samples, truth = lamp_samples(water, points=1000, views=5, across=0.04, **level)
+    exposure = (change * torch.randn(32, generator=torch.Generator().manual_seed(1))).exp()
+    assert evenness(replace(samples, I=samples.I * exposure[samples.frame, None]), truth["J"]) < 1.35
+
+
 def test_the_reference_point_has_the_lamps_light_and_far_water_on_the_axis_the_veiling_light(fit):
     axis, z = torch.tensor([0.0, 0.0, 1.0]), torch.tensor(fit.lamp.reference)
     unlit, lit = fit.at(z), fit.at(z, axis)
@@ -201,6 +224,17 @@ def test_stretching_the_scene_leaves_the_images_of_a_lamp(fit):
     torch.testing.assert_close(backscatter(5 * z, far), backscatter(z, near))
 
 
+def test_image_parts_hold_about_as_many_pixels_each():
+    g = torch.Generator().manual_seed(1)
+    rays = torch.cat([torch.rand(2400, 2, generator=g) ** 2, torch.ones(2400, 1)], -1)
+    part = image_parts(normalize(rays, dim=-1).double().numpy())
+    counts = np.bincount(part)
+    assert len(counts) == 24
+    assert counts.min() > 60
+    assert counts.max() < 140
+    assert image_parts(np.tile([[0.0, 0.0, 1.0]], (9, 1))).max() == 0
+
+
 def test_a_lamp_is_told_from_the_sun_by_the_light_of_points(drawn, water):
     samples, truth = drawn
     sunlit = add_water(truth["J"], samples.ray_depth, water)
@@ -253,6 +287,31 @@ def test_over_level_ground_a_pattern_alone_tells_a_lamp_if_it_is_strong(water):
     assert (strong.fall_off, weak.fall_off) == (None, None)
     assert strong.explained > SETTINGS.lamp_alone > weak.explained > SETTINGS.lamp_explained
     assert (strong.light, weak.light) == ("lamp", "sun")
+
+
+def test_the_error_of_the_power_is_told_by_groups_of_frames(drawn):
+    samples, _ = drawn
+    exposure = (0.3 * torch.randn(32, 1, generator=torch.Generator().manual_seed(2))).exp()
+    noisy = rough(replace(samples, I=samples.I * (0.5 * exposure).clamp(max=1)[samples.frame]), 0.15)
+    steady, changing = judged(samples), judged(noisy)
+    assert 0 < steady.fall_off_std < 0.5 * changing.fall_off_std
+    assert abs(steady.fall_off - changing.fall_off) < 0.2
+
+
+@pytest.mark.parametrize(
+    ("fall_off", "std", "share"),
+    [
+        (None, None, SETTINGS.lamp_alone),
+        (0.5, 2.0, SETTINGS.lamp_alone),
+        (1.6, 2.0, SETTINGS.lamp_alone),
+        (3.2, 1.5, SETTINGS.lamp_explained),
+        (1.2, 0.1, SETTINGS.lamp_explained),
+        (0.2, 0.1, np.inf),
+        (-0.7, 0.3, np.inf),
+    ],
+)
+def test_a_pattern_must_explain_more_where_the_power_does_not_tell(fall_off, std, share):
+    assert share_to_explain(fall_off, std, SETTINGS) == share
 
 
 def test_noise_is_told_apart_from_what_goes_with_the_light():

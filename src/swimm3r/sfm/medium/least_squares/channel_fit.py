@@ -389,12 +389,19 @@ def _scores(x: np.ndarray, seen: Observations, noise: _Noise) -> tuple[np.ndarra
 
 def _redundancy(x: np.ndarray, seen: Observations, noise: _Noise) -> float:
     """By how much the gradients of whole frames scatter more than independent residuals would let them."""
-    information, gradient = _scores(x, seen, noise)
+    return float(frame_scatter(*_scores(x, seen, noise)).mean())
+
+
+def frame_scatter(information: np.ndarray, gradient: np.ndarray) -> np.ndarray:
+    """Variance of the frames' gradients, [frames, unknowns], in units of the one that the information lets expect.
+
+    It is given along each eigenvector of the information that tells anything.
+    """
     gradient = gradient - gradient.mean(0)
     values, vectors = np.linalg.eigh(information)
     visible = values > 1e-6 * values.max()
     whitened = gradient @ vectors[:, visible] / np.sqrt(values[visible])
-    return float((whitened**2).sum() / visible.sum() * len(gradient) / max(1, len(gradient) - 1))
+    return (whitened**2).sum(0) * len(gradient) / max(1, len(gradient) - 1)
 
 
 def _covariance(

@@ -12,6 +12,10 @@ product with J alone: it is what makes surfaces reflect 1 / f on average, in the
 of its fall-off is not fitted, as attenuation looks much like it over the distances of a dive: it is that of a small
 lamp, 2 in linear light. For the same reason the lamp stands beside the camera, not ahead of it or behind, and beta_D
 changes little with distance (`lamp_slope_std`).
+
+Points that move along one axis of the images leave the beam across it open. Surfaces that are seen in one part of the
+images reflect about as much as those in another, on average. Slopes and errors of depth, which many points share, would
+outweigh that: points count by how well whole frames agree on the lamp (`redundancy_at`).
 """
 
 from dataclasses import dataclass, replace
@@ -41,6 +45,7 @@ from swimm3r.sfm.medium.least_squares import kernels
 from swimm3r.sfm.medium.least_squares.channel_fit import (
     BINF,
     LOG_BETA_D,
+    LOG_MEAN,
     SLOPE,
     Evidence,
     Observations,
@@ -50,6 +55,7 @@ from swimm3r.sfm.medium.least_squares.channel_fit import (
     best_start,
     daylight,
     evidence_of,
+    frame_scatter,
     prior_residuals,
     thinned,
 )
@@ -64,6 +70,7 @@ _WATER = 200  # pixels of open water, likewise
 _WATER_SHARED = 20.0  # of them that share an error
 _STEPS = 25
 _ROUNDS = 8
+_COLUMNS, _ROWS = 6, 4  # of parts of the images whose average colors are about alike
 _START = 0.1  # offset of the lamp to either side, in median depths: at the camera the light scattered has no derivative
 _SETTLED = 0.01  # change of the lamp's unknowns in a round, in their standard deviations, that ends the rounds
 _NOISE_BINS = 10  # of brightness
@@ -75,6 +82,7 @@ _WATER_COLOR = 0.3  # color of open water that counts as a pixel's of white in f
 _WIDE = (0.6, 0.45)  # of the image that open water is looked at in
 _HOLD = 1e-3  # of v to 0
 _START_BETA = 0.4  # attenuation over a median depth before anything is known
+_START_REDUNDANCY = 100.0  # likewise: what is known of lamps decides where the points tell little
 
 
 @dataclass(frozen=True)
@@ -139,26 +147,51 @@ def fit_lamp(
     unknowns, beta_D = np.zeros(_SHARED), np.full(len(channels), _START_BETA)
     unknowns[-2:] = _START
     lamp = _lamp(unknowns, fall_off)
-    noise = np.full((len(channels), len(every.rows)), settings.loss_scale)
+    noise, redundancy = np.full((len(channels), len(every.rows)), settings.loss_scale), _START_REDUNDANCY
+    part, starts = image_parts(few.direction), []
     for _ in range(_ROUNDS):  # range bins of the priors and noise are those of the light found so far
         whole = pixels.scatter(lamp, beta_D)
         priors = [evidence_of(pixels.of_channel(c, lamp, whole), settings) for c in channels]
-        if len(unknowns) == _SHARED:
-            waters, (scatter, _) = [], few.scatter(lamp, beta_D)
-            for c in channels:
-                ways = few.ways(lamp, scatter[:, c])
-                seen = Observations(every.rows, ways, every.point, every.frame, few.color[:, c])
-                waters.append(best_start(priors[c], seen, 0.0, settings))
-            unknowns = np.concatenate([unknowns, *waters])
-        problem = _Problem(
-            few, every.point, [prior.lit(-np.log(lamp.strength)) for prior in priors], noise, fall_off, settings
-        )
-        before, unknowns = unknowns[:_SHARED], problem.solved(unknowns)
+        waters = [] if starts else _first_waters(few, every, priors, lamp, beta_D, settings)
+        starts = starts or [np.concatenate([unknowns, *of_channels]) for of_channels in waters]
+        lit = [prior.lit(-np.log(lamp.strength)) for prior in priors]
+        problem = _Problem(few, every.point, part, lit, noise, redundancy, fall_off, settings)
+        before, unknowns = unknowns[:_SHARED], min(map(problem.solved, starts), key=problem.cost)
+        starts, redundancy = [unknowns], max(1.0, problem.redundancy_at(unknowns))
         noise, lamp = problem.noise_at(unknowns), _lamp(unknowns[:_SHARED], fall_off)
         beta_D = _beta_D(unknowns[_SHARED:].reshape(len(priors), -1))
         if np.all(np.abs(unknowns[:_SHARED] - before) < _SETTLED * _std()):
             break
     return lamp, beta_D
+
+
+def _first_waters(
+    few: LampPixels,
+    every: Observations,
+    priors: list[Evidence],
+    lamp: Lamp,
+    beta_D: np.ndarray,
+    settings: SeathruSettings,
+) -> tuple[list[np.ndarray], list[np.ndarray]]:
+    """Waters of all channels under a first lamp: as the points tell, and as all but the points tell.
+
+    Points take the unknown beam of a strip over level ground for attenuation, from which no step leads back.
+    """
+    scatter, _ = few.scatter(lamp, beta_D)
+    told, untold = [], []
+    for c, prior in enumerate(priors):
+        seen = Observations(every.rows, few.ways(lamp, scatter[:, c]), every.point, every.frame, few.color[:, c])
+        told.append(best_start(prior, seen, 0.0, settings))
+        untold.append(best_start(prior, None, 0.0, settings))
+    return told, untold
+
+
+def image_parts(direction: np.ndarray) -> np.ndarray:
+    """Numbers 0.. without gaps of the parts of the images that directions lie in, each with about as many of them."""
+    across, down = (direction[:, k] / direction[:, 2] for k in (0, 1))
+    column = np.searchsorted(np.quantile(across, np.arange(1, _COLUMNS) / _COLUMNS), across)
+    row = np.searchsorted(np.quantile(down, np.arange(1, _ROWS) / _ROWS), down)
+    return np.unique(column * _ROWS + row, return_inverse=True)[1]
 
 
 def of_average_color(lamp: Lamp, log_means: np.ndarray, settings: SeathruSettings) -> Lamp:
@@ -240,8 +273,10 @@ class _Problem:
 
     few: LampPixels  # that see the points
     point: np.ndarray
+    part: np.ndarray  # of the images
     priors: list[Evidence]  # of the channels, of a lamp of strength 1
     noise: np.ndarray  # of the channels' pixels, [c, n]
+    redundancy: float  # of the pixels, beyond that of patches
     fall_off: float
     settings: SeathruSettings
 
@@ -256,12 +291,34 @@ class _Problem:
             max_nfev=_STEPS, xtol=1e-5, ftol=1e-5,
         ).x  # fmt: skip
 
+    def cost(self, unknowns: np.ndarray) -> float:
+        """The loss that `solved` minimizes."""
+        return float((np.sqrt(1 + self.residuals(unknowns) ** 2) - 1).sum())
+
     def noise_at(self, unknowns: np.ndarray) -> np.ndarray:
         """Standard deviation of each channel's pixels about a solution."""
         lamp, waters = self._parts(unknowns)
         ways, (scatter, _) = self.few.ways(lamp), self.few.scatter(lamp, _beta_D(waters))
         parts = (self._direct(c, x, replace(ways, scatter=scatter[:, c])) for c, x in enumerate(waters))
         return np.stack([noise_by_light(off, light, self.settings.loss_scale) for light, off in parts])
+
+    def redundancy_at(self, unknowns: np.ndarray) -> float:
+        """By how much gradients of whole frames in the lamp scatter more than independent pixels would let them.
+
+        That is along the direction they scatter most in: exposures of frames tell of beams across a strip, which its
+        points hardly tell of.
+        """
+        here, rows = self.residuals(unknowns), self.jacobian(unknowns)
+        count, frames = len(self.few.z), np.unique(self.few.frame, return_inverse=True)[1]
+        gradient, information = np.zeros((frames.max() + 1, _SHARED)), np.zeros((_SHARED, _SHARED))
+        each = (len(here) - _SHARED) // len(self.priors)
+        for c in range(len(self.priors)):
+            first = _SHARED + c * each
+            off, of_lamp = here[first : first + count], rows[first : first + count, :_SHARED]
+            weighted = of_lamp / np.sqrt(1 + off**2)[:, None]
+            information += weighted.T @ of_lamp
+            gradient += np.stack([np.bincount(frames, column * off) for column in weighted.T], -1)
+        return self.redundancy * float(frame_scatter(information, gradient).max())
 
     def residuals(self, unknowns: np.ndarray) -> np.ndarray:
         """Everything in its own standard deviations: the lamp, then the channels one after another."""
@@ -306,11 +363,20 @@ class _Problem:
     ) -> np.ndarray:
         settings, water = self.settings, self.few.open_water[:, c]
         _, off = self._direct(c, x, replace(ways, scatter=scatter))
-        off = off / (self.noise[c] * np.sqrt(settings.min_redundancy * self.few.grids))
+        off = off / (self.noise[c] * np.sqrt(settings.min_redundancy * self.few.grids * self.redundancy))
         shared = settings.open_water_std * np.sqrt(max(1.0, len(water) / _WATER_SHARED))
         of_water = (water - x[BINF] * scatter_of_water) / shared
         prior = self.priors[c].lit(np.log(lamp.strength))
-        return np.concatenate([off, of_water, prior_residuals(x, prior, settings)])
+        of_parts = self._of_parts(c, x, replace(ways, scatter=scatter)) / np.sqrt(len(self.priors))
+        return np.concatenate([off, of_water, of_parts, prior_residuals(x, prior, settings)])
+
+    def _of_parts(self, c: int, x: np.ndarray, ways: Ways) -> np.ndarray:
+        """Average colors of the parts of the images about that of surfaces which reflect everywhere alike."""
+        T_D, B = attenuations(x, ways)
+        count = np.bincount(self.part)
+        expected = np.exp(x[LOG_MEAN]) * np.bincount(self.part, T_D) / count
+        off = np.bincount(self.part, self.few.color[:, c] - B) / count - expected
+        return off / np.hypot(self.settings.average_std * expected, self.settings.dark_std)
 
 
 def _beta_D(waters: np.ndarray) -> np.ndarray:
