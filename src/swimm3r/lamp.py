@@ -57,7 +57,7 @@ class LightEvidence:
     change: float  # standard deviation of its logarithm over the images
     points: int
     fall_off: float | None = None  # power of the distance that the light falls with, of the median channel
-    fall_off_std: float | None = None
+    fall_off_std: float | None = None  # its standard error; None in runs before 30 November 2026
 
 
 def pattern(direction: Float[Tensor, "*points 3"], coefficients: Float[Tensor, "6"]) -> Float[Tensor, "*points"]:

@@ -95,8 +95,8 @@ def _fall_off(
         rows = _thinned(rows, samples.track)
         point, frame = (np.unique(of[rows].numpy(), return_inverse=True)[1] for of in (samples.track, samples.frame))
         distance = samples.ray_depth[rows, None].double().log().numpy()
-        if _without_groups(distance, point, frame, np.ones(len(rows))).std() < _TELLING:
-            continue
+        if frame.max() < 2 or _without_groups(distance, point, frame, np.ones(len(rows))).std() < _TELLING:
+            continue  # two frames, one left out, tell no error
         terms = np.concatenate([distance, pattern_terms(samples.direction[rows].double())], -1)
         light = direct[rows, c].double().log().numpy()
         without = []

@@ -264,6 +264,12 @@ def judged(samples: WaterSamples) -> LightEvidence:
     return evidence
 
 
+def told_power(evidence: LightEvidence) -> tuple[float, float]:
+    assert evidence.fall_off is not None
+    assert evidence.fall_off_std is not None
+    return evidence.fall_off, evidence.fall_off_std
+
+
 @pytest.mark.parametrize("share", [0.25, 0.55])
 def test_the_corners_of_a_lens_are_not_taken_for_a_lamp(drawn, water, share: float):
     samples, truth = drawn
@@ -276,9 +282,7 @@ def test_a_pattern_that_explains_little_is_a_lamps_where_the_light_falls_with_di
     assert SETTINGS.lamp_explained < lit.explained < SETTINGS.lamp_alone
     assert lens.explained > SETTINGS.lamp_explained
     assert (lit.light, lens.light) == ("lamp", "sun")
-    assert lens.fall_off is not None
-    assert lit.fall_off is not None
-    assert lens.fall_off < SETTINGS.lamp_fall_off < lit.fall_off
+    assert told_power(lens)[0] < SETTINGS.lamp_fall_off < told_power(lit)[0]
 
 
 def test_over_level_ground_a_pattern_alone_tells_a_lamp_if_it_is_strong(water):
@@ -293,9 +297,14 @@ def test_the_error_of_the_power_is_told_by_groups_of_frames(drawn):
     samples, _ = drawn
     exposure = (0.3 * torch.randn(32, 1, generator=torch.Generator().manual_seed(2))).exp()
     noisy = rough(replace(samples, I=samples.I * (0.5 * exposure).clamp(max=1)[samples.frame]), 0.15)
-    steady, changing = judged(samples), judged(noisy)
-    assert 0 < steady.fall_off_std < 0.5 * changing.fall_off_std
-    assert abs(steady.fall_off - changing.fall_off) < 0.2
+    (steady, std), (changing, larger) = (told_power(judged(one)) for one in (samples, noisy))
+    assert 0 < std < 0.5 * larger
+    assert abs(steady - changing) < 0.2
+
+
+def test_two_frames_tell_no_power(drawn):
+    samples, _ = drawn
+    assert judged(replace(samples, frame=samples.frame % 2)).fall_off is None
 
 
 @pytest.mark.parametrize(

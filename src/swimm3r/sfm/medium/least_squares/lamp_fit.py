@@ -148,12 +148,14 @@ def fit_lamp(
     unknowns[-2:] = _START
     lamp = _lamp(unknowns, fall_off)
     noise, redundancy = np.full((len(channels), len(every.rows)), settings.loss_scale), _START_REDUNDANCY
-    part, starts = image_parts(few.direction), []
+    part = image_parts(few.direction)
+    starts: list[np.ndarray] = []
     for _ in range(_ROUNDS):  # range bins of the priors and noise are those of the light found so far
         whole = pixels.scatter(lamp, beta_D)
         priors = [evidence_of(pixels.of_channel(c, lamp, whole), settings) for c in channels]
-        waters = [] if starts else _first_waters(few, every, priors, lamp, beta_D, settings)
-        starts = starts or [np.concatenate([unknowns, *of_channels]) for of_channels in waters]
+        starts = starts or [
+            np.concatenate([unknowns, *waters]) for waters in _first_waters(few, every, priors, lamp, beta_D, settings)
+        ]
         lit = [prior.lit(-np.log(lamp.strength)) for prior in priors]
         problem = _Problem(few, every.point, part, lit, noise, redundancy, fall_off, settings)
         before, unknowns = unknowns[:_SHARED], min(map(problem.solved, starts), key=problem.cost)
