@@ -44,6 +44,7 @@ class Water:
     transmittance: str  # SVG
     tables: tuple[Table, ...]
     guessed: bool
+    colors: str  # of the restored frames, after "the colors"
     unit: str
     light: str  # sun or lamp, in words; empty for the sun
 
@@ -61,6 +62,7 @@ def water_section(rec: Reconstruction) -> Water | None:
         _chart(fit, "Share of light kept T_D(z)", unit, lambda z: transmittances(z, fit.at(z))[0]),
         tuple(_table(each, rec.metric) for each in (rec.medium_linear, fit) if each is not None),
         attenuation_is_a_guess(fit),
+        _colors(fit),
         unit,
         _light_note(fit),
     )
@@ -80,10 +82,16 @@ def _light_note(fit: MediumFit) -> str:
     return f"The dive is lit by a lamp on the camera ({told}). Colors without the water are evenly lit."
 
 
+def _colors(fit: MediumFit) -> str:
+    if not attenuation_is_a_guess(fit):
+        return "without the water"
+    return "as filmed" if fit.lamp is None else "evenly lit in the hue as filmed"
+
+
 def restored_as(fit: MediumFit) -> str:
     """The difference between restored and filmed frames, which depends on the knowledge of the water."""
     if attenuation_is_a_guess(fit):
-        return "left as filmed: the water is not determined"
+        return f"{'left ' if fit.lamp is None else ''}{_colors(fit)}: the water is not determined"
     balance = "white-balanced for display" if any_determined(fit) else "of a hue between that as filmed and gray"
     return f"without the water, {balance}"
 

@@ -32,7 +32,7 @@ class WhiteBalance:
 
     gains: tuple[float, float, float] = (1.0, 1.0, 1.0)
     source: Literal["restored", "filmed"] = "restored"
-    """Colors that are shown: the clear ones, or, where the light lost in the water is a guess, those filmed."""
+    """Colors that are shown: the clear ones, or, where the daylight lost in the water is a guess, those filmed."""
 
     def __post_init__(self) -> None:
         if not all(0 < gain <= _MOST for gain in self.gains):

@@ -11,6 +11,7 @@ import torch
 from swimm3r.appearance import FrameColors
 from swimm3r.cameras import image_directions
 from swimm3r.io import images
+from swimm3r.lamp import Lamp
 from swimm3r.medium import AttenuationCurve, Medium, MediumFit, remove_water
 from swimm3r.scene.frames import Frames
 from swimm3r.scene.reconstruction import DenseCloud
@@ -255,6 +256,29 @@ def test_gains_need_water_that_is_determined_and_somebody_who_wants_them(dive):
     assert white_balance(unsure, RestoreSettings(white_balance=False)) == WhiteBalance()
     guessed = replace(rec, medium=fit_of(dive.medium, 0.9, known=False))
     assert white_balance(guessed, RestoreSettings()) == WhiteBalance(source="filmed")
+    lit = replace(guessed, medium=under_a_lamp(guessed.medium))
+    assert white_balance(lit, RestoreSettings(white_balance=False)) == WhiteBalance()
+    hues = [brightest(cloud.restored) * white_balance(lit, RestoreSettings()).factors, brightest(cloud.raw)]
+    torch.testing.assert_close(hues[0] / hues[0].mean(), hues[1] / hues[1].mean(), atol=1e-3, rtol=0)
+
+
+def under_a_lamp(fit: MediumFit) -> MediumFit:
+    """The same water under a lamp whose light falls to the right."""
+    beam = torch.tensor([-1.5, 0.0, 0.0, 0.0, 0.0, 0.0])
+    return replace(fit, lamp=Lamp(torch.tensor([0.2, -0.1, 0.0]), 2.0, 2 / 2.2, 1.0, beam, torch.zeros(6)))
+
+
+def brightest(colors: torch.Tensor) -> torch.Tensor:
+    return (colors[(colors < 0.99).all(-1)] ** 6).mean(0) ** (1 / 6)
+
+
+def test_where_attenuation_is_a_guess_under_a_lamp_frames_are_shown_evenly_lit(dive, tmp_path: Path, monkeypatch):
+    fit = under_a_lamp(fit_of(dive.medium, 0.9, known=False))
+    assert "evenly lit" in said(fit)
+    found = written(dive, fit, tmp_path, monkeypatch)
+    ratio = (found["shown"] / found["filmed"].clip(0.02)).mean((0, 2))  # by column
+    third = len(ratio) // 3
+    assert ratio[-third:].mean() > 1.2 * ratio[:third].mean()
 
 
 def test_a_gray_clip_is_called_gray_and_stays_gray(dive, tmp_path: Path):

@@ -102,9 +102,10 @@ def _undetermined(fit: MediumFit, predicted: bool, linear: MediumFit | None) -> 
     )
     factor = optical_depth(fit)[1].max().exp().item()
     if attenuation_is_a_guess(fit):
+        kept = "the colors as filmed" if fit.lamp is None else "the hue as filmed and are evenly lit"
         return QualityWarning(
             "The water is not determined: the light lost on the way is uncertain by a factor of up to"
-            f" {factor:.1f}, so the restored frames keep the colors as filmed.",
+            f" {factor:.1f}, so the restored frames keep {kept}.",
             advice,
         )
     if any_determined(fit):

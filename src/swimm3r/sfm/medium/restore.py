@@ -150,15 +150,20 @@ def white_balance(rec: Reconstruction, settings: RestoreSettings) -> WhiteBalanc
 
     Where the frames determine nothing of the water, neutral grays would pass for the true colors of surfaces: what it
     says of the hue is believed as far as it leads toward gray (`milder_gains`). Where the light lost on the way is a
-    guess, colors are shown as filmed. Gains are ones where nobody asked for any.
+    guess, colors are shown as filmed, and under a lamp, whose beam frames tell all the same, evenly lit in the hue as
+    filmed. Gains are ones where nobody asked for any.
     """
     assert rec.cloud is not None
     assert rec.medium is not None
-    source = "filmed" if attenuation_is_a_guess(rec.medium) else "restored"
-    if source == "filmed" or not settings.white_balance:
-        return WhiteBalance(source=source)
-    known = any_determined(rec.medium)
-    gains = display_gains(rec.cloud.restored) if known else milder_gains(rec.cloud.raw, rec.cloud.restored)
+    guess = attenuation_is_a_guess(rec.medium)
+    if guess and rec.medium.lamp is None:
+        return WhiteBalance(source="filmed")
+    if not settings.white_balance:
+        return WhiteBalance()
+    if any_determined(rec.medium) and not guess:
+        gains = display_gains(rec.cloud.restored)
+    else:
+        gains = milder_gains(rec.cloud.raw, rec.cloud.restored, 0.0 if guess else 1.0)
     red, green, blue = gains.tolist()
     return WhiteBalance((red, green, blue))
 
@@ -204,17 +209,18 @@ def display_gains(restored: Float[Tensor, "n 3"]) -> Float[Tensor, "3"]:
     return (tint.mean() / tint).clamp(0.5, 2.0).float()
 
 
-def milder_gains(filmed: Float[Tensor, "n 3"], restored: Float[Tensor, "n 3"]) -> Float[Tensor, "3"]:
+def milder_gains(filmed: Float[Tensor, "n 3"], restored: Float[Tensor, "n 3"], most: float = 1.0) -> Float[Tensor, "3"]:
     """Gains of the colors of one cloud that take back what their restoration changes of the hue beyond gray.
 
-    With f and r the logarithms of both tints less their means, the gains are exp((t - 1) (r - f)) with t = 0..1 where
-    |f + t (r - f)| is least: of the hues between the filmed one and the restored one the nearest to gray. A camera that
-    was balanced for the water, or for its lamp, films grays as gray, and the whole correction would turn them orange.
+    With f and r the logarithms of both tints less their means, the gains are exp((t - 1) (r - f)) with t = 0..`most`
+    where |f + t (r - f)| is least: of the hues between the filmed one and the restored one the nearest to gray. A
+    camera that was balanced for the water, or for its lamp, films grays as gray, and the whole correction would turn
+    them orange.
     """
     seen = _unclipped(restored)
     f, r = (tint.log() - tint.log().mean() for tint in (_tint(filmed[seen]), _tint(restored[seen])))
     change = r - f
-    t = (-(f @ change) / (change @ change).clamp(min=1e-12)).clamp(0, 1)
+    t = (-(f @ change) / (change @ change).clamp(min=1e-12)).clamp(0, most)
     return ((t - 1) * change).exp().clamp(0.5, 2.0).float()
 
 
