@@ -136,7 +136,7 @@ def test_a_half_that_nobody_trusts_recolors_nothing(ground):
 
 
 def test_recoloring_by_tiles_undoes_a_smooth_gain(ground):
-    shading = 0.06 * torch.randn(len(ORDERS), 3, generator=torch.Generator().manual_seed(1))
+    shading = 0.06 * torch.randn(len(ORDERS), 1, generator=torch.Generator().manual_seed(1)).expand(-1, 3)
     everywhere = torch.ones(HEIGHT, WIDTH, dtype=torch.bool)
     target = (ground @ RECOLOR.mT + 0.05) * shading_gains(shading, HEIGHT, WIDTH).permute(1, 2, 0)
     after = recolored_by_tiles(ground, target, everywhere)

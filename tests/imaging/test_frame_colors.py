@@ -6,7 +6,7 @@ import pytest
 import torch
 
 from swimm3r.appearance import ORDERS, about_identity, cosines, identity_maps
-from swimm3r.imaging.frame_colors import ColorTracks, fit_frame_colors
+from swimm3r.imaging.frame_colors import ColorTracks, GroundColors, fit_frame_colors
 
 FRAMES, POINTS = 24, 3000
 BINF, BETA_D, BETA_B = torch.tensor([0.1, 0.5, 0.5]), torch.tensor([0.4, 0.15, 0.12]), torch.tensor([0.3, 0.25, 0.2])
@@ -170,7 +170,7 @@ def shaded(tracks: ColorTracks, size: float) -> tuple[ColorTracks, torch.Tensor]
     """The same tracks at random places of their images, in gains that change over each image."""
     rng = torch.Generator().manual_seed(4)
     waves = cosines(torch.rand(len(tracks.point), 2, generator=rng))
-    shading = size * torch.randn(FRAMES, len(ORDERS), 3, generator=rng)
+    shading = size * torch.randn(FRAMES, len(ORDERS), 1, generator=rng).expand(-1, -1, 3)
     shading = shading - shading.mean(0)
     gain = torch.einsum("ok,okc->oc", waves, shading[tracks.frame]).exp()
     return replace(tracks, color=tracks.color * gain, cosines=waves), shading
@@ -201,3 +201,55 @@ def test_water_and_exposure_are_not_read_as_gains_over_the_image():
     assert found.evidence.by_shading < 0.05
     assert found.shaded is not None
     assert float(found.shaded.shading.abs().mean()) < 0.01
+
+
+def test_shadings_are_alike_in_all_channels():
+    """Of gains that change over the image in one channel alone, as water does, the common part is taken."""
+    tracks = dive(STEADY)
+    waves = cosines(torch.rand(len(tracks.point), 2, generator=torch.Generator().manual_seed(4)))
+    slow = 0.1 * waves[:, ORDERS.index((1, 0))] * torch.where(tracks.frame % 2 == 0, 1.0, -1.0)
+    found = fit_frame_colors(
+        replace(tracks, color=tracks.color * (slow[:, None] * torch.eye(3)[2]).exp(), cosines=waves)
+    )
+    assert found is not None
+    assert found.shaded is not None
+    shading = found.shaded.shading
+    assert torch.equal(shading[..., 0], shading[..., 2])
+    assert float(shading[::2, ORDERS.index((1, 0)), 0].mean()) == pytest.approx(0.1 / 3, rel=0.4)
+
+
+def test_ground_that_reflects_alike_tells_of_light_that_no_point_tells_of():
+    """Two lines of a survey without a point in common, each in its own light, whose points keep their places."""
+    tracks, half = dive(STEADY, noise=0.003), FRAMES // 2
+    lines = torch.where(tracks.frame < half, 0, 1)
+    alone = lines == lines[tracks.point.new_tensor(range(len(tracks.point))) // (FRAMES // 3) * (FRAMES // 3)]
+    rows = {
+        name: getattr(tracks, name)[alone] for name in ("color", "ray_depth", "point", "frame", "T_D", "backscatter")
+    }
+    tracks = replace(tracks, **rows)
+    rng = torch.Generator().manual_seed(7)
+    waves = cosines(torch.rand(POINTS, 2, generator=rng))
+    across = ORDERS.index((1, 0))
+    tilt = torch.where(torch.arange(FRAMES) < half, 0.3, -0.3)
+    at = waves[tracks.point]
+    gain = (at[:, across] * tilt[tracks.frame]).exp()[:, None]
+    tracks = replace(tracks, color=tracks.color * gain, cosines=at)
+    x, y = torch.meshgrid((torch.arange(6) + 0.5) / 6, (torch.arange(4) + 0.5) / 4, indexing="ij")
+    parts, frame = (
+        cosines(torch.stack([x, y], -1).reshape(-1, 2)).repeat(FRAMES, 1),
+        torch.arange(FRAMES).repeat_interleave(24),
+    )
+    T_D, B = (torch.full((len(frame), 3), value) for value in (0.5, 0.1))
+    J = 0.4 * (0.1 * torch.randn(len(frame), 3, generator=rng)).exp()
+    light = (parts[:, across] * tilt[frame]).exp()[:, None]
+    ground = GroundColors(light * (J * T_D + B), T_D, B, frame, parts)
+
+    def told(ground: GroundColors | None) -> float:
+        found = fit_frame_colors(replace(tracks, ground=ground))
+        assert found is not None
+        assert found.shaded is not None
+        found_tilt = found.shaded.shading[:, across].mean(-1)
+        return float((found_tilt[:half].mean() - found_tilt[half:].mean()) / 0.6)
+
+    assert abs(told(None)) < 0.15
+    assert 0.5 < told(ground) < 1.1

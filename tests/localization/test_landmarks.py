@@ -12,7 +12,7 @@ from swimm3r.cameras import Cameras, image_directions, pixel_grid, project
 from swimm3r.geometry import pose_from, relative_poses, rotation_angle, so3_exp
 from swimm3r.imaging.turned_rows import half_time_pixels
 from swimm3r.io.images import write_rgb
-from swimm3r.localization.interpolation import between, neighbors, pose_from_neighbors
+from swimm3r.localization.interpolation import between, is_beside_registered, neighbors, pose_from_neighbors
 from swimm3r.localization.landmarks import Landmarks, landmarks_of, locate
 from swimm3r.pipeline.scores.held_out import first_poses
 from swimm3r.scene.frames import Frame, Frames
@@ -163,6 +163,32 @@ def test_a_frame_before_the_first_is_carried_on_backwards(plane):
     later = replace(rec, names=("1.png", "3.png"), cameras=cameras[[1, 3]])
     pose = pose_from_neighbors(later, frames, "0.png")
     torch.testing.assert_close(pose, between(cameras.cam2world[1], cameras.cam2world[3], -0.5))
+
+
+@pytest.mark.parametrize(("lost", "known"), [(2, True), (3, False)])
+def test_neighbors_tell_a_pose_only_where_they_are_near_in_the_order_of_the_dive(plane, lost, known):
+    """Frame 2 with `lost` training frames, which are not registered, between it and frame 3."""
+    rec, frames, _ = plane
+    gap = [replace(frames.frames[1], name=f"lost{k}.png", time=2 + (k + 1) / (lost + 1)) for k in range(lost)]
+    apart = replace(frames, frames=(*frames.frames[:3], *gap, frames.frames[3]))
+    assert is_beside_registered(rec, apart, "2.png") is known
+
+
+def test_a_test_frame_beyond_everything_registered_is_not_placed(plane, tmp_path: Path, caplog):
+    """Frame 2 shows the scene; another one, long after the last registered frame, shows nothing of it."""
+    rec, frames, _ = plane
+    noise = tmp_path / "far.png"
+    write_rgb(noise, torch.rand(180, 240, 3, generator=torch.Generator().manual_seed(1)).numpy())
+    lost = [replace(frames.frames[1], name=f"lost{k}.png", time=4.0 + k) for k in range(5)]
+    tests = [
+        replace(frames.frames[2], split="test"),
+        replace(frames.frames[2], name="far.png", path=noise, time=9.0, split="test"),
+    ]
+    dive = replace(frames, frames=(*frames.frames[:2], tests[0], frames.frames[3], *lost, tests[1]))
+    assert list(first_poses(rec, dive, SETTINGS)) == ["2.png"]
+    assert "far.png" in caplog.text
+    alone = first_poses(rec, replace(dive, frames=(*dive.frames[:2], *dive.frames[3:])), SETTINGS)
+    assert alone["far.png"].source == "distant neighbors"
 
 
 def test_a_test_frame_is_placed_with_the_turn_of_its_camera(plane, tmp_path: Path):

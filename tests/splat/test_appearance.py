@@ -10,7 +10,9 @@ from tests.splat.conftest import GAINS
 from swimm3r.appearance import ORDERS, FrameColors, about_identity, identity_maps, shading_gains
 from swimm3r.errors import InputError
 from swimm3r.evaluate.images import psnr
-from swimm3r.imaging.appearance import decide_appearance
+from swimm3r.geometry import so3_exp
+from swimm3r.imaging.appearance import color_tracks, decide_appearance, ground_colors
+from swimm3r.imaging.clipped import clipped
 from swimm3r.io.images import write_rgb
 from swimm3r.scene.frames import Frames
 from swimm3r.splat import train
@@ -190,7 +192,7 @@ def test_a_refit_composes_with_the_maps_of_before():
 
 
 def shadings(count: int, size: float = 0.04) -> torch.Tensor:
-    drawn = size * torch.randn(count, len(ORDERS), 3, generator=torch.Generator().manual_seed(5))
+    drawn = size * torch.randn(count, len(ORDERS), 1, generator=torch.Generator().manual_seed(5)).expand(-1, -1, 3)
     return drawn - drawn.mean(0)
 
 
@@ -224,6 +226,35 @@ def test_gains_that_change_over_frames_are_told_from_those_that_do_not(tiny_dive
     by_hand = decide_appearance(tracked, tone_mapped, tracked.names, MapAppearanceSettings(shading="off"))
     assert by_hand.decision.on
     assert not by_hand.decision.shaded
+
+
+def test_colors_of_frames_do_not_depend_on_the_axes_of_the_world(tracked, tone_mapped):
+    """Places in the images are those of the camera, however it is turned in the world."""
+    turn = so3_exp(torch.tensor([0.9, -0.4, 2.0], dtype=torch.float64))
+    poses = tracked.cameras.cam2world.clone()
+    poses[:, :3] = turn @ poses[:, :3]
+    points = replace(tracked.points, xyz=tracked.points.xyz.double() @ turn.mT)
+    turned = replace(tracked, cameras=replace(tracked.cameras, cam2world=poses), points=points)
+    plain, other = (color_tracks(rec, tone_mapped, rec.names) for rec in (tracked, turned))
+    assert plain.cosines is not None
+    assert other.cosines is not None
+    torch.testing.assert_close(other.cosines, plain.cosines, atol=1e-4, rtol=0)
+    torch.testing.assert_close(other.ray_depth, plain.ray_depth)
+
+
+def test_ground_has_the_average_colors_of_parts_of_each_image(tiny_dive, tracked):
+    ground = ground_colors(tracked, tiny_dive.frames, tracked.names)
+    assert ground is not None
+    name = tracked.names[3]
+    image = tiny_dive.frames.image(tiny_dive.frames.index(name))
+    measured = (tracked.depth[name].z_depth > 0) & ~clipped(image).any(-1)
+    across, down = image.shape[1] / 6, image.shape[0] / 4
+    for color, at in zip(ground.color[ground.frame == 3], ground.cosines[ground.frame == 3], strict=True):
+        x, y = (float(at[ORDERS.index(order)].clamp(-1, 1).arccos()) / torch.pi for order in ((1, 0), (0, 1)))
+        column, row = int(x * 6), int(y * 4)
+        part = slice(int(row * down), int((row + 1) * down)), slice(int(column * across), int((column + 1) * across))
+        torch.testing.assert_close(color, image[part][measured[part]].mean(0), atol=0.02, rtol=0)
+    assert int((ground.frame == 3).sum()) > 12
 
 
 def test_common_colors_of_tone_mapped_frames_are_those_of_the_dive(tiny_dive, tracked, tone_mapped):

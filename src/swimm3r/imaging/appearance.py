@@ -12,15 +12,18 @@ from torch import Tensor
 from torch.nn.functional import normalize
 
 from swimm3r.appearance import ORDERS, FrameColors, cosines, identity_maps
-from swimm3r.cameras import directions, project, rows_of_frames
+from swimm3r.cameras import Cameras, directions, project, rows_of_frames
 from swimm3r.imaging.clipped import clipped
 from swimm3r.imaging.filters import blur
-from swimm3r.imaging.frame_colors import ColorEvidence, ColorTracks, fit_frame_colors
+from swimm3r.imaging.frame_colors import ColorEvidence, ColorTracks, GroundColors, fit_frame_colors
 from swimm3r.imaging.settings import AppearanceSettings
+from swimm3r.imaging.undistortion import frame_rays
 from swimm3r.medium import backscatter, transmittances
 from swimm3r.scene.frames import Frames
 from swimm3r.scene.reconstruction import Reconstruction
 
+_ACROSS, _DOWN = 6, 4  # parts of an image that ground has average colors in
+_PIXELS, _FEWEST = 4_000, 40  # of an image with measured depth that these are taken of, and of a part that has any
 _POINT = 1 / 320  # of the longer side, sigma of the window that a point's color is taken over
 
 
@@ -129,9 +132,7 @@ def color_tracks(rec: Reconstruction, frames: Frames, names: Sequence[str]) -> C
         point = rec.tracks.point[rows]
         away = rec.points.xyz[point].double() - rec.cameras.centers[i].double()
         toward = normalize(directions(rec.cameras[i], rec.tracks.xy[rows].double()[None])[0], dim=-1)
-        ahead = rec.cameras.centers[i].double() + toward
-        place_in_view = project(canvases[i], ahead[None])[0][0] / torch.tensor([canvases.width, canvases.height])
-        at = cosines(place_in_view.float())
+        at = cosines(_places(canvases[i], toward))
         parts.append((color, away.norm(dim=-1).float(), point, torch.full_like(point, k), toward.float(), at))
     if not parts:
         nothing = torch.zeros(0, dtype=torch.int64)
@@ -141,7 +142,48 @@ def color_tracks(rec: Reconstruction, frames: Frames, names: Sequence[str]) -> C
     if rec.medium is None or rec.medium.encoding != "srgb":
         return tracks
     medium = rec.medium.at(ray_depth, toward)
-    return replace(tracks, T_D=transmittances(ray_depth, medium)[0], backscatter=backscatter(ray_depth, medium))
+    ground = None if rec.medium.lamp is None else ground_colors(rec, frames, names)
+    T_D, B = transmittances(ray_depth, medium)[0], backscatter(ray_depth, medium)
+    return replace(tracks, T_D=T_D, backscatter=B, ground=ground)
+
+
+def _places(canvas: Cameras, toward: Float[Tensor, "p 3"]) -> Float[Tensor, "p 2"]:
+    """Places in a view, 0..1 across and down, of directions in its camera's axes."""
+    ahead = canvas.cam2world[0, :3, 3] + toward.double() @ canvas.cam2world[0, :3, :3].mT
+    return (project(canvas, ahead[None])[0][0] / torch.tensor([canvas.width, canvas.height])).float()
+
+
+def ground_colors(rec: Reconstruction, frames: Frames, names: Sequence[str]) -> GroundColors | None:
+    """Average colors of ground of measured depth in 24 parts of each of some frames; None where none was measured.
+
+    `rec` has a water on values as stored.
+    """
+    assert rec.medium is not None
+    parts: list[tuple[Tensor, ...]] = []
+    canvases = rec.cameras.drawn()
+    for k, name in enumerate(names):
+        i, f = rec.index(name), frames.index(name)
+        if name not in rec.depth:
+            continue
+        pixel = torch.nonzero((rec.depth[name].z_depth > 0).flatten() & frames.mask(f).flatten())[:, 0]
+        pixel = pixel[:: max(1, len(pixel) // _PIXELS)]
+        color, rays = frames.colors(f, pixel), frame_rays(rec.cameras[i]).reshape(-1, 3)[pixel]
+        length = rays.norm(dim=-1)
+        ray_depth, direction = rec.depth[name].z_depth.flatten()[pixel] * length, rays / length[:, None]
+        place = _places(canvases[i], direction)
+        medium = rec.medium.at(ray_depth, direction)
+        shown = torch.cat([color, transmittances(ray_depth, medium)[0], backscatter(ray_depth, medium), place], -1)
+        kept = ~clipped(color).any(-1) & shown.isfinite().all(-1) & ((place >= 0) & (place < 1)).all(-1)
+        column, row = (place[kept] * torch.tensor([_ACROSS, _DOWN])).long().unbind(-1)
+        part, count = (column * _DOWN + row).unique(return_inverse=True, return_counts=True)[1:]
+        means = torch.zeros(len(count), shown.shape[1]).index_add_(0, part, shown[kept]) / count[:, None]
+        enough = count >= _FEWEST
+        parts.append((means[enough], torch.full((int(enough.sum()),), k)))
+    if not any(len(frame) for _, frame in parts):
+        return None
+    means, frame = (torch.cat(part) for part in zip(*parts, strict=True))
+    color, T_D, B, place = means.split([3, 3, 3, 2], dim=-1)
+    return GroundColors(color, T_D, B, frame, cosines(place))
 
 
 def _recorded_gains(frames: Frames, names: Sequence[str]) -> Float[Tensor, "f 3"] | None:

@@ -28,14 +28,15 @@ from dataclasses import dataclass, replace
 import numpy as np
 import torch
 from jaxtyping import Float, Int
-from scipy.sparse import csr_matrix
 from torch import Tensor
 
 from swimm3r.appearance import ORDERS, about_identity
+from swimm3r.imaging.joint_gains import GainEvidence, joint_gains
 
 _ROUNDS = 8  # of alternating fits
 _GAIN_STD, _MIX_STD, _OFFSET_STD = 0.3, 0.05, 0.02  # of a frame's map about the identity, before anything is seen
 _SHADING_STD = 0.2  # of a logarithmic gain's slowest cosines, before anything is seen; faster ones have less
+_GROUND_STD, _GROUND_SHARED = 0.3, 4.0  # of average colors in parts of images about the dive's, and parts that share it
 _REDUNDANCY = 100.0  # observations that share an error: what is common to a frame and no map of colors
 _NEAR = 20.0  # observations that share an error as they are near each other in a frame
 _LEAST_SCALE = 2e-3  # pixel value, the least spread that residuals are weighed by
@@ -44,6 +45,17 @@ _TERMS = 4  # of the water, per channel
 _HELD = 0.01  # range of the logarithms of recorded gains up to which a camera held them
 _SLOPES = 0.0, 1.5  # of a tone curve in logarithms; sRGB's is 0.42 to 1
 _DARK, _FULL = 0.02, 0.97  # pixel values beyond which nothing can be told about a color
+
+
+@dataclass(frozen=True)
+class GroundColors:
+    """Average colors of the ground in parts of the images, with the water before it."""
+
+    color: Float[Tensor, "m 3"]
+    T_D: Float[Tensor, "m 3"]
+    backscatter: Float[Tensor, "m 3"]
+    frame: Int[Tensor, " m"]
+    cosines: Float[Tensor, "m k"]  # at the middle of the part
 
 
 @dataclass(frozen=True)
@@ -59,6 +71,7 @@ class ColorTracks:
     backscatter: Float[Tensor, "o 3"] | None = None
     gains: Float[Tensor, "f 3"] | None = None  # of linear light, by the camera's record
     cosines: Float[Tensor, "o k"] | None = None  # of shadings, at the places of the observations in their images
+    ground: GroundColors | None = None  # where the frames are taken to show alike ground
 
 
 @dataclass(frozen=True)
@@ -134,7 +147,7 @@ def fit_frame_colors(tracks: ColorTracks) -> FrameColorFit | None:
     evidence = ColorEvidence(len(points), alone, water, frames, both, of_shading, *of_record)
     with_shading = None
     if seen.cosines is not None:
-        fit = _final(seen, center, shaded=True)
+        fit = _final(seen, center, shaded=True, ground=tracks.ground)
         with_shading = ShadedFit(torch.from_numpy(fit.maps).float(), torch.from_numpy(fit.shading).float())
     return FrameColorFit(torch.from_numpy(_final(seen, center).maps).float(), evidence, with_shading)
 
@@ -158,6 +171,11 @@ class _Seen:
         own = self.color[which], self.z[which], self.point[which], self.frame[which], self.frames
         return _Seen(*own, T_D, backscatter, self.log_gains, cosines)
 
+    def terms(self, *, shaded: bool) -> np.ndarray:
+        """The constant, and the cosines of shadings if there are to be any, [o, k]."""
+        constant = np.ones((len(self.point), 1))
+        return constant if self.cosines is None or not shaded else np.concatenate([constant, self.cosines], 1)
+
     def evened(self, shading: np.ndarray) -> "_Seen":
         """The same observations without the frames' shadings [f, k, 3]."""
         if self.cosines is None or not shading.any():
@@ -174,8 +192,13 @@ class _Fit:
     slope: float = 0.0  # of the tone curve through which recorded gains act
 
 
-# the maps of all frames from observations, common colors, weights, their scale, and the maps of before
-MapFit = Callable[[_Seen, np.ndarray, np.ndarray, float, np.ndarray], np.ndarray]
+# the maps and shadings of all frames from observations as filmed, common colors, weights, their scale, and the maps of
+# before
+Turn = Callable[[_Seen, np.ndarray, np.ndarray, float, np.ndarray], tuple[np.ndarray, np.ndarray]]
+
+
+def _no_shading(frames: int) -> np.ndarray:
+    return np.zeros((frames, len(ORDERS), 3))
 
 
 def _usable(tracks: ColorTracks) -> _Seen:
@@ -230,34 +253,32 @@ def _spreads(fitted: _Seen, held: _Seen) -> list[float]:
     """Spreads of held-out points: alone, with water, with frames' maps, with both, with water and recorded gains, and
     with water, maps and shadings."""
     recorded = _recorded(fitted)
-    own = _own_maps(recorded.maps)
+    own = _own_colors(recorded.maps)
     both = _fitted(fitted, True, own)
-    shaded = both if fitted.cosines is None else _fitted(fitted, True, own, shaded=True)
+    shaded = both if fitted.cosines is None else _fitted(fitted, True, _own_colors(recorded.maps, shaded=True))
     models = (_fitted(fitted, False), _fitted(fitted, True), _fitted(fitted, False, own), both, recorded, shaded)
     return [_spread(held, model) for model in models]
 
 
-def _fitted(seen: _Seen, with_water: bool, map_fit: MapFit | None = None, *, shaded: bool = False) -> _Fit:
+def _fitted(filmed: _Seen, with_water: bool, turn: Turn | None = None) -> _Fit:
     """Robust alternating least squares."""
-    filmed, maps = seen, np.tile(np.eye(3, 4), (seen.frames, 1, 1))
-    shading = np.zeros((seen.frames, len(ORDERS), 3))
-    water = np.zeros((_TERMS, 3))
-    mean = _Means(seen.point)
-    for _ in range(_ROUNDS if with_water or map_fit is not None else 0):
-        seen = filmed.evened(shading)
-        S = _common(seen, maps)
+    fit = _Fit(np.zeros((_TERMS, 3)), np.tile(np.eye(3, 4), (filmed.frames, 1, 1)), _no_shading(filmed.frames))
+    mean = _Means(filmed.point)
+    for _ in range(_ROUNDS if with_water or turn is not None else 0):
+        seen = filmed.evened(fit.shading)
+        S = _common(seen, fit.maps)
         a = mean(S)
         basis = _basis(seen, mean, a)
         if with_water:
-            water = np.stack([_least_squares(basis[..., c], (S - a)[:, c], mean.weight) for c in range(3)], -1)
-        of_water = np.einsum("otc,tc->oc", basis, water)
+            found = [_least_squares(basis[..., c], (S - a)[:, c], mean.weight) for c in range(3)]
+            fit = replace(fit, water=np.stack(found, -1))
+        of_water = np.einsum("otc,tc->oc", basis, fit.water)
         predicted = mean(S - of_water) + of_water
-        scale = mean.reweigh(seen.color - _filmed(seen, maps, predicted))
-        if map_fit is not None:
-            maps = map_fit(seen, predicted, mean.weight, scale, maps)
-        if shaded:
-            shading = _shadings(filmed, _filmed(seen, maps, predicted), mean.weight, scale)
-    return _Fit(water, maps, shading)
+        scale = mean.reweigh(seen.color - _filmed(seen, fit.maps, predicted))
+        if turn is not None:
+            maps, shading = turn(filmed, predicted, mean.weight, scale, fit.maps)
+            fit = replace(fit, maps=maps, shading=shading)
+    return fit
 
 
 def _recorded(seen: _Seen) -> _Fit:
@@ -270,7 +291,9 @@ def _recorded(seen: _Seen) -> _Fit:
     return replace(fit, slope=slope)
 
 
-def _record_maps(seen: _Seen, S: np.ndarray, weight: np.ndarray, scale: float, maps: np.ndarray) -> np.ndarray:
+def _record_maps(
+    seen: _Seen, S: np.ndarray, weight: np.ndarray, scale: float, maps: np.ndarray
+) -> tuple[np.ndarray, np.ndarray]:
     """The maps of the recorded gains, with the slope of the tone curve that fits the colors of points best."""
     assert seen.log_gains is not None
     mean = _Means(seen.point)
@@ -280,60 +303,84 @@ def _record_maps(seen: _Seen, S: np.ndarray, weight: np.ndarray, scale: float, m
     slope = (mean.weight @ (x * y).sum(1)) / max(float(mean.weight @ (x * x).sum(1)), 1e-12)
     out = np.tile(np.eye(3, 4), (seen.frames, 1, 1))
     out[:, range(3), range(3)] = np.exp(np.clip(slope, *_SLOPES) * seen.log_gains)
-    return about_identity(torch.from_numpy(out)).numpy()
+    return about_identity(torch.from_numpy(out)).numpy(), _no_shading(seen.frames)
 
 
-def _own_maps(center: np.ndarray) -> MapFit:
-    """The fit of a free map per frame, held to `center` [f, 3, 4]."""
+def _own_colors(center: np.ndarray, *, shaded: bool = False, ground: GroundColors | None = None) -> Turn:
+    """The fit of a free map per frame, held to `center` [f, 3, 4], and of shadings, held to 0 and to even `ground`.
 
-    def fit(seen: _Seen, S: np.ndarray, weight: np.ndarray, scale: float, maps: np.ndarray) -> np.ndarray:
-        return _frame_maps(seen, S, weight, scale, maps, center)
+    Lights that move and local tone mapping change all channels alike, and so do shadings: what changes by channel over
+    an image is water, which they would take for their own. By turns with the points' colors alone, frames that share no
+    point would take long to agree. So the points are moved first by what gains and shadings of all frames, found at
+    once, would change them by.
+    """
 
-    return fit
+    def turn(
+        filmed: _Seen, S: np.ndarray, weight: np.ndarray, scale: float, maps: np.ndarray
+    ) -> tuple[np.ndarray, np.ndarray]:
+        expected = _filmed(filmed, maps, S).clip(_DARK)
+        delta, of_logs = np.log(filmed.color / expected), weight * (expected**2).mean(1)
+        shown = of_logs, filmed.point, filmed.frame
+        alone = _held_to_none(filmed.frames, scale, shaded=shaded)
+        if ground is not None:
+            alone = _with_ground(alone, ground, maps, scale)
+        mean = delta.mean(1, keepdims=True)
+        of_all = joint_gains(mean, filmed.terms(shaded=shaded), *shown, alone)
+        apart = _held_to_none(filmed.frames, scale, shaded=False)
+        of_each = joint_gains(delta - mean, filmed.terms(shaded=False), *shown, apart)
+        shading = np.repeat(of_all.gains[:, 1:], 3, -1) if shaded else _no_shading(filmed.frames)
+        moved = S * np.exp(of_all.changes + of_each.changes)
+        return _affine_maps(filmed.evened(shading), moved, weight, scale, center), shading
+
+    return turn
 
 
-def _final(seen: _Seen, center: np.ndarray, *, shaded: bool = False) -> _Fit:
+def _held_to_none(frames: int, scale: float, *, shaded: bool) -> GainEvidence:
+    """Gains of frames, and their shadings if there are to be any, before anything is seen."""
+    stay = [_REDUNDANCY / _GAIN_STD**2]
+    if shaded:
+        stay += list(_NEAR * (np.hypot(*np.array(ORDERS).T) / _SHADING_STD) ** 2)
+    return GainEvidence(np.tile(scale**2 * np.diag(stay), (frames, 1, 1)), np.zeros((frames, len(stay), 1)))
+
+
+def _with_ground(alone: GainEvidence, ground: GroundColors, maps: np.ndarray, scale: float) -> GainEvidence:
+    """With ground that reflects alike everywhere, within `_GROUND_STD`."""
+    terms = np.concatenate([np.ones((len(ground.frame), 1)), ground.cosines.double().numpy()], 1)
+    color, T_D, B = (values.double().numpy() for values in (ground.color, ground.T_D, ground.backscatter))
+    frame = ground.frame.numpy()
+    inverse = np.linalg.inv(maps[..., :3])
+    direct = np.einsum("mij,mj->mi", inverse[frame], color - maps[frame, :, 3]) - B
+    J = direct.sum(0) / T_D.sum(0)
+    expected = np.einsum("mij,mj->mi", maps[frame, :, :3], J * T_D + B) + maps[frame, :, 3]
+    expected = expected.clip(_DARK)
+    std = np.hypot(_GROUND_STD * J * T_D, _DARK) / expected
+    weight = _NEAR * scale**2 / (_GROUND_SHARED * std**2).mean(1)
+    delta = np.log(color.clip(_DARK) / expected).mean(1, keepdims=True)
+    information, products = alone.information.copy(), alone.products.copy()
+    np.add.at(information, frame, weight[:, None, None] * terms[:, :, None] * terms[:, None, :])
+    np.add.at(products, frame, weight[:, None, None] * terms[:, :, None] * delta[:, None, :])
+    return GainEvidence(information, products)
+
+
+def _final(seen: _Seen, center: np.ndarray, *, shaded: bool = False, ground: GroundColors | None = None) -> _Fit:
     """The maps of all observations, held to `center`: in the measured water, in free water where none was measured."""
-    if seen.T_D is None:
-        return _fitted(seen, True, _own_maps(center), shaded=shaded)
-    return _fitted_in_water(seen, center, shaded=shaded)
+    turn = _own_colors(center, shaded=shaded, ground=ground)
+    return _fitted(seen, True, turn) if seen.T_D is None else _fitted_in_water(seen, center, turn)
 
 
-def _fitted_in_water(seen: _Seen, center: np.ndarray, *, shaded: bool) -> _Fit:
-    """The maps in known water, held to `center`."""
-    assert seen.T_D is not None
-    assert seen.backscatter is not None
-    filmed, maps, mean = seen, center, _Means(seen.point)
-    shading = np.zeros((seen.frames, len(ORDERS), 3))
+def _fitted_in_water(filmed: _Seen, center: np.ndarray, turn: Turn) -> _Fit:
+    """The maps in known water, from those of `center` on."""
+    assert filmed.T_D is not None
+    assert filmed.backscatter is not None
+    maps, shading, mean = center, _no_shading(filmed.frames), _Means(filmed.point)
     for _ in range(_ROUNDS):
         seen = filmed.evened(shading)
-        direct = _common(seen, maps) - seen.backscatter
-        J = (mean(seen.T_D * direct) / mean(seen.T_D**2).clip(1e-9)).clip(0.0, _BRIGHTEST)
-        predicted = J * seen.T_D + seen.backscatter
+        direct = _common(seen, maps) - filmed.backscatter
+        J = (mean(filmed.T_D * direct) / mean(filmed.T_D**2).clip(1e-9)).clip(0.0, _BRIGHTEST)
+        predicted = J * filmed.T_D + filmed.backscatter
         scale = mean.reweigh(seen.color - _filmed(seen, maps, predicted))
-        maps = _frame_maps(seen, predicted, mean.weight, scale, maps, center)
-        if shaded:
-            shading = _shadings(filmed, _filmed(seen, maps, predicted), mean.weight, scale)
+        maps, shading = turn(filmed, predicted, mean.weight, scale, maps)
     return _Fit(np.zeros((_TERMS, 3)), maps, shading)
-
-
-def _shadings(seen: _Seen, unshaded: np.ndarray, weight: np.ndarray, scale: float) -> np.ndarray:
-    """The shadings [f, k, 3] from what the frames would show without, 0 on average, held to 0 where little is seen."""
-    assert seen.cosines is not None
-    unshaded = unshaded.clip(_DARK)
-    delta, weights = np.log(seen.color / unshaded), weight[:, None] * unshaded**2
-    order = np.hypot(*np.array(ORDERS).T)
-    stay = np.diag(_NEAR * scale**2 * (order / _SHADING_STD) ** 2)
-    found = np.zeros((seen.frames, len(ORDERS), 3))
-    rows = np.argsort(seen.frame, kind="stable")
-    ends = np.searchsorted(seen.frame[rows], np.arange(seen.frames + 1))
-    for f in range(seen.frames):
-        own = rows[ends[f] : ends[f + 1]]
-        B = seen.cosines[own]
-        for c in range(3):
-            weighted = B * weights[own, c, None]
-            found[f, :, c] = np.linalg.solve(weighted.T @ B + stay, weighted.T @ delta[own, c])
-    return found - found.mean(0)
 
 
 def _spread(seen: _Seen, fit: _Fit) -> float:
@@ -361,37 +408,6 @@ def _filmed(seen: _Seen, maps: np.ndarray, S: np.ndarray) -> np.ndarray:
 def _least_squares(x: np.ndarray, y: np.ndarray, weight: np.ndarray) -> np.ndarray:
     information = (x * weight[:, None]).T @ x
     return np.linalg.solve(information + 1e-6 * len(x) * np.eye(x.shape[1]), x.T @ (weight * y))
-
-
-def _frame_maps(
-    seen: _Seen, S: np.ndarray, weight: np.ndarray, scale: float, maps: np.ndarray, center: np.ndarray
-) -> np.ndarray:
-    """Every frame's map from the dive's colors to its own, held to `center` where little is seen.
-
-    By turns with the points' colors alone, frames that share no point would take long to agree. So the points are
-    moved first by what gains of all frames, found at once, would change them by.
-    """
-    filmed = _filmed(seen, maps, S).clip(_DARK)
-    delta = np.log(seen.color / filmed)
-    of_points = _point_changes(seen, delta, weight * (filmed**2).mean(1), scale)
-    return _affine_maps(seen, S * np.exp(of_points), weight, scale, center)
-
-
-def _point_changes(seen: _Seen, delta: np.ndarray, weight: np.ndarray, scale: float) -> np.ndarray:
-    """The change of each observation's point [o, 3] in delta_tf = gain_f + change_t, weighted least squares."""
-    point = np.unique(seen.point, return_inverse=True)[1]
-    links = csr_matrix((weight, (seen.frame, point)), shape=(seen.frames, int(point.max()) + 1))
-    of_point = np.asarray(links.sum(0)).ravel().clip(1e-12)
-    shared = links.multiply(1 / of_point).tocsr() @ links.T
-    stay = _REDUNDANCY * scale**2 / _GAIN_STD**2
-    system = np.diag(np.asarray(links.sum(1)).ravel() + stay) - shared.toarray()
-    changes = np.zeros((len(point), 3))
-    for c in range(3):
-        mean = np.bincount(point, weight * delta[:, c]) / of_point
-        left = np.bincount(seen.frame, weight * (delta[:, c] - mean[point]), minlength=seen.frames)
-        gains = np.linalg.solve(system, left)
-        changes[:, c] = (np.bincount(point, weight * (delta[:, c] - gains[seen.frame])) / of_point)[point]
-    return changes
 
 
 def _affine_maps(seen: _Seen, S: np.ndarray, weight: np.ndarray, scale: float, center: np.ndarray) -> np.ndarray:

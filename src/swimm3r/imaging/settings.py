@@ -23,5 +23,5 @@ class AppearanceSettings(Settings):
     shading: Literal["auto", "on", "off"] = "auto"
     """Give every frame gains that change smoothly over the image beside its color map, which it then has in any case:
     always, never, or where the sparse points say so (auto)."""
-    least_shading: Share = 0.5
+    least_shading: Share = 0.45
     """Smallest share that such gains must explain of the variation that water and color maps leave, with `auto`."""

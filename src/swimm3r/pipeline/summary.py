@@ -126,7 +126,10 @@ def splat_sections(scene: SplatMap, rec: Reconstruction, frames: Frames, folder:
 
 
 def test_section(
-    views: Sequence[HeldOutView], settings: PoseRefinementSettings, colors: FrameColors | None
+    views: Sequence[HeldOutView],
+    settings: PoseRefinementSettings,
+    colors: FrameColors | None,
+    unplaced: Sequence[str],
 ) -> dict[str, object]:
     """Mean scores of the frames that training did not see, and how they were placed and compared."""
     means = {
@@ -136,7 +139,8 @@ def test_section(
         **mean_part([view.still for view in views]).summary(),
         "protocol": protocol(views, settings, colors),
     }
-    return summary_entries(means) | {"frames": [frame_entry(view) for view in views]}
+    left_out = {"unplaced": list(unplaced)} if unplaced else {}
+    return summary_entries(means) | left_out | {"frames": [frame_entry(view) for view in views]}
 
 
 def frame_entry(view: HeldOutView) -> dict[str, object]:

@@ -1,5 +1,6 @@
 """Frames on the page, as data URIs: as filmed, without the water, as the map shows them, and their depth in colors."""
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -107,11 +108,12 @@ def frames_only(frames: Frames) -> list[ShownFrame]:
     ]
 
 
-def test_frames(frames: Frames, folder: Path) -> list[ShownFrame]:
-    """A few test frames, evenly spread, beside the views of the map from there."""
+def test_frames(frames: Frames, folder: Path, unplaced: Sequence[str]) -> list[ShownFrame]:
+    """A few test frames, evenly spread, beside the views of the map from there; `unplaced` ones have none."""
     found, stems = [], view_stems(frames.names)
     alts = {"rgb": "as the map renders it", "clear": "as the map renders it without the water", "z_depth": "depth"}
-    for name in _spread(frames.test.names, _SHOWN_TESTS):
+    placed = tuple(name for name in frames.test.names if name not in unplaced)
+    for name in _spread(placed, _SHOWN_TESTS):
         views = [View("raw", _uri(filmed(frames, name)), f"{name} as filmed")]
         for kind, alt in alts.items():
             image = images.read_rgb(folder / "renders" / "test" / f"{stems[name]}_{kind}.png")

@@ -46,7 +46,7 @@ def write(folder: Path) -> Path:
     rec = load_reconstruction(sfm, frames) if (sfm / "reconstruction.json").is_file() else None
     fields = _made_with(folder, remedy) | _of_dive(frames, rec, folder)
     if "test" in summary:
-        fields["tests"] = shown_frames.test_frames(frames, folder)
+        fields["tests"] = shown_frames.test_frames(frames, folder, summary["test"].get("unplaced", ()))
     try:
         fields |= _of_summary(summary, folder) | {"rig": rig_section(summary, frames)}
         page = page_template(_part("page.html.j2")).render(fields)

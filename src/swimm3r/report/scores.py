@@ -46,7 +46,7 @@ def test_figures(summary: dict[str, Any]) -> list[Figure]:
     test, splat = summary["test"], summary["splat"]
     blurred = f"blurring the frames by 4 px would score {_number(test['blur4_psnr'], 1)} dB"
     return [
-        Figure(f"{_number(test['psnr'], 1)} dB", "PSNR, higher is better", blurred),
+        Figure(f"{_number(test['psnr'], 1)} dB", "PSNR, higher is better", blurred + _unplaced(test)),
         Figure(_number(test["ssim"], 3), "SSIM, at most 1"),
         Figure(_number(test["lpips"], 3), "LPIPS, lower is better", test.get("lpips_reason") or ""),
         Figure(f"{_number(test['sharpness'], 0, 100)} %", "Sharpness of the frames kept"),
@@ -54,6 +54,12 @@ def test_figures(summary: dict[str, Any]) -> list[Figure]:
         *_registration_figures(test),
         Figure(f"{splat['primitives']:,}", "Primitives", f"{splat['iterations']:,} steps, recipe {splat['recipe']}"),
     ]
+
+
+def _unplaced(test: dict[str, Any]) -> str:
+    """The test frames that no registered frame tells the place of."""
+    count = len(test.get("unplaced", ()))
+    return f"; {count} of {count + test['views']} test frames could not be placed and are not scored" if count else ""
 
 
 def _observed_figures(test: dict[str, Any]) -> list[Figure]:

@@ -29,24 +29,26 @@ def fit_to_view(
 ) -> ColorFit:
     """The map from a rendering to a view, held to the identity where the view's colors do not tell.
 
-    A shading is found together with the affine map, to first order in both.
+    A shading, alike in all channels, is found together with the affine map, to first order in both.
     """
     weight = seen.reshape(-1).double()
     x = torch.cat([render, torch.ones_like(render[:1])]).reshape(4, -1).double()
     y = target.reshape(3, -1).double()
     waves = image_cosines(*render.shape[1:]).to(x).reshape(len(ORDERS), -1) if shaded else x[:0]
-    maps, shading = [], []
+    stay = torch.full((4,), _STAY_MIX, dtype=torch.float64, device=x.device)
+    stay = torch.cat([stay, torch.full((len(waves),), _STAY_GAIN / 3).to(stay)]) * weight.sum().clamp(min=1.0)
+    system, products = x.new_zeros(12 + len(waves), 12 + len(waves)), x.new_zeros(12 + len(waves))
     for c in range(3):
         terms = torch.cat([x, waves * x[c]])
-        stay = torch.full((len(terms),), _STAY_MIX, dtype=torch.float64, device=x.device)
-        stay[c] = _STAY_GAIN
-        stay[4:] = _STAY_GAIN
-        stay = stay * weight.sum().clamp(min=1.0)
-        products = (terms * weight) @ y[c] + stay * torch.eye(len(terms)).to(stay)[c]
-        found = torch.linalg.solve((terms * weight) @ terms.mT + stay.diag(), products)
-        maps.append(found[:4])
-        shading.append(found[4:] / found[c])
-    return ColorFit(torch.stack(maps).float(), torch.stack(shading, -1).float() if shaded else None)
+        own = stay.clone()
+        own[c] *= _STAY_GAIN / _STAY_MIX
+        rows = torch.cat([4 * c + torch.arange(4), 12 + torch.arange(len(waves))]).to(x.device)
+        system[rows[:, None], rows] += (terms * weight) @ terms.mT + own.diag()
+        products[rows] += (terms * weight) @ y[c] + own * (torch.arange(len(terms)) == c).to(own)
+    found = torch.linalg.solve(system, products)
+    maps = found[:12].reshape(3, 4)
+    shading = found[12:, None] / maps[:, :3].diagonal().mean()
+    return ColorFit(maps.float(), shading.expand(-1, 3).float() if shaded else None)
 
 
 def write_decision(folder: Path, decision: AppearanceDecision) -> None:

@@ -157,6 +157,8 @@ def _cells_of_clip(
             shown.setdefault(key.method, folder / "test")
     stems = view_stems(first.frames.names)
     for name in first.frames.test.names:
+        if not all((images / f"{stems[name]}_target.png").is_file() for images in shown.values()):
+            continue  # a test frame that could not be placed
         _side_by_side(out / "images" / clip.name, stems[name], shown)
     return cells
 

@@ -66,6 +66,8 @@ def _scores(console: Console, test: dict) -> None:
         f" (if blurred by 4 px: {_number(test['blur4_psnr'], 1)}), SSIM {test['ssim']:.3f},"
         f" sharpness {_number(test['sharpness'], 2)}"
     )
+    if unplaced := test.get("unplaced"):
+        console.print(f"Not scored, as no frame near them is registered: {', '.join(unplaced)}")
     if test.get("psnr_observed") is not None and round(100 * test["observed"]) < 100:
         console.print(
             f"Of the test frames, training frames saw {_number(100 * test['observed'], 0)} %: PSNR"

@@ -1,11 +1,13 @@
 """Held-out views: poses of the test frames, the map rendered from there, and its scores.
 
 A frame's first pose comes from a reference where one is given, else from its matches with triangulated points and
-measured depth of the reconstruction, else from its neighbors in time. Then it is refined on the frozen map
-(`splat.poses`), for a score should be about the map and not about a pose that is a pixel off. Scores count the pixels
+measured depth of the reconstruction, else from its neighbors in time. A frame that matches nothing, and whose neighbors
+are not registered, has no known place and is not scored. Poses are refined on the frozen map (`splat.poses`), for a
+score should be about the map and not about a pose that is a pixel off. Scores count the pixels
 that the lens shows and the mask admits, on the pinhole canvas of the training size.
 """
 
+import logging
 from collections import Counter
 from collections.abc import Sequence
 from dataclasses import dataclass, fields, replace
@@ -28,7 +30,7 @@ from swimm3r.geometry import best_similarity
 from swimm3r.imaging.turned_rows import at_half_time, mask_at_half_time
 from swimm3r.imaging.undistortion import shown_pixels, undistorted
 from swimm3r.io.view_names import view_stems
-from swimm3r.localization.interpolation import neighbors, pose_from_neighbors
+from swimm3r.localization.interpolation import is_beside_registered, neighbors, pose_from_neighbors
 from swimm3r.localization.landmarks import Located, landmarks_of, locate
 from swimm3r.pipeline.renders import display_style, write_view
 from swimm3r.progress import Progress, silent
@@ -45,7 +47,9 @@ from swimm3r.splat.rendering import SplatMap
 from swimm3r.splat.settings import PoseRefinementSettings
 from swimm3r.splat.training_poses import as_mapped, axes_of_map
 
-Source = Literal["reference", "2D-3D matches", "neighbors"]
+log = logging.getLogger(__name__)
+
+Source = Literal["reference", "2D-3D matches", "neighbors", "distant neighbors"]
 _REFERENCES = 6  # registered frames, the nearest in time, that a held-out frame is matched with
 
 
@@ -134,7 +138,10 @@ def first_poses(
     reference: GroundTruth | None = None,
     progress: Progress = silent,
 ) -> dict[str, FirstPose]:
-    """A pose of every test frame in the axes and unit of the reconstruction."""
+    """A pose of every test frame that has a known place, in the axes and unit of the reconstruction.
+
+    Where none has, those of distant neighbors stand in for them, so that there is something to look at.
+    """
     known = {} if reference is None else reference_poses(rec, reference)
     landmarks = landmarks_of(rec, rec.still(frames), features)
     poses = {}
@@ -147,7 +154,8 @@ def first_poses(
         f, lens = frames.index(frame.name), rec.cameras[rec.index(near[0])]
         located = locate(frames.image(f), frames.mask(f), lens, [landmarks(name) for name in near], features)
         if located is None:
-            first = FirstPose(pose_from_neighbors(rec, frames, frame.name), "neighbors")
+            source: Source = "neighbors" if is_beside_registered(rec, frames, frame.name) else "distant neighbors"
+            first = FirstPose(pose_from_neighbors(rec, frames, frame.name), source)
         elif frames.rows_rectified:
             first = _turned(replace(lens, cam2world=located.cam2world[None]), located)
         else:
@@ -156,7 +164,10 @@ def first_poses(
             first = replace(first, cam2world=known[frame.name], source="reference")
         poses[frame.name] = first
     progress("placing test frames", len(frames.test), len(frames.test))
-    return poses
+    known_places = {name: pose for name, pose in poses.items() if pose.source != "distant neighbors"}
+    if unplaced := sorted(poses.keys() - known_places):
+        log.warning("not placed, for nothing near them is registered: test frames %s", ", ".join(unplaced))
+    return known_places or poses
 
 
 def _turned(camera: Cameras, located: Located) -> FirstPose:

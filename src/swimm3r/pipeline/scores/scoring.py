@@ -84,7 +84,7 @@ def score_map(
     stems = view_stems(frames.names)
     physical, shown = ([into / f"{stems[v.name]}_{kind}.png" for v in views] for kind in ("clear_physical", "clear"))
     return {
-        "test": sections.test_section(views, test, scene.colors),
+        "test": sections.test_section(views, test, scene.colors, [n for n in frames.test.names if n not in poses]),
         "restored": {"splat": restored_section(physical, shown, progress)},
         "truth": truth_section(rec, frames, truth, scene, views, progress) if truth else None,
     }
