@@ -7,8 +7,9 @@ moves, do to one frame's colors: it changes smoothly over the image, and is 0 wh
 
     s = sum_k h_k B_k,    B_k(x, y) = cos(pi i x) cos(pi j y),    (i, j) != (0, 0)
 
-with x and y across and down the image from 0 to 1, and h_k one number per channel. The constant is left out: it is the
-frame's exposure and white balance.
+with x and y across and down the image from 0 to 1, and h_k numbers per channel, which fits make alike: light and
+local tone mapping change all channels together, and water does not. The constant is left out: it is the frame's
+exposure and white balance.
 """
 
 from collections.abc import Sequence

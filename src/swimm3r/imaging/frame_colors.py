@@ -16,7 +16,9 @@ exposure and white balance are; the others, and offsets, are held closer to 0, a
 resemble frames with an offset.
 
 Where the gains of a frame change over the image, as under local tone mapping, I_f = e^(s_f) (M_f S + b_f) with the
-shading s_f of `swimm3r.appearance`, 0 on average over frames at every place. A further model has them, too.
+shading s_f of `swimm3r.appearance`, 0 on average over frames at every place. A further model has them, too, the
+same for all channels. Where a lamp lights the ground, average colors of parts of the images are held to ground that
+reflects alike (`GroundColors`): points do not tell of light that all frames of a line share.
 
 Where the camera recorded its gains g_f on linear light, they make a model of their own, whose one free number is the
 slope of the tone curve: M_f = diag(g_f^slope), about the identity. Maps of frames are then held to these, not to 1.

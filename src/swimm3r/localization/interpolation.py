@@ -10,9 +10,7 @@ from swimm3r.scene.frames import Frames
 from swimm3r.scene.reconstruction import Reconstruction
 
 _MAX_STEPS = 2.0  # a pose is carried on by at most this many steps of its neighbors
-_NEAR = (
-    3  # times of training frames away, at most: of frames farther apart none tells how the camera moved between them
-)
+_NEAR = 3  # times of training frames away, at most; frames farther apart do not tell how the camera moved between
 
 
 def between(before: Float[Tensor, "4 4"], after: Float[Tensor, "4 4"], share: float) -> Float[Tensor, "4 4"]:

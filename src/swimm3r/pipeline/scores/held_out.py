@@ -2,9 +2,9 @@
 
 A frame's first pose comes from a reference where one is given, else from its matches with triangulated points and
 measured depth of the reconstruction, else from its neighbors in time. A frame that matches nothing, and whose neighbors
-are not registered, has no known place and is not scored. Poses are refined on the frozen map (`splat.poses`), for a
-score should be about the map and not about a pose that is a pixel off. Scores count the pixels
-that the lens shows and the mask admits, on the pinhole canvas of the training size.
+are not registered, has no known place and is not scored beside others that have one. Poses are refined on the frozen
+map (`splat.pose_refinement`), for a score should be about the map and not about a pose that is a pixel off. Scores
+count the pixels that the lens shows and the mask admits, on the pinhole canvas of the training size.
 """
 
 import logging
@@ -140,7 +140,7 @@ def first_poses(
 ) -> dict[str, FirstPose]:
     """A pose of every test frame that has a known place, in the axes and unit of the reconstruction.
 
-    Where none has, those of distant neighbors stand in for them, so that there is something to look at.
+    Where none has, all have those of distant neighbors, which the log and `protocol` say.
     """
     known = {} if reference is None else reference_poses(rec, reference)
     landmarks = landmarks_of(rec, rec.still(frames), features)
@@ -166,7 +166,8 @@ def first_poses(
     progress("placing test frames", len(frames.test), len(frames.test))
     known_places = {name: pose for name, pose in poses.items() if pose.source != "distant neighbors"}
     if unplaced := sorted(poses.keys() - known_places):
-        log.warning("not placed, for nothing near them is registered: test frames %s", ", ".join(unplaced))
+        what = "not scored" if known_places else "scored where distant frames put them, which tells nothing of the map"
+        log.warning("test frames that match nothing, with no registered frame near, %s: %s", what, ", ".join(unplaced))
     return known_places or poses
 
 
