@@ -79,7 +79,7 @@ def drawn_from(
     at = pixels[0].reshape(*target.counted.shape, 2).float().numpy() - 0.5
     z = z[0].reshape(target.counted.shape)
     surface = _sampled(scene.render(canvas, sfm.frames.frames[f].time).z_depth, at)
-    shown = target.counted & (_sampled(seen.float(), at) > 0.99) & (z > 0)
+    shown = target.counted & _within(at, seen.shape) & (_sampled(seen.float(), at) > 0.99) & (z > 0)
     shown &= ((z / surface.clamp(min=1e-6)) - 1).abs() < SAME_DEPTH
     if float(shown.float().mean()) < LEAST_SHARE:
         return None
@@ -100,6 +100,12 @@ def smooth_flow(source: Float[Tensor, "h w 3"], target: Float[Tensor, "h w 3"]) 
 def _grid(like: Tensor) -> np.ndarray:
     row, column = np.mgrid[: like.shape[0], : like.shape[1]].astype(np.float32)
     return np.stack([column, row], -1)
+
+
+def _within(at: np.ndarray, shape: tuple[int, ...]) -> Tensor:
+    """Mask of the places that lie in an image; beyond it `_sampled` repeats its border."""
+    height, width = shape
+    return torch.from_numpy(((at >= 0) & (at <= (width - 1, height - 1))).all(-1))
 
 
 def _sampled(values: Tensor, at: np.ndarray) -> Tensor:

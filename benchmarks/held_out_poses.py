@@ -43,8 +43,8 @@ def main() -> None:
         ):
             with tempfile.TemporaryDirectory() as views:
                 scored = held_out.score_views(scene, run.rec, run.frames, poses, Path(views), settings)
-            covered = held_out.mean_part([view.covered for view in scored])
-            cells.append(f"{_number(covered.flow_px, 3)}, {_number(covered.psnr_affine, 2)}")
+            means = held_out.mean_scores(scored)
+            cells.append(f"{_number(means['flow_px'], 3)}, {_number(means['psnr_affine'], 2)}")
         print(f"| {folder.name} | {' | '.join(cells)} |", flush=True)
 
 

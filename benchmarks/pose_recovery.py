@@ -93,7 +93,7 @@ def measure(rec: Reconstruction, frames: held_out.Frames, truth: GroundTruth, se
         views = held_out.score_views(scene, rec, frames, starts, Path(folder) / "test", test)
     before = errors(rec.names, rec.cameras.cam2world, truth)
     after = errors(rec.names, ours.cameras.cam2world, truth)
-    return f"{before} | {after} | {held_out.mean_scores(views).psnr:.2f}"
+    return f"{before} | {after} | {held_out.mean_scores(views)['psnr']:.2f}"
 
 
 if __name__ == "__main__":

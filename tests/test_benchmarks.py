@@ -6,6 +6,7 @@ from importlib.util import module_from_spec, spec_from_file_location
 from pathlib import Path
 from types import ModuleType
 
+import numpy as np
 import pytest
 
 FOLDER = Path(__file__).parents[1] / "benchmarks"
@@ -41,3 +42,10 @@ def test_every_script_loads_and_names_its_command(monkeypatch: pytest.MonkeyPatc
             module = script(path)
         if "__main__" in path.read_text(encoding="utf-8"):  # others are read by those beside them
             assert f"python benchmarks/{path.relative_to(FOLDER)}" in (module.__doc__ or ""), path.name
+
+
+def test_a_frame_is_drawn_only_where_it_shows_the_place():
+    """Beyond its border an image is repeated, which is no frame's view."""
+    attainable = script(FOLDER / "attainable.py")
+    at = np.array([[[-0.5, 3.0], [0.0, 0.0], [7.0, 5.0], [7.5, 3.0], [3.0, 5.5], [np.nan, 0.0]]])
+    assert attainable._within(at, (6, 8)).tolist() == [[False, True, True, False, False, False]]

@@ -112,6 +112,20 @@ def test_no_key_of_the_summary_is_shown_as_it_is(page: str):
         assert name in text
 
 
+def test_a_map_whose_test_frames_could_not_be_placed_has_no_scores(make_run: Callable[..., Path]):
+    folder = make_run()
+    summary = json.loads((folder / "summary.json").read_text())
+    nothing = dict.fromkeys(("psnr", "ssim", "lpips", "blur4_psnr", "sharpness", "observed", "flow_px"))
+    names = [frame.name for frame in load_frames(folder / "prepare").test]
+    scores = {"views": 0, "psnr_reason": "none of them could be placed", "unplaced": names, "frames": []}
+    summary["test"] = nothing | scores | {"protocol": "every 8th frame; none could be placed"}
+    (folder / "summary.json").write_text(json.dumps(summary))
+    text = text_of(write_report(folder).read_text(encoding="utf-8"))
+    assert "none of them could be placed" in text
+    assert "\u2013 dB" not in text
+    assert "Primitives" in text
+
+
 def test_every_score_against_the_truth_has_a_name(finished: Path):
     truth = json.loads((finished / "summary.json").read_text())["truth"]
     rows = {row.label: row for row in truth_rows(truth)}

@@ -24,6 +24,7 @@ COLUMNS = columns(
     "psnr_affine", "flow_px",
     "flow_px_p90", "clear_psnr", "T_D_abs", "B_abs", "from_reference_pct", "train_cpu_seconds",
 )  # fmt: skip
+_SUMMARY_NAMES = {"ssim_3dgs": "ssim", "lpips_vgg": "lpips"}  # of columns that summary.json has by other names
 
 
 def trained(sfm: FinishedSfm, settings: SplatSettings, folder: Path, progress: Progress = silent) -> SplatMap:
@@ -56,18 +57,10 @@ def map_scores(
         f, window = sfm.frames.index(view.name), (view.window.rows, view.window.columns)
         target, _ = undistorted(sfm.frames.image(f), sfm.frames.mask(f), view.lens, view.canvas)
         images.write_rgb(folder / "test" / f"{stems[view.name]}_target.png", target[window].numpy())
-    mean, covered = held_out.mean_scores(views), held_out.mean_part([view.covered for view in views])
-    observed = held_out.mean_part([view.observed for view in views])
-    scores: dict[str, float | NotComputed] = {
-        "psnr": mean.psnr,
-        "ssim_3dgs": mean.ssim,
-        "lpips_vgg": mean.lpips,
-        "sharpness": mean.sharpness,
-        "blur4_psnr": mean.blur4_psnr,
-        "psnr_observed": observed.psnr,
-        "sharpness_observed": observed.sharpness,
-        **{name: getattr(covered, name) for name in ("psnr_affine", "flow_px", "flow_px_p90")},
-        "from_reference_pct": 100 * sum(view.first.source == "reference" for view in views) / len(views),
+    means = held_out.mean_scores(views)
+    named = ((column.score, _SUMMARY_NAMES.get(column.score, column.score)) for column in COLUMNS)
+    scores = {score: means[name] for score, name in named if name in means} | {
+        "from_reference_pct": 100 * sum(view.first.source == "reference" for view in views) / max(1, len(views)),
         "train_cpu_seconds": _training_seconds(folder, scene.settings),
     }
     if sfm.truth is not None and sfm.truth.medium is not None:

@@ -15,7 +15,7 @@ from swimm3r.imaging.undistortion import undistorted_matches
 from swimm3r.io.files.metrics_log import read_rows
 from swimm3r.lamp import lamp_document
 from swimm3r.medium import Medium, MediumFit
-from swimm3r.pipeline.scores.held_out import HeldOutView, mean_part, mean_scores, protocol
+from swimm3r.pipeline.scores.held_out import HeldOutView, mean_scores, protocol
 from swimm3r.scene.frames import Frames
 from swimm3r.scene.reconstruction import Matches, Reconstruction
 from swimm3r.splat.appearance import read_decision
@@ -132,13 +132,9 @@ def test_section(
     unplaced: Sequence[str],
 ) -> dict[str, object]:
     """Mean scores of the frames that training did not see, and how they were placed and compared."""
-    means = {
-        **vars(mean_scores(views)),
-        **mean_part([view.observed for view in views]).summary(),
-        **mean_part([view.covered for view in views]).summary(),
-        **mean_part([view.still for view in views]).summary(),
-        "protocol": protocol(views, settings, colors),
-    }
+    means = {**mean_scores(views), "protocol": protocol(views, settings, colors)}
+    if views:
+        means["variant"] = views[0].scores.variant
     left_out = {"unplaced": list(unplaced)} if unplaced else {}
     return summary_entries(means) | left_out | {"frames": [frame_entry(view) for view in views]}
 

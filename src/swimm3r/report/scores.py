@@ -44,6 +44,9 @@ class TruthRow:
 def test_figures(summary: dict[str, Any]) -> list[Figure]:
     """The scores of the frames that training did not see."""
     test, splat = summary["test"], summary["splat"]
+    made = Figure(f"{splat['primitives']:,}", "Primitives", f"{splat['iterations']:,} steps, recipe {splat['recipe']}")
+    if not test["views"]:
+        return [Figure(_MISSING, "Scores of test frames", test["psnr_reason"]), made]
     blurred = f"blurring the frames by 4 px would score {_number(test['blur4_psnr'], 1)} dB"
     return [
         Figure(f"{_number(test['psnr'], 1)} dB", "PSNR, higher is better", blurred + _unplaced(test)),
@@ -52,7 +55,7 @@ def test_figures(summary: dict[str, Any]) -> list[Figure]:
         Figure(f"{_number(test['sharpness'], 0, 100)} %", "Sharpness of the frames kept"),
         *_observed_figures(test),
         *_registration_figures(test),
-        Figure(f"{splat['primitives']:,}", "Primitives", f"{splat['iterations']:,} steps, recipe {splat['recipe']}"),
+        made,
     ]
 
 

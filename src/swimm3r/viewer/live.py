@@ -215,8 +215,8 @@ class LiveView:
         if len(frames.test):
             test = frames.test.names[len(frames.test) // 2]
             chosen = frames.select([i for i, f in enumerate(frames) if f.split == "train" or f.name == test])
-            found = first_poses(rec, chosen, FeatureSettings())[test]
-            if found.source == "2D-3D matches":  # a guess would show the map off its place
+            found = first_poses(rec, chosen, FeatureSettings()).get(test)
+            if found is not None and found.source == "2D-3D matches":  # a guess would show the map off its place
                 name, label, pose = test, "Test frame", found.cam2world
         lens = rec.cameras[rec.index(name) if pose is None else 0]
         camera = lens.drawn(_PREVIEW)

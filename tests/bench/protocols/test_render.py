@@ -160,6 +160,6 @@ def test_weights_that_arrive_fill_the_scores_that_lacked_them(
     (tmp_path / "weights").mkdir()
     monkeypatch.setattr(render, "lpips_weights", lambda: ["trunk", "heads"])
     mean_scores = held_out.mean_scores
-    monkeypatch.setattr(held_out, "mean_scores", lambda views: replace(mean_scores(views), lpips=0.25))
+    monkeypatch.setattr(held_out, "mean_scores", lambda views: mean_scores(views) | {"lpips": 0.25})
     assert compared().scores["lpips_vgg"] == 0.25
     assert trainings == [1]

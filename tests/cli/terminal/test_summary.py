@@ -23,3 +23,12 @@ def test_scores_of_what_training_frames_saw_stand_beside_those_of_all_pixels(cap
     assert said in printed(capsys, **observed)
     for nothing_else in ({}, observed | {"observed": 0.999}, {"observed": 0.0, "psnr_observed": None}):
         assert "training frames saw" not in printed(capsys, **nothing_else)
+
+
+def test_frames_that_could_not_be_placed_are_named_and_others_scored(capsys):
+    some = printed(capsys, unplaced=["far.png"])
+    assert "Not scored, as no frame near them is registered: far.png" in some
+    assert "PSNR 12.6 dB" in some
+    none = printed(capsys, views=0, psnr=None, ssim=None, unplaced=["far.png"])
+    assert "far.png" in none
+    assert "PSNR" not in none

@@ -2,22 +2,19 @@
 
 from dataclasses import replace
 
-import pytest
 import torch
 from tests.splat.conftest import TinyDive, tiny_dive  # noqa: F401 - a fixture
 
 from swimm3r.cameras import Cameras
-from swimm3r.evaluate import NotComputed
 from swimm3r.pipeline.scores.held_out import (
-    covered_scores,
     cut,
     first_poses,
-    mean_part,
-    observed_scores,
     visible_window,
 )
+from swimm3r.pipeline.summary import test_section as section_of
 from swimm3r.scene.ground_truth import GroundTruth
 from swimm3r.sfm.features.settings import FeatureSettings
+from swimm3r.splat.settings import PoseRefinementSettings
 
 
 def lens(k1: float) -> Cameras:
@@ -58,32 +55,11 @@ def test_reference_poses_are_aligned_and_their_rotations_stay_rotations(tiny_div
         torch.testing.assert_close(pose.cam2world, tiny_dive.cameras.cam2world[tiny_dive.frames.index(name)])
 
 
-def test_the_covered_score_looks_at_covered_pixels_alone():
-    render, target = torch.full((20, 20, 3), 0.5), torch.full((20, 20, 3), 0.5)
-    target[:, :10] = 0.6
-    target[:, 10:] = 0.9
-    left = torch.zeros(20, 20, dtype=torch.bool)
-    left[:, :10] = True
-    seen = torch.ones(20, 20, dtype=torch.bool)
-    scores = covered_scores(render, target, seen, left)
-    assert scores.share == 0.5
-    assert scores.psnr == pytest.approx(20.17, abs=0.01)  # 25 of 255
-    assert isinstance(covered_scores(render, target, seen, ~seen).psnr, NotComputed)
-
-
-def test_the_observed_score_looks_at_observed_pixels_alone():
-    render, target = torch.full((20, 20, 3), 0.5), torch.full((20, 20, 3), 0.6)
-    target[:, 5:] = 0.9
-    seen, left = torch.ones(20, 20, dtype=torch.bool), torch.zeros(20, 20, dtype=torch.bool)
-    left[:, :5] = True
-    scores = observed_scores(render, target, seen, left)
-    assert scores.share == 0.25
-    assert scores.psnr == pytest.approx(20.17, abs=0.01)
-    assert scores.sharpness == 0  # the render is flat; half of the edge in the frame is on a pixel that counts
-    nothing = observed_scores(render, target, seen, ~seen)
-    assert nothing.share == 0
-    assert isinstance(nothing.psnr, NotComputed)
-    assert isinstance(observed_scores(render, target, seen, None).share, NotComputed)
-    mean = mean_part([scores, nothing])
-    assert mean.share == 0.125
-    assert mean.psnr == scores.psnr
+def test_without_a_placed_test_frame_no_score_is_known():
+    section = section_of([], PoseRefinementSettings(), None, ["a.png"])
+    assert section["views"] == 0
+    assert section["unplaced"] == ["a.png"]
+    assert section["frames"] == []
+    scores = ("psnr", "ssim", "lpips", "sharpness", "psnr_observed", "psnr_covered", "flow_px", "psnr_still")
+    assert all(section[name] is None for name in scores)
+    assert all("placed" in str(section[f"{name}_reason"]) for name in scores)

@@ -61,13 +61,15 @@ def _water(console: Console, medium: dict) -> None:
 
 
 def _scores(console: Console, test: dict) -> None:
-    console.print(
-        f"{test['views']} test {'frame' if test['views'] == 1 else 'frames'}: PSNR {_number(test['psnr'], 1)} dB"
-        f" (if blurred by 4 px: {_number(test['blur4_psnr'], 1)}), SSIM {test['ssim']:.3f},"
-        f" sharpness {_number(test['sharpness'], 2)}"
-    )
     if unplaced := test.get("unplaced"):
         console.print(f"Not scored, as no frame near them is registered: {', '.join(unplaced)}")
+    if not test["views"]:
+        return
+    console.print(
+        f"{test['views']} test {'frame' if test['views'] == 1 else 'frames'}: PSNR {_number(test['psnr'], 1)} dB"
+        f" (if blurred by 4 px: {_number(test['blur4_psnr'], 1)}), SSIM {_number(test['ssim'], 3)},"
+        f" sharpness {_number(test['sharpness'], 2)}"
+    )
     if test.get("psnr_observed") is not None and round(100 * test["observed"]) < 100:
         console.print(
             f"Of the test frames, training frames saw {_number(100 * test['observed'], 0)} %: PSNR"
@@ -84,7 +86,9 @@ def _scores(console: Console, test: dict) -> None:
 def _other_scores(console: Console, protocols: dict) -> None:
     for name, other in protocols.items():
         scores = other["test"]
-        console.print(f"By the protocol {name}: PSNR {_number(scores['psnr'], 1)} dB, SSIM {scores['ssim']:.3f}")
+        console.print(
+            f"By the protocol {name}: PSNR {_number(scores['psnr'], 1)} dB, SSIM {_number(scores['ssim'], 3)}"
+        )
 
 
 def _warnings(console: Console, warnings: list) -> None:

@@ -2,7 +2,7 @@
 
 A frame's first pose comes from a reference where one is given, else from its matches with triangulated points and
 measured depth of the reconstruction, else from its neighbors in time. A frame that matches nothing, and whose neighbors
-are not registered, has no known place and is not scored beside others that have one. Poses are refined on the frozen
+are not registered, has no known place and is not scored. Poses are refined on the frozen
 map (`splat.pose_refinement`), for a score should be about the map and not about a pose that is a pixel off. Scores
 count the pixels that the lens shows and the mask admits, on the pinhole canvas of the training size.
 """
@@ -12,20 +12,20 @@ from collections import Counter
 from collections.abc import Sequence
 from dataclasses import dataclass, fields, replace
 from pathlib import Path
-from typing import Literal, TypeVar
+from typing import Literal
 
 import numpy as np
 import torch
-from jaxtyping import Bool, Float
+from jaxtyping import Float
 from torch import Tensor
 
 from swimm3r import weights
 from swimm3r.appearance import FrameColors
 from swimm3r.cameras import Cameras
 from swimm3r.evaluate import NotComputed
-from swimm3r.evaluate.images import ViewScores, as_8_bit, blur4_psnr, mean_view_scores, psnr, sharpness, view_scores
+from swimm3r.evaluate.images import ViewScores, mean_view_scores, view_scores
 from swimm3r.evaluate.lpips import Lpips, load_lpips
-from swimm3r.evaluate.registration import displacement, psnr_affine, recolored_by_halves, recolored_by_tiles
+from swimm3r.evaluate.registration import recolored_by_halves, recolored_by_tiles
 from swimm3r.geometry import best_similarity
 from swimm3r.imaging.turned_rows import at_half_time, mask_at_half_time
 from swimm3r.imaging.undistortion import shown_pixels, undistorted
@@ -33,6 +33,16 @@ from swimm3r.io.view_names import view_stems
 from swimm3r.localization.interpolation import is_beside_registered, neighbors, pose_from_neighbors
 from swimm3r.localization.landmarks import Located, landmarks_of, locate
 from swimm3r.pipeline.renders import display_style, write_view
+from swimm3r.pipeline.scores.part_scores import (
+    CoveredScores,
+    ObservedScores,
+    StillScores,
+    covered_scores,
+    mean_part,
+    not_computed,
+    observed_scores,
+    still_scores,
+)
 from swimm3r.progress import Progress, silent
 from swimm3r.scene.coverage import TrainingCoverage
 from swimm3r.scene.frames import Frames
@@ -49,7 +59,7 @@ from swimm3r.splat.training_poses import as_mapped, axes_of_map
 
 log = logging.getLogger(__name__)
 
-Source = Literal["reference", "2D-3D matches", "neighbors", "distant neighbors"]
+Source = Literal["reference", "2D-3D matches", "neighbors"]
 _REFERENCES = 6  # registered frames, the nearest in time, that a held-out frame is matched with
 
 
@@ -73,62 +83,9 @@ class HeldOutView:
     window: "Crop"  # of the canvas that was rendered and scored
     first: FirstPose
     scores: ViewScores
-    covered: "CoveredScores"
-    observed: "ObservedScores"
-    still: "StillScores"
-
-
-@dataclass(frozen=True)
-class CoveredScores:
-    """The scores where training frames measured what this frame shows; a map cannot know the rest.
-
-    A moving object in front of measured ground is none of it.
-    """
-
-    share: float  # of the pixels
-    psnr: float | NotComputed  # dB
-    blur4_psnr: float | NotComputed  # dB
-    psnr_affine: float | NotComputed  # dB, after the affine map of the rendering's colors that fits best
-    flow_px: float | NotComputed  # median displacement between rendering and frame, `evaluate.registration`
-    flow_px_p90: float | NotComputed  # its 90th percentile
-    flow_share: float | NotComputed  # of the covered pixels, those with texture enough for it
-
-    def summary(self) -> dict[str, object]:
-        """The scores by the names of summary.json."""
-        return {
-            "covered": self.share,
-            "psnr_covered": self.psnr,
-            "blur4_psnr_covered": self.blur4_psnr,
-            "psnr_affine": self.psnr_affine,
-            "flow_px": self.flow_px,
-            "flow_px_p90": self.flow_px_p90,
-            "flow_share": self.flow_share,
-        }
-
-
-@dataclass(frozen=True)
-class StillScores:
-    """The scores where nothing moves, by the surfaces that training frames measured (`sfm.moving`)."""
-
-    share: float | NotComputed  # of the pixels
-    psnr: float | NotComputed  # dB
-
-    def summary(self) -> dict[str, object]:
-        """The scores by the names of summary.json."""
-        return {"still": self.share, "psnr_still": self.psnr}
-
-
-@dataclass(frozen=True)
-class ObservedScores:
-    """The scores on what some training frame saw by the map's own depth, measured or guessed."""
-
-    share: float | NotComputed  # of the pixels
-    psnr: float | NotComputed  # dB
-    sharpness: float | NotComputed  # mean gradient magnitude, render : target
-
-    def summary(self) -> dict[str, object]:
-        """The scores by the names of summary.json."""
-        return {"observed": self.share, "psnr_observed": self.psnr, "sharpness_observed": self.sharpness}
+    covered: CoveredScores
+    observed: ObservedScores
+    still: StillScores
 
 
 def first_poses(
@@ -138,10 +95,7 @@ def first_poses(
     reference: GroundTruth | None = None,
     progress: Progress = silent,
 ) -> dict[str, FirstPose]:
-    """A pose of every test frame that has a known place, in the axes and unit of the reconstruction.
-
-    Where none has, all have those of distant neighbors, which the log and `protocol` say.
-    """
+    """A pose of every test frame that has a known place, in the axes and unit of the reconstruction."""
     known = {} if reference is None else reference_poses(rec, reference)
     landmarks = landmarks_of(rec, rec.still(frames), features)
     poses = {}
@@ -154,8 +108,9 @@ def first_poses(
         f, lens = frames.index(frame.name), rec.cameras[rec.index(near[0])]
         located = locate(frames.image(f), frames.mask(f), lens, [landmarks(name) for name in near], features)
         if located is None:
-            source: Source = "neighbors" if is_beside_registered(rec, frames, frame.name) else "distant neighbors"
-            first = FirstPose(pose_from_neighbors(rec, frames, frame.name), source)
+            if frame.name not in known and not is_beside_registered(rec, frames, frame.name):
+                continue
+            first = FirstPose(pose_from_neighbors(rec, frames, frame.name), "neighbors")
         elif frames.rows_rectified:
             first = _turned(replace(lens, cam2world=located.cam2world[None]), located)
         else:
@@ -164,11 +119,11 @@ def first_poses(
             first = replace(first, cam2world=known[frame.name], source="reference")
         poses[frame.name] = first
     progress("placing test frames", len(frames.test), len(frames.test))
-    known_places = {name: pose for name, pose in poses.items() if pose.source != "distant neighbors"}
-    if unplaced := sorted(poses.keys() - known_places):
-        what = "not scored" if known_places else "scored where distant frames put them, which tells nothing of the map"
-        log.warning("test frames that match nothing, with no registered frame near, %s: %s", what, ", ".join(unplaced))
-    return known_places or poses
+    if unplaced := [name for name in frames.test.names if name not in poses]:
+        log.warning(
+            "test frames that match nothing, with no registered frame near, not scored: %s", ", ".join(unplaced)
+        )
+    return poses
 
 
 def _turned(camera: Cameras, located: Located) -> FirstPose:
@@ -252,6 +207,8 @@ def score_views(
 
 def protocol(views: Sequence[HeldOutView], settings: PoseRefinementSettings, colors: FrameColors | None) -> str:
     """In words, how the poses of the scored frames, and the colors they are compared in, came about."""
+    if not views:
+        return "every 8th frame; none could be placed"
     counts = Counter(view.first.source for view in views)
     starts = ", ".join(f"{count} from {source}" for source, count in counts.items())
     turned = "; rows rectified by the turn that the same matches tell" * any(v.first.turn is not None for v in views)
@@ -262,82 +219,24 @@ def protocol(views: Sequence[HeldOutView], settings: PoseRefinementSettings, col
     return f"every 8th frame; poses {starts}, refined {settings.steps} steps on the frozen map by {by}{turned}{fit}"
 
 
-def mean_scores(views: Sequence[HeldOutView]) -> ViewScores:
-    """The scores averaged over frames."""
-    return mean_view_scores([view.scores for view in views])
-
-
-def covered_scores(
-    render: Float[Tensor, "h w 3"],
-    target: Float[Tensor, "h w 3"],
-    seen: Bool[Tensor, "h w"],
-    covered: Bool[Tensor, "h w"],
-) -> CoveredScores:
-    """PSNRs and displacement over the covered pixels; both images as their 8-bit files show them."""
-    counted = seen & covered
-    share = float(counted.sum() / seen.sum())
-    if not bool(counted.any()):
-        nothing = NotComputed("no training frame saw what the test frames show")
-        return CoveredScores(share, *[nothing] * 6)
-    render, target = as_8_bit(render), as_8_bit(target)
-    moved = displacement(render, target, counted)
-    flow = [moved] * 3 if isinstance(moved, NotComputed) else [moved.median, moved.p90, moved.share]
-    return CoveredScores(
-        share,
-        psnr(render[counted], target[counted]),
-        blur4_psnr(target, counted),
-        psnr_affine(render, target, counted),
-        *flow,
-    )
-
-
-def observed_scores(
-    render: Float[Tensor, "h w 3"],
-    target: Float[Tensor, "h w 3"],
-    seen: Bool[Tensor, "h w"],
-    observed: Bool[Tensor, "h w"] | None,
-) -> ObservedScores:
-    """Share, PSNR and sharpness of the observed pixels; both images as their 8-bit files show them."""
-    if observed is None:
-        unknown = NotComputed("the map was made before it kept what training frames saw")
-        return ObservedScores(unknown, unknown, unknown)
-    counted = seen & observed
-    share = float(counted.sum() / seen.sum())
-    if not bool(counted.any()):
-        nothing = NotComputed("no training frame saw what the test frames show")
-        return ObservedScores(share, nothing, nothing)
-    render, target = as_8_bit(render), as_8_bit(target)
-    return ObservedScores(share, psnr(render[counted], target[counted]), sharpness(render, target, counted))
-
-
-def still_scores(
-    render: Float[Tensor, "h w 3"],
-    target: Float[Tensor, "h w 3"],
-    seen: Bool[Tensor, "h w"],
-    quiet: Bool[Tensor, "h w"] | None,
-) -> StillScores:
-    """Share and PSNR of the pixels without moving objects; both images as their 8-bit files show them."""
-    if quiet is None:
-        unknown = NotComputed("moving objects were not looked for (--moving none)")
-        return StillScores(unknown, unknown)
-    share = float(quiet.sum() / seen.sum())
-    if not bool(quiet.any()):
-        return StillScores(share, NotComputed("moving objects cover the test frames wholly"))
-    return StillScores(share, psnr(as_8_bit(render)[quiet], as_8_bit(target)[quiet]))
-
-
-Part = TypeVar("Part", CoveredScores, ObservedScores, StillScores)
-
-
-def mean_part(parts: Sequence[Part]) -> Part:
-    """Means over frames; those without a number, as without a covered pixel, are left out of what they have none of."""
-
-    def mean(values: list[float | NotComputed]) -> float | NotComputed:
-        numbers = [v for v in values if not isinstance(v, NotComputed)]
-        return sum(numbers) / len(numbers) if numbers else values[0]
-
-    names = [f.name for f in fields(parts[0])]
-    return replace(parts[0], **{name: mean([getattr(part, name) for part in parts]) for name in names})
+def mean_scores(views: Sequence[HeldOutView]) -> dict[str, float | NotComputed]:
+    """The scores averaged over frames, and their number, by the names of summary.json; of no frames, none is known."""
+    if not views:
+        nothing = NotComputed("none of the test frames could be placed")
+        return {
+            **dict.fromkeys((f.name for f in fields(ViewScores) if f.name not in ("views", "variant")), nothing),
+            "views": 0,
+            **not_computed(ObservedScores, nothing).summary(),
+            **not_computed(CoveredScores, nothing).summary(),
+            **not_computed(StillScores, nothing).summary(),
+        }
+    whole = mean_view_scores([view.scores for view in views])
+    return {
+        **{f.name: getattr(whole, f.name) for f in fields(whole) if f.name != "variant"},
+        **mean_part([view.observed for view in views]).summary(),
+        **mean_part([view.covered for view in views]).summary(),
+        **mean_part([view.still for view in views]).summary(),
+    }
 
 
 @dataclass(frozen=True)
