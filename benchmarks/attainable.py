@@ -12,6 +12,8 @@ is an estimate and no bound, for drawing a frame blurs it and flow is not exact,
     mean    all of them averaged
     limit   the error that they have in common, the mean product of the errors of two: what endlessly many of them
             would leave, as is their own noise's share of the errors of one and of their mean
+    detail  sqrt(g(I) . g(T) / g(T) . g(T)), g the gradients of the channels' mean over all pixels, T the test frame, I
+            the training frame that has most of it, then the own map, moved by the flow: noise of a frame is in no other
     lead    the limit over the best map of another recipe
 
 Columns of maps are PSNR in dB after an affine map of colors, and in brackets after being moved by the flow as well.
@@ -40,6 +42,7 @@ from swimm3r.splat.rendering import SplatMap
 NEAREST = 16  # training frames that are asked for each test frame
 SAME_DEPTH = 0.05  # relative difference up to which a frame shows the surface and not one before it
 LEAST_SHARE = 0.15  # of the pixels, fewer of which say little of a frame
+_MAPS = 6  # columns of a row before those of maps
 BORDER = 7  # px, taken off what a frame shows: flow there is a guess
 SMOOTH = 2.0  # px, sigma that flow is smoothed by: single pixels' noise is no displacement
 
@@ -134,7 +137,7 @@ def rendered(sfm: FinishedSfm, path: Path) -> Rendered:
 
 
 def row_of(name: str, sfm: FinishedSfm, maps: list[Rendered]) -> list[float] | None:
-    """Share, one, mean, limit, then two columns per map; None where no two training frames show the test frame.
+    """Share, one, mean, limit, detail of both, then two columns per map; None where no two frames show the test frame.
 
     The first map places the training frames.
     """
@@ -157,14 +160,24 @@ def row_of(name: str, sfm: FinishedSfm, maps: list[Rendered]) -> list[float] | N
 
     mean = (drawn * shown[..., None]).sum(0) / shown.sum(0).clamp(min=1)[..., None]
     one = max(score(image, where & there) for image, there in zip(drawn, shown, strict=True) if (where & there).any())
-    row = [float(where.float().mean()), one, score(mean), _common_psnr(drawn - target.image, shown, where)]
+    renderings = []
     # rendered anew, for the pictures of a table mark what the map's own training frames did not see
     for scene, views in maps:
-        view = views[name]
-        image = as_8_bit(scene.render(cut(view.canvas, view.window), view.time).rgb)
+        image = as_8_bit(scene.render(cut(views[name].canvas, views[name].window), views[name].time).rgb)
         image = _recolored(image, target.image, where)
-        row += [score(image), score(_sampled(image, _grid(where) + smooth_flow(target.image, image)))]
-    return row
+        renderings += [image, _sampled(image, _grid(where) + smooth_flow(target.image, image))]
+    detail = max(common_detail(image, target.image, where & there) for image, there in zip(drawn, shown, strict=True))
+    row = [float(where.float().mean()), one, score(mean), _common_psnr(drawn - target.image, shown, where)]
+    row += [detail, common_detail(renderings[1], target.image, where)]
+    return row + [score(image) for image in renderings]
+
+
+def common_detail(image: Float[Tensor, "h w 3"], target: Float[Tensor, "h w 3"], over: Bool[Tensor, "h w"]) -> float:
+    """Root mean square share of the target's gradients that an image has as well; 0 over no pixel."""
+    if not bool(over.any()):
+        return 0.0
+    shown, asked = (torch.stack(torch.gradient(each.double().mean(-1)))[:, over] for each in (image, target))
+    return float(((shown * asked).sum() / (asked**2).sum()).clamp(min=0).sqrt())
 
 
 def _common_psnr(errors: Float[Tensor, "n h w 3"], shown: Bool[Tensor, "n h w"], where: Bool[Tensor, "h w"]) -> float:
@@ -184,20 +197,21 @@ def main() -> None:
     a = parser.parse_args()
     torch.set_num_threads(1)
     others = a.recipes if a.tables else []
-    print("| clip | frames | share | one | mean | limit | " + " | ".join(["own map", *others]) + " | lead |")
-    print("| --- " * (7 + len(others) + 1) + "|")
+    print("| clip | frames | share | one | mean | limit | detail | " + " | ".join(["own map", *others]) + " | lead |")
+    print("| --- " * (8 + len(others) + 1) + "|")
     for run in a.runs:
         sfm, paths = open_finished_sfm(run), [run / "splat" / "map.safetensors"]
         paths += [next((a.tables / run.name).glob(f"*/{recipe}/0/map.safetensors")) for recipe in others]
         maps = [rendered(sfm, path) for path in paths]
         rows = [row for name in maps[0][1] if (row := row_of(name, sfm, maps)) is not None]
         if not rows:
-            print(f"| {run.name} | 0 |" + " |" * (6 + len(others)), flush=True)
+            print(f"| {run.name} | 0 |" + " |" * (7 + len(others)), flush=True)
             continue
-        share, one, mean, limit, *scores = np.mean(rows, 0).tolist()
+        share, one, mean, limit, frame, own, *scores = np.mean(rows, 0).tolist()
         told = [f"{scores[i]:.2f} ({scores[i + 1]:.2f})" for i in range(0, len(scores), 2)]
-        lead = f"{np.mean([row[3] - max(row[6::2]) for row in rows]):.2f}" if others else ""
-        cells = [run.name, str(len(rows)), f"{share:.2f}", f"{one:.2f}", f"{mean:.2f}", f"{limit:.2f}", *told, lead]
+        lead = f"{np.mean([row[3] - max(row[_MAPS + 2 :: 2]) for row in rows]):.2f}" if others else ""
+        cells = [run.name, str(len(rows)), f"{share:.2f}", f"{one:.2f}", f"{mean:.2f}", f"{limit:.2f}"]
+        cells += [f"{frame:.2f}, {own:.2f}", *told, lead]
         print("| " + " | ".join(cells) + " |", flush=True)
 
 
