@@ -24,7 +24,6 @@ COLUMNS = columns(
     "psnr_affine", "flow_px",
     "flow_px_p90", "clear_psnr", "T_D_abs", "B_abs", "from_reference_pct", "train_cpu_seconds",
 )  # fmt: skip
-_SUMMARY_NAMES = {"ssim_3dgs": "ssim", "lpips_vgg": "lpips"}  # of columns that summary.json has by other names
 
 
 def trained(sfm: FinishedSfm, settings: SplatSettings, folder: Path, progress: Progress = silent) -> SplatMap:
@@ -58,8 +57,11 @@ def map_scores(
         target, _ = undistorted(sfm.frames.image(f), sfm.frames.mask(f), view.lens, view.canvas)
         images.write_rgb(folder / "test" / f"{stems[view.name]}_target.png", target[window].numpy())
     means = held_out.mean_scores(views)
-    named = ((column.score, _SUMMARY_NAMES.get(column.score, column.score)) for column in COLUMNS)
-    scores = {score: means[name] for score, name in named if name in means} | {
+    same = ("psnr", "sharpness", "blur4_psnr", "psnr_observed", "sharpness_observed")
+    same += ("psnr_affine", "flow_px", "flow_px_p90")
+    scores = {name: means[name] for name in same} | {
+        "ssim_3dgs": means["ssim"],
+        "lpips_vgg": means["lpips"],
         "from_reference_pct": 100 * sum(view.first.source == "reference" for view in views) / max(1, len(views)),
         "train_cpu_seconds": _training_seconds(folder, scene.settings),
     }
