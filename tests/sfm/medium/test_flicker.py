@@ -10,6 +10,7 @@ import torch
 from tests.sfm.conftest import FlatDive, flat_dive
 from torch import Tensor
 
+from swimm3r.appearance import ORDERS, shading_gains
 from swimm3r.cameras import image_directions, ray_depth_from_z
 from swimm3r.io import images
 from swimm3r.lamp import Lamp
@@ -85,6 +86,23 @@ def clear_image(path: Path) -> np.ndarray:
 def test_steady_light_is_left_alone(rec: Reconstruction, steady: FlatDive, tmp_path: Path):
     assert with_steady(rec, steady.frames, RestoreSettings(), tmp_path / "steady") is rec
     assert not (tmp_path / "steady").exists()
+
+
+def test_gains_over_large_parts_of_frames_are_the_cameras(
+    rec: Reconstruction, steady: FlatDive, tmp_path: Path, caplog: pytest.LogCaptureFixture
+):
+    """Local tone mapping changes brightness by more than flicker does, and more slowly over the image."""
+    toned, rng = [], np.random.default_rng(0)
+    for k, frame in enumerate(steady.frames):
+        image = steady.frames.image(k).permute(2, 0, 1)
+        shading = torch.from_numpy(rng.normal(0, 0.12, (len(ORDERS), 1))).float().expand(-1, 3)
+        path = tmp_path / frame.name
+        images.write_rgb(path, (image * shading_gains(shading, *image.shape[1:])).clamp(0, 1).permute(1, 2, 0).numpy())
+        toned.append(replace(frame, path=path))
+    caplog.set_level("INFO")
+    frames = replace(steady.frames, frames=tuple(toned))
+    assert with_steady(rec, frames, RestoreSettings(), tmp_path / "steady") is rec
+    assert "large parts" in caplog.text
 
 
 def test_patterns_of_light_that_move_are_evened_out(rec, sunny: Frames, steady: FlatDive, tmp_path: Path):

@@ -12,7 +12,9 @@ stands for light on values as stored, too: a power of it is a factor as well.
 Frames are compared at the size at which `sfm.moving` compares them. Whether there is flicker at all is told by a few
 of them, each beside its second next: by the spread of log(L_g / L_f) about its own large-scale part, which is exposure.
 Errors of water and lens, and surfaces that shine, change brightness too, but slowly along the path of the camera; what
-depends on the brightness of surfaces alone is left out.
+depends on the brightness of surfaces alone is left out. A camera that tones frames locally changes them over a third of
+the image and more: where a shading (`swimm3r.appearance`) explains as much of the spread as it takes to fit shadings,
+the change is the camera's.
 """
 
 import logging
@@ -26,6 +28,7 @@ import torch
 from jaxtyping import Bool, Float
 from torch import Tensor
 
+from swimm3r.appearance import image_cosines
 from swimm3r.cameras import project_visible
 from swimm3r.imaging.undistortion import frame_directions, frame_rays
 from swimm3r.io import images
@@ -46,6 +49,8 @@ log = logging.getLogger(__name__)
 _PROBES = 4  # frames that tell whether the light flickers
 _NEXT = 2  # places in time to the frame that they are compared with
 _FLICKERS = 0.032  # spread of the change, per frame, from which on it does; strobes that near the ground reach 0.03
+_TONED = 0.45  # share of the spread's square that shadings explain, from which on it is the camera's
+_FITS = 5  # of a shading, observations that miss counting less each time
 _SAME = 0.03  # of a depth, within which two frames see the same surface
 _TELLING = 0.25  # of an image, below which its measured part tells nothing
 _LEAST_CHANGE = 0.012  # of brightness itself, 0..1: on dark ground a small error of the water is a large ratio
@@ -70,6 +75,21 @@ class Flicker:
         large = _blurred(self.log_gain * weight, _LARGE) / np.maximum(_blurred(weight, _LARGE), 1e-6)
         left = np.abs(self.log_gain - large)[self.measured]
         return 1.4826 * float(np.median(left)) if len(left) >= _TELLING * weight.size else float("nan")
+
+    def beyond_shading(self) -> "Flicker":
+        """The same without the shading that explains most of the measured pixels (robust least squares)."""
+        at = self.measured
+        waves = image_cosines(*at.shape).permute(1, 2, 0).numpy()[at]
+        terms = np.concatenate([np.ones((len(waves), 1)), waves], 1).astype(np.float64)
+        y, weight = self.log_gain[at].astype(np.float64), np.ones(len(terms))
+        left = y
+        for _ in range(_FITS if len(y) > terms.shape[1] else 0):
+            left = y - terms @ np.linalg.lstsq(terms * weight[:, None], y * weight, rcond=None)[0]
+            scale = max(1e-6, 2 * 1.4826 * float(np.median(np.abs(left))))
+            weight = 1 / np.sqrt(1 + (left / scale) ** 2)
+        log_gain = self.log_gain.copy()
+        log_gain[at] = left
+        return replace(self, log_gain=log_gain)
 
 
 @dataclass(frozen=True)
@@ -152,8 +172,11 @@ def with_steady(
         return rec
     if not folder.is_dir():
         lit = LitScene(still_scene(rec, frames), rec.medium)
-        spread, change = _spread(lit, len(rec.names))
+        spread, change, toned = _spread(lit, len(rec.names))
         if not (spread >= _FLICKERS and change >= _LEAST_CHANGE):
+            return rec
+        if toned >= _TONED:
+            log.info("frames differ in brightness by gains over large parts of them: %.0f%% of the change", 100 * toned)
             return rec
         log.info("the sunlight flickers over the ground, by %.1f%% of its brightness from frame to frame", 100 * spread)
         _write_steady(rec, frames, lit, restore, folder, progress)
@@ -181,8 +204,9 @@ def _write_steady(
     progress("evening out the sunlight", len(rec.names), len(rec.names))
 
 
-def _spread(lit: LitScene, count: int) -> tuple[float, float]:
-    """Medians over a few frames of the change until the second next, per frame: of the logarithm, and of brightness.
+def _spread(lit: LitScene, count: int) -> tuple[float, float, float]:
+    """Medians over a few frames of the change until the second next, per frame: of the logarithm, and of brightness;
+    and the share of the first one's square that shadings explain.
 
     NaN where in half of them too little is seen twice.
     """
@@ -192,11 +216,12 @@ def _spread(lit: LitScene, count: int) -> tuple[float, float]:
         change = lit.change(i, i + _NEXT)
         spread = change.spread / 2**0.5
         if np.isfinite(spread):
-            told.append((spread, spread * lit.brightness(i, change.measured)))
+            left = change.beyond_shading().spread / 2**0.5
+            told.append((spread, spread * lit.brightness(i, change.measured), left))
     if 2 * len(told) <= len(probes):
-        return float("nan"), float("nan")
-    spread, change = np.median(told, axis=0).tolist()
-    return spread, change
+        return float("nan"), float("nan"), float("nan")
+    spread, change, left = np.median(told, axis=0).tolist()
+    return spread, change, 1 - (left / spread) ** 2 if spread > 0 else 0.0
 
 
 def _evened(
