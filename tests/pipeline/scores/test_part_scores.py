@@ -36,3 +36,5 @@ def test_the_observed_score_looks_at_observed_pixels_alone():
     mean = mean_part([scores, nothing])
     assert mean.share == 0.125
     assert mean.psnr == scores.psnr
+    with pytest.raises(ValueError, match="no frames"):
+        mean_part([])

@@ -2,9 +2,9 @@
 
 A frame's first pose comes from a reference where one is given, else from its matches with triangulated points and
 measured depth of the reconstruction, else from its neighbors in time. A frame that matches nothing, and whose neighbors
-are not registered, has no known place and is not scored. Poses are refined on the frozen
-map (`splat.pose_refinement`), for a score should be about the map and not about a pose that is a pixel off. Scores
-count the pixels that the lens shows and the mask admits, on the pinhole canvas of the training size.
+are not registered, has no known place and is not scored. Poses are refined on the frozen map (`splat.pose_refinement`),
+for a score should be about the map and not about a pose that is a pixel off. Scores count the pixels that the lens
+shows and the mask admits, on the pinhole canvas of the training size.
 """
 
 import logging
