@@ -113,8 +113,8 @@ class ColmapSettings(MediumSettings, LensSettings):
     overlap: CountOrZero = 10
     """Number of neighbors in time that each frame is matched with, followed by some at doubling distances."""
     loops: CountOrZero = 6
-    """Number of most similar frames elsewhere in the clip (VLAD) that each frame is matched with; five times as many
-    for folders of images."""
+    """Number of most similar frames elsewhere in the clip (VLAD) that each frame is matched with, followed by as many
+    at most beside those that match; five times as many for folders of images."""
     threads: Threads = 0
     """Number of threads for features and matching; 0 uses all cores."""
     features: FeatureSettings = field(default_factory=FeatureSettings)

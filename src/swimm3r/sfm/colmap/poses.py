@@ -43,7 +43,7 @@ from swimm3r.sfm.colmap.messages import (
     unknown_port,
 )
 from swimm3r.sfm.colmap.navigated import with_navigation
-from swimm3r.sfm.colmap.pairs import choose_pairs
+from swimm3r.sfm.colmap.pairs import match_frames
 from swimm3r.sfm.colmap.plausibility import depth_change, implausible
 from swimm3r.sfm.colmap.record import PARTS, record_of, write_parts
 from swimm3r.sfm.colmap.rig.lenses import RigLenses, lenses_of_rig
@@ -110,8 +110,7 @@ def reconstruct(
         numbers, shared = ((), None) if known.lenses is None else (known.lenses.numbers, known.lenses.under_first)
         store = start_database(folder, frames, known.camera, settings.features, numbers)
         fill_features(store, frames, settings.features, threads, progress, shared)
-        pairs = choose_pairs(store, frames, known.settings)
-        match_pairs(store, pairs, settings.features, threads, progress)
+        pairs = match_frames(store, frames, known.settings, threads, progress)
         with _working_copy(store) as working:
 
             def recorded(model: "pycolmap.Reconstruction") -> Reconstruction:

@@ -16,9 +16,9 @@ from swimm3r.io.files.atomic import DRAFT
 from swimm3r.progress import Progress, silent
 from swimm3r.scene.frames import Frames
 from swimm3r.scene.reconstruction import Points, Reconstruction, Tracks
-from swimm3r.sfm.colmap.pairs import choose_pairs
+from swimm3r.sfm.colmap.pairs import match_frames
 from swimm3r.sfm.colmap.record import verified_matches
-from swimm3r.sfm.features.database import fill_features, match_pairs, scaled_camera, start_database
+from swimm3r.sfm.features.database import fill_features, scaled_camera, start_database
 from swimm3r.sfm.features.settings import FeatureSettings
 from swimm3r.sfm.settings import ColmapSettings
 from swimm3r.sfm.tracks import MatchTracks, as_points
@@ -51,7 +51,7 @@ def triangulate(
         own = scaled_camera(each, store.scale)
         each.width, each.height, each.params = own.width, own.height, own.params
     fill_features(store, placed, settings, threads, progress)
-    match_pairs(store, choose_pairs(store, placed, ColmapSettings()), settings, threads, progress)
+    match_frames(store, placed, ColmapSettings(features=settings), threads, progress)
     options = pycolmap.IncrementalPipelineOptions()
     options.extract_colors = False
     options.num_threads = 1  # the same sums in the same order

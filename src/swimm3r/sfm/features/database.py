@@ -136,6 +136,16 @@ def flat_share(store: FeatureDatabase) -> float:
     return flat / max(1, sum(kind not in (kinds.UNDEFINED, kinds.DEGENERATE) for kind in found))
 
 
+def match_counts(store: FeatureDatabase) -> dict[tuple[int, int], int]:
+    """Number of verified matches of every pair of frames (i < j, counted from 0) that has enough of them."""
+    import pycolmap
+
+    with store.open() as database:
+        pairs, counts = database.read_two_view_geometry_num_inliers()
+    named = ((pycolmap.pair_id_to_image_pair(pair), count) for pair, count in zip(pairs, counts, strict=True))
+    return {(min(i, j) - 1, max(i, j) - 1): int(count) for (i, j), count in named if count >= MIN_INLIERS}
+
+
 def write_excerpt(store: FeatureDatabase, path: Path, images: Sequence[int]) -> FeatureDatabase:
     """A new database of some frames alone: keypoints and verified matches, as mapping needs them.
 

@@ -23,7 +23,7 @@ from swimm3r.sfm.colmap.chunks.pilot import PILOT, PilotLens, pilot_lens
 from swimm3r.sfm.colmap.chunks.place import ChunkTask, place_chunks, placed_models, remove_stale
 from swimm3r.sfm.colmap.chunks.plan import order_by_matches, plan_chunks
 from swimm3r.sfm.colmap.settings import MappingSettings
-from swimm3r.sfm.features.database import MIN_INLIERS, FeatureDatabase
+from swimm3r.sfm.features.database import FeatureDatabase, match_counts
 from swimm3r.sfm.settings import ColmapSettings
 from swimm3r.tasks.settings import EngineSettings
 from swimm3r.tasks.threads import thread_count
@@ -72,16 +72,6 @@ def map_long_clip(
     parts = [piece for part in placed for piece in coherent_parts(part)]
     models = _join(store, parts, lens, settings, progress) if parts else []
     return LongClip(models, lens.determined)
-
-
-def match_counts(store: FeatureDatabase) -> dict[tuple[int, int], int]:
-    """Number of verified matches of every pair of frames (i < j, counted from 0) that has enough of them."""
-    import pycolmap
-
-    with store.open() as database:
-        pairs, counts = database.read_two_view_geometry_num_inliers()
-    named = ((pycolmap.pair_id_to_image_pair(pair), count) for pair, count in zip(pairs, counts, strict=True))
-    return {(min(i, j) - 1, max(i, j) - 1): int(count) for (i, j), count in named if count >= MIN_INLIERS}
 
 
 def _task(
