@@ -21,7 +21,7 @@ from swimm3r.sfm.colmap.calibration.refinement import adjust_lens
 from swimm3r.sfm.colmap.calibration.start import lenses_of_pairs, lenses_to_try, set_camera
 from swimm3r.sfm.colmap.epipolar_outliers import contradicting_frames
 from swimm3r.sfm.colmap.resection_outliers import misplaced_frames
-from swimm3r.sfm.features.database import MIN_INLIERS, FeatureDatabase, flat_share
+from swimm3r.sfm.features.database import MIN_INLIERS, FeatureDatabase, flat_share, overlaps_little
 from swimm3r.sfm.settings import ColmapSettings
 
 if TYPE_CHECKING:
@@ -195,6 +195,7 @@ def _map_in_turn(
     options.min_model_size = 2
     most = total or store.frames
     options.min_num_matches = MIN_INLIERS
+    options.triangulation.ignore_two_view_tracks = not _counts_points_of_two(store, settings)
     options.ba_refine_focal_length = options.ba_refine_extra_params = False
     options.ba_global_function_tolerance = STILL
     options.mapper.abs_pose_refine_focal_length = options.mapper.abs_pose_refine_extra_params = False
@@ -226,6 +227,14 @@ def _map_in_turn(
     return sorted(models.values(), key=lambda m: _quality([m]), reverse=True)
 
 
+def _counts_points_of_two(store: FeatureDatabase, settings: ColmapSettings) -> bool:
+    """Return whether points that two frames alone see count: where frames overlap little, under a lens that is known.
+
+    While it is open they follow any: ruie_murky's frames all fit one of three times the focal length.
+    """
+    return settings.intrinsics == "fixed" and overlaps_little(store)
+
+
 def _map_globally(
     store: FeatureDatabase, settings: ColmapSettings, progress: Progress
 ) -> "list[pycolmap.Reconstruction]":
@@ -235,6 +244,7 @@ def _map_globally(
     options.num_threads = THREADS
     options.random_seed = SEED
     options.min_num_matches = MIN_INLIERS
+    options.mapper.retriangulation.ignore_two_view_tracks = not _counts_points_of_two(store, settings)
     options.mapper.bundle_adjustment.refine_focal_length = False
     options.mapper.bundle_adjustment.refine_extra_params = False
     models: list[pycolmap.Reconstruction] = []

@@ -49,7 +49,7 @@ from swimm3r.sfm.colmap.record import PARTS, record_of, write_parts
 from swimm3r.sfm.colmap.rig.lenses import RigLenses, lenses_of_rig
 from swimm3r.sfm.colmap.shutter.readout import adjust_rolling
 from swimm3r.sfm.colmap.shutter.turning import turned_rows
-from swimm3r.sfm.features.database import FeatureDatabase, fill_features, match_pairs, start_database
+from swimm3r.sfm.features.database import FeatureDatabase, fill_features, match_pairs, overlaps_little, start_database
 from swimm3r.sfm.lens import at_scale, behind_port, gives_lens, with_calibration
 from swimm3r.sfm.rectified.frames import BentImagesError, TurnedRowsError
 from swimm3r.sfm.settings import ColmapSettings
@@ -275,8 +275,9 @@ def _map(
         match_pairs(store, again, looser, threads, progress, again=True)
         if not long:
             model = refine(store, model, settings, progress).model  # a better lens places more
-        more = mapping.place_leftovers(store, model, settings, progress)
-        more = mapping.replace_misplaced(store, more, settings, progress)
+        held = replace(settings, intrinsics="fixed") if long else settings
+        more = mapping.place_leftovers(store, model, held, progress)
+        more = mapping.replace_misplaced(store, more, held, progress)
         more = without_jumps(more)
         model = more if more.num_reg_images() >= model.num_reg_images() else model
     calibrated = Calibrated(model, refined=determined) if long else refine(store, model, settings, progress)
@@ -311,7 +312,7 @@ def _navigated(
         navigator,
         recorded,
         progress,
-        lens=mapped.lens_refined,
+        lens=mapped.lens_refined and not overlaps_little(store),
     )
     return replace(mapped, model=found.model, others=found.others, warnings=[*mapped.warnings, *found.warnings])
 

@@ -157,11 +157,14 @@ def _observed(rec: Reconstruction) -> _Observed:
 
 
 def _stretch(observed: _Observed, bundle: Bundle, first: int, end: int) -> tuple[_Observed, Bundle]:
-    """Frames `first` to `end` - 1 alone, with the points that two of them show, or as many as make few enough."""
+    """Frames `first` to `end` - 1 alone, with the points that three of them show, or as many as make few enough.
+
+    Points of two frames follow turns that there are not.
+    """
     mine = observed.some((observed.frame >= first) & (observed.frame < end))
     count = np.bincount(mine.point, minlength=len(bundle.xyz))
     order = np.random.default_rng(0).permutation(len(count))
-    order = order[count[order] > 1]
+    order = order[count[order] > 2]
     chosen = np.zeros(len(count), dtype=bool)
     chosen[order[: np.searchsorted(count[order].cumsum(), _MOST)]] = True
     mine = mine.some(chosen[mine.point])
