@@ -5,6 +5,7 @@ import shutil
 from dataclasses import replace
 from pathlib import Path
 
+import numpy as np
 import pytest
 import torch
 
@@ -16,7 +17,7 @@ from swimm3r.bench.protocols.render import compare_renderers, settings_for
 from swimm3r.bench.runs import clips_of, made_runs
 from swimm3r.errors import InputError, UsageError
 from swimm3r.evaluate import NotComputed
-from swimm3r.io.images import read_rgb
+from swimm3r.io.images import read_rgb, write_rgb
 from swimm3r.pipeline.finished_sfm import open_finished_sfm
 from swimm3r.pipeline.presets import RunSettings
 from swimm3r.pipeline.scores import held_out
@@ -102,7 +103,10 @@ def test_a_scene_with_a_model_lends_its_poses_where_asked(run: Path, tmp_path: P
 
 def test_a_clip_that_cannot_be_placed_as_a_whole_is_remembered(run: Path, tmp_path: Path):
     sfm = open_finished_sfm(run)
-    few = replace(sfm.frames, frames=sfm.frames.frames[:8:7])
+    first, second = sfm.frames.frames[:2]
+    elsewhere = tmp_path / second.path.name
+    write_rgb(elsewhere, np.random.default_rng(0).random((sfm.frames.height, sfm.frames.width, 3)))
+    few = replace(sfm.frames, frames=(first, replace(second, path=elsewhere)))
     found = reference.of_clip(replace(sfm, frames=few), tmp_path)
     assert isinstance(found, NotComputed)
     assert json.loads((tmp_path / "reference.json").read_text())["failed"] == found.reason
