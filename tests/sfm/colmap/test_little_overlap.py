@@ -15,9 +15,8 @@ from swimm3r.geometry import align_similarity
 from swimm3r.progress import silent
 from swimm3r.scene.frames import Frame, Frames
 from swimm3r.sfm.colmap import mapping
-from swimm3r.sfm.colmap.calibration.adjust import adjusted
-from swimm3r.sfm.colmap.calibration.refinement import adjust_lens, refine, refine_again
-from swimm3r.sfm.features.database import MIN_INLIERS, FeatureDatabase, overlaps_little, start_database
+from swimm3r.sfm.colmap.calibration.refinement import refine, refine_again
+from swimm3r.sfm.features.database import MIN_INLIERS, FeatureDatabase, start_database, with_overlap
 
 WIDTH, HEIGHT, FOCAL, COUNT = 320, 240, 300.0, 12
 HELD = replace(SETTINGS, intrinsics="fixed", focal=FOCAL, mapping=replace(SETTINGS.mapping, method="incremental"))
@@ -64,7 +63,7 @@ def survey(step: float, folder: Path) -> FeatureDatabase:
                 found = pycolmap.estimate_two_view_geometry(camera, pixels[i], camera, pixels[j], matches, options)
                 database.write_matches(i + 1, j + 1, matches)
                 database.write_two_view_geometry(i + 1, j + 1, found)
-    return store
+    return with_overlap(store)
 
 
 @pytest.fixture(scope="module")
@@ -85,12 +84,12 @@ def off_line(model: pycolmap.Reconstruction, step: float) -> float:
 
 
 def test_stills_that_see_ground_twice_are_told_from_video(stills: FeatureDatabase, tmp_path: Path) -> None:
-    assert overlaps_little(stills)
-    assert not overlaps_little(survey(0.08, tmp_path))
+    assert stills.little_overlap
+    assert not survey(0.08, tmp_path).little_overlap
 
 
 def test_a_database_without_matches_is_not_one_of_little_overlap(tmp_path: Path) -> None:
-    assert not overlaps_little(survey(2.0, tmp_path))
+    assert not survey(2.0, tmp_path).little_overlap
 
 
 def of_two(model: pycolmap.Reconstruction) -> float:
@@ -98,30 +97,24 @@ def of_two(model: pycolmap.Reconstruction) -> float:
     return float(np.mean([point.track.length() == 2 for point in model.points3D.values()]))
 
 
-def test_points_of_two_frames_hold_the_poses_of_stills(
-    stills: FeatureDatabase, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_points_of_two_frames_hold_the_poses_of_stills(stills: FeatureDatabase) -> None:
     model = placed(stills)
     assert model.num_reg_images() == COUNT
     assert of_two(model) > 0.5
     assert off_line(model, 0.3) < 0.004
-    monkeypatch.setattr(mapping, "overlaps_little", lambda _: False)
-    assert len(placed(stills).points3D) < 0.5 * len(model.points3D)
+    assert len(placed(replace(stills, little_overlap=False)).points3D) < 0.5 * len(model.points3D)
 
 
 def test_while_the_lens_is_open_points_of_two_frames_do_not_count(stills: FeatureDatabase) -> None:
     opened = replace(HELD, intrinsics="prior")
     alone = mapping.map_frames(stills, opened, silent)[0]
     assert of_two(alone) < 0.3
-    model = placed(stills)
-    free = adjusted(stills, model, "SIMPLE_RADIAL", focal=True, distortion=True)
-    assert of_two(free) < 0.1
-    for settings in (HELD, opened):
-        found = refine(stills, alone, settings, silent)
-        assert of_two(found.model) > 0.5
-        assert found.model.num_reg_images() == COUNT
-        assert of_two(refine_again(stills, found, silent).model) > 0.5
-    under = adjust_lens(stills, model, opened, silent)
-    assert of_two(under) > 0.5
-    assert under.cameras[1].params == pytest.approx(free.cameras[1].params)
-    assert under.cameras[1].focal_length == pytest.approx(FOCAL, rel=0.02)
+    refined = refine(stills, alone, opened, silent)
+    assert refined.refined
+    assert of_two(refined.model) < 0.3
+    assert refined.model.cameras[1].focal_length == pytest.approx(FOCAL, rel=0.02)
+    held = refine(stills, refined.model, HELD, silent)
+    assert of_two(held.model) > 0.5
+    assert of_two(refine_again(stills, held, silent).model) > 0.5
+    assert held.model.num_reg_images() == COUNT
+    assert held.model.cameras[1].focal_length == refined.model.cameras[1].focal_length

@@ -21,7 +21,7 @@ from swimm3r.sfm.colmap.calibration.refinement import adjust_lens
 from swimm3r.sfm.colmap.calibration.start import lenses_of_pairs, lenses_to_try, set_camera
 from swimm3r.sfm.colmap.epipolar_outliers import contradicting_frames
 from swimm3r.sfm.colmap.resection_outliers import misplaced_frames
-from swimm3r.sfm.features.database import MIN_INLIERS, FeatureDatabase, flat_share, overlaps_little
+from swimm3r.sfm.features.database import MIN_INLIERS, FeatureDatabase, flat_share
 from swimm3r.sfm.settings import ColmapSettings
 
 if TYPE_CHECKING:
@@ -232,7 +232,7 @@ def _counts_points_of_two(store: FeatureDatabase, settings: ColmapSettings) -> b
 
     While it is open they follow any: ruie_murky's frames all fit one of three times the focal length.
     """
-    return settings.intrinsics == "fixed" and overlaps_little(store)
+    return settings.intrinsics == "fixed" and store.little_overlap
 
 
 def _map_globally(

@@ -49,7 +49,7 @@ from swimm3r.sfm.colmap.record import PARTS, record_of, write_parts
 from swimm3r.sfm.colmap.rig.lenses import RigLenses, lenses_of_rig
 from swimm3r.sfm.colmap.shutter.readout import adjust_rolling
 from swimm3r.sfm.colmap.shutter.turning import turned_rows
-from swimm3r.sfm.features.database import FeatureDatabase, fill_features, match_pairs, overlaps_little, start_database
+from swimm3r.sfm.features.database import FeatureDatabase, fill_features, match_pairs, start_database, with_overlap
 from swimm3r.sfm.lens import at_scale, behind_port, gives_lens, with_calibration
 from swimm3r.sfm.rectified.frames import BentImagesError, TurnedRowsError
 from swimm3r.sfm.settings import ColmapSettings
@@ -111,6 +111,7 @@ def reconstruct(
         store = start_database(folder, frames, known.camera, settings.features, numbers)
         fill_features(store, frames, settings.features, threads, progress, shared)
         pairs = match_frames(store, frames, known.settings, threads, progress)
+        store = with_overlap(store)
         with _working_copy(store) as working:
 
             def recorded(model: "pycolmap.Reconstruction") -> Reconstruction:
@@ -257,43 +258,52 @@ def _map(
 
     Raises RegistrationError where no two frames can be placed.
     """
-    n, threads = len(frames), settings.threads or thread_count()
-    long = is_long(n, settings.mapping)
-    determined = False
-    if long:
-        in_chunks = map_long_clip(store, settings, ordered=frames.ordered, progress=progress, engine=engine)
-        models, determined = in_chunks.models, in_chunks.lens_determined
-    else:
-        models = mapping.map_frames(store, settings, progress)
+    n, threads, long = len(frames), settings.threads or thread_count(), is_long(len(frames), settings.mapping)
+    models, determined = _models(store, frames, settings, progress, engine)
     if not models:
         raise too_few(0, frames, settings)
     model = without_jumps(models[0])
+    # points of two frames hold the poses of those that overlap little, under the lens that the others determined
+    further = replace(settings, intrinsics="fixed") if store.little_overlap else settings
     if model.num_reg_images() < n:
         placed = {i - 1 for i in model.reg_image_ids()}
         again = [(i, j) for i, j in pairs if i not in placed or j not in placed]
         looser = replace(settings.features, max_ratio=settings.mapping.retry_ratio)
         match_pairs(store, again, looser, threads, progress, again=True)
         if not long:
-            model = refine(store, model, settings, progress).model  # a better lens places more
-        held = replace(settings, intrinsics="fixed") if long else settings
-        more = mapping.place_leftovers(store, model, held, progress)
-        more = mapping.replace_misplaced(store, more, held, progress)
+            model = refine(store, model, further, progress).model  # a better lens places more
+        more = mapping.place_leftovers(store, model, further, progress)
+        more = mapping.replace_misplaced(store, more, further, progress)
         more = without_jumps(more)
         model = more if more.num_reg_images() >= model.num_reg_images() else model
-    calibrated = Calibrated(model, refined=determined) if long else refine(store, model, settings, progress)
+    calibrated = Calibrated(model, refined=determined) if long else refine(store, model, further, progress)
     if settings.mapping.align_keypoints:
         model = adjust_keypoints(store, calibrated.model, frames, threads, progress, lenses)
         calibrated = replace(calibrated, model=model)
         if not long:
             calibrated = refine_again(store, calibrated, progress)
-        elif determined:
+        elif determined and not store.little_overlap:
             calibrated = replace(calibrated, model=adjust_lens(store, model, settings, progress, is_large=True))
         else:
             calibrated = replace(calibrated, model=adjust_poses(store, model))
-    warnings = []
-    if not calibrated.refined and settings.intrinsics != "fixed":
-        warnings.append(assumed_lens(calibrated.model.cameras[1].focal_length_x / store.scale))
-    return _Mapped(calibrated.model, models[1:], calibrated.refined, warnings)
+    model, refined = calibrated.model, calibrated.refined or determined
+    assumed = not refined and settings.intrinsics != "fixed"
+    warnings = [assumed_lens(model.cameras[1].focal_length_x / store.scale)] if assumed else []
+    return _Mapped(model, models[1:], refined, warnings)
+
+
+def _models(
+    store: FeatureDatabase, frames: Frames, settings: ColmapSettings, progress: Progress, engine: EngineSettings
+) -> "tuple[list[pycolmap.Reconstruction], bool]":
+    """The models found, the largest first, and whether the images have determined the lens that they are under."""
+    if is_long(len(frames), settings.mapping):
+        in_chunks = map_long_clip(store, settings, ordered=frames.ordered, progress=progress, engine=engine)
+        return in_chunks.models, in_chunks.lens_determined
+    models = mapping.map_frames(store, settings, progress)
+    if not models or not store.little_overlap:
+        return models, False
+    first = refine(store, models[0], settings, progress)
+    return [first.model, *models[1:]], first.refined
 
 
 def _navigated(
@@ -312,7 +322,7 @@ def _navigated(
         navigator,
         recorded,
         progress,
-        lens=mapped.lens_refined and not overlaps_little(store),
+        lens=mapped.lens_refined and not store.little_overlap,
     )
     return replace(mapped, model=found.model, others=found.others, warnings=[*mapped.warnings, *found.warnings])
 

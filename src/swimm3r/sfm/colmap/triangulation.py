@@ -18,7 +18,7 @@ from swimm3r.scene.frames import Frames
 from swimm3r.scene.reconstruction import Points, Reconstruction, Tracks
 from swimm3r.sfm.colmap.pairs import match_frames
 from swimm3r.sfm.colmap.record import verified_matches
-from swimm3r.sfm.features.database import fill_features, overlaps_little, scaled_camera, start_database
+from swimm3r.sfm.features.database import fill_features, scaled_camera, start_database, with_overlap
 from swimm3r.sfm.features.settings import FeatureSettings
 from swimm3r.sfm.settings import ColmapSettings
 from swimm3r.sfm.tracks import MatchTracks, as_points
@@ -52,11 +52,12 @@ def triangulate(
         each.width, each.height, each.params = own.width, own.height, own.params
     fill_features(store, placed, settings, threads, progress)
     match_frames(store, placed, ColmapSettings(features=settings), threads, progress)
+    store = with_overlap(store)
     options = pycolmap.IncrementalPipelineOptions()
     options.extract_colors = False
     options.num_threads = 1  # the same sums in the same order
     options.random_seed = 0
-    options.triangulation.ignore_two_view_tracks = not overlaps_little(store)
+    options.triangulation.ignore_two_view_tracks = not store.little_overlap
     with tempfile.TemporaryDirectory(dir=folder, prefix=DRAFT) as scratch:
         progress("triangulating points", 0, 1)
         found = pycolmap.triangulate_points(model, str(store.path), str(folder), scratch, options=options)

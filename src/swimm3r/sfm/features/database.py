@@ -17,7 +17,7 @@ import sqlite3
 from collections.abc import Callable, Iterator, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from contextlib import closing, contextmanager
-from dataclasses import asdict, dataclass
+from dataclasses import asdict, dataclass, replace
 from pathlib import Path
 from typing import TYPE_CHECKING
 
@@ -51,6 +51,7 @@ class FeatureDatabase:
     path: Path
     frames: int
     scale: float = 1.0  # pixels of the database per pixel of the frames
+    little_overlap: bool = False  # most features match in one other frame alone (`with_overlap`)
 
     @contextmanager
     def open(self) -> "Iterator[pycolmap.Database]":
@@ -137,10 +138,11 @@ def flat_share(store: FeatureDatabase) -> float:
     return flat / max(1, sum(kind not in (kinds.UNDEFINED, kinds.DEGENERATE) for kind in found))
 
 
-def overlaps_little(store: FeatureDatabase) -> bool:
-    """Return whether most of the matched features match in one other frame alone, as in stills that see ground twice.
+def with_overlap(store: FeatureDatabase) -> FeatureDatabase:
+    """The database with what its matches say of overlap: little where most of the matched features match in one other
+    frame alone, as in stills that see ground twice.
 
-    Their points then have to hold the poses, too: COLMAP leaves out points of two frames where that is not asked for.
+    Points of two frames then have to hold the poses, too; COLMAP leaves them out where that is not asked for.
     """
     import pycolmap
 
@@ -155,7 +157,7 @@ def overlaps_little(store: FeatureDatabase) -> bool:
                 seen[: len(partners[image])] += partners[image]
                 partners[image] = seen
     count = np.concatenate(list(partners.values()))
-    return bool((count == 1).sum() > _SEEN_TWICE * (count > 0).sum())
+    return replace(store, little_overlap=bool((count == 1).sum() > _SEEN_TWICE * (count > 0).sum()))
 
 
 def match_counts(store: FeatureDatabase) -> dict[tuple[int, int], int]:
@@ -182,7 +184,7 @@ def write_excerpt(store: FeatureDatabase, path: Path, images: Sequence[int]) -> 
         for i, j in itertools.combinations(images, 2):
             if database.exists_two_view_geometry(i, j):
                 excerpt.write_two_view_geometry(new_id[i], new_id[j], database.read_two_view_geometry(i, j))
-    return FeatureDatabase(path, len(images), store.scale)
+    return replace(store, path=path, frames=len(images))
 
 
 def _write_frames(database: "pycolmap.Database", camera_id: int, numbers: Sequence[int]) -> None:

@@ -8,7 +8,7 @@ import numpy as np
 from swimm3r.io.colmap.cameras import under_model
 from swimm3r.sfm.colmap.adjustment import WIDEST, robust_adjustment
 from swimm3r.sfm.colmap.calibration.start import set_camera
-from swimm3r.sfm.features.database import MIN_INLIERS, FeatureDatabase, overlaps_little
+from swimm3r.sfm.features.database import MIN_INLIERS, FeatureDatabase
 
 if TYPE_CHECKING:
     import pycolmap
@@ -34,8 +34,7 @@ def adjusted(
 
     The loss is quadratic up to `width` pixels. Poses and lens of a large model are adjusted without its redundant
     points, which follow afterwards. The lens of the database becomes that of the model before it. Where frames overlap
-    little, points that two frames alone see hold the poses, too, if `points_of_two`; they follow any lens, and can
-    neither refine nor judge one.
+    little, `points_of_two` adds the points that two of them alone see; they follow any lens, and can tell none.
     """
     import pycolmap
 
@@ -48,9 +47,6 @@ def adjusted(
     out = pycolmap.Reconstruction(model)
     out.cameras[1].model = changed.model
     out.cameras[1].params = list(map(float, changed.params))
-    little = overlaps_little(store)
-    if little and not points_of_two:
-        _drop_points_of_two(out)
     mapper = pycolmap.IncrementalMapper(cache)
     mapper.begin_reconstruction(out)
     mapping = pycolmap.IncrementalMapperOptions()
@@ -60,24 +56,19 @@ def adjusted(
     mapping.ba_global_ignore_redundant_points3D = is_large
     triangulation = pycolmap.IncrementalTriangulatorOptions()
     triangulation.random_seed = SEED
-    triangulation.ignore_two_view_tracks = not (little and points_of_two)
+    added = points_of_two and store.little_overlap
+    triangulation.ignore_two_view_tracks = not added
     adjustment = robust_adjustment(width)
     adjustment.refine_focal_length, adjustment.refine_extra_params = focal, distortion
     adjustment.ceres.solver_options.num_threads = THREADS
     adjustment.ceres.solver_options.function_tolerance = STILL
-    if little and points_of_two:
+    if added:
         for image in sorted(out.reg_image_ids()):
             mapper.triangulate_image(triangulation, image)
     mapper.iterative_global_refinement(5, 0.0005, mapping, adjustment, triangulation)
     mapper.end_reconstruction(False)
     out.update_point_3d_errors()
     return out
-
-
-def _drop_points_of_two(model: "pycolmap.Reconstruction") -> None:
-    """Take out the points that two frames alone see."""
-    for point in [p for p, seen in model.points3D.items() if seen.track.length() == 2]:
-        model.delete_point3D(point)
 
 
 def settled(

@@ -139,7 +139,7 @@ def _held_out(
 ) -> Kept:
     """Observations of other frames that the lens fitted to some keeps; none where it loses frames."""
     lens = fitted(store, own, family, _free(family)).cameras[1]  # no real one, perhaps: then it errs on other frames
-    held = with_lens(other, lens)
+    held = _with_lens(other, lens)
     held = settled(lambda model: adjusted(store, model, lens.model.name), held)
     if held.num_reg_images() < other.num_reg_images():
         return _NOTHING
@@ -165,8 +165,7 @@ def _part(model: "pycolmap.Reconstruction", images: Sequence[int]) -> "pycolmap.
     return part
 
 
-def with_lens(model: "pycolmap.Reconstruction", lens: "pycolmap.Camera") -> "pycolmap.Reconstruction":
-    """A copy of a model under another lens."""
+def _with_lens(model: "pycolmap.Reconstruction", lens: "pycolmap.Camera") -> "pycolmap.Reconstruction":
     import pycolmap
 
     out = pycolmap.Reconstruction(model)

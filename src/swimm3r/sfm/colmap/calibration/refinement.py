@@ -10,9 +10,9 @@ from typing import TYPE_CHECKING
 from swimm3r.progress import Progress
 from swimm3r.sfm.colmap.adjustment import typical_error
 from swimm3r.sfm.colmap.calibration.adjust import adjusted, settled
-from swimm3r.sfm.colmap.calibration.hypotheses import LensFamily, family_of, fitted, likeliest, squeezed_like, with_lens
+from swimm3r.sfm.colmap.calibration.hypotheses import LensFamily, family_of, fitted, likeliest, squeezed_like
 from swimm3r.sfm.colmap.calibration.start import is_lens, set_camera
-from swimm3r.sfm.features.database import FeatureDatabase, overlaps_little
+from swimm3r.sfm.features.database import FeatureDatabase
 from swimm3r.sfm.settings import ColmapSettings
 
 if TYPE_CHECKING:
@@ -39,8 +39,7 @@ def adjust_lens(
 ) -> "pycolmap.Reconstruction":
     """The model after one bundle adjustment with its lens; as it was where that gives no lens or loses frames.
 
-    Poses and lens of a large model are adjusted without its redundant points, which follow afterwards. Where frames
-    overlap little, the lens is that of points which three frames see, and poses and all points are adjusted under it.
+    Poses and lens of a large model are adjusted without its redundant points, which follow afterwards.
     """
     if settings.intrinsics == "fixed":
         return model
@@ -52,9 +51,6 @@ def adjust_lens(
 
     found = fitted(store, model, family, adjust)
     progress(_STEP, 1, 1)
-    if overlaps_little(store) and is_lens(found.cameras[1]):
-        known, name = with_lens(model, found.cameras[1]), found.cameras[1].model.name
-        return adjusted(store, known, name, is_large=is_large, points_of_two=True)
     if _is_sound(found, model):
         return found
     set_camera(store, model.cameras[1])
@@ -87,7 +83,7 @@ def refine(
     if kept is None:
         return Calibrated(_poses_alone(store, model), refined=False)
     sharp = _sharpened(store, kept, family, distortion=distortion)
-    kept = _with_points_of_two(store, sharp if _is_sound(sharp, kept) else kept)
+    kept = sharp if _is_sound(sharp, kept) else kept
     set_camera(store, kept.cameras[1])
     return Calibrated(kept, refined=True)
 
@@ -104,7 +100,6 @@ def refine_again(store: FeatureDatabase, calibrated: Calibrated, progress: Progr
     for _ in range(2):  # errors are smaller after the first, and the loss of the second is as wide as they are
         found = _sharpened(store, kept, family, distortion=distortion)
         kept = found if _is_sound(found, kept) else kept
-    kept = _with_points_of_two(store, kept)
     progress(_STEP, 1, 1)
     set_camera(store, kept.cameras[1])
     return Calibrated(kept, refined=True)
@@ -168,11 +163,6 @@ def _poses_alone(store: FeatureDatabase, model: "pycolmap.Reconstruction") -> "p
     name = model.cameras[1].model.name
     found = adjusted(store, model, name, points_of_two=True)
     return adjusted(store, found, name, points_of_two=True, width=typical_error(found))
-
-
-def _with_points_of_two(store: FeatureDatabase, model: "pycolmap.Reconstruction") -> "pycolmap.Reconstruction":
-    """The model, where frames overlap little adjusted under its lens with the points that two alone see."""
-    return _poses_alone(store, model) if overlaps_little(store) else model
 
 
 def _is_sound(found: "pycolmap.Reconstruction", before: "pycolmap.Reconstruction") -> bool:

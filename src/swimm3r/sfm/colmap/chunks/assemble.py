@@ -14,7 +14,7 @@ from swimm3r.sfm.colmap.calibration.adjust import SEED
 from swimm3r.sfm.colmap.calibration.start import set_camera
 from swimm3r.sfm.colmap.chunks.join import Joined
 from swimm3r.sfm.colmap.chunks.parts import Part
-from swimm3r.sfm.features.database import MIN_INLIERS, FeatureDatabase, overlaps_little
+from swimm3r.sfm.features.database import MIN_INLIERS, FeatureDatabase
 from swimm3r.sim3 import Sim3
 
 if TYPE_CHECKING:
@@ -45,7 +45,7 @@ def assemble(
         model.register_frame(frame.frame_id)
     triangulation = pycolmap.IncrementalTriangulatorOptions()
     triangulation.random_seed = SEED
-    triangulation.ignore_two_view_tracks = not overlaps_little(store)
+    triangulation.ignore_two_view_tracks = not store.little_overlap
     for done, image in enumerate(sorted(poses)):
         progress(_STEP, done, len(poses))
         mapper.triangulate_image(triangulation, image)

@@ -84,8 +84,9 @@ def _task(
 ) -> ChunkTask:
     own = set(chunk)
     inside = sorted((i, j, count) for (i, j), count in matches.items() if i + 1 in own and j + 1 in own)
-    key = cache_key(chunk, inside, lens.model, lens.params, settings.mapping)
-    return ChunkTask(key, store.path, store.frames, chunk, (lens.model, lens.params), settings, folder / key)
+    key = cache_key(chunk, inside, lens.model, lens.params, settings.mapping, store.little_overlap)
+    held = (lens.model, lens.params)
+    return ChunkTask(key, store.path, store.frames, chunk, held, settings, folder / key, store.little_overlap)
 
 
 def _join(
@@ -108,7 +109,7 @@ def _join(
     models: list[pycolmap.Reconstruction] = []
     for group in sorted(groups, key=lambda group: _frames_of(group, parts), reverse=True):
         model = assemble(store, parts, group, lens, progress)
-        if pilot.determined and not models:
+        if pilot.determined and not models and not store.little_overlap:
             model = adjust_lens(store, model, settings, progress, is_large=True)
             lens = model.cameras[1]
         else:

@@ -43,6 +43,7 @@ class ChunkTask:
     lens: tuple[str, tuple[float, ...]]  # COLMAP's model name and parameters
     settings: ColmapSettings
     folder: Path  # that receives the models
+    little_overlap: bool = False  # of the whole clip's frames (`FeatureDatabase`)
 
 
 def place_chunk(task: ChunkTask, progress: Progress = silent) -> None:
@@ -51,7 +52,8 @@ def place_chunk(task: ChunkTask, progress: Progress = silent) -> None:
         return
     task.folder.parent.mkdir(parents=True, exist_ok=True)
     with tempfile.TemporaryDirectory(dir=task.folder.parent, prefix=".mapping.") as scratch:
-        store = write_excerpt(FeatureDatabase(task.database, task.frames), Path(scratch) / "database.db", task.images)
+        whole = FeatureDatabase(task.database, task.frames, little_overlap=task.little_overlap)
+        store = write_excerpt(whole, Path(scratch) / "database.db", task.images)
         name, parameters = task.lens
         with store.open() as database:
             camera = database.read_camera(1)
