@@ -230,7 +230,7 @@ def _map_in_turn(
 def _counts_points_of_two(store: FeatureDatabase, settings: ColmapSettings) -> bool:
     """Return whether points that two frames alone see count: where frames overlap little, under a lens that is known.
 
-    While it is open they follow any: ruie_murky's frames all fit one of three times the focal length.
+    While it is open they follow any: ruie_murky's frames all fit one of more than twice the focal length.
     """
     return settings.intrinsics == "fixed" and store.little_overlap
 

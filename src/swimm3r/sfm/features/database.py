@@ -39,7 +39,7 @@ log = logging.getLogger(__name__)
 
 MIN_INLIERS = 15  # of a pair; COLMAP's limit, below it chance agrees with some geometry
 _HINT_OF_OVERLAP = 8  # matches
-_SEEN_TWICE = 0.5  # of the matched features; 0.12 to 0.35 of those of videos, 0.60 to 0.73 of those of stills of an AUV
+_SEEN_TWICE = 0.5  # of the matched features; 0.12 to 0.35 of most clips' and 0.60 to 0.73 of an AUV's stills' match so
 _BATCH = 32  # frames or pairs worked on together: what a killed run loses
 _HELD = 64  # frames in memory while matching: 0.1 GB
 
