@@ -167,7 +167,8 @@ def test_distances_that_no_light_comes_back_from_say_nothing_of_the_surfaces():
     z, J = np.linspace(0.3, 6, 4000), g.uniform(0.1, 0.7, 4000)
     Binf, beta_D, beta_B = 0.3, 2.0, 1.0
     I = J * np.exp(-beta_D * z) - Binf * np.expm1(-beta_B * z) + 0.004 * g.normal(0, 1, 4000)
-    pixels = Pixels(I, I, daylight(z), np.zeros(4000, dtype=np.int64), np.full(300, Binf))
+    measured = np.ones(4000, dtype=bool)
+    pixels = Pixels(I, I, daylight(z), np.zeros(4000, dtype=np.int64), np.full(300, Binf), measured)
     true = np.array([Binf, np.log(beta_B), np.log(beta_D), 0.0, 0.1, np.log(0.4)])
     averages = prior_residuals(true, evidence_of(pixels, SETTINGS), SETTINGS)[SETTINGS.range_bins : -5]
     assert np.abs(averages).max() < 0.2  # 1.7 where the logarithm of no light was compared

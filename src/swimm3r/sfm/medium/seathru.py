@@ -8,7 +8,8 @@ and one bounded least-squares problem finds Binf, beta_B and beta_D(z) = a exp(b
 
     tracks      the same point seen from several distances; J_t is eliminated in closed form (variable projection), so
                 the decay of color *differences* gives beta_D without any guess about the illuminant
-    dark        the darkest pixels of each range bin are B plus J' T_D with a small common J' (Sea-Thru's B(z))
+    dark        the darkest pixels of each range bin are B plus J' T_D with a small common J' (Sea-Thru's B(z)), those
+                of guessed depth among them
     average     the average color of a range bin decays as T_D from 1 / f (local space average color, f = 2): decides
                 only what the tracks leave open
     open water  pixels that look past every surface show Binf; without any, Binf is not far from what is farthest
@@ -79,7 +80,8 @@ def fit_medium(samples: WaterSamples, settings: SeathruSettings, encoding: Encod
     Gray samples are one channel, which is fitted once and stands for all three. Raises InputError where fewer than
     `settings.min_samples` pixels have a depth, and under a lamp where too few points are seen by several frames.
     """
-    n = len(samples.ray_depth)
+    measured = samples.measured.numpy()
+    n = int(measured.sum())
     if n < settings.min_samples:
         raise InputError(
             f"the water cannot be estimated from {n} pixels with known depth",
@@ -90,7 +92,7 @@ def fit_medium(samples: WaterSamples, settings: SeathruSettings, encoding: Encod
         settings = replace(settings, slope_std=settings.lamp_slope_std)
     color, open_water = encoded(samples, encoding)
     ray_depth = samples.ray_depth.double().numpy()
-    unit = float(np.median(ray_depth))
+    unit = float(np.median(ray_depth[measured]))
     z = ray_depth / unit
     frame = np.unique(samples.frame.numpy(), return_inverse=True)[1]
     chosen = telling_rows(samples, z, settings) if light == "sun" else _lit_rows(samples, z, settings)
@@ -103,7 +105,9 @@ def fit_medium(samples: WaterSamples, settings: SeathruSettings, encoding: Encod
         every = [lit.of_channel(c, lamp, scatter) for c in range(color.shape[1])]
     else:
         lamp, brightness, ways = None, color.mean(1), daylight(z)
-        every = [Pixels(color[:, c], brightness, ways, frame, open_water[:, c]) for c in range(color.shape[1])]
+        every = [
+            Pixels(color[:, c], brightness, ways, frame, open_water[:, c], measured) for c in range(color.shape[1])
+        ]
     channels = []
     for pixels in every:
         observations = None
@@ -111,7 +115,7 @@ def fit_medium(samples: WaterSamples, settings: SeathruSettings, encoding: Encod
             rows, point = chosen
             observations = Observations(rows, pixels.ways.rows(rows), point, frame[rows], pixels.I[rows], samples.grids)
         channels.append(fit_channel(pixels, observations, settings))
-    fit = _medium_fit(channels * (3 // len(channels)), unit, ray_depth, settings, encoding)
+    fit = _medium_fit(channels * (3 // len(channels)), unit, ray_depth[measured], settings, encoding)
     if lamp is None:
         return fit
     log_means = np.array([_log_mean_color(c, pixels) for c, pixels in zip(channels, every, strict=True)])
@@ -125,6 +129,7 @@ def fit_medium(samples: WaterSamples, settings: SeathruSettings, encoding: Encod
 
 def _log_mean_color(fit: ChannelFit, pixels: Pixels) -> float:
     """Logarithm of a channel's mean clear color over the pixels, weighted by the share of light that arrives."""
+    pixels = pixels.of_measured_depth()
     T_D, B = attenuations(fit.x, pixels.ways)
     return float(np.log(max(np.mean(pixels.I - B), _DARKEST) / np.mean(T_D)))
 
@@ -146,7 +151,7 @@ def _lit(
         raise ValueError("a lamp's light is told by the directions of pixels, and these samples have none")
     directions = (values.double().numpy() for values in (samples.direction, samples.water_direction))
     direction, toward_water = directions
-    return LampPixels(color, z, direction, frame, open_water, toward_water, samples.grids)
+    return LampPixels(color, z, direction, frame, open_water, toward_water, samples.measured.numpy(), samples.grids)
 
 
 def _lit_rows(samples: WaterSamples, z: np.ndarray, settings: SeathruSettings) -> tuple[np.ndarray, np.ndarray] | None:

@@ -60,6 +60,13 @@ class Pixels:
     ways: Ways
     frame: np.ndarray  # 0.. without gaps
     open_water: np.ndarray
+    measured: np.ndarray  # False where the depth is a guess: such pixels tell of the darkest alone
+
+    def of_measured_depth(self) -> "Pixels":
+        """The pixels whose depth is no guess."""
+        rows = self.measured
+        kept = self.I[rows], self.brightness[rows], self.ways.rows(rows), self.frame[rows]
+        return Pixels(*kept, self.open_water, rows[rows])
 
 
 @dataclass(frozen=True)
@@ -184,35 +191,40 @@ def evidence_of(pixels: Pixels, settings: SeathruSettings, gain_std: float = 0.0
     """Everything that pixels tell besides the points among them; gains of frames are uncertain by `gain_std`."""
     water = _open_water_color(pixels.open_water, gain_std, settings)
     lower, upper = LOWER.copy(), UPPER.copy()
-    upper[BINF] = _largest_Binf(pixels.I, pixels.ways.z)
+    I, z = pixels.I[pixels.measured], pixels.ways.z[pixels.measured]
+    upper[BINF] = _largest_Binf(I, z)
     if water is None:
-        far = float(np.mean(pixels.I[pixels.ways.z >= np.quantile(pixels.ways.z, 0.9)]))
+        far = float(np.mean(I[z >= np.quantile(z, 0.9)]))
         return Evidence(_range_bins(pixels, settings), (far, settings.far_color_std), alone, lower, upper)
     upper[BINF] = min(1.0, max(upper[BINF], water[0] + 3 * water[1]))
     return Evidence(_range_bins(pixels, settings), water, alone, lower, upper)
 
 
 def _range_bins(pixels: Pixels, settings: SeathruSettings) -> _RangeBins:
-    """The darkest pixels (by brightness) and the average of each of `range_bins` equal depth intervals."""
+    """The darkest pixels of each of `range_bins` equal depth intervals, and the average of those of measured depth.
+
+    The darkest by brightness: by each channel's values alone noise would choose, and lie below the backscatter.
+    """
     I, brightness, z = pixels.I, pixels.brightness, pixels.ways.z
-    edges = np.linspace(np.quantile(z, 0.002), np.quantile(z, 0.998), settings.range_bins + 1)
+    edges = np.linspace(*np.quantile(z[pixels.measured], [0.002, 0.998]), settings.range_bins + 1)
     which = np.digitize(z, edges[1:-1])
-    dark, all_of_bin = [], []
+    dark, measured = [], []
     for k in range(settings.range_bins):
         inside = np.flatnonzero(which == k)
-        if len(inside) < settings.min_bin_pixels:
+        told = inside[pixels.measured[inside]]
+        if len(told) < settings.min_bin_pixels:
             continue
         count = int(np.ceil(settings.dark_fraction * len(inside)))
         dark.append(inside[np.argpartition(brightness[inside], count - 1)[:count]])
-        all_of_bin.append(inside)
+        measured.append(told)
     if not dark:  # few samples: one bin is all there is
         dark.append(np.argsort(brightness, kind="stable")[: max(1, int(settings.dark_fraction * len(z)))])
-        all_of_bin.append(np.arange(len(z)))
+        measured.append(np.flatnonzero(pixels.measured))
     return _RangeBins(
         _median_ways(pixels.ways, dark),
         np.array([np.median(I[which]) for which in dark]),
-        _median_ways(pixels.ways, all_of_bin),
-        np.array([np.mean(I[which]) for which in all_of_bin]),
+        _median_ways(pixels.ways, measured),
+        np.array([np.mean(I[which]) for which in measured]),
     )
 
 

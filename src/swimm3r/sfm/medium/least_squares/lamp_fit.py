@@ -95,6 +95,7 @@ class LampPixels:
     frame: np.ndarray
     open_water: np.ndarray  # [m, c]
     water_direction: np.ndarray
+    measured: np.ndarray  # False where the depth is a guess
     grids: int = 1  # of patches, all of which show the same pixels
 
     def scatter(self, lamp: Lamp, beta_D: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
@@ -112,9 +113,9 @@ class LampPixels:
     def of_channel(self, c: int, lamp: Lamp, scatter: tuple[np.ndarray, np.ndarray]) -> Pixels:
         """One channel of them; open water as it would be on the optical axis."""
         here, water = (values[:, c] for values in scatter)
-        return Pixels(
-            self.color[:, c], self.color.mean(1), self.ways(lamp, here), self.frame, self.open_water[:, c] / water
-        )
+        ways = self.ways(lamp, here)
+        color = self.color[:, c], self.color.mean(1)
+        return Pixels(*color, ways, self.frame, self.open_water[:, c] / water, self.measured)
 
 
 def seen_nearby(rows: np.ndarray, point: np.ndarray, z: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
@@ -142,7 +143,7 @@ def fit_lamp(
     few = LampPixels(
         pixels.color[every.rows], pixels.z[every.rows], pixels.direction[every.rows], every.frame,
         *(values[:: max(1, len(values) // _WATER)] for values in (pixels.open_water, pixels.water_direction)),
-        grids=pixels.grids,
+        measured=pixels.measured[every.rows], grids=pixels.grids,
     )  # fmt: skip
     unknowns, beta_D = np.zeros(_SHARED), np.full(len(channels), _START_BETA)
     unknowns[-2:] = _START
