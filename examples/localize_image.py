@@ -16,6 +16,7 @@ import torch
 import swimm3r
 from swimm3r.io.images import read_rgb
 from swimm3r.localization.localizer import Localizer
+from swimm3r.sfm.rectified.run import run_rectification
 
 
 def main(arguments: Sequence[str] | None = None) -> list[torch.Tensor]:
@@ -26,13 +27,15 @@ def main(arguments: Sequence[str] | None = None) -> list[torch.Tensor]:
     parser.add_argument("--time", type=float, help="second of the clip at which a dynamic map is rendered")
     given = parser.parse_args(arguments)
 
-    frames = swimm3r.load_frames(given.run / "prepare")
+    frames, rectification = swimm3r.run_frames(given.run), run_rectification(given.run)
     rec = swimm3r.load_reconstruction(given.run / "sfm", frames)
     scene = swimm3r.load_map(given.run / "splat" / "map.safetensors")
-    localizer = Localizer(scene, rec, frames)  # features of the references are computed once
+    localizer = Localizer(scene, rec, rec.still(frames))  # features of the references are computed once
     poses = []
     for path in given.images:
         stored = read_rgb(path)
+        if rectification is not None:  # the map is of rectified frames
+            stored = rectification.any_image(stored)
         image = torch.from_numpy(stored.astype(np.float32) / np.iinfo(stored.dtype).max)
         try:
             found = localizer.locate(image, time=given.time)

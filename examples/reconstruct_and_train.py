@@ -29,7 +29,13 @@ def main(arguments: Sequence[str] | None = None) -> None:
     frames = swimm3r.read_frames(given.folder, preset.frames, folder=given.out / "prepare")
     print(f"{len(frames.train)} training frames and {len(frames.test)} test frames of {frames.width}x{frames.height}")
 
-    rec = swimm3r.reconstruct(frames, preset.sfm, folder=given.out / "sfm")
+    while True:  # once as filmed, and once after each of the two rectifications
+        try:
+            rec = swimm3r.reconstruct(swimm3r.run_frames(given.out), preset.sfm, folder=given.out / "sfm")
+            break
+        except swimm3r.RectifiableError as error:
+            swimm3r.rectify_run(given.out, error.rectification)
+    frames = swimm3r.run_frames(given.out)
     print(f"{len(rec.names)} frames registered, {len(rec.points.xyz)} points")
     for warning in rec.warnings:
         print(f"Warning: {warning.what} {warning.advice}")

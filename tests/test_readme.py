@@ -1,4 +1,4 @@
-"""The Python of the README and of the package's docstring is run as it is printed."""
+"""The Python of the README, of First dive's loop and of the package's docstring is run as it is printed."""
 
 import re
 from collections.abc import Callable
@@ -10,18 +10,23 @@ from textwrap import dedent
 import numpy as np
 import pytest
 import torch
+from tests.imaging.test_rectification import stretching_lens
 
 import swimm3r
+from swimm3r.imaging.rectification import rectification_of
+from swimm3r.imaging.turned_rows import RowTurns
 from swimm3r.io.images import read_rgb
 from swimm3r.sfm.plane_sweep.settings import PlaneSweepSettings
+from swimm3r.sfm.rectified.frames import BentImagesError, TurnedRowsError
 from swimm3r.splat.projection.view_camera import view_camera
 from swimm3r.splat.settings import DensifySettings, InitialSettings, MediumFieldSettings, UwbsSettings
 
 README = Path(__file__).parents[1] / "README.md"
+FIRST_DIVE = README.parent / "docs" / "first-dive.md"
 
 
-def snippets() -> list[str]:
-    return re.findall(r"^```python\n(.*?)^```", README.read_text(encoding="utf-8"), re.MULTILINE | re.DOTALL)
+def snippets(document: Path) -> list[str]:
+    return re.findall(r"^```python\n(.*?)^```", document.read_text(encoding="utf-8"), re.MULTILINE | re.DOTALL)
 
 
 @pytest.fixture
@@ -45,7 +50,7 @@ def beside_a_dive(tmp_path: Path, write_video: Callable[..., Path], monkeypatch:
 
 
 def test_the_readmes_python_runs_as_printed(beside_a_dive: Path):
-    (snippet,) = snippets()
+    (snippet,) = snippets(README)
     names: dict = {}
     exec(compile(snippet, str(README), "exec"), names)
     out, camera = names["out"], names["camera"]
@@ -71,6 +76,28 @@ def test_the_docstrings_python_runs_as_printed(beside_a_dive: Path):
     assert torch.isfinite(names["pose"]).all()
     for shown in (names["frames"], rec, rec.medium, scene, out):
         assert "<" in shown._repr_html_()
+
+
+def test_the_loop_over_rectifications_runs_as_printed(beside_a_dive: Path, monkeypatch: pytest.MonkeyPatch):
+    (snippet,) = (text for text in snippets(FIRST_DIVE) if "RectifiableError" in text)
+    way, seen = rectification_of(stretching_lens(240, 160)), []
+
+    def reconstruct(frames: swimm3r.Frames, *_: object, **__: object) -> str:
+        seen.append((frames.width, frames.rows_rectified))
+        if frames.width == 240:
+            raise BentImagesError(way)
+        if not frames.rows_rectified:
+            raise TurnedRowsError(RowTurns(way.pinhole, {frames.names[1]: np.array([0.02, 0.0, 0.01])}))
+        return "poses"
+
+    monkeypatch.setattr(swimm3r, "reconstruct", reconstruct)
+    for resumed in (False, True):
+        seen.clear()
+        names: dict = {}
+        exec(compile(snippet, str(FIRST_DIVE), "exec"), names)
+        assert seen == [(240, False), (way.pinhole.width, False)] * (not resumed) + [(way.pinhole.width, True)]
+        assert names["rec"] == "poses"
+        assert (names["frames"].width, names["frames"].rows_rectified) == seen[-1]
 
 
 def test_every_public_name_loads():

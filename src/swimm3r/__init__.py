@@ -36,7 +36,8 @@ if TYPE_CHECKING:
     from swimm3r.scene.reconstruction_io import load_reconstruction
     from swimm3r.scene.settings import FrameSettings
     from swimm3r.sfm import reconstruct
-    from swimm3r.sfm.rectified.frames import rectify_frames
+    from swimm3r.sfm.rectified.frames import RectifiableError, rectify_frames
+    from swimm3r.sfm.rectified.run import rectify_run, run_frames
     from swimm3r.sfm.settings import ColmapSettings, Mast3rSettings
     from swimm3r.splat import train
     from swimm3r.splat.map_file import load_map
@@ -67,7 +68,10 @@ _HOME = {
     "Progress": "progress",
     "silent": "progress",
     "reconstruct": "sfm",
+    "RectifiableError": "sfm.rectified.frames",
     "rectify_frames": "sfm.rectified.frames",
+    "rectify_run": "sfm.rectified.run",
+    "run_frames": "sfm.rectified.run",
     "ColmapSettings": "sfm.settings",
     "Mast3rSettings": "sfm.settings",
     "SplatMap": "splat.rendering",
@@ -93,6 +97,7 @@ __all__ = [
     "MediumFit",
     "Progress",
     "Reconstruction",
+    "RectifiableError",
     "RunSettings",
     "SplatMap",
     "Swimm3rError",
@@ -107,7 +112,9 @@ __all__ = [
     "read_frames",
     "reconstruct",
     "rectify_frames",
+    "rectify_run",
     "remove_water",
+    "run_frames",
     "run_pipeline",
     "silent",
     "train",

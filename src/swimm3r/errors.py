@@ -1,7 +1,7 @@
 """Failures a user can cause or mend: what happened, the likely cause, one thing to try, and the exit code.
 
 Exit codes: 0 done, 2 usage, 3 input data, 4 weights, 5 device or memory, 6 too few registered images, 7 storage, 8
-dives of a batch failed for different reasons, 130 interrupted.
+dives of a batch failed for different reasons, 130 interrupted, 141 the reader of the output ended.
 Everything else is our own mistake and keeps its traceback.
 """
 

@@ -4,9 +4,10 @@ import os
 import re
 import subprocess
 import sys
+import tomllib
 from pathlib import Path
 
-from tests.docs.documents import ROOT
+from tests.docs.documents import DOCUMENTS, ROOT
 from tests.test_architecture import PACKAGE, ROWS
 
 ARCHITECTURE = (ROOT / "docs" / "architecture.md").read_text(encoding="utf-8")
@@ -25,6 +26,19 @@ def test_the_site_builds_strictly_and_asks_no_other_server(tmp_path: Path):
     assert re.findall(r'<(?:script|link|img)[^>]*(?:src|href)="(?:https?:)?//[^"]*"', front) == []
     reference = (tmp_path / "site" / "reference" / "swimm3r" / "index.html").read_text(encoding="utf-8")
     assert 'id="swimm3r.medium.add_water"' in reference
+
+
+def test_the_installation_page_lists_every_extra():
+    page = (ROOT / "docs" / "installation.md").read_text(encoding="utf-8")
+    project = tomllib.loads((ROOT / "pyproject.toml").read_text(encoding="utf-8"))["project"]
+    listed = re.findall(r"^\| `pip install '\.\[(\w+)\]'`", page, re.MULTILINE)
+    assert {*listed, "dev"} == project["optional-dependencies"].keys()
+
+
+def test_documents_install_extras_from_the_clone():
+    """The package is in no index; only the installation page names the form that needs an installed one."""
+    named = [path.name for path in DOCUMENTS if "swimm3r[" in path.read_text(encoding="utf-8")]
+    assert named == ["installation.md"]
 
 
 def test_the_page_lists_every_room():

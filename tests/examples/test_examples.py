@@ -5,14 +5,16 @@ import re
 from collections.abc import Callable
 from importlib.util import module_from_spec, spec_from_file_location
 from pathlib import Path
-from types import ModuleType
+from types import ModuleType, SimpleNamespace
 
 import pytest
 import torch
+from tests.imaging.test_rectification import stretching_lens
 
 import swimm3r
 from swimm3r.evaluate.images import psnr
 from swimm3r.geometry import align_poses, rotation_angle
+from swimm3r.imaging.rectification import rectification_of
 from swimm3r.io.cameras_json import read_cameras
 from swimm3r.io.images import read_rgb
 from swimm3r.scene.ground_truth import read_ground_truth
@@ -81,6 +83,34 @@ def test_localize_image_finds_a_test_frame(dive: Path, work: Path, example: Call
     axes = align_poses(truth.cameras.cam2world[rows], torch.from_numpy(found.cam2world))
     true = axes.poses(truth.cameras.cam2world[[truth.names.index("0008.png")]])[0]
     assert torch.rad2deg(rotation_angle(true[:3, :3].mT @ pose[:3, :3])) < 2
+
+
+def test_localize_image_rectifies_images_where_the_run_is_of_rectified_frames(
+    dive: Path, example: Callable[[str], ModuleType], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+):
+    way, run, seen = rectification_of(stretching_lens(240, 160)), tmp_path / "run", []
+    monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path / "cache"))
+    swimm3r.rectify_frames(swimm3r.read_frames(dive / "images"), way, run / "sfm" / "rectified")
+
+    class Localizer:
+        def __init__(self, _: None, rec: None, frames: swimm3r.Frames) -> None:
+            seen.append((frames.height, frames.width))
+
+        def locate(self, image: torch.Tensor, time: float | None) -> SimpleNamespace:
+            seen.append(tuple(image.shape[:2]))
+            return SimpleNamespace(cam2world=torch.eye(4), stage="refined", candidates=())
+
+        def in_axes_of_sfm(self, pose: torch.Tensor) -> torch.Tensor:
+            return pose
+
+    localize_image = example("localize_image")
+    monkeypatch.setattr(localize_image, "Localizer", Localizer)
+    monkeypatch.setattr(swimm3r, "load_map", lambda _: None)
+    rec = SimpleNamespace(still=lambda frames: frames)
+    monkeypatch.setattr(swimm3r, "load_reconstruction", lambda *_: rec)
+    localize_image.main([str(run), str(dive / "images" / "0008.png")])
+    assert seen == [(way.pinhole.height, way.pinhole.width)] * 2
+    assert seen[0] != (160, 240)
 
 
 def test_the_notebook_runs_cell_by_cell(tmp_path: Path, monkeypatch: pytest.MonkeyPatch):

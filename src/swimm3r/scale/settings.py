@@ -70,8 +70,8 @@ class ScaleSettings(Settings):
     laser_std: Positive = 0.001
     """Standard deviation of --laser-spacing, in metres."""
     nav: Path | None = None
-    """Navigation of the vehicle: CSV with named columns, NMEA, Matisse .dim2, TUM, .srt, a ROS bag, or a folder of
-    images with GPS in EXIF."""
+    """Navigation of the vehicle: CSV with named columns, NMEA, Matisse .dim2, TUM, .srt, a dive computer's log as
+    Subsurface's XML, a ROS bag, or a folder of images with GPS in EXIF."""
     nav_topic: str | None = None
     """Topic of positions of a ROS bag that holds several; `swimm3r topics BAG` lists them."""
     nav_offset: Annotated[float, Range(-1e10, 1e10)] | None = None

@@ -41,20 +41,21 @@ def has_rectified_rows(run: Path) -> bool:
     return (run / RECTIFIED_ROWS).is_dir()
 
 
-def rectify_run(run: Path, rectification: Rectification | RowTurns, progress: Progress = silent) -> None:
+def rectify_run(run: str | Path, rectification: Rectification | RowTurns, progress: Progress = silent) -> None:
     """Redraw the frames that a run works on; from here on it works on these.
 
     Raises InputError where they are not of the size of the rectification's lens.
     """
     into = RECTIFIED if isinstance(rectification, Rectification) else RECTIFIED_ROWS
-    rectify_frames(run_frames(run), rectification, run / into, progress)
+    rectify_frames(run_frames(run), rectification, Path(run) / into, progress)
 
 
-def run_frames(run: Path) -> Frames:
+def run_frames(run: str | Path) -> Frames:
     """The frames that a run's structure from motion and all after it work on: rectified ones where there are any.
 
     Raises InputError where they are incomplete.
     """
+    run = Path(run)
     if has_rectified_rows(run):
         return load_frames(run / RECTIFIED_ROWS)
     return load_frames(run / RECTIFIED if is_rectified(run) else run / "prepare")
