@@ -12,6 +12,7 @@ from swimm3r.io.files.cache_key import cache_key
 from swimm3r.io.imports.read import read_foreign
 from swimm3r.io.view_names import view_stems
 from swimm3r.pipeline import summary as sections
+from swimm3r.pipeline.camera_paths import rows_of_one_camera
 from swimm3r.pipeline.presets import RunSettings
 from swimm3r.pipeline.renders import display_style, write_flythrough
 from swimm3r.pipeline.scores import held_out
@@ -102,9 +103,8 @@ def score_restored_frames(run: MappedRun, progress: Progress = silent) -> dict[s
 def film_flight(run: MappedRun, progress: Progress = silent) -> None:
     """Write RUN/renders/flythrough.mp4, at the size the map was trained at."""
     scene, path = run.scene, as_mapped(run.rec, run.scene.poses)
-    first = None if run.frames.rig is None else run.frames.rig.names[0]
-    rows = [i for i, name in enumerate(path.names) if run.frames.frames[run.frames.index(name)].camera == first]
-    lens = path.cameras[0]
+    rows = rows_of_one_camera(path.names, run.frames)
+    lens = path.cameras[rows[0]]
     canvas = lens.drawn(scene.settings.long_side)
     write_flythrough(
         run.folder / "renders" / "flythrough.mp4",
