@@ -25,6 +25,7 @@ from swimm3r.scene.reconstruction_io import load_reconstruction, unfiltered_matc
 from swimm3r.scene.run_folder import open_run
 from swimm3r.sfm import reconstruct
 from swimm3r.sfm.between import read_between
+from swimm3r.sfm.imported.model_poses import check_model_poses
 from swimm3r.sfm.lens import known_lens
 from swimm3r.sfm.rectified.frames import RectifiableError
 from swimm3r.sfm.rectified.run import (
@@ -36,6 +37,7 @@ from swimm3r.sfm.rectified.run import (
     run_frames,
     write_masks_as_filmed,
 )
+from swimm3r.sfm.settings import ColmapModelSettings
 from swimm3r.splat import train
 from swimm3r.splat.map_file import load_map
 from swimm3r.splat.rendering import SplatMap
@@ -68,6 +70,8 @@ class Stages:
         frames, rec = self._sfm(frames)
         if last == "sfm":
             return
+        if last == "eval" and truth is None and isinstance(self.settings.sfm, ColmapModelSettings):
+            check_model_poses(self.settings.sfm.model, folder / "sfm")  # before hours of training
         scene = self._splat(frames, rec)
         if last == "splat":
             return
