@@ -9,10 +9,11 @@ from swimm3r import devices
 from swimm3r.pipeline import summary as sections
 from swimm3r.pipeline.inputs import truth_of
 from swimm3r.pipeline.presets import RunSettings
-from swimm3r.pipeline.run_record import RunRecord, stage_keys
+from swimm3r.pipeline.run_record import RunRecord
 from swimm3r.pipeline.run_settings import navigation_of_mapping
 from swimm3r.pipeline.scores.evaluation import own_scores
 from swimm3r.pipeline.scores.scoring import MappedRun, Protocol
+from swimm3r.pipeline.stage_keys import StageKey, stage_keys
 from swimm3r.prepare import load_frames, read_frames
 from swimm3r.progress import Progress
 from swimm3r.scale.navigation.navigator import NavigationFile
@@ -79,7 +80,7 @@ class Stages:
         own_scores(self.record, run, own, rectified_truth(folder, truth), self.progress, reuse=True)
 
     @cached_property
-    def _keys(self) -> dict[str, str]:
+    def _keys(self) -> dict[str, StageKey]:
         return stage_keys(self.record.fingerprint, self.settings, self.reference)
 
     def _prepare(self) -> Frames:
