@@ -23,7 +23,7 @@ from swimm3r.errors import UsageError
 from swimm3r.io.files.cache_key import sample_digest
 from swimm3r.io.images import write_rgb
 from swimm3r.pipeline.presets import PRESETS, to_yaml
-from swimm3r.pipeline.run_record import stage_keys
+from swimm3r.pipeline.stage_keys import stage_keys
 from swimm3r.scale.run import scale_run
 from swimm3r.scale.settings import ScaleSettings
 from swimm3r.sfm.settings import ColmapSettings
@@ -173,7 +173,7 @@ def test_a_dive_is_finished_where_it_has_the_scale_of_its_sources(tapes: Path, t
     run = write_run(tmp_path / "reef", survey)
     digest = sample_digest(plain.source, leave_out=run)
     keys = stage_keys(digest, plain.settings, None)
-    stages = {stage: {"status": "done", "key": keys[stage]} for stage in ("prepare", "sfm")}
+    stages = {stage: {"status": "done", **keys[stage].entry(None)} for stage in ("prepare", "sfm")}
     summary = json.loads((run / "summary.json").read_text())
     summary |= {"input": {"path": str(plain.source), "fingerprint": digest}, "stages": stages}
     (run / "summary.json").write_text(json.dumps(summary))

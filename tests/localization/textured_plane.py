@@ -49,9 +49,13 @@ def photo(seen_by: Cameras, shown: torch.Tensor) -> torch.Tensor:
 
 
 def reconstruction(folder: Path, places: list[float]) -> tuple[Reconstruction, Frames]:
-    """Frames from these places; each keypoint is the observation of a point of its own."""
+    """Frames from these places (`filmed`)."""
+    return filmed(folder, [camera(x, turn=x) for x in places])
+
+
+def filmed(folder: Path, cameras: list[Cameras]) -> tuple[Reconstruction, Frames]:
+    """Frames by these cameras; each keypoint is the observation of a point of its own."""
     shown, frames, points, rows = texture(), [], [], []
-    cameras = [camera(x, turn=x) for x in places]
     for i, one in enumerate(cameras):
         path = folder / f"{i}.png"
         image = photo(one, shown)

@@ -9,8 +9,10 @@ import torch
 from swimm3r.cameras import Cameras, project
 from swimm3r.errors import InputError
 from swimm3r.geometry import Similarity, so3_exp
-from swimm3r.pipeline.camera_paths import CameraPath, Dive, camera_path, looking_at, smooth_path
+from swimm3r.pipeline.camera_paths import CameraPath, Dive, camera_path, looking_at, rows_of_one_camera, smooth_path
 from swimm3r.pipeline.view_settings import ViewSettings
+from swimm3r.scene.frames import Frame, Frames
+from swimm3r.scene.rig import Rig, RigCamera
 
 COUNT = 8
 
@@ -28,7 +30,8 @@ def dive(tmp_path: Path) -> Dive:
     K = torch.tensor([[70.0, 0, 40], [0, 70, 30], [0, 0, 1]], dtype=torch.float64).repeat(COUNT, 1, 1)
     cameras = Cameras(K, torch.zeros(COUNT, 0).double(), poses, 80, 60)
     frames = CameraPath(tuple(f"{i}.png" for i in range(COUNT)), cameras, tuple(float(i) for i in range(COUNT)))
-    return Dive(frames, ground, (0.0, 7.0), tmp_path / "sfm" / "cameras.json", None)
+    clip = Frames(tuple(Frame(name, Path(name), 0.0, 1.0, "train") for name in frames.names), 80, 60, True)
+    return Dive(frames, clip, ground, (0.0, 7.0), tmp_path / "sfm" / "cameras.json", None)
 
 
 def test_without_a_wish_the_frames_are_rendered(dive: Dive):
@@ -46,6 +49,41 @@ def test_a_flight_passes_the_frames_in_their_times(name, dive: Dive):
     apart = torch.cdist(found.cameras.centers, dive.frames.cameras.centers).min(0).values
     assert apart[1:-1].max() < 0.1
     assert len(camera_path(dive, ViewSettings("dive")).cameras) == 90
+
+
+@pytest.fixture
+def rig_dive(dive: Dive) -> Dive:
+    """Left and right in turn, the right one 3 above and with another lens; the first left frame is not registered."""
+    cameras, names = dive.frames.cameras, dive.frames.names
+    K, poses, right = cameras.K.clone(), cameras.cam2world.clone(), slice(0, None, 2)
+    K[right, 0, 0], poses[right, 2, 3] = 140.0, -5.0
+    sides = {name: ("right", "left")[i % 2] for i, name in enumerate(names)}
+    clip = replace(
+        dive.clip,
+        frames=tuple(replace(frame, camera=sides[frame.name]) for frame in dive.clip),
+        rig=Rig((RigCamera("left"), RigCamera("right"))),
+    )
+    return replace(dive, clip=clip, frames=replace(dive.frames, cameras=replace(cameras, K=K, cam2world=poses)))
+
+
+@pytest.mark.parametrize("settings", [ViewSettings("dive"), ViewSettings("frames", count=20), ViewSettings("orbit")])
+def test_a_flight_of_a_rig_is_that_of_its_first_camera(settings: ViewSettings, rig_dive: Dive):
+    found = camera_path(rig_dive, settings)
+    assert (found.cameras.K[:, 0, 0] == 70).all()
+    if settings.path != "orbit":
+        torch.testing.assert_close(found.cameras.centers[:, 2], torch.full((len(found.names),), -2.0).double())
+        assert found.times is not None
+        assert found.times[0] == 1.0
+
+
+def test_the_frames_of_a_rig_are_all_rendered_each_with_its_lens(rig_dive: Dive):
+    assert camera_path(rig_dive, ViewSettings()) is rig_dive.frames
+
+
+def test_a_rig_whose_first_camera_is_nowhere_flies_along_the_next(rig_dive: Dive):
+    right = rig_dive.frames.names[0::2]
+    assert rows_of_one_camera(right, rig_dive.clip) == [0, 1, 2, 3]
+    assert rows_of_one_camera(["of another program"], rig_dive.clip) == [0]
 
 
 @pytest.mark.parametrize("name", ["orbit", "spiral"])

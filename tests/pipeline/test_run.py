@@ -274,9 +274,11 @@ def test_the_report_needs_no_network(finished: tuple[Path, dict]):
 
 
 _NOT_OF_THIS_RUN = {
-    "splat/cameras.json", "splat/blocks", "sfm/cameras_between.json", "sfm/parts", "scale.json", "georeference.json"
+    "splat/cameras.json", "splat/blocks", "sfm/cameras_between.json", "sfm/cameras_imported.json", "sfm/parts",
+    "scale.json", "georeference.json",
 }  # fmt: skip
-"""Of maps that refined the poses, large maps, long clips, clips that fall into parts, runs with sources of scale."""
+"""Of maps that refined the poses, large maps, long clips, imported models, clips that fall into parts, runs with
+sources of scale."""
 
 
 def test_the_report_lists_every_result_and_names_every_score(finished: tuple[Path, dict]):

@@ -18,6 +18,7 @@ from swimm3r.pipeline.presets import PRESETS, RunSettings, from_yaml
 from swimm3r.pipeline.run import run_pipeline
 from swimm3r.pipeline.run_record import open_record
 from swimm3r.pipeline.run_settings import differences, starting_settings
+from swimm3r.pipeline.stage_keys import StageKey, stage_keys
 from swimm3r.scene.run_folder import open_run, read_run
 from swimm3r.synthetic import write_dive
 from swimm3r.synthetic.settings import DiveSettings
@@ -50,11 +51,9 @@ def contents(folder: Path) -> dict[str, bytes]:
 
 def pretend(run: Path, stage: str, status: str = "done") -> None:
     """A later stage as if it had been made with the folder's settings."""
-    from swimm3r.pipeline.run_record import stage_keys
-
     document = json.loads((run / "summary.json").read_text())
     keys = stage_keys(document["input"]["fingerprint"], from_yaml(run / "settings.yaml"), None)
-    document["stages"][stage] = {"status": status, "key": keys[stage]}
+    document["stages"][stage] = {"status": status, **keys[stage].entry(None)}
     (run / "summary.json").write_text(json.dumps(document))
     marker = {"sfm": "sfm/reconstruction.json", "splat": "splat/map.safetensors", "eval": "renders/test/0.png"}[stage]
     (run / marker).parent.mkdir(parents=True)
@@ -139,7 +138,7 @@ def test_what_was_made_from_a_stage_is_not_done_once_it_is_made_again(
         raise KeyboardInterrupt
 
     with open_record(run, dive, read_run(run).input.fingerprint) as record, pytest.raises(KeyboardInterrupt):
-        record.stage(made, "key", killed, lambda: None)
+        record.stage(made, StageKey("key"), killed, lambda: None)
     kept = {"prepare", "sfm", "splat", "eval"} - set(gone)
     assert set(json.loads((run / "summary.json").read_text())["stages"]) == kept
 

@@ -14,8 +14,9 @@ from swimm3r.errors import InputError, UsageError
 from swimm3r.io.images import write_rgb
 from swimm3r.pipeline.presets import PRESETS, RunSettings, from_yaml, to_yaml
 from swimm3r.pipeline.run import run_pipeline
-from swimm3r.pipeline.run_record import _set_aside, open_record, stage_keys
+from swimm3r.pipeline.run_record import _set_aside, open_record
 from swimm3r.pipeline.run_settings import differences
+from swimm3r.pipeline.stage_keys import stage_keys
 from swimm3r.pipeline.stages import _scaled
 from swimm3r.progress import silent
 from swimm3r.scale.rescale import RESCALING

@@ -14,8 +14,8 @@ from swimm3r.io.files.atomic import write_text
 from swimm3r.io.files.cache_key import sample_digest
 from swimm3r.io.files.damage import remake
 from swimm3r.pipeline.presets import from_yaml
-from swimm3r.pipeline.run_record import stage_keys
 from swimm3r.pipeline.run_settings import with_stages_of
+from swimm3r.pipeline.stage_keys import stage_keys
 from swimm3r.report.verdict import water_verdict
 from swimm3r.scale.run import is_scaled
 from swimm3r.scene.run_folder import STAGES, is_run, read_run
@@ -66,9 +66,9 @@ def is_finished(dive: Dive, out: Path, last_stage: str) -> bool:
     scored = run.stages.get("eval")
     known = dive.reference or (Path(scored.reference) if scored is not None and scored.reference else None)
     keys = stage_keys(run.input.fingerprint, settings, known)
-    made = all(run.stages[stage].key == keys[stage] for stage in stages)
+    made = all(keys[stage].is_of(run.stages[stage]) for stage in stages)
     return made and (
-        "sfm" not in stages or not settings.scale.has_sources or is_scaled(folder, keys["sfm"], settings.scale)
+        "sfm" not in stages or not settings.scale.has_sources or is_scaled(folder, keys["sfm"].key, settings.scale)
     )
 
 

@@ -26,6 +26,7 @@ from swimm3r.geometry import Similarity, pose_from, quaternion_from_rotation, ro
 from swimm3r.io import cameras_json
 from swimm3r.io.files.damage import Remedy, guard
 from swimm3r.pipeline.view_settings import PathName, ViewSettings
+from swimm3r.scene.frames import Frames
 
 _SMOOTH = 1.5  # frames of the dive over which the flight's hand steadies
 _MADE = 90  # cameras of a made path
@@ -56,6 +57,7 @@ class Dive:
     """The facts of a run that paths are made from, in the axes of the map."""
 
     frames: CameraPath  # the training frames
+    clip: Frames  # all frames, which tell the cameras of a rig apart
     ground: Float[Tensor, "p 3"]  # points of the scene
     span: tuple[float, float]  # of the clip, seconds
     own_file: Path  # the cameras.json of the training frames in these axes
@@ -68,13 +70,25 @@ def camera_path(dive: Dive, settings: ViewSettings) -> CameraPath:
     match settings.path:
         case Path() as file:
             given = _from_file(file, dive)
-            return _through(given, count) if count else given
+            return _through(given, dive, count) if count else given
         case "frames":
-            return _through(dive.frames, count) if count else dive.frames
+            return _through(dive.frames, dive, count) if count else dive.frames
         case "dive":
-            return _through(dive.frames, count or _MADE)
+            return _through(dive.frames, dive, count or _MADE)
         case "orbit" | "spiral":
             return _around(dive, settings.path, count or _MADE)
+
+
+def rows_of_one_camera(names: Sequence[str], clip: Frames) -> list[int]:
+    """Places in a list of frames of those that the first camera of a rig took, or the next that took any.
+
+    All of them without a rig, and where none is a frame of the clip.
+    """
+    camera = {frame.name: frame.camera for frame in clip}
+    own = [camera.get(name) for name in names]
+    cameras = () if clip.rig is None else clip.rig.names
+    first = next((each for each in cameras if each in own), None)
+    return [row for row, each in enumerate(own) if first is None or each == first]
 
 
 def smooth_path(cam2world: Float[Tensor, "c 4 4"], count: int) -> Float[Tensor, "f 4 4"]:
@@ -97,11 +111,13 @@ def times_along(times: Sequence[float], count: int) -> tuple[float, ...]:
     return tuple(np.interp(np.linspace(0, len(times) - 1, count), np.arange(len(times)), times).tolist())
 
 
-def _through(given: CameraPath, count: int) -> CameraPath:
-    """A smooth path of `count` cameras through others, with the lens of the first."""
-    poses = smooth_path(given.cameras.cam2world, count)
-    times = None if given.times is None else times_along(given.times, count)
-    return CameraPath(_numbered(count), _posed(given.cameras, poses), times)
+def _through(given: CameraPath, dive: Dive, count: int) -> CameraPath:
+    """A smooth path of `count` cameras through others, with the lens of the first; through those of one of a rig."""
+    rows = rows_of_one_camera(given.names, dive.clip)
+    cameras = given.cameras[rows]
+    poses = smooth_path(cameras.cam2world, count)
+    times = None if given.times is None else times_along([given.times[row] for row in rows], count)
+    return CameraPath(_numbered(count), _posed(cameras, poses), times)
 
 
 def _around(dive: Dive, name: PathName, count: int) -> CameraPath:
@@ -115,7 +131,7 @@ def _around(dive: Dive, name: PathName, count: int) -> CameraPath:
     centers = stand.middle + stand.radius * reach[:, None] * flat + stand.distance * near[:, None] * stand.axis
     poses = torch.stack([looking_at(center, stand.middle, stand.up) for center in centers])
     times = tuple(np.linspace(*dive.span, count).tolist())
-    return CameraPath(_numbered(count), _posed(dive.frames.cameras, poses), times)
+    return CameraPath(_numbered(count), _posed(_one_camera(dive), poses), times)
 
 
 def looking_at(center: Float[Tensor, "3"], target: Float[Tensor, "3"], up: Float[Tensor, "3"]) -> Float[Tensor, "4 4"]:
@@ -166,7 +182,7 @@ def _from_file(file: Path, dive: Dive) -> CameraPath:
     if file.resolve() == dive.own_file.resolve():
         return dive.frames
     if file.suffix.lower() == ".csv":
-        given = _from_csv(file, dive.frames.cameras)
+        given = _from_csv(file, _one_camera(dive))
     else:
         table = cameras_json.read_cameras(file)
         given = CameraPath(table.names, cameras_of(table), table.times)
@@ -203,6 +219,11 @@ def _numbers(number: int, words: list[str]) -> list[float]:
     if not all(map(math.isfinite, values)) or not math.hypot(*values[4:]) > 0.5:
         raise ValueError(f"line {number} has a number that is not finite, or a quaternion of zeros")
     return values
+
+
+def _one_camera(dive: Dive) -> Cameras:
+    """The training frames of one camera of a rig; all without one."""
+    return dive.frames.cameras[rows_of_one_camera(dive.frames.names, dive.clip)]
 
 
 def _posed(lens: Cameras, poses: Float[Tensor, "c 4 4"]) -> Cameras:

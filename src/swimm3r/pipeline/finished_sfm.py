@@ -29,7 +29,7 @@ class FinishedSfm:
 
     def first_poses(self, progress: Progress = silent) -> dict[str, FirstPose]:
         """Poses from which the refinement of the test frames starts, in the reconstruction's axes."""
-        return start_poses(self.rec, self.frames, self.settings, self.truth, progress)
+        return start_poses(self.folder, self.rec, self.frames, self.settings, self.truth, progress)
 
 
 def open_finished_sfm(folder: Path, reference: Path | None = None) -> FinishedSfm:

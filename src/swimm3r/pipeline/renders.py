@@ -179,7 +179,7 @@ def render_run(
     scene = load_map(folder / "splat" / "map.safetensors").to(devices.for_maps(map_device))
     frames = run_frames(folder)
     rec = load_reconstruction(folder / "sfm", frames)
-    dive, out = _dive(folder, scene, rec), out or folder / "renders" / "views"
+    dive, out = _dive(folder, scene, rec, frames), out or folder / "renders" / "views"
     path = camera_path(dive, settings)
     times, drawn = moments_of(scene, path, frames, settings.time), path.cameras.drawn(settings.long_side)
     style = display_style(scene, rec, restore)
@@ -196,12 +196,12 @@ def render_run(
     return out
 
 
-def _dive(folder: Path, scene: SplatMap, rec: Reconstruction) -> Dive:
+def _dive(folder: Path, scene: SplatMap, rec: Reconstruction, frames: Frames) -> Dive:
     refined = folder / "splat" / "cameras.json"
     own = refined if refined.is_file() else folder / "sfm" / "cameras.json"
     table, to_map = cameras_json.read_cameras(own), axes_of_map(rec, scene.poses)
     ground = rec.points.xyz if to_map is None else to_map.points(rec.points.xyz.double())
-    return Dive(CameraPath(table.names, cameras_of(table), table.times), ground, scene.span, own, to_map)
+    return Dive(CameraPath(table.names, cameras_of(table), table.times), frames, ground, scene.span, own, to_map)
 
 
 def _write_cameras(path: Path, shown: CameraPath, times: Sequence[float], dive: Dive, rec: Reconstruction) -> None:

@@ -16,7 +16,8 @@ from swimm3r.io.files.atomic import write_text
 from swimm3r.pipeline.estimate import estimate_run
 from swimm3r.pipeline.inputs import check_inputs, input_fingerprint
 from swimm3r.pipeline.presets import RunSettings, to_yaml
-from swimm3r.pipeline.run_record import open_record, stage_keys
+from swimm3r.pipeline.run_record import open_record
+from swimm3r.pipeline.stage_keys import stage_keys
 from swimm3r.pipeline.stage_start import StageStart, ignore_stages
 from swimm3r.pipeline.stages import Stages
 from swimm3r.progress import Progress, watched
@@ -65,7 +66,7 @@ def run_pipeline(
         keys = stage_keys(record.fingerprint, settings, reference)
         to_do = record.to_do(keys)
         has_sfm = last_stage != "prepare" and "sfm" not in to_do
-        scaled = has_sfm and is_scaled(folder, keys["sfm"], settings.scale)
+        scaled = has_sfm and is_scaled(folder, keys["sfm"].key, settings.scale)
         check_inputs(source, settings, reference, to_do, scaled=scaled)
         record.set_aside(superseded)
         record.write()

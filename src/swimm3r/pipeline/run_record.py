@@ -16,13 +16,13 @@ from typing import Any, TypeVar
 
 from swimm3r.errors import DeviceError, InputError, StorageError, Swimm3rError, UsageError
 from swimm3r.io.files.atomic import remove_drafts, write_text
-from swimm3r.io.files.cache_key import cache_key
 from swimm3r.io.files.folder_lock import folder_lock
 from swimm3r.io.files.outputs import check_file, output_folder
 from swimm3r.memory import available_mb, peak_mb, return_freed
 from swimm3r.pipeline.estimate import Estimate, check_disk, duration, size
 from swimm3r.pipeline.presets import RunSettings, from_yaml
-from swimm3r.pipeline.run_settings import differences, settings_by_stage, with_stages_of
+from swimm3r.pipeline.run_settings import differences, files_by_stage, with_stages_of
+from swimm3r.pipeline.stage_keys import StageKey, stage_keys
 from swimm3r.pipeline.stage_start import StageStart, ignore_stages
 from swimm3r.products.record import summary_section
 from swimm3r.scale.rescale import finish_rescale
@@ -122,7 +122,7 @@ class RunRecord:
         """Digest of the input's files."""
         return self.summary["input"]["fingerprint"]
 
-    def to_do(self, keys: dict[str, str]) -> list[str]:
+    def to_do(self, keys: dict[str, StageKey]) -> list[str]:
         """The stages up to the last one that are not done with these keys."""
         return [name for name in STAGES[: self._count] if not self._is_done(name, keys[name])]
 
@@ -145,24 +145,33 @@ class RunRecord:
         """
         keys = stage_keys(self.fingerprint, settings, reference)
         made = {name: record for name in STAGES if (record := self._stage(name)) is not None}
-        changed = [name for name, record in made.items() if record.key != keys[name]]
+        changed = [name for name, record in made.items() if not keys[name].is_of(record)]
         if not changed:
+            self._complete(made, keys)
             return ()
         held = self._held(False)
         listed = [] if held is None else differences(held, settings, list(made))
         scored = made.get("eval")
         if scored is not None and scored.reference != _text(reference):
             listed.append(f"reference: {scored.reference} -> {reference}")
-        if held is not None and not listed:
+        paths = {name: path for files in files_by_stage(settings, reference).values() for name, path in files.items()}
+        named = dict.fromkeys(name for stage, record in made.items() for name in keys[stage].changed_files(record))
+        edited = [name for name in named if not any(line.startswith(f"{name}: ") for line in listed)]
+        if held is not None and not listed and not edited:
             # the settings are the same: another version of the program names or hashes them in another way
             log.warning("%s was made by another version; its finished stages are kept", self.folder)
-            for name in changed:
-                self.summary["stages"][name]["key"] = keys[name]
+            self._complete(made, keys)
             return ()
         found = STAGES[STAGES.index(changed[0]) :]
         if not self._redo:
-            raise _superseded(self.folder, [name for name in made if name in found], listed)
+            stages = [name for name in made if name in found]
+            raise _superseded(self.folder, stages, listed, [f"{name}: {paths[name]}" for name in edited])
         return found
+
+    def _complete(self, made: dict[str, StageRecord], keys: dict[str, StageKey]) -> None:
+        """Give stages the keys of this version, with digests of the files that earlier ones did not record."""
+        for name, record in made.items():
+            self.summary["stages"][name] |= keys[name].entry(record)
 
     def set_aside(self, stages: Sequence[str]) -> None:
         """Move what these stages made to old/."""
@@ -193,7 +202,12 @@ class RunRecord:
         self.add(self._scores_before)
 
     def stage(
-        self, name: str, key: str, make: Callable[[], Result], reuse: Callable[[], Result] | None = None, **facts: Any
+        self,
+        name: str,
+        key: StageKey,
+        make: Callable[[], Result],
+        reuse: Callable[[], Result] | None = None,
+        **facts: Any,
     ) -> Result:
         """Do a stage, or reuse it where it is done with the same key and is still there; `facts` go to its record.
 
@@ -205,9 +219,10 @@ class RunRecord:
             return reuse()
         self._check_space()
         self._check_memory(name)
+        entry = key.entry(self._stage(name))
         for later in _MADE_FROM.get(name, ()):  # their keys tell settings, not what is made now
             self.summary["stages"].pop(later, None)
-        self.summary["stages"][name] = {"status": "running", "key": key, **facts}
+        self.summary["stages"][name] = {"status": "running", **entry, **facts}
         self.write()
         self._log("started", stage=name)
         wall, cpu = time.perf_counter(), _cpu_seconds()
@@ -225,7 +240,7 @@ class RunRecord:
             "cpu_seconds": round(_cpu_seconds() - cpu, 2),
             "peak_mb": None if peak is None else round(peak),
             "status": "done",
-            "key": key,
+            **entry,
             **facts,
         }
         self.write()
@@ -249,9 +264,9 @@ class RunRecord:
         if expected and seconds > _TELLING_S:
             self._pace = min(max(seconds / expected, 1 / _MOST_OFF), _MOST_OFF)
 
-    def _is_done(self, name: str, key: str) -> bool:
+    def _is_done(self, name: str, key: StageKey) -> bool:
         before = self._stage(name)
-        return before is not None and (before.key, before.status) == (key, "done") and self._is_there(name)
+        return before is not None and before.status == "done" and key.is_of(before) and self._is_there(name)
 
     def write(self) -> dict:
         """Bring summary.json up to date and return it."""
@@ -294,7 +309,7 @@ class RunRecord:
         found = self.summary["stages"].get(name)
         if found is None:
             return None
-        return StageRecord(found["status"], found["key"], found.get("reference"))
+        return StageRecord(found["status"], found["key"], found.get("reference"), files=found.get("files", {}))
 
     def _is_there(self, name: str) -> bool:
         return (self.folder / MARKERS[name]).exists()
@@ -324,16 +339,6 @@ class RunRecord:
             file.write(line + "\n")
 
 
-def stage_keys(fingerprint: str, settings: RunSettings, reference: Path | None) -> dict[str, str]:
-    """Key of a stage's result: a hash of its settings and of everything before the stage."""
-    keys, before = {}, fingerprint
-    for stage, values in settings_by_stage(settings).items():
-        if stage == "eval":
-            values = {"reference": str(reference), "test": values}
-        keys[stage] = before = cache_key(stage, before, values)[:16]
-    return keys
-
-
 def _set_aside(folder: Path, stages: Sequence[str]) -> Path:
     """Move what stages made, with copies of the files that describe it, to old/1, old/2, ..."""
     numbers = [int(path.name) for path in (folder / "old").glob("*") if path.name.isdecimal()]
@@ -359,7 +364,16 @@ def _text(path: Path | None) -> str | None:
     return None if path is None else str(path)
 
 
-def _superseded(folder: Path, stages: list[str], listed: list[str]) -> UsageError:
+def _superseded(folder: Path, stages: list[str], listed: list[str], edited: list[str]) -> UsageError:
+    if edited and not listed:
+        return UsageError(
+            f"{folder} holds stages made from files that have changed since ({', '.join(stages)}):"
+            + "".join(f"\n    {line}" for line in edited),
+            cause="a file or folder that the settings name was edited or made again",
+            hint=f"--redo moves these stages to {folder / 'old'} and makes them again; or the files as they were; or"
+            " another --out",
+        )
+    listed = [*listed, *(f"{line} has changed" for line in edited)]
     shown = "".join(f"\n    {line}" for line in listed) or " (settings.yaml, which names them, cannot be read)"
     if listed and all(line.startswith("scale.") for line in listed):
         return UsageError(

@@ -11,6 +11,8 @@ from swimm3r.splat.settings import RecipeName, UwbsSettings, with_recipe
 
 _PARTS = {"prepare": "frames", "sfm": "sfm", "splat": "splat", "eval": "test"}  # of RunSettings, by the stage they make
 
+_WRITTEN = ("sfm.cache",)  # settings that name a folder to write into
+
 _BESIDE_POSES = ("features", "depth", "water", "restore")  # parts of structure from motion that do not find poses
 
 
@@ -21,6 +23,17 @@ def settings_by_stage(settings: RunSettings) -> dict[str, dict[str, Any]]:
         "sfm": {type(settings.sfm).__name__: asdict(settings.sfm), **_mapping_navigation(settings)},
         "splat": asdict(settings.splat),
         "eval": asdict(settings.test),
+    }
+
+
+def files_by_stage(settings: RunSettings, reference: Path | None) -> dict[str, dict[str, Path]]:
+    """The files and folders that settings name, by the names in settings.yaml, under the stage that reads them."""
+    found = {stage: _flat(asdict(getattr(settings, part)), part) for stage, part in _PARTS.items()}
+    found["sfm"] |= _mapping_navigation(settings)
+    found["eval"]["reference"] = reference
+    return {
+        stage: {name: value for name, value in values.items() if isinstance(value, Path) and name not in _WRITTEN}
+        for stage, values in found.items()
     }
 
 
@@ -55,7 +68,7 @@ def _mapping_navigation(settings: RunSettings) -> dict[str, Any]:
     """The same by the names in settings.yaml."""
     if navigation_of_mapping(settings) is None:
         return {}
-    return {f"scale.{name}": _plain(getattr(settings.scale, name)) for name in NAVIGATION}
+    return {f"scale.{name}": getattr(settings.scale, name) for name in NAVIGATION}
 
 
 def starting_settings(
@@ -91,9 +104,5 @@ def _flat(values: dict[str, Any], under: str) -> dict[str, Any]:
         if isinstance(value, dict):
             flat |= _flat(value, f"{under}.{name}")
         else:
-            flat[f"{under}.{name}"] = _plain(value)
+            flat[f"{under}.{name}"] = value
     return flat
-
-
-def _plain(value: object) -> object:
-    return str(value) if isinstance(value, Path) else value

@@ -9,10 +9,11 @@ from swimm3r import devices
 from swimm3r.pipeline import summary as sections
 from swimm3r.pipeline.inputs import truth_of
 from swimm3r.pipeline.presets import RunSettings
-from swimm3r.pipeline.run_record import RunRecord, stage_keys
+from swimm3r.pipeline.run_record import RunRecord
 from swimm3r.pipeline.run_settings import navigation_of_mapping
 from swimm3r.pipeline.scores.evaluation import own_scores
 from swimm3r.pipeline.scores.scoring import MappedRun, Protocol
+from swimm3r.pipeline.stage_keys import StageKey, stage_keys
 from swimm3r.prepare import load_frames, read_frames
 from swimm3r.progress import Progress
 from swimm3r.scale.navigation.navigator import NavigationFile
@@ -25,6 +26,7 @@ from swimm3r.scene.reconstruction_io import load_reconstruction, unfiltered_matc
 from swimm3r.scene.run_folder import open_run
 from swimm3r.sfm import reconstruct
 from swimm3r.sfm.between import read_between
+from swimm3r.sfm.imported.model_poses import check_model_poses
 from swimm3r.sfm.lens import known_lens
 from swimm3r.sfm.rectified.frames import RectifiableError
 from swimm3r.sfm.rectified.run import (
@@ -36,6 +38,7 @@ from swimm3r.sfm.rectified.run import (
     run_frames,
     write_masks_as_filmed,
 )
+from swimm3r.sfm.settings import ColmapModelSettings
 from swimm3r.splat import train
 from swimm3r.splat.map_file import load_map
 from swimm3r.splat.rendering import SplatMap
@@ -68,6 +71,8 @@ class Stages:
         frames, rec = self._sfm(frames)
         if last == "sfm":
             return
+        if last == "eval" and truth is None and isinstance(self.settings.sfm, ColmapModelSettings):
+            check_model_poses(self.settings.sfm.model, folder / "sfm")  # before hours of training
         scene = self._splat(frames, rec)
         if last == "splat":
             return
@@ -75,7 +80,7 @@ class Stages:
         own_scores(self.record, run, own, rectified_truth(folder, truth), self.progress, reuse=True)
 
     @cached_property
-    def _keys(self) -> dict[str, str]:
+    def _keys(self) -> dict[str, StageKey]:
         return stage_keys(self.record.fingerprint, self.settings, self.reference)
 
     def _prepare(self) -> Frames:

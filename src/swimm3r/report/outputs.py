@@ -16,6 +16,7 @@ OUTPUTS = {  # path in the run folder -> contents
     "sfm/backdrop.ply": "Surfaces that no second frame confirmed, at a guessed depth",
     "sfm/cameras.json": "Camera poses and lens",
     "sfm/cameras_between.json": "Camera poses of the frames between keyframes",
+    "sfm/cameras_imported.json": "Camera poses of all frames in the imported model",
     "sfm/trajectory.tum": "Path of the camera with times (TUM)",
     "sfm/sparse": "COLMAP model",
     "sfm/parts": "COLMAP models of frames that did not join the rest",

@@ -35,7 +35,13 @@ from swimm3r.splat.rendering import SplatMap
 
 _STEP = "rescaling files"
 _JOURNAL = RESCALING.name
-_POSES = ("sfm/cameras.json", "sfm/cameras_between.json", "splat/cameras.json", "localization/poses.json")
+_POSES = (
+    "sfm/cameras.json",
+    "sfm/cameras_between.json",
+    "sfm/cameras_imported.json",
+    "splat/cameras.json",
+    "localization/poses.json",
+)
 _TRAJECTORIES = ("sfm/trajectory.tum", "splat/trajectory.tum", "localization/poses.tum")
 _CLOUDS = ("points", "backdrop")
 _EXPORTS = ("products/products.json", "gaussians*", "*.splat", "*.spz", "*.glb", "transforms.json")

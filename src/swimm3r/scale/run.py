@@ -15,7 +15,7 @@ from typing import Any
 import numpy as np
 
 from swimm3r.errors import UsageError
-from swimm3r.io.files.cache_key import cache_key, content_digest, sample_digest
+from swimm3r.io.files.cache_key import cache_key, given_digest
 from swimm3r.io.files.damage import Remedy
 from swimm3r.io.files.folder_lock import folder_lock
 from swimm3r.io.files.json_file import read_json
@@ -33,7 +33,6 @@ from swimm3r.sfm.rectified.run import run_frames
 SCALE = "scale.json"
 _SAME = 1e-9  # of a factor: the same sources again, by other roundings
 _FILES = ("points", "distances", "marker_file", "laser_dots", "nav", "control")  # settings that name a file
-_READ_WHOLE = 64 << 20  # bytes; bags, and folders of images, are told apart by samples
 _REMEDY = Remedy("swimm3r scale RUN with the sources it was made from writes it again")
 
 
@@ -126,15 +125,8 @@ def _key(sfm_key: str, settings: ScaleSettings, digests: Mapping[str, str]) -> s
 
 def _digests(settings: ScaleSettings, missing: Mapping[str, str] = MappingProxyType({})) -> dict[str, str]:
     """Of the content of each file that settings name; of those that are not on this computer, the given ones."""
-    found = {name: _digest(path) or missing.get(name) for name in _FILES if (path := getattr(settings, name))}
+    found = {name: given_digest(path) or missing.get(name) for name in _FILES if (path := getattr(settings, name))}
     return {name: digest for name, digest in found.items() if digest is not None}
-
-
-def _digest(path: Path) -> str | None:
-    if not path.exists():
-        return None
-    whole = path.is_file() and path.stat().st_size <= _READ_WHOLE
-    return content_digest(path) if whole else sample_digest(path)
 
 
 def scale_sections(folder: Path, rec: Reconstruction) -> dict[str, Any]:

@@ -5,7 +5,8 @@ cameras.json, trajectory.tum, z_depth/NAME.npz, masks/NAME.png (0 at moving obje
 the flicker of the sun), matches.npz, medium.json, white_balance.json, frame_colors.json (of frames in exposures of
 their own), reconstruction.json (back end, metric flag, warnings, points found), and the dense cloud in three colors,
 points.ply (as shown: restored and white-balanced), points_physical.ply (restored) and points_raw.ply (as filmed);
-backdrop.ply and its two are ground at a guessed depth.
+backdrop.ply and its two are ground at a guessed depth. Of frames that take no part, `reconstruct` writes poses beside
+it: cameras_between.json those between keyframes, cameras_imported.json all that an imported model places.
 """
 
 import json

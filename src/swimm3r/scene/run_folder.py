@@ -5,7 +5,7 @@ docs/conventions.md shows the layout.
 
 import json
 import os
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from importlib.metadata import version
 from pathlib import Path
 from typing import Any, Literal
@@ -44,6 +44,7 @@ class StageRecord:
     key: str  # of the stage's settings and everything before it
     reference: str | None = None  # the file of known poses that the scores are taken against
     cpu_seconds: float | None = None
+    files: dict[str, str] = field(default_factory=dict[str, str])  # digests of those that settings name, by the setting
 
 
 @dataclass(frozen=True)

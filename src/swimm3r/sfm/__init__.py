@@ -28,7 +28,8 @@ def reconstruct(
 ) -> "swimm3r.scene.reconstruction.Reconstruction":
     """Cameras, points, dense depth, water and restored cloud of a set of frames, made from `frames.train` alone.
 
-    Frames between keyframes get poses in cameras_between.json (`sfm.between`).
+    Frames between keyframes get poses in cameras_between.json (`sfm.between`), and all frames that a given model places
+    in cameras_imported.json (`sfm.imported.model_poses`).
 
     `settings` choose the method: `ColmapSettings()` by default, `swimm3r.PRESETS["fast"].sfm` the quickest. Works in
     `folder` (a new temporary one by default) and goes on from what an interrupted call left there. A terminal or a
@@ -54,6 +55,10 @@ def reconstruct(
             from swimm3r.sfm.between import place_between
 
             place_between(rec, frames, work, told)
+        if isinstance(settings, ColmapModelSettings):
+            from swimm3r.sfm.imported.model_poses import keep_model_poses
+
+            keep_model_poses(frames, settings.model, work)
         return rec
 
 

@@ -1,18 +1,19 @@
 """Poses of the frames between keyframes: points of the keyframes around them, tracked into them, and PnP.
 
+The keyframes of a rig are those of the frame's own camera, and so is the lens.
 The cost of a frame is that of tracking a few hundred points; it takes no part in anything else.
 """
 
+import logging
 from bisect import bisect_left
 from collections.abc import Sequence
 from concurrent.futures import ThreadPoolExecutor
+from dataclasses import replace
 from itertools import pairwise
 from pathlib import Path
 
 import numpy as np
 import torch
-from jaxtyping import Float
-from torch import Tensor
 
 from swimm3r.cameras import Cameras
 from swimm3r.imaging.gray import gray_levels, weights_for_features
@@ -25,6 +26,8 @@ from swimm3r.scene.frames import Frames
 from swimm3r.scene.reconstruction import Reconstruction
 from swimm3r.sfm.colmap.absolute_pose import absolute_pose
 from swimm3r.tasks.threads import thread_count
+
+log = logging.getLogger(__name__)
 
 BETWEEN = "cameras_between.json"
 _POINTS = 400  # of a keyframe that are tracked
@@ -41,27 +44,34 @@ def place_between(rec: Reconstruction, frames: Frames, folder: Path, progress: P
     if not between:
         return
     placed = {name: row for row, name in enumerate(rec.names)}
-    known = [(i, placed[frame.name]) for i, frame in enumerate(frames) if frame.name in placed]
+    known: dict[str | None, list[tuple[int, int]]] = {frame.camera: [] for frame in frames}
+    for i, frame in enumerate(frames):
+        if frame.name in placed:
+            known[frame.camera].append((i, placed[frame.name]))
     observations = _observations(rec)
 
-    def place(i: int) -> Float[Tensor, "4 4"] | None:
-        at = bisect_left(known, (i, -1))
-        around = known[max(0, at - 1) : at + 1]
-        return _place(i, around, rec, frames, observations)
+    def place(i: int) -> Cameras | None:
+        own = known[frames.frames[i].camera]
+        at = bisect_left(own, (i, -1))
+        return _place(i, own[max(0, at - 1) : at + 1], rec, frames, observations)
 
-    names, poses = [], []
+    names, cameras = [], []
     with ThreadPoolExecutor(thread_count()) as pool:
-        for done, (i, pose) in enumerate(zip(between, pool.map(place, between), strict=True)):
+        for done, (i, camera) in enumerate(zip(between, pool.map(place, between), strict=True)):
             progress(_STEP, done, len(between))
-            if pose is not None:
+            if camera is not None:
                 names.append(frames.frames[i].name)
-                poses.append(pose)
+                cameras.append(camera)
     progress(_STEP, len(between), len(between))
     (folder / BETWEEN).unlink(missing_ok=True)
-    if poses:
-        lens = rec.cameras[[0] * len(poses)]
-        cameras = Cameras(lens.K, lens.distortion, torch.stack(poses), lens.width, lens.height, lens.model)
-        cameras.save(folder / BETWEEN, tuple(names), frames.times_of(names), "metres" if rec.metric else "scene units")
+    for camera in sorted(str(camera) for camera, own in known.items() if not own):
+        log.warning("frames between keyframes of %s have no pose: no keyframe of that camera is registered", camera)
+    if cameras:
+        K, distortion, cam2world = (
+            torch.cat([getattr(camera, part) for camera in cameras]) for part in ("K", "distortion", "cam2world")
+        )
+        joined = replace(rec.cameras, K=K, distortion=distortion, cam2world=cam2world)
+        joined.save(folder / BETWEEN, tuple(names), frames.times_of(names), "metres" if rec.metric else "scene units")
 
 
 def read_between(folder: Path) -> CameraTable | None:
@@ -88,8 +98,8 @@ def _place(
     rec: Reconstruction,
     frames: Frames,
     observations: list[tuple[np.ndarray, np.ndarray]],
-) -> Float[Tensor, "4 4"] | None:
-    """cam2world of a frame from the registered ones before and after it; None where too few points agree."""
+) -> Cameras | None:
+    """A frame's lens and pose by its camera's keyframes before and after it; None where too few points agree."""
     weights = weights_for_features(frames.image(i), frames.mask(i))
     image = gray_levels(frames.image(i), weights)
     pixels, points = [], []
@@ -103,7 +113,8 @@ def _place(
         return None
     max_error = max(_LEAST_ERROR, _MAX_ERROR * max(frames.width, frames.height) / 1000)
     xy, xyz = (torch.from_numpy(np.concatenate(part).astype(np.float64)) for part in (pixels, points))
-    estimate = absolute_pose(xy, xyz, rec.cameras[around[0][1]], max_error)
+    lens = rec.cameras[around[0][1]]
+    estimate = absolute_pose(xy, xyz, lens, max_error)
     if estimate is None or int(estimate[1].sum()) < _FEWEST:
         return None
-    return estimate[0]
+    return replace(lens, cam2world=estimate[0][None])

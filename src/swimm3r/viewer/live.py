@@ -22,6 +22,7 @@ from torch import Tensor
 from swimm3r.cameras import Cameras
 from swimm3r.evaluate.images import psnr
 from swimm3r.imaging.undistortion import undistorted
+from swimm3r.localization.interpolation import lens_of
 from swimm3r.pipeline.renders import DisplayStyle, display_style
 from swimm3r.pipeline.scores.held_out import first_poses
 from swimm3r.progress import Progress
@@ -218,7 +219,8 @@ class LiveView:
             found = first_poses(rec, chosen, FeatureSettings()).get(test)
             if found is not None and found.source == "2D-3D matches":  # a guess would show the map off its place
                 name, label, pose = test, "Test frame", found.cam2world
-        lens = rec.cameras[rec.index(name) if pose is None else 0]
+        lens = rec.cameras[rec.index(name)] if pose is None else lens_of(rec, frames, name)
+        assert lens is not None, name  # `first_poses` leaves such frames out
         camera = lens.drawn(_PREVIEW)
         number = frames.index(name)
         image, _ = undistorted(frames.image(number), frames.mask(number), lens, camera)

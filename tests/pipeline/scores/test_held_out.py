@@ -7,12 +7,15 @@ from tests.splat.conftest import TinyDive, tiny_dive  # noqa: F401 - a fixture
 
 from swimm3r.cameras import Cameras
 from swimm3r.pipeline.scores.held_out import (
+    FirstPose,
     cut,
     first_poses,
+    score_views,
     visible_window,
 )
 from swimm3r.pipeline.summary import test_section as section_of
 from swimm3r.scene.ground_truth import GroundTruth
+from swimm3r.scene.rig import Rig, RigCamera
 from swimm3r.sfm.features.settings import FeatureSettings
 from swimm3r.splat.settings import PoseRefinementSettings
 
@@ -53,6 +56,22 @@ def test_reference_poses_are_aligned_and_their_rotations_stay_rotations(tiny_div
     for name, pose in poses.items():
         assert pose.source == "reference"
         torch.testing.assert_close(pose.cam2world, tiny_dive.cameras.cam2world[tiny_dive.frames.index(name)])
+
+
+def test_a_test_frame_of_a_rig_is_rendered_through_the_lens_of_its_camera(tiny_dive: TinyDive, tmp_path):  # noqa: F811
+    """The frame before the last is of another camera, with another lens."""
+    rec, sides = tiny_dive.rec, ["left", "right"]
+    frames = replace(
+        tiny_dive.frames,
+        frames=tuple(replace(frame, camera=sides[i % 2], instant=i // 2) for i, frame in enumerate(tiny_dive.frames)),
+        rig=Rig((RigCamera("left"), RigCamera("right"))),
+    )
+    K = rec.cameras.K.clone()
+    K[0::2, [0, 1], [0, 1]] = 90.0  # rec.names begins at frame 1, a right one
+    poses = {"8.png": FirstPose(tiny_dive.cameras.cam2world[8], "reference")}
+    rec = replace(rec, cameras=replace(rec.cameras, K=K))
+    (view,) = score_views(tiny_dive.truth, rec, frames, poses, tmp_path, PoseRefinementSettings(steps=0))
+    assert view.lens.K[0, 0, 0] == 60
 
 
 def test_without_a_placed_test_frame_no_score_is_known():

@@ -1,14 +1,16 @@
 """The lens that a run found, for other clips of the same camera in the same mode."""
 
 import logging
+from contextlib import suppress
 from pathlib import Path
 
 import numpy as np
 
 from swimm3r.cameras import DISTORTION_PARAMETERS
-from swimm3r.errors import UsageError
+from swimm3r.errors import Swimm3rError, UsageError
 from swimm3r.io.calibration.record import Calibration
 from swimm3r.io.cameras_json import CameraTable, read_cameras
+from swimm3r.io.files.cache_key import cache_key
 from swimm3r.io.files.damage import Remedy, guard
 
 CAMERAS = Path("sfm") / "cameras.json"
@@ -48,6 +50,19 @@ def calibration_of_run(folder: Path) -> Calibration:
     table = read_cameras(run / CAMERAS)
     with guard(run / CAMERAS, _REMEDY):
         return _calibration(run.name, table)
+
+
+def lens_digest(folder: Path) -> str | None:
+    """Of the lens of a run folder, whatever its unit; None where it cannot be read.
+
+    None of a folder of runs, too: further runs in it may change the choice, and say nothing against what was made.
+    """
+    if not (folder / CAMERAS).is_file():
+        return None
+    with suppress(Swimm3rError):
+        table = read_cameras(folder / CAMERAS)
+        return cache_key(table.model, table.width, table.height, table.K.tolist(), table.distortion.tolist())
+    return None
 
 
 def _focal(table: CameraTable) -> float:

@@ -20,6 +20,7 @@ import swimm3r
 
 _ONLY_SHOWS = ("cli", "report", "export")
 _LENGTH = 32  # hexadecimal digits
+_READ_WHOLE = 64 << 20  # bytes
 _SAMPLE = 16 << 10  # bytes, at either end of a file
 
 
@@ -42,6 +43,18 @@ def content_digest(path: Path | None) -> str | None:
         stat = path.stat()
         return _file_digest(path.resolve(), stat.st_size, stat.st_mtime_ns)
     return cache_key(*([file.relative_to(path).as_posix(), content_digest(file)] for file in files_below(path)))
+
+
+def given_digest(path: Path) -> str | None:
+    """Of a file or folder that a setting names; None where there is nothing.
+
+    A file of up to 64 MiB is read whole. A larger one, and the files of a folder, count by names, sizes and their first
+    and last 16 KiB (`sample_digest`): bags, weights, and folders of masks or models would take long otherwise.
+    """
+    if not path.exists():
+        return None
+    whole = path.is_file() and path.stat().st_size <= _READ_WHOLE
+    return content_digest(path) if whole else sample_digest(path)
 
 
 def sample_digest(path: Path, leave_out: Path | None = None) -> str:

@@ -1,8 +1,10 @@
 """Readers for the files of other programs, chosen by name and content."""
 
+from contextlib import suppress
 from pathlib import Path
 
 from swimm3r.cameras import cameras_of, check_lens
+from swimm3r.errors import InputError
 from swimm3r.io.cameras_json import read_cameras
 from swimm3r.io.colmap import model as colmap
 from swimm3r.io.files import json_file
@@ -23,6 +25,13 @@ def read_foreign(path: Path) -> ForeignModel:
         foreign = _read(found) if found else ForeignModel("COLMAP model", colmap.read_model(path))
         check_lens(cameras_of(foreign.model))
         return foreign
+
+
+def model_path(path: Path) -> Path | None:
+    """The file, or the folder of a COLMAP model, that `read_foreign` reads; None where there is none."""
+    with suppress(InputError):
+        return _file(path) or colmap.find_model(path)
+    return None
 
 
 def _read(path: Path) -> ForeignModel:

@@ -6,8 +6,9 @@ from pathlib import Path
 from swimm3r import devices
 from swimm3r.pipeline.inputs import truth_of
 from swimm3r.pipeline.presets import from_yaml
-from swimm3r.pipeline.run_record import RunRecord, open_record, stage_keys
+from swimm3r.pipeline.run_record import RunRecord, open_record
 from swimm3r.pipeline.scores.scoring import MappedRun, Protocol, film_flight, score_map, score_restored_frames
+from swimm3r.pipeline.stage_keys import stage_keys
 from swimm3r.progress import Progress, watched
 from swimm3r.report import write_report
 from swimm3r.scene.ground_truth import GroundTruth

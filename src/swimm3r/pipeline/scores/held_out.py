@@ -30,7 +30,7 @@ from swimm3r.geometry import best_similarity
 from swimm3r.imaging.turned_rows import at_half_time, mask_at_half_time
 from swimm3r.imaging.undistortion import shown_pixels, undistorted
 from swimm3r.io.view_names import view_stems
-from swimm3r.localization.interpolation import is_beside_registered, neighbors, pose_from_neighbors
+from swimm3r.localization.interpolation import is_beside_registered, lens_of, neighbors, pose_from_neighbors
 from swimm3r.localization.landmarks import Located, landmarks_of, locate
 from swimm3r.pipeline.renders import display_style, write_view
 from swimm3r.pipeline.scores.part_scores import (
@@ -98,32 +98,50 @@ def first_poses(
     """A pose of every test frame that has a known place, in the axes and unit of the reconstruction."""
     known = {} if reference is None else reference_poses(rec, reference)
     landmarks = landmarks_of(rec, rec.still(frames), features)
-    poses = {}
-    for done, frame in enumerate(frames.test):
+    poses, without_lens, unplaced = {}, [], []
+    for done, name in enumerate(frames.test.names):
         progress("placing test frames", done, len(frames.test))
-        if frame.name in known and not frames.rows_rectified:
-            poses[frame.name] = FirstPose(known[frame.name], "reference")
+        lens = lens_of(rec, frames, name)
+        if lens is None:
+            without_lens.append(name)
             continue
-        near = neighbors(rec, frames, frame.name, _REFERENCES)
-        f, lens = frames.index(frame.name), rec.cameras[rec.index(near[0])]
-        located = locate(frames.image(f), frames.mask(f), lens, [landmarks(name) for name in near], features)
-        if located is None:
-            if frame.name not in known and not is_beside_registered(rec, frames, frame.name):
-                continue
-            first = FirstPose(pose_from_neighbors(rec, frames, frame.name), "neighbors")
-        elif frames.rows_rectified:
-            first = _turned(replace(lens, cam2world=located.cam2world[None]), located)
+        if name in known and not frames.rows_rectified:
+            poses[name] = FirstPose(known[name], "reference")
+            continue
+        f, near = frames.index(name), neighbors(rec, frames, name, _REFERENCES)
+        located = locate(frames.image(f), frames.mask(f), lens, [landmarks(other) for other in near], features)
+        first = _first_pose(rec, frames, name, lens, located)
+        if name in known:
+            turn = None if first is None else first.turn
+            first = FirstPose(known[name], "reference", turn)
+        if first is None:
+            unplaced.append(name)
         else:
-            first = FirstPose(located.cam2world, "2D-3D matches")
-        if frame.name in known:
-            first = replace(first, cam2world=known[frame.name], source="reference")
-        poses[frame.name] = first
+            poses[name] = first
     progress("placing test frames", len(frames.test), len(frames.test))
-    if unplaced := [name for name in frames.test.names if name not in poses]:
+    if unplaced:
         log.warning(
             "test frames that match nothing, with no registered frame near, not scored: %s", ", ".join(unplaced)
         )
+    if without_lens:
+        log.warning(
+            "test frames of a camera whose lens is not known, as none of its frames is registered and no calibration"
+            " states it, not scored: %s",
+            ", ".join(without_lens),
+        )
     return poses
+
+
+def _first_pose(
+    rec: Reconstruction, frames: Frames, name: str, lens: Cameras, located: Located | None
+) -> FirstPose | None:
+    """The pose of a test frame by its matches, else by its camera's frames around it; None where these are far away."""
+    if located is None:
+        near = is_beside_registered(rec, frames, name)
+        return FirstPose(pose_from_neighbors(rec, frames, name), "neighbors") if near else None
+    if frames.rows_rectified:
+        return _turned(replace(lens, cam2world=located.cam2world[None]), located)
+    return FirstPose(located.cam2world, "2D-3D matches")
 
 
 def _turned(camera: Cameras, located: Located) -> FirstPose:
@@ -174,7 +192,8 @@ def score_views(
     for done, (name, first) in enumerate(poses.items()):
         progress("scoring test frames", done, len(poses))
         f = frames.index(name)
-        lens = rec.cameras[rec.index(neighbors(rec, frames, name, 1)[0])]
+        lens = lens_of(rec, frames, name)
+        assert lens is not None, name  # `first_poses` leaves such frames out
         lens = replace(lens, cam2world=first.cam2world[None].to(lens.cam2world))
         time, image, mask = frames.frames[f].time, frames.image(f), frames.mask(f)
         if first.turn is not None:

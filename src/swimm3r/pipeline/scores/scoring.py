@@ -9,9 +9,9 @@ from dataclasses import asdict, dataclass
 from pathlib import Path
 
 from swimm3r.io.files.cache_key import cache_key
-from swimm3r.io.imports.read import read_foreign
 from swimm3r.io.view_names import view_stems
 from swimm3r.pipeline import summary as sections
+from swimm3r.pipeline.camera_paths import rows_of_one_camera
 from swimm3r.pipeline.presets import RunSettings
 from swimm3r.pipeline.renders import display_style, write_flythrough
 from swimm3r.pipeline.scores import held_out
@@ -21,7 +21,7 @@ from swimm3r.progress import Progress, silent
 from swimm3r.scene.frames import Frames
 from swimm3r.scene.ground_truth import GroundTruth
 from swimm3r.scene.reconstruction import Reconstruction
-from swimm3r.sfm.imported.match_frames import model_cameras
+from swimm3r.sfm.imported.model_poses import model_poses
 from swimm3r.sfm.settings import ColmapModelSettings
 from swimm3r.splat.rendering import SplatMap
 from swimm3r.splat.settings import PoseRefinementSettings
@@ -62,14 +62,18 @@ class MappedRun:
 
 
 def start_poses(
-    rec: Reconstruction, frames: Frames, settings: RunSettings, truth: GroundTruth | None, progress: Progress = silent
+    folder: Path,
+    rec: Reconstruction,
+    frames: Frames,
+    settings: RunSettings,
+    truth: GroundTruth | None,
+    progress: Progress = silent,
 ) -> dict[str, held_out.FirstPose]:
-    """Poses from which the refinement of the test frames starts, in the reconstruction's axes: the truth's where known.
-
-    Without a truth, at those of the model that the reconstruction was imported from.
+    """Poses from which the refinement of a run's test frames starts, in the reconstruction's axes: the truth's where
+    known. Without a truth, at those of the model that the reconstruction was imported from.
     """
     if truth is None and isinstance(settings.sfm, ColmapModelSettings):
-        names, cameras = model_cameras(frames, read_foreign(settings.sfm.model).model)
+        names, cameras = model_poses(frames, settings.sfm.model, folder / "sfm")
         truth = GroundTruth(names, cameras, metric=False)
     return held_out.first_poses(rec, frames, settings.sfm.features, truth, progress)
 
@@ -79,7 +83,7 @@ def score_map(
 ) -> dict[str, dict | None]:
     """The sections "test", "restored" (of the map) and "truth" by a protocol; the views it renders go to `into`."""
     frames, rec, scene, restore = run.frames, run.rec, run.scene, run.settings.sfm.restore
-    poses = held_out.in_axes_of(scene, rec, start_poses(rec, frames, run.settings, truth, progress))
+    poses = held_out.in_axes_of(scene, rec, start_poses(run.folder, rec, frames, run.settings, truth, progress))
     views = held_out.score_views(scene, rec, frames, poses, into, test, restore, progress)
     stems = view_stems(frames.names)
     physical, shown = ([into / f"{stems[v.name]}_{kind}.png" for v in views] for kind in ("clear_physical", "clear"))
@@ -102,9 +106,8 @@ def score_restored_frames(run: MappedRun, progress: Progress = silent) -> dict[s
 def film_flight(run: MappedRun, progress: Progress = silent) -> None:
     """Write RUN/renders/flythrough.mp4, at the size the map was trained at."""
     scene, path = run.scene, as_mapped(run.rec, run.scene.poses)
-    first = None if run.frames.rig is None else run.frames.rig.names[0]
-    rows = [i for i, name in enumerate(path.names) if run.frames.frames[run.frames.index(name)].camera == first]
-    lens = path.cameras[0]
+    rows = rows_of_one_camera(path.names, run.frames)
+    lens = path.cameras[rows[0]]
     canvas = lens.drawn(scene.settings.long_side)
     write_flythrough(
         run.folder / "renders" / "flythrough.mp4",

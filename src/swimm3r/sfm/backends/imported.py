@@ -5,7 +5,7 @@ pairs of observations of one point; where a file has neither observations nor de
 poses (`swimm3r.sfm.colmap.triangulation`). Depth that comes with the file is used, else it is swept.
 
 Frames that the model places but the split holds back take no part; their poses serve as reference
-(`imported.match_frames`).
+(`imported.model_poses`).
 """
 
 from dataclasses import replace

@@ -22,6 +22,7 @@ from swimm3r.io.colmap.cameras import from_pycolmap_camera, to_pycolmap_camera
 from swimm3r.io.colmap.model import ColmapModel
 from swimm3r.scene.frames import Frames
 from swimm3r.scene.reconstruction import Matches
+from swimm3r.scene.rig import RigCamera
 from swimm3r.sfm.features.sift import Features
 from swimm3r.sfm.lens import gives_lens
 from swimm3r.sfm.settings import ColmapSettings
@@ -108,7 +109,7 @@ def lenses_of_rig(frames: Frames, settings: ColmapSettings, first: "pycolmap.Cam
     begin = Cameras(K, distortion, torch.eye(4, dtype=torch.float64)[None], first.width, first.height, model)
     lenses = [begin]
     for camera in rig.cameras[1:]:
-        stated = begin if camera.lens is None else lens_at(read(camera.lens)[0], frames.width, frames.height).camera
+        stated = stated_lens(camera, frames) or begin
         if (stated.model == "OPENCV_FISHEYE") != (model == "OPENCV_FISHEYE"):
             raise InputError(
                 f"the lens of {camera.name} is {stated.model}, and that of {rig.names[0]} {first.model.name}",
@@ -119,6 +120,11 @@ def lenses_of_rig(frames: Frames, settings: ColmapSettings, first: "pycolmap.Cam
     if all(_same(lens, begin) for lens in lenses):
         return None
     return RigLenses(tuple(lenses), tuple(rig.names.index(frame.camera or "") for frame in frames))
+
+
+def stated_lens(camera: RigCamera, frames: Frames) -> Cameras | None:
+    """The calibrated lens of a rig's camera in frames of this size; None without one. Raises as `lens_at` does."""
+    return None if camera.lens is None else lens_at(read(camera.lens)[0], frames.width, frames.height).camera
 
 
 def under_model_of(lens: Cameras, model: str) -> Cameras:
