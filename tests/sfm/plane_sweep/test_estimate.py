@@ -206,6 +206,18 @@ def test_ground_in_one_source_alone_is_judged_by_that_source():
     assert raw.correlation[12:-12, 45:95][q > 0].median() > 0.9
 
 
+def test_a_lone_source_says_no_more_than_when_it_is_given_twice_or_beside_one_that_sees_nothing():
+    views = views_of(SLANTED)
+    noise = torch.randn(HEIGHT, WIDTH, generator=torch.Generator().manual_seed(0))
+    lone = replace(views[1], detail=views[1].detail + 0.15 * noise)  # of middling correlation
+    blind = replace(lone, seen=torch.zeros_like(lone.seen))
+    one, *others = (sweep(views[2], sources, (2.0, 9.0), SETTINGS) for sources in ([lone], [lone, lone], [lone, blind]))
+    assert 0.2 < others[0].inverse_depth.count_nonzero() / noise.numel() < 0.8
+    for two in others:
+        assert torch.equal(one.inverse_depth, two.inverse_depth)
+        assert torch.equal(one.correlation, two.correlation)
+
+
 def test_a_depth_that_one_other_frame_can_see_needs_that_frame_alone():
     cameras = dive()
     cameras.cam2world[:, 0, 3] *= 5  # 1.25 apart at a depth of 4: each image overlaps the next by two thirds
