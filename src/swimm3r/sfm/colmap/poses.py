@@ -276,7 +276,10 @@ def _map(
         more = mapping.replace_misplaced(store, more, further, progress)
         more = without_jumps(more)
         model = more if more.num_reg_images() >= model.num_reg_images() else model
-    calibrated = Calibrated(model, refined=determined) if long else refine(store, model, further, progress)
+    if long:
+        calibrated = Calibrated(model, refined=determined, distortion=determined)
+    else:
+        calibrated = refine(store, model, further, progress)
     if settings.mapping.align_keypoints:
         model = adjust_keypoints(store, calibrated.model, frames, threads, progress, lenses)
         calibrated = replace(calibrated, model=model)

@@ -4,7 +4,7 @@ A lens with more parameters always fits its own frames better. Where OPENCV's ex
 asks which lens also holds on frames that it was not fitted to.
 """
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import TYPE_CHECKING
 
 from swimm3r.progress import Progress
@@ -27,6 +27,7 @@ class Calibrated:
 
     model: "pycolmap.Reconstruction"
     refined: bool  # intrinsics as refined; False where refinement gave no lens and the assumed ones stand
+    distortion: bool  # refined, too; False where the assumed one stands, as refinement with it gave no lens
 
 
 def adjust_lens(
@@ -68,7 +69,7 @@ def refine(
     """The model after bundle adjustment of everything, its lens included unless the user holds it fixed."""
     own = family_of(model.cameras[1])
     if settings.intrinsics == "fixed":
-        return Calibrated(_poses_alone(store, model), refined=False)
+        return Calibrated(_poses_alone(store, model), refined=False, distortion=False)
     progress(_STEP, 0, 3)
     kept = _refined(store, model, own)
     family = own
@@ -81,28 +82,27 @@ def refine(
         kept = _refined(store, model, family, distortion=False)
     progress(_STEP, 3, 3)
     if kept is None:
-        return Calibrated(_poses_alone(store, model), refined=False)
+        return Calibrated(_poses_alone(store, model), refined=False, distortion=False)
     sharp = _sharpened(store, kept, family, distortion=distortion)
     kept = sharp if _is_sound(sharp, kept) else kept
     set_camera(store, kept.cameras[1])
-    return Calibrated(kept, refined=True)
+    return Calibrated(kept, refined=True, distortion=distortion)
 
 
 def refine_again(store: FeatureDatabase, calibrated: Calibrated, progress: Progress) -> Calibrated:
-    """A refined model whose observations were moved after another adjustment, its kind of lens as it is."""
+    """A refined model whose observations were moved after another adjustment of what was refined of its lens."""
     model = calibrated.model
     if not calibrated.refined:
-        return Calibrated(_poses_alone(store, model), refined=False)
+        return Calibrated(_poses_alone(store, model), refined=False, distortion=False)
     progress(_STEP, 0, 1)
     family = family_of(model.cameras[1])
-    distortion = any(model.cameras[1].params[i] for i in model.cameras[1].extra_params_idxs())
     kept = model
     for _ in range(2):  # errors are smaller after the first, and the loss of the second is as wide as they are
-        found = _sharpened(store, kept, family, distortion=distortion)
+        found = _sharpened(store, kept, family, distortion=calibrated.distortion)
         kept = found if _is_sound(found, kept) else kept
     progress(_STEP, 1, 1)
     set_camera(store, kept.cameras[1])
-    return Calibrated(kept, refined=True)
+    return replace(calibrated, model=kept)
 
 
 def _with_more_parameters(
