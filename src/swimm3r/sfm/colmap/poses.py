@@ -69,6 +69,7 @@ class _Mapped:
     model: "pycolmap.Reconstruction"
     others: "list[pycolmap.Reconstruction]"
     lens_refined: bool  # from the images; else assumed, or held for the user
+    distortion_refined: bool  # as well
     warnings: list[QualityWarning]
 
 
@@ -292,7 +293,7 @@ def _map(
     model, refined = calibrated.model, calibrated.refined or determined
     assumed = not refined and settings.intrinsics != "fixed"
     warnings = [assumed_lens(model.cameras[1].focal_length_x / store.scale)] if assumed else []
-    return _Mapped(model, models[1:], refined, warnings)
+    return _Mapped(model, models[1:], refined, calibrated.distortion, warnings)
 
 
 def _models(
@@ -317,6 +318,7 @@ def _navigated(
     recorded: "Callable[[pycolmap.Reconstruction], Reconstruction]",
     progress: Progress,
 ) -> _Mapped:
+    is_open = mapped.lens_refined and not store.little_overlap
     found = with_navigation(
         store,
         mapped.model,
@@ -325,7 +327,8 @@ def _navigated(
         navigator,
         recorded,
         progress,
-        lens=mapped.lens_refined and not store.little_overlap,
+        focal=is_open,
+        distortion=is_open and mapped.distortion_refined,
     )
     return replace(mapped, model=found.model, others=found.others, warnings=[*mapped.warnings, *found.warnings])
 

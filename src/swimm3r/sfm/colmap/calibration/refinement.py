@@ -10,7 +10,15 @@ from typing import TYPE_CHECKING
 from swimm3r.progress import Progress
 from swimm3r.sfm.colmap.adjustment import typical_error
 from swimm3r.sfm.colmap.calibration.adjust import adjusted, settled
-from swimm3r.sfm.colmap.calibration.hypotheses import LensFamily, family_of, fitted, likeliest, squeezed_like
+from swimm3r.sfm.colmap.calibration.hypotheses import (
+    LensFamily,
+    ModelAdjustment,
+    family_of,
+    fitted,
+    likeliest,
+    squeezed_like,
+    within_family,
+)
 from swimm3r.sfm.colmap.calibration.start import is_lens, set_camera
 from swimm3r.sfm.features.database import FeatureDatabase
 from swimm3r.sfm.settings import ColmapSettings
@@ -103,6 +111,14 @@ def refine_again(store: FeatureDatabase, calibrated: Calibrated, progress: Progr
     progress(_STEP, 1, 1)
     set_camera(store, kept.cameras[1])
     return replace(calibrated, model=kept)
+
+
+def adjust_within_family(
+    model: "pycolmap.Reconstruction", free: ModelAdjustment, held: ModelAdjustment
+) -> "pycolmap.Reconstruction":
+    """A model after an adjustment with its lens `free` within its family; where that gives no lens, with it `held`."""
+    found = within_family(model, family_of(model.cameras[1]), free)
+    return found if is_lens(found.cameras[1]) else held(model)
 
 
 def _with_more_parameters(
