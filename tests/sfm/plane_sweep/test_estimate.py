@@ -392,17 +392,40 @@ def test_the_number_of_threads_changes_no_bit(tmp_path: Path):
         assert torch.equal(one[name].confidence, four[name].confidence)
 
 
+def twice_as_large(rec: Reconstruction) -> Reconstruction:
+    cameras = replace(rec.cameras, cam2world=rec.cameras.cam2world.clone())
+    cameras.cam2world[:, :3, 3] *= 2
+    return replace(rec, cameras=cameras, points=replace(rec.points, xyz=rec.points.xyz * 2))
+
+
+def median_depth(maps: DepthMaps) -> float:
+    with np.load(maps.path("2.png")) as stored:
+        return float(np.median(stored["z_depth"][stored["z_depth"] > 0]))
+
+
 def test_maps_of_other_cameras_are_not_kept(tmp_path: Path):
     cameras = dive()
     frames = frames_on_disk(cameras, FRONTAL, tmp_path)
     rec = reconstruction(cameras, FRONTAL, tmp_path)
     estimate_depth(rec, frames, SETTINGS)
-    twice = replace(cameras, cam2world=cameras.cam2world.clone())
-    twice.cam2world[:, :3, 3] *= 2
-    larger = replace(rec, cameras=twice, points=replace(rec.points, xyz=rec.points.xyz * 2))
-    estimate_depth(larger, frames, SETTINGS)
-    with np.load(rec.depth.path("2.png")) as stored:
-        assert np.median(stored["z_depth"][stored["z_depth"] > 0]) == pytest.approx(8.0, rel=0.01)
+    estimate_depth(twice_as_large(rec), frames, SETTINGS)
+    assert median_depth(rec.depth) == pytest.approx(8.0, rel=0.01)
+
+
+def test_a_process_that_goes_on_takes_the_reconstruction_that_the_folder_holds_now(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+):
+    def in_one_process(work: Callable[[estimate.PartOfPass], None], parts: list[estimate.PartOfPass], *_, **__) -> list:
+        return [work(part) for part in parts][:0]
+
+    monkeypatch.setattr(estimate, "run_tasks", in_one_process)
+    cameras = dive()
+    frames = frames_on_disk(cameras, FRONTAL, tmp_path)
+    rec = reconstruction(cameras, FRONTAL, tmp_path / "sfm")
+    for now, depth in ((rec, 4.0), (twice_as_large(rec), 8.0)):
+        now.save(tmp_path / "sfm", frames)
+        maps = estimate_depth(now, frames, SETTINGS, engine=EngineSettings(jobs=2))
+        assert median_depth(maps) == pytest.approx(depth, rel=0.01)
 
 
 def test_progress_counts_every_frame_of_every_pass(tmp_path: Path):
