@@ -37,6 +37,7 @@ from swimm3r.sfm.colmap.keypoint_adjustment import adjust_keypoints
 from swimm3r.sfm.colmap.messages import (
     LOST_SCALE,
     assumed_lens,
+    lens_not_told,
     registration_warnings,
     scale_lost,
     too_few,
@@ -262,7 +263,8 @@ def _map(
     n, threads, long = len(frames), settings.threads or thread_count(), is_long(len(frames), settings.mapping)
     models, determined = _models(store, frames, settings, progress, engine)
     if not models:
-        raise too_few(0, frames, settings)
+        untold = store.little_overlap and settings.intrinsics != "fixed"
+        raise lens_not_told(frames) if untold else too_few(0, frames, settings)
     model = without_jumps(models[0])
     # points of two frames hold the poses of those that overlap little, under the lens that the others determined
     further = replace(settings, intrinsics="fixed") if store.little_overlap else settings
