@@ -118,3 +118,10 @@ def test_while_the_lens_is_open_points_of_two_frames_do_not_count(stills: Featur
     assert of_two(refine_again(stills, held, silent).model) > 0.5
     assert held.model.num_reg_images() == COUNT
     assert held.model.cameras[1].focal_length == refined.model.cameras[1].focal_length
+
+
+def test_stills_of_which_each_feature_is_seen_twice_at_most_need_a_lens_that_is_held(tmp_path: Path) -> None:
+    pairs = survey(0.75, tmp_path)  # a still overlaps the next by a third, and none further
+    assert pairs.little_overlap
+    assert not mapping.map_frames(pairs, replace(HELD, intrinsics="prior"), silent)
+    assert mapping.map_frames(pairs, HELD, silent)

@@ -10,8 +10,9 @@ import torch
 from scipy.spatial.transform import Rotation
 from tests.scale.conftest import SCALE, Survey, survey_along
 
+from swimm3r.cameras import project
 from swimm3r.geometry import align_similarity
-from swimm3r.io.colmap.model import from_pycolmap, to_pycolmap
+from swimm3r.io.colmap.model import ColmapModel, from_pycolmap, to_pycolmap
 from swimm3r.progress import silent
 from swimm3r.scale.navigation.navigator import NavigationFile
 from swimm3r.scale.settings import ScaleSettings
@@ -46,11 +47,16 @@ def seen_with_errors(survey: Survey, pixels: float, rng: np.random.Generator) ->
     return replace(survey.rec, tracks=replace(tracks, point=tracks.point[few], frame=tracks.frame[few], xy=xy))
 
 
+def adjusted_to(rec: Reconstruction, places: np.ndarray, std: float, **lens: bool) -> ColmapModel:
+    """A run after an adjustment with places of its cameras, in its axes and unit, of this standard deviation."""
+    priors = {name: Prior(place, np.eye(3) * std**2) for name, place in zip(rec.names, places, strict=True)}
+    model = to_pycolmap(rec.colmap_model())
+    return from_pycolmap(adjust_to_positions(model, priors, silent, **{"focal": False, "distortion": False} | lens))
+
+
 def held_to(rec: Reconstruction, survey: Survey, stated: np.ndarray, std: float) -> float:
     """The error of the path after an adjustment with positions of this standard deviation, metres."""
-    cov = np.eye(3) * (std / SCALE) ** 2
-    priors = {name: Prior(p, cov) for name, p in zip(survey.rec.names, survey.in_run(stated), strict=True)}
-    held = from_pycolmap(adjust_to_positions(to_pycolmap(rec.colmap_model()), priors, silent, lens=False))
+    held = adjusted_to(rec, survey.in_run(stated), std / SCALE)
     return path_error(held.cam2world[:, :3, 3], survey.position)
 
 
@@ -80,6 +86,49 @@ def test_images_count_by_their_own_errors_against_positions():
         errors.append(held_to(rec, survey, jumping, std))
     assert errors[0] < 0.2 * std
     assert errors[1] > 0.3 * std
+
+
+def seen_through(params: list[float]) -> Reconstruction:
+    """A strip as seen through a lens of OPENCV, with errors of 0.3 px."""
+    survey = survey_along(STRIP)
+    fx, fy, cx, cy, *distortion = params
+    cameras, count = survey.rec.cameras, len(STRIP)
+    K = torch.tensor([[fx, 0, cx], [0, fy, cy], [0, 0, 1]], dtype=torch.float64).repeat(count, 1, 1)
+    k = torch.tensor(distortion, dtype=torch.float64).repeat(count, 1)
+    cameras = replace(cameras, K=K, distortion=k, model="OPENCV")
+    tracks, xy = survey.rec.tracks, survey.rec.tracks.xy.clone()
+    for i in range(count):
+        own = tracks.frame == i
+        xy[own] = project(cameras[i], survey.rec.points.xyz[tracks.point[own]][None].double())[0][0].float()
+    seen = replace(survey, rec=replace(survey.rec, cameras=cameras, tracks=replace(tracks, xy=xy)))
+    return seen_with_errors(seen, 0.3, np.random.default_rng(0))
+
+
+def test_a_squeezed_lens_stays_squeezed_where_navigation_adjusts_it():
+    rec = seen_through([500.0, 500.0 * 4 / 3, 320.0, 240.0, 0.03, 0.0, 0.0, 0.0])
+    wrong = replace(rec, cameras=replace(rec.cameras, K=rec.cameras.K * torch.tensor([1.03, 1.03, 1])[:, None]))
+    found = adjusted_to(wrong, rec.cameras.centers.numpy(), 0.01, focal=True, distortion=True)
+    np.testing.assert_allclose(found.K[0, 0, 0], 500.0, rtol=0.01)
+    np.testing.assert_allclose(found.K[:, 1, 1] / found.K[:, 0, 0], 4 / 3, rtol=1e-12)
+    assert (found.distortion[:, 1:] == 0).all()
+    assert found.distortion[0, 0] != 0.03
+
+
+def test_a_distortion_that_is_assumed_is_held_where_navigation_adjusts_the_focal_length():
+    rec = seen_through([500.0, 500.0, 320.0, 240.0, 0.03, 0.0, 0.0, 0.0])
+    found = adjusted_to(rec, rec.cameras.centers.numpy(), 0.01, focal=True, distortion=False)
+    assert found.K[0, 0, 0] != 500.0
+    assert (found.distortion == [0.03, 0, 0, 0]).all()
+
+
+def test_a_lens_is_held_where_navigation_makes_none_of_it():
+    """Heights that are stated ten times as large fit a lens ten times as long."""
+    survey = survey_along(STRIP)
+    rec = seen_with_errors(survey, 0.3, np.random.default_rng(0))
+    stated = survey.in_run(survey.position * [1, 1, 10])
+    found = adjusted_to(rec, stated, 0.001, focal=True, distortion=True)
+    np.testing.assert_array_equal(found.K, rec.cameras.K.numpy())
+    assert path_error(found.cam2world[:, :3, 3], survey.position) > 0.1
 
 
 @pytest.fixture(scope="module")

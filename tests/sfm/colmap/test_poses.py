@@ -28,7 +28,7 @@ from swimm3r.scene.frames import Frame, Frames
 from swimm3r.scene.reconstruction import Reconstruction
 from swimm3r.sfm.colmap import poses as colmap
 from swimm3r.sfm.colmap.calibration.start import first_camera
-from swimm3r.sfm.colmap.messages import too_few
+from swimm3r.sfm.colmap.messages import lens_not_told, too_few
 from swimm3r.sfm.colmap.pairs import choose_pairs
 from swimm3r.sfm.colmap.settings import MappingSettings
 from swimm3r.sfm.features import database as feature_database
@@ -196,6 +196,24 @@ def test_a_given_focal_length_of_no_lens_is_named_where_frames_cannot_be_placed(
     error = too_few(0, frames, replace(SETTINGS, focal=focal))
     assert (f"{9.8 * WIDTH:.0f} px" in error.cause and "--calibration" in error.hint) == doubted
     assert ("--fps" in error.hint) != doubted
+
+
+def test_two_frames_of_an_open_lens_are_refused_with_what_they_lack_and_placed_under_a_held_one(
+    frames: Frames, tmp_path: Path
+) -> None:
+    two, given = frames.select([2, 5]), replace(SETTINGS, focal=FOCAL)
+    with pytest.raises(RegistrationError, match="none of 2 frames") as caught:
+        colmap.reconstruct(two, given, tmp_path)
+    assert "lens" in caught.value.what
+    assert "--intrinsics fixed" in caught.value.hint
+    assert caught.value.exit_code == 6
+    held = colmap.reconstruct(two, replace(given, intrinsics="fixed"), tmp_path)
+    assert held.names == two.names
+
+
+def test_frames_that_overlap_in_pairs_alone_are_told_from_few_frames(frames: Frames) -> None:
+    assert "seen in three" not in lens_not_told(frames.select([0, 1])).cause
+    assert "seen in three" in lens_not_told(frames.select([0, 1, 2])).cause
 
 
 def test_one_frame_is_an_input_error(frames: Frames, tmp_path: Path) -> None:

@@ -206,6 +206,18 @@ def test_ground_in_one_source_alone_is_judged_by_that_source():
     assert raw.correlation[12:-12, 45:95][q > 0].median() > 0.9
 
 
+def test_a_lone_source_says_no_more_than_when_it_is_given_twice_or_beside_one_that_sees_nothing():
+    views = views_of(SLANTED)
+    noise = torch.randn(HEIGHT, WIDTH, generator=torch.Generator().manual_seed(0))
+    lone = replace(views[1], detail=views[1].detail + 0.15 * noise)  # of middling correlation
+    blind = replace(lone, seen=torch.zeros_like(lone.seen))
+    one, *others = (sweep(views[2], sources, (2.0, 9.0), SETTINGS) for sources in ([lone], [lone, lone], [lone, blind]))
+    assert 0.2 < others[0].inverse_depth.count_nonzero() / noise.numel() < 0.8
+    for two in others:
+        assert torch.equal(one.inverse_depth, two.inverse_depth)
+        assert torch.equal(one.correlation, two.correlation)
+
+
 def test_a_depth_that_one_other_frame_can_see_needs_that_frame_alone():
     cameras = dive()
     cameras.cam2world[:, 0, 3] *= 5  # 1.25 apart at a depth of 4: each image overlaps the next by two thirds
@@ -380,17 +392,40 @@ def test_the_number_of_threads_changes_no_bit(tmp_path: Path):
         assert torch.equal(one[name].confidence, four[name].confidence)
 
 
+def twice_as_large(rec: Reconstruction) -> Reconstruction:
+    cameras = replace(rec.cameras, cam2world=rec.cameras.cam2world.clone())
+    cameras.cam2world[:, :3, 3] *= 2
+    return replace(rec, cameras=cameras, points=replace(rec.points, xyz=rec.points.xyz * 2))
+
+
+def median_depth(maps: DepthMaps) -> float:
+    with np.load(maps.path("2.png")) as stored:
+        return float(np.median(stored["z_depth"][stored["z_depth"] > 0]))
+
+
 def test_maps_of_other_cameras_are_not_kept(tmp_path: Path):
     cameras = dive()
     frames = frames_on_disk(cameras, FRONTAL, tmp_path)
     rec = reconstruction(cameras, FRONTAL, tmp_path)
     estimate_depth(rec, frames, SETTINGS)
-    twice = replace(cameras, cam2world=cameras.cam2world.clone())
-    twice.cam2world[:, :3, 3] *= 2
-    larger = replace(rec, cameras=twice, points=replace(rec.points, xyz=rec.points.xyz * 2))
-    estimate_depth(larger, frames, SETTINGS)
-    with np.load(rec.depth.path("2.png")) as stored:
-        assert np.median(stored["z_depth"][stored["z_depth"] > 0]) == pytest.approx(8.0, rel=0.01)
+    estimate_depth(twice_as_large(rec), frames, SETTINGS)
+    assert median_depth(rec.depth) == pytest.approx(8.0, rel=0.01)
+
+
+def test_a_process_that_goes_on_takes_the_reconstruction_that_the_folder_holds_now(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+):
+    def in_one_process(work: Callable[[estimate.PartOfPass], None], parts: list[estimate.PartOfPass], *_, **__) -> list:
+        return [work(part) for part in parts][:0]
+
+    monkeypatch.setattr(estimate, "run_tasks", in_one_process)
+    cameras = dive()
+    frames = frames_on_disk(cameras, FRONTAL, tmp_path)
+    rec = reconstruction(cameras, FRONTAL, tmp_path / "sfm")
+    for now, depth in ((rec, 4.0), (twice_as_large(rec), 8.0)):
+        now.save(tmp_path / "sfm", frames)
+        maps = estimate_depth(now, frames, SETTINGS, engine=EngineSettings(jobs=2))
+        assert median_depth(maps) == pytest.approx(depth, rel=0.01)
 
 
 def test_progress_counts_every_frame_of_every_pass(tmp_path: Path):

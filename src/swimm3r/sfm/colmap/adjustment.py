@@ -10,7 +10,9 @@ which observations are dropped. A loss that is quadratic up to 1 px, COLMAP's, l
 (`benchmarks/stereo.py`), so that of a last adjustment is quadratic up to the typical error.
 """
 
+from collections.abc import Callable
 from dataclasses import replace
+from functools import partial
 from typing import TYPE_CHECKING
 
 import numpy as np
@@ -49,22 +51,34 @@ def robust_adjustment(width: float) -> "pycolmap.BundleAdjustmentOptions":
 
 def bundle_adjust(rec: Reconstruction, *, lens: bool = False) -> Reconstruction:
     """The same frames and tracks with poses and points that reproject best, and the lens too where asked."""
-    import pycolmap
+    return with_adjusted_model(rec, partial(adjust_model, lens=lens))
 
-    model = to_pycolmap(rec.colmap_model())
-    model.update_point_3d_errors()
-    options = robust_adjustment(typical_error(model))
-    options.refine_focal_length = options.refine_extra_params = lens
-    options.ceres.solver_options.num_threads = 1  # as in mapping: the same sums in the same order
-    pycolmap.bundle_adjustment(model, options)
-    model.update_point_3d_errors()
-    table = from_pycolmap(model)
+
+def with_adjusted_model(
+    rec: Reconstruction, adjust: "Callable[[pycolmap.Reconstruction], pycolmap.Reconstruction]"
+) -> Reconstruction:
+    """The same frames and tracks with poses, points and lens of their model after an adjustment."""
+    table = from_pycolmap(adjust(to_pycolmap(rec.colmap_model())))
     return replace(
         rec,
         cameras=cameras_of(table),
         points=replace(rec.points, xyz=torch.from_numpy(table.xyz), error=torch.from_numpy(table.error)),
         tracks=Tracks(*(torch.from_numpy(a) for a in (table.track_point, table.track_frame, table.track_xy))),
     )
+
+
+def adjust_model(model: "pycolmap.Reconstruction", *, lens: bool = False) -> "pycolmap.Reconstruction":
+    """A copy of a model after bundle adjustment of its poses and points, and its lens where asked."""
+    import pycolmap
+
+    out = pycolmap.Reconstruction(model)
+    out.update_point_3d_errors()
+    options = robust_adjustment(typical_error(out))
+    options.refine_focal_length = options.refine_extra_params = lens
+    options.ceres.solver_options.num_threads = 1  # as in mapping: the same sums in the same order
+    pycolmap.bundle_adjustment(out, options)
+    out.update_point_3d_errors()
+    return out
 
 
 def adjust_through_port(

@@ -67,6 +67,17 @@ def too_few(placed: int, frames: Frames, settings: ColmapSettings) -> Registrati
     )
 
 
+def lens_not_told(frames: Frames) -> RegistrationError:
+    """The error of frames that overlap in pairs alone, none of which can be placed while their lens is open."""
+    seen = "" if len(frames) == 2 else ", and hardly any feature is seen in three"
+    return RegistrationError(
+        f"none of {len(frames)} frames could be placed: they cannot tell the lens, which is not held",
+        cause=f"two frames fit any lens{seen}; placed under a guess, they may be many degrees off",
+        hint="hold a lens that is known: --lens-from RUN, or --calibration or --focal (and --k1) with --intrinsics "
+        "fixed; or give more frames, so that most of the ground is seen in three or more (a higher --fps)",
+    )
+
+
 def scale_lost(placed: int, frames: int) -> RegistrationError:
     """The error of a model whose depths contradict each other beyond all measure."""
     return _not_placed(

@@ -10,6 +10,7 @@ pixels: its sum is w^2 times this one, with covariances divided by w^2.
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
+from functools import partial
 from typing import TYPE_CHECKING
 
 import numpy as np
@@ -21,6 +22,7 @@ from swimm3r.scene.placement import Navigator, Placement
 from swimm3r.scene.reconstruction import QualityWarning, Reconstruction
 from swimm3r.sfm.colmap.adjustment import WIDEST, robust_adjustment, typical_error
 from swimm3r.sfm.colmap.calibration.adjust import SEED, STILL, THREADS
+from swimm3r.sfm.colmap.calibration.refinement import adjust_within_family
 from swimm3r.sfm.colmap.chunks.assemble import assemble
 from swimm3r.sfm.colmap.chunks.join import Joined
 from swimm3r.sfm.colmap.chunks.parts import LEAST_FRAMES, part_of
@@ -62,9 +64,10 @@ def with_navigation(
     record: "Callable[[pycolmap.Reconstruction], Reconstruction]",
     progress: Progress,
     *,
-    lens: bool,
+    focal: bool,
+    distortion: bool,
 ) -> Navigated:
-    """The largest model with the parts that navigation places beside it, adjusted; its lens, too, where `lens`.
+    """The largest model with the parts that navigation places beside it, adjusted; what is asked of its lens, too.
 
     Raises InputError where the navigation contradicts the largest model.
     """
@@ -84,15 +87,32 @@ def with_navigation(
     if parts:
         model = _joined(store, model, parts, placed, progress)
     placements = [placed, *(found for _, found in parts)]
-    model = adjust_to_positions(model, _priors(placements, frames), progress, lens=lens)
+    model = adjust_to_positions(model, _priors(placements, frames), progress, focal=focal, distortion=distortion)
     warnings = [_joined_warning(placed, parts)] if parts else []
     return Navigated(model, left, warnings)
 
 
 def adjust_to_positions(
-    model: "pycolmap.Reconstruction", priors: dict[str, Prior], progress: Progress, *, lens: bool
+    model: "pycolmap.Reconstruction", priors: dict[str, Prior], progress: Progress, *, focal: bool, distortion: bool
 ) -> "pycolmap.Reconstruction":
-    """The model after bundle adjustment with priors of camera centers, by name of the image."""
+    """The model after bundle adjustment with priors of camera centers, by name of the image.
+
+    Its lens is held but for what is asked, and stays in its family; all of it is held where that gives no lens.
+    """
+    held = partial(_adjusted, priors=priors, progress=progress)
+    if not (focal or distortion):
+        return held(model)
+    return adjust_within_family(model, partial(held, focal=focal, distortion=distortion), held)
+
+
+def _adjusted(
+    model: "pycolmap.Reconstruction",
+    *,
+    priors: dict[str, Prior],
+    progress: Progress,
+    focal: bool = False,
+    distortion: bool = False,
+) -> "pycolmap.Reconstruction":
     import pycolmap
 
     out = pycolmap.Reconstruction(model)
@@ -107,7 +127,7 @@ def adjust_to_positions(
         out.update_point_3d_errors()
         width = typical_error(out) if done else WIDEST  # the priors move poses at first
         options = robust_adjustment(width)
-        options.refine_focal_length = options.refine_extra_params = lens
+        options.refine_focal_length, options.refine_extra_params = focal, distortion
         options.ceres.solver_options.num_threads = THREADS
         options.ceres.solver_options.function_tolerance = STILL
         prior_options.ceres.prior_position_loss_scale = prior_width * width

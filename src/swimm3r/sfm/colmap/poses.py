@@ -37,6 +37,7 @@ from swimm3r.sfm.colmap.keypoint_adjustment import adjust_keypoints
 from swimm3r.sfm.colmap.messages import (
     LOST_SCALE,
     assumed_lens,
+    lens_not_told,
     registration_warnings,
     scale_lost,
     too_few,
@@ -69,6 +70,7 @@ class _Mapped:
     model: "pycolmap.Reconstruction"
     others: "list[pycolmap.Reconstruction]"
     lens_refined: bool  # from the images; else assumed, or held for the user
+    distortion_refined: bool  # as well
     warnings: list[QualityWarning]
 
 
@@ -261,7 +263,8 @@ def _map(
     n, threads, long = len(frames), settings.threads or thread_count(), is_long(len(frames), settings.mapping)
     models, determined = _models(store, frames, settings, progress, engine)
     if not models:
-        raise too_few(0, frames, settings)
+        untold = store.little_overlap and settings.intrinsics != "fixed"
+        raise lens_not_told(frames) if untold else too_few(0, frames, settings)
     model = without_jumps(models[0])
     # points of two frames hold the poses of those that overlap little, under the lens that the others determined
     further = replace(settings, intrinsics="fixed") if store.little_overlap else settings
@@ -276,7 +279,10 @@ def _map(
         more = mapping.replace_misplaced(store, more, further, progress)
         more = without_jumps(more)
         model = more if more.num_reg_images() >= model.num_reg_images() else model
-    calibrated = Calibrated(model, refined=determined) if long else refine(store, model, further, progress)
+    if long:
+        calibrated = Calibrated(model, refined=determined, distortion=determined)
+    else:
+        calibrated = refine(store, model, further, progress)
     if settings.mapping.align_keypoints:
         model = adjust_keypoints(store, calibrated.model, frames, threads, progress, lenses)
         calibrated = replace(calibrated, model=model)
@@ -289,7 +295,7 @@ def _map(
     model, refined = calibrated.model, calibrated.refined or determined
     assumed = not refined and settings.intrinsics != "fixed"
     warnings = [assumed_lens(model.cameras[1].focal_length_x / store.scale)] if assumed else []
-    return _Mapped(model, models[1:], refined, warnings)
+    return _Mapped(model, models[1:], refined, calibrated.distortion, warnings)
 
 
 def _models(
@@ -314,6 +320,7 @@ def _navigated(
     recorded: "Callable[[pycolmap.Reconstruction], Reconstruction]",
     progress: Progress,
 ) -> _Mapped:
+    is_open = mapped.lens_refined and not store.little_overlap
     found = with_navigation(
         store,
         mapped.model,
@@ -322,7 +329,8 @@ def _navigated(
         navigator,
         recorded,
         progress,
-        lens=mapped.lens_refined and not store.little_overlap,
+        focal=is_open,
+        distortion=is_open and mapped.distortion_refined,
     )
     return replace(mapped, model=found.model, others=found.others, warnings=[*mapped.warnings, *found.warnings])
 

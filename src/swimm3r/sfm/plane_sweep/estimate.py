@@ -79,7 +79,8 @@ def estimate_depth(
     first frame that failed.
     """
     folder = rec.depth.folder
-    _claim(folder, _stamp(rec, frames, settings))
+    stamp = _stamp(rec, frames, settings)
+    _claim(folder, stamp)
     passes = _Passes(rec, frames, settings)
     before: Step | None = None
     for step, wanted in passes.wanted().items():
@@ -93,7 +94,7 @@ def estimate_depth(
                 PartOfPass(f"{step} of frames {k + 1} to {k + len(group)}", step, group)
                 for k, group in zip(firsts, groups, strict=True)
             ]
-            work = partial(make_part, folder=folder.parent.resolve(), frames=frames, settings=settings)
+            work = partial(make_part, folder=folder.parent.resolve(), frames=frames, settings=settings, stamp=stamp)
             if failures := run_tasks(work, parts, engine, progress, step, logs=folder.parent.resolve() / "logs"):
                 raise failures[0].error
         if before is not None:
@@ -111,15 +112,18 @@ class PartOfPass:
     items: tuple[int, ...]
 
 
-def make_part(part: PartOfPass, *, folder: Path, frames: Frames, settings: PlaneSweepSettings) -> None:
-    """The task of some frames, with the reconstruction that a folder holds; finished ones are left as they are."""
-    passes = _passes_over(folder, frames, settings)
+def make_part(part: PartOfPass, *, folder: Path, frames: Frames, settings: PlaneSweepSettings, stamp: str) -> None:
+    """The task of some frames, with the reconstruction that a folder holds; finished ones are left as they are.
+
+    `stamp` tells it from those that the folder held before.
+    """
+    passes = _passes_over(folder, frames, settings, stamp)
     left = [k for k in part.items if not passes.is_done(part.step, k)]
     _each(passes.step(part.step), left, len(part.items), settings.threads, lambda done, total: None)
 
 
-@lru_cache(maxsize=1)  # several tasks in one process
-def _passes_over(folder: Path, frames: Frames, settings: PlaneSweepSettings) -> "_Passes":
+@lru_cache(maxsize=1)  # several tasks in one process, which may outlive the reconstruction
+def _passes_over(folder: Path, frames: Frames, settings: PlaneSweepSettings, stamp: str) -> "_Passes":
     return _Passes(load_reconstruction(folder, frames), frames, settings)
 
 

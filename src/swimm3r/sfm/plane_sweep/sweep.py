@@ -90,11 +90,11 @@ def sweep(
     backend = _backend(device)
     found = backend.coarse_depth(coarse, numbers)
     refined = backend.refined(fine, numbers, kernels.doubled(found), _rounds(settings.rounds, _ASIDE))
-    narrow = _judged(fine, refined, settings)
+    narrow = _judged(fine, refined, numbers.keep, settings)
     frontal = np.stack([found, np.zeros_like(found), np.zeros_like(found)], -1)
     averaged = replace(numbers, noise=numbers.noise / 4, edge=_FAINT_EDGE)
     refined = backend.refined(coarse, averaged, frontal, _rounds(_WIDE_ROUNDS, _WIDE_ASIDE))
-    wide = _judged(coarse, refined, settings)
+    wide = _judged(coarse, refined, numbers.keep, settings)
     added = ~narrow.sure & _at_full_size(_smooth(wide, narrow)) & (_texture(reference) < _FAINT * settings.noise)
     full_size = interpolate(torch.from_numpy(wide.q)[None, None], added.shape, mode="bilinear")[0, 0].numpy()
     q = np.where(added, full_size, np.where(narrow.sure, narrow.q, 0))
@@ -102,11 +102,17 @@ def sweep(
     return RawDepth(torch.from_numpy(q), torch.from_numpy(correlation))
 
 
-def _judged(level: Level, refined: tuple[np.ndarray, np.ndarray, np.ndarray], settings: PlaneSweepSettings) -> _Judged:
-    """Refined surfaces, and where the images determine them: well correlated, and worse where they are moved."""
+def _judged(
+    level: Level, refined: tuple[np.ndarray, np.ndarray, np.ndarray], keep: int, settings: PlaneSweepSettings
+) -> _Judged:
+    """Refined surfaces, and where the images determine them: well correlated, and worse where they are moved.
+
+    `keep` sources counted in the refinement.
+    """
     surface, cost, peak = refined
     q = np.ascontiguousarray(surface[..., 0])
-    alone = _sighting(level, q) == 1  # the sweep has counted a second source, which does not see the pixel, as no match
+    # where two or more count, the sweep has counted a second source, which does not see the pixel, as no match
+    alone = (keep > 1) & (_sighting(level, q) == 1)
     cost, peak = np.where(alone, 2 * cost - 1, cost).clip(0), np.where(alone, 2 * peak, peak)
     cost, peak = _with_neighbors(cost), _with_neighbors(peak)
     sure = (1 - cost >= settings.min_ncc) & (peak >= settings.min_peak * (cost + 0.03)) & (q > 0)

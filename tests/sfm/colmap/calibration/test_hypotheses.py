@@ -1,5 +1,6 @@
 """The family of a clip's lens, from exact observations of known lenses with noise, and from halves of the frames."""
 
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -7,6 +8,7 @@ import pycolmap
 import pytest
 
 from swimm3r.progress import silent
+from swimm3r.sfm.colmap.calibration import refinement
 from swimm3r.sfm.colmap.calibration.hypotheses import (
     Kept,
     LensFamily,
@@ -16,12 +18,13 @@ from swimm3r.sfm.colmap.calibration.hypotheses import (
     likeliest,
     squeezed_like,
 )
-from swimm3r.sfm.colmap.calibration.refinement import adjust_lens, refine
+from swimm3r.sfm.colmap.calibration.refinement import adjust_lens, refine, refine_again
 from swimm3r.sfm.features.database import FeatureDatabase
 from swimm3r.sfm.settings import ColmapSettings
 
 SIZE = 640, 480
-K2 = 5  # of OPENCV's parameters
+K1 = 3  # of SIMPLE_RADIAL's parameters
+K2 = 5  # of OPENCV's
 SQUARE, FREE = LensFamily("SIMPLE_RADIAL"), LensFamily("OPENCV")
 LENSES = {
     SQUARE: ("SIMPLE_RADIAL", [500.0, 320.0, 240.0, 0.06]),
@@ -76,6 +79,23 @@ def test_a_squeezed_lens_stays_squeezed_in_every_further_adjustment(tmp_path: Pa
     ):
         assert family_of(again.cameras[1]) == family
         np.testing.assert_allclose(again.cameras[1].params, once.cameras[1].params, rtol=3e-3, atol=3e-3)
+
+
+def test_a_distortion_that_gives_no_lens_is_held_in_every_further_adjustment(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+):
+    store, model = seen_through(SQUARE, tmp_path)
+    assumed = 0.03
+    model.cameras[1].params = [*model.cameras[1].params[:K1], assumed]
+    with monkeypatch.context() as no_distortion:
+        no_distortion.setattr(refinement, "is_lens", lambda camera: bool(camera.params[K1] == assumed))
+        once = refine(store, model, ColmapSettings(), silent)
+    assert (once.refined, once.distortion) == (True, False)
+    again = refine_again(store, once, silent)
+    assert again.model.cameras[1].params[K1] == assumed
+    assert (again.refined, again.distortion) == (True, False)
+    free = refine_again(store, replace(once, distortion=True), silent)
+    assert free.model.cameras[1].params[K1] > 0.04  # toward 0.06, its own
 
 
 def test_an_adjustment_in_stretched_pixels_leaves_the_observations_and_the_database_as_they_were(tmp_path: Path):

@@ -38,6 +38,7 @@ _SAME = 1e-6
 
 log = logging.getLogger(__name__)
 
+ModelAdjustment = Callable[["pycolmap.Reconstruction"], "pycolmap.Reconstruction"]
 Adjustment = Callable[[FeatureDatabase, "pycolmap.Reconstruction"], "pycolmap.Reconstruction"]
 
 
@@ -111,13 +112,32 @@ def held_out_errors(judged: "Sequence[Sequence[Kept]]") -> list[float]:
 def fitted(
     store: FeatureDatabase, model: "pycolmap.Reconstruction", family: LensFamily, adjust: Adjustment
 ) -> "pycolmap.Reconstruction":
-    """A model after an adjustment that sees pixels of the family's shape; its lens is of pixels as filmed."""
+    """`within_family` of an adjustment that also reads the database, whose keypoints are in the same pixels."""
     if family.shape == 1:
         return adjust(store, model)
-    with _stretched(store, model, family) as (own_store, own_model):
-        found = adjust(own_store, own_model)
-    out = _in_other_rows(found, model, 1.0)
-    f, cx, cy, k = found.cameras[1].params  # of SIMPLE_RADIAL
+
+    def adjust_stretched(stretched: "pycolmap.Reconstruction") -> "pycolmap.Reconstruction":
+        with _stretched(store, stretched.cameras[1], family) as own_store:
+            return adjust(own_store, stretched)
+
+    return within_family(model, family, adjust_stretched)
+
+
+def within_family(
+    model: "pycolmap.Reconstruction", family: LensFamily, adjust: ModelAdjustment
+) -> "pycolmap.Reconstruction":
+    """A model after an adjustment that sees pixels of the family's shape; its lens is of pixels as filmed."""
+    if family.shape == 1:
+        return adjust(model)
+    lens = under_model(model.cameras[1], "OPENCV")
+    fx, fy, cx, cy, k = lens.params[:5]
+    tall = 1 / family.shape
+    stretched = _in_other_rows(model, model, tall)
+    focal = float(np.sqrt(fx * fy * tall))
+    _set_lens(stretched, family.model, [focal, cx, cy * tall, k], round(lens.height * tall))
+    stretched.update_point_3d_errors()
+    out = _in_other_rows(adjust(stretched), model, 1.0)
+    f, cx, cy, k = out.cameras[1].params  # of SIMPLE_RADIAL
     _set_lens(out, "OPENCV", [f, f * family.shape, cx, cy * family.shape, k, 0, 0, 0], model.cameras[1].height)
     out.update_point_3d_errors()
     return out
@@ -183,27 +203,18 @@ def _set_lens(model: "pycolmap.Reconstruction", name: str, params: Sequence[floa
 
 
 @contextmanager
-def _stretched(
-    store: FeatureDatabase, model: "pycolmap.Reconstruction", family: LensFamily
-) -> "Iterator[tuple[FeatureDatabase, pycolmap.Reconstruction]]":
-    """Copies of database and model in which a pixel of the family's shape is a square."""
-    lens = under_model(model.cameras[1], "OPENCV")
-    fx, fy, cx, cy, k = lens.params[:5]
-    tall = 1 / family.shape
-    out = _in_other_rows(model, model, tall)
-    focal = float(np.sqrt(fx * fy * tall))
-    _set_lens(out, family.model, [focal, cx, cy * tall, k], round(lens.height * tall))
-    out.update_point_3d_errors()
+def _stretched(store: FeatureDatabase, camera: "pycolmap.Camera", family: LensFamily) -> Iterator[FeatureDatabase]:
+    """A copy of the database in which a pixel of the family's shape is a square, and the lens that of a camera."""
     with tempfile.TemporaryDirectory(dir=store.path.parent, prefix=".mapping.") as folder:
         own = replace(store, path=Path(folder) / "database.db")
         shutil.copyfile(store.path, own.path)
         with own.open() as database:
-            database.update_camera(out.cameras[1])
+            database.update_camera(camera)
             for i in range(1, own.frames + 1):
                 keypoints = database.read_keypoints(i)
-                keypoints[:, 1] *= tall
+                keypoints[:, 1] *= 1 / family.shape
                 database.update_keypoints(i, keypoints)
-        yield own, out
+        yield own
 
 
 def _in_other_rows(

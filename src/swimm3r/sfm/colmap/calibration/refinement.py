@@ -4,13 +4,21 @@ A lens with more parameters always fits its own frames better. Where OPENCV's ex
 asks which lens also holds on frames that it was not fitted to.
 """
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import TYPE_CHECKING
 
 from swimm3r.progress import Progress
 from swimm3r.sfm.colmap.adjustment import typical_error
 from swimm3r.sfm.colmap.calibration.adjust import adjusted, settled
-from swimm3r.sfm.colmap.calibration.hypotheses import LensFamily, family_of, fitted, likeliest, squeezed_like
+from swimm3r.sfm.colmap.calibration.hypotheses import (
+    LensFamily,
+    ModelAdjustment,
+    family_of,
+    fitted,
+    likeliest,
+    squeezed_like,
+    within_family,
+)
 from swimm3r.sfm.colmap.calibration.start import is_lens, set_camera
 from swimm3r.sfm.features.database import FeatureDatabase
 from swimm3r.sfm.settings import ColmapSettings
@@ -27,6 +35,7 @@ class Calibrated:
 
     model: "pycolmap.Reconstruction"
     refined: bool  # intrinsics as refined; False where refinement gave no lens and the assumed ones stand
+    distortion: bool  # refined, too; False where the assumed one stands, as refinement with it gave no lens
 
 
 def adjust_lens(
@@ -68,7 +77,7 @@ def refine(
     """The model after bundle adjustment of everything, its lens included unless the user holds it fixed."""
     own = family_of(model.cameras[1])
     if settings.intrinsics == "fixed":
-        return Calibrated(_poses_alone(store, model), refined=False)
+        return Calibrated(_poses_alone(store, model), refined=False, distortion=False)
     progress(_STEP, 0, 3)
     kept = _refined(store, model, own)
     family = own
@@ -81,28 +90,35 @@ def refine(
         kept = _refined(store, model, family, distortion=False)
     progress(_STEP, 3, 3)
     if kept is None:
-        return Calibrated(_poses_alone(store, model), refined=False)
+        return Calibrated(_poses_alone(store, model), refined=False, distortion=False)
     sharp = _sharpened(store, kept, family, distortion=distortion)
     kept = sharp if _is_sound(sharp, kept) else kept
     set_camera(store, kept.cameras[1])
-    return Calibrated(kept, refined=True)
+    return Calibrated(kept, refined=True, distortion=distortion)
 
 
 def refine_again(store: FeatureDatabase, calibrated: Calibrated, progress: Progress) -> Calibrated:
-    """A refined model whose observations were moved after another adjustment, its kind of lens as it is."""
+    """A refined model whose observations were moved after another adjustment of what was refined of its lens."""
     model = calibrated.model
     if not calibrated.refined:
-        return Calibrated(_poses_alone(store, model), refined=False)
+        return Calibrated(_poses_alone(store, model), refined=False, distortion=False)
     progress(_STEP, 0, 1)
     family = family_of(model.cameras[1])
-    distortion = any(model.cameras[1].params[i] for i in model.cameras[1].extra_params_idxs())
     kept = model
     for _ in range(2):  # errors are smaller after the first, and the loss of the second is as wide as they are
-        found = _sharpened(store, kept, family, distortion=distortion)
+        found = _sharpened(store, kept, family, distortion=calibrated.distortion)
         kept = found if _is_sound(found, kept) else kept
     progress(_STEP, 1, 1)
     set_camera(store, kept.cameras[1])
-    return Calibrated(kept, refined=True)
+    return replace(calibrated, model=kept)
+
+
+def adjust_within_family(
+    model: "pycolmap.Reconstruction", free: ModelAdjustment, held: ModelAdjustment
+) -> "pycolmap.Reconstruction":
+    """A model after an adjustment with its lens `free` within its family; where that gives no lens, with it `held`."""
+    found = within_family(model, family_of(model.cameras[1]), free)
+    return found if is_lens(found.cameras[1]) else held(model)
 
 
 def _with_more_parameters(

@@ -20,6 +20,7 @@ finds.
 import logging
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
+from functools import partial
 
 import numpy as np
 import torch
@@ -27,11 +28,10 @@ from jaxtyping import Float
 from scipy.spatial.transform import Rotation
 
 from swimm3r.cameras import Cameras, project, rows_of_frames
-from swimm3r.io.colmap.cameras import to_pycolmap_camera
 from swimm3r.progress import Progress, silent
 from swimm3r.scene.reconstruction import QualityWarning, Reconstruction
-from swimm3r.sfm.colmap.adjustment import bundle_adjust
-from swimm3r.sfm.colmap.calibration.hypotheses import family_of
+from swimm3r.sfm.colmap.adjustment import adjust_model, with_adjusted_model
+from swimm3r.sfm.colmap.calibration.refinement import adjust_within_family
 
 _LONGEST = 0.5  # intervals between frames; video cameras have 5 to 35 ms
 _GAP = 3.0  # median intervals between frames beyond which the path does not go on
@@ -197,41 +197,15 @@ def _typical_error(rec: Reconstruction) -> float:
 
 
 def _adjusted(rec: Reconstruction, times: Sequence[float], T: float, *, lens: bool) -> Reconstruction:
+    with_lens = partial(adjust_within_family, free=partial(adjust_model, lens=True), held=adjust_model)
+    adjust = with_lens if lens else adjust_model
     for _ in range(_AGAIN):
         shift = torch.nan_to_num(T * _shift_per_second(rec, times), nan=0.0)
         tracks = replace(rec.tracks, xy=(rec.tracks.xy.double() - shift).to(rec.tracks.xy))
-        moved = _bundle_adjusted(replace(rec, tracks=tracks), lens=lens)
+        moved = with_adjusted_model(replace(rec, tracks=tracks), adjust)
         points = replace(rec.points, xyz=moved.points.xyz, error=moved.points.error)
         rec = replace(rec, cameras=moved.cameras, points=points)
     return rec
-
-
-def _bundle_adjusted(rec: Reconstruction, *, lens: bool) -> Reconstruction:
-    """`bundle_adjust`, in which a squeezed lens stays squeezed."""
-    family = family_of(to_pycolmap_camera(rec.cameras))
-    if family.shape == 1:
-        return bundle_adjust(rec, lens=lens)
-    model, height = rec.cameras.model, rec.cameras.height
-    rows = torch.tensor([1.0, 1 / family.shape], dtype=torch.float64)
-    K = rec.cameras.K * torch.tensor([1, 1 / family.shape, 1], dtype=rec.cameras.K.dtype)[:, None]
-    K[:, 1, 1] = K[:, 0, 0]  # exactly
-    square = replace(
-        rec,
-        cameras=replace(
-            rec.cameras,
-            K=K,
-            distortion=rec.cameras.distortion[:, :1],
-            height=round(height / family.shape),
-            model=family.model,
-        ),
-        tracks=replace(rec.tracks, xy=(rec.tracks.xy.double() * rows).to(rec.tracks.xy)),
-    )
-    moved = bundle_adjust(square, lens=lens)
-    K = moved.cameras.K * torch.tensor([1, family.shape, 1], dtype=moved.cameras.K.dtype)[:, None]
-    distortion = torch.nn.functional.pad(moved.cameras.distortion, (0, rec.cameras.distortion.shape[1] - 1))
-    return replace(
-        moved, cameras=replace(moved.cameras, K=K, distortion=distortion, height=height, model=model), tracks=rec.tracks
-    )
 
 
 def _shift_per_second(rec: Reconstruction, times: Sequence[float]) -> Float[torch.Tensor, "t 2"]:
