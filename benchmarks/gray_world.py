@@ -19,8 +19,8 @@ from swimm3r.export.splats import open_map
 from swimm3r.imaging.undistortion import undistorted
 from swimm3r.io import images
 from swimm3r.pipeline.renders import display_style, shown_clear
-from swimm3r.prepare import load_frames
 from swimm3r.scene.reconstruction_io import load_reconstruction
+from swimm3r.sfm.rectified.run import run_frames
 from swimm3r.splat.training_poses import as_mapped
 
 _COVERED = 0.95  # alpha of a pixel that counts
@@ -30,7 +30,7 @@ _NEAR = 0.01  # of the map's working unit
 def gray_world(run: Path) -> dict[str, torch.Tensor]:
     """Ratios to the restored frames, R, G, B."""
     found = open_map(run, SplatPlySettings())
-    rec = load_reconstruction(run / "sfm", load_frames(run / "prepare"))
+    rec = load_reconstruction(run / "sfm", run_frames(run))
     assert rec.cloud is not None
     mapped, style = as_mapped(rec, found.scene.poses), display_style(found.scene, rec)
     of_frames, covered, splat, views = [], [], [], []

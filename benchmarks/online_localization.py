@@ -30,10 +30,10 @@ from swimm3r.localization.online.landmark_map import LandmarkMap
 from swimm3r.localization.online.tracker import Tracker
 from swimm3r.localization.settings import LocalizationSettings
 from swimm3r.pipeline.presets import from_yaml
-from swimm3r.prepare import load_frames
 from swimm3r.scene.ground_truth import FOLDER, read_ground_truth
 from swimm3r.scene.reconstruction_io import load_reconstruction
 from swimm3r.settings_document import from_document
+from swimm3r.sfm.rectified.run import run_frames
 from swimm3r.splat.map_file import load_map
 from swimm3r.synthetic import make_dive
 from swimm3r.synthetic.dive import Dive
@@ -136,7 +136,7 @@ def tracked(landmarks: LandmarkMap) -> Callable[[Tensor, float], Found]:
 
 def one_by_one(run: Path) -> Callable[[Tensor, float], Found]:
     """Placing by the protocol of single images."""
-    frames = load_frames(run / "prepare")
+    frames = run_frames(run)
     rec = load_reconstruction(run / "sfm", frames)
     localizer = Localizer(
         load_map(run / "splat" / "map.safetensors"), rec, frames, LocalizationSettings(matcher="sift")

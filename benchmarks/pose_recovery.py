@@ -21,10 +21,10 @@ from swimm3r.evaluate.poses import absolute_pose_errors
 from swimm3r.geometry import pose_from, so3_exp
 from swimm3r.pipeline.presets import PRESETS
 from swimm3r.pipeline.scores import held_out
-from swimm3r.prepare import load_frames
 from swimm3r.scene.ground_truth import FOLDER, GroundTruth, read_ground_truth
 from swimm3r.scene.reconstruction import Reconstruction
 from swimm3r.scene.reconstruction_io import load_reconstruction
+from swimm3r.sfm.rectified.run import run_frames
 from swimm3r.splat import train
 from swimm3r.splat.settings import PoseRefinementSettings, TrainingPoseSettings, UwbsSettings
 from swimm3r.splat.training_poses import as_mapped, spread_of
@@ -71,7 +71,7 @@ def main() -> None:
     for run in a.runs:
         source = json.loads((run / "summary.json").read_text())["input"]["path"]
         truth = read_ground_truth(Path(source) / FOLDER)
-        rec, frames = load_reconstruction(run / "sfm"), load_frames(run / "prepare")
+        rec, frames = load_reconstruction(run / "sfm"), run_frames(run)
         for degrees in a.degrees:
             bent = disturbed(rec, degrees, a.share if degrees else 0.0)
             for rate in [0.0, *a.rates]:
