@@ -110,6 +110,30 @@ def test_an_interrupted_run_leaves_a_database_that_a_later_one_completes(
     assert sorted(path.name for path in tmp_path.iterdir()) == ["database.db", "database.json"]
 
 
+def test_the_journal_of_a_killed_run_is_not_replayed(rec, frames: Frames, folder: Path, tmp_path: Path) -> None:
+    shutil.copytree(folder, tmp_path / "sfm")
+    killed = feature_database.FeatureDatabase(tmp_path / "killed" / "mapping.db", COUNT)
+    killed.path.parent.mkdir()
+    shutil.copyfile(folder / "database.db", killed.path)
+    with killed.open() as database:
+        database.update_keypoints(1, np.full_like(database.read_keypoints(1), 7))
+        for left in killed.path.parent.iterdir():  # as long as it is open, the change is in the journal alone
+            shutil.copyfile(left, tmp_path / "sfm" / left.name)
+    assert (tmp_path / "sfm" / "mapping.db-wal").stat().st_size > 0
+
+    def progress(what: str, _done: int, _total: int, /) -> None:
+        if what == "placing frames":
+            with replace(killed, path=tmp_path / "sfm" / "mapping.db").open() as database:
+                used.append(database.read_keypoints(1))
+            raise KeyboardInterrupt
+
+    used: list[np.ndarray] = []
+    with pytest.raises(KeyboardInterrupt):
+        colmap.reconstruct(frames, SETTINGS, tmp_path / "sfm", progress)
+    assert np.ptp(used[0][:, 0]) > 0.5 * WIDTH
+    assert sorted(path.name for path in (tmp_path / "sfm").iterdir()) == ["database.db", "database.json"]
+
+
 def test_other_settings_start_a_new_database(frames: Frames, tmp_path: Path) -> None:
     camera = first_camera(WIDTH, HEIGHT, SETTINGS)
     store = feature_database.start_database(tmp_path, frames, camera, SETTINGS.features)
@@ -216,12 +240,23 @@ def test_settings_that_contradict_themselves_are_usage_errors(settings: ColmapSe
         first_camera(WIDTH, HEIGHT, settings)
 
 
-def test_a_full_disk_is_a_storage_error(frames: Frames, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    def full(*_: object) -> None:
-        raise RuntimeError("[sqlite3_utils.h:50] SQLite error: database or disk is full")
+@pytest.mark.parametrize(
+    ("message", "error"),
+    [
+        ("database or disk is full", StorageError),
+        ("disk I/O error", StorageError),
+        ("attempt to write a readonly database", StorageError),
+        ("database disk image is malformed", RuntimeError),
+    ],
+)
+def test_a_disk_that_cannot_be_written_is_a_storage_error_and_damage_is_not(
+    message: str, error: type[Exception], frames: Frames, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    def failing(*_: object) -> None:
+        raise RuntimeError(f"[sqlite3_utils.h:50] SQLite error: {message}")
 
-    monkeypatch.setattr(colmap, "fill_features", full)
-    with pytest.raises(StorageError):
+    monkeypatch.setattr(colmap, "fill_features", failing)
+    with pytest.raises(error, match=message):
         colmap.reconstruct(frames, SETTINGS, tmp_path)
 
 

@@ -49,7 +49,14 @@ from swimm3r.sfm.colmap.record import PARTS, record_of, write_parts
 from swimm3r.sfm.colmap.rig.lenses import RigLenses, lenses_of_rig
 from swimm3r.sfm.colmap.shutter.readout import adjust_rolling
 from swimm3r.sfm.colmap.shutter.turning import turned_rows
-from swimm3r.sfm.features.database import FeatureDatabase, fill_features, match_pairs, start_database, with_overlap
+from swimm3r.sfm.features.database import (
+    FeatureDatabase,
+    fill_features,
+    match_pairs,
+    remove_database,
+    start_database,
+    with_overlap,
+)
 from swimm3r.sfm.lens import at_scale, behind_port, gives_lens, with_calibration
 from swimm3r.sfm.rectified.frames import BentImagesError, TurnedRowsError
 from swimm3r.sfm.settings import ColmapSettings
@@ -60,6 +67,8 @@ if TYPE_CHECKING:
     import pycolmap
 
 log = logging.getLogger(__name__)
+
+_NOT_WRITABLE = ("disk is full", "disk I/O", "readonly")  # in SQLite's messages; a malformed "disk image" is damage
 
 
 @dataclass(frozen=True)
@@ -223,12 +232,13 @@ def _working_copy(store: FeatureDatabase) -> Iterator[FeatureDatabase]:
     for leftover in store.path.parent.glob(".mapping.*"):  # of a killed run
         shutil.rmtree(leftover)
     working = replace(store, path=store.path.with_name("mapping.db"))
+    remove_database(working.path)
     try:
         with atomic_path(working.path) as draft:
             shutil.copyfile(store.path, draft)
         yield working
     finally:
-        working.path.unlink(missing_ok=True)
+        remove_database(working.path)
 
 
 @contextmanager
@@ -236,7 +246,7 @@ def _full_disk_said_plainly(folder: Path) -> Iterator[None]:
     try:
         yield
     except RuntimeError as error:  # what pycolmap makes of SQLite's complaint
-        if "disk" not in str(error):
+        if not any(words in str(error) for words in _NOT_WRITABLE):
             raise
         raise StorageError(
             f"the database in {folder} could not be written ({str(error).splitlines()[-1][:200]})",

@@ -105,12 +105,20 @@ def start_database(
         log.warning("%s is damaged: features and matches are found again", path)
     folder.mkdir(parents=True, exist_ok=True)
     about.unlink(missing_ok=True)
-    for leftover in folder.glob("database.db*"):
-        leftover.unlink()
+    remove_database(path)
     with out.open() as database:
         _write_frames(database, cameras, range(len(frames)))
     write_text(about, described)
     return out
+
+
+def remove_database(path: Path) -> None:
+    """Remove a database, if there is one, with the journal that a killed process may have left beside it.
+
+    SQLite would replay the journal into the next database of that name.
+    """
+    for file in path.parent.glob(f"{path.name}*"):
+        file.unlink()
 
 
 def _described(camera: "pycolmap.Camera") -> dict[str, object]:
