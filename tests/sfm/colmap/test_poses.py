@@ -23,11 +23,13 @@ from tests.sfm.colmap.two_planes import (
 from swimm3r.cameras import project
 from swimm3r.errors import InputError, RegistrationError, StorageError, UsageError
 from swimm3r.geometry import align_similarity
+from swimm3r.io.colmap.model import read_model
 from swimm3r.prepare import read_frames
 from swimm3r.scene.frames import Frame, Frames
 from swimm3r.scene.reconstruction import Reconstruction
 from swimm3r.sfm.colmap import poses as colmap
 from swimm3r.sfm.colmap.calibration.start import first_camera
+from swimm3r.sfm.colmap.chunks import parts
 from swimm3r.sfm.colmap.messages import too_few
 from swimm3r.sfm.colmap.pairs import choose_pairs
 from swimm3r.sfm.colmap.settings import MappingSettings
@@ -198,6 +200,25 @@ def test_frames_of_another_place_are_left_out_and_said(frames: Frames, tmp_path:
     found = colmap.reconstruct(replace(frames, frames=(*frames.frames, stranger)), SETTINGS, tmp_path / "sfm")
     assert found.names == frames.names
     assert any("1 of 9 frames could not be placed" in warning.what for warning in found.warnings)
+
+
+def test_what_is_cut_off_a_model_whose_scale_jumps_is_a_part(
+    rec: Reconstruction, frames: Frames, folder: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Placed again beside the rest with looser limits, its frames are cut off again, and are one part all the same."""
+
+    def cut(part: parts.Part) -> list[parts.Part]:
+        pieces = part.images[:3], part.images[3:]
+        return [replace(part, cam_from_world={i: part.cam_from_world[i] for i in piece}) for piece in pieces]
+
+    monkeypatch.setattr(parts, "coherent_parts", cut)
+    shutil.copytree(folder, tmp_path / "sfm")
+    settings = replace(SETTINGS, mapping=MappingSettings(method="incremental", align_keypoints=False))
+    found = colmap.reconstruct(frames, settings, tmp_path / "sfm")
+    assert found.names == frames.names[3:]
+    assert any(f"({COUNT - 3} + 3 of {COUNT})" in warning.what for warning in found.warnings)
+    assert read_model(tmp_path / "sfm" / colmap.PARTS / "1").names == frames.names[:3]
+    assert not (tmp_path / "sfm" / colmap.PARTS / "2").exists()
 
 
 @pytest.mark.parametrize("image", ["black", "unrelated"])

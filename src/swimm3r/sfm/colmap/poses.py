@@ -32,7 +32,7 @@ from swimm3r.sfm.colmap.calibration.polynomial import bent_lens
 from swimm3r.sfm.colmap.calibration.refinement import Calibrated, adjust_lens, adjust_poses, refine, refine_again
 from swimm3r.sfm.colmap.calibration.start import first_camera
 from swimm3r.sfm.colmap.chunks.long_clip import is_long, map_long_clip
-from swimm3r.sfm.colmap.chunks.parts import without_jumps
+from swimm3r.sfm.colmap.chunks.parts import coherent_models
 from swimm3r.sfm.colmap.keypoint_adjustment import adjust_keypoints
 from swimm3r.sfm.colmap.messages import (
     LOST_SCALE,
@@ -76,7 +76,7 @@ class _Mapped:
     """The model that is used, those that did not join it, and warnings."""
 
     model: "pycolmap.Reconstruction"
-    others: "list[pycolmap.Reconstruction]"
+    others: "list[pycolmap.Reconstruction]"  # some of their frames may be in larger ones, too
     lens_refined: bool  # from the images; else assumed, or held for the user
     warnings: list[QualityWarning]
 
@@ -272,7 +272,7 @@ def _map(
     models, determined = _models(store, frames, settings, progress, engine)
     if not models:
         raise too_few(0, frames, settings)
-    model = without_jumps(models[0])
+    model, *cut_off = coherent_models(models[0])
     # points of two frames hold the poses of those that overlap little, under the lens that the others determined
     further = replace(settings, intrinsics="fixed") if store.little_overlap else settings
     if model.num_reg_images() < n:
@@ -284,8 +284,9 @@ def _map(
             model = refine(store, model, further, progress).model  # a better lens places more
         more = mapping.place_leftovers(store, model, further, progress)
         more = mapping.replace_misplaced(store, more, further, progress)
-        more = without_jumps(more)
-        model = more if more.num_reg_images() >= model.num_reg_images() else model
+        more, *again_cut_off = coherent_models(more)
+        if more.num_reg_images() >= model.num_reg_images():
+            model, cut_off = more, [*cut_off, *again_cut_off]
     calibrated = Calibrated(model, refined=determined) if long else refine(store, model, further, progress)
     if settings.mapping.align_keypoints:
         model = adjust_keypoints(store, calibrated.model, frames, threads, progress, lenses)
@@ -299,7 +300,7 @@ def _map(
     model, refined = calibrated.model, calibrated.refined or determined
     assumed = not refined and settings.intrinsics != "fixed"
     warnings = [assumed_lens(model.cameras[1].focal_length_x / store.scale)] if assumed else []
-    return _Mapped(model, models[1:], refined, warnings)
+    return _Mapped(model, [*models[1:], *cut_off], refined, warnings)
 
 
 def _models(
