@@ -13,7 +13,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 from swimm3r.cameras import Cameras, resized
-from swimm3r.errors import InputError, StorageError, UsageError
+from swimm3r.errors import InputError, UsageError
 from swimm3r.imaging.rectification import rectification_of
 from swimm3r.io.colmap.cameras import to_pycolmap_camera
 from swimm3r.io.colmap.model import silence_log
@@ -52,6 +52,7 @@ from swimm3r.sfm.colmap.shutter.turning import turned_rows
 from swimm3r.sfm.features.database import (
     FeatureDatabase,
     fill_features,
+    full_disk_said_plainly,
     match_pairs,
     remove_database,
     start_database,
@@ -67,8 +68,6 @@ if TYPE_CHECKING:
     import pycolmap
 
 log = logging.getLogger(__name__)
-
-_NOT_WRITABLE = ("disk is full", "disk I/O", "readonly")  # in SQLite's messages; a malformed "disk image" is damage
 
 
 @dataclass(frozen=True)
@@ -115,7 +114,7 @@ def reconstruct(
     _check_input(frames, settings, navigator)
     silence_log()
     known, threads = _known(frames, settings, lens), settings.threads or thread_count()
-    with _full_disk_said_plainly(folder):
+    with full_disk_said_plainly(folder):
         numbers, shared = ((), None) if known.lenses is None else (known.lenses.numbers, known.lenses.under_first)
         store = start_database(folder, frames, known.camera, settings.features, numbers)
         fill_features(store, frames, settings.features, threads, progress, shared)
@@ -239,20 +238,6 @@ def _working_copy(store: FeatureDatabase) -> Iterator[FeatureDatabase]:
         yield working
     finally:
         remove_database(working.path)
-
-
-@contextmanager
-def _full_disk_said_plainly(folder: Path) -> Iterator[None]:
-    try:
-        yield
-    except RuntimeError as error:  # what pycolmap makes of SQLite's complaint
-        if not any(words in str(error) for words in _NOT_WRITABLE):
-            raise
-        raise StorageError(
-            f"the database in {folder} could not be written ({str(error).splitlines()[-1][:200]})",
-            cause="the disk is full or read-only",
-            hint="free some space, or choose another --out, and run the same command again: it goes on from here",
-        ) from error
 
 
 def _map(

@@ -27,6 +27,7 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
+from swimm3r.errors import StorageError
 from swimm3r.io.files.atomic import write_text
 from swimm3r.progress import Progress, silent
 from swimm3r.scene.frames import Frames
@@ -43,6 +44,7 @@ _HINT_OF_OVERLAP = 8  # matches
 _SEEN_TWICE = 0.5  # of the matched features; 0.12 to 0.35 of most clips' and 0.60 to 0.73 of an AUV's stills' match so
 _BATCH = 32  # frames or pairs worked on together: what a killed run loses
 _HELD = 64  # frames in memory while matching: 0.1 GB
+_NOT_WRITABLE = ("disk is full", "disk I/O", "readonly")  # in SQLite's messages; a malformed "disk image" is damage
 
 
 @dataclass(frozen=True)
@@ -110,6 +112,21 @@ def start_database(
         _write_frames(database, cameras, range(len(frames)))
     write_text(about, described)
     return out
+
+
+@contextmanager
+def full_disk_said_plainly(folder: Path) -> Iterator[None]:
+    """Raise StorageError where a database in `folder` cannot be written."""
+    try:
+        yield
+    except RuntimeError as error:  # what pycolmap makes of SQLite's complaint
+        if not any(words in str(error) for words in _NOT_WRITABLE):
+            raise
+        raise StorageError(
+            f"the database in {folder} could not be written ({str(error).splitlines()[-1][:200]})",
+            cause="the disk is full or read-only",
+            hint="free some space, or choose another --out, and run the same command again: it goes on from here",
+        ) from error
 
 
 def remove_database(path: Path) -> None:
