@@ -243,6 +243,15 @@ def test_a_given_focal_length_of_no_lens_is_named_where_frames_cannot_be_placed(
     assert ("--fps" in error.hint) != doubted
 
 
+def test_a_given_focal_length_is_judged_in_pixels_of_the_frames(tmp_path: Path) -> None:
+    cv2.imwrite(str(tmp_path / "black.png"), np.zeros((HEIGHT, WIDTH), np.uint8))
+    black = tuple(Frame(f"{i}.png", tmp_path / "black.png", float(i), 0.0, "train") for i in range(2))
+    settings = replace(SETTINGS, focal=0.5 * WIDTH, features=replace(SETTINGS.features, long_side=WIDTH // 2))
+    with pytest.raises(RegistrationError, match="only 0 of 2") as caught:
+        colmap.reconstruct(Frames(black, WIDTH, HEIGHT, True), settings, tmp_path / "sfm")
+    assert "focal length" not in caught.value.cause
+
+
 def test_one_frame_is_an_input_error(frames: Frames, tmp_path: Path) -> None:
     with pytest.raises(InputError, match="at least 2"):
         colmap.reconstruct(frames.select([0]), SETTINGS, tmp_path)

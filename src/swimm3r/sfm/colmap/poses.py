@@ -125,8 +125,7 @@ def reconstruct(
             def recorded(model: "pycolmap.Reconstruction") -> Reconstruction:
                 return record_of(model, working, frames, folder, known.lenses)
 
-            scaled = at_scale(known.settings, frames.width, frames.height, store.scale)
-            mapped = _map(working, frames, pairs, scaled, progress, engine, known.lenses)
+            mapped = _map(working, frames, pairs, known, progress, engine)
             if not frames.rows_rectified:
                 _check_rectifiable(mapped, known, frames, recorded, progress)
             if navigator is not None:
@@ -244,19 +243,19 @@ def _map(
     store: FeatureDatabase,
     frames: Frames,
     pairs: list[tuple[int, int]],
-    settings: ColmapSettings,
+    known: _Known,
     progress: Progress,
     engine: EngineSettings,
-    lenses: RigLenses | None,
 ) -> _Mapped:
     """The largest model, its keypoints aligned and its lens refined.
 
     Raises RegistrationError where no two frames can be placed.
     """
+    settings = at_scale(known.settings, frames.width, frames.height, store.scale)
     n, threads, long = len(frames), settings.threads or thread_count(), is_long(len(frames), settings.mapping)
     models, determined = _models(store, frames, settings, progress, engine)
     if not models:
-        raise too_few(0, frames, settings)
+        raise too_few(0, frames, known.settings)
     model, *cut_off = coherent_models(models[0])
     # points of two frames hold the poses of those that overlap little, under the lens that the others determined
     further = replace(settings, intrinsics="fixed") if store.little_overlap else settings
@@ -274,7 +273,7 @@ def _map(
             model, cut_off = more, [*cut_off, *again_cut_off]
     calibrated = Calibrated(model, refined=determined) if long else refine(store, model, further, progress)
     if settings.mapping.align_keypoints:
-        model = adjust_keypoints(store, calibrated.model, frames, threads, progress, lenses)
+        model = adjust_keypoints(store, calibrated.model, frames, threads, progress, known.lenses)
         calibrated = replace(calibrated, model=model)
         if not long:
             calibrated = refine_again(store, calibrated, progress)
