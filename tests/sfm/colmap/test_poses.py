@@ -31,7 +31,7 @@ from swimm3r.sfm.colmap import poses as colmap
 from swimm3r.sfm.colmap.calibration.start import first_camera
 from swimm3r.sfm.colmap.chunks import parts
 from swimm3r.sfm.colmap.messages import too_few
-from swimm3r.sfm.colmap.pairs import choose_pairs
+from swimm3r.sfm.colmap.pairs import check_pairs, choose_pairs
 from swimm3r.sfm.colmap.settings import MappingSettings
 from swimm3r.sfm.features import database as feature_database
 from swimm3r.sfm.settings import ColmapSettings
@@ -241,6 +241,26 @@ def test_a_given_focal_length_of_no_lens_is_named_where_frames_cannot_be_placed(
     error = too_few(0, frames, replace(SETTINGS, focal=focal))
     assert (f"{9.8 * WIDTH:.0f} px" in error.cause and "--calibration" in error.hint) == doubted
     assert ("--fps" in error.hint) != doubted
+
+
+def test_many_images_without_a_feature_fail_with_advice(tmp_path: Path) -> None:
+    cv2.imwrite(str(tmp_path / "black.png"), np.zeros((HEIGHT, WIDTH), np.uint8))
+    black = tuple(Frame(f"{i}.png", tmp_path / "black.png", float(i), 0.0, "train") for i in range(3))
+    with pytest.raises(RegistrationError, match="of 3 frames"):
+        colmap.reconstruct(Frames(black, WIDTH, HEIGHT, True), replace(SETTINGS, exhaustive_to=2), tmp_path / "sfm")
+
+
+def test_a_folder_without_similar_images_to_match_is_a_usage_error_before_any_work(frames, tmp_path: Path) -> None:
+    settings, folder = replace(SETTINGS, exhaustive_to=4, loops=0), tmp_path / "sfm"
+    with pytest.raises(UsageError, match="--loops 0 leaves the 8 images"):
+        colmap.reconstruct(replace(frames, ordered=False), settings, folder)
+    assert not folder.exists()
+
+
+@pytest.mark.parametrize("settings", [{"exhaustive_to": COUNT}, {"pairs": "exhaustive"}, {"pairs": "sequential"}])
+def test_without_loops_every_pair_or_neighbors_of_a_folder_are_matched(frames: Frames, settings: dict) -> None:
+    check_pairs(replace(frames, ordered=False), replace(SETTINGS, **{"exhaustive_to": 4, "loops": 0, **settings}))
+    check_pairs(frames, replace(SETTINGS, exhaustive_to=4, loops=0))
 
 
 def test_a_given_focal_length_is_judged_in_pixels_of_the_frames(tmp_path: Path) -> None:

@@ -43,7 +43,7 @@ from swimm3r.sfm.colmap.messages import (
     unknown_port,
 )
 from swimm3r.sfm.colmap.navigated import with_navigation
-from swimm3r.sfm.colmap.pairs import match_frames
+from swimm3r.sfm.colmap.pairs import check_pairs, match_frames
 from swimm3r.sfm.colmap.plausibility import depth_change, implausible
 from swimm3r.sfm.colmap.record import PARTS, record_of, write_parts
 from swimm3r.sfm.colmap.rig.lenses import RigLenses, lenses_of_rig
@@ -141,7 +141,7 @@ def reconstruct(
 
 
 def _check_input(frames: Frames, settings: ColmapSettings, navigator: Navigator | None) -> None:
-    """Raise InputError for fewer than 2 frames, and UsageError where the exposure of rows cannot be corrected."""
+    """Raise InputError for fewer than 2 frames, and UsageError for settings that its frames do not allow."""
     if len(frames) < 2:
         raise InputError(
             f"structure from motion needs at least 2 frames, got {len(frames)}",
@@ -155,6 +155,7 @@ def _check_input(frames: Frames, settings: ColmapSettings, navigator: Navigator 
             cause="the adjustment with rows exposed one after another knows a single camera and its images alone",
             hint="leave out one of them",
         )
+    check_pairs(frames, settings)
 
 
 def _known(frames: Frames, settings: ColmapSettings, lens: Cameras | None) -> _Known:
