@@ -141,7 +141,13 @@ def test_the_ends_of_a_range_are_taken_and_what_lies_beyond_is_refused(kind: typ
     for name, hint, rule in ranges_of_class(kind):
         inside, outside = edges(rule, whole=int in _kinds(hint))
         for number in inside:
-            with_others = {(FrameSettings, "end"), (ScaleSettings, "marker_size"), (ColmapSettings, "readout")}
+            with_others = {
+                (FrameSettings, "end"),
+                (ScaleSettings, "marker_size"),
+                (ColmapSettings, "readout"),
+                (MappingSettings, "chunk_frames"),
+                (MappingSettings, "chunk_overlap"),
+            }
             if (kind, name) not in with_others:
                 filled(kind, **{name: shaped(hint, number)})
         for number in (*outside, 1e300, -1e300, 10**400):

@@ -64,6 +64,13 @@ def test_a_calibration_that_does_not_fit_is_told_with_its_exit_code(
     assert (found, message in said) == (code, True), said
 
 
+def test_chunks_that_share_all_their_frames_are_exit_2(capsys: pytest.CaptureFixture[str], tmp_path: Path):
+    command = ("run", str(tmp_path / "dive"), "--out", str(tmp_path / "run"), "--mapping.chunk-frames", "8")
+    code, message = outcome(capsys, *command, "--mapping.chunk-overlap", "8")
+    assert code == 2
+    assert "chunks of 8 frames cannot share 8" in message
+
+
 def test_half_a_colmap_model_is_exit_2(capsys: pytest.CaptureFixture[str], tmp_path: Path):
     code, message = outcome(capsys, "splat", "--colmap", str(tmp_path), "--out", str(tmp_path / "run"))
     assert code == 2

@@ -114,7 +114,7 @@ class ColmapSettings(MediumSettings, LensSettings):
     """Number of neighbors in time that each frame is matched with, followed by some at doubling distances."""
     loops: CountOrZero = 6
     """Number of most similar frames elsewhere in the clip (VLAD) that each frame is matched with, followed by as many
-    at most beside those that match; five times as many for folders of images."""
+    at most beside those that match; five times as many for folders of images, which need at least 1."""
     threads: Threads = 0
     """Number of threads for features and matching; 0 uses all cores."""
     features: FeatureSettings = field(default_factory=FeatureSettings)

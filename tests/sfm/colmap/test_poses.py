@@ -23,6 +23,7 @@ from tests.sfm.colmap.two_planes import (
 from swimm3r.cameras import project
 from swimm3r.errors import InputError, RegistrationError, StorageError, UsageError
 from swimm3r.geometry import align_similarity
+from swimm3r.io.colmap.model import read_model
 from swimm3r.prepare import read_frames
 from swimm3r.scene.frames import Frame, Frames
 from swimm3r.scene.reconstruction import Reconstruction
@@ -30,6 +31,11 @@ from swimm3r.sfm.colmap import poses as colmap
 from swimm3r.sfm.colmap.calibration.start import first_camera
 from swimm3r.sfm.colmap.messages import lens_not_told, too_few
 from swimm3r.sfm.colmap.pairs import choose_pairs
+
+
+from swimm3r.sfm.colmap.chunks import parts
+from swimm3r.sfm.colmap.messages import too_few
+from swimm3r.sfm.colmap.pairs import check_pairs, choose_pairs
 from swimm3r.sfm.colmap.settings import MappingSettings
 from swimm3r.sfm.features import database as feature_database
 from swimm3r.sfm.settings import ColmapSettings
@@ -110,6 +116,30 @@ def test_an_interrupted_run_leaves_a_database_that_a_later_one_completes(
     assert sorted(path.name for path in tmp_path.iterdir()) == ["database.db", "database.json"]
 
 
+def test_the_journal_of_a_killed_run_is_not_replayed(rec, frames: Frames, folder: Path, tmp_path: Path) -> None:
+    shutil.copytree(folder, tmp_path / "sfm")
+    killed = feature_database.FeatureDatabase(tmp_path / "killed" / "mapping.db", COUNT)
+    killed.path.parent.mkdir()
+    shutil.copyfile(folder / "database.db", killed.path)
+    with killed.open() as database:
+        database.update_keypoints(1, np.full_like(database.read_keypoints(1), 7))
+        for left in killed.path.parent.iterdir():  # as long as it is open, the change is in the journal alone
+            shutil.copyfile(left, tmp_path / "sfm" / left.name)
+    assert (tmp_path / "sfm" / "mapping.db-wal").stat().st_size > 0
+
+    def progress(what: str, _done: int, _total: int, /) -> None:
+        if what == "placing frames":
+            with replace(killed, path=tmp_path / "sfm" / "mapping.db").open() as database:
+                used.append(database.read_keypoints(1))
+            raise KeyboardInterrupt
+
+    used: list[np.ndarray] = []
+    with pytest.raises(KeyboardInterrupt):
+        colmap.reconstruct(frames, SETTINGS, tmp_path / "sfm", progress)
+    assert np.ptp(used[0][:, 0]) > 0.5 * WIDTH
+    assert sorted(path.name for path in (tmp_path / "sfm").iterdir()) == ["database.db", "database.json"]
+
+
 def test_other_settings_start_a_new_database(frames: Frames, tmp_path: Path) -> None:
     camera = first_camera(WIDTH, HEIGHT, SETTINGS)
     store = feature_database.start_database(tmp_path, frames, camera, SETTINGS.features)
@@ -176,6 +206,25 @@ def test_frames_of_another_place_are_left_out_and_said(frames: Frames, tmp_path:
     assert any("1 of 9 frames could not be placed" in warning.what for warning in found.warnings)
 
 
+def test_what_is_cut_off_a_model_whose_scale_jumps_is_a_part(
+    rec: Reconstruction, frames: Frames, folder: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Placed again beside the rest with looser limits, its frames are cut off again, and are one part all the same."""
+
+    def cut(part: parts.Part) -> list[parts.Part]:
+        pieces = part.images[:3], part.images[3:]
+        return [replace(part, cam_from_world={i: part.cam_from_world[i] for i in piece}) for piece in pieces]
+
+    monkeypatch.setattr(parts, "coherent_parts", cut)
+    shutil.copytree(folder, tmp_path / "sfm")
+    settings = replace(SETTINGS, mapping=MappingSettings(method="incremental", align_keypoints=False))
+    found = colmap.reconstruct(frames, settings, tmp_path / "sfm")
+    assert found.names == frames.names[3:]
+    assert any(f"({COUNT - 3} + 3 of {COUNT})" in warning.what for warning in found.warnings)
+    assert read_model(tmp_path / "sfm" / colmap.PARTS / "1").names == frames.names[:3]
+    assert not (tmp_path / "sfm" / colmap.PARTS / "2").exists()
+
+
 @pytest.mark.parametrize("image", ["black", "unrelated"])
 def test_images_without_common_ground_fail_with_advice(image: str, tmp_path: Path) -> None:
     frames = []
@@ -216,6 +265,35 @@ def test_frames_that_overlap_in_pairs_alone_are_told_from_few_frames(frames: Fra
     assert "seen in three" in lens_not_told(frames.select([0, 1, 2])).cause
 
 
+def test_many_images_without_a_feature_fail_with_advice(tmp_path: Path) -> None:
+    cv2.imwrite(str(tmp_path / "black.png"), np.zeros((HEIGHT, WIDTH), np.uint8))
+    black = tuple(Frame(f"{i}.png", tmp_path / "black.png", float(i), 0.0, "train") for i in range(3))
+    with pytest.raises(RegistrationError, match="of 3 frames"):
+        colmap.reconstruct(Frames(black, WIDTH, HEIGHT, True), replace(SETTINGS, exhaustive_to=2), tmp_path / "sfm")
+
+
+def test_a_folder_without_similar_images_to_match_is_a_usage_error_before_any_work(frames, tmp_path: Path) -> None:
+    settings, folder = replace(SETTINGS, exhaustive_to=4, loops=0), tmp_path / "sfm"
+    with pytest.raises(UsageError, match="--loops 0 leaves the 8 images"):
+        colmap.reconstruct(replace(frames, ordered=False), settings, folder)
+    assert not folder.exists()
+
+
+@pytest.mark.parametrize("settings", [{"exhaustive_to": COUNT}, {"pairs": "exhaustive"}, {"pairs": "sequential"}])
+def test_without_loops_every_pair_or_neighbors_of_a_folder_are_matched(frames: Frames, settings: dict) -> None:
+    check_pairs(replace(frames, ordered=False), replace(SETTINGS, **{"exhaustive_to": 4, "loops": 0, **settings}))
+    check_pairs(frames, replace(SETTINGS, exhaustive_to=4, loops=0))
+
+
+def test_a_given_focal_length_is_judged_in_pixels_of_the_frames(tmp_path: Path) -> None:
+    cv2.imwrite(str(tmp_path / "black.png"), np.zeros((HEIGHT, WIDTH), np.uint8))
+    black = tuple(Frame(f"{i}.png", tmp_path / "black.png", float(i), 0.0, "train") for i in range(2))
+    settings = replace(SETTINGS, focal=0.5 * WIDTH, features=replace(SETTINGS.features, long_side=WIDTH // 2))
+    with pytest.raises(RegistrationError, match="only 0 of 2") as caught:
+        colmap.reconstruct(Frames(black, WIDTH, HEIGHT, True), settings, tmp_path / "sfm")
+    assert "focal length" not in caught.value.cause
+
+
 def test_one_frame_is_an_input_error(frames: Frames, tmp_path: Path) -> None:
     with pytest.raises(InputError, match="at least 2"):
         colmap.reconstruct(frames.select([0]), SETTINGS, tmp_path)
@@ -234,12 +312,23 @@ def test_settings_that_contradict_themselves_are_usage_errors(settings: ColmapSe
         first_camera(WIDTH, HEIGHT, settings)
 
 
-def test_a_full_disk_is_a_storage_error(frames: Frames, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    def full(*_: object) -> None:
-        raise RuntimeError("[sqlite3_utils.h:50] SQLite error: database or disk is full")
+@pytest.mark.parametrize(
+    ("message", "error"),
+    [
+        ("database or disk is full", StorageError),
+        ("disk I/O error", StorageError),
+        ("attempt to write a readonly database", StorageError),
+        ("database disk image is malformed", RuntimeError),
+    ],
+)
+def test_a_disk_that_cannot_be_written_is_a_storage_error_and_damage_is_not(
+    message: str, error: type[Exception], frames: Frames, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    def failing(*_: object) -> None:
+        raise RuntimeError(f"[sqlite3_utils.h:50] SQLite error: {message}")
 
-    monkeypatch.setattr(colmap, "fill_features", full)
-    with pytest.raises(StorageError):
+    monkeypatch.setattr(colmap, "fill_features", failing)
+    with pytest.raises(error, match=message):
         colmap.reconstruct(frames, SETTINGS, tmp_path)
 
 

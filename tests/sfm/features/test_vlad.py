@@ -26,6 +26,10 @@ def test_a_place_seen_again_is_found_among_all_frames() -> None:
     assert alike[same & off].min() > alike[~same].max()
 
 
+def test_frames_without_a_feature_are_alike_in_nothing() -> None:
+    assert not _described([torch.zeros(0, 128)] * 3).any()
+
+
 def test_loops_leave_out_neighbors_in_time() -> None:
     described = _described(_frames_of_places([0, 0, 1, 1, 2, 2, 0, 1]))
     pairs = vlad.alike_pairs(described, 1, apart=2)

@@ -12,6 +12,7 @@ from itertools import pairwise
 
 import torch
 
+from swimm3r.errors import UsageError
 from swimm3r.progress import Progress, silent
 from swimm3r.scene.frames import Frames
 from swimm3r.scene.rig import first_of_instants
@@ -40,6 +41,24 @@ def match_frames(
         pairs = sorted([*pairs, *more])
         left -= len(more)
     return pairs
+
+
+def check_pairs(frames: Frames, settings: ColmapSettings) -> None:
+    """Raise UsageError where the settings leave a folder of images without any pair to match."""
+    if settings.loops == 0 and not _matches_all(frames, settings) and _matches_alike_alone(frames, settings):
+        raise UsageError(
+            f"--loops 0 leaves the {len(frames)} images of a folder without a pair to match",
+            cause=f"more than {settings.exhaustive_to} images without an order are matched with similar ones alone",
+            hint="leave out --loops, or match all pairs (--pairs exhaustive) or neighbors by name (--pairs sequential)",
+        )
+
+
+def _matches_all(frames: Frames, settings: ColmapSettings) -> bool:
+    return settings.pairs == "exhaustive" or (settings.pairs == "auto" and len(frames) <= settings.exhaustive_to)
+
+
+def _matches_alike_alone(frames: Frames, settings: ColmapSettings) -> bool:
+    return not frames.ordered and settings.pairs == "auto"
 
 
 def beside_returns(tried: Sequence[Pair], matches: Mapping[Pair, int], cameras: Sequence[str | None]) -> list[Pair]:
@@ -78,13 +97,13 @@ def _with_neighbors(cameras: Sequence[str | None]) -> list[list[int]]:
 def choose_pairs(store: FeatureDatabase, frames: Frames, settings: ColmapSettings) -> list[Pair]:
     """The pairs of frames that are matched first, sorted."""
     n = len(frames)
-    if settings.pairs == "exhaustive" or (settings.pairs == "auto" and n <= settings.exhaustive_to):
+    if _matches_all(frames, settings):
         return list(itertools.combinations(range(n), 2))
     with store.open() as database:
         described = vlad.describe_frames(
             n, lambda i: unit_descriptors(database.read_descriptors(i + 1).data), torch.Generator().manual_seed(0)
         )
-    if not frames.ordered and settings.pairs == "auto":
+    if _matches_alike_alone(frames, settings):
         return vlad.alike_pairs(described, 5 * settings.loops)
     steps = {*range(1, settings.overlap + 1), *(2**k for k in range(settings.overlap.bit_length(), 8))}
     cameras = 1 if frames.rig is None else len(frames.rig.cameras)

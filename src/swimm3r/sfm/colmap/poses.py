@@ -13,7 +13,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 from swimm3r.cameras import Cameras, resized
-from swimm3r.errors import InputError, StorageError, UsageError
+from swimm3r.errors import InputError, UsageError
 from swimm3r.imaging.rectification import rectification_of
 from swimm3r.io.colmap.cameras import to_pycolmap_camera
 from swimm3r.io.colmap.model import silence_log
@@ -32,7 +32,7 @@ from swimm3r.sfm.colmap.calibration.polynomial import bent_lens
 from swimm3r.sfm.colmap.calibration.refinement import Calibrated, adjust_lens, adjust_poses, refine, refine_again
 from swimm3r.sfm.colmap.calibration.start import first_camera
 from swimm3r.sfm.colmap.chunks.long_clip import is_long, map_long_clip
-from swimm3r.sfm.colmap.chunks.parts import without_jumps
+from swimm3r.sfm.colmap.chunks.parts import coherent_models
 from swimm3r.sfm.colmap.keypoint_adjustment import adjust_keypoints
 from swimm3r.sfm.colmap.messages import (
     LOST_SCALE,
@@ -44,13 +44,21 @@ from swimm3r.sfm.colmap.messages import (
     unknown_port,
 )
 from swimm3r.sfm.colmap.navigated import with_navigation
-from swimm3r.sfm.colmap.pairs import match_frames
+from swimm3r.sfm.colmap.pairs import check_pairs, match_frames
 from swimm3r.sfm.colmap.plausibility import depth_change, implausible
 from swimm3r.sfm.colmap.record import PARTS, record_of, write_parts
 from swimm3r.sfm.colmap.rig.lenses import RigLenses, lenses_of_rig
 from swimm3r.sfm.colmap.shutter.readout import adjust_rolling
 from swimm3r.sfm.colmap.shutter.turning import turned_rows
-from swimm3r.sfm.features.database import FeatureDatabase, fill_features, match_pairs, start_database, with_overlap
+from swimm3r.sfm.features.database import (
+    FeatureDatabase,
+    fill_features,
+    full_disk_said_plainly,
+    match_pairs,
+    remove_database,
+    start_database,
+    with_overlap,
+)
 from swimm3r.sfm.lens import at_scale, behind_port, gives_lens, with_calibration
 from swimm3r.sfm.rectified.frames import BentImagesError, TurnedRowsError
 from swimm3r.sfm.settings import ColmapSettings
@@ -68,7 +76,7 @@ class _Mapped:
     """The model that is used, those that did not join it, and warnings."""
 
     model: "pycolmap.Reconstruction"
-    others: "list[pycolmap.Reconstruction]"
+    others: "list[pycolmap.Reconstruction]"  # some of their frames may be in larger ones, too
     lens_refined: bool  # from the images; else assumed, or held for the user
     distortion_refined: bool  # as well
     warnings: list[QualityWarning]
@@ -108,7 +116,7 @@ def reconstruct(
     _check_input(frames, settings, navigator)
     silence_log()
     known, threads = _known(frames, settings, lens), settings.threads or thread_count()
-    with _full_disk_said_plainly(folder):
+    with full_disk_said_plainly(folder):
         numbers, shared = ((), None) if known.lenses is None else (known.lenses.numbers, known.lenses.under_first)
         store = start_database(folder, frames, known.camera, settings.features, numbers)
         fill_features(store, frames, settings.features, threads, progress, shared)
@@ -119,8 +127,7 @@ def reconstruct(
             def recorded(model: "pycolmap.Reconstruction") -> Reconstruction:
                 return record_of(model, working, frames, folder, known.lenses)
 
-            scaled = at_scale(known.settings, frames.width, frames.height, store.scale)
-            mapped = _map(working, frames, pairs, scaled, progress, engine, known.lenses)
+            mapped = _map(working, frames, pairs, known, progress, engine)
             if not frames.rows_rectified:
                 _check_rectifiable(mapped, known, frames, recorded, progress)
             if navigator is not None:
@@ -136,7 +143,7 @@ def reconstruct(
 
 
 def _check_input(frames: Frames, settings: ColmapSettings, navigator: Navigator | None) -> None:
-    """Raise InputError for fewer than 2 frames, and UsageError where the exposure of rows cannot be corrected."""
+    """Raise InputError for fewer than 2 frames, and UsageError for settings that its frames do not allow."""
     if len(frames) < 2:
         raise InputError(
             f"structure from motion needs at least 2 frames, got {len(frames)}",
@@ -150,6 +157,7 @@ def _check_input(frames: Frames, settings: ColmapSettings, navigator: Navigator 
             cause="the adjustment with rows exposed one after another knows a single camera and its images alone",
             hint="leave out one of them",
         )
+    check_pairs(frames, settings)
 
 
 def _known(frames: Frames, settings: ColmapSettings, lens: Cameras | None) -> _Known:
@@ -225,47 +233,34 @@ def _working_copy(store: FeatureDatabase) -> Iterator[FeatureDatabase]:
     for leftover in store.path.parent.glob(".mapping.*"):  # of a killed run
         shutil.rmtree(leftover)
     working = replace(store, path=store.path.with_name("mapping.db"))
+    remove_database(working.path)
     try:
         with atomic_path(working.path) as draft:
             shutil.copyfile(store.path, draft)
         yield working
     finally:
-        working.path.unlink(missing_ok=True)
-
-
-@contextmanager
-def _full_disk_said_plainly(folder: Path) -> Iterator[None]:
-    try:
-        yield
-    except RuntimeError as error:  # what pycolmap makes of SQLite's complaint
-        if "disk" not in str(error):
-            raise
-        raise StorageError(
-            f"the database in {folder} could not be written ({str(error).splitlines()[-1][:200]})",
-            cause="the disk is full or read-only",
-            hint="free some space, or choose another --out, and run the same command again: it goes on from here",
-        ) from error
+        remove_database(working.path)
 
 
 def _map(
     store: FeatureDatabase,
     frames: Frames,
     pairs: list[tuple[int, int]],
-    settings: ColmapSettings,
+    known: _Known,
     progress: Progress,
     engine: EngineSettings,
-    lenses: RigLenses | None,
 ) -> _Mapped:
     """The largest model, its keypoints aligned and its lens refined.
 
     Raises RegistrationError where no two frames can be placed.
     """
+    settings = at_scale(known.settings, frames.width, frames.height, store.scale)
     n, threads, long = len(frames), settings.threads or thread_count(), is_long(len(frames), settings.mapping)
     models, determined = _models(store, frames, settings, progress, engine)
     if not models:
         untold = store.little_overlap and settings.intrinsics != "fixed"
-        raise lens_not_told(frames) if untold else too_few(0, frames, settings)
-    model = without_jumps(models[0])
+        raise lens_not_told(frames) if untold else too_few(0, frames, known.settings)
+    model, *cut_off = coherent_models(models[0])
     # points of two frames hold the poses of those that overlap little, under the lens that the others determined
     further = replace(settings, intrinsics="fixed") if store.little_overlap else settings
     if model.num_reg_images() < n:
@@ -277,14 +272,15 @@ def _map(
             model = refine(store, model, further, progress).model  # a better lens places more
         more = mapping.place_leftovers(store, model, further, progress)
         more = mapping.replace_misplaced(store, more, further, progress)
-        more = without_jumps(more)
-        model = more if more.num_reg_images() >= model.num_reg_images() else model
+        more, *again_cut_off = coherent_models(more)
+        if more.num_reg_images() >= model.num_reg_images():
+            model, cut_off = more, [*cut_off, *again_cut_off]
     if long:
         calibrated = Calibrated(model, refined=determined, distortion=determined)
     else:
         calibrated = refine(store, model, further, progress)
     if settings.mapping.align_keypoints:
-        model = adjust_keypoints(store, calibrated.model, frames, threads, progress, lenses)
+        model = adjust_keypoints(store, calibrated.model, frames, threads, progress, known.lenses)
         calibrated = replace(calibrated, model=model)
         if not long:
             calibrated = refine_again(store, calibrated, progress)
@@ -295,7 +291,7 @@ def _map(
     model, refined = calibrated.model, calibrated.refined or determined
     assumed = not refined and settings.intrinsics != "fixed"
     warnings = [assumed_lens(model.cameras[1].focal_length_x / store.scale)] if assumed else []
-    return _Mapped(model, models[1:], refined, calibrated.distortion, warnings)
+    return _Mapped(model, [*models[1:], *cut_off], refined, calibrated.distortion, warnings)
 
 
 def _models(

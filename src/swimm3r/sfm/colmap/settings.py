@@ -3,6 +3,7 @@
 from dataclasses import dataclass
 from typing import Annotated, Literal
 
+from swimm3r.errors import UsageError
 from swimm3r.settings import CountOrZero, NotEmpty, PositiveShare, Range, Settings, Share
 
 
@@ -15,7 +16,7 @@ class MappingSettings(Settings):
     chunk_frames: Annotated[int, Range(8)] = 48
     """Largest number of frames of a chunk; `auto` maps clips with more than twice as many in chunks that are joined."""
     chunk_overlap: Annotated[int, Range(2)] = 8
-    """Number of frames that neighboring chunks share."""
+    """Number of frames that neighboring chunks share, less than a chunk has."""
     focal_ladder: Annotated[tuple[Annotated[float, Range(0.1, 20)], ...], NotEmpty()] = (0.75, 1.1, 0.6, 1.5)
     """Focal lengths, as multiples of the image width, tried in turn if the lens is unknown and frames are not
     registered."""
@@ -42,3 +43,12 @@ class MappingSettings(Settings):
     opencv_gain: Share = 0.03
     """Relative decrease of the reprojection error from which camera `auto` compares lenses on frames that they were not
     fitted to, and by which one with more freedom must be better there."""
+
+    def __post_init__(self) -> None:
+        super().__post_init__()
+        if self.chunk_overlap >= self.chunk_frames:
+            raise UsageError(
+                f"chunks of {self.chunk_frames} frames cannot share {self.chunk_overlap}",
+                cause="--mapping.chunk-overlap is not smaller than --mapping.chunk-frames",
+                hint="a smaller overlap, such as a sixth of a chunk, or larger chunks",
+            )

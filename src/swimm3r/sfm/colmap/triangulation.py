@@ -11,6 +11,7 @@ from pathlib import Path
 import numpy as np
 import torch
 
+from swimm3r.io.colmap.cameras import to_pycolmap_camera
 from swimm3r.io.colmap.model import from_pycolmap, silence_log, to_pycolmap
 from swimm3r.io.files.atomic import DRAFT
 from swimm3r.progress import Progress, silent
@@ -44,9 +45,10 @@ def triangulate(
         track_point=table.track_point[:0], track_frame=table.track_frame[:0], track_xy=table.track_xy[:0],
     )  # fmt: skip
     model = to_pycolmap(bare)
-    camera = to_pycolmap(bare).cameras[1]
-    camera.has_prior_focal_length = True
-    store = start_database(folder, placed, camera, settings)
+    cameras = [to_pycolmap_camera(bare, i) for i in range(len(model.cameras))]
+    for camera in cameras:
+        camera.has_prior_focal_length = True
+    store = start_database(folder, placed, cameras, settings)
     for each in model.cameras.values():
         own = scaled_camera(each, store.scale)
         each.width, each.height, each.params = own.width, own.height, own.params

@@ -100,11 +100,6 @@ def cosine_similarity(
     return unit(queries, dim=1) @ unit(queries if database is None else database, dim=1).T
 
 
-def most_similar(similarity: Float[Tensor, "q n"], count: int) -> Int64[Tensor, "q k"]:
-    """For each query its most similar frames, best first."""
-    return similarity.topk(min(count, similarity.shape[1]), dim=1).indices
-
-
 def asmk_similarity(
     features: Sequence[Float[Tensor, "_ c"]],
     codebook: Float[Tensor, "words c"],

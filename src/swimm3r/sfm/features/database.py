@@ -1,10 +1,11 @@
 """COLMAP's database of one dive: keypoints per frame, verified matches per pair; what is in it is not computed again.
 
-Frames stand in it as 000000, 000001, ... in the order of `Frames`, all of one camera; keypoints of a rig's frames that
-have another lens stand where the one lens has their rays. Its pixels are those of the images that keypoints are found
-in: COLMAP's limits of a few pixels are meant for keypoints that are exact to one, and those of an image of 3840 pixels
-that was reduced to 1000 would be four times as far off. Two-view geometry is verified by fundamental matrix and
-homography as long as nobody knows the focal length, so that matches outlive any guess of it.
+Frames stand in it as 000000, 000001, ... in the order of `Frames`, all of one camera, or each of its own where poses
+with several lenses are given; keypoints of a calibrated rig's frames that have another lens stand where the one lens
+has their rays. Its pixels are those of the images that keypoints are found in: COLMAP's limits of a few pixels are
+meant for keypoints that are exact to one, and those of an image of 3840 pixels that was reduced to 1000 would be four
+times as far off. Two-view geometry is verified by fundamental matrix and homography as long as nobody knows the focal
+length, so that matches outlive any guess of it.
 
 Nothing is written in COLMAP's transactions: one that meets a full disk aborts the process. Instead the last write of a
 frame (keypoints) and of a pair (two-view geometry) says that it is complete.
@@ -26,6 +27,7 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
+from swimm3r.errors import StorageError
 from swimm3r.io.files.atomic import write_text
 from swimm3r.progress import Progress, silent
 from swimm3r.scene.frames import Frames
@@ -42,6 +44,7 @@ _HINT_OF_OVERLAP = 8  # matches
 _SEEN_TWICE = 0.5  # of the matched features; 0.12 to 0.35 of most clips' and 0.60 to 0.73 of an AUV's stills' match so
 _BATCH = 32  # frames or pairs worked on together: what a killed run loses
 _HELD = 64  # frames in memory while matching: 0.1 GB
+_NOT_WRITABLE = ("disk is full", "disk I/O", "readonly")  # in SQLite's messages; a malformed "disk image" is damage
 
 
 @dataclass(frozen=True)
@@ -68,46 +71,78 @@ class FeatureDatabase:
 def start_database(
     folder: Path,
     frames: Frames,
-    camera: "pycolmap.Camera",
+    camera: "pycolmap.Camera | Sequence[pycolmap.Camera]",
     settings: FeatureSettings,
     lenses: Sequence[Sequence[float]] = (),
 ) -> FeatureDatabase:
     """The database in `folder`, new unless the one there was made of the same frames with the same settings.
 
-    `camera` is in pixels of the frames. `lenses` are the numbers of those that keypoints are moved from, see
-    `fill_features`.
+    `camera` is that of all frames, or a list with one for each, with ids 1, 2, ...; in pixels of the frames. `lenses`
+    are the numbers of those that keypoints are moved from, see `fill_features`.
     """
+    import pycolmap
+
+    cameras = [camera] if isinstance(camera, pycolmap.Camera) else list(camera)
     path, about = folder / "database.db", folder / "database.json"
     content = {
         "frames": [[frame.name, round(frame.sharpness, 3), str(frame.mask)] for frame in frames],
         "size": [frames.width, frames.height],
         "features": asdict(settings),
-        "camera": camera.model.name if camera.has_prior_focal_length else "unknown",
-        "params": camera.params.tolist() if camera.has_prior_focal_length else [],
+        **(_described(cameras[0]) if len(cameras) == 1 else {"cameras": [_described(each) for each in cameras]}),
     }
     if lenses:
         content["lenses"] = [list(numbers) for numbers in lenses]
     scale = min(1.0, settings.long_side / max(frames.width, frames.height))
     if scale < 1:
         content["scale"] = scale
-        camera = scaled_camera(camera, scale)
+        cameras = [scaled_camera(each, scale) for each in cameras]
     out = FeatureDatabase(path, len(frames), scale)
     described = json.dumps(content)
     if path.is_file() and about.is_file() and about.read_bytes() == described.encode():
         if _is_whole(path, len(frames)):
             with out.open() as database:
-                database.update_camera(camera)
+                for each in cameras:
+                    database.update_camera(each)
             return out
         log.warning("%s is damaged: features and matches are found again", path)
     folder.mkdir(parents=True, exist_ok=True)
     about.unlink(missing_ok=True)
-    for leftover in folder.glob("database.db*"):
-        leftover.unlink()
+    remove_database(path)
     with out.open() as database:
-        camera_id = database.write_camera(camera, use_camera_id=True)
-        _write_frames(database, camera_id, range(len(frames)))
+        _write_frames(database, cameras, range(len(frames)))
     write_text(about, described)
     return out
+
+
+@contextmanager
+def full_disk_said_plainly(folder: Path) -> Iterator[None]:
+    """Raise StorageError where a database in `folder` cannot be written."""
+    try:
+        yield
+    except RuntimeError as error:  # what pycolmap makes of SQLite's complaint
+        if not any(words in str(error) for words in _NOT_WRITABLE):
+            raise
+        raise StorageError(
+            f"the database in {folder} could not be written ({str(error).splitlines()[-1][:200]})",
+            cause="the disk is full or read-only",
+            hint="free some space, or choose another --out, and run the same command again: it goes on from here",
+        ) from error
+
+
+def remove_database(path: Path) -> None:
+    """Remove a database, if there is one, with the journal that a killed process may have left beside it.
+
+    SQLite would replay the journal into the next database of that name.
+    """
+    for file in path.parent.glob(f"{path.name}*"):
+        file.unlink()
+
+
+def _described(camera: "pycolmap.Camera") -> dict[str, object]:
+    """The lens of a camera as far as it is known, for the file that says what a database was made of."""
+    if not camera.has_prior_focal_length:
+        return {"camera": "unknown", "params": []}
+    return {"camera": camera.model.name, "params": camera.params.tolist()}
 
 
 def scaled_camera(camera: "pycolmap.Camera", scale: float) -> "pycolmap.Camera":
@@ -176,8 +211,7 @@ def write_excerpt(store: FeatureDatabase, path: Path, images: Sequence[int]) -> 
     Frames keep their names; the k-th of `images` (ids) has id k + 1.
     """
     with store.open() as database, FeatureDatabase(path, len(images)).open() as excerpt:
-        camera_id = excerpt.write_camera(database.read_camera(1), use_camera_id=True)
-        _write_frames(excerpt, camera_id, [image - 1 for image in images])
+        _write_frames(excerpt, [database.read_camera(1)], [image - 1 for image in images])
         new_id = {image: k + 1 for k, image in enumerate(images)}
         for image in images:
             excerpt.write_keypoints(new_id[image], database.read_keypoints(image))
@@ -187,16 +221,19 @@ def write_excerpt(store: FeatureDatabase, path: Path, images: Sequence[int]) -> 
     return replace(store, path=path, frames=len(images))
 
 
-def _write_frames(database: "pycolmap.Database", camera_id: int, numbers: Sequence[int]) -> None:
-    """Write images of one camera, each a frame of its own, named by their numbers in the clip."""
+def _write_frames(database: "pycolmap.Database", cameras: "Sequence[pycolmap.Camera]", numbers: Sequence[int]) -> None:
+    """Write images of one camera or of one each, every image a frame of its own, named by their numbers in the clip."""
     import pycolmap
 
-    sensor = pycolmap.sensor_t(pycolmap.SensorType.CAMERA, camera_id)
-    rig = pycolmap.Rig()
-    rig.add_ref_sensor(sensor)
-    rig_id = database.write_rig(rig)
+    rigs = []  # of each camera: its sensor and the id of its rig
+    for camera in cameras:
+        sensor = pycolmap.sensor_t(pycolmap.SensorType.CAMERA, database.write_camera(camera, use_camera_id=True))
+        rig = pycolmap.Rig()
+        rig.add_ref_sensor(sensor)
+        rigs.append((sensor, database.write_rig(rig)))
     for k, number in enumerate(numbers):
-        image = pycolmap.Image(name=f"{number:06d}", camera_id=camera_id, image_id=k + 1)
+        sensor, rig_id = rigs[k if len(rigs) > 1 else 0]
+        image = pycolmap.Image(name=f"{number:06d}", camera_id=sensor.id, image_id=k + 1)
         database.write_image(image, use_image_id=True)
         frame = pycolmap.Frame()
         frame.rig_id = rig_id
@@ -270,7 +307,8 @@ def match_pairs(
     verification.ransac.random_seed = 0
     what = "matching the frames left over" if again else "matching frames"
     with store.open() as database:
-        camera = database.read_camera(1)
+        cameras = {camera.camera_id: camera for camera in database.read_all_cameras()}
+        camera_of = {image.image_id - 1: cameras[image.camera_id] for image in database.read_all_images()}
         if again:  # pairs without even a few matches at the first look have nothing in common
             missing = [(i, j) for i, j in pairs if len(database.read_matches(i + 1, j + 1)) >= _HINT_OF_OVERLAP]
         else:
@@ -283,7 +321,8 @@ def match_pairs(
         matches = match_descriptors(d_i, d_j, settings.max_ratio).numpy().astype(np.uint32)
         if len(matches) < MIN_INLIERS:
             return matches, pycolmap.TwoViewGeometry()
-        return matches, pycolmap.estimate_two_view_geometry(camera, xy_i, camera, xy_j, matches, verification)
+        camera_i, camera_j = camera_of[pair[0]], camera_of[pair[1]]
+        return matches, pycolmap.estimate_two_view_geometry(camera_i, xy_i, camera_j, xy_j, matches, verification)
 
     torch_threads = torch.get_num_threads()
     torch.set_num_threads(1)  # pairs are the parallel unit

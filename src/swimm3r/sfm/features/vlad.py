@@ -45,9 +45,11 @@ def alike_pairs(described: Float[Tensor, "c d"], count: int, apart: int = 0) -> 
 
 
 def vocabulary(descriptors: Sequence[Float[Tensor, "_ 128"]], generator: torch.Generator) -> Float[Tensor, "k 128"]:
-    """Visual words: spherical k-means over a sample of all frames' descriptors."""
+    """Visual words: spherical k-means over a sample of all frames' descriptors; one of zeros where there are none."""
     share = max(1, _SAMPLES // len(descriptors))
     samples = torch.cat([d[torch.randperm(len(d), generator=generator)[:share]] for d in descriptors])
+    if len(samples) == 0:
+        return samples.new_zeros(1, samples.shape[1])
     words = samples[torch.randperm(len(samples), generator=generator)[:_WORDS]]
     for _ in range(_ROUNDS):
         nearest = (samples @ words.mT).argmax(1)

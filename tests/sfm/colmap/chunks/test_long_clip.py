@@ -10,6 +10,7 @@ import torch
 
 from swimm3r.evaluate import NotComputed
 from swimm3r.evaluate.poses import absolute_pose_errors
+from swimm3r.io.colmap.model import ColmapModel, to_pycolmap
 from swimm3r.prepare import read_frames
 from swimm3r.progress import silent
 from swimm3r.scene.frames import Frames
@@ -18,7 +19,7 @@ from swimm3r.scene.reconstruction import Reconstruction
 from swimm3r.sfm.between import place_between, read_between
 from swimm3r.sfm.colmap import poses
 from swimm3r.sfm.colmap.chunks import place
-from swimm3r.sfm.colmap.chunks.parts import Part, coherent_parts
+from swimm3r.sfm.colmap.chunks.parts import Part, coherent_models, coherent_parts
 from swimm3r.sfm.settings import ColmapSettings
 from swimm3r.synthetic import write_dive
 from swimm3r.synthetic.settings import DiveSettings
@@ -133,6 +134,33 @@ def test_a_part_is_cut_where_the_scale_jumps_and_where_few_points_hold():
     jumped = chain([1.0, 1.0, 1.0, 50.0, 50.0, 50.0])
     assert [piece.images for piece in coherent_parts(jumped)] == [(1, 2, 3), (4, 5, 6)]
     assert coherent_parts(chain([1.0] * 6, shared=8)) == []
+
+
+def test_a_model_is_cut_into_models_of_all_its_pieces_the_largest_first():
+    part = chain([1.0, 1.0, 1.0, 50.0, 50.0, 50.0, 50.0])
+    rows = [(point, image - 1) for image, points in part.point_of.items() for point in points]
+    track_point, track_frame = (np.array(row) for row in zip(*rows, strict=True))
+    bottom = np.array([[0.0, 0.0, 0.0, 1.0]])
+    n, p = len(part.images), len(part.xyz)
+    model = ColmapModel(
+        names=tuple(f"{i:06d}" for i in range(n)),
+        model="PINHOLE",
+        width=100,
+        height=100,
+        K=np.tile(np.array([[100.0, 0, 50], [0, 100, 50], [0, 0, 1]]), (n, 1, 1)),
+        distortion=np.zeros((n, 0)),
+        cam2world=np.stack([np.linalg.inv(np.vstack([part.cam_from_world[i], bottom])) for i in part.images]),
+        xyz=part.xyz,
+        rgb=np.zeros((p, 3), np.uint8),
+        error=np.zeros(p),
+        track_point=track_point,
+        track_frame=track_frame,
+        track_xy=np.zeros((len(rows), 2)),
+    )
+    pieces = coherent_models(to_pycolmap(model))
+    assert [sorted(piece.reg_image_ids()) for piece in pieces] == [[4, 5, 6, 7], [1, 2, 3]]
+    whole = to_pycolmap(replace(model, cam2world=np.tile(np.eye(4), (n, 1, 1))))
+    assert coherent_models(whole) == [whole]
 
 
 def test_frames_that_share_few_points_must_stand_at_depths_that_differ_little():

@@ -1,8 +1,9 @@
-"""Chunks that other processes place, and those that fall apart.
+"""Chunks that threads and other processes place, and those that fall apart.
 
 Finished ones are left alone, and one that cannot be placed is told.
 """
 
+import errno
 import shutil
 from dataclasses import replace
 from pathlib import Path
@@ -10,7 +11,7 @@ from pathlib import Path
 import pycolmap
 import pytest
 
-from swimm3r.errors import StorageError
+from swimm3r.errors import DeviceError, StorageError
 from swimm3r.prepare import read_frames
 from swimm3r.progress import silent
 from swimm3r.sfm.colmap import mapping, poses
@@ -21,11 +22,12 @@ from swimm3r.sfm.settings import ColmapSettings
 from swimm3r.synthetic import write_dive
 from swimm3r.synthetic.settings import DiveSettings
 from swimm3r.tasks import EngineSettings
-from swimm3r.tasks.outcome import Failure
+from swimm3r.tasks.outcome import Failure, TaskError
 
 
-def test_chunks_in_processes_are_left_alone_where_they_are_finished_and_told_where_they_fail(
-    tmp_path: Path, caplog: pytest.LogCaptureFixture
+@pytest.mark.parametrize("jobs", [1, 2])
+def test_chunks_are_left_alone_where_they_are_finished_and_told_where_they_fail(
+    jobs: int, tmp_path: Path, caplog: pytest.LogCaptureFixture
 ):
     def task(name: str) -> ChunkTask:
         database = tmp_path / "missing.db"
@@ -33,13 +35,15 @@ def test_chunks_in_processes_are_left_alone_where_they_are_finished_and_told_whe
 
     finished = tmp_path / "chunks" / "finished"
     finished.mkdir(parents=True)
-    engine = EngineSettings(jobs=2, retries=0)
+    engine = EngineSettings(jobs=jobs, retries=0)
     place_chunks([task("finished")], 1, "placing chunks", silent, engine)
     assert list(finished.iterdir()) == []
     place_chunks([task("lost"), task("finished")], 1, "placing chunks", silent, engine)
     assert "a chunk of frames is left out: lost failed" in caplog.text
     assert placed_models(tmp_path / "chunks" / "lost") == []
-    assert "Traceback" in (tmp_path / "logs" / "lost.log").read_text()
+    assert "Traceback" in (caplog.text if jobs == 1 else (tmp_path / "logs" / "lost.log").read_text())
+    with pytest.raises(TaskError, match="lost failed"):
+        place_chunks([task("lost")], 1, "placing chunks", silent, engine)
 
 
 def test_an_error_of_the_disk_is_no_chunks_own(tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
@@ -48,6 +52,31 @@ def test_an_error_of_the_disk_is_no_chunks_own(tmp_path: Path, monkeypatch: pyte
     task = ChunkTask("a", tmp_path / "a.db", 3, (1, 2, 3), ("PINHOLE", ()), ColmapSettings(), tmp_path / "chunks" / "a")
     with pytest.raises(StorageError, match="disk is full"):
         place_chunks([task], 1, "placing chunks", silent, EngineSettings(jobs=2))
+
+
+@pytest.mark.parametrize(
+    ("error", "raised"),
+    [
+        (KeyboardInterrupt(), KeyboardInterrupt),
+        (RuntimeError("[sqlite3_utils.h:50] SQLite error: database or disk is full"), StorageError),
+        (OSError(errno.ENOSPC, "No space left on device"), StorageError),
+        (MemoryError(), DeviceError),
+    ],
+)
+def test_an_error_that_is_no_chunks_own_ends_the_placing_in_threads(
+    error: BaseException, raised: type[BaseException], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+):
+    def failing(*_: object) -> None:
+        raise error
+
+    monkeypatch.setattr(place, "write_excerpt", failing)
+    tasks = [
+        ChunkTask(name, tmp_path / "a.db", 3, (1, 2, 3), ("PINHOLE", ()), ColmapSettings(), tmp_path / "chunks" / name)
+        for name in ("finished", "failing")
+    ]
+    tasks[0].folder.mkdir(parents=True)
+    with pytest.raises(raised):
+        place_chunks(tasks, 1, "placing chunks", silent)
 
 
 def of_frames(model: pycolmap.Reconstruction, images: set[int]) -> pycolmap.Reconstruction:

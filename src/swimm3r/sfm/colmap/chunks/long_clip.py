@@ -18,7 +18,7 @@ from swimm3r.sfm.colmap.calibration.start import set_camera
 from swimm3r.sfm.colmap.chunks.assemble import assemble
 from swimm3r.sfm.colmap.chunks.join import Joined, join_parts
 from swimm3r.sfm.colmap.chunks.links import link
-from swimm3r.sfm.colmap.chunks.parts import Part, coherent_parts, part_of, shared_points, without_jumps
+from swimm3r.sfm.colmap.chunks.parts import Part, coherent_models, coherent_parts, part_of, shared_points
 from swimm3r.sfm.colmap.chunks.pilot import PILOT, PilotLens, pilot_lens
 from swimm3r.sfm.colmap.chunks.place import ChunkTask, place_chunks, placed_models, remove_stale
 from swimm3r.sfm.colmap.chunks.plan import order_by_matches, plan_chunks
@@ -114,7 +114,7 @@ def _join(
             lens = model.cameras[1]
         else:
             model = adjust_poses(store, model)
-        models.append(without_jumps(model))
+        models.extend(coherent_models(model))
     set_camera(store, lens)
     return sorted(models, key=lambda model: model.num_reg_images(), reverse=True)
 

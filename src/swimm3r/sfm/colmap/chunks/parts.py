@@ -99,17 +99,22 @@ def coherent_parts(part: Part) -> list[Part]:
     return [_piece(part, own) for own in pieces if len(own) >= LEAST_FRAMES]
 
 
-def without_jumps(model: "pycolmap.Reconstruction") -> "pycolmap.Reconstruction":
-    """The model with the frames of its largest coherent part alone; itself where it is coherent."""
+def coherent_models(model: "pycolmap.Reconstruction") -> "list[pycolmap.Reconstruction]":
+    """The model cut where `coherent_parts` cuts it, the largest piece first; itself where that leaves it whole."""
+    part = part_of(model)
+    pieces = sorted(coherent_parts(part), key=lambda piece: len(piece.images), reverse=True)
+    if not pieces or len(pieces[0].images) == len(part.images):
+        return [model]
+    return [_of_frames(model, piece) for piece in pieces]
+
+
+def _of_frames(model: "pycolmap.Reconstruction", part: Part) -> "pycolmap.Reconstruction":
+    """The model with the frames of a part of it alone."""
     import pycolmap
 
-    part = part_of(model)
-    largest = max(coherent_parts(part), key=lambda piece: len(piece.images), default=part)
-    if len(largest.images) == len(part.images):
-        return model
     kept = pycolmap.Reconstruction(model)
     for image_id in model.reg_image_ids():
-        if int(model.images[image_id].name) + 1 not in largest.cam_from_world:
+        if int(model.images[image_id].name) + 1 not in part.cam_from_world:
             kept.deregister_frame(model.images[image_id].frame_id)
     return kept
 

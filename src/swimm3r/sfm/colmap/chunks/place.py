@@ -9,6 +9,7 @@ import tempfile
 from collections.abc import Sequence
 from concurrent.futures import ALL_COMPLETED, ThreadPoolExecutor, wait
 from dataclasses import dataclass, replace
+from functools import partial
 from pathlib import Path
 from threading import Event
 from typing import TYPE_CHECKING
@@ -19,10 +20,10 @@ from swimm3r.progress import Progress, silent
 from swimm3r.sfm.colmap.calibration.start import set_camera
 from swimm3r.sfm.colmap.chunks.parts import LEAST_FRAMES
 from swimm3r.sfm.colmap.mapping import map_frames, place_leftovers, replace_misplaced
-from swimm3r.sfm.features.database import FeatureDatabase, write_excerpt
+from swimm3r.sfm.features.database import FeatureDatabase, full_disk_said_plainly, write_excerpt
 from swimm3r.sfm.settings import ColmapSettings
 from swimm3r.tasks import run_tasks
-from swimm3r.tasks.outcome import TaskError
+from swimm3r.tasks.outcome import Failure, TaskError, attempt
 from swimm3r.tasks.settings import EngineSettings
 
 if TYPE_CHECKING:
@@ -51,7 +52,10 @@ def place_chunk(task: ChunkTask, progress: Progress = silent) -> None:
     if task.folder.is_dir():
         return
     task.folder.parent.mkdir(parents=True, exist_ok=True)
-    with tempfile.TemporaryDirectory(dir=task.folder.parent, prefix=".mapping.") as scratch:
+    with (
+        full_disk_said_plainly(task.folder.parent),
+        tempfile.TemporaryDirectory(dir=task.folder.parent, prefix=".mapping.") as scratch,
+    ):
         whole = FeatureDatabase(task.database, task.frames, little_overlap=task.little_overlap)
         store = write_excerpt(whole, Path(scratch) / "database.db", task.images)
         name, parameters = task.lens
@@ -99,17 +103,24 @@ def place_chunks(
 ) -> None:
     """Place several chunks at a time, in threads (COLMAP releases the interpreter) or where `engine` says.
 
-    `progress` may stop it. A chunk that failed or was killed for good is said in the log and left out; a repeated run
-    tries it again. Any other error, of the disk or the input, is no chunk's own and raised.
+    `progress` may stop it. A chunk that failed or whose process was killed for good is said in the log and left out; a
+    repeated run tries it again. Where all failed, the error of the first is raised, and so is any that is no chunk's
+    own: of the disk, the input or this process's memory.
     """
-    if not engine.is_in_this_process:
+    if engine.is_in_this_process:
+        failures, own = _place_in_threads(tasks, threads, label, progress), (TaskError,)
+    else:
         absolute = [replace(task, database=task.database.resolve(), folder=task.folder.resolve()) for task in tasks]
         logs = absolute[0].database.parent / "logs" if absolute else None
-        for failure in run_tasks(place_chunk, absolute, engine, progress, label, logs=logs):
-            if not isinstance(failure.error, TaskError | DeviceError):
-                raise failure.error
-            log.warning("a chunk of frames is left out: %s", failure.message)
-        return
+        failures, own = run_tasks(place_chunk, absolute, engine, progress, label, logs=logs), (TaskError, DeviceError)
+    for failure in failures:
+        if not isinstance(failure.error, own) or len(failures) == len(tasks):
+            raise failure.error
+        log.warning("a chunk of frames is left out: %s", failure.message)
+
+
+def _place_in_threads(tasks: Sequence[ChunkTask], threads: int, label: str, progress: Progress) -> tuple[Failure, ...]:
+    """Place chunks in threads of this process and return the failures; `progress` may stop it."""
     stopped = Event()
 
     def watch(what: str, done: int, total: int, /) -> None:
@@ -118,18 +129,18 @@ def place_chunks(
 
     progress(label, 0, len(tasks))
     with ThreadPoolExecutor(threads) as pool:
-        pending = [pool.submit(place_chunk, task, watch) for task in tasks]
+        pending = [pool.submit(attempt, partial(place_chunk, progress=watch), task) for task in tasks]
         try:
             done = 0
             while done < len(tasks):  # told twice a second, so that ^C is heard between two chunks, too
                 done = len(wait(pending, timeout=0.5, return_when=ALL_COMPLETED).done)
                 progress(label, done, len(tasks))
-            for future in pending:
-                future.result()
+            errors = [future.result().error for future in pending]
         except BaseException:
             stopped.set()
             pool.shutdown(wait=True, cancel_futures=True)
             raise
+    return tuple(Failure(task.name, error) for task, error in zip(tasks, errors, strict=True) if error is not None)
 
 
 def placed_models(folder: Path) -> "list[pycolmap.Reconstruction]":
