@@ -86,8 +86,12 @@ class Stages:
             make=lambda: read_frames(self.source, self.settings.frames, folder, self.progress, lens),
             reuse=lambda: load_frames(folder),
         )
-        self.record.summary["input"] |= sections.frames_section(frames)
-        self.record.add({"warnings": [{"what": what, "advice": ""} for what in frames.warnings]})
+        described = sections.frames_section(frames)
+        if self.record.is_done("sfm", self._keys["sfm"]):  # it may work on frames of another size, and warns of more
+            self.record.summary["input"] = described | self.record.summary["input"]
+        else:
+            self.record.summary["input"] |= described
+            self.record.summary["warnings"] = [{"what": what, "advice": ""} for what in frames.warnings]
         return frames
 
     def _sfm(self, prepared: Frames) -> tuple[Frames, Reconstruction]:
@@ -101,24 +105,20 @@ class Stages:
             reuse=lambda: None,
         )
         frames = run_frames(folder)
-        self.record.summary["input"] |= {
-            "width": frames.width,
-            "height": frames.height,
-            "rectified": is_rectified(folder),
-            "rows_rectified": has_rectified_rows(folder),
-        }
         rec = self._recorded(frames)
         if _scaled(self.record, rec, self.settings, self.progress):
             rec = self._recorded(frames)
-        self.record.add(scale_sections(folder, rec))
         return frames, rec
 
     def _recorded(self, frames: Frames) -> Reconstruction:
         """The reconstruction on disk, with its sections in the record."""
-        folder = self.record.folder / "sfm"
+        run, folder = self.record.folder, self.record.folder / "sfm"
         rec, between = load_reconstruction(folder, frames), read_between(folder)
         placed = 0 if between is None else len(between.names)
-        self.record.add(sections.sfm_sections(rec, frames, unfiltered_matches(folder, rec), placed))
+        found = sections.sfm_sections(rec, frames, unfiltered_matches(folder, rec), placed)
+        of_frames = {"rectified": is_rectified(run), "rows_rectified": has_rectified_rows(run)}
+        size = {"width": frames.width, "height": frames.height}
+        self.record.describe("sfm", {**found, **scale_sections(run, rec), "input": {**size, **of_frames}})
         return rec
 
     def _splat(self, frames: Frames, rec: Reconstruction) -> SplatMap:
@@ -132,7 +132,7 @@ class Stages:
             reuse=lambda: None,
         )
         scene = load_map(folder / "map.safetensors").to(devices.for_maps(device))
-        self.record.add(sections.splat_sections(scene, rec, frames, folder))
+        self.record.describe("splat", sections.splat_sections(scene, rec, frames, folder))
         return scene
 
 
@@ -171,4 +171,5 @@ def _scaled(record: RunRecord, rec: Reconstruction, settings: RunSettings, progr
     if is_scaled(record.folder, run.stages["sfm"].key, settings.scale):
         return False
     scale_folder(record.folder, run, settings.scale, progress)
+    record.reread()
     return True

@@ -39,7 +39,6 @@ def evaluate_run(
         settings.test if steps is None else replace(settings.test, steps=steps), reference or own.reference
     )
     with watched(progress) as told, open_record(folder, source, before.input.fingerprint) as record:
-        record.summary |= before.sections
         scene = load_map(folder / "splat" / "map.safetensors").to(devices.for_maps(map_device))
         frames = run_frames(folder)
         run = MappedRun(folder, frames, load_reconstruction(folder / "sfm", frames), scene, settings)
@@ -68,11 +67,11 @@ def own_scores(
         scores = score_map(run, own.test, truth, run.folder / "renders" / "test", progress)
         film_flight(run, progress)
         restored = {"sfm": score_restored_frames(run, progress), **(scores["restored"] or {})}
-        record.summary |= {**scores, "restored": restored}
+        record.describe("eval", {**scores, "restored": restored})
 
     reference = None if own.reference is None else str(own.reference)
     key = stage_keys(record.fingerprint, run.settings, own.reference)["eval"]
-    record.stage("eval", key, make, record.keep_scores if reuse else None, reference=reference)
+    record.stage("eval", key, make, (lambda: None) if reuse else None, reference=reference)
 
 
 def _other_scores(
