@@ -31,9 +31,9 @@ from swimm3r.sfm.rectified.run import (
     given_rectification,
     has_rectified_rows,
     is_rectified,
-    rectified_truth,
     rectify_run,
     run_frames,
+    run_truth,
     write_masks_as_filmed,
 )
 from swimm3r.splat import train
@@ -72,7 +72,7 @@ class Stages:
         if last == "splat":
             return
         run, own = MappedRun(folder, frames, rec, scene, self.settings), Protocol(self.settings.test, self.reference)
-        own_scores(self.record, run, own, rectified_truth(folder, truth), self.progress, reuse=True)
+        own_scores(self.record, run, own, run_truth(folder, frames, truth), self.progress, reuse=True)
 
     @cached_property
     def _keys(self) -> dict[str, str]:

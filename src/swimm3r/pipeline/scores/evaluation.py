@@ -13,7 +13,7 @@ from swimm3r.report import write_report
 from swimm3r.scene.ground_truth import GroundTruth
 from swimm3r.scene.reconstruction_io import load_reconstruction
 from swimm3r.scene.run_folder import open_run
-from swimm3r.sfm.rectified.run import rectified_truth, run_frames
+from swimm3r.sfm.rectified.run import run_frames, run_truth
 from swimm3r.splat.map_file import load_map
 from swimm3r.splat.settings import MapDevice
 
@@ -42,7 +42,7 @@ def evaluate_run(
         scene = load_map(folder / "splat" / "map.safetensors").to(devices.for_maps(map_device))
         frames = run_frames(folder)
         run = MappedRun(folder, frames, load_reconstruction(folder / "sfm", frames), scene, settings)
-        truth = rectified_truth(folder, truth_of(source, asked.reference))
+        truth = run_truth(folder, frames, truth_of(source, asked.reference))
         if beside := asked.key_beside(own):
             record.add_protocol(beside, _other_scores(run, asked, truth, f"renders/protocols/{beside}", told))
         else:
