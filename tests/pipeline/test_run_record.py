@@ -2,6 +2,7 @@
 
 import json
 import os
+import shutil
 import subprocess
 import sys
 from collections.abc import Callable
@@ -16,7 +17,7 @@ from swimm3r.io.files.atomic import DRAFT
 from swimm3r.io.files.folder_lock import folder_lock
 from swimm3r.pipeline.presets import PRESETS, RunSettings, from_yaml
 from swimm3r.pipeline.run import run_pipeline
-from swimm3r.pipeline.run_record import open_record
+from swimm3r.pipeline.run_record import open_record, stage_keys
 from swimm3r.pipeline.run_settings import differences, starting_settings
 from swimm3r.scene.run_folder import open_run, read_run
 from swimm3r.synthetic import write_dive
@@ -50,8 +51,6 @@ def contents(folder: Path) -> dict[str, bytes]:
 
 def pretend(run: Path, stage: str, status: str = "done") -> None:
     """A later stage as if it had been made with the folder's settings."""
-    from swimm3r.pipeline.run_record import stage_keys
-
     document = json.loads((run / "summary.json").read_text())
     keys = stage_keys(document["input"]["fingerprint"], from_yaml(run / "settings.yaml"), None)
     document["stages"][stage] = {"status": status, "key": keys[stage]}
@@ -92,6 +91,41 @@ def test_a_command_that_stops_while_it_loads_keeps_the_scores_of_a_finished_run(
     with pytest.raises(InputError):  # the pretended structure from motion cannot be read
         run_pipeline(dive, run)
     assert json.loads((run / "summary.json").read_text()) == before
+
+
+def refer_to(run: Path, reference: Path) -> None:
+    """The run as if it had been scored against known poses."""
+    document = json.loads((run / "summary.json").read_text())
+    keys = stage_keys(document["input"]["fingerprint"], from_yaml(run / "settings.yaml"), reference)
+    document["stages"]["eval"] |= {"key": keys["eval"], "reference": str(reference)}
+    (run / "summary.json").write_text(json.dumps(document))
+
+
+def test_a_reference_is_the_same_from_another_folder(
+    dive: Path, run: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+):
+    pretend_finished(run)
+    known = tmp_path / "cameras.json"
+    shutil.copy(dive / "truth" / "cameras.json", known)
+    refer_to(run, known)
+    monkeypatch.chdir(tmp_path)
+    run_pipeline(dive, run, last_stage="prepare", reference=Path("cameras.json"))
+    assert read_run(run).stages["eval"].reference == str(known)
+    with pytest.raises(UsageError, match=r"reference: .*cameras\.json -> .*elsewhere\.json"):
+        run_pipeline(dive, run, last_stage="prepare", reference=Path("elsewhere.json"))
+
+
+def test_scores_against_a_reference_that_is_gone_are_kept_with_a_warning(
+    dive: Path, run: Path, tmp_path: Path, caplog: pytest.LogCaptureFixture
+):
+    pretend_finished(run)
+    refer_to(run, tmp_path / "gone.json")
+    before = json.loads((run / "summary.json").read_text())
+    assert run_pipeline(dive, run, last_stage="prepare") == before
+    assert "gone.json is not on this computer" in caplog.text
+    shutil.rmtree(run / "renders")
+    with pytest.raises(InputError, match=r"gone\.json"):  # the scores are to be taken again
+        run_pipeline(dive, run)
 
 
 def test_sections_of_stages_that_are_set_aside_are_not_shown_as_current(dive: Path, run: Path):

@@ -61,7 +61,6 @@ class Stages:
 
     def make(self, last: str) -> None:
         """Make or reuse the stages one after another up to `last`."""
-        folder, truth = self.record.folder, truth_of(self.source, self.reference)
         frames = self._prepare()
         if last == "prepare":
             return
@@ -71,8 +70,12 @@ class Stages:
         scene = self._splat(frames, rec)
         if last == "splat":
             return
-        run, own = MappedRun(folder, frames, rec, scene, self.settings), Protocol(self.settings.test, self.reference)
-        own_scores(self.record, run, own, run_truth(folder, frames, truth), self.progress, reuse=True)
+        folder, own = self.record.folder, Protocol(self.settings.test, self.reference)
+        scored = self.record.is_done("eval", self._keys["eval"])  # and the reference may be gone since
+        truth = None if scored else run_truth(folder, frames, truth_of(self.source, self.reference))
+        own_scores(
+            self.record, MappedRun(folder, frames, rec, scene, self.settings), own, truth, self.progress, reuse=True
+        )
 
     @cached_property
     def _keys(self) -> dict[str, str]:

@@ -32,6 +32,7 @@ def evaluate_run(
     "other_protocols", and the views in RUN/renders/protocols. Raises InputError where the run has no map yet.
     """
     before = open_run(folder, "splat")
+    reference = None if reference is None else reference.resolve()
     settings, source = from_yaml(folder / "settings.yaml"), Path(before.input.path)
     scored = before.stages.get("eval")
     own = Protocol(settings.test, None if scored is None or scored.reference is None else Path(scored.reference))
