@@ -26,7 +26,7 @@ from swimm3r.evaluate import NotComputed
 from swimm3r.evaluate.images import ViewScores, mean_view_scores, view_scores
 from swimm3r.evaluate.lpips import Lpips, load_lpips
 from swimm3r.evaluate.registration import recolored_by_halves, recolored_by_tiles
-from swimm3r.geometry import best_similarity
+from swimm3r.geometry import Similarity, best_similarity
 from swimm3r.imaging.turned_rows import at_half_time, mask_at_half_time
 from swimm3r.imaging.undistortion import shown_pixels, undistorted
 from swimm3r.io.view_names import view_stems
@@ -57,7 +57,7 @@ from swimm3r.sfm.moving.still_scene import still_scene
 from swimm3r.splat.pose_refinement import refine_pose
 from swimm3r.splat.rendering import SplatMap
 from swimm3r.splat.settings import PoseRefinementSettings
-from swimm3r.splat.training_poses import as_mapped, axes_of_map
+from swimm3r.splat.training_poses import axes_of_map
 
 log = logging.getLogger(__name__)
 
@@ -173,7 +173,8 @@ def score_views(
     """
     perceptual = published_lpips()
     views, stems = [], view_stems(frames.names)
-    surfaces = None if rec.moving is None else still_scene(as_mapped(rec, scene.poses), frames)
+    surfaces = None if rec.moving is None else still_scene(rec, frames)
+    to_map = axes_of_map(rec, scene.poses)
     style, coverage = display_style(scene, rec, restore), TrainingCoverage(rec)
     for done, (name, first) in enumerate(poses.items()):
         progress("scoring test frames", done, len(poses))
@@ -191,8 +192,8 @@ def score_views(
         camera = cut(canvas, window)
         out = scene.render(camera, time)
         write_view(folder, stems[name], out, camera, style)
-        known = coverage.of(camera)
-        found = None if surfaces is None else surfaces.moving_in(lens, image, neighbors(rec, frames, name, 2))
+        known, unturned = coverage.of(_in_axes_of_rec(camera, to_map)), _in_axes_of_rec(lens, to_map)
+        found = None if surfaces is None else surfaces.moving_in(unturned, image, neighbors(rec, frames, name, 2))
         true = None if truth is None else truth.moving(name)
         quiet, unmoved = (
             None if moving is None else undistorted(image, mask & ~moving, lens, canvas)[1][window.rows, window.columns]
@@ -207,6 +208,11 @@ def score_views(
         views.append(HeldOutView(name, time, lens, canvas, window, first, scores, covered, observed, still, motion))
     progress("scoring test frames", len(poses), len(poses))
     return views
+
+
+def _in_axes_of_rec(camera: Cameras, to_map: Similarity | None) -> Cameras:
+    """A camera of the map where the reconstruction, whose points and depth have its own unit and axes, has it."""
+    return camera if to_map is None else replace(camera, cam2world=to_map.inverse().poses(camera.cam2world.double()))
 
 
 def _in_colors_of(
