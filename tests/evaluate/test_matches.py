@@ -4,7 +4,7 @@ import pytest
 import torch
 
 from swimm3r.evaluate import NotComputed, matches
-from swimm3r.evaluate.matches import epipolar_errors, match_scores, registration_rate
+from swimm3r.evaluate.matches import epipolar_errors, match_scores
 from swimm3r.geometry import fundamental_from_poses, pose_from, so3_exp, symmetric_epipolar_error
 
 K = torch.tensor([[[400.0, 0, 320], [0, 400, 240], [0, 0, 1]]]).double().repeat(4, 1, 1)
@@ -76,9 +76,3 @@ def test_no_matches_are_no_score():
     none = torch.zeros(0, dtype=torch.int64)
     errors = epipolar_errors(none, none, torch.zeros(0, 2).double(), torch.zeros(0, 2).double(), K, dive()[4])
     assert isinstance(match_scores(errors).inlier_1px, NotComputed)
-
-
-def test_registration_rate_is_the_share_of_frames_placed():
-    assert registration_rate(torch.tensor([True, True, True, False])) == 0.75
-    with pytest.raises(ValueError, match="no frames"):
-        registration_rate(torch.zeros(0, dtype=torch.bool))

@@ -1,5 +1,6 @@
 """UIQM and UCIQE to published numbers; water scores from waters whose error is known."""
 
+from collections.abc import Sequence
 from dataclasses import replace
 
 import numpy as np
@@ -7,9 +8,11 @@ import pytest
 import torch
 from PIL import Image
 from skimage.color import rgb2lab
+from torch import Tensor
 
 from swimm3r.evaluate import NotComputed
 from swimm3r.evaluate.underwater import (
+    WaterScores,
     _lab_from_srgb,
     clear_psnr,
     lit_enough,
@@ -17,7 +20,6 @@ from swimm3r.evaluate.underwater import (
     uciqe,
     uiqm,
     view_water_errors,
-    water_scores,
     water_scores_from_errors,
 )
 from swimm3r.medium import AttenuationCurve, Medium, MediumFit, add_water, backscatter, remove_water
@@ -93,6 +95,12 @@ def test_uiqm_needs_one_whole_block():
         uiqm(torch.zeros(9, 40, 3))
 
 
+def water_scores(fit: MediumFit, ray_depths: Sequence[Tensor], true: Medium) -> WaterScores:
+    """The scores of a fit over views of these depths."""
+    errors = [view_water_errors(z, fit.at(z), true) for z in ray_depths]
+    return water_scores_from_errors(errors, fit.constant(), fit.identifiable, true)
+
+
 def test_the_true_water_has_no_error():
     scores = water_scores(fit_of(WATER), [Z, 2 * Z], WATER)
     for errors in (scores.T_D_abs, scores.B_abs, scores.Binf_abs, scores.beta_D_rel, scores.beta_B_rel):
@@ -132,11 +140,6 @@ def test_coefficients_that_are_not_identifiable_are_null_with_a_reason():
     assert entries["beta_D_rel_reason"] == "not identifiable in G, B"
     assert "beta_B_rel_reason" not in entries
     assert entries["T_D_abs"] == pytest.approx([0, 0, 0], abs=1e-6)
-
-
-def test_linear_light_is_not_compared_with_stored_values():
-    with pytest.raises(ValueError, match="linear"):
-        water_scores(replace(fit_of(WATER), encoding="linear"), [Z], WATER)
 
 
 def test_a_medium_that_varies_over_the_image_is_scored_at_its_pixels():

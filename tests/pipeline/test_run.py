@@ -163,6 +163,10 @@ def test_scores_by_another_protocol_stand_beside_the_runs_own(dive: Path, finish
     copy = tmp_path / "run"
     shutil.copytree(folder, copy)
     before = digests(copy / "renders")
+    known = os.path.relpath(dive / "truth" / "cameras.json")
+    assert evaluate_run(copy, steps=1, reference=Path(known))["stages"] == summary["stages"]
+    (against,) = json.loads((copy / "summary.json").read_text())["other_protocols"].values()
+    assert against["reference"] == str(dive / "truth" / "cameras.json")
     again = evaluate_run(copy, steps=1)
     assert {name: again[name] for name in ("test", "restored", "truth", "stages")} == {
         name: summary[name] for name in ("test", "restored", "truth", "stages")
@@ -299,7 +303,8 @@ def test_finished_stages_are_reused_bit_for_bit(dive: Path, finished: tuple[Path
     folder, _ = finished
     kept = ("prepare", "sfm", "splat", "renders")
     before = [digests(folder / name) for name in kept]
-    assert run_pipeline(dive, folder, TINY_MAP) == finished[1]
+    for last in ("prepare", "sfm", "eval"):
+        assert run_pipeline(dive, folder, TINY_MAP, last_stage=last) == finished[1]
     assert [digests(folder / name) for name in kept] == before
 
 

@@ -2,6 +2,7 @@
 
 import json
 import os
+import shutil
 import subprocess
 import sys
 from collections.abc import Callable
@@ -58,6 +59,90 @@ def pretend(run: Path, stage: str, status: str = "done") -> None:
     marker = {"sfm": "sfm/reconstruction.json", "splat": "splat/map.safetensors", "eval": "renders/test/0.png"}[stage]
     (run / marker).parent.mkdir(parents=True)
     (run / marker).write_text(f"hours of work on {stage}")
+
+
+SECTIONS = {
+    "sfm": {"sfm": {"points": 9}, "scale": {"unit": "m"}, "warnings": [{"what": "of structure from motion"}]},
+    "splat": {"splat": {"primitives": 7}},
+    "eval": {"test": {"psnr": 30.0}, "restored": {"sfm": {}}, "truth": None, "other_protocols": {"steps-1": {}}},
+}
+"""Of summary.json, beside "medium", of which two stages make entries."""
+
+
+def pretend_finished(run: Path) -> dict:
+    """The summary of a run whose later stages are as if they had been made."""
+    for stage in SECTIONS:
+        pretend(run, stage)
+    document = json.loads((run / "summary.json").read_text())
+    document |= {name: section for of_stage in SECTIONS.values() for name, section in of_stage.items()}
+    document["medium"] = {"sfm": {"Binf": [0.1]}, "splat": {"Binf": [0.2]}}
+    document["input"] |= {"width": 99, "rectified": True}
+    (run / "summary.json").write_text(json.dumps(document))
+    return document
+
+
+def test_a_command_that_stops_earlier_keeps_the_scores_of_a_finished_run(dive: Path, run: Path):
+    before = pretend_finished(run)
+    assert run_pipeline(dive, run, last_stage="prepare") == before
+    assert json.loads((run / "summary.json").read_text()) == before
+
+
+def test_a_command_that_stops_while_it_loads_keeps_the_scores_of_a_finished_run(dive: Path, run: Path):
+    before = pretend_finished(run)
+    with pytest.raises(InputError):  # the pretended structure from motion cannot be read
+        run_pipeline(dive, run)
+    assert json.loads((run / "summary.json").read_text()) == before
+
+
+def refer_to(run: Path, reference: Path) -> None:
+    """The run as if it had been scored against known poses."""
+    document = json.loads((run / "summary.json").read_text())
+    keys = stage_keys(document["input"]["fingerprint"], from_yaml(run / "settings.yaml"), reference)
+    document["stages"]["eval"] |= {**keys["eval"].entry(None), "reference": str(reference)}
+    (run / "summary.json").write_text(json.dumps(document))
+
+
+def test_a_reference_is_the_same_from_another_folder(
+    dive: Path, run: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+):
+    pretend_finished(run)
+    known = tmp_path / "cameras.json"
+    shutil.copy(dive / "truth" / "cameras.json", known)
+    refer_to(run, known)
+    monkeypatch.chdir(tmp_path)
+    run_pipeline(dive, run, last_stage="prepare", reference=Path("cameras.json"))
+    assert read_run(run).stages["eval"].reference == str(known)
+    with pytest.raises(UsageError, match=r"reference: .*cameras\.json -> .*elsewhere\.json"):
+        run_pipeline(dive, run, last_stage="prepare", reference=Path("elsewhere.json"))
+
+
+def test_scores_against_a_reference_that_is_gone_are_kept_with_a_warning(
+    dive: Path, run: Path, tmp_path: Path, caplog: pytest.LogCaptureFixture
+):
+    pretend_finished(run)
+    refer_to(run, tmp_path / "gone.json")
+    before = json.loads((run / "summary.json").read_text())
+    assert run_pipeline(dive, run, last_stage="prepare") == before
+    assert "gone.json is not on this computer" in caplog.text
+    shutil.rmtree(run / "renders")
+    with pytest.raises(InputError, match=r"gone\.json"):  # the scores are to be taken again
+        run_pipeline(dive, run)
+
+
+def test_sections_of_stages_that_are_set_aside_are_not_shown_as_current(dive: Path, run: Path):
+    pretend_finished(run)
+    other = replace(FAST, splat=replace(FAST.splat, iterations=7))
+    with pytest.raises(InputError):
+        run_pipeline(dive, run, other, last_stage="splat", redo=True)
+    summary = json.loads((run / "summary.json").read_text())
+    assert {*SECTIONS["sfm"], "medium"} < set(summary)
+    assert not set(summary) & {*SECTIONS["splat"], *SECTIONS["eval"]}
+    assert summary["medium"] == {"sfm": {"Binf": [0.1]}}
+    made = run_pipeline(dive, run, SMALLER, last_stage="prepare", redo=True)
+    assert set(made) == {"schema", "input", "stages", "warnings"}
+    assert made["warnings"] == []
+    assert made["input"]["width"] == 32
+    assert "rectified" not in made["input"]
 
 
 def test_other_settings_are_refused_by_name_and_nothing_is_touched(dive: Path, run: Path):
@@ -131,8 +216,7 @@ def test_what_was_made_from_a_stage_is_not_done_once_it_is_made_again(
     dive: Path, run: Path, made: str, gone: list[str]
 ):
     """Not even where the run is killed before it comes to them."""
-    for stage in ("sfm", "splat", "eval"):
-        pretend(run, stage)
+    pretend_finished(run)
 
     def killed() -> None:
         raise KeyboardInterrupt
@@ -140,7 +224,11 @@ def test_what_was_made_from_a_stage_is_not_done_once_it_is_made_again(
     with open_record(run, dive, read_run(run).input.fingerprint) as record, pytest.raises(KeyboardInterrupt):
         record.stage(made, StageKey("key"), killed, lambda: None)
     kept = {"prepare", "sfm", "splat", "eval"} - set(gone)
-    assert set(json.loads((run / "summary.json").read_text())["stages"]) == kept
+    summary = json.loads((run / "summary.json").read_text())
+    assert set(summary["stages"]) == kept
+    shown = {stage for stage in SECTIONS if set(SECTIONS[stage]) <= set(summary)}
+    assert shown == kept - {"prepare", made}
+    assert set(summary.get("medium", {})) == {"sfm", "splat"} - {made, *gone}
 
 
 def test_a_run_of_another_version_keeps_its_stages(dive: Path, run: Path, caplog: pytest.LogCaptureFixture):

@@ -64,7 +64,8 @@ def is_finished(dive: Dive, out: Path, last_stage: str) -> bool:
         return False
     settings = with_stages_of(dive.settings, held, STAGES[len(stages) :])
     scored = run.stages.get("eval")
-    known = dive.reference or (Path(scored.reference) if scored is not None and scored.reference else None)
+    known = Path(scored.reference) if scored is not None and scored.reference else None
+    known = known if dive.reference is None else dive.reference.resolve()
     keys = stage_keys(run.input.fingerprint, settings, known)
     made = all(keys[stage].is_of(run.stages[stage]) for stage in stages)
     return made and (

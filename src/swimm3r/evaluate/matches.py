@@ -8,7 +8,7 @@ in undistorted pixels of the original images, which must be the same grid for ev
 from dataclasses import dataclass
 
 import torch
-from jaxtyping import Bool, Float, Int
+from jaxtyping import Float, Int
 from torch import Tensor
 
 from swimm3r.evaluate import NotComputed
@@ -57,10 +57,3 @@ def match_scores(errors: Float[Tensor, " m"], pixel_scale: float = 1.0, form: Sy
         return MatchScores(none, none, 0, variant)
     inliers = (errors < 1).double().mean().item()
     return MatchScores(errors.mean().item(), inliers, len(errors), variant)
-
-
-def registration_rate(registered: Bool[Tensor, " n"]) -> float:
-    """Share of the frames handed to the method that it placed in its (largest) model, 0..1."""
-    if not len(registered):
-        raise ValueError("the registration rate of no frames is undefined")
-    return registered.double().mean().item()

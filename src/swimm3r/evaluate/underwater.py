@@ -20,7 +20,7 @@ from torch import Tensor
 
 from swimm3r.evaluate import NotComputed
 from swimm3r.evaluate.images import as_8_bit, psnr_from_errors
-from swimm3r.medium import Encoding, Medium, MediumFit, backscatter, linear_from_srgb, transmittances
+from swimm3r.medium import Medium, backscatter, linear_from_srgb, transmittances
 
 URANKER = NotComputed("URanker's network is not published in enough detail to be rebuilt")
 """The reason for the missing UnderwaterRanker score (Guo et al. 2023).
@@ -103,20 +103,6 @@ def uciqe(rgb: Float[Tensor, "h w 3"]) -> float:
     contrast = float(ordered[len(L) - extreme :].mean() - ordered[:extreme].mean())
     saturation = torch.where(L > 0, chroma / L, 0.0)
     return (0.4680 * chroma.std(correction=0) + 0.2745 * contrast + 0.2576 * saturation.mean()).item()
-
-
-def water_scores(
-    fit: MediumFit, ray_depths: Iterable[Float[Tensor, "_ _"]], true: Medium, encoding: Encoding = "srgb"
-) -> WaterScores:
-    """Errors of a fitted water with true depth maps of held-out frames (0 or not finite: no surface, not counted).
-
-    The fit must be in the truth's unit of length (`medium.rescale`). ValueError where the fit explains values of
-    another encoding than the truth does: their coefficients are different quantities.
-    """
-    if fit.encoding != encoding:
-        raise ValueError(f"the fit explains {fit.encoding} values, the true water {encoding} ones")
-    errors = [view_water_errors(z, fit.at(z), true) for z in ray_depths]
-    return water_scores_from_errors(errors, fit.constant(), fit.identifiable, true)
 
 
 def view_water_errors(

@@ -13,7 +13,7 @@ from swimm3r.scene.ground_truth import GroundTruth
 from swimm3r.scene.reconstruction import Reconstruction
 from swimm3r.scene.reconstruction_io import load_reconstruction
 from swimm3r.scene.run_folder import open_run
-from swimm3r.sfm.rectified.run import rectified_truth, run_frames
+from swimm3r.sfm.rectified.run import run_frames, run_truth
 
 
 @dataclass(frozen=True)
@@ -41,6 +41,6 @@ def open_finished_sfm(folder: Path, reference: Path | None = None) -> FinishedSf
         frames,
         load_reconstruction(folder / "sfm", frames),
         from_yaml(folder / "settings.yaml"),
-        rectified_truth(folder, truth_of(Path(run.input.path), reference)),
+        run_truth(folder, frames, truth_of(Path(run.input.path), reference)),
         run.stages["sfm"].key,
     )

@@ -6,6 +6,7 @@ short goes on from what it left on disk; one whose settings changed is refused o
 """
 
 import json
+import logging
 import platform
 from collections.abc import Callable
 from importlib.metadata import version
@@ -27,6 +28,8 @@ from swimm3r.splat.settings import MapDevice
 from swimm3r.splat.training.observer import Observer
 from swimm3r.tasks.settings import EngineSettings
 
+log = logging.getLogger(__name__)
+
 
 def run_pipeline(
     source: str | Path,
@@ -47,7 +50,8 @@ def run_pipeline(
     `settings` are a preset's (`swimm3r.PRESETS["fast"]`), or changed from one. Without them the run goes by those that
     the folder holds, a new one by the defaults. Stages made with other settings are refused, or with `redo` moved to
     `folder`/old and made again. `reference` is a cameras.json to score against; a synthetic dive brings its own truth.
-    An input may be gone once its frames are prepared, as where the folder was copied to another computer.
+    A run remembers it, and keeps its scores where the file is gone. An input may be gone once its frames are prepared,
+    as where the folder was copied to another computer.
     `map_device` is where the map is trained and rendered. A rough estimate of time and disk is logged first, and
     `on_stage` is told of every stage that starts, `observer` of every step of the map's training. A terminal or a
     notebook shows how far it is, unless `progress` is given (`swimm3r.silent`: nothing). `engine` can spread chunks of
@@ -58,16 +62,19 @@ def run_pipeline(
     far too small.
     """
     source, folder = Path(source), Path(folder)
+    given = None if reference is None else reference.resolve()
     digest = input_fingerprint(source, folder)
     device = devices.for_maps(map_device)  # before there is a folder, and minutes of structure from motion
     with watched(progress) as told, open_record(folder, source, digest, redo=redo) as record:
-        settings, reference = record.settle(settings, reference, last_stage)
+        settings, reference = record.settle(settings, given, last_stage)
         superseded = record.superseded(settings, reference)
         keys = stage_keys(record.fingerprint, settings, reference)
         to_do = record.to_do(keys)
         has_sfm = last_stage != "prepare" and "sfm" not in to_do
         scaled = has_sfm and is_scaled(folder, keys["sfm"].key, settings.scale)
-        check_inputs(source, settings, reference, to_do, scaled=scaled)
+        check_inputs(source, settings, reference if "eval" in to_do else given, to_do, scaled=scaled)
+        if reference is not None and not reference.exists() and record.is_done("eval", keys["eval"]):
+            log.warning("%s is not on this computer: the scores that were taken against it are kept", reference)
         record.set_aside(superseded)
         record.write()
         write_text(folder / "settings.yaml", to_yaml(settings))

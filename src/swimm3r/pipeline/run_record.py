@@ -31,7 +31,15 @@ from swimm3r.scene.run_folder import MARKERS, SCHEMA, STAGES, RunFolder, StageRe
 log = logging.getLogger(__name__)
 Result = TypeVar("Result")
 
-_SCORES = ("test", "restored", "truth")  # the sections that the last stage makes
+_SECTIONS = {  # of summary.json that a stage makes; "medium.splat" is an entry of the section "medium"
+    "prepare": (),
+    "sfm": (
+        *("sfm", "rig", "moving", "flicker", "appearance", "medium.sfm", "medium.sfm_linear", "scale", "water"),
+        *("input.rectified", "input.rows_rectified"),
+    ),
+    "splat": ("splat", "medium.splat"),
+    "eval": ("test", "restored", "truth"),
+}
 _OTHERS = "other_protocols"  # scores by other protocols than the run's own, by their names
 _FILES = ("settings.yaml", "versions.json", "log.jsonl", "summary.json", "report.html")
 _CONTENTS = {  # what a stage leaves, and what later commands make of it
@@ -89,15 +97,9 @@ class RunRecord:
         self._on_stage: Callable[[StageStart], None] = ignore_stages
         self._redo = redo
         before = self._found(fingerprint)
-        sections = {} if before is None else before.sections
-        self.summary: dict[str, Any] = {
-            "schema": SCHEMA,
-            "input": {"path": str(source.resolve()), "fingerprint": fingerprint},
-            "stages": dict(sections.get("stages", {})),
-        }
-        self._scores_before = {name: sections[name] for name in _SCORES if name in sections}
-        if _OTHERS in sections:
-            self.summary[_OTHERS] = dict(sections[_OTHERS])
+        sections = {"stages": {}} if before is None else before.sections
+        given = {"path": str(source.resolve()), "fingerprint": fingerprint}
+        self.summary: dict[str, Any] = {"schema": SCHEMA, **sections, "input": {**sections.get("input", {}), **given}}
         self._log("opened", process=os.getpid(), input=str(source))
 
     def settle(
@@ -124,7 +126,12 @@ class RunRecord:
 
     def to_do(self, keys: dict[str, StageKey]) -> list[str]:
         """The stages up to the last one that are not done with these keys."""
-        return [name for name in STAGES[: self._count] if not self._is_done(name, keys[name])]
+        return [name for name in STAGES[: self._count] if not self.is_done(name, keys[name])]
+
+    def is_done(self, name: str, key: StageKey) -> bool:
+        """Return whether a stage is done with this key and still there."""
+        before = self._stage(name)
+        return before is not None and before.status == "done" and key.is_of(before) and self._is_there(name)
 
     def announce(self, plan: Estimate | None, on_stage: Callable[[StageStart], None] = ignore_stages) -> None:
         """Log the estimate of the work to come and tell `on_stage` of its stages.
@@ -180,12 +187,15 @@ class RunRecord:
         target = _set_aside(self.folder, stages)
         self._log("moved", stages=list(stages), to=str(target.relative_to(self.folder)))
         for stage in stages:
-            self.summary["stages"].pop(stage, None)
-        self.summary.pop(_OTHERS, None)
+            self._forget(stage)
+        if "sfm" in stages:  # prepared frames say all of this anew
+            self.summary.pop("warnings", None)
+            self.summary["input"] = {name: self.summary["input"][name] for name in ("path", "fingerprint")}
         self.write()
 
-    def add(self, found: dict[str, object]) -> None:
-        """Sections for the summary; what a section already holds of an earlier stage stays."""
+    def describe(self, stage: str, found: dict[str, object]) -> None:
+        """The sections of a stage, in the place of those of before; entries that other stages made of one stay."""
+        self._drop_sections(stage)
         for name, section in found.items():
             before = self.summary.get(name)
             if isinstance(before, dict) and isinstance(section, dict):
@@ -197,9 +207,24 @@ class RunRecord:
         self.summary[_OTHERS] = {**self.summary.get(_OTHERS, {}), name: scores}
         self._log("scored", protocol=name)
 
-    def keep_scores(self) -> None:
-        """The sections of the last stage as the summary had them."""
-        self.add(self._scores_before)
+    def reread(self) -> None:
+        """Take over summary.json as another part of the program left it on disk."""
+        self.summary = read_run(self.folder).sections
+
+    def _forget(self, stage: str) -> None:
+        """Take a stage out of the summary, with all that it tells of its result and what was made of it."""
+        self.summary["stages"].pop(stage, None)
+        self._drop_sections(stage)
+        self.summary.pop(_OTHERS, None)
+
+    def _drop_sections(self, stage: str) -> None:
+        for name, _, entry in (path.partition(".") for path in _SECTIONS[stage]):
+            if not entry:
+                self.summary.pop(name, None)
+            elif name in self.summary:
+                self.summary[name] = {key: value for key, value in self.summary[name].items() if key != entry}
+                if not self.summary[name]:
+                    del self.summary[name]
 
     def stage(
         self,
@@ -214,14 +239,15 @@ class RunRecord:
         Stages made from one that is made again are to be made again, even where this run is killed in between.
         """
         self._begin(name)
-        if reuse and self._is_done(name, key):
+        if reuse and self.is_done(name, key):
             self._log("reused", stage=name)
             return reuse()
         self._check_space()
         self._check_memory(name)
         entry = key.entry(self._stage(name))
         for later in _MADE_FROM.get(name, ()):  # their keys tell settings, not what is made now
-            self.summary["stages"].pop(later, None)
+            self._forget(later)
+        self._drop_sections(name)
         self.summary["stages"][name] = {"status": "running", **entry, **facts}
         self.write()
         self._log("started", stage=name)
@@ -264,12 +290,9 @@ class RunRecord:
         if expected and seconds > _TELLING_S:
             self._pace = min(max(seconds / expected, 1 / _MOST_OFF), _MOST_OFF)
 
-    def _is_done(self, name: str, key: StageKey) -> bool:
-        before = self._stage(name)
-        return before is not None and before.status == "done" and key.is_of(before) and self._is_there(name)
-
     def write(self) -> dict:
         """Bring summary.json up to date and return it."""
+        self.summary.pop("products", None)
         self.summary |= summary_section(self.folder)
         write_text(self.folder / "summary.json", json.dumps(self.summary, indent=2) + "\n")
         return self.summary

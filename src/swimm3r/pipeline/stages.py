@@ -33,9 +33,9 @@ from swimm3r.sfm.rectified.run import (
     given_rectification,
     has_rectified_rows,
     is_rectified,
-    rectified_truth,
     rectify_run,
     run_frames,
+    run_truth,
     write_masks_as_filmed,
 )
 from swimm3r.sfm.settings import ColmapModelSettings
@@ -64,20 +64,32 @@ class Stages:
 
     def make(self, last: str) -> None:
         """Make or reuse the stages one after another up to `last`."""
-        folder, truth = self.record.folder, truth_of(self.source, self.reference)
         frames = self._prepare()
         if last == "prepare":
             return
         frames, rec = self._sfm(frames)
         if last == "sfm":
             return
-        if last == "eval" and truth is None and isinstance(self.settings.sfm, ColmapModelSettings):
-            check_model_poses(self.settings.sfm.model, folder / "sfm")  # before hours of training
+        if last == "eval" and not self._scored():
+            self._check_test_poses()
         scene = self._splat(frames, rec)
         if last == "splat":
             return
-        run, own = MappedRun(folder, frames, rec, scene, self.settings), Protocol(self.settings.test, self.reference)
-        own_scores(self.record, run, own, rectified_truth(folder, truth), self.progress, reuse=True)
+        folder, own = self.record.folder, Protocol(self.settings.test, self.reference)
+        truth = None if self._scored() else truth_of(self.source, self.reference)  # its file may be gone once scored
+        truth = run_truth(folder, frames, truth)
+        own_scores(
+            self.record, MappedRun(folder, frames, rec, scene, self.settings), own, truth, self.progress, reuse=True
+        )
+
+    def _scored(self) -> bool:
+        return self.record.is_done("eval", self._keys["eval"])
+
+    def _check_test_poses(self) -> None:
+        """Raise InputError, before hours of training, where test frames' poses were in a model that is gone."""
+        model = self.settings.sfm
+        if isinstance(model, ColmapModelSettings) and truth_of(self.source, self.reference) is None:
+            check_model_poses(model.model, self.record.folder / "sfm")
 
     @cached_property
     def _keys(self) -> dict[str, StageKey]:
@@ -91,8 +103,12 @@ class Stages:
             make=lambda: read_frames(self.source, self.settings.frames, folder, self.progress, lens),
             reuse=lambda: load_frames(folder),
         )
-        self.record.summary["input"] |= sections.frames_section(frames)
-        self.record.add({"warnings": [{"what": what, "advice": ""} for what in frames.warnings]})
+        described = sections.frames_section(frames)
+        if self.record.is_done("sfm", self._keys["sfm"]):  # it may work on frames of another size, and warns of more
+            self.record.summary["input"] = described | self.record.summary["input"]
+        else:
+            self.record.summary["input"] |= described
+            self.record.summary["warnings"] = [{"what": what, "advice": ""} for what in frames.warnings]
         return frames
 
     def _sfm(self, prepared: Frames) -> tuple[Frames, Reconstruction]:
@@ -106,24 +122,20 @@ class Stages:
             reuse=lambda: None,
         )
         frames = run_frames(folder)
-        self.record.summary["input"] |= {
-            "width": frames.width,
-            "height": frames.height,
-            "rectified": is_rectified(folder),
-            "rows_rectified": has_rectified_rows(folder),
-        }
         rec = self._recorded(frames)
         if _scaled(self.record, rec, self.settings, self.progress):
             rec = self._recorded(frames)
-        self.record.add(scale_sections(folder, rec))
         return frames, rec
 
     def _recorded(self, frames: Frames) -> Reconstruction:
         """The reconstruction on disk, with its sections in the record."""
-        folder = self.record.folder / "sfm"
+        run, folder = self.record.folder, self.record.folder / "sfm"
         rec, between = load_reconstruction(folder, frames), read_between(folder)
         placed = 0 if between is None else len(between.names)
-        self.record.add(sections.sfm_sections(rec, frames, unfiltered_matches(folder, rec), placed))
+        found = sections.sfm_sections(rec, frames, unfiltered_matches(folder, rec), placed)
+        of_frames = {"rectified": is_rectified(run), "rows_rectified": has_rectified_rows(run)}
+        size = {"width": frames.width, "height": frames.height}
+        self.record.describe("sfm", {**found, **scale_sections(run, rec), "input": {**size, **of_frames}})
         return rec
 
     def _splat(self, frames: Frames, rec: Reconstruction) -> SplatMap:
@@ -137,7 +149,7 @@ class Stages:
             reuse=lambda: None,
         )
         scene = load_map(folder / "map.safetensors").to(devices.for_maps(device))
-        self.record.add(sections.splat_sections(scene, rec, frames, folder))
+        self.record.describe("splat", sections.splat_sections(scene, rec, frames, folder))
         return scene
 
 
@@ -176,4 +188,5 @@ def _scaled(record: RunRecord, rec: Reconstruction, settings: RunSettings, progr
     if is_scaled(record.folder, run.stages["sfm"].key, settings.scale):
         return False
     scale_folder(record.folder, run, settings.scale, progress)
+    record.reread()
     return True

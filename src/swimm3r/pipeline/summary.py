@@ -21,6 +21,7 @@ from swimm3r.scene.reconstruction import Matches, Reconstruction
 from swimm3r.splat.appearance import read_decision
 from swimm3r.splat.rendering import SplatMap, mean_water
 from swimm3r.splat.settings import PoseRefinementSettings
+from swimm3r.splat.training_poses import as_mapped
 
 _ASKED = 16  # training views that the map's mean water is taken over
 
@@ -149,10 +150,10 @@ def frame_entry(view: HeldOutView) -> dict[str, object]:
 
 def mean_medium(scene: SplatMap, rec: Reconstruction, frames: Frames) -> Medium:
     """The map's water averaged over the directions and times of the training frames, per scene unit of ray depth."""
-    times = frames.times_of(rec.names)
+    times, cameras = frames.times_of(rec.names), as_mapped(rec, scene.poses).cameras
     every = max(1, len(rec.names) // _ASKED)
     with torch.no_grad():
-        views = [mean_water(scene, rec.cameras[i].pinhole(64), times[i]) for i in range(0, len(rec.names), every)]
+        views = [mean_water(scene, cameras[i].pinhole(64), times[i]) for i in range(0, len(rec.names), every)]
     return Medium(**{name: torch.stack([getattr(view, name) for view in views]).mean(0) for name in vars(views[0])})
 
 

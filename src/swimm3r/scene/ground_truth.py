@@ -5,7 +5,7 @@ where something moves) and medium.json where they exist; under a lamp lamp/NAME.
 cameras.json alone is a reference, too.
 """
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 
 import numpy as np
@@ -13,7 +13,7 @@ import torch
 from jaxtyping import Bool, Float
 from torch import Tensor
 
-from swimm3r.cameras import Cameras, cameras_of
+from swimm3r.cameras import Cameras, cameras_of, resized
 from swimm3r.io import cameras_json, images
 from swimm3r.io.files.array_file import Layout, read_arrays
 from swimm3r.io.files.damage import Remedy, damaged
@@ -38,13 +38,27 @@ class LampImages:
 
 @dataclass(frozen=True)
 class GroundTruth:
-    """Reference poses of named frames; `folder` holds the rest where there is any."""
+    """Reference poses of named frames; `folder` holds the rest where there is any.
+
+    Images are of the size of the cameras, whatever that of the files is.
+    """
 
     names: tuple[str, ...]
     cameras: Cameras
     metric: bool
     medium: Medium | None = None  # scene-wide, [3], on pixel values as stored
     folder: Path | None = None
+    stored: tuple[int, int] | None = None  # width and height of the files; None: those of the cameras
+
+    def at_size(self, width: int, height: int) -> "GroundTruth":
+        """The same of frames of another size: depth and masks of the nearest pixels, colors averaged by area."""
+        if (width, height) == (self.cameras.width, self.cameras.height):
+            return self
+        return replace(self, cameras=resized(self.cameras, width, height), stored=self._stored)
+
+    @property
+    def _stored(self) -> tuple[int, int]:
+        return self.stored or (self.cameras.width, self.cameras.height)
 
     def z_depth(self, name: str) -> Float[Tensor, "h w"] | None:
         """Exact depth along the optical axis, 0 where the ray meets nothing; None where the reference has none."""
@@ -53,7 +67,7 @@ class GroundTruth:
             return None
         z_depth = read_arrays(path, {"z_depth": Layout("h w")}, _REMEDY)["z_depth"]
         self._check_size(path, z_depth)
-        return torch.from_numpy(z_depth.astype(np.float32))
+        return torch.from_numpy(self._nearest(z_depth.astype(np.float32)))
 
     def clear(self, name: str) -> Float[Tensor, "h w 3"] | None:
         """The image without water, 0..1; None where the reference has none."""
@@ -62,7 +76,7 @@ class GroundTruth:
             return None
         rgb = images.read_rgb(path)
         self._check_size(path, rgb)
-        return torch.from_numpy(rgb.astype(np.float32)) / (255.0 if rgb.dtype == np.uint8 else 65535.0)
+        return torch.from_numpy(self._averaged(rgb.astype(np.float32) / np.float32(np.iinfo(rgb.dtype).max)))
 
     @property
     def lit(self) -> bool:
@@ -76,7 +90,8 @@ class GroundTruth:
             return None
         found = read_arrays(path, {"light": Layout("h w 3"), "backscatter": Layout("h w 3")}, _REMEDY)
         self._check_size(path, found["light"])
-        return LampImages(*(torch.from_numpy(found[key].astype(np.float32)) for key in ("light", "backscatter")))
+        parts = (self._averaged(found[key].astype(np.float32)) for key in ("light", "backscatter"))
+        return LampImages(*(torch.from_numpy(part) for part in parts))
 
     def moving(self, name: str) -> Bool[Tensor, "h w"] | None:
         """True where the image shows something that moves; None where the reference does not say."""
@@ -85,10 +100,20 @@ class GroundTruth:
             return None
         still = images.read_mask(path)
         self._check_size(path, still)
-        return ~torch.from_numpy(still.copy())
+        return ~torch.from_numpy(self._nearest(still.astype(np.uint8)) > 0)
+
+    def _nearest(self, values: np.ndarray) -> np.ndarray:
+        import cv2
+
+        return cv2.resize(values, (self.cameras.width, self.cameras.height), interpolation=cv2.INTER_NEAREST_EXACT)
+
+    def _averaged(self, values: np.ndarray) -> np.ndarray:
+        import cv2
+
+        return cv2.resize(values, (self.cameras.width, self.cameras.height), interpolation=cv2.INTER_AREA)
 
     def _check_size(self, path: Path, values: np.ndarray) -> None:
-        width, height = self.cameras.width, self.cameras.height
+        width, height = self._stored
         if values.shape[:2] != (height, width):
             why = f"it has {values.shape[1]}x{values.shape[0]} pixels, its cameras.json says {width}x{height}"
             raise damaged(path, why, _REMEDY)

@@ -1,23 +1,36 @@
 """Frames that training did not see: placed, rendered, scored."""
 
 from dataclasses import replace
+from math import cos, sin
+from pathlib import Path
 
+import pytest
 import torch
 from tests.splat.conftest import TinyDive, tiny_dive  # noqa: F401 - a fixture
+from torch import Tensor
 
 from swimm3r.cameras import Cameras
+from swimm3r.geometry import Similarity
+from swimm3r.medium import Medium
 from swimm3r.pipeline.scores.held_out import (
     FirstPose,
     cut,
     first_poses,
+    in_axes_of,
     score_views,
     visible_window,
 )
+from swimm3r.pipeline.summary import mean_medium
 from swimm3r.pipeline.summary import test_section as section_of
+from swimm3r.scene.coverage import TrainingCoverage
 from swimm3r.scene.ground_truth import GroundTruth
+from swimm3r.scene.reconstruction import MovingMasks
 from swimm3r.scene.rig import Rig, RigCamera
 from swimm3r.sfm.features.settings import FeatureSettings
+from swimm3r.sfm.moving.still_scene import StillScene
+from swimm3r.splat.rendering import SplatMap
 from swimm3r.splat.settings import PoseRefinementSettings
+from swimm3r.splat.training_poses import RefinedPoses
 
 
 def lens(k1: float) -> Cameras:
@@ -82,3 +95,49 @@ def test_without_a_placed_test_frame_no_score_is_known():
     scores = ("psnr", "ssim", "lpips", "sharpness", "psnr_observed", "psnr_covered", "flow_px", "psnr_still")
     assert all(section[name] is None for name in scores)
     assert all("placed" in str(section[f"{name}_reason"]) for name in scores)
+
+
+def test_coverage_and_what_moves_are_asked_in_the_axes_of_the_reconstruction(
+    tiny_dive: TinyDive,  # noqa: F811
+    tmp_path: Path,
+    monkeypatch: pytest.MonkeyPatch,
+):
+    """The training of a map may have moved all of its cameras together."""
+    frames, angle, name = tiny_dive.frames, 0.3, tiny_dive.frames.test.names[0]
+    R = torch.tensor([[cos(angle), 0, sin(angle)], [0, 1, 0], [-sin(angle), 0, cos(angle)]], dtype=torch.float64)
+    to_map = Similarity(torch.tensor(1.1).double(), R, torch.tensor([0.5, -0.3, 0.2]).double())
+    moved = RefinedPoses(tiny_dive.rec.names, to_map.poses(tiny_dive.rec.cameras.cam2world))
+    scene = replace(tiny_dive.truth, poses=moved)
+    there = tiny_dive.cameras.cam2world[frames.index(name)]
+    asked: list[Cameras] = []
+
+    def moving_in(self: StillScene, lens: Cameras, image: Tensor, neighbors: tuple[str, ...] = ()) -> Tensor:
+        assert torch.equal(self.cameras.cam2world, tiny_dive.rec.cameras.cam2world)
+        asked.append(lens)
+        return torch.zeros(lens.height, lens.width, dtype=torch.bool)
+
+    monkeypatch.setattr(StillScene, "moving_in", moving_in)
+    rec = replace(tiny_dive.rec, moving=MovingMasks(tmp_path / "masks"))
+    poses = in_axes_of(scene, rec, {name: FirstPose(there, "reference")})
+    (view,) = score_views(scene, rec, frames, poses, tmp_path, PoseRefinementSettings(steps=0))
+    canvas = replace(cut(view.canvas, view.window), cam2world=there[None])
+    expected = TrainingCoverage(rec).of(canvas).float().mean().item()
+    assert expected > 0.2
+    assert view.covered.share == pytest.approx(expected, abs=0.01)
+    torch.testing.assert_close(asked[0].cam2world[0], there, rtol=0, atol=1e-6)
+
+
+def test_the_mean_water_of_a_map_is_that_of_its_own_cameras(
+    tiny_dive: TinyDive,  # noqa: F811
+    monkeypatch: pytest.MonkeyPatch,
+):
+    moved = RefinedPoses(tiny_dive.rec.names, tiny_dive.rec.cameras.cam2world.flip(0))
+    asked: list[Tensor] = []
+
+    def mean_water(scene: SplatMap, camera: Cameras, time: float) -> Medium:
+        asked.append(camera.cam2world[0])
+        return Medium(torch.zeros(3), torch.zeros(3), torch.zeros(3))
+
+    monkeypatch.setattr("swimm3r.pipeline.summary.mean_water", mean_water)
+    mean_medium(replace(tiny_dive.truth, poses=moved), tiny_dive.rec, tiny_dive.frames)
+    torch.testing.assert_close(torch.stack(asked), moved.cam2world)

@@ -29,12 +29,8 @@ from swimm3r.scene.frames import Frame, Frames
 from swimm3r.scene.reconstruction import Reconstruction
 from swimm3r.sfm.colmap import poses as colmap
 from swimm3r.sfm.colmap.calibration.start import first_camera
-from swimm3r.sfm.colmap.messages import lens_not_told, too_few
-from swimm3r.sfm.colmap.pairs import choose_pairs
-
-
 from swimm3r.sfm.colmap.chunks import parts
-from swimm3r.sfm.colmap.messages import too_few
+from swimm3r.sfm.colmap.messages import lens_not_told, too_few
 from swimm3r.sfm.colmap.pairs import check_pairs, choose_pairs
 from swimm3r.sfm.colmap.settings import MappingSettings
 from swimm3r.sfm.features import database as feature_database

@@ -28,9 +28,9 @@ from swimm3r.sfm.rectified.frames import BentImagesError, rectify_frames
 from swimm3r.sfm.rectified.run import (
     RECTIFIED,
     given_rectification,
-    rectified_truth,
     run_frames,
     run_rectification,
+    run_truth,
 )
 from swimm3r.sfm.settings import ColmapSettings
 from swimm3r.tasks.settings import EngineSettings
@@ -174,9 +174,12 @@ def test_the_error_goes_from_process_to_process():
 def test_reference_poses_turn_with_the_frames(bent: Frames, truth: Cameras, tmp_path: Path):
     way = rectification_of(stretching_lens(WIDTH, HEIGHT))
     stated = GroundTruth(tuple(f"{i}.jpg" for i in range(len(truth))), truth, metric=False, folder=tmp_path)
-    assert rectified_truth(tmp_path, stated) is stated
+    of_their_size = run_truth(tmp_path, bent, stated)
+    assert of_their_size is not None
+    assert (of_their_size.cameras.width, of_their_size.cameras.height) == (bent.width, bent.height)
+    assert of_their_size.names == stated.names
     rectify_frames(bent, way, tmp_path / RECTIFIED)
-    turned = rectified_truth(tmp_path, stated)
+    turned = run_truth(tmp_path, bent, stated)
     assert turned is not None
     assert turned.names == bent.names
     torch.testing.assert_close(turned.cameras.centers, truth.centers)

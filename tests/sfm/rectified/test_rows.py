@@ -25,8 +25,8 @@ from swimm3r.sfm.rectified.run import (
     RECTIFIED_ROWS,
     has_rectified_rows,
     is_rectified,
-    rectified_truth,
     run_frames,
+    run_truth,
     run_turns,
     write_masks_as_filmed,
 )
@@ -130,9 +130,9 @@ def test_the_truth_has_the_frames_names(filmed: Frames, tmp_path: Path):
     run = tmp_path / "run"
     cameras = replace(lens(), K=lens().K)[[0] * 3]
     stated = GroundTruth(filmed.names, cameras, metric=False, folder=tmp_path)
-    assert rectified_truth(run, stated) is stated
+    assert run_truth(run, filmed, stated) is stated
     rectify_frames(filmed, TURNS, run / RECTIFIED_ROWS)
-    named = rectified_truth(run, stated)
+    named = run_truth(run, filmed, stated)
     assert named is not None
     assert named.names == ("0.png", "1.png", "2.png")
     assert named.folder is None

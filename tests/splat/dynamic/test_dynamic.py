@@ -154,7 +154,8 @@ def test_what_moves_is_scored_apart_where_the_truth_knows_it(tiny_dive, trained,
         write_rgb(tmp_path / "truth" / "masks" / f"{name}.png", 255 - moving)
     truth = GroundTruth(frames.names, cameras, True, tiny_dive.rec.medium.constant(), tmp_path / "truth")
     poses = {name: FirstPose(cameras.cam2world[frames.index(name)], "reference") for name in frames.test.names}
-    views = score_views(scene, tiny_dive.rec, frames, poses, tmp_path, PoseRefinementSettings(steps=0))
+    settings = PoseRefinementSettings(steps=0)
+    views = score_views(scene, tiny_dive.rec, frames, poses, tmp_path, settings, truth=truth)
     section: Any = truth_section(tiny_dive.rec, frames, truth, scene, views)["splat"]
     expected = []
     for name in frames.test.names:

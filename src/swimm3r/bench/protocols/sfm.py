@@ -31,7 +31,7 @@ from swimm3r.report.plan_view import plan_view
 from swimm3r.scene.ground_truth import GroundTruth
 from swimm3r.scene.reconstruction import Reconstruction
 from swimm3r.scene.reconstruction_io import load_reconstruction
-from swimm3r.sfm.rectified.run import rectified_truth, run_frames
+from swimm3r.sfm.rectified.run import run_frames, run_truth
 from swimm3r.sfm.settings import ColmapSettings, Mast3rSettings
 from swimm3r.tasks.settings import EngineSettings
 
@@ -111,7 +111,8 @@ def _scores(
         seconds = summary["stages"]["sfm"]["cpu_seconds"]
     except RegistrationError as failure:  # no frame counts as registered, and the row says why
         seconds = NotComputed(failure.what)
-    frames, truth = run_frames(run), rectified_truth(run, truth)
+    frames = run_frames(run)
+    truth = run_truth(run, frames, truth)
     if rec is not None:
         uncapped = Uncapped.of(run / "sfm", rec, frames, settings.sfm.water.tracks, progress)
     scores = model_scores(rec, uncapped, len(frames.train), original_pixels(clip, frames))

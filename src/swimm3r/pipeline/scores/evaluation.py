@@ -14,7 +14,7 @@ from swimm3r.report import write_report
 from swimm3r.scene.ground_truth import GroundTruth
 from swimm3r.scene.reconstruction_io import load_reconstruction
 from swimm3r.scene.run_folder import open_run
-from swimm3r.sfm.rectified.run import rectified_truth, run_frames
+from swimm3r.sfm.rectified.run import run_frames, run_truth
 from swimm3r.splat.map_file import load_map
 from swimm3r.splat.settings import MapDevice
 
@@ -33,6 +33,7 @@ def evaluate_run(
     "other_protocols", and the views in RUN/renders/protocols. Raises InputError where the run has no map yet.
     """
     before = open_run(folder, "splat")
+    reference = None if reference is None else reference.resolve()
     settings, source = from_yaml(folder / "settings.yaml"), Path(before.input.path)
     scored = before.stages.get("eval")
     own = Protocol(settings.test, None if scored is None or scored.reference is None else Path(scored.reference))
@@ -40,11 +41,10 @@ def evaluate_run(
         settings.test if steps is None else replace(settings.test, steps=steps), reference or own.reference
     )
     with watched(progress) as told, open_record(folder, source, before.input.fingerprint) as record:
-        record.summary |= before.sections
         scene = load_map(folder / "splat" / "map.safetensors").to(devices.for_maps(map_device))
         frames = run_frames(folder)
         run = MappedRun(folder, frames, load_reconstruction(folder / "sfm", frames), scene, settings)
-        truth = rectified_truth(folder, truth_of(source, asked.reference))
+        truth = run_truth(folder, frames, truth_of(source, asked.reference))
         if beside := asked.key_beside(own):
             record.add_protocol(beside, _other_scores(run, asked, truth, f"renders/protocols/{beside}", told))
         else:
@@ -69,11 +69,11 @@ def own_scores(
         scores = score_map(run, own.test, truth, run.folder / "renders" / "test", progress)
         film_flight(run, progress)
         restored = {"sfm": score_restored_frames(run, progress), **(scores["restored"] or {})}
-        record.summary |= {**scores, "restored": restored}
+        record.describe("eval", {**scores, "restored": restored})
 
     reference = None if own.reference is None else str(own.reference)
     key = stage_keys(record.fingerprint, run.settings, own.reference)["eval"]
-    record.stage("eval", key, make, record.keep_scores if reuse else None, reference=reference)
+    record.stage("eval", key, make, (lambda: None) if reuse else None, reference=reference)
 
 
 def _other_scores(

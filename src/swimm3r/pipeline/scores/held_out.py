@@ -16,7 +16,7 @@ from typing import Literal
 
 import numpy as np
 import torch
-from jaxtyping import Float
+from jaxtyping import Bool, Float
 from torch import Tensor
 
 from swimm3r import weights
@@ -26,7 +26,7 @@ from swimm3r.evaluate import NotComputed
 from swimm3r.evaluate.images import ViewScores, mean_view_scores, view_scores
 from swimm3r.evaluate.lpips import Lpips, load_lpips
 from swimm3r.evaluate.registration import recolored_by_halves, recolored_by_tiles
-from swimm3r.geometry import best_similarity
+from swimm3r.geometry import Similarity, best_similarity
 from swimm3r.imaging.turned_rows import at_half_time, mask_at_half_time
 from swimm3r.imaging.undistortion import shown_pixels, undistorted
 from swimm3r.io.view_names import view_stems
@@ -35,10 +35,12 @@ from swimm3r.localization.landmarks import Located, landmarks_of, locate
 from swimm3r.pipeline.renders import display_style, write_view
 from swimm3r.pipeline.scores.part_scores import (
     CoveredScores,
+    MotionScores,
     ObservedScores,
     StillScores,
     covered_scores,
     mean_part,
+    motion_scores,
     not_computed,
     observed_scores,
     still_scores,
@@ -55,7 +57,7 @@ from swimm3r.sfm.moving.still_scene import still_scene
 from swimm3r.splat.pose_refinement import refine_pose
 from swimm3r.splat.rendering import SplatMap
 from swimm3r.splat.settings import PoseRefinementSettings
-from swimm3r.splat.training_poses import as_mapped, axes_of_map
+from swimm3r.splat.training_poses import axes_of_map
 
 log = logging.getLogger(__name__)
 
@@ -86,6 +88,7 @@ class HeldOutView:
     covered: CoveredScores
     observed: ObservedScores
     still: StillScores
+    motion: MotionScores
 
 
 def first_poses(
@@ -180,14 +183,16 @@ def score_views(
     settings: PoseRefinementSettings | None = None,
     restore: RestoreSettings | None = None,
     progress: Progress = silent,
+    truth: GroundTruth | None = None,
 ) -> list[HeldOutView]:
     """Refine, render and score each frame of `poses`; its images go to `folder` (`renders.write_view`).
 
-    The clear ones look like the frames that `restore` made.
+    The clear ones look like the frames that `restore` made. A `truth` may say what moves.
     """
     perceptual = published_lpips()
     views, stems = [], view_stems(frames.names)
-    surfaces = None if rec.moving is None else still_scene(as_mapped(rec, scene.poses), frames)
+    surfaces = None if rec.moving is None else still_scene(rec, frames)
+    to_map = axes_of_map(rec, scene.poses)
     style, coverage = display_style(scene, rec, restore), TrainingCoverage(rec)
     for done, (name, first) in enumerate(poses.items()):
         progress("scoring test frames", done, len(poses))
@@ -206,22 +211,42 @@ def score_views(
         camera = cut(canvas, window)
         out = scene.render(camera, time)
         write_view(folder, stems[name], out, camera, style)
-        known, quiet = coverage.of(camera), None
-        if surfaces is not None:
-            unmoved = mask & ~surfaces.moving_in(lens, image, neighbors(rec, frames, name, 2))
-            quiet = undistorted(image, unmoved, lens, canvas)[1][window.rows, window.columns]
-        shown = out.rgb
-        if scene.colors is not None:
-            recolored = recolored_by_halves if scene.colors.shading is None else recolored_by_tiles
-            told = seen & (known if out.observed is None else out.observed)
-            shown = recolored(shown, target, told if quiet is None else told & quiet)
+        known, unturned = coverage.of(_in_axes_of_rec(camera, to_map)), _in_axes_of_rec(lens, to_map)
+        found = None if surfaces is None else surfaces.moving_in(unturned, image, neighbors(rec, frames, name, 2))
+        true = None if truth is None else truth.moving(name)
+        quiet, unmoved = (
+            None if moving is None else undistorted(image, mask & ~moving, lens, canvas)[1][window.rows, window.columns]
+            for moving in (found, true)
+        )
+        told = seen & (known if out.observed is None else out.observed)
+        shown = _in_colors_of(target, out.rgb, told if quiet is None else told & quiet, scene.colors)
         scores = view_scores(shown, target, perceptual, seen)
         covered = covered_scores(shown, target, seen, known if quiet is None else known & quiet)
         observed = observed_scores(shown, target, seen, out.observed)
-        still = still_scores(shown, target, seen, quiet)
-        views.append(HeldOutView(name, time, lens, canvas, window, first, scores, covered, observed, still))
+        still, motion = still_scores(shown, target, seen, quiet), motion_scores(shown, target, seen, unmoved)
+        views.append(HeldOutView(name, time, lens, canvas, window, first, scores, covered, observed, still, motion))
     progress("scoring test frames", len(poses), len(poses))
     return views
+
+
+def _in_axes_of_rec(camera: Cameras, to_map: Similarity | None) -> Cameras:
+    """A camera of the map where the reconstruction, whose points and depth have its own unit and axes, has it."""
+    return camera if to_map is None else replace(camera, cam2world=to_map.inverse().poses(camera.cam2world.double()))
+
+
+def _in_colors_of(
+    target: Float[Tensor, "h w 3"],
+    render: Float[Tensor, "h w 3"],
+    told: Bool[Tensor, "h w"],
+    colors: FrameColors | None,
+) -> Float[Tensor, "h w 3"]:
+    """A rendering as it is compared: each part in the colors that the other parts have where they are `told`.
+
+    As it is where all frames were exposed alike.
+    """
+    if colors is None:
+        return render
+    return (recolored_by_halves if colors.shading is None else recolored_by_tiles)(render, target, told)
 
 
 def protocol(views: Sequence[HeldOutView], settings: PoseRefinementSettings, colors: FrameColors | None) -> str:

@@ -65,6 +65,18 @@ class ObservedScores:
         return {"observed": self.share, "psnr_observed": self.psnr, "sharpness_observed": self.sharpness}
 
 
+@dataclass(frozen=True)
+class MotionScores:
+    """The scores where a truth says that something moves, and where it says that nothing does."""
+
+    moving: float | NotComputed  # PSNR, dB
+    still: float | NotComputed  # PSNR, dB
+
+    def summary(self) -> dict[str, float | NotComputed]:
+        """The scores by the names of summary.json."""
+        return {"psnr_moving": self.moving, "psnr_still": self.still}
+
+
 def covered_scores(
     render: Float[Tensor, "h w 3"],
     target: Float[Tensor, "h w 3"],
@@ -124,7 +136,27 @@ def still_scores(
     return StillScores(share, psnr(as_8_bit(render)[quiet], as_8_bit(target)[quiet]))
 
 
-Part = TypeVar("Part", CoveredScores, ObservedScores, StillScores)
+def motion_scores(
+    render: Float[Tensor, "h w 3"],
+    target: Float[Tensor, "h w 3"],
+    seen: Bool[Tensor, "h w"],
+    quiet: Bool[Tensor, "h w"] | None,
+) -> MotionScores:
+    """PSNR of the pixels that a truth's masks admit, and of the others; both images as their 8-bit files show them."""
+    if quiet is None:
+        unknown = NotComputed("no truth says what moves")
+        return MotionScores(unknown, unknown)
+    render, target = as_8_bit(render), as_8_bit(target)
+
+    def of(where: Bool[Tensor, "h w"]) -> float | NotComputed:
+        if not bool(where.any()):
+            return NotComputed("no held-out frame shows any of it")
+        return psnr(render[where], target[where])
+
+    return MotionScores(of(seen & ~quiet), of(quiet))
+
+
+Part = TypeVar("Part", CoveredScores, ObservedScores, StillScores, MotionScores)
 
 
 def mean_part(parts: Sequence[Part]) -> Part:

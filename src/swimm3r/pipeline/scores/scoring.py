@@ -84,7 +84,7 @@ def score_map(
     """The sections "test", "restored" (of the map) and "truth" by a protocol; the views it renders go to `into`."""
     frames, rec, scene, restore = run.frames, run.rec, run.scene, run.settings.sfm.restore
     poses = held_out.in_axes_of(scene, rec, start_poses(run.folder, rec, frames, run.settings, truth, progress))
-    views = held_out.score_views(scene, rec, frames, poses, into, test, restore, progress)
+    views = held_out.score_views(scene, rec, frames, poses, into, test, restore, progress, truth)
     stems = view_stems(frames.names)
     physical, shown = ([into / f"{stems[v.name]}_{kind}.png" for v in views] for kind in ("clear_physical", "clear"))
     return {

@@ -16,7 +16,6 @@ from torch.nn.functional import normalize
 from swimm3r.cameras import image_directions, ray_depth_from_z
 from swimm3r.evaluate import NotComputed, summary_entries
 from swimm3r.evaluate.depth import depth_scores
-from swimm3r.evaluate.images import as_8_bit, psnr
 from swimm3r.evaluate.poses import absolute_pose_errors, pose_scores
 from swimm3r.evaluate.underwater import (
     clear_psnr,
@@ -29,6 +28,7 @@ from swimm3r.geometry import DegenerateAlignmentError, align_poses, align_simila
 from swimm3r.imaging.undistortion import nearest_pixels, undistorted
 from swimm3r.medium import Medium, MediumFit, remove_water, rescale
 from swimm3r.pipeline.scores.held_out import HeldOutView, cut
+from swimm3r.pipeline.scores.part_scores import mean_part
 from swimm3r.pipeline.summary import identifiable_coefficients, mean_medium
 from swimm3r.progress import Progress, silent
 from swimm3r.scene.frames import Frames
@@ -86,7 +86,7 @@ def truth_section(
         coefficients = Medium(water.Binf, water.beta_D / scale, water.beta_B / scale)
         entries["splat"] = _against_water(of_map, truth.lit, coefficients, identifiable_coefficients(rec), truth.medium)
         if truth.moving(views[0].name if views else "") is not None:
-            entries["splat"] |= summary_entries(_moving_section(scene, frames, views, truth))
+            entries["splat"] |= summary_entries(mean_part([view.motion for view in views]).summary())
     return entries
 
 
@@ -223,28 +223,3 @@ def _mean(values: Sequence[float | NotComputed]) -> float | NotComputed:
     """The mean of those that were computed; the first one's reason where none was."""
     known = [value for value in values if not isinstance(value, NotComputed)]
     return sum(known) / len(known) if known else values[0]
-
-
-def _moving_section(
-    scene: SplatMap, frames: Frames, views: Sequence[HeldOutView], truth: GroundTruth
-) -> dict[str, object]:
-    """PSNR of the held-out views where something moves and where nothing does, means over the views that show it."""
-    moved, still = [], []
-    for view in views:
-        f, moving = frames.index(view.name), truth.moving(view.name)
-        if moving is None:
-            continue
-        window = (view.window.rows, view.window.columns)
-        target, seen = undistorted(frames.image(f), frames.mask(f), view.lens, view.canvas)
-        _, quiet = undistorted(frames.image(f), frames.mask(f) & ~moving, view.lens, view.canvas)
-        camera = cut(view.canvas, view.window)
-        render = as_8_bit(scene.render(camera, view.time, backscatter=False, observed=False).rgb)
-        target, seen, quiet = as_8_bit(target)[window], seen[window], quiet[window]
-        for where, found in ((seen & ~quiet, moved), (quiet, still)):
-            if bool(where.any()):
-                found.append(psnr(render[where], target[where]))
-
-    def mean(values: list[float]) -> float | NotComputed:
-        return sum(values) / len(values) if values else NotComputed("no held-out frame shows any of it")
-
-    return {"psnr_moving": mean(moved), "psnr_still": mean(still)}

@@ -77,13 +77,15 @@ def run_turns(run: Path) -> RowTurns | None:
     return read_turns(run / RECTIFIED_ROWS) if has_rectified_rows(run) else None
 
 
-def rectified_truth(run: Path, truth: GroundTruth | None) -> GroundTruth | None:
-    """Reference poses as a run's frames have them: named like rectified frames and in the axes of their cameras.
+def run_truth(run: Path, frames: Frames, truth: GroundTruth | None) -> GroundTruth | None:
+    """A clip's truth as the frames that its run works on have it: of their size and names, in their cameras' axes.
 
     Depth and images of the truth are of frames as filmed, and rectified ones go without.
     """
-    rectification = run_rectification(run)
-    if truth is None or (rectification is None and not has_rectified_rows(run)):
+    if truth is None:
+        return None
+    truth, rectification = truth.at_size(frames.width, frames.height), run_rectification(run)
+    if rectification is None and not has_rectified_rows(run):
         return truth
     cameras = truth.cameras
     if rectification is not None:

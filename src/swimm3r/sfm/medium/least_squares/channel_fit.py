@@ -206,7 +206,8 @@ def _range_bins(pixels: Pixels, settings: SeathruSettings) -> _RangeBins:
     The darkest by brightness: by each channel's values alone noise would choose, and lie below the backscatter.
     """
     I, brightness, z = pixels.I, pixels.brightness, pixels.ways.z
-    edges = np.linspace(*np.quantile(z[pixels.measured], [0.002, 0.998]), settings.range_bins + 1)
+    nearest, farthest = np.quantile(z[pixels.measured], [0.002, 0.998])
+    edges = np.linspace(nearest, farthest, settings.range_bins + 1)
     which = np.digitize(z, edges[1:-1])
     dark, measured = [], []
     for k in range(settings.range_bins):
