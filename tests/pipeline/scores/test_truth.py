@@ -82,7 +82,7 @@ def test_what_moves_is_scored_in_the_colors_that_the_frame_is_compared_in(
     relit: Frames,  # noqa: F811
     tmp_path: Path,
 ):
-    """Where each frame was exposed by itself, the map's average exposure is none of theirs."""
+    """The map's average exposure is that of no frame, as each was exposed by itself."""
     truth, name = write_truth(tiny_dive, tmp_path), relit.test.names[0]
     poses = {name: FirstPose(tiny_dive.cameras.cam2world[relit.index(name)], "reference")}
     count = len(tiny_dive.rec.names)
