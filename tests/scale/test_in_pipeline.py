@@ -42,7 +42,7 @@ def scaled(run: Path, settings: ScaleSettings) -> bool:
     with open_record(run, Path("dive.mp4"), "none") as record:
         record.summary |= json.loads((run / "summary.json").read_text())
         done = _scaled(record, load_reconstruction(run / "sfm"), RunSettings(scale=settings), silent)
-        record.add(scale_sections(run, load_reconstruction(run / "sfm")))
+        record.describe("sfm", scale_sections(run, load_reconstruction(run / "sfm")))
         record.write()
     return done
 

@@ -216,11 +216,6 @@ def _without_specks(found: np.ndarray, known: np.ndarray) -> np.ndarray:
     return (closed | ((size < 0.01 * found.size) & ~has_depth)[holes]) & ~known
 
 
-def local_texture(image: Float[Tensor, "h w 3"]) -> Float[Tensor, "h w"]:
-    """Standard deviation in a small window, after removing pixel noise and the slope of brightness."""
-    return torch.from_numpy(_texture(_without_pixel_noise(image.numpy())))
-
-
 def _without_pixel_noise(image: np.ndarray) -> np.ndarray:
     import cv2
 

@@ -201,6 +201,15 @@ class Mast3rSettings(MediumSettings, LensSettings):
     moving: MovingChoice = "auto"
     """Masks of moving objects: found where they hide surfaces that other frames measured (auto), or none."""
 
+    def __post_init__(self) -> None:
+        super().__post_init__()
+        if self.adapter is not None and self.light == "lamp":
+            raise UsageError(
+                "--adapter and --light lamp exclude each other",
+                cause="the water that an adapter's physics head predicts is that of daylight",
+                hint="leave out one of them",
+            )
+
     @property
     def backend(self) -> BackendName:
         """The back end as --backend names it."""

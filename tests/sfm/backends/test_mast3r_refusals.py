@@ -101,6 +101,13 @@ def test_settings_that_cannot_work_are_refused(
         swimm3r.reconstruct(small.frames, replace(small.settings, **change), tmp_path)
 
 
+def test_a_lamp_beside_the_daylight_of_an_adapter_is_refused(small: Dive):
+    adapted = replace(small.settings, adapter=Path("adapter.safetensors"))
+    with pytest.raises(UsageError, match="--adapter and --light lamp exclude each other"):
+        replace(adapted, light="lamp")
+    assert replace(adapted, light="auto").light == "auto"
+
+
 @pytest.mark.parametrize(
     ("change", "error", "message"),
     [

@@ -146,7 +146,8 @@ class MediumSettings(Settings):
     """The light, the water and all that is restored with them (`sfm/medium/apply.py`), the same for each back end."""
 
     light: LightChoice = "auto"
-    """Light of the dive: the sun, a lamp on the camera, or the one of them that the frames tell (auto)."""
+    """Light of the dive: the sun, a lamp on the camera, or the one of them that the frames tell (auto); with an
+    adapter's water the sun."""
     flicker: FlickerChoice = "auto"
     """Sunlight that flickers over the ground (caustics): evened out where the frames show it (auto), or kept as filmed.
     """
