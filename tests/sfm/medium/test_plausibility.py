@@ -96,6 +96,16 @@ def test_channels_without_error_stay_and_those_of_any_error_become_alike(teal, s
     torch.testing.assert_close(found - found.mean(), expected, rtol=1e-3, atol=1e-4)
 
 
+def test_water_whose_backscatter_alone_is_told_has_one_color_where_it_ends(teal):
+    z, B = torch.tensor(2.0), torch.tensor([0.05, 0.06, 0.06])
+    beta_B = torch.tensor([0.01, 0.2, 0.5])
+    fit = fit_of(replace(teal, Binf=B / -torch.expm1(-beta_B * z), beta_B=beta_B), 0.3, known=False)
+    alike = with_like_channels(replace(fit, std=replace(fit.std, beta_B=100 * beta_B)), B * 5)
+    assert fit.Binf[0] > 10 * fit.Binf[2]
+    torch.testing.assert_close(alike.Binf / alike.Binf.sum(), B / B.sum(), rtol=1e-3, atol=0)
+    torch.testing.assert_close(backscatter_share(alike, B * 5), torch.full((3,), 0.2), rtol=1e-3, atol=0)
+
+
 def test_a_channel_without_light_or_backscatter_stays_finite(teal):
     dark = replace(teal, Binf=torch.tensor([0.0, 0.5, 0.4]))
     alike = with_like_channels(fit_of(dark, 0.3, known=False), torch.tensor([0.0, 0.5, 0.4]))

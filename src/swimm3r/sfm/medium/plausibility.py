@@ -45,7 +45,8 @@ def any_determined(fit: MediumFit) -> bool:
 def with_like_channels(fit: MediumFit, mean_color: Float[Tensor, "3"]) -> MediumFit:
     """The fit with its channels drawn together where the frames determine no coefficient.
 
-    Of the optical depth tau at the middle depth, and of the backscatter there as a share of the frames' mean color:
+    Of the optical depth tau at the middle depth, of the backscatter there as a share of the frames' mean color, and of
+    ln beta_B, which gives Binf to that backscatter:
 
         x_c' = m + v / (v + s^2) (x_c - m)     m, v: mean and variance over the channels,   s^2: mean of their variances
 
@@ -61,9 +62,10 @@ def with_like_channels(fit: MediumFit, mean_color: Float[Tensor, "3"]) -> Medium
     built_up = -torch.expm1(-fit.beta_B * z)
     share = fit.Binf * built_up / color
     share_std = torch.hypot(fit.std.Binf * built_up, fit.Binf * (1 - built_up) * z * fit.std.beta_B) / color
-    Binf = _drawn_together(share, share_std) * color / built_up
+    beta_B = _drawn_together(fit.beta_B.log(), fit.std.beta_B / fit.beta_B).exp()
+    Binf = _drawn_together(share, share_std) * color / -torch.expm1(-beta_B * z)
     curve = replace(fit.curve, a=fit.curve.a * thinner, c=fit.curve.c * thinner)
-    return replace(fit, Binf=Binf.clamp(max=1), beta_D=fit.beta_D * thinner, curve=curve)
+    return replace(fit, Binf=Binf.clamp(max=1), beta_D=fit.beta_D * thinner, beta_B=beta_B, curve=curve)
 
 
 def _drawn_together(x: Float[Tensor, "3"], std: Float[Tensor, "3"]) -> Float[Tensor, "3"]:
