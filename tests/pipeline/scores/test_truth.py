@@ -2,7 +2,7 @@
 
 from dataclasses import replace
 from pathlib import Path
-from typing import Any
+from typing import Any, cast
 
 import numpy as np
 import pytest
@@ -18,6 +18,7 @@ from swimm3r.pipeline.scores.truth import truth_section
 from swimm3r.scene.frames import Frames
 from swimm3r.scene.ground_truth import GroundTruth
 from swimm3r.splat.settings import PoseRefinementSettings
+from swimm3r.splat.training_poses import RefinedPoses
 
 
 def write_truth(dive: TinyDive, folder: Path, enlarged: int = 1) -> GroundTruth:
@@ -97,3 +98,20 @@ def test_what_moves_is_scored_in_the_colors_that_the_frame_is_compared_in(
         everything = view.scores.psnr
         assert min(psnrs[-1]) <= everything <= max(psnrs[-1])
     assert min(psnrs[1]) > max(psnrs[0]) + 5
+
+
+def test_the_water_of_a_map_whose_unit_changed_in_training_is_compared_in_that_of_the_truth(
+    tiny_dive: TinyDive,  # noqa: F811
+    tmp_path: Path,
+):
+    truth, frames = write_truth(tiny_dive, tmp_path), tiny_dive.frames
+    poses = {n: FirstPose(tiny_dive.cameras.cam2world[frames.index(n)], "reference") for n in frames.test.names}
+    settings = PoseRefinementSettings(steps=0)
+    views = score_views(tiny_dive.truth, tiny_dive.rec, frames, poses, tmp_path, settings, truth=truth)
+    larger = tiny_dive.rec.cameras.cam2world.clone()
+    larger[:, :3, 3] *= 1.25
+    scenes = tiny_dive.truth, replace(tiny_dive.truth, poses=RefinedPoses(tiny_dive.rec.names, larger))
+    before, after = cast(Any, [truth_section(tiny_dive.rec, frames, truth, scene, views)["splat"] for scene in scenes])
+    for name in ("beta_D_rel", "beta_B_rel"):
+        assert before[name] == pytest.approx([0.0] * 3, abs=1e-5)
+        assert after[name] == pytest.approx([0.25] * 3, rel=1e-4)  # the same numbers per a unit 1.25 times as short

@@ -35,7 +35,7 @@ from swimm3r.scene.frames import Frames
 from swimm3r.scene.ground_truth import GroundTruth, LampImages
 from swimm3r.scene.reconstruction import Reconstruction
 from swimm3r.splat.rendering import SplatMap
-from swimm3r.splat.training_poses import RefinedPoses
+from swimm3r.splat.training_poses import RefinedPoses, axes_of_map
 
 
 def truth_section(
@@ -81,9 +81,11 @@ def truth_section(
         of_fit = partial(_views_of_fit, fit, frames.test, truth, progress)
         entries["sfm"] = _against_water(of_fit, truth.lit, fit.constant(), fit.identifiable, truth.medium)
     if truth.medium is not None and scene is not None:
-        of_map = partial(_views_of_map, scene, views, truth, scale)
+        to_map = axes_of_map(rec, scene.poses)
+        unit = scale if to_map is None else scale / to_map.scale.item()  # the map's, which training may have changed
+        of_map = partial(_views_of_map, scene, views, truth, unit)
         water = mean_medium(scene, rec, frames)
-        coefficients = Medium(water.Binf, water.beta_D / scale, water.beta_B / scale)
+        coefficients = Medium(water.Binf, water.beta_D / unit, water.beta_B / unit)
         entries["splat"] = _against_water(of_map, truth.lit, coefficients, identifiable_coefficients(rec), truth.medium)
         if truth.moving(views[0].name if views else "") is not None:
             entries["splat"] |= summary_entries(mean_part([view.motion for view in views]).summary())
@@ -166,8 +168,8 @@ def _views_of_fit(fit: MediumFit, held_out: Frames, truth: GroundTruth, progress
         yield _View(restored, clear, ray_depth, medium, truth.lamp(frame.name))
 
 
-def _views_of_map(scene: SplatMap, views: Sequence[HeldOutView], truth: GroundTruth, scale: float) -> Iterator[_View]:
-    """The held-out views of a map: its own clear rendering, and its water field at true ray depth."""
+def _views_of_map(scene: SplatMap, views: Sequence[HeldOutView], truth: GroundTruth, unit: float) -> Iterator[_View]:
+    """The held-out views of a map of this unit of length: clear renderings, and its water field at true ray depth."""
     for view in views:
         z_depth, clear = truth.z_depth(view.name), truth.clear(view.name)
         if z_depth is None or clear is None:
@@ -178,7 +180,7 @@ def _views_of_map(scene: SplatMap, views: Sequence[HeldOutView], truth: GroundTr
         true_z = torch.where(shown, z_depth[nearest_pixels(view.lens, view.canvas)], 0.0)
         ray_depth = ray_depth_from_z(true_z, image_directions(view.canvas).float())[window]
         out = scene.render(cut(view.canvas, view.window), view.time, backscatter=False)
-        medium = Medium(out.medium.Binf, out.medium.beta_D / scale, out.medium.beta_B / scale)
+        medium = Medium(out.medium.Binf, out.medium.beta_D / unit, out.medium.beta_B / unit)
         lamp = truth.lamp(view.name)
         if lamp is not None:
             parts = (undistorted(part, everything, view.lens, view.canvas)[0] for part in vars(lamp).values())
