@@ -42,7 +42,7 @@ def fit_lit(samples: WaterSamples, settings: SeathruSettings, light: LightChoice
             stored = fit_medium(samples, settings, "srgb", "lamp")
         log.info("the light is taken for %s", "a lamp's on the camera" if light == "lamp" else "the sun's")
     linear = fit_medium(samples, settings, "linear", light)
-    stored = with_like_channels(stored, samples.I.mean(0))
+    stored = with_like_channels(stored, samples.I[samples.measured].mean(0))
     return replace(stored, light=evidence), replace(linear, light=evidence)
 
 
