@@ -131,6 +131,20 @@ def test_backscatter_stays_below_the_dark_envelope_where_pixels_are_seen_once(te
     assert ((samples.I - B) < -0.03).float().mean() < 0.03
 
 
+def test_ground_that_lacks_a_color_bounds_the_backscatter_of_that_color(teal):
+    """Green leaves that are brighter than the darkest stones leave nothing of red and blue but the water."""
+    g = np.random.default_rng(3)
+    z = torch.from_numpy((2.5 * np.exp(g.normal(0, 0.15, 20_000))).astype(np.float32))
+    J = g.uniform(0.15, 0.6, (len(z), 1)).repeat(3, 1)
+    J[:1000] = (0.0, 0.6, 0.0)
+    I = add_water(torch.from_numpy(J.astype(np.float32)), z, teal)
+    once = torch.zeros(len(z), dtype=torch.long)
+    fit = fit_medium(WaterSamples(I, z, once, once - 1, torch.zeros(0, 3)), SETTINGS, "srgb")
+    too_bright = (backscatter(z, fit.at(z)) - backscatter(z, teal)).mean(0)
+    assert too_bright[[0, 2]].abs().max() < 0.01  # 0.04 and 0.11 by the darkest of all channels together
+    assert too_bright[1] > 0.05
+
+
 def test_beta_D_is_the_curve_at_the_median_depth(teal):
     samples = draw_samples(teal)
     fit = fit_medium(samples, SETTINGS, "srgb")
@@ -168,7 +182,7 @@ def test_distances_that_no_light_comes_back_from_say_nothing_of_the_surfaces():
     Binf, beta_D, beta_B = 0.3, 2.0, 1.0
     I = J * np.exp(-beta_D * z) - Binf * np.expm1(-beta_B * z) + 0.004 * g.normal(0, 1, 4000)
     measured = np.ones(4000, dtype=bool)
-    pixels = Pixels(I, I, daylight(z), np.zeros(4000, dtype=np.int64), np.full(300, Binf), measured)
+    pixels = Pixels(I, daylight(z), np.zeros(4000, dtype=np.int64), np.full(300, Binf), measured)
     true = np.array([Binf, np.log(beta_B), np.log(beta_D), 0.0, 0.1, np.log(0.4)])
     averages = prior_residuals(true, evidence_of(pixels, SETTINGS), SETTINGS)[SETTINGS.range_bins : -5]
     assert np.abs(averages).max() < 0.2  # 1.7 where the logarithm of no light was compared

@@ -1,8 +1,9 @@
 """The pixels from which the water is fitted: drawn from every training frame of a dive, with their ray depths.
 
-Single pixels serve the dark envelope and the averages; the decay of color differences is read from patches of surface
-(patches.py). Black things, which show the backscatter, rarely have texture enough for a depth of their own: kelp and
-its shadows have none. Pixels far from measured depth take a guessed one, and serve the dark envelope alone.
+Pixels on their own, averaged over a few around them, serve the dark envelope and the averages; the decay of color
+differences is read from patches of surface (patches.py). Black things, which show the backscatter, rarely have texture
+enough for a depth of their own: kelp and its shadows have none. Pixels far from measured depth take a guessed one, and
+serve the dark envelope alone.
 """
 
 from dataclasses import dataclass, replace
@@ -25,6 +26,7 @@ from swimm3r.sfm.medium.settings import SeathruSettings
 from swimm3r.sfm.medium.side_by_side import in_order
 
 _ALONE = 240  # frames whose single pixels are sampled: more of a long dive tell nothing new
+_QUIET = 1.5  # px, standard deviation of the window that pixels on their own are averaged over
 _ASKED = 4  # other frames that are asked what they show of a surface without a measured depth
 
 
@@ -121,18 +123,18 @@ def _pixels_alone(
     Pixels without a measured depth are as the frames `asked` show them.
     """
     index, camera = frames.index(rec.names[i]), rec.cameras[i]
-    image, mask = frames.image(index), frames.mask(index).reshape(-1)
+    image, mask = frames.image(index), frames.mask(index)
     z_depth, near, sea = _depth_everywhere(image, rec.depth[rec.names[i]])
     ray_depth = ray_depth_map(z_depth, frame_rays(camera)).reshape(-1)
-    pixels = torch.nonzero((ray_depth > 0) & mask)[:, 0]
+    pixels = torch.nonzero((ray_depth > 0) & mask.reshape(-1))[:, 0]
     pixels = pixels[:: max(1, len(pixels) // count)]
     pixels, guessed = pixels[near.reshape(-1)[pixels]], pixels[~near.reshape(-1)[pixels]]
-    shown = torch.nonzero(sea.reshape(-1) & mask)[:, 0]
+    shown = torch.nonzero((sea & mask).reshape(-1))[:, 0]
     shown = shown[:: max(1, -(-len(shown) // settings.open_water_pixels))]
-    colors, direction = image.reshape(-1, 3), frame_directions(camera).reshape(-1, 3)
+    colors, direction = quiet(image, mask).reshape(-1, 3), frame_directions(camera).reshape(-1, 3)
     own = WaterSamples(
         colors[pixels], ray_depth[pixels], torch.full_like(pixels, i), torch.full_like(pixels, -1),
-        colors[shown], frames.gray, torch.zeros_like(pixels) > 0, direction[pixels], direction[shown],
+        image.reshape(-1, 3)[shown], frames.gray, torch.zeros_like(pixels) > 0, direction[pixels], direction[shown],
     )  # fmt: skip
     places = pixel_grid(*sea.shape).reshape(-1, 2)[None, guessed].double()
     points = unproject(camera, places, z_depth.reshape(1, -1)[:, guessed].double())
@@ -153,6 +155,17 @@ def _depth_everywhere(
     return filled, (blur(known.float()[..., None], reach)[..., 0] > 0.1) & ~sea, sea
 
 
+def quiet(image: Float[Tensor, "h w 3"], mask: Bool[Tensor, "h w"] | None = None) -> Float[Tensor, "h w 3"]:
+    """An image whose pixels are averaged with those around them, with none outside the mask.
+
+    The darkest of single pixels are those with the most negative noise, which lie below the backscatter.
+    """
+    if mask is None:
+        return blur(image, _QUIET)
+    share = mask[..., None].float()
+    return blur(image * share, _QUIET) / blur(share, _QUIET).clamp_min(1e-6)
+
+
 def _brightest_views(
     rec: Reconstruction, frames: Frames, views: list[int], points: Float[Tensor, "p 3"]
 ) -> WaterSamples:
@@ -167,8 +180,9 @@ def _brightest_views(
         seen, _, inside = project_visible(camera, points[None])
         rows = torch.nonzero(inside[0])[:, 0]
         x, y = seen[0, rows].long().unbind(-1)
-        shown = frames.mask(index)[y, x]
-        rows, color = rows[shown], frames.image(index)[y[shown], x[shown]]
+        image, mask = quiet(frames.image(index), frames.mask(index)), frames.mask(index)
+        shown = mask[y, x]
+        rows, color = rows[shown], image[y[shown], x[shown]]
         brighter = color.mean(-1) > I[rows].mean(-1)
         times[rows] += 1
         rows = rows[brighter]

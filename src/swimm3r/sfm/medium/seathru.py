@@ -104,10 +104,8 @@ def fit_medium(samples: WaterSamples, settings: SeathruSettings, encoding: Encod
         scatter = lit.scatter(lamp, beta_D)
         every = [lit.of_channel(c, lamp, scatter) for c in range(color.shape[1])]
     else:
-        lamp, brightness, ways = None, color.mean(1), daylight(z)
-        every = [
-            Pixels(color[:, c], brightness, ways, frame, open_water[:, c], measured) for c in range(color.shape[1])
-        ]
+        lamp, ways = None, daylight(z)
+        every = [Pixels(color[:, c], ways, frame, open_water[:, c], measured) for c in range(color.shape[1])]
     channels = []
     for pixels in every:
         observations = None

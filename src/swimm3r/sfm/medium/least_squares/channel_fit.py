@@ -56,7 +56,6 @@ class Pixels:
     """All samples of one channel."""
 
     I: np.ndarray
-    brightness: np.ndarray  # mean of the channels: what "darkest" means
     ways: Ways
     frame: np.ndarray  # 0.. without gaps
     open_water: np.ndarray
@@ -65,8 +64,7 @@ class Pixels:
     def of_measured_depth(self) -> "Pixels":
         """The pixels whose depth is no guess."""
         rows = self.measured
-        kept = self.I[rows], self.brightness[rows], self.ways.rows(rows), self.frame[rows]
-        return Pixels(*kept, self.open_water, rows[rows])
+        return Pixels(self.I[rows], self.ways.rows(rows), self.frame[rows], self.open_water, rows[rows])
 
 
 @dataclass(frozen=True)
@@ -203,9 +201,9 @@ def evidence_of(pixels: Pixels, settings: SeathruSettings, gain_std: float = 0.0
 def _range_bins(pixels: Pixels, settings: SeathruSettings) -> _RangeBins:
     """The darkest pixels of each of `range_bins` equal depth intervals, and the average of those of measured depth.
 
-    The darkest by brightness: by each channel's values alone noise would choose, and lie below the backscatter.
+    The darkest of this channel: leaves whose green reaches the camera leave nothing of red but the backscatter.
     """
-    I, brightness, z = pixels.I, pixels.brightness, pixels.ways.z
+    I, z = pixels.I, pixels.ways.z
     nearest, farthest = np.quantile(z[pixels.measured], [0.002, 0.998])
     edges = np.linspace(nearest, farthest, settings.range_bins + 1)
     which = np.digitize(z, edges[1:-1])
@@ -216,10 +214,10 @@ def _range_bins(pixels: Pixels, settings: SeathruSettings) -> _RangeBins:
         if len(told) < settings.min_bin_pixels:
             continue
         count = int(np.ceil(settings.dark_fraction * len(inside)))
-        dark.append(inside[np.argpartition(brightness[inside], count - 1)[:count]])
+        dark.append(inside[np.argpartition(I[inside], count - 1)[:count]])
         measured.append(told)
     if not dark:  # few samples: one bin is all there is
-        dark.append(np.argsort(brightness, kind="stable")[: max(1, int(settings.dark_fraction * len(z)))])
+        dark.append(np.argsort(I, kind="stable")[: max(1, int(settings.dark_fraction * len(z)))])
         measured.append(np.flatnonzero(pixels.measured))
     return _RangeBins(
         _median_ways(pixels.ways, dark),

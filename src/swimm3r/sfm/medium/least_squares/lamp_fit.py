@@ -114,8 +114,7 @@ class LampPixels:
         """One channel of them; open water as it would be on the optical axis."""
         here, water = (values[:, c] for values in scatter)
         ways = self.ways(lamp, here)
-        color = self.color[:, c], self.color.mean(1)
-        return Pixels(*color, ways, self.frame, self.open_water[:, c] / water, self.measured)
+        return Pixels(self.color[:, c], ways, self.frame, self.open_water[:, c] / water, self.measured)
 
 
 def seen_nearby(rows: np.ndarray, point: np.ndarray, z: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
