@@ -5,7 +5,8 @@ import json
 import pytest
 import torch
 
-from swimm3r.evaluate import NotComputed, poses as evaluated, summary_entries
+from swimm3r.evaluate import NotComputed, summary_entries
+from swimm3r.evaluate import poses as evaluated
 from swimm3r.evaluate.poses import (
     RelativePoseErrors,
     absolute_pose_errors,
