@@ -21,6 +21,7 @@ from swimm3r.io.images import read_rgb, write_rgb
 from swimm3r.pipeline.finished_sfm import open_finished_sfm
 from swimm3r.pipeline.presets import RunSettings
 from swimm3r.pipeline.scores import held_out
+from swimm3r.scene.rig import Rig, RigCamera
 from swimm3r.sfm.plane_sweep.settings import PlaneSweepSettings
 from swimm3r.sfm.settings import ColmapSettings
 from swimm3r.splat.settings import RECIPES, PoseRefinementSettings, UwbsSettings
@@ -120,6 +121,22 @@ def test_turned_test_frames_are_not_placed_as_if_exposed_at_once(run: Path, tmp_
     assert isinstance(found, NotComputed)
     assert "turned within exposures" in found.reason
     assert list(tmp_path.iterdir()) == []  # which takes no structure from motion to find out
+
+
+def test_no_lens_of_a_rig_is_held_for_all_of_its_cameras(run: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
+    asked = []
+    monkeypatch.setattr(reference, "whole_clip", lambda *given: asked.append(given) or NotComputed("asked"))
+    sfm = open_finished_sfm(run)
+    sides = [replace(f, camera=("left", "right")[i % 2]) for i, f in enumerate(sfm.frames.frames)]
+    rig = replace(sfm.frames, frames=tuple(sides), rig=Rig((RigCamera("left"), RigCamera("right"))))
+    assert reference.of_clip(replace(sfm, frames=rig), tmp_path) == NotComputed("asked")  # both have the same
+    K = sfm.rec.cameras.K.clone()
+    K[[rig.frames[rig.index(name)].camera == "right" for name in sfm.rec.names], 0, 2] += 20
+    own = replace(sfm, frames=rig, rec=replace(sfm.rec, cameras=replace(sfm.rec.cameras, K=K)))
+    found = reference.of_clip(own, tmp_path)
+    assert isinstance(found, NotComputed)
+    assert "lenses of their own" in found.reason
+    assert len(asked) == 1
 
 
 @pytest.mark.parametrize(
