@@ -86,6 +86,24 @@ def test_clips_are_reconstructed_once_and_runs_are_taken_as_they_are(
     assert made == [(clip, tmp_path / "runs" / "dive", "sfm")]
 
 
+def test_clips_of_one_name_are_refused_before_the_first_is_reconstructed(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+):
+    made = []
+    monkeypatch.setattr("swimm3r.bench.runs.run_pipeline", lambda source, folder, *_, **__: made.append(folder.name))
+    for day in ("2024.06.01", "2024.06.02"):
+        (tmp_path / day / "images").mkdir(parents=True)
+    days = sorted(path for path in tmp_path.iterdir())
+    made_runs([day / "images" for day in days], tmp_path / "out", RunSettings())
+    made_runs(days, tmp_path / "out", RunSettings())
+    monkeypatch.chdir(days[0])
+    made_runs([Path("images")], tmp_path / "out", RunSettings())
+    assert made == ["2024.06.01", "2024.06.02"] * 2 + ["2024.06.01"]
+    with pytest.raises(InputError, match="one name: GX01, GX01"):
+        made_runs([tmp_path / "a" / "GX01.MP4", tmp_path / "b" / "GX01.MP4"], tmp_path / "out", RunSettings())
+    assert len(made) == 5
+
+
 def test_a_scene_with_a_model_lends_its_poses_where_asked(run: Path, tmp_path: Path):
     scene = tmp_path / "Curasao"
     shutil.copytree(run.parent / "dive" / "images", scene / "Images_wb")
