@@ -244,7 +244,8 @@ def _relative_scores(
         counted = _with_baseline(errors, longest)
         angle += errors.translation[counted].sum().item()
         pairs, directed = pairs + n, directed + int(counted.sum())
-    return _RelativeScores(*(percent / pairs).tolist(), angle / directed if directed else _NO_BASELINE)
+    rra15, rta15, maa30 = (percent / pairs).tolist()
+    return _RelativeScores(rra15, rta15, maa30, angle / directed if directed else _NO_BASELINE)
 
 
 def mean_translation_error(errors: RelativePoseErrors) -> float | NotComputed:
