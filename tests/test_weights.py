@@ -29,6 +29,7 @@ class Server:
     break_after: list[int] = field(default_factory=list)  # bytes of the next answers before the connection breaks
     requests: list[dict[str, str]] = field(default_factory=list)
     silent_seconds: float = 0.0
+    chunked: bool = False  # no length is stated
 
     @property
     def url(self) -> str:
@@ -56,11 +57,19 @@ def server() -> Iterator[Server]:
             self.send_response(206 if start else 200)
             if start:
                 self.send_header("Content-Range", f"bytes {start}-{len(state.body) - 1}/{len(state.body)}")
-            self.send_header("Content-Length", str(len(state.body) - start))
+            length = ("Transfer-Encoding", "chunked") if state.chunked else ("Content-Length", len(state.body) - start)
+            self.send_header(length[0], str(length[1]))
             self.send_header("ETag", state.tag)
             self.end_headers()
             rest = state.body[start:]
-            self.wfile.write(rest[: state.break_after.pop(0)] if state.break_after else rest)
+            if state.chunked:
+                self.wfile.write(f"{len(rest):x}\r\n".encode())
+            if state.break_after:
+                self.wfile.write(rest[: state.break_after.pop(0)])
+                return
+            self.wfile.write(rest)
+            if state.chunked:
+                self.wfile.write(b"\r\n0\r\n\r\n")
 
         def log_message(self, format: str, *args: object) -> None:
             pass
@@ -122,6 +131,15 @@ def test_broken_connection_goes_on_where_it_stopped(server: Server, home: Path):
     assert path.read_bytes() == BODY
     starts = [r.get("Range") for r in server.requests]
     assert starts == [None, "bytes=300000-", "bytes=500000-"]
+
+
+def test_a_file_of_unknown_length_is_whole_only_where_the_server_ends_it(server: Server, home: Path):
+    """As proxies send files on, in chunks: nothing but the last chunk says that one is whole."""
+    server.chunked, server.break_after = True, [300_000]
+    unknown = manifest(server.url, size=None, sha256=None)
+    path = weights.fetch("net", manifest=unknown)
+    assert path.read_bytes() == BODY
+    assert [r.get("Range") for r in server.requests] == [None, "bytes=300000-"]
 
 
 def test_interrupted_download_is_resumed_by_the_next_call(server: Server, home: Path):

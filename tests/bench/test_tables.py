@@ -83,6 +83,19 @@ def test_latex_prints_the_best_of_each_column_in_bold():
     assert r"peer & 20.50 & -- & 30.50 & -- & 25.50 & -- \\" in by_scene
 
 
+def test_latex_prints_no_mean_over_easier_scenes_in_bold():
+    """A method that fails on the hard scene is not the best for it."""
+    cells = [Result("easy", "peer", 0, {"psnr": 30.0}), Result("hard", "peer", 0, {"psnr": 20.0})]
+    cells += [Result("easy", "ours", 0, {"psnr": 29.0}), Result("hard", "ours", 0, {"psnr": NotComputed("lost")})]
+    cells += [Result("easy", "third", 0, {"psnr": 28.0}), Result("hard", "third", 0, {"psnr": 19.0})]
+    text = latex(Table("t", "T", cells, columns("psnr")))
+    assert r"peer & \textbf{25.00} \\" in text
+    assert r"ours & 29.00 (1) \\" in text
+    by_scene = text.split(r"\end{tabular}")[1]
+    assert r"peer & \textbf{30.00} & \textbf{20.00} & \textbf{25.00} \\" in by_scene
+    assert r"ours & 29.00 & -- & 29.00 (1) \\" in by_scene
+
+
 def test_csv_and_json_hold_every_cell(tmp_path: Path):
     write(tmp_path, Table("t", "T", cells_with_a_gain(0.1), columns("psnr")))
     lines = (tmp_path / "t.csv").read_text().splitlines()

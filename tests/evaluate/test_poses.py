@@ -6,6 +6,7 @@ import pytest
 import torch
 
 from swimm3r.evaluate import NotComputed, summary_entries
+from swimm3r.evaluate import poses as evaluated
 from swimm3r.evaluate.poses import (
     RelativePoseErrors,
     absolute_pose_errors,
@@ -86,6 +87,21 @@ def test_baselines_seen_from_the_other_camera_give_the_other_published_number(ve
     assert rra(errors, 15.0) == pytest.approx(vectors["posediffusion"]["RRA15"], abs=1e-5)
     assert rta(errors, 15.0) == pytest.approx(vectors["posediffusion"]["RTA15"], abs=1e-5)
     assert maa(errors, 30) == pytest.approx(vectors["posediffusion"]["mAA30"], abs=1e-5)
+
+
+def test_pairs_of_a_long_dive_are_scored_a_part_at_a_time(monkeypatch: pytest.MonkeyPatch):
+    """All pairs of 10,000 frames at once would take 36 GB."""
+    true, held, taken = some_poses(500), [], evaluated.relative_poses
+    monkeypatch.setattr(evaluated, "relative_poses", lambda i, j: held.append(len(i)) or taken(i, j))
+    estimate, registered = disturbed(true, degrees=9, shift=0.3), torch.arange(500) % 7 > 0
+    scores = pose_scores(estimate, true, registered)
+    assert sum(held) == 2 * 500 * 499 / 2
+    assert max(held) < 70_000
+    together = relative_pose_errors(estimate, true, registered)
+    assert together.pairs.tolist() == torch.triu_indices(500, 500, 1).mT.tolist()
+    assert (scores.rra15, scores.rta15) == pytest.approx((rra(together, 15.0), rta(together, 15.0)))
+    assert scores.maa30 == pytest.approx(maa(together, 30))
+    assert scores.translation_deg == pytest.approx(mean_translation_error(together))
 
 
 def test_perfect_poses_score_full_marks_in_any_world():

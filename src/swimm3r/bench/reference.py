@@ -10,7 +10,8 @@ small hazy images by a quarter), and poses under two lenses differ by more than 
 
 A camera that turned while rows were exposed has no pose without its turn. Structure from motion of test frames as
 filmed is off by a part of it (on ruie_cyan_slope renderings are 0.30 px beside their frames; a pose and a turn from a
-frame's own matches leave 0.19), so such clips have no reference unless somebody gives one.
+frame's own matches leave 0.19), so such clips have no reference unless somebody gives one. Nor have rigs whose cameras
+have lenses of their own, as the lens that is held would be that of one of them.
 """
 
 import json
@@ -60,12 +61,26 @@ def required(references: Path | None, scenes: Sequence[str]) -> None:
 def of_clip(sfm: FinishedSfm, folder: Path, progress: Progress = silent) -> GroundTruth | NotComputed:
     """The reference of a run's clip, by the run's own settings where COLMAP found its poses, else by the defaults.
 
-    NotComputed where frames cannot be placed, and where rows of training frames are rectified but not of test frames.
+    NotComputed where frames cannot be placed, where rows of training frames are rectified but not of test frames, and
+    where the cameras of a rig have lenses of their own.
     """
     if sfm.frames.rows_rectified:
         return NotComputed("no reference: the camera turned within exposures; test frames are placed by their matches")
+    if _lenses(sfm) > 1:
+        return NotComputed("no reference: the rig's cameras have lenses of their own; --references DIR gives one")
     settings = sfm.settings.sfm if isinstance(sfm.settings.sfm, ColmapSettings) else ColmapSettings()
     return whole_clip(sfm.frames, sfm.rec.cameras[0], settings, folder, progress)
+
+
+def _lenses(sfm: FinishedSfm) -> int:
+    """The number of lenses that the cameras of a rig have; 1 without a rig."""
+    if sfm.frames.rig is None:
+        return 1
+    rec, of_camera = sfm.rec, {}
+    for i, name in enumerate(rec.names):
+        of_camera.setdefault(sfm.frames.frames[sfm.frames.index(name)].camera, i)
+    rows = list(of_camera.values())
+    return len({(*rec.cameras.K[i].flatten().tolist(), *rec.cameras.distortion[i].tolist()) for i in rows})
 
 
 def whole_clip(

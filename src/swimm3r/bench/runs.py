@@ -48,6 +48,25 @@ class Clip:
     runs: tuple[SfmRun, ...]
 
 
+def clip_name(source: Path) -> str:
+    """The name of a clip: a folder's own, or that of the one around it where it is called `images`; a file's stem."""
+    source = source.absolute()
+    named = source.parent if source.name.lower() in IMAGES else source
+    return named.stem if named.suffix and not named.is_dir() else named.name
+
+
+def clip_names(sources: Sequence[Path]) -> list[str]:
+    """The names of clips. Raises InputError where two have one name."""
+    names = [clip_name(source) for source in sources]
+    if len(set(names)) < len(names):
+        raise InputError(
+            f"two of the clips have one name: {', '.join(sorted(names))}",
+            cause="results are kept by the clips' names",
+            hint="another name for one of them",
+        )
+    return names
+
+
 def clips_of(folders: Sequence[Path]) -> list[Clip]:
     """The runs by clip. Two runs of a clip whose poses were found in the same way are told apart by their folders.
 
@@ -58,9 +77,7 @@ def clips_of(folders: Sequence[Path]) -> list[Clip]:
     prints: dict[str, str] = {}
     for folder in folders:
         sfm, run = open_finished_sfm(folder), open_run(folder, "sfm")
-        source = Path(run.input.path)
-        named = source.parent if source.name.lower() in IMAGES else source
-        name = named.stem if named.suffix and not named.is_dir() else named.name
+        name = clip_name(Path(run.input.path))
         if prints.setdefault(name, run.input.fingerprint) != run.input.fingerprint:
             raise InputError(
                 f"two clips have the name {name}",
@@ -82,14 +99,15 @@ def made_runs(
     """Run folders as they are; of clips, new ones up to their structure from motion in OUT/runs.
 
     With `given_poses` a clip is a folder of images with their COLMAP model, whose poses are taken. Raises InputError
-    where it has none.
+    where it has none, and before anything is made where two clips have one name.
     """
+    clip_names([given for given in inputs if not is_run(given)])
     runs = []
     for given in inputs:
         if is_run(given):
             runs.append(given)
             continue
-        runs.append(out / "runs" / given.stem)
+        runs.append(out / "runs" / clip_name(given))
         source, chosen = _with_given_poses(given, settings) if given_poses else (given, settings)
         run_pipeline(source, runs[-1], chosen, redo=True, last_stage="sfm", progress=progress)
     return tuple(runs)

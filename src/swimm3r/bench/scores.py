@@ -73,6 +73,7 @@ COLUMNS = (
     ),
     Column("uciqe_cielab", "UCIQE", 2, "high", f"CIELAB's own units; {_COLORS}"),
     Column("uranker", "URank", 3, "high", "URanker"),
+    Column("scored_pct", "Scored, %", 1, "neither", "of the training frames; rows of other frames do not compare"),
     Column("located_pct", "Located, %", 1, "high", "test frames that were given a pose"),
     Column("inlier_5px_pct", "Inlier@5px, %", 1, "high", "of query-to-render matches; 0 where not located"),
     Column("reprojection_px", "Reproj., px", 2, "low", "median over located frames of the median over inliers"),

@@ -68,7 +68,7 @@ def markdown(table: Table) -> str:
 def latex(table: Table) -> str:
     """A tabular of the means, and where there are several scenes another of the first columns by scene, as the paper's.
 
-    The best of each column is bold.
+    The best of each column is bold, among the means over the most cells; a mean over fewer has their number behind it.
     """
     shown = table.shown
     found = rows(table.cells, table.against)
@@ -93,15 +93,22 @@ def _tabular(table: Table, heads: Sequence[str], columns: Sequence[tuple[Sequenc
         *heads,
         r"\hline",
     ]
-    best = [_best([r for r in found if r.score == c.score], c) for found, c in columns]
+    printed = [_printed([r for r in found if r.score == c.score], c) for found, c in columns]
     for method in _methods(table.cells):
-        values = []
-        for (found, c), winner in zip(columns, best, strict=True):
-            row = next((r for r in found if r.method == method and r.score == c.score), None)
-            value = "--" if row is None else f"{row.mean:.{c.digits}f}"
-            values.append(rf"\textbf{{{value}}}" if row is not None and value == winner else value)
-        lines.append(" & ".join([_escaped(method), *values]) + r" \\")
+        lines.append(" & ".join([_escaped(method), *(values.get(method, "--") for values in printed)]) + r" \\")
     return "\n".join([*lines, r"\hline", r"\end{tabular}"]) + "\n"
+
+
+def _printed(found: Sequence[Row], column: Column) -> dict[str, str]:
+    """The means of a column by method; only those over the most cells compete for bold."""
+    most = max((r.cells for r in found), default=0)
+    winner = _best([r for r in found if r.cells == most], column)
+    printed = {}
+    for r in found:
+        value = f"{r.mean:.{column.digits}f}"
+        bold = rf"\textbf{{{value}}}" if value == winner else value
+        printed[r.method] = f"{value} ({r.cells})" if r.cells < most else bold
+    return printed
 
 
 def _means(table: Table, found: Sequence[Row], seeds: int) -> str:

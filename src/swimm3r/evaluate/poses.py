@@ -6,6 +6,7 @@ of pairs strictly below a threshold, mAA(30) the area under the accuracy curve o
 whole-degree bins up to 30. A pair with an unregistered frame is a failure of 180 degrees.
 """
 
+from collections.abc import Iterator
 from dataclasses import dataclass
 from typing import Literal
 
@@ -25,6 +26,8 @@ from swimm3r.geometry import (
 
 SeenFrom = Literal["i", "j"]
 Curve = Literal["histogram", "trapezoid"]
+_NO_BASELINE = NotComputed("no pair of registered frames has a baseline in the reference")
+_BLOCK = 1 << 16  # pairs at a time: 10,000 frames have 50 million
 
 
 @dataclass(frozen=True)
@@ -79,10 +82,38 @@ def relative_pose_errors(
 
     A baseline of no length has no direction and stands at 90 degrees from any other.
     """
-    registered = _all_if_none(registered, cam2world)
+    blocks = list(_blocks(cam2world, reference, _all_if_none(registered, cam2world), seen_from))
+    return RelativePoseErrors(
+        **{name: torch.cat([getattr(block, name) for block in blocks]) for name in vars(blocks[0])}
+    )
+
+
+def _blocks(
+    cam2world: Float[Tensor, "n 4 4"],
+    reference: Float[Tensor, "n 4 4"],
+    registered: Bool[Tensor, " n"],
+    seen_from: SeenFrom = "i",
+) -> Iterator[RelativePoseErrors]:
+    """`relative_pose_errors` a block of pairs after the other, so that memory does not grow with their number."""
     _check_finite(cam2world[registered], "estimated")
     _check_finite(reference, "reference")
-    pairs = torch.triu_indices(len(cam2world), len(cam2world), 1).mT
+    n, row = len(cam2world), 0
+    while True:  # once without any pair, too
+        rows = max(1, _BLOCK // max(1, n - row))
+        pairs = torch.triu_indices(min(rows, n - row), n - row, 1).mT + row
+        yield _errors_of(pairs, cam2world, reference, registered, seen_from)
+        row += rows
+        if row >= n - 1:
+            return
+
+
+def _errors_of(
+    pairs: Int[Tensor, "pairs 2"],
+    cam2world: Float[Tensor, "n 4 4"],
+    reference: Float[Tensor, "n 4 4"],
+    registered: Bool[Tensor, " n"],
+    seen_from: SeenFrom,
+) -> RelativePoseErrors:
     first, second = pairs.unbind(-1) if seen_from == "i" else pairs.flip(-1).unbind(-1)
     found = relative_poses(cam2world[first], cam2world[second])
     true = relative_poses(reference[first], reference[second])
@@ -169,7 +200,7 @@ def pose_scores(
 ) -> PoseScores:
     """Every pose score of one sequence of at least 2 frames; rows of `cam2world` count where `registered`."""
     registered = _all_if_none(registered, cam2world)
-    errors = relative_pose_errors(cam2world, reference, registered)
+    relative = _relative_scores(cam2world, reference, registered)
     variant = "pairs i<j, W_i W_j^-1, sign-blind RTA, whole-degree mAA"
     if registered.sum() < 2:
         too_few = NotComputed(f"{int(registered.sum())} of {len(registered)} frames registered, at least 2 are needed")
@@ -177,12 +208,12 @@ def pose_scores(
     else:
         absolute = absolute_pose_errors(cam2world[registered], reference[registered])
         rotation_deg, ate = absolute.rotation_deg, absolute.ate
-        translation_deg = mean_translation_error(errors)
+        translation_deg = relative.translation_deg
         variant += f", ATE aligned by {absolute.alignment}"
     return PoseScores(
-        rra15=rra(errors, 15.0),
-        rta15=rta(errors, 15.0),
-        maa30=maa(errors, 30),
+        rra15=relative.rra15,
+        rta15=relative.rta15,
+        maa30=relative.maa30,
         rotation_deg=rotation_deg,
         translation_deg=translation_deg,
         ate=ate,
@@ -192,15 +223,48 @@ def pose_scores(
     )
 
 
+@dataclass(frozen=True)
+class _RelativeScores:
+    rra15: float  # %
+    rta15: float  # %
+    maa30: float  # %
+    translation_deg: float | NotComputed
+
+
+def _relative_scores(
+    cam2world: Float[Tensor, "n 4 4"], reference: Float[Tensor, "n 4 4"], registered: Bool[Tensor, " n"]
+) -> _RelativeScores:
+    """The scores of all pairs, which are never held together."""
+    longest = _longest_baseline(reference)
+    percent, pairs = torch.zeros(3, dtype=torch.float64), 0
+    angle, directed = 0.0, 0
+    for errors in _blocks(cam2world, reference, registered):
+        n = len(errors.pairs)
+        percent += n * torch.tensor([rra(errors, 15.0), rta(errors, 15.0), maa(errors, 30)], dtype=torch.float64)
+        counted = _with_baseline(errors, longest)
+        angle += errors.translation[counted].sum().item()
+        pairs, directed = pairs + n, directed + int(counted.sum())
+    rra15, rta15, maa30 = (percent / pairs).tolist()
+    return _RelativeScores(rra15, rta15, maa30, angle / directed if directed else _NO_BASELINE)
+
+
 def mean_translation_error(errors: RelativePoseErrors) -> float | NotComputed:
     """Mean angle between estimated and true relative translations (signed, 0..180) over registered pairs, degrees.
 
     Pairs whose true baseline is under a millionth of the longest have no direction and are left out.
     """
-    counted = errors.registered & (errors.baseline > 1e-6 * errors.baseline.max())
-    if not counted.any():
-        return NotComputed("no pair of registered frames has a baseline in the reference")
-    return errors.translation[counted].mean().item()
+    counted = _with_baseline(errors, errors.baseline.max().item())
+    return errors.translation[counted].mean().item() if counted.any() else _NO_BASELINE
+
+
+def _with_baseline(errors: RelativePoseErrors, longest: float) -> Bool[Tensor, " pairs"]:
+    return errors.registered & (errors.baseline > 1e-6 * longest)
+
+
+def _longest_baseline(reference: Float[Tensor, "n 4 4"]) -> float:
+    centers = reference[:, :3, 3]
+    rows = centers.split(max(1, _BLOCK // max(1, len(centers))))
+    return max((torch.cdist(some, centers).max().item() for some in rows), default=0.0)
 
 
 def _angle_between(a: Float[Tensor, "n 3"], b: Float[Tensor, "n 3"]) -> Float[Tensor, " n"]:

@@ -115,8 +115,8 @@ def _receive(url: str, part: Path, weights: Weights, progress: Progress, seconds
         tag = response.headers.get("ETag") or response.headers.get("Last-Modified")
         origin.write_text(json.dumps({"url": url, "validator": None if (tag or "").startswith("W/") else tag}))
         with part.open("ab" if resumed else "wb") as file:
-            have = _copy(response, file, have, lambda done: progress(weights.filename, done, total or done))
-    return total is None or have == total
+            ended = _copy(response, file, have, lambda done: progress(weights.filename, done, total or done))
+    return ended if total is None else _size(part) == total
 
 
 def _request(url: str, origin: Path, have: int) -> urllib.request.Request:
@@ -148,15 +148,16 @@ def _origin(part: Path) -> Path:
     return part.with_name(part.name + ".origin")
 
 
-def _copy(response: HTTPResponse, file: IO[bytes], have: int, report: Callable[[int], None]) -> int:
+def _copy(response: HTTPResponse, file: IO[bytes], have: int, report: Callable[[int], None]) -> bool:
+    """Write what comes, after the `have` bytes that are there; False where the connection broke."""
     report(have)
     while True:
         try:
             chunk = response.read1(_CHUNK)
         except (TimeoutError, ConnectionError, http.client.HTTPException):
-            return have  # what came is kept
+            return False  # what came is kept
         if not chunk:
-            return have
+            return True
         file.write(chunk)
         have += len(chunk)
         report(have)

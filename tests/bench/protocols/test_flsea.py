@@ -156,6 +156,10 @@ def test_poses_beside_the_images_are_the_reference(tree: Path, tmp_path: Path, t
     assert isinstance(found, GroundTruth)
     assert found.names == frames.names[:3]
     torch.testing.assert_close(found.cameras.cam2world, truth.cameras.cam2world[1:4].double())
+    beyond = sequence.shots[5:]
+    none = flsea.reference_of(posed, beyond, _named([f"{s.name}.tiff" for s in beyond]), ColmapSettings(), tmp_path)
+    assert isinstance(none, NotComputed)
+    assert "none of these frames" in none.reason
 
 
 def test_without_restored_images_there_is_no_reference(tree: Path, tmp_path: Path):

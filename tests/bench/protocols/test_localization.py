@@ -4,19 +4,24 @@ import json
 import shutil
 from dataclasses import replace
 from pathlib import Path
+from types import SimpleNamespace
 
+import numpy as np
 import pytest
 import torch
 
+from swimm3r.bench.protocols import localization
 from swimm3r.bench.protocols.localization import localization_scores, localize, pose_scores
-from swimm3r.bench.runs import clips_of
-from swimm3r.errors import InputError
+from swimm3r.bench.runs import SfmRun, clips_of
+from swimm3r.errors import InputError, RegistrationError
 from swimm3r.evaluate import NotComputed
 from swimm3r.geometry import pose_from, so3_exp
+from swimm3r.io.images import write_rgb
 from swimm3r.localization.batch import Answer
-from swimm3r.localization.localizer import Localization
+from swimm3r.localization.localizer import Localization, Localizer
 from swimm3r.localization.settings import LocalizationSettings
 from swimm3r.pipeline.finished_sfm import open_finished_sfm
+from swimm3r.scene.frame_changes import MovingMasks
 from swimm3r.sfm.colmap import poses as colmap
 from swimm3r.splat import train
 from swimm3r.splat.settings import UwbsSettings
@@ -108,6 +113,29 @@ def test_runs_of_one_clip_are_rows_and_their_reference_is_made_once(
         assert isinstance(cell.scores["rra2_map"], float)
     assert localize(runs, tmp_path / "out", LocalizationSettings(matcher="sift")).cells == table.cells
     assert len(made) == 1
+
+
+def test_maps_are_searched_in_the_frames_that_localize_takes_without_what_moves(
+    run: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+):
+    sfm, given = open_finished_sfm(run), []
+    name, masks = sfm.rec.names[0], MovingMasks(tmp_path / "masks")
+    write_rgb(masks.path(name), np.zeros((sfm.frames.height, sfm.frames.width, 3)))
+    moving = replace(sfm, rec=replace(sfm.rec, moving=masks))
+
+    class Watched(Localizer):
+        def __init__(self, scene, rec, frames, settings):
+            given.append(frames)
+            raise RegistrationError("enough was seen", cause="", hint="")
+
+    monkeypatch.setattr(localization, "load_map", lambda path: SimpleNamespace(to=lambda device: path))
+    monkeypatch.setattr(localization, "Localizer", Watched)
+    monkeypatch.setattr(SfmRun, "open", lambda self: moving)
+    (mapped,) = clips_of([run])[0].runs
+    with pytest.raises(RegistrationError, match="enough was seen"):
+        localization._scores(tmp_path, run=mapped, path=run, truth=NotComputed("none"), settings=LocalizationSettings())
+    assert not given[0].mask(given[0].index(name)).any()
+    assert given[0].mask(given[0].index(sfm.rec.names[1])).all()
 
 
 def test_runs_with_other_frames_do_not_compare(run: Path, tmp_path: Path):

@@ -21,6 +21,7 @@ from swimm3r.io.images import read_rgb, write_rgb
 from swimm3r.pipeline.finished_sfm import open_finished_sfm
 from swimm3r.pipeline.presets import RunSettings
 from swimm3r.pipeline.scores import held_out
+from swimm3r.scene.rig import Rig, RigCamera
 from swimm3r.sfm.plane_sweep.settings import PlaneSweepSettings
 from swimm3r.sfm.settings import ColmapSettings
 from swimm3r.splat.settings import RECIPES, PoseRefinementSettings, UwbsSettings
@@ -85,6 +86,24 @@ def test_clips_are_reconstructed_once_and_runs_are_taken_as_they_are(
     assert made == [(clip, tmp_path / "runs" / "dive", "sfm")]
 
 
+def test_clips_of_one_name_are_refused_before_the_first_is_reconstructed(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+):
+    made = []
+    monkeypatch.setattr("swimm3r.bench.runs.run_pipeline", lambda source, folder, *_, **__: made.append(folder.name))
+    for day in ("2024.06.01", "2024.06.02"):
+        (tmp_path / day / "images").mkdir(parents=True)
+    days = sorted(path for path in tmp_path.iterdir())
+    made_runs([day / "images" for day in days], tmp_path / "out", RunSettings())
+    made_runs(days, tmp_path / "out", RunSettings())
+    monkeypatch.chdir(days[0])
+    made_runs([Path("images")], tmp_path / "out", RunSettings())
+    assert made == ["2024.06.01", "2024.06.02"] * 2 + ["2024.06.01"]
+    with pytest.raises(InputError, match="one name: GX01, GX01"):
+        made_runs([tmp_path / "a" / "GX01.MP4", tmp_path / "b" / "GX01.MP4"], tmp_path / "out", RunSettings())
+    assert len(made) == 5
+
+
 def test_a_scene_with_a_model_lends_its_poses_where_asked(run: Path, tmp_path: Path):
     scene = tmp_path / "Curasao"
     shutil.copytree(run.parent / "dive" / "images", scene / "Images_wb")
@@ -120,6 +139,22 @@ def test_turned_test_frames_are_not_placed_as_if_exposed_at_once(run: Path, tmp_
     assert isinstance(found, NotComputed)
     assert "turned within exposures" in found.reason
     assert list(tmp_path.iterdir()) == []  # which takes no structure from motion to find out
+
+
+def test_no_lens_of_a_rig_is_held_for_all_of_its_cameras(run: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
+    asked = []
+    monkeypatch.setattr(reference, "whole_clip", lambda *given: asked.append(given) or NotComputed("asked"))
+    sfm = open_finished_sfm(run)
+    sides = [replace(f, camera=("left", "right")[i % 2]) for i, f in enumerate(sfm.frames.frames)]
+    rig = replace(sfm.frames, frames=tuple(sides), rig=Rig((RigCamera("left"), RigCamera("right"))))
+    assert reference.of_clip(replace(sfm, frames=rig), tmp_path) == NotComputed("asked")  # both have the same
+    K = sfm.rec.cameras.K.clone()
+    K[[rig.frames[rig.index(name)].camera == "right" for name in sfm.rec.names], 0, 2] += 20
+    own = replace(sfm, frames=rig, rec=replace(sfm.rec, cameras=replace(sfm.rec.cameras, K=K)))
+    found = reference.of_clip(own, tmp_path)
+    assert isinstance(found, NotComputed)
+    assert "lenses of their own" in found.reason
+    assert len(asked) == 1
 
 
 @pytest.mark.parametrize(

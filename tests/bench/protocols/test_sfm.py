@@ -228,6 +228,8 @@ def test_restored_frames_are_scored_in_physical_colors_beside_the_shown_ones_and
         assert cell.scores["uiqm_funie"] == pytest.approx(sum(uiqm(image).uiqm for image in images) / 2, rel=1e-3)
         assert cell.scores["uciqe_cielab"] == pytest.approx(sum(uciqe(image) for image in images) / 2, rel=1e-3)
         assert cell.scores["uranker"] == URANKER
+        assert cell.scores["scored_pct"] == pytest.approx(100 * 2 / 7)  # five were not restored
+    assert table.cells[0].scores["scored_pct"] == 100
     assert len({f"{cell.scores['uciqe_cielab']:.2f}" for cell in table.cells}) == 3
     assert list((tmp_path / "out" / "images" / "dive").glob("*.png"))
     nothing = score_restoration([with_water(run, tmp_path / "unrestored")], tmp_path / "none").cells[1]

@@ -9,7 +9,9 @@ import torch
 from tests.splat.conftest import TinyDive, tiny_dive  # noqa: F401 - a fixture
 from torch import Tensor
 
+from swimm3r import weights
 from swimm3r.cameras import Cameras
+from swimm3r.evaluate import NotComputed
 from swimm3r.geometry import Similarity
 from swimm3r.medium import Medium
 from swimm3r.pipeline.scores.held_out import (
@@ -17,6 +19,7 @@ from swimm3r.pipeline.scores.held_out import (
     cut,
     first_poses,
     in_axes_of,
+    published_lpips,
     score_views,
     visible_window,
 )
@@ -141,3 +144,17 @@ def test_the_mean_water_of_a_map_is_that_of_its_own_cameras(
     monkeypatch.setattr("swimm3r.pipeline.summary.mean_water", mean_water)
     mean_medium(replace(tiny_dive.truth, poses=moved), tiny_dive.rec, tiny_dive.frames)
     torch.testing.assert_close(torch.stack(asked), moved.cam2world)
+
+
+def test_a_missing_lpips_names_the_weights_as_the_command_that_gets_them_does(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+):
+    """The published file is called vgg.pth; under that name nothing looks for it."""
+    monkeypatch.setenv("SWIMM3R_WEIGHTS_DIR", str(tmp_path))
+    monkeypatch.setenv("SWIMM3R_CACHE", str(tmp_path / "cache"))
+    for name in ("vgg16", "lpips-vgg"):
+        missing = published_lpips()
+        assert isinstance(missing, NotComputed)
+        assert f"swimm3r weights get {name}" in missing.reason
+        weights_file = weights.entry(name)
+        (tmp_path / weights_file.filename).write_bytes(b"0" * (weights_file.size or 1))

@@ -138,6 +138,22 @@ def test_a_store_opened_again_adds_nothing_twice_and_leaves_nothing_out(
         torch.testing.assert_close(store.read(i).view.relative_depth, view.relative_depth, atol=1e-6, rtol=0)
 
 
+def test_looking_for_the_frames_that_are_done_keeps_to_the_memory_that_is_allowed(
+    passes: dict, views: list[CanonicalView], tmp_path: Path
+):
+    stream(tmp_path, passes, 1 << 30, PAIRS[:3])
+    one = 7 * 8 * HEIGHT * WIDTH
+    again = FrameStore(tmp_path, NAMES, PARTNERS, one)
+    done = {(i, j) for i in range(N) for j in PARTNERS[i] if again.has(i, j)}
+    assert done == {(i, j) for i, j in ((0, 1), (0, 2), (0, 3), (1, 0), (2, 0), (3, 0))}
+    assert len(again._held) == 1
+    for i in range(1, N):
+        for j in sorted(PARTNERS[i] - {0}):
+            again.add(i, j, *passes[i, j])
+    for i, view in enumerate(views):
+        torch.testing.assert_close(again.read(i).view.relative_depth, view.relative_depth, atol=1e-6, rtol=0)
+
+
 def test_other_partners_are_another_view(passes: dict, tmp_path: Path):
     stream(tmp_path, passes, 1 << 30, PAIRS)
     fewer = FrameStore(tmp_path, NAMES, [{1}, {0}, set(), set()], 1 << 30)

@@ -132,6 +132,8 @@ def reference_of(
     named = {Path(name).stem: name for name in frames.names}
     if sequence.cam2world:
         posed = [shot.name for shot in shots if shot.name in sequence.cam2world and shot.name in named]
+        if not posed:
+            return NotComputed("no reference: the COLMAP model beside the images is of none of these frames")
         poses = torch.stack([torch.from_numpy(sequence.cam2world[name]).double() for name in posed])
         K = torch.eye(3, dtype=torch.float64) if lens is None else lens.K[0]
         flat = torch.zeros(len(posed), 0, dtype=torch.float64)

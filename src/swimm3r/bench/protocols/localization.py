@@ -151,7 +151,7 @@ def _scores(
     scene = load_map(path).to(devices.for_maps())
 
     def work() -> tuple[Localizer, list[Answer]]:
-        localizer = Localizer(scene, sfm.rec, sfm.frames, settings)
+        localizer = Localizer(scene, sfm.rec, sfm.rec.still(sfm.frames), settings)
         return localizer, _answers(localizer, sfm, folder)
 
     (localizer, answers), peaks = with_peak_mb(work)

@@ -23,7 +23,7 @@ from swimm3r.progress import Progress, silent
 from swimm3r.scene.frames import Frames
 from swimm3r.tasks.settings import EngineSettings
 
-COLUMNS = columns("uiqm_funie", "uciqe_cielab", "uranker")
+COLUMNS = columns("uiqm_funie", "uciqe_cielab", "uranker", "scored_pct")
 _FILMED = "as filmed"
 _SHOWN_AS = "{}, white-balanced"
 _SHOWN = 4  # frames side by side
@@ -46,7 +46,7 @@ def _cells_of_clip(clip: Clip, /, *, out: Path, progress: Progress) -> list[Resu
             out,
             ResultKey(clip.name, _FILMED),
             [clip.runs[0].frames, [content_digest(frame.path) for frame in frames]],
-            partial(_of_paths, paths=[frame.path for frame in frames], progress=progress),
+            partial(_of_paths, paths=[frame.path for frame in frames], frames=len(frames), progress=progress),
             scored,
         )
     ]
@@ -58,7 +58,7 @@ def _cells_of_clip(clip: Clip, /, *, out: Path, progress: Progress) -> list[Resu
         restored = f"{run.sfm} + {sfm.rec.medium.estimator}"
         for method, kind in ((restored, "restored_physical"), (_SHOWN_AS.format(restored), "restored")):
             paths = [run.folder / "sfm" / kind / f"{name}.png" for name in sfm.rec.names]
-            make = partial(_of_paths, paths=paths, progress=progress)
+            make = partial(_of_paths, paths=paths, frames=len(frames), progress=progress)
             made_from = [reconstruction_of(run.folder, sfm), [content_digest(path) for path in paths]]
             cells.append(kept_cell(out, ResultKey(clip.name, method), made_from, make, scored))
     for i in range(0, len(frames), max(1, len(frames) // _SHOWN)):
@@ -66,9 +66,10 @@ def _cells_of_clip(clip: Clip, /, *, out: Path, progress: Progress) -> list[Resu
     return cells
 
 
-def _of_paths(_: Path, *, paths: Sequence[Path], progress: Progress) -> Scores:
-    found = no_reference_scores(paths, progress)
-    return {"uiqm_funie": found.uiqm, "uciqe_cielab": found.uciqe, "uranker": found.urank}
+def _of_paths(_: Path, *, paths: Sequence[Path], frames: int, progress: Progress) -> Scores:
+    found, there = no_reference_scores(paths, progress), sum(path.is_file() for path in paths)
+    scores = {"uiqm_funie": found.uiqm, "uciqe_cielab": found.uciqe, "uranker": found.urank}
+    return {**scores, "scored_pct": 100 * there / frames}
 
 
 def _side_by_side(out: Path, clip: Clip, frames: Frames, i: int) -> None:

@@ -13,12 +13,12 @@ from swimm3r.bench import reference
 from swimm3r.bench.cells import Result, ResultKey, Scores, check_choice, kept_cell, over_scenes
 from swimm3r.bench.images import Panel, write_grid
 from swimm3r.bench.inputs import files_of
-from swimm3r.bench.runs import original_pixels
+from swimm3r.bench.runs import clip_name, clip_names, original_pixels
 from swimm3r.bench.scores import columns
 from swimm3r.bench.settings import SfmMethods
 from swimm3r.bench.sfm_methods import Uncapped, model_scores, reference_scores, settings_for
 from swimm3r.bench.tables import Table
-from swimm3r.errors import InputError, RegistrationError
+from swimm3r.errors import RegistrationError
 from swimm3r.evaluate import NotComputed
 from swimm3r.geometry import Similarity, best_similarity
 from swimm3r.io.files.cache_key import sample_digest
@@ -59,13 +59,7 @@ def compare_sfm(
     """
     check_choice("methods", given.methods)
     reference.given(references, "")
-    names = [clip.stem for clip in clips]
-    if len(set(names)) < len(names):
-        raise InputError(
-            f"two of the clips have one name: {', '.join(sorted(names))}",
-            cause="results are kept by the clips' names",
-            hint="another name for one of them",
-        )
+    clip_names(clips)
     for clip in clips:
         check_source(clip)
     work = partial(_cells_of_clip, out=out, given=given, settings=settings, mast3r=mast3r, references=references)
@@ -84,7 +78,7 @@ def _cells_of_clip(
     references: Path | None,
     progress: Progress,
 ) -> list[Result]:
-    scene = clip.stem
+    scene = clip_name(clip)
     truth = reference.given(references, scene) or truth_of(clip, None)
     assert isinstance(settings.sfm, ColmapSettings)
     cells = []

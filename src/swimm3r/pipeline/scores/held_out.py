@@ -316,5 +316,9 @@ def cut(canvas: Cameras, window: Crop) -> Cameras:
 
 
 def published_lpips() -> Lpips | NotComputed:
-    """LPIPS where its two weight files are on this computer."""
-    return load_lpips(weights.find("vgg16"), weights.find("lpips-vgg"))
+    """LPIPS where its two weight files are on this computer, else how to get the first that is missing."""
+    found = {name: weights.find(name) for name in ("vgg16", "lpips-vgg")}
+    for name, path in found.items():
+        if path is None:
+            return NotComputed(f"the weights {name!r} are not on this computer (swimm3r weights get {name})")
+    return load_lpips(found["vgg16"], found["lpips-vgg"])

@@ -116,7 +116,8 @@ class FrameStore:
         self.partners = partners
         self.subsample, self.pixel_center = subsample, pixel_center
         self._max_bytes = max_bytes
-        self._held: OrderedDict[int, tuple[CanonicalSums, set[int]]] = OrderedDict()
+        self._held: OrderedDict[int, CanonicalSums] = OrderedDict()
+        self._done: dict[int, set[int]] = {}  # of frames looked at, the partners already added
         self._unsaved: set[int] = set()
         self._finished: set[int] = set()
         self._saved_at = time.monotonic()
@@ -126,22 +127,22 @@ class FrameStore:
         if i in self._finished or self._view_path(i).is_file():
             self._finished.add(i)
             return True
-        sums = self._sums(i)
-        return sums is not None and partner in sums[1]
+        if i not in self._done:
+            self._sums(i)
+            self._make_room()
+        return partner in self._done[i]
 
     def add(self, i: int, partner: int, points: Float[Tensor, "h w 3"], confidence: Float[Tensor, "h w"]) -> None:
         """Add a pass of frame i, once. Raises WeightsError for a pointmap that is not finite."""
         if self.has(i, partner):
             return
-        sums, done = self._sums(i) or (None, set())
-        self._held[i] = (add_pass(sums, points, confidence, self.subsample), done | {partner})
+        self._held[i] = add_pass(self._sums(i), points, confidence, self.subsample)
+        self._done[i].add(partner)
         self._held.move_to_end(i)
         self._unsaved.add(i)
-        if self._held[i][1] >= self.partners[i]:
+        if self._done[i] >= self.partners[i]:
             self._finish(i)
-        while len(self._held) > 1 and sum(_bytes(s) for s, _ in self._held.values()) > self._max_bytes:
-            self._save(next(iter(self._held)))
-            self._held.popitem(last=False)
+        self._make_room()
         if time.monotonic() - self._saved_at > _FLUSH_SECONDS:
             self.flush()
 
@@ -163,32 +164,38 @@ class FrameStore:
         height, width = confidence.shape
         return FrameRecord(AnchoredFrame(height, width, focal, anchors, mean), view)
 
-    def _sums(self, i: int) -> tuple[CanonicalSums, set[int]] | None:
+    def _make_room(self) -> None:
+        while len(self._held) > 1 and sum(map(_bytes, self._held.values())) > self._max_bytes:
+            self._save(next(iter(self._held)))
+            self._held.popitem(last=False)
+
+    def _sums(self, i: int) -> CanonicalSums | None:
         if i in self._held:
             self._held.move_to_end(i)
             return self._held[i]
         path = self._sums_path(i)
         if not path.is_file():
+            self._done[i] = set()
             return None
         with guard(path, remake(path)):
             stored = read_tensors(path, _SumsHeader, remake(path), None)
             arrays = [stored.tensors[field.name] for field in fields(CanonicalSums)[1:]]
         done = set(stored.about.done)
-        here = {p for p in self.partners[i] if self.names[p] in done}
-        self._held[i] = (CanonicalSums(len(done), *arrays), here)
+        self._done[i] = {p for p in self.partners[i] if self.names[p] in done}
+        self._held[i] = CanonicalSums(len(done), *arrays)
         return self._held[i]
 
     def _save(self, i: int) -> None:
         if i not in self._unsaved:
             return
-        sums, done = self._held[i]
+        sums = self._held[i]
         arrays = {field.name: getattr(sums, field.name) for field in fields(sums)[1:]}
-        header = _SumsHeader(tuple(self.names[p] for p in sorted(done)))
+        header = _SumsHeader(tuple(self.names[p] for p in sorted(self._done[i])))
         write_tensors(self._sums_path(i), arrays, asdict(header))
         self._unsaved.discard(i)
 
     def _finish(self, i: int) -> None:
-        sums, _ = self._held.pop(i)
+        sums = self._held.pop(i)
         self._unsaved.discard(i)
         view = canonical_view(sums, self.subsample)
         frame = anchored_frame(view, self.subsample, self.pixel_center)
