@@ -164,16 +164,17 @@ def test_hidden_files_are_not_images(dive, prepared):
 
 
 def test_the_cameras_clock_orders_and_times_images(tmp_path, prepared):
-    for name, clock, fraction in (("a", "12:00:05", "50"), ("b", "12:00:01", "0"), ("c", "12:00:01", "250")):
+    for name, clock, fraction in (("a", "12:00:05", "50"), ("b", "12:00:01", "125"), ("c", "12:00:01", "250")):
         exif = Image.Exif()
         exif.get_ifd(0x8769).update({36867: f"2024:05:01 {clock}", 37521: fraction})
         write(tmp_path / "dive" / f"{name}.jpg", image(ord(name)), exif=exif)
     frames = read_frames(tmp_path / "dive", folder=prepared)
     assert frames.names == ("b.jpg", "c.jpg", "a.jpg")
-    np.testing.assert_allclose([frame.time for frame in frames], [0, 0.25, 4.5])
+    np.testing.assert_allclose([frame.time for frame in frames], [0, 0.125, 4.375])
     assert frames.ordered
     assert any("clock" in warning for warning in frames.warnings)
-    assert frames.recorded == load_frames(prepared).recorded == "2024-05-01T12:00:01"
+    assert frames.recorded == load_frames(prepared).recorded == "2024-05-01T12:00:01.125000"
+    assert frames.timed
 
 
 def test_without_a_clock_on_every_image_time_is_the_index(dive, prepared):
@@ -184,6 +185,8 @@ def test_without_a_clock_on_every_image_time_is_the_index(dive, prepared):
     frames = read_frames(dive, folder=prepared)
     assert [frame.time for frame in frames] == list(range(12))
     assert frames.recorded == "2024-05-01T12:00:00"
+    assert not frames.timed
+    assert not load_frames(prepared).timed
 
 
 def test_without_any_clock_no_date_is_made_up(dive, prepared):

@@ -115,6 +115,7 @@ def test_stamps_in_names_pair_images_within_the_tolerance(tmp_path, prepared):
     assert len({frame.instant for frame in frames}) == 10
     assert frames.frames[2].time == pytest.approx(0.1)
     assert frames.recorded == "2020-09-13T12:26:40"
+    assert frames.timed
 
 
 def test_cameras_that_are_not_synchronized_are_refused_with_their_difference(tmp_path, prepared):

@@ -121,6 +121,7 @@ class _Document:
     rig: Rig | None = None
     development: str | None = None
     rows_rectified: bool = False
+    timed: bool = True
 
     def __post_init__(self) -> None:
         if min(self.width, self.height) < 1:
@@ -170,6 +171,7 @@ def load_frames(folder: Path) -> Frames:
         rig=document.rig,
         development=document.development,
         rows_rectified=document.rows_rectified,
+        timed=document.timed,
     )
 
 
@@ -260,6 +262,7 @@ def _write_frames(
         calibration=dive.calibration,
         rig=dive.rig,
         development=dive.development,
+        timed=dive.timed,
     )
     write_index(draft, frames, str(source.resolve()))
 

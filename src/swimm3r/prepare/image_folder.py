@@ -6,7 +6,6 @@ from collections import Counter
 from collections.abc import Callable, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass, replace
-from datetime import UTC, datetime
 from functools import partial
 from pathlib import Path
 from typing import TypeVar
@@ -27,6 +26,7 @@ from swimm3r.prepare.candidates import (
     Taken,
     blank_warning,
     is_gray,
+    recorded_on,
     scaled_down,
     sharpness,
     small_gray,
@@ -103,6 +103,7 @@ def prepare_stills(
         originals=[path.relative_to(folder.root) for path in folder.paths],
         files=frozenset(folder.root.resolve() / path.relative_to(folder.root) for path in folder.paths),
         recorded=choice.recorded,
+        timed=choice.timed,
         calibration=None if rig is None else write_lens(draft, rig, settings),
         rig=rig,
         development=str(development) if development.changes or development.balance is not None else None,
@@ -115,6 +116,7 @@ class _Choice:
 
     taken: list[Taken]
     ordered: bool  # neighbors were taken in turn
+    timed: bool  # every image carries a time
     recorded: str | None  # date of the earliest image that has one, ISO 8601
     warnings: list[str]
 
@@ -132,10 +134,11 @@ def _choose(
         )
     if cameras:
         paired = pair_images(folder.root, paths, cameras, settings)
-        return _Choice(list(paired.images), paired.ordered, paired.recorded, [*warnings, *paired.warnings])
-    paths, times, ordered, recorded = _in_time_order(paths, warnings)
-    taken = thinned([Taken(path, time) for path, time in zip(paths, times, strict=True)], settings.max_frames)
-    return _Choice(taken, ordered, recorded, warnings)
+        told = [*warnings, *paired.warnings]
+        return _Choice(list(paired.images), paired.ordered, paired.timed, paired.recorded, told)
+    taken, timed, recorded = _in_time_order(paths, warnings)
+    ordered = timed or image_folder.numbered(paths)
+    return _Choice(thinned(taken, settings.max_frames), ordered, timed, recorded, warnings)
 
 
 def _headers(paths: Sequence[Path], development: Development) -> tuple[dict[Path, ImageHeader], dict[Path, InputError]]:
@@ -247,20 +250,20 @@ def _one_size(
     return [p for p in paths if sizes[p] == usual], [f"{len(odd)} images of another size were left out: {which}."]
 
 
-def _in_time_order(paths: list[Path], warnings: list[str]) -> tuple[list[Path], list[float], bool, str | None]:
-    """Sorted images, their times, whether neighbors were taken in turn; by the camera's clock where all carry it.
+def _in_time_order(paths: list[Path], warnings: list[str]) -> tuple[list[Taken], bool, str | None]:
+    """Sorted images, and whether their times are those of the camera's clock, which all carry then.
 
     Last, the date of the earliest image that has one.
     """
-    taken = [capture_time(path) for path in paths]
-    known = [time for time in taken if time is not None]
-    recorded = datetime.fromtimestamp(min(known), UTC).strftime("%Y-%m-%dT%H:%M:%S") if known else None
+    clock = [capture_time(path) for path in paths]
+    known = [time for time in clock if time is not None]
+    recorded = recorded_on(min(known)) if known else None
     if len(known) < len(paths) or len(set(known)) < 2:
-        return paths, [float(i) for i in range(len(paths))], image_folder.numbered(paths), recorded
+        return [Taken(path, float(i)) for i, path in enumerate(paths)], False, recorded
     order = sorted(range(len(paths)), key=known.__getitem__)  # stable: equal seconds keep the order of names
     if order != list(range(len(paths))):
         warnings.append("The images are ordered by the camera's clock, which is not the order of their names.")
-    return [paths[i] for i in order], [known[i] - min(known) for i in order], True, recorded
+    return [Taken(paths[i], known[i] - min(known)) for i in order], True, recorded
 
 
 def _named(chosen: list[Taken], root: Path, long_side: int, headers: dict[Path, ImageHeader]) -> list[_Still]:

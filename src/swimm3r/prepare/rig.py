@@ -4,7 +4,6 @@ import logging
 import re
 from collections.abc import Sequence
 from dataclasses import dataclass
-from datetime import UTC, datetime
 from pathlib import Path
 
 from swimm3r.errors import InputError, UsageError
@@ -14,7 +13,7 @@ from swimm3r.io.files.atomic import write_text
 from swimm3r.io.files.damage import guard
 from swimm3r.io.image_folder import find_images, natural_key, numbered
 from swimm3r.io.image_header import capture_time
-from swimm3r.prepare.candidates import Taken, thinned
+from swimm3r.prepare.candidates import Taken, recorded_on, thinned
 from swimm3r.prepare.instants import CameraImages, instants_of, missing
 from swimm3r.scene.rig import Rig, RigCamera, pose_of
 from swimm3r.scene.settings import FrameSettings
@@ -34,6 +33,7 @@ class RigImages:
 
     images: tuple[Taken, ...]
     ordered: bool  # neighboring instants were taken in turn
+    timed: bool  # every image carries a time
     recorded: str | None  # date of the first instant, ISO 8601, where images carry it
     warnings: tuple[str, ...]
 
@@ -141,9 +141,9 @@ def pair_images(root: Path, paths: Sequence[Path], cameras: Sequence[str], setti
         for name in cameras
         if name in instant
     ]
-    recorded = datetime.fromtimestamp(begin, UTC).strftime("%Y-%m-%dT%H:%M:%S") if clocked else None
+    recorded = recorded_on(begin) if clocked else None
     warnings = () if told is None else (f"{told} They are used as they are.",)
-    return RigImages(tuple(images), clocked or numbered(own[cameras[0]]), recorded, warnings)
+    return RigImages(tuple(images), clocked or numbered(own[cameras[0]]), clocked, recorded, warnings)
 
 
 def _by_camera(root: Path, paths: Sequence[Path], cameras: Sequence[str]) -> dict[str, list[Path]]:

@@ -22,10 +22,13 @@ _ZONES = [half * 1800.0 for half in range(-28, 29) if half]  # offsets of time z
 
 @dataclass(frozen=True)
 class FrameTimes:
-    """Moments of the registered frames: since 1970 where `clock` is "utc", else seconds of the clip."""
+    """Moments of the registered frames: since 1970 where `clock` is "utc", seconds of the clip where it is "clip".
+
+    Frames without a clock ("none") have their places in the order instead.
+    """
 
     names: tuple[str, ...]
-    clock: Literal["utc", "clip"]
+    clock: Literal["utc", "clip", "none"]
     seconds: Float[np.ndarray, " c"]
 
 
@@ -50,6 +53,8 @@ def frame_times(names: Sequence[str], frames: Frames, clip_start: str | None) ->
     if clip_start is None and frames.start_ns is not None:  # a bag's, of a clock that need not count from 1970
         seconds = frames.start_ns * 1e-9 + times
         return FrameTimes(tuple(names), "utc" if is_date(float(seconds[0])) else "clip", seconds)
+    if not frames.timed:
+        return FrameTimes(tuple(names), "none", times)
     begin = clip_start or frames.recorded
     if begin is None:
         return FrameTimes(tuple(names), "clip", times)
@@ -79,6 +84,16 @@ def match_names(navigation: Navigation, names: Sequence[str]) -> Matched | None:
             hint="the navigation of this dive, or one with times",
         )
     return None
+
+
+def check_timed(navigation: Navigation, times: FrameTimes) -> None:
+    """Raise InputError for frames that have no times, and so no place in navigation that does not name them."""
+    if times.clock == "none":
+        raise InputError(
+            f"the frames cannot be found in {navigation.path}: they have no times, and it does not name them",
+            cause="images without the time of the camera's clock, at least one of them: an editor left EXIF out",
+            hint="a table with the column `name`; or date and time in the images' names (20190404_120001.jpg) or EXIF",
+        )
 
 
 def match_times(navigation: Navigation, times: FrameTimes, offset: float, max_gap: float) -> Matched:
