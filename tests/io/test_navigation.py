@@ -117,13 +117,22 @@ def test_matisse_files_name_images(shared):
     assert seconds_of_name(found.names[0]) == pytest.approx(found.time[0], abs=1e-6)
 
 
-def test_nmea_sentences_with_a_date(tmp_path):
-    def sentence(body: str) -> str:
-        total = 0
-        for character in body.encode():
-            total ^= character
-        return f"${body}*{total:02X}"
+def sentence(body: str) -> str:
+    total = 0
+    for character in body.encode():
+        total ^= character
+    return f"${body}*{total:02X}"
 
+
+def gga(time: str) -> str:
+    return sentence(f"GPGGA,{time},2159.350600,S,17633.99990,W,1,08,0.9,12.0,M,0,M,,")
+
+
+def rmc(time: str, date: str) -> str:
+    return sentence(f"GPRMC,{time},A,2159.350600,S,17633.99990,W,0.1,90,{date},,")
+
+
+def test_nmea_sentences_with_a_date(tmp_path):
     lines = [
         sentence("GPRMC,040808.00,A,2159.350658,S,17633.99998,W,0.1,90,040419,,"),
         sentence("SDDPT,3.4,0.0"),
@@ -135,6 +144,39 @@ def test_nmea_sentences_with_a_date(tmp_path):
     np.testing.assert_allclose(found.position[0, :2], [-21.9891776, -176.5666663], atol=1e-7)
     assert found.altitude is not None
     assert found.altitude[0] == 3.4
+
+
+MIDNIGHT = 1767312000.0  # 2026-01-02
+
+
+@pytest.mark.parametrize(
+    ("lines", "seconds"),
+    [
+        pytest.param(
+            [rmc("235959", "010126"), gga("000000"), rmc("000000", "020126"), gga("000001")], [-1, 0, 1], id="behind"
+        ),
+        pytest.param([rmc("000000", "020126"), gga("235959.90"), gga("000001")], [-0.1, 0, 1], id="late sentence"),
+        pytest.param(
+            [sentence("GPZDA,235957,01,01,2026,00,00"), gga("235959"), gga("000001"), gga("120000"), gga("000002")],
+            [-1, 1, 43200, 86402],
+            id="one date for days",
+        ),
+        pytest.param(
+            [rmc("080000", "010126"), rmc("070000", "020126"), gga("070001")], [-57600, 25200, 25201], id="gap"
+        ),
+    ],
+)
+def test_nmea_times_go_on_after_midnight(tmp_path, lines, seconds):
+    found = read_navigation(written(tmp_path, "\n".join(lines) + "\n", "log.nmea"))
+    np.testing.assert_allclose(found.time - MIDNIGHT, seconds, atol=1e-6)
+
+
+@pytest.mark.parametrize(
+    "cut", ["$GPGGA,2359", "$GPGGA,235952,2159.35", "$GPDPT", "$GPRMC,235952,A", "$GPZDA,235952,02,01,20", "$"]
+)
+def test_a_sentence_that_is_cut_off_is_left_out(tmp_path, cut):
+    lines = [rmc("235950", "010126"), gga("235951"), cut]
+    assert len(read_navigation(written(tmp_path, "\n".join(lines), "log.nmea"))) == 2
 
 
 def test_tum_trajectories(tmp_path):
