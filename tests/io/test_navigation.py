@@ -212,6 +212,26 @@ def test_positions_in_the_images_themselves(tmp_path):
     assert found.names == ("0.jpg", "1.jpg")
 
 
+@pytest.mark.parametrize("latitude", ["numbers over zero", (0.0, 0.0, 0.0), 21.5, None])
+def test_images_that_are_damaged_or_had_no_fix_have_no_position(tmp_path, latitude):
+    from PIL import Image
+    from PIL.TiffImagePlugin import IFDRational
+
+    place = {1: "N", 2: (21.0, 30.5), 3: "E", 4: (17.0, 0.0)}
+    latitude = (IFDRational(0, 0),) * 3 if latitude == "numbers over zero" else latitude
+    without_fix = {} if latitude is None else {**place, 2: latitude, 4: (0.0, 0.0, 0.0)}
+    for i, gps in enumerate((place, place, without_fix)):
+        exif = Image.Exif()
+        exif.get_ifd(0x8825).update(gps)
+        (tmp_path / "a").mkdir(exist_ok=True)
+        Image.new("RGB", (16, 16)).save(tmp_path / "a" / f"{i}.jpg", exif=exif)
+    (tmp_path / "cut.jpg").write_bytes((tmp_path / "a" / "0.jpg").read_bytes()[:60])
+    (tmp_path / "empty.png").touch()
+    found = read_navigation(tmp_path)
+    assert found.names == ("a/0.jpg", "a/1.jpg")
+    np.testing.assert_allclose(found.position[:, :2], [[21 + 30.5 / 60, 17]] * 2)
+
+
 @pytest.mark.parametrize(
     ("text", "words"),
     [

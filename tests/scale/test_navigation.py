@@ -438,3 +438,14 @@ def test_frames_without_times_are_not_looked_for_by_their_places_in_the_order(tm
     assert caught.value.exit_code == 3
     named = write_csv(tmp_path / "named.csv", survey, time=None, name=list(survey.rec.names))
     assert fit_navigation(survey.rec, frames, ScaleSettings(nav=named)).by == "name"
+
+
+def test_images_of_one_name_in_several_folders_are_told_apart(survey):
+    names = ("100media/dji_0001.png", "100media/dji_0002.png", "101media/dji_0001.png")
+    given = ("DCIM\\101MEDIA\\DJI_0001.JPG", "DCIM\\100MEDIA\\DJI_0001.JPG", "DCIM\\100MEDIA\\DJI_0002.JPG")
+    navigation = replace(survey.navigation().rows(np.arange(3)), names=given)
+    matched = match_names(navigation, names)
+    assert matched is not None
+    assert matched.navigation.names == (given[1], given[2], given[0])
+    without_folders = tuple(name.rpartition("/")[2] for name in names)
+    assert match_names(navigation, without_folders) is None  # dji_0001 is one of two
