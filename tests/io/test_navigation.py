@@ -185,7 +185,9 @@ def test_tum_trajectories(tmp_path):
     )
     np.testing.assert_allclose(found.position, [[1, 2, 3], [2, 2, 3]])
     assert found.attitude is not None
+    np.testing.assert_allclose(found.attitude[0] @ [0, 0, 1], [0, 0, -1], atol=1e-6)  # level: its z, down, is down
     np.testing.assert_allclose(found.attitude[1] @ [1, 0, 0], [0, 1, 0], atol=1e-6)
+    np.testing.assert_allclose(found.attitude[1] @ [0, 1, 0], [1, 0, 0], atol=1e-6)  # north ahead, east to starboard
 
 
 @pytest.mark.parametrize(
@@ -193,6 +195,9 @@ def test_tum_trajectories(tmp_path):
 )
 def test_subtitles_with_positions(tmp_path, place):
     blocks = [f"{i}\n00:00:0{i},500 --> 00:00:0{i},600\n<font>{place}</font>\n" for i in range(3)]
+    blocks.append(
+        "4\n00:00:04,500 --> 00:00:04,600\n[latitude: 0.000000] [longitude: 0.000000] [rel_alt: 1.2]\n"
+    )  # no fix
     found = read_navigation(written(tmp_path, "\n".join(blocks), "clip.srt"))
     np.testing.assert_allclose(found.time, [0.5, 1.5, 2.5])
     assert found.position[0, :2].tolist() == [12.5, 44.25]
@@ -244,6 +249,9 @@ def test_images_that_are_damaged_or_had_no_fix_have_no_position(tmp_path, latitu
         ("lat,lon\n50,8\n51,8\n", "neither times nor names"),
         ("time,lat,lon\n10:00:01,50,8\n10:00:02,51,8\n", "no date"),
         ("time,lat,lon\n1,50,8\n2,fifty,8\n", "line 3: the latitude is 'fifty'"),
+        ("timestamp,x,y\n1600000000000,0,0\n1600000001000,1,0\n", "milliseconds since 1970"),
+        ("1600000000000000000 0 0 0 0 0 0 1\n1600000001000000000 1 0 0 0 0 0 1\n", "nanoseconds since 1970"),
+        ("time,x,y\n20190404120000,0,0\n20190404120001,1,0\n", "a date written as one number"),
         ("time,lat,lon\nnoon,50,8\nlater,50,9\n", "a time cannot be read"),
         ("time,lat,lon,depth [fathom]\n1,50,8,3\n2,50,8,4\n", "the unit of 'depth [fathom]' is fathom"),
         ("time,lat,latitude,lon\n1,50,50,8\n2,51,51,8\n", "two of its columns are the latitude"),

@@ -8,7 +8,7 @@ from pathlib import Path
 import numpy as np
 
 from swimm3r.io.navigation.clock import seconds_of_date, seconds_of_day
-from swimm3r.io.navigation.record import Navigation, vehicle_attitude
+from swimm3r.io.navigation.record import PORT_UP, Navigation, vehicle_attitude
 
 _DIM2 = ("latitude", "longitude", "depth", "altitude", "heading", "roll", "pitch")
 _DIM2_FIRST = 6  # fields before them: a flag, date, time, camera, size, file
@@ -47,7 +47,10 @@ def read_dim2(path: Path) -> Navigation:
 
 
 def read_tum(path: Path) -> Navigation:
-    """A TUM trajectory: time, position and orientation (quaternion x, y, z, w) of the vehicle, metres, z up."""
+    """A TUM trajectory: time, position and orientation (quaternion x, y, z, w) of the vehicle, metres, z up.
+
+    A vehicle that lies level has its z up, too: its axes are ROS's, x forward and y to port (REP 103).
+    """
     from scipy.spatial.transform import Rotation
 
     lines = [line for line in path.read_text(encoding="utf-8").splitlines() if line.strip() and line[0] != "#"]
@@ -62,7 +65,7 @@ def read_tum(path: Path) -> Navigation:
         position=table[:, 1:4],
         clock="utc" if table[0, 0] > 1e8 else "clip",
         time=table[:, 0],
-        attitude=Rotation.from_quat(table[:, 4:]).as_matrix(),
+        attitude=Rotation.from_quat(table[:, 4:]).as_matrix() @ PORT_UP,
     )
 
 
@@ -72,7 +75,7 @@ def read_srt(path: Path) -> Navigation:
     for block in re.split(r"\n\s*\n", path.read_text(encoding="utf-8", errors="replace").replace("\r", "")):
         begin = _BLOCK.search(block)
         place = _srt_place(block)
-        if begin is not None and place is not None:
+        if begin is not None and place is not None and (place[0] or place[1]):  # zeros: no fix yet
             hours, minutes, seconds, fraction = begin.groups()
             times.append(int(hours) * 3600 + int(minutes) * 60 + int(seconds) + float(f"0.{fraction}"))
             rows.append(place)
