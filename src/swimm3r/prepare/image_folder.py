@@ -13,7 +13,7 @@ from typing import TypeVar
 from swimm3r import memory
 from swimm3r.errors import InputError
 from swimm3r.io import image_folder, images
-from swimm3r.io.files.cache_key import files_below
+from swimm3r.io.files.cache_key import cache_key, files_below, sample_digest
 from swimm3r.io.files.safe_names import safe_name, shown_name
 from swimm3r.io.image_header import ImageHeader, ImageSizeError, capture_time
 from swimm3r.io.raw import RAW_SUFFIXES
@@ -157,8 +157,21 @@ def _mask_folders(source: Path, root: Path, settings: FrameSettings) -> list[Pat
     """The folders that may hold masks: the one that the settings name, else those beside the images, each once."""
     if settings.masks is not None:
         return [settings.masks]
-    outer = [root.parent / MASKS] if root.name == "images" else []
-    return list(dict.fromkeys([root, root / MASKS, source / MASKS, *outer]))
+    outer = _masks_outside(root)
+    return list(dict.fromkeys([root, root / MASKS, source / MASKS, *([] if outer is None else [outer])]))
+
+
+def _masks_outside(folder: Path) -> Path | None:
+    """The folder masks/ beside a folder that is called images/; None of any other."""
+    whole = folder.absolute()
+    return whole.parent / MASKS if whole.name == "images" else None
+
+
+def source_digest(source: Path, leave_out: Path | None = None) -> str:
+    """`sample_digest` of a source, and of the masks beside it where it is a folder images/ that was named itself."""
+    own = sample_digest(source, leave_out)
+    masks = _masks_outside(source) if source.is_dir() else None
+    return own if masks is None or not masks.is_dir() else cache_key(own, sample_digest(masks))
 
 
 def images_of(source: Path, leave_out: Sequence[Path] = ()) -> ImageFolder:
