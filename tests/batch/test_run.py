@@ -80,6 +80,8 @@ def test_a_dive_that_fails_leaves_the_others_alone_and_finished_ones_are_not_tou
     assert failed["error"] == rows[0].error
     with pytest.raises(BatchError, match="animal"):
         check_outcome(rows, out)
+    (out / "wall" / "prepare" / "frames.json").write_text("{")  # by a crash: its page has no frame, and that is all
+    assert [row.name for row in run_batch(found, out, last_stage="prepare")] == ["animal", "reef", "wall"]
 
 
 ENGINES = [
