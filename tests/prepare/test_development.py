@@ -90,6 +90,16 @@ def test_images_beside_raw_files_are_used_and_that_is_said(tmp_path: Path):
     assert any("4 camera raw files lie beside the images" in warning for warning in frames.warnings)
 
 
+def test_raw_files_of_a_stereo_pair_are_a_rig(tmp_path: Path):
+    for side in ("left", "right"):
+        (tmp_path / side).mkdir()
+        for k in range(3):
+            write_dng(tmp_path / side / f"{k}.dng", patterned(k))
+    frames = read_frames(tmp_path, FrameSettings(), tmp_path / "frames")
+    assert frames.rig is not None
+    assert frames.names[:2] == ("left/0.png", "right/0.png")
+
+
 def test_linear_tiff_keeps_its_light(tmp_path: Path):
     for k in range(4):
         tifffile.imwrite(tmp_path / f"{k}.tif", (patterned(k) * 65535).astype(np.uint16))

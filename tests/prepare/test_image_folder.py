@@ -149,6 +149,21 @@ def test_the_images_folder_is_taken_where_a_dive_has_one(dive, tmp_path, prepare
     assert len(load_frames(prepared)) == 12
 
 
+def test_files_that_are_passed_over_beside_the_images_are_told(dive, prepared):
+    for name in ("a.HEIC", "b.heic", "c.jxl", "GX010042.MP4"):
+        (dive / name).write_bytes(b"not looked into")
+    told = " ".join(read_frames(dive, folder=prepared).warnings)
+    assert "3 images of formats that are not read (HEIC, JPEG XL ...) lie beside the images and were left out" in told
+    assert "1 videos lie beside the images" in told
+    assert "raw" not in told
+
+
+def test_digits_that_are_no_decimals_are_letters_of_a_name(tmp_path, prepared):
+    for i in range(3):
+        write(tmp_path / "dive" / f"4\u00b2{i}.png", image(i))
+    assert len(read_frames(tmp_path / "dive", folder=prepared)) == 3
+
+
 def test_run_folders_inside_the_input_are_not_images(dive):
     first = read_frames(dive, folder=dive / "run" / "prepare", long_side=32)
     assert read_frames(dive, folder=dive / "run" / "prepare", long_side=32).names == first.names

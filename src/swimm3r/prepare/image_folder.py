@@ -40,6 +40,8 @@ from swimm3r.scene.settings import FrameSettings
 
 MASKS = "masks"  # a folder of this name in the input is not searched for frames
 
+_NOT_READ = (".heic", ".heif", ".hif", ".avif", ".jxl", ".jp2", ".psd")
+
 Job = TypeVar("Job")
 Result = TypeVar("Result")
 
@@ -69,7 +71,7 @@ class ImageFolder:
     root: Path  # names are relative to it
     paths: list[Path]
     unreadable: list[Path]  # folders that could not be searched
-    raw_beside: int = 0  # camera raw files that were passed over, as there are images
+    beside: tuple[str, ...] = ()  # sentences about files that were passed over, as there are images
 
 
 def prepare_stills(
@@ -127,11 +129,7 @@ def _choose(
     """The readable images of one size, in order: those of a rig by instants, others by time, thinned."""
     sizes = {path: header.size for path, header in headers.items()}
     paths, warnings = _one_size(list(headers), sizes, folder.root, settings)
-    if folder.raw_beside:
-        warnings.append(
-            f"{folder.raw_beside} camera raw files lie beside the images and were left out. "
-            "A folder that holds them alone is developed."
-        )
+    warnings += folder.beside
     if cameras:
         paired = pair_images(folder.root, paths, cameras, settings)
         told = [*warnings, *paired.warnings]
@@ -180,19 +178,39 @@ def images_of(source: Path, leave_out: Sequence[Path] = ()) -> ImageFolder:
     Raises InputError where there are neither.
     """
     root = _root_of(source)
-    outer = [path for path in leave_out if path.resolve() != root.resolve()]
-    found = image_folder.find_images(root, [*outer, root / MASKS])
-    raw = image_folder.find_files(root, RAW_SUFFIXES, [*outer, root / MASKS])
+    closed = [root / MASKS, *(path for path in leave_out if path.resolve() != root.resolve())]
+    found = image_folder.find_images(root, closed)
+    raw = image_folder.find_files(root, RAW_SUFFIXES, closed)
     if found.paths:
-        return ImageFolder(root, found.paths, found.unreadable, len(raw.paths))
+        return ImageFolder(root, found.paths, found.unreadable, _passed_over(root, closed, len(raw.paths)))
     if raw.paths:
-        return ImageFolder(root, raw.paths, raw.unreadable)
+        return ImageFolder(root, raw.paths, raw.unreadable, _passed_over(root, closed))
     kinds = Counter(path.suffix.lower() for path in files_below(root))
     instead = ", ".join(f"{count} {kind or 'nameless'}" for kind, count in kinds.most_common(4))
     raise InputError(
         f"{source} holds no images" + (f", only {instead}" if instead else ": it is empty"),
         cause="another folder was meant, or the images are HEIC",
         hint=f"a folder with {', '.join(images.SUFFIXES)}, or camera raw files; a video is given by its own path",
+    )
+
+
+def _passed_over(root: Path, closed: Sequence[Path], raw: int = 0) -> tuple[str, ...]:
+    """Sentences about so many raw files beside images, about images that are not read, and about videos."""
+    found = {
+        "camera raw files": (raw, "A folder that holds them alone is developed."),
+        "images of formats that are not read (HEIC, JPEG XL ...)": (
+            len(image_folder.find_files(root, _NOT_READ, closed).paths),
+            "Convert them to JPEG, PNG or TIFF to use them.",
+        ),
+        "videos": (
+            len(image_folder.find_files(root, VIDEO_SUFFIXES, closed).paths),
+            "A video is given by its own path.",
+        ),
+    }
+    return tuple(
+        f"{count} {what} lie beside the images and were left out. {hint}"
+        for what, (count, hint) in found.items()
+        if count
     )
 
 

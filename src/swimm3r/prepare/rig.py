@@ -11,8 +11,9 @@ from swimm3r.io.calibration.record import REMEDY, Calibration, lens_at
 from swimm3r.io.calibration.rig import read_rig
 from swimm3r.io.files.atomic import write_text
 from swimm3r.io.files.damage import guard
-from swimm3r.io.image_folder import find_images, natural_key, numbered
+from swimm3r.io.image_folder import find_files, find_images, natural_key, numbered
 from swimm3r.io.image_header import capture_time
+from swimm3r.io.raw import RAW_SUFFIXES
 from swimm3r.prepare.candidates import Taken, recorded_on, thinned
 from swimm3r.prepare.instants import CameraImages, instants_of, missing
 from swimm3r.scene.rig import Rig, RigCamera, pose_of
@@ -62,14 +63,19 @@ def cameras_of_folder(root: Path, settings: FrameSettings) -> tuple[str, ...]:
             )
         return settings.rig
     sides = {path.name.lower(): path for path in root.iterdir() if path.is_dir()}
-    if not set(STEREO) <= sides.keys() or find_images(root, [path for path in sides.values()]).paths:
+    if not set(STEREO) <= sides.keys() or _has_images(root, list(sides.values())):
         return ()
-    with_images = {name for name, path in sides.items() if name != "masks" and find_images(path).paths}
+    with_images = {name for name, path in sides.items() if name != "masks" and _has_images(path)}
     if with_images != set(STEREO):
         return ()
     found = tuple(sides[name].name for name in STEREO)
     log.info("%s: %s/ and %s/ are taken as a stereo pair (--rig none: as one camera).", root, *found)
     return found
+
+
+def _has_images(folder: Path, leave_out: Sequence[Path] = ()) -> bool:
+    """Return whether images or camera raw files are below a folder."""
+    return bool(find_images(folder, leave_out).paths or find_files(folder, RAW_SUFFIXES, leave_out).paths)
 
 
 def check_rig(source: Path, settings: FrameSettings) -> None:
