@@ -7,6 +7,7 @@ import numpy as np
 import pytest
 import tifffile
 import torch
+from tests.bag_files import SECOND, START, image, write_bag
 from tests.prepare.raw_files import write_dng
 
 from swimm3r.errors import DeviceError, InputError, UsageError
@@ -106,6 +107,19 @@ def test_linear_tiff_keeps_its_light(tmp_path: Path):
     frames = read_frames(tmp_path, FrameSettings(transfer="linear"), tmp_path / "frames")
     np.testing.assert_allclose(linear_from_srgb(frames.image(2)).numpy(), patterned(2), atol=6e-5)
     assert frames.development == "linear, +0 stops, stored by sRGB's curve"
+
+
+@pytest.mark.parametrize("rig", [(), ("/left/image_raw", "/right/image_raw")], ids=["camera", "rig"])
+def test_dark_linear_frames_of_a_bag_show_something_once_they_are_developed(tmp_path: Path, rig: tuple[str, ...]):
+    topics = rig or ("/cam/image_raw",)
+    dark = [(patterned(k) * 400).astype(np.uint16) for k in range(4)]  # of 12 bits in 16
+    sent = [image(topic, dark[k], "rgb16", START + k * SECOND // 5) for k in range(4) for topic in topics]
+    bag = write_bag(tmp_path, "mcap", sent)
+    settings = FrameSettings(transfer="linear", stops=4.0, rig=rig)
+    frames = read_frames(bag, settings, tmp_path / "frames")
+    assert len(frames) == 4 * len(topics)
+    with pytest.raises(InputError, match="0 usable frames"):
+        read_frames(bag, FrameSettings(rig=rig), tmp_path / "as_stored")
 
 
 def test_a_stop_is_twice_the_light_up_to_white():
