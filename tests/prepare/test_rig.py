@@ -100,6 +100,17 @@ def test_a_few_missing_partners_are_told_and_their_images_used(stereo, prepared)
     assert [frame.name for frame in frames if frame.instant == 4] == ["left/0004.png"]
 
 
+@pytest.mark.parametrize("form", ["frame_{:03d}", "{:d}", "{camera}_{:02d}"])
+def test_cameras_that_are_called_by_a_number_leave_the_numbers_of_their_images_alone(tmp_path, prepared, form):
+    names = {camera: [form.format(i, camera=camera) for i in range(12)] for camera in ("0", "1")}
+    for camera, own in names.items():
+        for i, name in enumerate(own):
+            write(tmp_path / "dive" / camera / f"{name}.png", image(i))
+    frames = read_frames(tmp_path / "dive", folder=prepared, rig=("0", "1"))
+    together = [(f"0/{a}.png", f"1/{b}.png") for a, b in zip(names["0"], names["1"], strict=True)]
+    assert list(zip(frames.names[::2], frames.names[1::2], strict=True)) == together
+
+
 def test_many_missing_partners_are_refused_with_the_counts(stereo, prepared):
     for i in range(4):
         (stereo / "right" / f"{i:04d}.png").unlink()

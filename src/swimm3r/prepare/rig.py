@@ -174,7 +174,10 @@ def _images_of(root: Path, name: str, paths: Sequence[Path]) -> CameraImages:
 def _key(path: Path, root: Path, camera: str) -> str:
     """The name of an image without its camera's: left/left_0001.png and right/R-0001.jpg are both 0001."""
     inner = path.relative_to(root / camera).with_suffix("").as_posix().lower()
-    words = [word.removeprefix(camera.lower()) for word in re.split(r"[^0-9a-z]+", inner)]
+    words = re.split(r"[^0-9a-z]+", inner)
+    if camera.isdecimal():  # other numbers in a name are those of the image
+        return "_".join(words[1:] if words[0] == camera and len(words) > 1 else words)
+    words = [word.removeprefix(camera.lower()) for word in words]
     return "_".join(word for word in words if word and word != camera[:1].lower())
 
 
