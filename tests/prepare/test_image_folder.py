@@ -14,6 +14,7 @@ from swimm3r.io import images
 from swimm3r.io.files.atomic import DRAFT
 from swimm3r.io.image_header import read_header
 from swimm3r.prepare import check_source, load_frames, read_frames
+from swimm3r.prepare.image_folder import source_digest
 
 
 def image(seed=0, height=48, width=64):
@@ -147,6 +148,16 @@ def test_the_images_folder_is_taken_where_a_dive_has_one(dive, tmp_path, prepare
     write(tmp_path / "set" / "depth_mm" / "img0.png", image(50))
     assert read_frames(tmp_path / "set", folder=prepared).names[0] == "img0.png"
     assert len(load_frames(prepared)) == 12
+
+
+def test_the_digest_of_a_folder_is_that_of_its_files_without_runs_and_what_systems_leave(dive):
+    before = source_digest(dive, dive / "run")
+    for path in ("run/prepare/frames.json", "other/prepare/frames.json", "other/log.jsonl", ".DS_Store", "Thumbs.db"):
+        (dive / path).parent.mkdir(parents=True, exist_ok=True)
+        (dive / path).write_bytes(b"{}")
+    assert source_digest(dive, dive / "run") == before
+    write(dive / "img0.png", image(77))
+    assert source_digest(dive, dive / "run") != before
 
 
 def test_files_that_are_passed_over_beside_the_images_are_told(dive, prepared):

@@ -5,6 +5,7 @@ import shutil
 from collections import Counter
 from collections.abc import Callable, Sequence
 from concurrent.futures import ThreadPoolExecutor
+from contextlib import suppress
 from dataclasses import dataclass, replace
 from functools import partial
 from pathlib import Path
@@ -13,7 +14,8 @@ from typing import TypeVar
 from swimm3r import memory
 from swimm3r.errors import InputError
 from swimm3r.io import image_folder, images
-from swimm3r.io.files.cache_key import cache_key, files_below, sample_digest
+from swimm3r.io.bags.bag import is_bag
+from swimm3r.io.files.cache_key import cache_key, files_below, sample_digest, samples_digest
 from swimm3r.io.files.safe_names import safe_name, shown_name
 from swimm3r.io.image_header import ImageHeader, ImageSizeError, capture_time
 from swimm3r.io.raw import RAW_SUFFIXES
@@ -166,10 +168,18 @@ def _masks_outside(folder: Path) -> Path | None:
 
 
 def source_digest(source: Path, leave_out: Path | None = None) -> str:
-    """`sample_digest` of a source, and of the masks beside it where it is a folder images/ that was named itself."""
-    own = sample_digest(source, leave_out)
-    masks = _masks_outside(source) if source.is_dir() else None
-    return own if masks is None or not masks.is_dir() else cache_key(own, sample_digest(masks))
+    """`sample_digest` of a source, and of the masks beside it where it is a folder images/ that was named itself.
+
+    Runs within a folder of images or videos are no part of it.
+    """
+    if not source.is_dir() or is_bag(source):
+        return sample_digest(source, leave_out)
+    with suppress(OSError):  # a folder that may not be searched counts as empty
+        found = image_folder.find_files(source, ("",), [] if leave_out is None else [leave_out]).paths
+        own = samples_digest(source, sorted(path for path in found if path.is_file()))
+        masks = _masks_outside(source)
+        return own if masks is None or not masks.is_dir() else cache_key(own, sample_digest(masks))
+    return samples_digest(source, [])
 
 
 def images_of(source: Path, leave_out: Sequence[Path] = ()) -> ImageFolder:
