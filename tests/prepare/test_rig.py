@@ -72,6 +72,13 @@ def test_other_folders_are_a_rig_only_when_named(stereo, prepared):
     assert frames.names[:2] == ("starboard/0000.png", "port/0000.png")
 
 
+def test_names_of_cameras_may_end_as_a_shell_completes_them_and_lie_right_in_the_input(stereo, prepared):
+    frames = read_frames(stereo, folder=prepared, rig=("left/", "right/"))
+    assert frames.names[:2] == ("left/0000.png", "right/0000.png")
+    with pytest.raises(UsageError, match="dive/left, which is no name of a folder right in"):
+        read_frames(stereo.parent, folder=prepared, rig=("dive/left", "dive/right"))
+
+
 def test_a_third_folder_leaves_the_choice_to_the_user(stereo, prepared):
     write(stereo / "top" / "0000.png", image(99))
     assert read_frames(stereo, folder=prepared).rig is None

@@ -114,7 +114,7 @@ def _reason_in(path: Path, out: Path, cameras: Sequence[str]) -> str | None:
             return "it is the folder of a run"
         suffixes = {child.suffix.lower() for child in path.iterdir() if child.is_file()}
         folders = {child.name.lower() for child in path.iterdir() if child.is_dir()}
-        inner = "images" in folders or folders >= {name.lower() for name in cameras}
+        inner = "images" in folders or folders >= {name.lower().rstrip("/\\") for name in cameras}
         if not inner and not suffixes & {*images.SUFFIXES, *RAW_SUFFIXES, *VIDEO_SUFFIXES}:
             return "it holds no images, no camera raw files, no folder images/ and no video"
     elif path.suffix.lower() not in VIDEO_SUFFIXES:

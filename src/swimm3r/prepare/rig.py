@@ -4,7 +4,7 @@ import logging
 import re
 from collections.abc import Sequence
 from dataclasses import dataclass
-from pathlib import Path
+from pathlib import Path, PurePath
 
 from swimm3r.errors import InputError, UsageError
 from swimm3r.io.calibration.record import REMEDY, Calibration, lens_at
@@ -53,7 +53,15 @@ def cameras_of_folder(root: Path, settings: FrameSettings) -> tuple[str, ...]:
                 cause="a rig has two cameras and more",
                 hint="--rig left right, --rig side-by-side for a video that shows two views, or --rig none",
             )
-        missing = [name for name in settings.rig if not (root / name).exists()]
+        named = tuple(name.rstrip("/\\") for name in settings.rig)  # as a shell completes names of folders
+        deeper = next((name for name in named if len(PurePath(name).parts) != 1), None)
+        if deeper is not None:
+            raise UsageError(
+                f"--rig names {deeper or '/'}, which is no name of a folder right in {root}",
+                cause="the cameras of a rig are the folders next to each other in the input",
+                hint="the folder that holds those of the cameras as input, and --rig with their names alone",
+            )
+        missing = [name for name in named if not (root / name).exists()]
         if missing:
             there = sorted(path.name for path in root.iterdir() if path.is_dir())
             raise InputError(
@@ -61,7 +69,7 @@ def cameras_of_folder(root: Path, settings: FrameSettings) -> tuple[str, ...]:
                 cause="a slip in --rig, whose names are those of sub-folders",
                 hint="--rig with the names of the cameras, the first of which gives the axes",
             )
-        return settings.rig
+        return named
     sides = {path.name.lower(): path for path in root.iterdir() if path.is_dir()}
     if not set(STEREO) <= sides.keys() or _has_images(root, list(sides.values())):
         return ()
