@@ -337,6 +337,13 @@ def test_without_a_folder_the_cache_is_used_and_found_again(dive, tmp_path, monk
     assert read_frames(dive, long_side=32).frames[0].path != frames.frames[0].path
 
 
+def test_frames_of_a_relative_folder_are_found_from_another_one(dive, tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    frames = (read_frames(dive, folder="prepare"), load_frames("prepare"))
+    monkeypatch.chdir(dive)
+    assert all(each.image(0).shape == each.image(11).shape for each in frames)
+
+
 def test_settings_that_make_no_sense_are_refused(dive, prepared):
     cases: list[dict[str, Any]]
     cases = [{"fps": -1.0}, {"fps": float("nan")}, {"start": 5.0, "end": 5.0}, {"long_side": -1}]
