@@ -125,7 +125,10 @@ def _facts(folder: Path) -> dict[str, Any]:
 
 def _water(folder: Path, summary: dict[str, Any]) -> str:
     path = folder / "sfm" / "medium.json"
-    fits = medium_json.read_fits(path, remake(path)) if path.is_file() else {}
+    try:
+        fits = medium_json.read_fits(path, remake(path)) if path.is_file() else {}
+    except InputError:
+        return ""  # damaged, which is the matter of that run alone
     gray = bool(summary["input"].get("gray"))
     return water_verdict(fits.get("linear") or fits.get("stored"), metric=summary["sfm"]["metric"], gray=gray)
 
