@@ -3,7 +3,7 @@
 import math
 from collections.abc import Sequence
 from pathlib import Path
-from typing import SupportsFloat
+from typing import Any
 
 import numpy as np
 
@@ -45,7 +45,7 @@ def _place(path: Path) -> tuple[float, float, float] | None:
     return latitude, longitude, height * (-1 if below else 1) if math.isfinite(height) else math.nan
 
 
-def _decimal(parts: Sequence[SupportsFloat]) -> float:
-    """Degrees of degrees, minutes and seconds, of which the last may be left out."""
+def _decimal(parts: Any) -> float:
+    """Degrees of degrees, minutes and seconds, of which the last may be left out. Raises TypeError for no sequence."""
     degrees, minutes, seconds = (*map(float, parts), 0.0, 0.0)[:3]
     return degrees + minutes / 60 + seconds / 3600
