@@ -94,12 +94,13 @@ def match_names(navigation: Navigation, names: Sequence[str]) -> Matched | None:
 
 
 def check_timed(navigation: Navigation, times: FrameTimes) -> None:
-    """Raise InputError for frames that have no times, and so no place in navigation that does not name them."""
+    """Raise InputError for frames that have no times, and so no place in navigation by them."""
     if times.clock == "none":
         raise InputError(
-            f"the frames cannot be found in {navigation.path}: they have no times, and it does not name them",
+            f"the frames cannot be found in {navigation.path} by time: they have no times",
             cause="images without the time of the camera's clock, at least one of them: an editor left EXIF out",
-            hint="a table with the column `name`; or date and time in the images' names (20190404_120001.jpg) or EXIF",
+            hint="a table that names the images, without --nav-offset; or date and time in their names"
+            " (20190404_120001.jpg) or EXIF",
         )
 
 
