@@ -1,5 +1,8 @@
 """The dives of a batch: found in folders, by patterns and in tables; names, and errors that name the place."""
 
+import errno
+import os
+from collections.abc import Iterator
 from dataclasses import replace
 from pathlib import Path
 
@@ -56,6 +59,32 @@ def test_single_dives_patterns_and_the_folder_of_the_images_itself(tapes: Path):
     assert names(tapes / "wall", tapes / "reef" / "images") == ["wall", "reef"]
     assert names(tapes / "*") == ["reef", "wall"]
     assert names(tapes / "w*") == ["wall"]
+
+
+def test_folders_of_raw_files_and_of_stereo_pairs_are_dives_of_their_own(tmp_path: Path):
+    for dive in ("north", "south"):
+        (tmp_path / dive).mkdir()
+        for k in range(3):
+            (tmp_path / dive / f"{k}.NEF").write_bytes(b"raw")
+    for side in ("left", "right"):
+        make_images(tmp_path / "pair" / side)
+        make_images(tmp_path / "rig" / f"cam_{side}")
+    assert names(tmp_path) == ["north", "pair", "south"]
+    of_rig = replace(FAST, frames=replace(FAST.frames, rig=("cam_left", "cam_right")))
+    assert [dive.name for dive in find_dives([tmp_path], of_rig, Path("out")).dives] == ["north", "rig", "south"]
+
+
+def test_a_folder_that_may_not_be_searched_is_left_out(tapes: Path, monkeypatch: pytest.MonkeyPatch):
+    def iterdir(folder: Path) -> Iterator[Path]:
+        if folder.name == "lost+found":  # permissions do not bind the user root
+            raise PermissionError(errno.EACCES, "Permission denied", str(folder))
+        return iter([folder / name for name in os.listdir(folder)])
+
+    (tapes / "lost+found").mkdir()
+    monkeypatch.setattr(Path, "iterdir", iterdir)
+    found = find_dives([tapes], FAST, tapes / "out")
+    assert [dive.name for dive in found.dives] == ["reef", "wall"]
+    assert {one.path.name: one.reason for one in found.skipped}["lost+found"] == "it cannot be read: Permission denied"
 
 
 def test_runs_and_results_among_the_dives_are_no_dives(tapes: Path):

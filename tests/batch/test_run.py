@@ -16,7 +16,7 @@ from tests.scale.test_rescale import write_run
 from swimm3r.batch import run as batch_run
 from swimm3r.batch.dive import Dive
 from swimm3r.batch.dives import FoundDives, Skipped, find_dives
-from swimm3r.batch.results import Row, is_finished
+from swimm3r.batch.results import Row, is_finished, row_of
 from swimm3r.batch.run import BatchError, check_outcome, run_batch
 from swimm3r.cli.main import main
 from swimm3r.errors import UsageError
@@ -80,6 +80,8 @@ def test_a_dive_that_fails_leaves_the_others_alone_and_finished_ones_are_not_tou
     assert failed["error"] == rows[0].error
     with pytest.raises(BatchError, match="animal"):
         check_outcome(rows, out)
+    (out / "wall" / "prepare" / "frames.json").write_text("{")  # by a crash: its page has no frame, and that is all
+    assert [row.name for row in run_batch(found, out, last_stage="prepare")] == ["animal", "reef", "wall"]
 
 
 ENGINES = [
@@ -187,3 +189,7 @@ def test_a_dive_is_finished_where_it_has_the_scale_of_its_sources(tapes: Path, t
     assert is_finished(plain, tmp_path, "sfm")
     file.write_text(file.read_text().replace("5", "6"))
     assert not is_finished(given, tmp_path, "sfm")
+
+    assert row_of(plain, tmp_path, "finished").medium
+    (run / "sfm" / "medium.json").write_text("{")  # by a crash
+    assert row_of(plain, tmp_path, "finished").medium == ""

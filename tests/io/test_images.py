@@ -57,6 +57,20 @@ def test_float_tiff_becomes_sixteen_bits_whatever_its_scale(tmp_path, scale):
     np.testing.assert_allclose(read / 65535, unit, atol=1 / 65535)
 
 
+def test_half_floats_keep_their_brightest_values(tmp_path):
+    unit = np.linspace(0, 1, 16 * 24 * 3, dtype=np.float16).reshape(16, 24, 3)
+    tifffile.imwrite(tmp_path / "p.tif", unit, photometric="rgb")
+    found = read_rgb(tmp_path / "p.tif")
+    np.testing.assert_allclose(found / 65535, unit.astype(np.float64), atol=1e-5)
+
+
+@pytest.mark.parametrize("mode", ["CMYK", "YCbCr"])
+def test_tiff_of_other_colors_becomes_rgb(tmp_path, mode):
+    plain = np.full((16, 24, 3), (200, 120, 40), np.uint8)
+    Image.fromarray(plain).convert(mode).save(tmp_path / "p.tif")
+    np.testing.assert_allclose(read_rgb(tmp_path / "p.tif").astype(int), plain, atol=3)
+
+
 def test_float_tiff_with_holes_is_refused(tmp_path):
     tifffile.imwrite(tmp_path / "p.tif", np.full((4, 4, 3), np.nan, np.float32), photometric="rgb")
     with pytest.raises(InputError, match=r"p\.tif .* not finite"):

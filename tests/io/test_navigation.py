@@ -117,13 +117,22 @@ def test_matisse_files_name_images(shared):
     assert seconds_of_name(found.names[0]) == pytest.approx(found.time[0], abs=1e-6)
 
 
-def test_nmea_sentences_with_a_date(tmp_path):
-    def sentence(body: str) -> str:
-        total = 0
-        for character in body.encode():
-            total ^= character
-        return f"${body}*{total:02X}"
+def sentence(body: str) -> str:
+    total = 0
+    for character in body.encode():
+        total ^= character
+    return f"${body}*{total:02X}"
 
+
+def gga(time: str) -> str:
+    return sentence(f"GPGGA,{time},2159.350600,S,17633.99990,W,1,08,0.9,12.0,M,0,M,,")
+
+
+def rmc(time: str, date: str) -> str:
+    return sentence(f"GPRMC,{time},A,2159.350600,S,17633.99990,W,0.1,90,{date},,")
+
+
+def test_nmea_sentences_with_a_date(tmp_path):
     lines = [
         sentence("GPRMC,040808.00,A,2159.350658,S,17633.99998,W,0.1,90,040419,,"),
         sentence("SDDPT,3.4,0.0"),
@@ -137,13 +146,48 @@ def test_nmea_sentences_with_a_date(tmp_path):
     assert found.altitude[0] == 3.4
 
 
+MIDNIGHT = 1767312000.0  # 2026-01-02
+
+
+@pytest.mark.parametrize(
+    ("lines", "seconds"),
+    [
+        pytest.param(
+            [rmc("235959", "010126"), gga("000000"), rmc("000000", "020126"), gga("000001")], [-1, 0, 1], id="behind"
+        ),
+        pytest.param([rmc("000000", "020126"), gga("235959.90"), gga("000001")], [-0.1, 0, 1], id="late sentence"),
+        pytest.param(
+            [sentence("GPZDA,235957,01,01,2026,00,00"), gga("235959"), gga("000001"), gga("120000"), gga("000002")],
+            [-1, 1, 43200, 86402],
+            id="one date for days",
+        ),
+        pytest.param(
+            [rmc("080000", "010126"), rmc("070000", "020126"), gga("070001")], [-57600, 25200, 25201], id="gap"
+        ),
+    ],
+)
+def test_nmea_times_go_on_after_midnight(tmp_path, lines, seconds):
+    found = read_navigation(written(tmp_path, "\n".join(lines) + "\n", "log.nmea"))
+    np.testing.assert_allclose(found.time - MIDNIGHT, seconds, atol=1e-6)
+
+
+@pytest.mark.parametrize(
+    "cut", ["$GPGGA,2359", "$GPGGA,235952,2159.35", "$GPDPT", "$GPRMC,235952,A", "$GPZDA,235952,02,01,20", "$"]
+)
+def test_a_sentence_that_is_cut_off_is_left_out(tmp_path, cut):
+    lines = [rmc("235950", "010126"), gga("235951"), cut]
+    assert len(read_navigation(written(tmp_path, "\n".join(lines), "log.nmea"))) == 2
+
+
 def test_tum_trajectories(tmp_path):
     found = read_navigation(
         written(tmp_path, "# t x y z q\n0 1 2 3 0 0 0 1\n1 2 2 3 0 0 0.7071068 0.7071068\n", "a.txt")
     )
     np.testing.assert_allclose(found.position, [[1, 2, 3], [2, 2, 3]])
     assert found.attitude is not None
+    np.testing.assert_allclose(found.attitude[0] @ [0, 0, 1], [0, 0, -1], atol=1e-6)  # level: its z, down, is down
     np.testing.assert_allclose(found.attitude[1] @ [1, 0, 0], [0, 1, 0], atol=1e-6)
+    np.testing.assert_allclose(found.attitude[1] @ [0, 1, 0], [1, 0, 0], atol=1e-6)  # north ahead, east to starboard
 
 
 @pytest.mark.parametrize(
@@ -151,6 +195,9 @@ def test_tum_trajectories(tmp_path):
 )
 def test_subtitles_with_positions(tmp_path, place):
     blocks = [f"{i}\n00:00:0{i},500 --> 00:00:0{i},600\n<font>{place}</font>\n" for i in range(3)]
+    blocks.append(
+        "4\n00:00:04,500 --> 00:00:04,600\n[latitude: 0.000000] [longitude: 0.000000] [rel_alt: 1.2]\n"
+    )  # no fix
     found = read_navigation(written(tmp_path, "\n".join(blocks), "clip.srt"))
     np.testing.assert_allclose(found.time, [0.5, 1.5, 2.5])
     assert found.position[0, :2].tolist() == [12.5, 44.25]
@@ -170,6 +217,26 @@ def test_positions_in_the_images_themselves(tmp_path):
     assert found.names == ("0.jpg", "1.jpg")
 
 
+@pytest.mark.parametrize("latitude", ["numbers over zero", (0.0, 0.0, 0.0), 21.5, None])
+def test_images_that_are_damaged_or_had_no_fix_have_no_position(tmp_path, latitude):
+    from PIL import Image
+    from PIL.TiffImagePlugin import IFDRational
+
+    place = {1: "N", 2: (21.0, 30.5), 3: "E", 4: (17.0, 0.0)}
+    latitude = (IFDRational(0, 0),) * 3 if latitude == "numbers over zero" else latitude
+    without_fix = {} if latitude is None else {**place, 2: latitude, 4: (0.0, 0.0, 0.0)}
+    for i, gps in enumerate((place, place, without_fix)):
+        exif = Image.Exif()
+        exif.get_ifd(0x8825).update(gps)
+        (tmp_path / "a").mkdir(exist_ok=True)
+        Image.new("RGB", (16, 16)).save(tmp_path / "a" / f"{i}.jpg", exif=exif)
+    (tmp_path / "cut.jpg").write_bytes((tmp_path / "a" / "0.jpg").read_bytes()[:60])
+    (tmp_path / "empty.png").touch()
+    found = read_navigation(tmp_path)
+    assert found.names == ("a/0.jpg", "a/1.jpg")
+    np.testing.assert_allclose(found.position[:, :2], [[21 + 30.5 / 60, 17]] * 2)
+
+
 @pytest.mark.parametrize(
     ("text", "words"),
     [
@@ -182,6 +249,9 @@ def test_positions_in_the_images_themselves(tmp_path):
         ("lat,lon\n50,8\n51,8\n", "neither times nor names"),
         ("time,lat,lon\n10:00:01,50,8\n10:00:02,51,8\n", "no date"),
         ("time,lat,lon\n1,50,8\n2,fifty,8\n", "line 3: the latitude is 'fifty'"),
+        ("timestamp,x,y\n1600000000000,0,0\n1600000001000,1,0\n", "milliseconds since 1970"),
+        ("1600000000000000000 0 0 0 0 0 0 1\n1600000001000000000 1 0 0 0 0 0 1\n", "nanoseconds since 1970"),
+        ("time,x,y\n20190404120000,0,0\n20190404120001,1,0\n", "a date written as one number"),
         ("time,lat,lon\nnoon,50,8\nlater,50,9\n", "a time cannot be read"),
         ("time,lat,lon,depth [fathom]\n1,50,8,3\n2,50,8,4\n", "the unit of 'depth [fathom]' is fathom"),
         ("time,lat,latitude,lon\n1,50,50,8\n2,51,51,8\n", "two of its columns are the latitude"),

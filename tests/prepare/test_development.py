@@ -7,6 +7,7 @@ import numpy as np
 import pytest
 import tifffile
 import torch
+from tests.bag_files import SECOND, START, image, write_bag
 from tests.prepare.raw_files import write_dng
 
 from swimm3r.errors import DeviceError, InputError, UsageError
@@ -90,12 +91,35 @@ def test_images_beside_raw_files_are_used_and_that_is_said(tmp_path: Path):
     assert any("4 camera raw files lie beside the images" in warning for warning in frames.warnings)
 
 
+def test_raw_files_of_a_stereo_pair_are_a_rig(tmp_path: Path):
+    for side in ("left", "right"):
+        (tmp_path / side).mkdir()
+        for k in range(3):
+            write_dng(tmp_path / side / f"{k}.dng", patterned(k))
+    frames = read_frames(tmp_path, FrameSettings(), tmp_path / "frames")
+    assert frames.rig is not None
+    assert frames.names[:2] == ("left/0.png", "right/0.png")
+
+
 def test_linear_tiff_keeps_its_light(tmp_path: Path):
     for k in range(4):
         tifffile.imwrite(tmp_path / f"{k}.tif", (patterned(k) * 65535).astype(np.uint16))
     frames = read_frames(tmp_path, FrameSettings(transfer="linear"), tmp_path / "frames")
     np.testing.assert_allclose(linear_from_srgb(frames.image(2)).numpy(), patterned(2), atol=6e-5)
     assert frames.development == "linear, +0 stops, stored by sRGB's curve"
+
+
+@pytest.mark.parametrize("rig", [(), ("/left/image_raw", "/right/image_raw")], ids=["camera", "rig"])
+def test_dark_linear_frames_of_a_bag_show_something_once_they_are_developed(tmp_path: Path, rig: tuple[str, ...]):
+    topics = rig or ("/cam/image_raw",)
+    dark = [(patterned(k) * 400).astype(np.uint16) for k in range(4)]  # of 12 bits in 16
+    sent = [image(topic, dark[k], "rgb16", START + k * SECOND // 5) for k in range(4) for topic in topics]
+    bag = write_bag(tmp_path, "mcap", sent)
+    settings = FrameSettings(transfer="linear", stops=4.0, rig=rig)
+    frames = read_frames(bag, settings, tmp_path / "frames")
+    assert len(frames) == 4 * len(topics)
+    with pytest.raises(InputError, match="0 usable frames"):
+        read_frames(bag, FrameSettings(rig=rig), tmp_path / "as_stored")
 
 
 def test_a_stop_is_twice_the_light_up_to_white():

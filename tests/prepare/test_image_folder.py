@@ -14,6 +14,7 @@ from swimm3r.io import images
 from swimm3r.io.files.atomic import DRAFT
 from swimm3r.io.image_header import read_header
 from swimm3r.prepare import check_source, load_frames, read_frames
+from swimm3r.prepare.image_folder import source_digest
 
 
 def image(seed=0, height=48, width=64):
@@ -149,6 +150,31 @@ def test_the_images_folder_is_taken_where_a_dive_has_one(dive, tmp_path, prepare
     assert len(load_frames(prepared)) == 12
 
 
+def test_the_digest_of_a_folder_is_that_of_its_files_without_runs_and_what_systems_leave(dive):
+    before = source_digest(dive, dive / "run")
+    for path in ("run/prepare/frames.json", "other/prepare/frames.json", "other/log.jsonl", ".DS_Store", "Thumbs.db"):
+        (dive / path).parent.mkdir(parents=True, exist_ok=True)
+        (dive / path).write_bytes(b"{}")
+    assert source_digest(dive, dive / "run") == before
+    write(dive / "img0.png", image(77))
+    assert source_digest(dive, dive / "run") != before
+
+
+def test_files_that_are_passed_over_beside_the_images_are_told(dive, prepared):
+    for name in ("a.HEIC", "b.heic", "c.jxl", "GX010042.MP4"):
+        (dive / name).write_bytes(b"not looked into")
+    told = " ".join(read_frames(dive, folder=prepared).warnings)
+    assert "3 images of formats that are not read (HEIC, JPEG XL ...) lie beside the images and were left out" in told
+    assert "1 videos lie beside the images" in told
+    assert "raw" not in told
+
+
+def test_digits_that_are_no_decimals_are_letters_of_a_name(tmp_path, prepared):
+    for i in range(3):
+        write(tmp_path / "dive" / f"4\u00b2{i}.png", image(i))
+    assert len(read_frames(tmp_path / "dive", folder=prepared)) == 3
+
+
 def test_run_folders_inside_the_input_are_not_images(dive):
     first = read_frames(dive, folder=dive / "run" / "prepare", long_side=32)
     assert read_frames(dive, folder=dive / "run" / "prepare", long_side=32).names == first.names
@@ -164,16 +190,17 @@ def test_hidden_files_are_not_images(dive, prepared):
 
 
 def test_the_cameras_clock_orders_and_times_images(tmp_path, prepared):
-    for name, clock, fraction in (("a", "12:00:05", "50"), ("b", "12:00:01", "0"), ("c", "12:00:01", "250")):
+    for name, clock, fraction in (("a", "12:00:05", "50"), ("b", "12:00:01", "125"), ("c", "12:00:01", "250")):
         exif = Image.Exif()
         exif.get_ifd(0x8769).update({36867: f"2024:05:01 {clock}", 37521: fraction})
         write(tmp_path / "dive" / f"{name}.jpg", image(ord(name)), exif=exif)
     frames = read_frames(tmp_path / "dive", folder=prepared)
     assert frames.names == ("b.jpg", "c.jpg", "a.jpg")
-    np.testing.assert_allclose([frame.time for frame in frames], [0, 0.25, 4.5])
+    np.testing.assert_allclose([frame.time for frame in frames], [0, 0.125, 4.375])
     assert frames.ordered
     assert any("clock" in warning for warning in frames.warnings)
-    assert frames.recorded == load_frames(prepared).recorded == "2024-05-01T12:00:01"
+    assert frames.recorded == load_frames(prepared).recorded == "2024-05-01T12:00:01.125000"
+    assert frames.timed
 
 
 def test_without_a_clock_on_every_image_time_is_the_index(dive, prepared):
@@ -184,6 +211,8 @@ def test_without_a_clock_on_every_image_time_is_the_index(dive, prepared):
     frames = read_frames(dive, folder=prepared)
     assert [frame.time for frame in frames] == list(range(12))
     assert frames.recorded == "2024-05-01T12:00:00"
+    assert not frames.timed
+    assert not load_frames(prepared).timed
 
 
 def test_without_any_clock_no_date_is_made_up(dive, prepared):
@@ -306,6 +335,13 @@ def test_without_a_folder_the_cache_is_used_and_found_again(dive, tmp_path, monk
     assert read_frames(dive, long_side=40).width == 40
     write(dive / "img0.png", image(77))
     assert read_frames(dive, long_side=32).frames[0].path != frames.frames[0].path
+
+
+def test_frames_of_a_relative_folder_are_found_from_another_one(dive, tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    frames = (read_frames(dive, folder="prepare"), load_frames("prepare"))
+    monkeypatch.chdir(dive)
+    assert all(each.image(0).shape == each.image(11).shape for each in frames)
 
 
 def test_settings_that_make_no_sense_are_refused(dive, prepared):

@@ -10,6 +10,7 @@ from PIL import Image
 
 from swimm3r.errors import InputError
 from swimm3r.prepare import read_frames
+from swimm3r.prepare.image_folder import source_digest
 
 USABLE = np.zeros((48, 64), bool)
 USABLE[:, 20:] = True
@@ -157,3 +158,24 @@ def test_masks_that_match_nothing_are_refused_where_they_were_asked_for(dive, tm
         read_frames(dive, folder=tmp_path / "prepare", masks=tmp_path / "elsewhere")
     with pytest.raises(InputError, match="no folder of masks"):
         read_frames(dive, folder=tmp_path / "prepare", masks=tmp_path / "nowhere")
+
+
+@pytest.mark.parametrize("place", ["elsewhere", "dive/masks"])
+def test_frames_are_prepared_anew_where_masks_have_changed(dive, tmp_path, monkeypatch, place):
+    monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path / "cache"))
+    given = tmp_path / "elsewhere" if place == "elsewhere" else None
+    for usable in (USABLE, ~USABLE):
+        for stem in "abcd":
+            write_mask(tmp_path / place / f"{stem}.png", usable)
+        frames = read_frames(dive / "images", masks=given)
+        assert np.array_equal(frames.mask(0).numpy(), usable)
+
+
+def test_masks_beside_the_folder_of_images_count_in_the_digest_of_the_source(dive, monkeypatch):
+    before = source_digest(dive / "images")
+    write_mask(dive / "masks" / "a.png")
+    masked = source_digest(dive / "images")
+    write_mask(dive / "masks" / "a.png", ~USABLE)
+    assert len({before, masked, source_digest(dive / "images")}) == 3
+    monkeypatch.chdir(dive / "images")
+    assert read_frames(".", folder=dive.parent / "prepare").frames[0].mask is not None

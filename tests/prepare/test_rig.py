@@ -72,6 +72,13 @@ def test_other_folders_are_a_rig_only_when_named(stereo, prepared):
     assert frames.names[:2] == ("starboard/0000.png", "port/0000.png")
 
 
+def test_names_of_cameras_may_end_as_a_shell_completes_them_and_lie_right_in_the_input(stereo, prepared):
+    frames = read_frames(stereo, folder=prepared, rig=("left/", "right/"))
+    assert frames.names[:2] == ("left/0000.png", "right/0000.png")
+    with pytest.raises(UsageError, match="dive/left, which is no name of a folder right in"):
+        read_frames(stereo.parent, folder=prepared, rig=("dive/left", "dive/right"))
+
+
 def test_a_third_folder_leaves_the_choice_to_the_user(stereo, prepared):
     write(stereo / "top" / "0000.png", image(99))
     assert read_frames(stereo, folder=prepared).rig is None
@@ -100,6 +107,17 @@ def test_a_few_missing_partners_are_told_and_their_images_used(stereo, prepared)
     assert [frame.name for frame in frames if frame.instant == 4] == ["left/0004.png"]
 
 
+@pytest.mark.parametrize("form", ["frame_{:03d}", "{:d}", "{camera}_{:02d}"])
+def test_cameras_that_are_called_by_a_number_leave_the_numbers_of_their_images_alone(tmp_path, prepared, form):
+    names = {camera: [form.format(i, camera=camera) for i in range(12)] for camera in ("0", "1")}
+    for camera, own in names.items():
+        for i, name in enumerate(own):
+            write(tmp_path / "dive" / camera / f"{name}.png", image(i))
+    frames = read_frames(tmp_path / "dive", folder=prepared, rig=("0", "1"))
+    together = [(f"0/{a}.png", f"1/{b}.png") for a, b in zip(names["0"], names["1"], strict=True)]
+    assert list(zip(frames.names[::2], frames.names[1::2], strict=True)) == together
+
+
 def test_many_missing_partners_are_refused_with_the_counts(stereo, prepared):
     for i in range(4):
         (stereo / "right" / f"{i:04d}.png").unlink()
@@ -115,6 +133,7 @@ def test_stamps_in_names_pair_images_within_the_tolerance(tmp_path, prepared):
     assert len({frame.instant for frame in frames}) == 10
     assert frames.frames[2].time == pytest.approx(0.1)
     assert frames.recorded == "2020-09-13T12:26:40"
+    assert frames.timed
 
 
 def test_cameras_that_are_not_synchronized_are_refused_with_their_difference(tmp_path, prepared):

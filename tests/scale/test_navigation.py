@@ -426,3 +426,26 @@ def test_too_few_frames_with_a_position_are_counted(survey, tmp_path):
     text = file.read_text().splitlines()
     file.write_text("\n".join(text[:3]) + "\n")
     assert "2 of 48 frames" in refused(survey, file, nav_offset=0.0)
+
+
+def test_frames_without_times_are_not_looked_for_by_their_places_in_the_order(tmp_path):
+    survey = survey_along(lines(), spacing=3.0)
+    numbered = tuple(replace(frame, time=float(i)) for i, frame in enumerate(survey.frames))
+    frames = replace(survey.frames, frames=numbered, timed=False)
+    file = write_csv(tmp_path / "nav.csv", survey)
+    with pytest.raises(InputError, match="they have no times") as caught:
+        fit_navigation(survey.rec, frames, ScaleSettings(nav=file))
+    assert caught.value.exit_code == 3
+    named = write_csv(tmp_path / "named.csv", survey, time=None, name=list(survey.rec.names))
+    assert fit_navigation(survey.rec, frames, ScaleSettings(nav=named)).by == "name"
+
+
+def test_images_of_one_name_in_several_folders_are_told_apart(survey):
+    names = ("100media/dji_0001.png", "100media/dji_0002.png", "101media/dji_0001.png")
+    given = ("DCIM\\101MEDIA\\DJI_0001.JPG", "DCIM\\100MEDIA\\DJI_0001.JPG", "DCIM\\100MEDIA\\DJI_0002.JPG")
+    navigation = replace(survey.navigation().rows(np.arange(3)), names=given)
+    matched = match_names(navigation, names)
+    assert matched is not None
+    assert matched.navigation.names == (given[1], given[2], given[0])
+    without_folders = tuple(name.rpartition("/")[2] for name in names)
+    assert match_names(navigation, without_folders) is None  # dji_0001 is one of two

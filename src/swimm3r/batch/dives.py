@@ -11,9 +11,11 @@ from swimm3r.batch.sheet import read_sheet
 from swimm3r.errors import InputError
 from swimm3r.io import images
 from swimm3r.io.bags.bag import is_bag
+from swimm3r.io.raw import RAW_SUFFIXES
+from swimm3r.io.video import VIDEO_SUFFIXES
 from swimm3r.pipeline.presets import RunSettings
 from swimm3r.prepare import check_source
-from swimm3r.prepare.image_folder import VIDEO_SUFFIXES
+from swimm3r.prepare.rig import STEREO
 from swimm3r.scene.run_folder import is_run
 
 
@@ -46,7 +48,7 @@ def find_dives(given: Sequence[Path], settings: RunSettings, out: Path, referenc
             dives += read_sheet(path, settings, reference)
             continue
         for one in _expanded(path):
-            sources, others = _dives_at(one, out)
+            sources, others = _dives_at(one, out, settings.frames.rig or STEREO)
             dives += [Dive(_name_of(source), source, settings, reference) for source in sources]
             skipped += others
     if not dives:
@@ -72,17 +74,19 @@ def _expanded(path: Path) -> list[Path]:
     return found
 
 
-def _dives_at(path: Path, out: Path) -> tuple[list[Path], list[Skipped]]:
+def _dives_at(path: Path, out: Path, cameras: Sequence[str]) -> tuple[list[Path], list[Skipped]]:
     """The path where it is a dive, else those of its children that are; and the others with the reason.
+
+    A folder with a folder of each of the `cameras` is a dive of their rig.
 
     A folder whose images lie deeper counts where it was named itself and no child of it is a dive.
     """
-    own = _reason_against(path, out)
+    own = _reason_against(path, out, cameras)
     if own is None:
         return [path], []
     if path.is_dir() and not is_run(path) and path.resolve() != out.resolve():
         children = sorted(child for child in path.iterdir() if not child.name.startswith("."))
-        reasons = {child: _reason_against(child, out) for child in children}
+        reasons = {child: _reason_against(child, out, cameras) for child in children}
         dives = [child for child, reason in reasons.items() if reason is None]
         if dives:
             return dives, [Skipped(child, reason) for child, reason in reasons.items() if reason is not None]
@@ -91,8 +95,16 @@ def _dives_at(path: Path, out: Path) -> tuple[list[Path], list[Skipped]]:
     return [], [Skipped(path, own)]
 
 
-def _reason_against(path: Path, out: Path) -> str | None:
+def _reason_against(path: Path, out: Path, cameras: Sequence[str]) -> str | None:
     """The reason why a path is no dive; None where it is one."""
+    try:
+        return _reason_in(path, out, cameras)
+    except OSError as error:  # lost+found of a disk, somebody else's folder
+        return f"it cannot be read: {error.strerror}"
+
+
+def _reason_in(path: Path, out: Path, cameras: Sequence[str]) -> str | None:
+    """`_reason_against` of a path that may be looked into."""
     if path.resolve() == out.resolve():
         return "it is the folder of the results"
     if is_bag(path):
@@ -101,8 +113,10 @@ def _reason_against(path: Path, out: Path) -> str | None:
         if is_run(path):
             return "it is the folder of a run"
         suffixes = {child.suffix.lower() for child in path.iterdir() if child.is_file()}
-        if not suffixes & {*images.SUFFIXES, *VIDEO_SUFFIXES} and not (path / "images").is_dir():
-            return "it holds no images, no folder images/ and no video"
+        folders = {child.name.lower() for child in path.iterdir() if child.is_dir()}
+        inner = "images" in folders or folders >= {name.lower().rstrip("/\\") for name in cameras}
+        if not inner and not suffixes & {*images.SUFFIXES, *RAW_SUFFIXES, *VIDEO_SUFFIXES}:
+            return "it holds no images, no camera raw files, no folder images/ and no video"
     elif path.suffix.lower() not in VIDEO_SUFFIXES:
         return "it is neither a folder nor a video nor a bag"
     return _refusal(path)

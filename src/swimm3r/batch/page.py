@@ -12,6 +12,7 @@ from markupsafe import Markup
 
 from swimm3r.batch.dives import Skipped
 from swimm3r.batch.results import Row
+from swimm3r.errors import InputError
 from swimm3r.io import images
 from swimm3r.io.files.atomic import write_text
 from swimm3r.report.frames import filmed
@@ -53,7 +54,10 @@ def shown_row(row: Row, out: Path) -> Shown:
     folder = out / row.name
     if not is_run(folder) or not (folder / MARKERS["prepare"]).is_file():
         return Shown(row)
-    shown = Shown(row, *_thumbnails(folder))
+    try:
+        shown = Shown(row, *_thumbnails(folder))
+    except InputError:  # damaged: its own run says so, and the others go on
+        return Shown(row)
     if (folder / "report.html").is_file():
         shown = replace(shown, report=f"{quote(row.name)}/report.html")
     if row.registered is None:

@@ -11,11 +11,11 @@ from swimm3r.batch.dive import Dive
 from swimm3r.errors import InputError, UsageError
 from swimm3r.io import medium_json
 from swimm3r.io.files.atomic import write_text
-from swimm3r.io.files.cache_key import sample_digest
 from swimm3r.io.files.damage import remake
 from swimm3r.pipeline.presets import from_yaml
 from swimm3r.pipeline.run_settings import with_stages_of
 from swimm3r.pipeline.stage_keys import stage_keys
+from swimm3r.prepare.image_folder import source_digest
 from swimm3r.report.verdict import water_verdict
 from swimm3r.scale.run import is_scaled
 from swimm3r.scene.run_folder import STAGES, is_run, read_run
@@ -60,7 +60,7 @@ def is_finished(dive: Dive, out: Path, last_stage: str) -> bool:
     stages = STAGES[: STAGES.index(last_stage) + 1]
     if not all(run.is_finished(stage) for stage in stages):
         return False
-    if run.input.fingerprint != sample_digest(dive.source, leave_out=folder):
+    if run.input.fingerprint != source_digest(dive.source, leave_out=folder):
         return False
     settings = with_stages_of(dive.settings, held, STAGES[len(stages) :])
     scored = run.stages.get("eval")
@@ -125,7 +125,10 @@ def _facts(folder: Path) -> dict[str, Any]:
 
 def _water(folder: Path, summary: dict[str, Any]) -> str:
     path = folder / "sfm" / "medium.json"
-    fits = medium_json.read_fits(path, remake(path)) if path.is_file() else {}
+    try:
+        fits = medium_json.read_fits(path, remake(path)) if path.is_file() else {}
+    except InputError:
+        return ""  # damaged, which is the matter of that run alone
     gray = bool(summary["input"].get("gray"))
     return water_verdict(fits.get("linear") or fits.get("stored"), metric=summary["sfm"]["metric"], gray=gray)
 

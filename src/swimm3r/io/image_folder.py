@@ -79,7 +79,7 @@ def natural_key(path: Path, folder: Path) -> list[tuple[int, int, str]]:
     """Sorts img2 before img10, and a folder's own images before those of its subfolders."""
     relative = path.relative_to(folder)
     pieces = re.split(r"(\d+)", relative.as_posix().lower())
-    number = [(0, int(piece), "") if piece.isdigit() else (1, 0, piece) for piece in pieces]
+    number = [(0, int(piece), "") if piece.isdecimal() else (1, 0, piece) for piece in pieces]
     return [(len(relative.parts) > 1, 0, ""), *number, (1, 0, relative.as_posix())]
 
 

@@ -68,14 +68,22 @@ def header_in(file: io.BufferedReader | io.BytesIO, byte_count: int, path: Path)
 
 def capture_time(path: Path) -> float | None:
     """Seconds on the camera's clock (EXIF DateTimeOriginal with its fraction); None where the file does not tell."""
+    exif = exif_ifd(path, _EXIF)
+    try:
+        taken = datetime.strptime(str(exif[_TAKEN]).strip("\x00 "), "%Y:%m:%d %H:%M:%S")
+    except (KeyError, ValueError):
+        return None
+    digits = str(exif.get(_FRACTION, "")).strip("\x00 ")
+    return (taken - datetime(1970, 1, 1)).total_seconds() + (float(f"0.{digits}") if digits.isdigit() else 0.0)
+
+
+def exif_ifd(path: Path, number: int) -> dict[int, Any]:
+    """The tags of a part of an image's EXIF block, by their numbers; none where the file has none, or is damaged."""
     try:
         with path.open("rb") as file, _opened(file) as image:
-            exif = Image.Image.getexif(image).get_ifd(_EXIF)  # PngImageFile's own decodes the image
-            taken = datetime.strptime(str(exif[_TAKEN]).strip("\x00 "), "%Y:%m:%d %H:%M:%S")
-            digits = str(exif.get(_FRACTION, "")).strip("\x00 ")
+            return dict(Image.Image.getexif(image).get_ifd(number))  # PngImageFile's own decodes the image
     except (*DAMAGED, Image.DecompressionBombError):
-        return None
-    return (taken - datetime(1970, 1, 1)).total_seconds() + (float(f"0.{digits}") if digits.isdigit() else 0.0)
+        return {}
 
 
 def verify_checksums(png: bytes) -> None:

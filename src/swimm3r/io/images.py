@@ -30,6 +30,13 @@ SUFFIXES = (".jpg", ".jpeg", ".png", ".tif", ".tiff", ".bmp", ".webp")  # what a
 
 Rgb = UInt8[np.ndarray, "h w 3"] | UInt16[np.ndarray, "h w 3"]
 
+_OTHER_COLORS = (  # of TIFF: CMYK, YCbCr and L*a*b*, which OpenCV turns into RGB or refuses
+    tifffile.PHOTOMETRIC.SEPARATED,
+    tifffile.PHOTOMETRIC.YCBCR,
+    tifffile.PHOTOMETRIC.CIELAB,
+    tifffile.PHOTOMETRIC.ICCLAB,
+    tifffile.PHOTOMETRIC.ITULAB,
+)
 _NEEDS_NO_CODEC = (1, 8, 32773, 32946)  # TIFF compressions that tifffile undoes alone: none, deflate, packbits, deflate
 
 
@@ -140,8 +147,8 @@ def _decode_tiff(data: bytes) -> tuple[np.ndarray, int]:
     with tifffile.TiffFile(io.BytesIO(data)) as tiff:
         page: Any = tiff.pages[0]
         orientation = tiff_orientation(page)
-        if page.compression not in _NEEDS_NO_CODEC:
-            return _opencv(data), 1  # LZW, JPEG ...; OpenCV turns TIFF upright itself, whatever the flags
+        if page.compression not in _NEEDS_NO_CODEC or page.photometric in _OTHER_COLORS:
+            return _opencv(data), 1  # LZW, JPEG, CMYK ...; OpenCV turns TIFF upright itself, whatever the flags
         stored = page.asarray()
         if page.axes.startswith("S"):  # one plane per channel
             stored = np.moveaxis(stored, 0, -1)
@@ -198,4 +205,4 @@ def _quantized(stored: np.ndarray, path: Path) -> np.ndarray:
     scale = next((full for limit, full in ((2, 1), (256, 255), (65536, 65535)) if stored.max() <= limit), None)
     if scale is None:
         raise unreadable(path, f"its largest value is {stored.max():g}; a scale of 1, 255 or 65535 was expected")
-    return (np.clip(stored / scale, 0, 1) * 65535 + 0.5).astype(np.uint16)
+    return (np.clip(stored.astype(np.float64) / scale, 0, 1) * 65535 + 0.5).astype(np.uint16)

@@ -6,10 +6,10 @@ from pathlib import Path
 
 from swimm3r.errors import UsageError
 from swimm3r.io.bags.bag import is_bag
-from swimm3r.io.files.cache_key import sample_digest
 from swimm3r.pipeline.presets import RunSettings
 from swimm3r.prepare import check_source
 from swimm3r.prepare.clip import open_clip
+from swimm3r.prepare.image_folder import source_digest
 from swimm3r.prepare.masks import check_masks
 from swimm3r.prepare.rig import NONE, check_rig
 from swimm3r.scale.sources import check_sources
@@ -32,7 +32,7 @@ def input_fingerprint(source: Path, folder: Path) -> str:
             log.info("%s is not on this computer: the run goes on with the frames of %s", source, folder / "prepare")
             return run.input.fingerprint
     check_source(source)
-    return sample_digest(source, leave_out=folder)
+    return source_digest(source, leave_out=folder)
 
 
 def check_inputs(

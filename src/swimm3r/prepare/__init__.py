@@ -32,7 +32,7 @@ def read_frames(
     """
     from swimm3r.prepare import frames_folder
 
-    folder = None if folder is None else Path(folder)
+    folder = None if folder is None else Path(folder).absolute()  # images are read later, from wherever that is
     with watched(progress) as told:
         return frames_folder.read_frames(source, settings, folder, told, lens, **changes)
 
@@ -41,7 +41,7 @@ def load_frames(folder: str | Path) -> "swimm3r.scene.frames.Frames":
     """The frames that `read_frames` or `Frames.save` left in a folder. Raises InputError where they are incomplete."""
     from swimm3r.prepare import frames_folder
 
-    return frames_folder.load_frames(Path(folder))
+    return frames_folder.load_frames(Path(folder).absolute())
 
 
 def check_source(source: Path) -> Path:

@@ -2,6 +2,7 @@
 
 from collections.abc import Sequence
 from dataclasses import dataclass
+from datetime import UTC, datetime
 from pathlib import Path
 from typing import TypeVar
 
@@ -62,6 +63,7 @@ class SelectedImages:
     rig: Rig | None = None
     development: str | None = None  # how values were brought to sRGB's curve; None where they are as stored
     gyroscope: Gyroscope | None = None
+    timed: bool = True  # false where times are places in the order
 
 
 def sharpness(gray: UInt8[np.ndarray, "h w"]) -> float:
@@ -113,6 +115,11 @@ def thinned(items: Sequence[Item], most: int) -> list[Item]:
     if not most or len(items) <= most:
         return list(items)
     return [items[i] for i in np.linspace(0, len(items) - 1, most).round().astype(int)]
+
+
+def recorded_on(seconds: float) -> str:
+    """The date of a moment of the camera's clock, ISO 8601; its fraction counts, as times are counted from it."""
+    return datetime.fromtimestamp(seconds, UTC).replace(tzinfo=None).isoformat()
 
 
 def blank_warning(count: int, of: str) -> str:

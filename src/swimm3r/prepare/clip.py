@@ -29,9 +29,10 @@ from swimm3r.prepare.candidates import (
     is_gray,
     scaled_down,
     sharpness,
+    small_gray,
     thinned,
 )
-from swimm3r.prepare.development import Development, developed, development_of
+from swimm3r.prepare.development import Development, developed, developed_gray, development_of
 from swimm3r.prepare.rig import NONE, SIDE_BY_SIDE, STEREO, rig_of, write_lens
 from swimm3r.prepare.telemetry import with_telemetry
 from swimm3r.progress import Progress
@@ -113,7 +114,7 @@ def prepare_clip(source: Path, draft: Path, settings: FrameSettings, progress: P
     instants: list[list[SourceImage]] = []
     blank = 0
     for frames in reading.bins():
-        best = _best(frames, settings.pick)
+        best = _best(frames, settings.pick, development)
         if best is None:
             blank += 1
             continue
@@ -204,16 +205,29 @@ def _warnings(video: Clip, last: float, reached: float) -> list[str]:
     return warnings
 
 
-def _best(frames: Iterator[ClipFrame], pick: Literal["sharpest", "uniform"]) -> tuple[ClipFrame, float] | None:
+def _best(
+    frames: Iterator[ClipFrame], pick: Literal["sharpest", "uniform"], development: Development
+) -> tuple[ClipFrame, float] | None:
     """The frame to take of a bin with its sharpness; None where all show nothing."""
     best: tuple[ClipFrame, float] | None = None
     for frame in frames:
         if best and pick == "uniform":
             continue
-        gray = frame.gray(GRAY_SIDE)
+        gray = _judged_gray(frame, development)
         if gray.std() < BLANK:
             continue
         sharp = sharpness(gray)
         if best is None or sharp > best[1]:
             best = (frame, sharp)
     return best
+
+
+def _judged_gray(frame: ClipFrame, development: Development) -> UInt8[np.ndarray, "rows columns"]:
+    """The small gray copy that a frame is judged by, developed as the frame will be: linear light is dark before."""
+    if not development.changes:
+        return frame.gray(GRAY_SIDE)
+    if isinstance(frame, VideoFrame):
+        return developed_gray(frame.gray(GRAY_SIDE), development)
+    views = frame.images.values() if isinstance(frame, RigInstant) else [frame]
+    small = [developed(scaled_down(view.rgb(), GRAY_SIDE), development) for view in views]
+    return np.concatenate([small_gray(view) for view in small], axis=1)

@@ -17,7 +17,7 @@ from pathlib import Path
 
 import numpy as np
 import torch
-from jaxtyping import Float, UInt16
+from jaxtyping import Float, UInt8, UInt16
 
 from swimm3r.errors import InputError, UsageError
 from swimm3r.io import images
@@ -98,6 +98,11 @@ def developed(image: Rgb, development: Development) -> Rgb:
     if not development.changes:
         return image
     return _curve(development.transfer, development.stops, 8 * image.itemsize)[image]
+
+
+def developed_gray(gray: UInt8[np.ndarray, "h w"], development: Development) -> UInt8[np.ndarray, "h w"]:
+    """Gray values of a frame by sRGB's curve, 8 bits as they came."""
+    return (_curve(development.transfer, development.stops, 8)[gray] >> 8).astype(np.uint8)
 
 
 def light_of(values: Float[np.ndarray, "*n"], transfer: Transfer) -> Float[np.ndarray, "*n"]:

@@ -24,14 +24,14 @@ from swimm3r.errors import InputError
 from swimm3r.io import images
 from swimm3r.io.bags.bag import is_bag, open_bag
 from swimm3r.io.files.atomic import DRAFT
-from swimm3r.io.files.cache_key import cache_key, sample_digest
+from swimm3r.io.files.cache_key import cache_key, given_digest
 from swimm3r.io.files.damage import guard, remake
 from swimm3r.io.files.json_file import read_json
 from swimm3r.io.files.safe_names import check_name, check_names, shown_name
 from swimm3r.io.video import Video
 from swimm3r.prepare.candidates import SelectedImages, SourceImage, small_gray, target_size
 from swimm3r.prepare.clip import prepare_clip
-from swimm3r.prepare.image_folder import images_of, only_video, prepare_stills
+from swimm3r.prepare.image_folder import images_of, only_video, prepare_stills, source_digest
 from swimm3r.prepare.keyframes import SIDE as MOTION_SIDE
 from swimm3r.prepare.keyframes import Gray
 from swimm3r.prepare.masks import check_masks, prepare_masks
@@ -121,6 +121,7 @@ class _Document:
     rig: Rig | None = None
     development: str | None = None
     rows_rectified: bool = False
+    timed: bool = True
 
     def __post_init__(self) -> None:
         if min(self.width, self.height) < 1:
@@ -170,6 +171,7 @@ def load_frames(folder: Path) -> Frames:
         rig=document.rig,
         development=document.development,
         rows_rectified=document.rows_rectified,
+        timed=document.timed,
     )
 
 
@@ -260,6 +262,7 @@ def _write_frames(
         calibration=dive.calibration,
         rig=dive.rig,
         development=dive.development,
+        timed=dive.timed,
     )
     write_index(draft, frames, str(source.resolve()))
 
@@ -349,6 +352,7 @@ def _whole_folder(folder: Path) -> Iterator[Path]:
 
 
 def _cache_folder(source: Path, settings: FrameSettings) -> Path:
-    """Folder in the cache for frames that were given none; the same source and settings find it again."""
-    key = cache_key(str(source.resolve()), sample_digest(source), settings)[:16]
+    """Folder in the cache for frames that were given none; the same source, settings and files find it again."""
+    named = [None if path is None else given_digest(path) for path in (settings.masks, settings.rig_calibration)]
+    key = cache_key(str(source.resolve()), source_digest(source), settings, *named)[:16]
     return Path(os.environ.get("XDG_CACHE_HOME") or Path.home() / ".cache") / "swimm3r" / "frames" / key

@@ -5,8 +5,8 @@ import shutil
 from collections import Counter
 from collections.abc import Callable, Sequence
 from concurrent.futures import ThreadPoolExecutor
+from contextlib import suppress
 from dataclasses import dataclass, replace
-from datetime import UTC, datetime
 from functools import partial
 from pathlib import Path
 from typing import TypeVar
@@ -14,7 +14,8 @@ from typing import TypeVar
 from swimm3r import memory
 from swimm3r.errors import InputError
 from swimm3r.io import image_folder, images
-from swimm3r.io.files.cache_key import files_below
+from swimm3r.io.bags.bag import is_bag
+from swimm3r.io.files.cache_key import cache_key, files_below, sample_digest, samples_digest
 from swimm3r.io.files.safe_names import safe_name, shown_name
 from swimm3r.io.image_header import ImageHeader, ImageSizeError, capture_time
 from swimm3r.io.raw import RAW_SUFFIXES
@@ -27,6 +28,7 @@ from swimm3r.prepare.candidates import (
     Taken,
     blank_warning,
     is_gray,
+    recorded_on,
     scaled_down,
     sharpness,
     small_gray,
@@ -39,6 +41,8 @@ from swimm3r.progress import Progress
 from swimm3r.scene.settings import FrameSettings
 
 MASKS = "masks"  # a folder of this name in the input is not searched for frames
+
+_NOT_READ = (".heic", ".heif", ".hif", ".avif", ".jxl", ".jp2", ".psd")
 
 Job = TypeVar("Job")
 Result = TypeVar("Result")
@@ -69,7 +73,7 @@ class ImageFolder:
     root: Path  # names are relative to it
     paths: list[Path]
     unreadable: list[Path]  # folders that could not be searched
-    raw_beside: int = 0  # camera raw files that were passed over, as there are images
+    beside: tuple[str, ...] = ()  # sentences about files that were passed over, as there are images
 
 
 def prepare_stills(
@@ -103,6 +107,7 @@ def prepare_stills(
         originals=[path.relative_to(folder.root) for path in folder.paths],
         files=frozenset(folder.root.resolve() / path.relative_to(folder.root) for path in folder.paths),
         recorded=choice.recorded,
+        timed=choice.timed,
         calibration=None if rig is None else write_lens(draft, rig, settings),
         rig=rig,
         development=str(development) if development.changes or development.balance is not None else None,
@@ -115,6 +120,7 @@ class _Choice:
 
     taken: list[Taken]
     ordered: bool  # neighbors were taken in turn
+    timed: bool  # every image carries a time
     recorded: str | None  # date of the earliest image that has one, ISO 8601
     warnings: list[str]
 
@@ -125,17 +131,14 @@ def _choose(
     """The readable images of one size, in order: those of a rig by instants, others by time, thinned."""
     sizes = {path: header.size for path, header in headers.items()}
     paths, warnings = _one_size(list(headers), sizes, folder.root, settings)
-    if folder.raw_beside:
-        warnings.append(
-            f"{folder.raw_beside} camera raw files lie beside the images and were left out. "
-            "A folder that holds them alone is developed."
-        )
+    warnings += folder.beside
     if cameras:
         paired = pair_images(folder.root, paths, cameras, settings)
-        return _Choice(list(paired.images), paired.ordered, paired.recorded, [*warnings, *paired.warnings])
-    paths, times, ordered, recorded = _in_time_order(paths, warnings)
-    taken = thinned([Taken(path, time) for path, time in zip(paths, times, strict=True)], settings.max_frames)
-    return _Choice(taken, ordered, recorded, warnings)
+        told = [*warnings, *paired.warnings]
+        return _Choice(list(paired.images), paired.ordered, paired.timed, paired.recorded, told)
+    taken, timed, recorded = _in_time_order(paths, warnings)
+    ordered = timed or image_folder.numbered(paths)
+    return _Choice(thinned(taken, settings.max_frames), ordered, timed, recorded, warnings)
 
 
 def _headers(paths: Sequence[Path], development: Development) -> tuple[dict[Path, ImageHeader], dict[Path, InputError]]:
@@ -154,8 +157,29 @@ def _mask_folders(source: Path, root: Path, settings: FrameSettings) -> list[Pat
     """The folders that may hold masks: the one that the settings name, else those beside the images, each once."""
     if settings.masks is not None:
         return [settings.masks]
-    outer = [root.parent / MASKS] if root.name == "images" else []
-    return list(dict.fromkeys([root, root / MASKS, source / MASKS, *outer]))
+    outer = _masks_outside(root)
+    return list(dict.fromkeys([root, root / MASKS, source / MASKS, *([] if outer is None else [outer])]))
+
+
+def _masks_outside(folder: Path) -> Path | None:
+    """The folder masks/ beside a folder that is called images/; None of any other."""
+    whole = folder.absolute()
+    return whole.parent / MASKS if whole.name == "images" else None
+
+
+def source_digest(source: Path, leave_out: Path | None = None) -> str:
+    """`sample_digest` of a source, and of the masks beside it where it is a folder images/ that was named itself.
+
+    Runs within a folder of images or videos are no part of it.
+    """
+    if not source.is_dir() or is_bag(source):
+        return sample_digest(source, leave_out)
+    with suppress(OSError):  # a folder that may not be searched counts as empty
+        found = image_folder.find_files(source, ("",), [] if leave_out is None else [leave_out]).paths
+        own = samples_digest(source, sorted(path for path in found if path.is_file()))
+        masks = _masks_outside(source)
+        return own if masks is None or not masks.is_dir() else cache_key(own, sample_digest(masks))
+    return samples_digest(source, [])
 
 
 def images_of(source: Path, leave_out: Sequence[Path] = ()) -> ImageFolder:
@@ -164,19 +188,39 @@ def images_of(source: Path, leave_out: Sequence[Path] = ()) -> ImageFolder:
     Raises InputError where there are neither.
     """
     root = _root_of(source)
-    outer = [path for path in leave_out if path.resolve() != root.resolve()]
-    found = image_folder.find_images(root, [*outer, root / MASKS])
-    raw = image_folder.find_files(root, RAW_SUFFIXES, [*outer, root / MASKS])
+    closed = [root / MASKS, *(path for path in leave_out if path.resolve() != root.resolve())]
+    found = image_folder.find_images(root, closed)
+    raw = image_folder.find_files(root, RAW_SUFFIXES, closed)
     if found.paths:
-        return ImageFolder(root, found.paths, found.unreadable, len(raw.paths))
+        return ImageFolder(root, found.paths, found.unreadable, _passed_over(root, closed, len(raw.paths)))
     if raw.paths:
-        return ImageFolder(root, raw.paths, raw.unreadable)
+        return ImageFolder(root, raw.paths, raw.unreadable, _passed_over(root, closed))
     kinds = Counter(path.suffix.lower() for path in files_below(root))
     instead = ", ".join(f"{count} {kind or 'nameless'}" for kind, count in kinds.most_common(4))
     raise InputError(
         f"{source} holds no images" + (f", only {instead}" if instead else ": it is empty"),
         cause="another folder was meant, or the images are HEIC",
         hint=f"a folder with {', '.join(images.SUFFIXES)}, or camera raw files; a video is given by its own path",
+    )
+
+
+def _passed_over(root: Path, closed: Sequence[Path], raw: int = 0) -> tuple[str, ...]:
+    """Sentences about so many raw files beside images, about images that are not read, and about videos."""
+    found = {
+        "camera raw files": (raw, "A folder that holds them alone is developed."),
+        "images of formats that are not read (HEIC, JPEG XL ...)": (
+            len(image_folder.find_files(root, _NOT_READ, closed).paths),
+            "Convert them to JPEG, PNG or TIFF to use them.",
+        ),
+        "videos": (
+            len(image_folder.find_files(root, VIDEO_SUFFIXES, closed).paths),
+            "A video is given by its own path.",
+        ),
+    }
+    return tuple(
+        f"{count} {what} lie beside the images and were left out. {hint}"
+        for what, (count, hint) in found.items()
+        if count
     )
 
 
@@ -247,20 +291,20 @@ def _one_size(
     return [p for p in paths if sizes[p] == usual], [f"{len(odd)} images of another size were left out: {which}."]
 
 
-def _in_time_order(paths: list[Path], warnings: list[str]) -> tuple[list[Path], list[float], bool, str | None]:
-    """Sorted images, their times, whether neighbors were taken in turn; by the camera's clock where all carry it.
+def _in_time_order(paths: list[Path], warnings: list[str]) -> tuple[list[Taken], bool, str | None]:
+    """Sorted images, and whether their times are those of the camera's clock, which all carry then.
 
     Last, the date of the earliest image that has one.
     """
-    taken = [capture_time(path) for path in paths]
-    known = [time for time in taken if time is not None]
-    recorded = datetime.fromtimestamp(min(known), UTC).strftime("%Y-%m-%dT%H:%M:%S") if known else None
+    clock = [capture_time(path) for path in paths]
+    known = [time for time in clock if time is not None]
+    recorded = recorded_on(min(known)) if known else None
     if len(known) < len(paths) or len(set(known)) < 2:
-        return paths, [float(i) for i in range(len(paths))], image_folder.numbered(paths), recorded
+        return [Taken(path, float(i)) for i, path in enumerate(paths)], False, recorded
     order = sorted(range(len(paths)), key=known.__getitem__)  # stable: equal seconds keep the order of names
     if order != list(range(len(paths))):
         warnings.append("The images are ordered by the camera's clock, which is not the order of their names.")
-    return [paths[i] for i in order], [known[i] - min(known) for i in order], True, recorded
+    return [Taken(paths[i], known[i] - min(known)) for i in order], True, recorded
 
 
 def _named(chosen: list[Taken], root: Path, long_side: int, headers: dict[Path, ImageHeader]) -> list[_Still]:

@@ -4,17 +4,17 @@ import logging
 import re
 from collections.abc import Sequence
 from dataclasses import dataclass
-from datetime import UTC, datetime
-from pathlib import Path
+from pathlib import Path, PurePath
 
 from swimm3r.errors import InputError, UsageError
 from swimm3r.io.calibration.record import REMEDY, Calibration, lens_at
 from swimm3r.io.calibration.rig import read_rig
 from swimm3r.io.files.atomic import write_text
 from swimm3r.io.files.damage import guard
-from swimm3r.io.image_folder import find_images, natural_key, numbered
+from swimm3r.io.image_folder import find_files, find_images, natural_key, numbered
 from swimm3r.io.image_header import capture_time
-from swimm3r.prepare.candidates import Taken, thinned
+from swimm3r.io.raw import RAW_SUFFIXES
+from swimm3r.prepare.candidates import Taken, recorded_on, thinned
 from swimm3r.prepare.instants import CameraImages, instants_of, missing
 from swimm3r.scene.rig import Rig, RigCamera, pose_of
 from swimm3r.scene.settings import FrameSettings
@@ -34,6 +34,7 @@ class RigImages:
 
     images: tuple[Taken, ...]
     ordered: bool  # neighboring instants were taken in turn
+    timed: bool  # every image carries a time
     recorded: str | None  # date of the first instant, ISO 8601, where images carry it
     warnings: tuple[str, ...]
 
@@ -52,7 +53,15 @@ def cameras_of_folder(root: Path, settings: FrameSettings) -> tuple[str, ...]:
                 cause="a rig has two cameras and more",
                 hint="--rig left right, --rig side-by-side for a video that shows two views, or --rig none",
             )
-        missing = [name for name in settings.rig if not (root / name).exists()]
+        named = tuple(name.rstrip("/\\") for name in settings.rig)  # as a shell completes names of folders
+        deeper = next((name for name in named if len(PurePath(name).parts) != 1), None)
+        if deeper is not None:
+            raise UsageError(
+                f"--rig names {deeper or '/'}, which is no name of a folder right in {root}",
+                cause="the cameras of a rig are the folders next to each other in the input",
+                hint="the folder that holds those of the cameras as input, and --rig with their names alone",
+            )
+        missing = [name for name in named if not (root / name).exists()]
         if missing:
             there = sorted(path.name for path in root.iterdir() if path.is_dir())
             raise InputError(
@@ -60,16 +69,21 @@ def cameras_of_folder(root: Path, settings: FrameSettings) -> tuple[str, ...]:
                 cause="a slip in --rig, whose names are those of sub-folders",
                 hint="--rig with the names of the cameras, the first of which gives the axes",
             )
-        return settings.rig
+        return named
     sides = {path.name.lower(): path for path in root.iterdir() if path.is_dir()}
-    if not set(STEREO) <= sides.keys() or find_images(root, [path for path in sides.values()]).paths:
+    if not set(STEREO) <= sides.keys() or _has_images(root, list(sides.values())):
         return ()
-    with_images = {name for name, path in sides.items() if name != "masks" and find_images(path).paths}
+    with_images = {name for name, path in sides.items() if name != "masks" and _has_images(path)}
     if with_images != set(STEREO):
         return ()
     found = tuple(sides[name].name for name in STEREO)
     log.info("%s: %s/ and %s/ are taken as a stereo pair (--rig none: as one camera).", root, *found)
     return found
+
+
+def _has_images(folder: Path, leave_out: Sequence[Path] = ()) -> bool:
+    """Return whether images or camera raw files are below a folder."""
+    return bool(find_images(folder, leave_out).paths or find_files(folder, RAW_SUFFIXES, leave_out).paths)
 
 
 def check_rig(source: Path, settings: FrameSettings) -> None:
@@ -141,9 +155,9 @@ def pair_images(root: Path, paths: Sequence[Path], cameras: Sequence[str], setti
         for name in cameras
         if name in instant
     ]
-    recorded = datetime.fromtimestamp(begin, UTC).strftime("%Y-%m-%dT%H:%M:%S") if clocked else None
+    recorded = recorded_on(begin) if clocked else None
     warnings = () if told is None else (f"{told} They are used as they are.",)
-    return RigImages(tuple(images), clocked or numbered(own[cameras[0]]), recorded, warnings)
+    return RigImages(tuple(images), clocked or numbered(own[cameras[0]]), clocked, recorded, warnings)
 
 
 def _by_camera(root: Path, paths: Sequence[Path], cameras: Sequence[str]) -> dict[str, list[Path]]:
@@ -168,7 +182,10 @@ def _images_of(root: Path, name: str, paths: Sequence[Path]) -> CameraImages:
 def _key(path: Path, root: Path, camera: str) -> str:
     """The name of an image without its camera's: left/left_0001.png and right/R-0001.jpg are both 0001."""
     inner = path.relative_to(root / camera).with_suffix("").as_posix().lower()
-    words = [word.removeprefix(camera.lower()) for word in re.split(r"[^0-9a-z]+", inner)]
+    words = re.split(r"[^0-9a-z]+", inner)
+    if camera.isdecimal():  # other numbers in a name are those of the image
+        return "_".join(words[1:] if words[0] == camera and len(words) > 1 else words)
+    words = [word.removeprefix(camera.lower()) for word in words]
     return "_".join(word for word in words if word and word != camera[:1].lower())
 
 

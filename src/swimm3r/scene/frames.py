@@ -69,6 +69,7 @@ class Frames:
     rig: Rig | None = None  # cameras that are fixed to each other; frames of one instant are neighbors in the list
     development: str | None = None  # how raw, linear or log values became sRGB's; None where frames are as stored
     rows_rectified: bool = False  # rows that were exposed while the camera turned are drawn as at half time
+    timed: bool = True  # false where times are places in the order: stills of which one at least has no clock
     own_colors: FrameColors | None = None  # of frames that are given in the dive's common colors; None: all as stored
 
     def __len__(self) -> int:
@@ -240,6 +241,7 @@ def write_index(folder: Path, frames: Frames, source: str = "") -> None:
         "rig": None if frames.rig is None else asdict(frames.rig),
         "development": frames.development,
         **({"rows_rectified": True} if frames.rows_rectified else {}),
+        **({} if frames.timed else {"timed": False}),
         "frames": [
             {
                 "name": frame.name,

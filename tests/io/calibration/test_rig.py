@@ -63,13 +63,33 @@ def ros(folder: Path) -> Path:
     return folder / "ros"
 
 
-@pytest.mark.parametrize("make", [kalibr, opencv, ros])
+def echoed(folder: Path) -> Path:
+    """The same as messages of ROS 2, as ros2 topic echo prints them."""
+    for path in ros(folder).iterdir():
+        file = yaml.safe_load(path.read_text())
+        names = {"k": "camera_matrix", "d": "distortion_coefficients", "r": "rectification_matrix"}
+        message = {letter: file[name]["data"] for letter, name in {**names, "p": "projection_matrix"}.items()}
+        size = {"width": file["image_width"], "height": file["image_height"]}
+        write(path, {"header": {"frame_id": "camera"}, **size, "distortion_model": "plumb_bob", **message})
+    return folder / "ros"
+
+
+@pytest.mark.parametrize("make", [kalibr, opencv, ros, echoed])
 def test_every_program_states_the_same_pose(make, tmp_path):
     found = read_rig(make(tmp_path), SIDES)
     np.testing.assert_allclose(found.camera_from_rig[0], np.eye(4), atol=1e-12)
     np.testing.assert_allclose(found.camera_from_rig[1], POSE, atol=1e-9)
     assert len(found.lenses) == 2
     assert found.lenses[0].K[0, 2] == 320.5  # the center of the first pixel is (0.5, 0.5)
+
+
+def test_lenses_belong_to_their_cameras_whatever_the_order_of_a_file(tmp_path):
+    document = yaml.safe_load(opencv(tmp_path).read_text())
+    document["M1"] = [[510.0, 0.0, 320.0], [0.0, 510.0, 240.0], [0.0, 0.0, 1.0]]
+    second_first = {name: document[name] for name in sorted(document, reverse=True)}
+    path = tmp_path / "second_first.yaml"
+    path.write_text(yaml.safe_dump(second_first, sort_keys=False))
+    assert [lens.K[0, 0] for lens in read_rig(path, SIDES).lenses] == [510.0, 500.0]
 
 
 def test_three_cameras_of_a_chain_are_poses_from_the_first(tmp_path):

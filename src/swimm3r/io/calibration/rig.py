@@ -83,7 +83,8 @@ def _stereo(document: Mapping[str, Any]) -> RigCalibration:
         raise ValueError("it has no R and T of a second camera")
     pose = np.eye(4)
     pose[:3, :3], pose[:3, 3] = _numbers(values["r"], (3, 3)), _numbers(values["t"], (3,))
-    return RigCalibration(tuple(read_document(document)), np.stack([np.eye(4), pose]))
+    lenses = sorted(read_document(document), key=lambda lens: lens.name)  # 1 before 2 and left before right
+    return RigCalibration(tuple(lenses), np.stack([np.eye(4), pose]))
 
 
 def _rectified(folder: Path, cameras: Sequence[str]) -> RigCalibration:
@@ -101,16 +102,21 @@ def rectified_poses(documents: Sequence[Mapping[str, Any]]) -> Float[np.ndarray,
     """camera_from_rig of cameras whose camera_info is given. Raises ValueError where one has no R or P."""
     rectified, offsets = [], []
     for document in documents:
-        P = _numbers(document.get("projection_matrix", document.get("P")), (3, 4))
+        P = _numbers(_first(document, "projection_matrix", "P", "p"), (3, 4))
         if not P[0, 0] * P[1, 1]:
             raise ValueError("a projection_matrix in it is zero")
-        rectified.append(_numbers(document.get("rectification_matrix", document.get("R")), (3, 3)))
+        rectified.append(_numbers(_first(document, "rectification_matrix", "R", "r"), (3, 3)))
         offsets.append(np.array([-P[0, 3] / P[0, 0], -P[1, 3] / P[1, 1], 0.0]))
     poses = np.tile(np.eye(4), (len(documents), 1, 1))
     for k in range(1, len(documents)):
         poses[k, :3, :3] = rectified[k].T @ rectified[0]
         poses[k, :3, 3] = -rectified[k].T @ (offsets[k] - offsets[0])
     return poses
+
+
+def _first(document: Mapping[str, Any], *names: str) -> Any:
+    """The value of the first name that there is: of a file, of a message of ROS 1 or of one of ROS 2; else None."""
+    return next((document[name] for name in names if name in document), None)
 
 
 def _numbers(value: Any, shape: tuple[int, ...]) -> np.ndarray:

@@ -8,6 +8,7 @@ only show results leave a key as it is, so that kept results survive an edit tha
 import ast
 import json
 import os
+from collections.abc import Sequence
 from contextlib import suppress
 from dataclasses import asdict, is_dataclass
 from functools import cache, lru_cache
@@ -19,6 +20,7 @@ from typing import Any
 import swimm3r
 
 _ONLY_SHOWS = ("cli", "report", "export")
+_OF_SYSTEMS = ("thumbs.db", "desktop.ini")
 _LENGTH = 32  # hexadecimal digits
 _READ_WHOLE = 64 << 20  # bytes
 _SAMPLE = 16 << 10  # bytes, at either end of a file
@@ -61,10 +63,16 @@ def sample_digest(path: Path, leave_out: Path | None = None) -> str:
     """Of a file's size and of its first and last 16 KiB, or of those of all files below a folder with their names.
 
     Hours of video are told apart as fast as they are found, and a copy on another disk is the same. Files below
-    `leave_out` are no part of it; those that may not be read count by name and size.
+    `leave_out` are no part of it, nor are hidden ones and those that systems leave in folders (.DS_Store, Thumbs.db);
+    those that may not be read count by name and size.
     """
+    return samples_digest(path, files_below(path, leave_out))
+
+
+def samples_digest(path: Path, files: Sequence[Path]) -> str:
+    """`sample_digest` of some of the files below a folder, in their order."""
     digest = sha256()
-    for file in files_below(path, leave_out):
+    for file in (file for file in files if not _is_of_system(file.relative_to(path))):
         with suppress(FileNotFoundError):  # removed meanwhile
             size = file.stat().st_size
             digest.update(f"{file.relative_to(path)}|{size}\n".encode(errors="surrogateescape"))
@@ -113,6 +121,10 @@ def statements(source: str) -> str:
 def _file_digest(path: Path, size: int, changed: int) -> str:
     with path.open("rb") as file:
         return file_digest(file, "sha256").hexdigest()[:_LENGTH]
+
+
+def _is_of_system(relative: Path) -> bool:
+    return any(part.startswith(".") for part in relative.parts) or relative.name.lower() in _OF_SYSTEMS
 
 
 def _is_text(node: Any) -> bool:

@@ -18,11 +18,10 @@ from swimm3r.io.bags.bag import Bag, open_bag
 from swimm3r.io.bags.topics import FIX, IMU, POSE, PRESSURE, Topics, choose_positions, topics_of
 from swimm3r.io.navigation.clock import is_date
 from swimm3r.io.navigation.pressure import depth_of_pressure
-from swimm3r.io.navigation.record import Navigation
+from swimm3r.io.navigation.record import PORT_UP, Navigation
 
 log = logging.getLogger(__name__)
 
-_PORT_UP = np.diag([1.0, -1.0, -1.0])  # axes of ROS's vehicles from those of `record`: starboard and down
 _NO_FIX = -1  # NavSatStatus
 _GAUGE = 0.5  # bar; absolute pressures are never below, those above the air's are at the surface
 _UNKNOWN = 0.0  # variance: the message has none
@@ -106,7 +105,7 @@ def _with_attitude(navigation: Navigation, bag: Bag, topics: Topics) -> Navigati
     turning = Slerp(time, Rotation.from_quat(np.array([known[t] for t in time.tolist()])))
     attitude = np.full((len(navigation), 3, 3), np.nan)
     inside = (navigation.time >= time[0]) & (navigation.time <= time[-1])
-    attitude[inside] = turning(navigation.time[inside]).as_matrix() @ _PORT_UP
+    attitude[inside] = turning(navigation.time[inside]).as_matrix() @ PORT_UP
     return replace(navigation, attitude=attitude) if inside.any() else navigation
 
 
@@ -178,5 +177,5 @@ def _attitudes(quaternions: Float[np.ndarray, "n 4"]) -> Float[np.ndarray, "n 3 
 
     out = np.full((len(quaternions), 3, 3), np.nan)
     known = np.isfinite(quaternions).all(1)
-    out[known] = Rotation.from_quat(quaternions[known]).as_matrix() @ _PORT_UP
+    out[known] = Rotation.from_quat(quaternions[known]).as_matrix() @ PORT_UP
     return out

@@ -1,5 +1,6 @@
 """Matisse's .dim2, NMEA 0183 sentences, TUM trajectories and .srt subtitles of drones -> navigation."""
 
+import math
 import re
 from datetime import UTC, datetime
 from pathlib import Path
@@ -7,7 +8,7 @@ from pathlib import Path
 import numpy as np
 
 from swimm3r.io.navigation.clock import seconds_of_date, seconds_of_day
-from swimm3r.io.navigation.record import Navigation, vehicle_attitude
+from swimm3r.io.navigation.record import PORT_UP, Navigation, vehicle_attitude
 
 _DIM2 = ("latitude", "longitude", "depth", "altitude", "heading", "roll", "pitch")
 _DIM2_FIRST = 6  # fields before them: a flag, date, time, camera, size, file
@@ -15,6 +16,8 @@ _BLOCK = re.compile(r"(\d\d):(\d\d):(\d\d)[,.](\d{1,3})\s*-->")
 _NUMBER = r"\s*[:=]?\s*(-?\d+(?:\.\d+)?)"
 _PLACE = re.compile(r"GPS\s*\(\s*(-?\d+(?:\.\d+)?)\s*,\s*(-?\d+(?:\.\d+)?)\s*(?:,\s*(-?\d+(?:\.\d+)?))?")
 _KNOT_FREE = ("GGA", "GLL", "RMC")  # sentences with a position
+_FIELDS = 10  # of a sentence that are looked at
+_DAY, _LATE = 86400.0, 3600.0  # seconds
 
 
 def read_dim2(path: Path) -> Navigation:
@@ -44,7 +47,10 @@ def read_dim2(path: Path) -> Navigation:
 
 
 def read_tum(path: Path) -> Navigation:
-    """A TUM trajectory: time, position and orientation (quaternion x, y, z, w) of the vehicle, metres, z up."""
+    """A TUM trajectory: time, position and orientation (quaternion x, y, z, w) of the vehicle, metres, z up.
+
+    A vehicle that lies level has its z up, too: its axes are ROS's, x forward and y to port (REP 103).
+    """
     from scipy.spatial.transform import Rotation
 
     lines = [line for line in path.read_text(encoding="utf-8").splitlines() if line.strip() and line[0] != "#"]
@@ -59,7 +65,7 @@ def read_tum(path: Path) -> Navigation:
         position=table[:, 1:4],
         clock="utc" if table[0, 0] > 1e8 else "clip",
         time=table[:, 0],
-        attitude=Rotation.from_quat(table[:, 4:]).as_matrix(),
+        attitude=Rotation.from_quat(table[:, 4:]).as_matrix() @ PORT_UP,
     )
 
 
@@ -69,7 +75,7 @@ def read_srt(path: Path) -> Navigation:
     for block in re.split(r"\n\s*\n", path.read_text(encoding="utf-8", errors="replace").replace("\r", "")):
         begin = _BLOCK.search(block)
         place = _srt_place(block)
-        if begin is not None and place is not None:
+        if begin is not None and place is not None and (place[0] or place[1]):  # zeros: no fix yet
             hours, minutes, seconds, fraction = begin.groups()
             times.append(int(hours) * 3600 + int(minutes) * 60 + int(seconds) + float(f"0.{fraction}"))
             rows.append(place)
@@ -97,15 +103,17 @@ def _srt_place(block: str) -> tuple[float, float, float] | None:
 
 
 def read_nmea(path: Path) -> Navigation:
-    """NMEA 0183: positions of GGA, RMC or GLL, dates of RMC or ZDA, headings of HDT, altitudes of DPT.
+    """NMEA 0183: positions of GGA, RMC or GLL, dates of RMC or ZDA, altitudes of DPT.
 
-    Sentences whose checksum is wrong are left out. Heights are not taken from GGA: they are the antenna's.
+    Sentences whose checksum is wrong, or that are cut off, are left out. Heights are not taken from GGA: they are the
+    antenna's. Times of GGA and GLL go on after midnight, where the sentence that names the new day comes later.
     """
     fixes: dict[float, tuple[float, float]] = {}
     altitudes: dict[float, float] = {}
     date: float | None = None
     wrong = count = 0
-    now: float | None = None
+    latest: float | None = None  # moment of a sentence that names the day, or of a fix after it
+    last: float | None = None  # moment of the last fix
     for line in path.read_text(encoding="utf-8", errors="replace").splitlines():
         start = line.find("$")
         if start < 0:
@@ -116,14 +124,15 @@ def read_nmea(path: Path) -> Navigation:
             wrong += 1
             continue
         kind = fields[0][-3:]
-        date = _nmea_date(kind, fields) or date
-        if kind in _KNOT_FREE and date is not None:
-            fix = _nmea_fix(kind, fields)
-            if fix is not None:
-                now = date + fix[0]
-                fixes[now] = fix[1:]
-        if kind == "DPT" and now is not None and fields[1]:
-            altitudes[now] = float(fields[1])
+        fields += [""] * (_FIELDS - len(fields))
+        day, fix = _nmea_date(kind, fields), _nmea_fix(kind, fields) if kind in _KNOT_FREE else None
+        if day is not None:
+            date, latest = day, day + (_nmea_seconds(fields[1]) or 0.0)
+        if fix is not None and date is not None:
+            last = latest = _on_its_day(date + fix[0], latest)
+            fixes[last] = fix[1:]
+        if kind == "DPT" and last is not None and fields[1]:
+            altitudes[last] = float(fields[1])
     if count and wrong > count / 2:
         raise ValueError(f"the checksums of {wrong} of {count} sentences are wrong")
     if not fixes:
@@ -133,6 +142,11 @@ def read_nmea(path: Path) -> Navigation:
     altitude = np.array([altitudes.get(time, np.nan) for time in times.tolist()])
     std = np.tile([np.nan, np.nan, np.inf], (len(times), 1))
     return Navigation(path, "geodetic", position, "utc", times, std=std, altitude=altitude)
+
+
+def _on_its_day(moment: float, latest: float | None) -> float:
+    """A moment whose date may be that of a day before or after: at most an hour before the latest one."""
+    return moment if latest is None else moment + _DAY * math.ceil((latest - _LATE - moment) / _DAY)
 
 
 def _sentence(text: str) -> list[str] | None:
@@ -148,9 +162,9 @@ def _sentence(text: str) -> list[str] | None:
 
 def _nmea_date(kind: str, fields: list[str]) -> float | None:
     """Seconds since 1970 of the day that a sentence names."""
-    if kind == "RMC" and len(fields) > 9 and len(fields[9]) == 6:
+    if kind == "RMC" and len(fields[9]) == 6:
         return datetime.strptime(fields[9], "%d%m%y").replace(tzinfo=UTC).timestamp()
-    if kind == "ZDA" and len(fields) > 4 and all(fields[2:5]):
+    if kind == "ZDA" and all(fields[2:5]) and len(fields[4]) == 4:
         return datetime(int(fields[4]), int(fields[3]), int(fields[2]), tzinfo=UTC).timestamp()
     return None
 
@@ -160,10 +174,15 @@ def _nmea_fix(kind: str, fields: list[str]) -> tuple[float, float, float] | None
     at = {"GGA": (1, 2), "RMC": (1, 3), "GLL": (5, 1)}[kind]
     time, place = fields[at[0]], fields[at[1] : at[1] + 4]
     is_void = (kind == "RMC" and fields[2] != "A") or (kind == "GGA" and fields[6] == "0")
-    if is_void or len(time) < 6 or len(place) < 4 or not all(place):
+    seconds = _nmea_seconds(time)
+    if is_void or seconds is None or not all(place):
         return None
-    seconds = seconds_of_day(f"{time[:2]}:{time[2:4]}:{time[4:]}")
     return seconds, _degrees(place[0], 2, place[1] == "S"), _degrees(place[2], 3, place[3] == "W")
+
+
+def _nmea_seconds(time: str) -> float | None:
+    """Seconds of the day of hhmmss.ss; None without them."""
+    return None if len(time) < 6 else seconds_of_day(f"{time[:2]}:{time[2:4]}:{time[4:]}")
 
 
 def _degrees(text: str, digits: int, negative: bool) -> float:

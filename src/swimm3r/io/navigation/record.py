@@ -20,6 +20,9 @@ Frame = Literal["geodetic", "projected", "local"]
 Clock = Literal["utc", "clip", "names"]
 """Seconds since 1970; seconds of the clip; or none, where rows are those of named images."""
 
+PORT_UP = np.diag([1.0, -1.0, -1.0])  # axes of ROS's vehicles from those above: starboard and down
+_EARLY, _FAR = 631_152_000.0, 4_102_444_800.0  # 1990 and 2100 in seconds since 1970
+_UNITS = {"milliseconds": 1e-3, "microseconds": 1e-6, "nanoseconds": 1e-9}
 _NED_TO_ENU = np.array([[0.0, 1, 0], [1, 0, 0], [0, 0, -1]])
 
 
@@ -99,6 +102,7 @@ def check_coordinates(navigation: Navigation) -> None:
             cause="cells such as NaN or inf",
             hint="leave such rows out",
         )
+    _check_unit_of_times(navigation)
     if navigation.frame != "geodetic" or not len(position):
         return
     latitude, longitude = position[:, 0], position[:, 1]
@@ -115,3 +119,16 @@ def check_coordinates(navigation: Navigation) -> None:
             cause="another unit than degrees, or easting and northing under the names of longitude and latitude",
             hint="decimal degrees, or the columns easting and northing",
         )
+
+
+def _check_unit_of_times(navigation: Navigation) -> None:
+    """Raise InputError for times beyond the year 2100, which are no seconds."""
+    latest = float(np.abs(navigation.time).max(initial=0.0))
+    if latest < _FAR:
+        return
+    unit = next((name for name, factor in _UNITS.items() if _EARLY < latest * factor < _FAR), None)
+    raise InputError(
+        f"{navigation.path} has the time {latest:.12g} s, beyond the year 2100",
+        cause=f"{unit} since 1970 where seconds are expected" if unit else "a date written as one number",
+        hint="a table whose column states the unit, as time [ms], [us] or [ns]; or dates such as 2026-05-14T09:30:00",
+    )

@@ -22,6 +22,7 @@ from swimm3r.scale.navigation.matching import (
     FrameTimes,
     Matched,
     check_overlap,
+    check_timed,
     frame_times,
     match_names,
     match_times,
@@ -133,6 +134,7 @@ def _match(
     named = match_names(navigation, rec.names) if settings.nav_offset is None else None
     if named is not None:
         return named, None, []
+    check_timed(navigation, times)
     notes: list[str] = []
     centers = rec.cameras.centers.double().numpy()
     if settings.nav_offset is not None:

@@ -3,7 +3,7 @@
 t_navigation = t_frame + offset
 """
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence, Set
 from dataclasses import dataclass
 from pathlib import PurePosixPath
 from typing import Literal
@@ -22,10 +22,13 @@ _ZONES = [half * 1800.0 for half in range(-28, 29) if half]  # offsets of time z
 
 @dataclass(frozen=True)
 class FrameTimes:
-    """Moments of the registered frames: since 1970 where `clock` is "utc", else seconds of the clip."""
+    """Moments of the registered frames: since 1970 where `clock` is "utc", seconds of the clip where it is "clip".
+
+    Frames without a clock ("none") have their places in the order instead.
+    """
 
     names: tuple[str, ...]
-    clock: Literal["utc", "clip"]
+    clock: Literal["utc", "clip", "none"]
     seconds: Float[np.ndarray, " c"]
 
 
@@ -50,6 +53,8 @@ def frame_times(names: Sequence[str], frames: Frames, clip_start: str | None) ->
     if clip_start is None and frames.start_ns is not None:  # a bag's, of a clock that need not count from 1970
         seconds = frames.start_ns * 1e-9 + times
         return FrameTimes(tuple(names), "utc" if is_date(float(seconds[0])) else "clip", seconds)
+    if not frames.timed:
+        return FrameTimes(tuple(names), "none", times)
     begin = clip_start or frames.recorded
     if begin is None:
         return FrameTimes(tuple(names), "clip", times)
@@ -64,11 +69,18 @@ def frame_times(names: Sequence[str], frames: Frames, clip_start: str | None) ->
 
 
 def match_names(navigation: Navigation, names: Sequence[str]) -> Matched | None:
-    """The rows whose image is a frame, by their names without folder and suffix; None where fewer than 3 are."""
+    """The rows whose image is a frame, by their names without suffix; None where fewer than 3 are.
+
+    Folders count where several images of the navigation have one name, and as far as both sides state them.
+    """
     if navigation.names is None:
         return None
-    rows = {_stem(name): row for row, name in enumerate(navigation.names)}
-    pairs = [(i, rows[stem]) for i, name in enumerate(names) if (stem := _stem(name)) in rows]
+    rows = {_endings(name)[0]: row for row, name in enumerate(navigation.names)}
+    images: dict[str, set[str]] = {}
+    for name in rows:
+        for end in _endings(name):
+            images.setdefault(end, set()).add(name)
+    pairs = [(i, rows[image]) for i, name in enumerate(names) if (image := _image_of(name, images)) is not None]
     if len(pairs) >= FEWEST:
         frame, row = np.array(pairs).T
         return Matched(frame, navigation.rows(row), "name")
@@ -79,6 +91,17 @@ def match_names(navigation: Navigation, names: Sequence[str]) -> Matched | None:
             hint="the navigation of this dive, or one with times",
         )
     return None
+
+
+def check_timed(navigation: Navigation, times: FrameTimes) -> None:
+    """Raise InputError for frames that have no times, and so no place in navigation by them."""
+    if times.clock == "none":
+        raise InputError(
+            f"the frames cannot be found in {navigation.path} by time: they have no times",
+            cause="images without the time of the camera's clock, at least one of them: an editor left EXIF out",
+            hint="a table that names the images, without --nav-offset; or date and time in their names"
+            " (20190404_120001.jpg) or EXIF",
+        )
 
 
 def match_times(navigation: Navigation, times: FrameTimes, offset: float, max_gap: float) -> Matched:
@@ -157,5 +180,17 @@ def _covered(navigation: Navigation, seconds: Float[np.ndarray, " c"], slack: fl
     return (seconds >= navigation.time[0] - slack) & (seconds <= navigation.time[-1] + slack)
 
 
-def _stem(name: str) -> str:
-    return PurePosixPath(name.replace("\\", "/")).stem.lower()
+def _image_of(name: str, images: Mapping[str, Set[str]]) -> str | None:
+    """The one image whose name ends as a frame's does, as long as it can be; None without one, or with several."""
+    ends = _endings(name)
+    found = next((images[end] for end in ends if end in images), frozenset())
+    if ends[0] in found:
+        return ends[0]
+    return next(iter(found)) if len(found) == 1 else None
+
+
+def _endings(name: str) -> list[str]:
+    """A name without suffix and case, then without its first folder, and so on."""
+    path = PurePosixPath(name.replace("\\", "/").lower())
+    parts = [*path.parts[:-1], path.stem]
+    return ["/".join(parts[k:]) for k in range(len(parts))]
