@@ -12,7 +12,7 @@ from swimm3r.errors import InputError, UsageError
 from swimm3r.scale.control import fit_control
 from swimm3r.scale.estimate import estimate_scale
 from swimm3r.scale.marked_points import FrameNames, read_distances, read_points, read_scale_bars
-from swimm3r.scale.navigation.geodesy import geodetic_from_local
+from swimm3r.scale.navigation.geodesy import geodetic_from_local, utm_zone
 from swimm3r.scale.settings import ScaleSettings
 from swimm3r.scale.solve import ScaleEstimate, solve_scale
 from swimm3r.scale.sources import ground_below, placed_points, scale_sources
@@ -289,6 +289,24 @@ def test_ground_control_places_the_run_and_check_points_tell_its_accuracy(survey
         survey.in_run(GROUND["a"])
     )
     assert np.linalg.norm(local) == pytest.approx(np.linalg.norm(GROUND["e"] - GROUND["a"]), rel=1e-4)
+
+
+def test_eastings_of_control_points_beside_latitudes_need_their_system(survey, marks, tmp_path):
+    pyproj = pytest.importorskip("pyproj")
+    epsg = utm_zone(ORIGIN.latitude, ORIGIN.longitude)
+    latitude, longitude, height = geodetic_from_local(np.stack(list(GROUND.values())), ORIGIN).T
+    east, north = pyproj.Transformer.from_crs(4326, epsg, always_xy=True).transform(longitude, latitude)
+    stated = np.stack([east, north, height], -1)
+    rows = [f"{name},{e!r},{n!r},{h!r}" for name, (e, n, h) in zip(GROUND, stated.tolist(), strict=True)]
+    control = tmp_path / "c.csv"
+    control.write_text("name,easting,northing,height\n" + "\n".join(rows) + "\n")
+    settings = ScaleSettings(points=marks, control=control, nav=write_csv(tmp_path / "nav.csv", survey))
+    with pytest.raises(UsageError, match="different reference systems") as told:
+        estimate_scale(survey.rec, survey.frames, settings)
+    assert "--nav-crs" in told.value.hint
+    found = estimate_scale(survey.rec, survey.frames, replace(settings, nav_crs=f"EPSG:{epsg}")).georeference
+    ground = found.to_crs(survey.in_run(np.stack(list(GROUND.values()))))
+    np.testing.assert_allclose(ground, stated, atol=2e-3)
 
 
 def fitted(survey: Survey, marks: Path, control: Path):
