@@ -107,6 +107,14 @@ def test_the_volume_of_the_mound_is_that_of_its_integral(run: Path):
     assert net.std == pytest.approx(3 * SCALE_STD * net.value, rel=0.1)
 
 
+def test_an_outline_that_reaches_beyond_the_map_is_measured_in_part(run: Path):
+    outline = [on_map(x, y, 0.0) for x, y in ((0.5, 0.2), (20.5, 0.2), (20.5, 0.6), (0.5, 0.6))]  # the map ends at 1.6
+    found = measure_run(run, area=outline, volume=outline)
+    for name in ("area of the surface", "volume net"):
+        (share,) = re.findall(r"(\d+)% of", by_name(found, name).name)
+        assert 3 <= int(share) <= 6
+
+
 def test_deviations_are_those_of_a_simulation(seabed: Seabed):
     survey = seabed.survey()
     exact = replace(survey, place=replace(survey.place, scale_std=0.0))

@@ -14,14 +14,14 @@ from itertools import pairwise
 from pathlib import Path
 
 import numpy as np
-from jaxtyping import Float
+from jaxtyping import Bool, Float
 
 from swimm3r.errors import InputError, UsageError
 from swimm3r.io.files.cache_key import cache_key
 from swimm3r.products.grid import Grid
 from swimm3r.products.habitat.areas import Area
 from swimm3r.products.habitat.figures import figures
-from swimm3r.products.habitat.tables import Lattice, squares_inside
+from swimm3r.products.habitat.tables import Lattice, lies_on_map, squares_inside
 from swimm3r.products.picked_points import PickedPoint, picked
 from swimm3r.products.record import FOLDER, read_record
 from swimm3r.products.survey import Survey, open_survey
@@ -96,13 +96,15 @@ def areas(points: Sequence[PickedPoint], survey: Survey, heights: Lattice | None
         _measured("perimeter", closed[:-1], _perimeter, survey, survey.place.unit, 1),
     ]
     if heights is not None:
-        window, own = squares_inside(heights, _outline(points))
+        outline = _outline(points)
+        window, own = squares_inside(heights, outline)
         surface = figures(heights.heights(window), heights.spacing, own) if own.any() else None
         if surface is not None:
             planar = found[1]
             ratio = surface.rugosity
             std = None if planar.std is None else planar.std * ratio
-            covered = f"{surface.coverage:.0%} of it measured, heights every {heights.spacing:.3g} {survey.place.unit}"
+            share = _measured_share(heights, outline, surface.coverage * own.sum(), own)
+            covered = f"{share:.0%} of it measured, heights every {heights.spacing:.3g} {survey.place.unit}"
             found.append(Measurement(f"area of the surface ({covered})", planar.value * ratio, std, unit))
     return found
 
@@ -112,7 +114,8 @@ def volumes(points: Sequence[PickedPoint], survey: Survey, heights: Lattice) -> 
 
     Raises InputError where no height inside was measured.
     """
-    window, own = squares_inside(heights, _outline(points))
+    outline = _outline(points)
+    window, own = squares_inside(heights, outline)
     cells = _cell_heights(heights.heights(window)) if own.any() else np.full(own.shape, np.nan)
     known = own & ~np.isnan(cells)
     if not known.any():
@@ -136,7 +139,8 @@ def volumes(points: Sequence[PickedPoint], survey: Survey, heights: Lattice) -> 
     def net(p: np.ndarray) -> float:
         return float((z - _plane_at(p, x, y)).sum() * d**2)
 
-    unit, covered = f"{survey.place.unit}³", f"{known.sum() / own.sum():.0%} of the outline measured"
+    share = _measured_share(heights, outline, float(known.sum()), own)
+    unit, covered = f"{survey.place.unit}³", f"{share:.0%} of the outline measured"
     kinds = (("above", part(1)), ("below", part(-1)), ("net", net))
     return [
         _measured(f"volume {name} ({covered})", points, volume, survey, unit, 3, by_cells) for name, volume in kinds
@@ -206,6 +210,13 @@ def _plane_at(p: Float[np.ndarray, "n 3"], x: np.ndarray, y: np.ndarray) -> np.n
 def _cell_heights(values: Float[np.ndarray, "h w"]) -> Float[np.ndarray, "h1 w1"]:
     """Heights in the middle of the squares between four."""
     return (values[:-1, :-1] + values[:-1, 1:] + values[1:, :-1] + values[1:, 1:]) / 4
+
+
+def _measured_share(heights: Lattice, outline: Area, squares: float, own: Bool[np.ndarray, "h w"]) -> float:
+    """Share of an outline that so many measured squares make up, by the squares inside of it that are on the map."""
+    if lies_on_map(heights, outline):
+        return squares / float(own.sum())
+    return min(1.0, squares * heights.spacing**2 / outline.exact_area)
 
 
 def _outline(points: Sequence[PickedPoint]) -> Area:

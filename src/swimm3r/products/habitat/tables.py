@@ -124,7 +124,7 @@ def write_areas(heights: Lattice, areas: Sequence[Area], files: list[str]) -> li
         if found is None:
             outside.append(area.name)
             continue
-        found = _of_exact_area(found, area.exact_area, whole=window == _around(heights, area))
+        found = _of_exact_area(found, area.exact_area, whole=lies_on_map(heights, area))
         noise = heights.heights(window, "elevation_std")
         middle = np.mean(area.bounds, axis=0) * heights.place.grid_scale + heights.place.origin[:2]
         table.append(_row(area.name, (float(middle[0]), float(middle[1])), found, heights, _median(noise)))
@@ -229,6 +229,12 @@ def squares_inside(heights: Lattice, area: Area) -> tuple[Window, Bool[np.ndarra
         shapes, out_shape=(window.rows - 1, window.columns - 1), transform=Affine(d, 0, x, 0, -d, y), dtype="uint8"
     )
     return window, np.asarray(burned, bool)
+
+
+def lies_on_map(heights: Lattice, area: Area) -> bool:
+    """Return whether all of a polygon does: squares beyond the map are in no window of it."""
+    around = _around(heights, area)
+    return _clipped(around, *heights.shape) == around
 
 
 def _around(heights: Lattice, area: Area) -> Window:
