@@ -15,7 +15,7 @@ from swimm3r.cli.main import main
 from swimm3r.errors import DeviceError, InputError, UsageError
 from swimm3r.evaluate.images import psnr
 from swimm3r.products import ProductSettings, write_products
-from swimm3r.products.elevation import gradients, hill_shade
+from swimm3r.products.elevation import _medians, gradients, hill_shade
 from swimm3r.products.grid import Grid, Window, chosen_gsd, grid_of
 from swimm3r.products.preview import decimals_of
 from swimm3r.products.record import ProductsRecord, read_record
@@ -245,3 +245,10 @@ def test_a_map_without_any_height_is_refused_and_leaves_nothing(seabed: Seabed, 
     with pytest.raises(InputError, match="no cell of the map"):
         write_products(seabed.folder, tmp_path / "out", replace(MAPS, **settings), silent)
     assert not (tmp_path / "out").exists()
+
+
+def test_cells_that_many_views_show_are_kept_however_many_are_asked_for():
+    views = np.array([[60, 30]], np.uint16)
+    heights, weights = np.zeros((32, 1, 2)), np.ones((32, 1, 2), np.float32)
+    height, _, _ = _medians(heights, weights, views, 40)
+    assert np.isfinite(height).tolist() == [[True, False]]
