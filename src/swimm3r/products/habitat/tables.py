@@ -142,22 +142,23 @@ def write_profiles(heights: Lattice, lines: Sequence[Line], files: list[str]) ->
         z = sampled(heights, points)
         std = sampled(heights, points, "elevation_std")
         on_map = points * place.grid_scale + place.origin[:2]
-        for at, (east, north), height, deviation in zip(distance, on_map, z, std, strict=True):
+        for at, (east, north), height, noise in zip(distance, on_map, z, std, strict=True):
             profiles.append(
-                [line.name, *(f"{value:.6g}" for value in (at,)), *_place(east, north), _f(height), _f(deviation)]
+                [line.name, *(f"{value:.6g}" for value in (at,)), *_place(east, north), _f(height), _f(noise)]
             )
         known = ~np.isnan(z)
         steps = known[1:] & known[:-1]
-        if not steps.any():
+        straight = np.diff(distance)[steps]
+        s, length = place.scale_std, float(straight.sum())
+        if not length:  # outside, or both ends are one point
             outside.append(line.name)
             continue
-        straight = np.diff(distance)[steps]
         over = float(np.hypot(straight, np.diff(z)[steps]).sum())
-        s, length = place.scale_std, float(straight.sum())
-        noise, relief = _median(std), float(np.ptp(z[known]))
+        relief = float(np.ptp(z[known]))
+        deviation = relief_std(relief, place, _median(std))
         table.append([
             line.name, _f(steps.mean()), _f(length), _f(None if s is None else s * length), _f(over),
-            _f(None if s is None else s * over), _f(over / length), _f(relief), _f(_relief_std(relief, s, noise)),
+            _f(None if s is None else s * over), _f(over / length), _f(relief), _f(deviation),
             _f(heights.spacing),
         ])  # fmt: skip
     head = ["name", f"distance_{u}", "easting", "northing", f"height_{u}", f"height_std_{u}"]
@@ -273,7 +274,7 @@ def _row(name: str, at: tuple[float, float], found: Figures, heights: Lattice, n
     stds = {
         "planar_area": None if s is None else 2 * s * found.planar_area,
         "surface_area": None if s is None else 2 * s * found.surface_area,
-        "relief": _relief_std(found.relief, s, noise),
+        "relief": relief_std(found.relief, heights.place, noise),
     }
     row = [name, *_place(*at)]
     for figure, value in asdict(found).items():
@@ -282,11 +283,14 @@ def _row(name: str, at: tuple[float, float], found: Figures, heights: Lattice, n
     return [*row, _f(heights.spacing)]
 
 
-def _relief_std(relief: float, scale_std: float | None, noise: float | None) -> float | None:
-    """Of the difference of two heights: by the scale, and by the noise of both."""
-    if noise is None:
+def relief_std(relief: float, place: Georeference, noise: float | None) -> float | None:
+    """The standard deviation of a difference of two heights, by the scale and by the noise of both.
+
+    None where either is not known.
+    """
+    if noise is None or (place.scale is not None and place.scale_std is None):
         return None
-    return math.hypot((scale_std or 0.0) * relief, math.sqrt(2) * noise)
+    return math.hypot((place.scale_std or 0.0) * relief, math.sqrt(2) * noise)
 
 
 def _median(values: np.ndarray) -> float | None:
