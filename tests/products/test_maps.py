@@ -138,6 +138,26 @@ def test_holes_stay_holes(seabed: Seabed, tmp_path: Path):
     assert (told["unit"], "elevation.tif" in told["files"]) == ("m", True)
 
 
+def test_maps_made_anew_name_what_is_of_an_earlier_time_and_no_record_outlives_its_maps(
+    seabed: Seabed, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+):
+    out, coarse = tmp_path / "products", ProductSettings(mesh=False, cloud=False, gsd=0.04)
+    first = write_products(seabed.folder, out, coarse, silent)
+    replace(first, files=(*first.files, "mesh.glb")).save(out)
+    (out / "mesh.glb").touch()
+    assert any("mesh.glb" in note for note in write_products(seabed.folder, out, coarse, silent).notes)
+
+    def interrupted(*_: object) -> list[str]:
+        raise KeyboardInterrupt
+
+    monkeypatch.setattr("swimm3r.products.write.write_solids", interrupted)
+    with pytest.raises(KeyboardInterrupt):
+        write_products(seabed.folder, out, replace(coarse, gsd=0.05), silent)
+    with rasterio.open(out / "elevation.tif") as file:
+        assert file.res == pytest.approx((0.05, 0.05))
+    assert read_record(out) is None  # that of cells of 4 cm would place and size the new ones wrongly
+
+
 def test_without_georeference_up_is_from_the_scene_and_the_unit_stays_unknown(seabed: Seabed, tmp_path: Path):
     run = tmp_path / "run"
     shutil.copytree(seabed.folder, run)
