@@ -132,6 +132,24 @@ def test_deviations_are_those_of_a_simulation(seabed: Seabed):
         assert std == pytest.approx(np.std(values), rel=0.1)
 
 
+def test_figures_against_the_level_are_as_uncertain_as_up(seabed: Seabed):
+    survey = seabed.survey()
+    exact = replace(survey, place=replace(survey.place, scale_std=0.0, rotation_std_deg=(0.5, 2.0, 9.0)))
+    guessed = replace(survey, place=replace(survey.place, scale_std=0.0, rotation_std_deg=None))
+    measured = replace(guessed, rec=replace(guessed.rec, up=(0.0, 0.0, 1.0)))
+    north = [PickedPoint("p", np.array([0.0, y, 0.2 * y]), np.zeros((3, 3)), True, 3) for y in (0.0, 10.0)]
+    corners = [[0.0, 0, 0], [2.0, 0, 2], [2.0, 1, 2], [0.0, 1, 0]]  # sloping by 45 degrees to the west
+    outline = [PickedPoint("p", np.array(xyz), np.zeros((3, 3)), True, 3) for xyz in corners]
+    rise, level = (by_name(lengths(north, exact), name).std for name in ("difference", "horizontal"))
+    assert rise == pytest.approx(10 * np.radians(0.5), rel=1e-3)
+    assert level == pytest.approx(2 * np.radians(0.5), rel=1e-3)
+    assert by_name(areas(outline, exact, None), "area from above").std == pytest.approx(2 * np.radians(2.0), rel=1e-3)
+    assert by_name(areas(outline, exact, None), "area in the plane").std == pytest.approx(0, abs=1e-6)
+    assert by_name(lengths(north, measured), "difference").std == pytest.approx(10 * np.radians(1.0), rel=1e-3)
+    for told in (*lengths(north, guessed), *areas(outline, guessed, None)):
+        assert (told.std is None) == told.name.startswith(("horizontal", "difference", "area from above"))
+
+
 def test_depth_maps_that_disagree_make_a_point_uncertain(seabed: Seabed, tmp_path: Path):
     survey = seabed.survey()
     noisy = DepthMaps(tmp_path)
