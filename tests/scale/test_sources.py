@@ -93,6 +93,33 @@ def test_a_scale_bar_that_cannot_be_used_is_named(survey, words, said):
     assert said in str(told.value)
 
 
+@pytest.mark.parametrize(
+    ("given", "found"),
+    [
+        ("left/0001.png", 0), ("right/0001.png", 2), ("left/0001", 0), ("right/0001.jpg", 2), ("0003", 3),
+        ("0003.jpg", 3), ("0002.png", 1), ("dive/prepare/0003.png", 3),
+    ],
+)  # fmt: skip
+def test_short_names_of_frames_tell_one(given, found):
+    names = FrameNames(("left/0001.png", "left/0002.png", "right/0001.png", "0003.png"), 10, 10, ["right/0004.png"])
+    assert names.sighting("here", given, 1, 1).frame == found
+
+
+@pytest.mark.parametrize(
+    ("given", "said"),
+    [
+        ("0001.png", "several are called so: left/0001.png, right/0001.png"), ("0001", "several"),
+        ("right/0002.png", "has no pose"), ("right/0002", "has no pose"), ("0004", "has no pose"),
+        ("middle/0003.png", "does not have"), (".", "does not have"),
+    ],
+)  # fmt: skip
+def test_a_frame_of_another_camera_is_never_taken_for_one_without_a_pose(given, said):
+    placed = ("left/0001.png", "right/0001.png", "left/0002.png", "left/0003.png")
+    names = FrameNames(placed, 10, 10, ["right/0002.png", "0004.png"])
+    with pytest.raises(InputError, match=said):
+        names.sighting("here", given, 1, 1)
+
+
 def test_exchanged_ends_in_one_frame_are_named(survey):
     words = list(words_of(survey, BAR, LENGTH))
     words[2], words[3] = words[3], words[2]
