@@ -197,6 +197,9 @@ def test_the_altimeter_is_one_source_beside_the_navigation(survey, tmp_path):
     by_name = {each.estimate.source: each.estimate for each in found.sources}
     assert by_name["altimeter"].scale == pytest.approx(SCALE, rel=0.02)
     assert by_name["altimeter"].std > 0.09
+    lost = np.where(np.arange(len(survey.position)) % 3, survey.position[:, 2], -1.0)  # no echo, as sounders write it
+    found = solved(survey, nav=write_csv(tmp_path / "lost.csv", survey, altitude=lost), altimeter=True)
+    assert found.sources[1].estimate.scale == pytest.approx(SCALE, rel=0.02)
     with pytest.raises(InputError, match="no altitude"):
         solved(survey, nav=write_csv(tmp_path / "bare.csv", survey), altimeter=True)
 
