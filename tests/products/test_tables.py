@@ -15,9 +15,10 @@ from tests.products.conftest import ORIGIN, SCALE_STD, Seabed, height
 from swimm3r.errors import InputError
 from swimm3r.products import ProductSettings, write_products
 from swimm3r.products.geotiff import crs_of
+from swimm3r.products.grid import Grid, Window
 from swimm3r.products.habitat.areas import along, read_areas
 from swimm3r.products.habitat.figures import NAMES, figures
-from swimm3r.products.habitat.tables import relief_std
+from swimm3r.products.habitat.tables import Lattice, relief_std
 from swimm3r.products.record import ProductsRecord
 from swimm3r.progress import silent
 from swimm3r.scene.georeference import Georeference
@@ -116,6 +117,18 @@ def test_a_profile_follows_the_ground(made: tuple[Path, ProductsRecord]):
     assert float(line["length_m"]) == pytest.approx(np.hypot(0.8, 1.0), rel=1e-5)
     assert float(line["length_std_m"]) == pytest.approx(SCALE_STD * float(line["length_m"]), rel=1e-3)
     assert 1 < float(line["chain_rugosity"]) < 1.2
+
+
+def test_heights_are_read_piece_by_piece(made: tuple[Path, ProductsRecord], monkeypatch: pytest.MonkeyPatch):
+    record = made[1]
+    grid = Grid(record.west - ORIGIN[0], record.north - ORIGIN[1], record.gsd, record.rows, record.columns)
+    heights = Lattice(grid, PLACE, 2, made[0])
+    window = Window(-3, 5, 80, 60)
+    whole = heights.heights(window)
+    monkeypatch.setattr("swimm3r.products.habitat.tables._PIECE", 1000)
+    np.testing.assert_array_equal(heights.heights(window), whole)
+    assert np.isfinite(whole).mean() > 0.5
+    assert heights.heights(Window(0, 0, 0, 7)).shape == (0, 7)
 
 
 def test_the_relief_is_as_uncertain_as_the_scale():

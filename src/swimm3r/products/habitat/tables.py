@@ -28,6 +28,7 @@ from swimm3r.scene.georeference import Georeference
 _CELL_M, _RESOLUTION_M = 1.0, 0.01  # of runs with scale, as coral reefs are surveyed
 _CELLS = 256  # of the map, along a square of a run without scale
 _COARSE = 5  # cells of the map between two heights, at least: the width of the windows that depth is matched by
+_PIECE = 8_000_000  # cells of the map that are in memory at a time
 _KNOWN = 0.5  # share of the cells of a mean
 
 
@@ -52,10 +53,18 @@ class Lattice:
 
     def heights(self, window: Window, name: str = "elevation") -> Float[np.ndarray, "h w"]:
         """Means over blocks, NaN where less than half of one is known."""
-        b = self.block
-        cells = Window(window.row * b, window.column * b, window.rows * b, window.columns * b)
+        step = max(1, _PIECE // max(1, window.columns * self.block**2))
+        pieces = [np.zeros((0, window.columns))]
         with StoredMap(self.folder / f"{name}.tif") as stored:
-            values = stored.read(cells).astype(np.float64)
+            for row in range(0, window.rows, step):
+                part = Window(window.row + row, window.column, min(step, window.rows - row), window.columns)
+                pieces.append(self._means(stored, part))
+        return np.concatenate(pieces)
+
+    def _means(self, stored: StoredMap, window: Window) -> Float[np.ndarray, "h w"]:
+        b = self.block
+        values = stored.read(Window(window.row * b, window.column * b, window.rows * b, window.columns * b))
+        values = values.astype(np.float64)
         blocks = values.reshape(window.rows, b, window.columns, b).transpose(0, 2, 1, 3).reshape(*_size(window), b * b)
         known = ~np.isnan(blocks)
         count = known.sum(-1)
