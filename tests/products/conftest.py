@@ -127,7 +127,7 @@ def write_survey(folder: Path) -> None:
     rows = tuple(tuple(float(value) for value in row) for row in R.T)
     save_georeference(
         folder,
-        Georeference(32631, ORIGIN, rows, SCALE, SCALE_STD, ("a scale bar",), (0.05, 0.05, 0.1)),  # pyright: ignore[reportArgumentType]
+        Georeference(32631, ORIGIN, rows, SCALE, SCALE_STD, ("a scale bar",), (0.05, 0.05, 0.1), (0.0, 0.0, 0.0)),  # pyright: ignore[reportArgumentType]
     )
     (folder / "settings.yaml").write_text("frames:\n  fps: 5.0\n")
     (folder / "versions.json").write_text('{"swimm3r": "0.2.0"}')

@@ -7,12 +7,12 @@ import cv2
 import numpy as np
 import pytest
 import torch
-from tests.products.conftest import Seabed
+from tests.products.conftest import Seabed, height, poses, write_survey
 
 from swimm3r.appearance import FrameColors
 from swimm3r.io.images import write_rgb
-from swimm3r.products.frame_colors import low_band
-from swimm3r.products.survey import Survey
+from swimm3r.products.frame_colors import Points, low_band, sight
+from swimm3r.products.survey import Survey, open_survey
 
 
 @pytest.mark.parametrize(("width", "height"), [(1280, 720), (333, 501), (96, 72)])
@@ -42,3 +42,22 @@ def test_frames_with_the_water_have_one_exposure_where_restored_ones_have(seabed
         expected, found, stored = (survey.image("filmed", i) for survey in (steady, evened, as_stored))
         assert np.abs(found - expected).max() < 1.5 / 255
         assert (np.abs(stored / expected - float(gains[i])) < 0.05).mean() > 0.95
+
+
+def test_a_frame_from_near_by_ranks_above_one_from_afar_whatever_else_is_asked_for(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+):
+    placed = poses()
+    placed[6] = placed[5]
+    placed[6, 2, 3] += 1.0  # twice as high over the same place
+    monkeypatch.setattr("tests.products.conftest.poses", lambda: placed)
+    write_survey(tmp_path / "run")
+    survey = open_survey(tmp_path / "run")
+    x, y = (axis.ravel() for axis in np.meshgrid(np.linspace(0.2, 0.8, 13), np.linspace(0.1, 0.6, 11)))
+    points = Points(np.stack([x, y, height(x, y)], -1), size=0.01)
+    near, far = (sight(survey, points, i).rank for i in (5, 6))
+    middle = np.hypot(x - 0.5, y - 0.35) < 0.1
+    assert (near[middle] > 1.6 * far[middle]).all()
+    assert (far[middle] > 0).all()
+    part = np.flatnonzero(x < 0.4)
+    np.testing.assert_allclose(sight(survey, points.select(part), 5).rank, near[part], rtol=1e-6)

@@ -15,7 +15,7 @@ from swimm3r.cli.main import main
 from swimm3r.errors import DeviceError, InputError, UsageError
 from swimm3r.evaluate.images import psnr
 from swimm3r.products import ProductSettings, write_products
-from swimm3r.products.elevation import gradients, hill_shade
+from swimm3r.products.elevation import _medians, gradients, hill_shade
 from swimm3r.products.grid import Grid, Window, chosen_gsd, grid_of
 from swimm3r.products.preview import decimals_of
 from swimm3r.products.record import ProductsRecord, read_record
@@ -138,6 +138,26 @@ def test_holes_stay_holes(seabed: Seabed, tmp_path: Path):
     assert (told["unit"], "elevation.tif" in told["files"]) == ("m", True)
 
 
+def test_maps_made_anew_name_what_is_of_an_earlier_time_and_no_record_outlives_its_maps(
+    seabed: Seabed, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+):
+    out, coarse = tmp_path / "products", ProductSettings(mesh=False, cloud=False, gsd=0.04)
+    first = write_products(seabed.folder, out, coarse, silent)
+    replace(first, files=(*first.files, "mesh.glb")).save(out)
+    (out / "mesh.glb").touch()
+    assert any("mesh.glb" in note for note in write_products(seabed.folder, out, coarse, silent).notes)
+
+    def interrupted(*_: object) -> list[str]:
+        raise KeyboardInterrupt
+
+    monkeypatch.setattr("swimm3r.products.write.write_solids", interrupted)
+    with pytest.raises(KeyboardInterrupt):
+        write_products(seabed.folder, out, replace(coarse, gsd=0.05), silent)
+    with rasterio.open(out / "elevation.tif") as file:
+        assert file.res == pytest.approx((0.05, 0.05))
+    assert read_record(out) is None  # that of cells of 4 cm would place and size the new ones wrongly
+
+
 def test_without_georeference_up_is_from_the_scene_and_the_unit_stays_unknown(seabed: Seabed, tmp_path: Path):
     run = tmp_path / "run"
     shutil.copytree(seabed.folder, run)
@@ -245,3 +265,10 @@ def test_a_map_without_any_height_is_refused_and_leaves_nothing(seabed: Seabed, 
     with pytest.raises(InputError, match="no cell of the map"):
         write_products(seabed.folder, tmp_path / "out", replace(MAPS, **settings), silent)
     assert not (tmp_path / "out").exists()
+
+
+def test_cells_that_many_views_show_are_kept_however_many_are_asked_for():
+    views = np.array([[60, 30]], np.uint16)
+    heights, weights = np.zeros((32, 1, 2)), np.ones((32, 1, 2), np.float32)
+    height, _, _ = _medians(heights, weights, views, 40)
+    assert np.isfinite(height).tolist() == [[True, False]]

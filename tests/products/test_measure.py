@@ -107,6 +107,14 @@ def test_the_volume_of_the_mound_is_that_of_its_integral(run: Path):
     assert net.std == pytest.approx(3 * SCALE_STD * net.value, rel=0.1)
 
 
+def test_an_outline_that_reaches_beyond_the_map_is_measured_in_part(run: Path):
+    outline = [on_map(x, y, 0.0) for x, y in ((0.5, 0.2), (20.5, 0.2), (20.5, 0.6), (0.5, 0.6))]  # the map ends at 1.6
+    found = measure_run(run, area=outline, volume=outline)
+    for name in ("area of the surface", "volume net"):
+        (share,) = re.findall(r"(\d+)% of", by_name(found, name).name)
+        assert 3 <= int(share) <= 6
+
+
 def test_deviations_are_those_of_a_simulation(seabed: Seabed):
     survey = seabed.survey()
     exact = replace(survey, place=replace(survey.place, scale_std=0.0))
@@ -122,6 +130,24 @@ def test_deviations_are_those_of_a_simulation(seabed: Seabed):
         std = by_name(told(points(corners), exact), name).std
         values = [by_name(told(points(xyz), exact), name).value for xyz in drawn[:400]]
         assert std == pytest.approx(np.std(values), rel=0.1)
+
+
+def test_figures_against_the_level_are_as_uncertain_as_up(seabed: Seabed):
+    survey = seabed.survey()
+    exact = replace(survey, place=replace(survey.place, scale_std=0.0, rotation_std_deg=(0.5, 2.0, 9.0)))
+    guessed = replace(survey, place=replace(survey.place, scale_std=0.0, rotation_std_deg=None))
+    measured = replace(guessed, rec=replace(guessed.rec, up=(0.0, 0.0, 1.0)))
+    north = [PickedPoint("p", np.array([0.0, y, 0.2 * y]), np.zeros((3, 3)), True, 3) for y in (0.0, 10.0)]
+    corners = [[0.0, 0, 0], [2.0, 0, 2], [2.0, 1, 2], [0.0, 1, 0]]  # sloping by 45 degrees to the west
+    outline = [PickedPoint("p", np.array(xyz), np.zeros((3, 3)), True, 3) for xyz in corners]
+    rise, level = (by_name(lengths(north, exact), name).std for name in ("difference", "horizontal"))
+    assert rise == pytest.approx(10 * np.radians(0.5), rel=1e-3)
+    assert level == pytest.approx(2 * np.radians(0.5), rel=1e-3)
+    assert by_name(areas(outline, exact, None), "area from above").std == pytest.approx(2 * np.radians(2.0), rel=1e-3)
+    assert by_name(areas(outline, exact, None), "area in the plane").std == pytest.approx(0, abs=1e-6)
+    assert by_name(lengths(north, measured), "difference").std == pytest.approx(10 * np.radians(1.0), rel=1e-3)
+    for told in (*lengths(north, guessed), *areas(outline, guessed, None)):
+        assert (told.std is None) == told.name.startswith(("horizontal", "difference", "area from above"))
 
 
 def test_depth_maps_that_disagree_make_a_point_uncertain(seabed: Seabed, tmp_path: Path):

@@ -56,6 +56,8 @@ def test_the_laz_cloud_keeps_map_coordinates_in_double_precision(made: tuple[Pat
     )
     np.testing.assert_allclose(z, height(x, y), atol=2e-4)  # 32-bit floats at five million metres step by 0.5
     assert cloud.header.parse_crs().to_epsg() == 32631
+    assert (np.asarray(cloud.return_number) == 1).all()
+    assert cloud.header.number_of_points_by_return[0] == len(x)
     clear = color(x, y)
     assert np.abs(np.stack([cloud.red, cloud.green, cloud.blue], -1) / 65535 - clear).mean() < 0.01
 

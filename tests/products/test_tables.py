@@ -15,8 +15,10 @@ from tests.products.conftest import ORIGIN, SCALE_STD, Seabed, height
 from swimm3r.errors import InputError
 from swimm3r.products import ProductSettings, write_products
 from swimm3r.products.geotiff import crs_of
+from swimm3r.products.grid import Grid, Window
 from swimm3r.products.habitat.areas import along, read_areas
 from swimm3r.products.habitat.figures import NAMES, figures
+from swimm3r.products.habitat.tables import Lattice, relief_std
 from swimm3r.products.record import ProductsRecord
 from swimm3r.progress import silent
 from swimm3r.scene.georeference import Georeference
@@ -58,7 +60,10 @@ def made(seabed: Seabed, tmp_path_factory: pytest.TempPathFactory) -> tuple[Path
         feature("Polygon", [on_map(SQUARE), on_map(CUT)], "reef"),
         feature("Polygon", [on_map([[90, 90], [91, 90], [91, 91]])], "far"),
         feature("LineString", on_map(LINE), "transect"),
+        feature("MultiPolygon", [], "empty"),
+        feature("LineString", on_map([LINE[0], LINE[0]]), "clicked twice"),
     )
+    areas.write_text("\ufeff" + areas.read_text(), encoding="utf-8")  # as editors of Windows write it
     settings = ProductSettings(areas=areas, habitat_resolution=0.02, habitat_cell=0.4, mesh=False, cloud=False)
     return folder / "products", write_products(seabed.folder, folder / "products", settings, silent)
 
@@ -99,19 +104,38 @@ def test_the_part_of_a_polygon_off_the_map_counts_as_not_covered(seabed: Seabed,
 
 
 def test_what_lies_outside_is_named(made: tuple[Path, ProductsRecord]):
-    assert any("far" in note for note in made[1].notes)
+    assert any("far, clicked twice of" in note for note in made[1].notes)
     assert "far" in str(made[1])
 
 
 def test_a_profile_follows_the_ground(made: tuple[Path, ProductsRecord]):
     rows = table(made[0] / "profiles.csv")
-    assert {row["name"] for row in rows} == {"transect"}
+    assert {row["name"] for row in rows} == {"transect", "clicked twice"}
     x, y, z = (np.array([float(row[key]) for row in rows]) for key in ("easting", "northing", "height_m"))
     np.testing.assert_allclose(z, height(x - ORIGIN[0], y - ORIGIN[1]) + ORIGIN[2], atol=4e-3)
     (line,) = table(made[0] / "lines.csv")
     assert float(line["length_m"]) == pytest.approx(np.hypot(0.8, 1.0), rel=1e-5)
     assert float(line["length_std_m"]) == pytest.approx(SCALE_STD * float(line["length_m"]), rel=1e-3)
     assert 1 < float(line["chain_rugosity"]) < 1.2
+
+
+def test_heights_are_read_piece_by_piece(made: tuple[Path, ProductsRecord], monkeypatch: pytest.MonkeyPatch):
+    record = made[1]
+    grid = Grid(record.west - ORIGIN[0], record.north - ORIGIN[1], record.gsd, record.rows, record.columns)
+    heights = Lattice(grid, PLACE, 2, made[0])
+    window = Window(-3, 5, 80, 60)
+    whole = heights.heights(window)
+    monkeypatch.setattr("swimm3r.products.habitat.tables._PIECE", 1000)
+    np.testing.assert_array_equal(heights.heights(window), whole)
+    assert np.isfinite(whole).mean() > 0.5
+    assert heights.heights(Window(0, 0, 0, 7)).shape == (0, 7)
+
+
+def test_the_relief_is_as_uncertain_as_the_scale():
+    known, unknown = (replace(PLACE, scale_std=std) for std in (0.02, None))
+    assert relief_std(2.0, known, 0.01) == pytest.approx(np.hypot(0.04, np.sqrt(2) * 0.01))
+    assert relief_std(2.0, unknown, 0.01) is None
+    assert relief_std(2.0, LOCAL, 0.01) == pytest.approx(np.sqrt(2) * 0.01)  # in units of the run, which are exact
 
 
 def test_squares_are_a_table_and_a_map_of_the_same_figures(made: tuple[Path, ProductsRecord]):
@@ -176,6 +200,8 @@ def test_names_are_distinct_and_parts_of_a_line_are_numbered(tmp_path: Path):
         ('{"type": "Polygon", "coordinates": [[[0, 0], [1, 0], [NaN, 1]]]}', "finite"),
         ('{"type": "Polygon", "coordinates": [[[0, 0], [1, 0], [1]]]}', "inhomogeneous|finite"),
         ('{"type": "Polygon", "coordinates": null}', "no coordinates"),
+        ('{"type": "MultiPolygon", "coordinates": null}', "no coordinates"),
+        ('{"type": "MultiPolygon", "coordinates": []}', "no polygon"),
         ('{"type": "Polygon", "coordinates": [5]}', "coordinates"),
         ('{"type": "Polygon", "coordinates": [[1, 2, 3]]}', "coordinates"),
         ('{"type": "Polygon", "coordinates": [[[0,0],[1,0],[1,1]]], "crs": {"properties": {"name": "x"}}}', "no EPSG"),

@@ -313,6 +313,36 @@ def test_georeferenced_centers_lie_where_the_projection_puts_the_navigation(surv
     np.testing.assert_allclose(place.to_crs(survey.rec.cameras.centers.numpy()), true, atol=2e-3)
 
 
+@pytest.mark.parametrize(
+    ("epsg", "latitude", "longitude"), [(27700, 50.3, -4.1), (31466, 54.2, 7.9), (26717, 25.1, -80.3)]
+)
+def test_positions_of_satellites_land_where_a_national_system_has_them(epsg, latitude, longitude, tmp_path):
+    """The systems of Great Britain, Germany and Florida are of other datums than WGS 84: 45 to 187 m away."""
+    pyproj = pytest.importorskip("pyproj")
+    survey = survey_along(lines())
+    place = Origin(latitude, longitude, -8.0)
+    stated = geodetic_from_local(survey.position, place)
+    columns = {"latitude": stated[:, 0], "longitude": stated[:, 1], "depth": -stated[:, 2]}
+    file = write_csv(tmp_path / "nav.csv", survey, **columns)
+    found = estimate_scale(survey.rec, survey.frames, ScaleSettings(nav=file, crs=f"EPSG:{epsg}")).georeference
+    true = pyproj.Transformer.from_crs(4326, epsg, always_xy=True).transform(stated[:, 1], stated[:, 0])
+    np.testing.assert_allclose(found.to_crs(survey.rec.cameras.centers.numpy())[:, :2], np.stack(true, -1), atol=0.02)
+    assert found.geodetic is not None
+    np.testing.assert_allclose(found.geodetic, (latitude, longitude), atol=3e-4)
+
+
+def test_eastings_of_a_national_system_land_where_they_are_on_the_globe(tmp_path):
+    pyproj = pytest.importorskip("pyproj")
+    survey = survey_along(lines())
+    east, north = 250_000.0 + survey.position[:, 0], 50_000.0 + survey.position[:, 1]
+    columns = {"latitude": None, "longitude": None, "heading": None, "pitch": None, "roll": None}
+    file = write_csv(tmp_path / "nav.csv", survey, **columns, easting=east, northing=north)
+    settings = ScaleSettings(nav=file, nav_crs="EPSG:27700", crs="EPSG:32630")
+    found = estimate_scale(survey.rec, survey.frames, settings).georeference
+    true = pyproj.Transformer.from_crs(27700, 32630, always_xy=True).transform(east, north)
+    np.testing.assert_allclose(found.to_crs(survey.rec.cameras.centers.numpy())[:, :2], np.stack(true, -1), atol=0.02)
+
+
 def test_without_pyproj_the_message_names_the_extra_and_local_metres_need_none(survey, tmp_path, monkeypatch):
     monkeypatch.setitem(__import__("sys").modules, "pyproj", None)
     file = write_csv(tmp_path / "nav.csv", survey)

@@ -16,7 +16,9 @@ from tests.splat.cut import in_blocks
 from swimm3r.cameras import project, ray_depth_from_z, unproject
 from swimm3r.cli.main import main
 from swimm3r.errors import InputError, UsageError
+from swimm3r.export.settings import FORMATS
 from swimm3r.io import ply
+from swimm3r.io.cameras_json import read_cameras
 from swimm3r.io.images import write_rgb
 from swimm3r.io.medium_json import read_fits
 from swimm3r.medium import AttenuationCurve, Medium, MediumFit, add_water
@@ -241,6 +243,24 @@ def test_every_file_with_lengths_changes_and_no_other(run):
     }  # fmt: skip
     kept = {name for name in before if name.startswith("prepare/")} | {"sfm/matches.npz", "sfm/white_balance.json"}
     assert not changed & kept
+
+
+def test_cameras_of_rendered_views_stay_those_of_their_depth(run):
+    views = run / "renders" / "views"
+    load_reconstruction(run / "sfm").cameras.save(views / "rendered_cameras.json")
+    before = read_cameras(views / "rendered_cameras.json")
+    rescale_run(run, 0.4, {})
+    after = read_cameras(views / "rendered_cameras.json")
+    np.testing.assert_allclose(after.cam2world[:, :3, 3], 0.4 * before.cam2world[:, :3, 3], rtol=1e-6)
+    assert after.units == "metres"
+
+
+@pytest.mark.parametrize("settings", FORMATS.values(), ids=FORMATS)
+def test_exports_of_every_format_are_listed_as_of_the_old_unit(run, settings):
+    path = run / settings.file_name
+    path.parent.mkdir(parents=True, exist_ok=True)
+    path.touch()
+    assert settings.file_name in rescale_run(run, 0.4, {})
 
 
 @pytest.mark.parametrize("after", [0, 1, 7])

@@ -12,7 +12,7 @@ from swimm3r.errors import InputError, UsageError
 from swimm3r.scale.control import fit_control
 from swimm3r.scale.estimate import estimate_scale
 from swimm3r.scale.marked_points import FrameNames, read_distances, read_points, read_scale_bars
-from swimm3r.scale.navigation.geodesy import geodetic_from_local
+from swimm3r.scale.navigation.geodesy import geodetic_from_local, utm_zone
 from swimm3r.scale.settings import ScaleSettings
 from swimm3r.scale.solve import ScaleEstimate, solve_scale
 from swimm3r.scale.sources import ground_below, placed_points, scale_sources
@@ -93,6 +93,33 @@ def test_a_scale_bar_that_cannot_be_used_is_named(survey, words, said):
     assert said in str(told.value)
 
 
+@pytest.mark.parametrize(
+    ("given", "found"),
+    [
+        ("left/0001.png", 0), ("right/0001.png", 2), ("left/0001", 0), ("right/0001.jpg", 2), ("0003", 3),
+        ("0003.jpg", 3), ("0002.png", 1), ("dive/prepare/0003.png", 3),
+    ],
+)  # fmt: skip
+def test_short_names_of_frames_tell_one(given, found):
+    names = FrameNames(("left/0001.png", "left/0002.png", "right/0001.png", "0003.png"), 10, 10, ["right/0004.png"])
+    assert names.sighting("here", given, 1, 1).frame == found
+
+
+@pytest.mark.parametrize(
+    ("given", "said"),
+    [
+        ("0001.png", "several are called so: left/0001.png, right/0001.png"), ("0001", "several"),
+        ("right/0002.png", "has no pose"), ("right/0002", "has no pose"), ("0004", "has no pose"),
+        ("middle/0003.png", "does not have"), (".", "does not have"),
+    ],
+)  # fmt: skip
+def test_a_frame_of_another_camera_is_never_taken_for_one_without_a_pose(given, said):
+    placed = ("left/0001.png", "right/0001.png", "left/0002.png", "left/0003.png")
+    names = FrameNames(placed, 10, 10, ["right/0002.png", "0004.png"])
+    with pytest.raises(InputError, match=said):
+        names.sighting("here", given, 1, 1)
+
+
 def test_exchanged_ends_in_one_frame_are_named(survey):
     words = list(words_of(survey, BAR, LENGTH))
     words[2], words[3] = words[3], words[2]
@@ -170,6 +197,9 @@ def test_the_altimeter_is_one_source_beside_the_navigation(survey, tmp_path):
     by_name = {each.estimate.source: each.estimate for each in found.sources}
     assert by_name["altimeter"].scale == pytest.approx(SCALE, rel=0.02)
     assert by_name["altimeter"].std > 0.09
+    lost = np.where(np.arange(len(survey.position)) % 3, survey.position[:, 2], -1.0)  # no echo, as sounders write it
+    found = solved(survey, nav=write_csv(tmp_path / "lost.csv", survey, altitude=lost), altimeter=True)
+    assert found.sources[1].estimate.scale == pytest.approx(SCALE, rel=0.02)
     with pytest.raises(InputError, match="no altitude"):
         solved(survey, nav=write_csv(tmp_path / "bare.csv", survey), altimeter=True)
 
@@ -289,6 +319,24 @@ def test_ground_control_places_the_run_and_check_points_tell_its_accuracy(survey
         survey.in_run(GROUND["a"])
     )
     assert np.linalg.norm(local) == pytest.approx(np.linalg.norm(GROUND["e"] - GROUND["a"]), rel=1e-4)
+
+
+def test_eastings_of_control_points_beside_latitudes_need_their_system(survey, marks, tmp_path):
+    pyproj = pytest.importorskip("pyproj")
+    epsg = utm_zone(ORIGIN.latitude, ORIGIN.longitude)
+    latitude, longitude, height = geodetic_from_local(np.stack(list(GROUND.values())), ORIGIN).T
+    east, north = pyproj.Transformer.from_crs(4326, epsg, always_xy=True).transform(longitude, latitude)
+    stated = np.stack([east, north, height], -1)
+    rows = [f"{name},{e!r},{n!r},{h!r}" for name, (e, n, h) in zip(GROUND, stated.tolist(), strict=True)]
+    control = tmp_path / "c.csv"
+    control.write_text("name,easting,northing,height\n" + "\n".join(rows) + "\n")
+    settings = ScaleSettings(points=marks, control=control, nav=write_csv(tmp_path / "nav.csv", survey))
+    with pytest.raises(UsageError, match="different reference systems") as told:
+        estimate_scale(survey.rec, survey.frames, settings)
+    assert "--nav-crs" in told.value.hint
+    found = estimate_scale(survey.rec, survey.frames, replace(settings, nav_crs=f"EPSG:{epsg}")).georeference
+    ground = found.to_crs(survey.in_run(np.stack(list(GROUND.values()))))
+    np.testing.assert_allclose(ground, stated, atol=2e-3)
 
 
 def fitted(survey: Survey, marks: Path, control: Path):

@@ -17,7 +17,7 @@ from swimm3r.sim3 import Sim3
 from swimm3r.visits.alignment.depth import with_depth
 from swimm3r.visits.alignment.joint import Joint, Link, map_jointly, moved, shape_similarity
 from swimm3r.visits.alignment.matches import VisitMatches
-from swimm3r.visits.alignment.misfit import Bends
+from swimm3r.visits.alignment.misfit import Bends, Fit, fits_between
 from swimm3r.visits.alignment.place import place_visits
 from swimm3r.visits.alignment.similarity import Alignment, Known, align
 from swimm3r.visits.settings import VisitSettings
@@ -282,3 +282,21 @@ def test_ground_beside_shared_points_has_their_offset():
     level, up = Bends(xy, off).at(xy)
     np.testing.assert_allclose(up[:10], 0.09, rtol=1e-6)
     np.testing.assert_allclose(level[50:], Bends(xy, off).spread[0], rtol=1e-6)
+
+
+@pytest.mark.parametrize(
+    ("onto", "earlier", "later", "between"),
+    [
+        ({"b": "a"}, "a", "b", "b"),
+        ({"b": "a", "c": "a"}, "b", "c", "bc"),
+        ({"b": "a", "c": "b"}, "b", "c", "c"),
+        ({"b": "a", "c": "a", "d": "b"}, "c", "d", "cdb"),
+        ({"b": "a", "c": "b", "d": "a"}, "c", "d", "cbd"),
+    ],
+)
+def test_two_visits_are_as_uncertain_as_all_steps_from_one_to_the_other(onto, earlier, later, between):
+    none = np.zeros(0, bool)
+    alignment = Alignment("images", Sim3(1.0, np.eye(3), np.zeros(3)), np.zeros((7, 7)), np.zeros(3), none, none, 0)
+    fits = {name: Fit(to, alignment, ord(name), 0, None, 0.0, 0.0, None) for name, to in onto.items()}
+    found = fits_between(earlier, later, {"a": None, **fits})
+    assert [chr(fit.check_points) for fit in found] == list(between)

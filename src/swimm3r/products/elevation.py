@@ -108,9 +108,9 @@ def _medians(heights, weights, views, min_views):
     away = np.empty(layers)
     for row in range(rows):
         for column in range(columns):
-            n = min(layers, views[row, column])
-            if n < max(min_views, 1):
+            if views[row, column] < max(min_views, 1):
                 continue
+            n = min(layers, views[row, column])
             values, shares = heights[:n, row, column], weights[:n, row, column]
             middle[row, column] = _weighted_median(values, shares)
             confidence[row, column] = shares.mean()

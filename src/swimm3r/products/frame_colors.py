@@ -4,8 +4,9 @@
 
 in two bands (Burt & Adelson 1983): low is the frame blurred, and changes from frame to frame over a wide margin, so
 that no step in brightness is left; the detail comes from the best frame, so that nothing is doubled. The rank s of a
-frame at a point is high from straight above, from near by, and in the middle of the frame. A frame whose depth map
-shows something nearer does not see the point; one without depth there counts only where no other frame does.
+frame at a point is high from straight above, with small pixels on the ground, and in the middle of the frame. A frame
+whose depth map shows something nearer does not see the point; one without depth there counts only where no other frame
+does.
 """
 
 import math
@@ -25,6 +26,10 @@ _UNCONFIRMED = 0.25  # rank of a frame that has no depth at a point: 4^32 times 
 _WIDE, _NARROW = 2, 32  # powers of the rank in the two bands
 _BLUR = 0.03  # of the long side, standard deviation of the low band
 _BLURRED = 8.0  # the same in pixels of the low band: between them, reading it linearly errs by 2e-4
+_NEARNESS = (
+    0.5,
+    2.0,
+)  # bounds of the usual pixel on the ground by that of a frame: what it has no depth at may be a fish
 _TAPER = 0.15  # of the short side: within it of the border, the rank falls to 0
 _REACH = 0.3  # of the ground that a frame's depth map shows, beyond it, where the frame may show more
 _LEAST_FACING = 0.05  # cosine between ray and normal below which a frame sees a surface too obliquely
@@ -115,16 +120,16 @@ def sight(survey: Survey, points: Points, i: int) -> Sight:
     inside = (depth > 0) & (pixels >= 0).all(1) & (pixels <= np.array([camera.width - 1, camera.height - 1])).all(1)
     inside &= facing > _LEAST_FACING
     (kept,) = np.nonzero(inside)
+    focal = float(torch.sqrt(camera.K[0, 0, 0] * camera.K[0, 1, 1]))
     rank = np.zeros(len(depth), np.float32)
     if len(kept):
         nearest = np.rint(pixels[kept]).astype(np.int64)
         border = np.minimum(pixels[kept], np.array([camera.width, camera.height]) - 1 - pixels[kept]).min(1)
         taper = np.clip((border + 0.5) / (_TAPER * min(camera.width, camera.height)), 0, 1)
-        value = facing[kept] * np.median(distance[kept]) / distance[kept] * taper
+        value = facing[kept] * np.clip(survey.footprint * focal / distance[kept], *_NEARNESS) * taper
         value *= _confirmed(survey, i, nearest, depth[kept])
         value *= survey.usable(i)[nearest[:, 1], nearest[:, 0]]
         rank[kept] = value
-    focal = float(torch.sqrt(camera.K[0, 0, 0] * camera.K[0, 1, 1]))
     pixel = float(np.median(depth[kept])) / focal if len(kept) else 0.0
     return Sight(pixels[:, 0].astype(np.float32), pixels[:, 1].astype(np.float32), rank, pixel)
 

@@ -1,8 +1,10 @@
 """Distances, areas and volumes between picked points, each with the standard deviation that its points and scale cause.
 
-    var f = sum_i g_i^T C_i g_i + (p s f)^2
+    var f = sum_i g_i^T C_i g_i + (p s f)^2 + sum_k (t_k df/dk)^2
 
 with the gradient g_i by point i, the relative deviation s of the scale, and p = 1, 2, 3 for lengths, areas and volumes.
+t_k is the deviation of up about the local axes east and north, by which figures against the level change: where up is
+that of the scene, its ground may slope, and their deviation is not known.
 
 Volumes are those between the elevation map and the plane through the points of an outline; the heights of its cells add
 cell^2 std sqrt(n) to their deviation.
@@ -14,25 +16,27 @@ from itertools import pairwise
 from pathlib import Path
 
 import numpy as np
-from jaxtyping import Float
+from jaxtyping import Bool, Float
+from scipy.spatial.transform import Rotation
 
 from swimm3r.errors import InputError, UsageError
 from swimm3r.io.files.cache_key import cache_key
 from swimm3r.products.grid import Grid
 from swimm3r.products.habitat.areas import Area
 from swimm3r.products.habitat.figures import figures
-from swimm3r.products.habitat.tables import Lattice, squares_inside
+from swimm3r.products.habitat.tables import Lattice, lies_on_map, squares_inside
 from swimm3r.products.picked_points import PickedPoint, picked
 from swimm3r.products.record import FOLDER, read_record
 from swimm3r.products.survey import Survey, open_survey
 from swimm3r.rounding import rounded
 
-_STEP = 1e-4  # of the points' extent, of numeric gradients
+_STEP = 1e-4  # of the points' extent, of numeric gradients; of a turn in radians
+_GRAVITY_STD_DEG = 1.0  # of up as a camera measured it
 
 
 @dataclass(frozen=True)
 class Measurement:
-    """One figure. `std` is None where the scale's, or that of a point, is not known."""
+    """One figure. `std` is None where the scale's, or that of a point or of a level, is not known."""
 
     name: str
     value: float
@@ -81,8 +85,8 @@ def lengths(points: Sequence[PickedPoint], survey: Survey) -> list[Measurement]:
     if len(points) > 2:
         found.append(_measured("whole length", points, _length, survey, unit, 1))
     ends = [points[0], points[-1]]
-    found.append(_measured("horizontal distance", ends, lambda p: float(np.hypot(*(p[1] - p[0])[:2])), survey, unit, 1))
-    found.append(_measured("difference in height", ends, lambda p: float(p[1, 2] - p[0, 2]), survey, unit, 1))
+    found.append(_measured("horizontal distance", ends, _level_distance, survey, unit, 1, by_level=True))
+    found.append(_measured("difference in height", ends, _rise, survey, unit, 1, by_level=True))
     return found
 
 
@@ -92,17 +96,19 @@ def areas(points: Sequence[PickedPoint], survey: Survey, heights: Lattice | None
     closed = [*points, points[0]]
     found = [
         _measured("area in the plane of the outline", points, _area, survey, unit, 2),
-        _measured("area from above", points, _planar_area, survey, unit, 2),
+        _measured("area from above", points, _planar_area, survey, unit, 2, by_level=True),
         _measured("perimeter", closed[:-1], _perimeter, survey, survey.place.unit, 1),
     ]
     if heights is not None:
-        window, own = squares_inside(heights, _outline(points))
+        outline = _outline(points)
+        window, own = squares_inside(heights, outline)
         surface = figures(heights.heights(window), heights.spacing, own) if own.any() else None
         if surface is not None:
-            planar = found[1]
+            planar = _measured("", points, _planar_area, survey, unit, 2)
             ratio = surface.rugosity
             std = None if planar.std is None else planar.std * ratio
-            covered = f"{surface.coverage:.0%} of it measured, heights every {heights.spacing:.3g} {survey.place.unit}"
+            share = _measured_share(heights, outline, surface.coverage * own.sum(), own)
+            covered = f"{share:.0%} of it measured, heights every {heights.spacing:.3g} {survey.place.unit}"
             found.append(Measurement(f"area of the surface ({covered})", planar.value * ratio, std, unit))
     return found
 
@@ -112,7 +118,8 @@ def volumes(points: Sequence[PickedPoint], survey: Survey, heights: Lattice) -> 
 
     Raises InputError where no height inside was measured.
     """
-    window, own = squares_inside(heights, _outline(points))
+    outline = _outline(points)
+    window, own = squares_inside(heights, outline)
     cells = _cell_heights(heights.heights(window)) if own.any() else np.full(own.shape, np.nan)
     known = own & ~np.isnan(cells)
     if not known.any():
@@ -136,7 +143,8 @@ def volumes(points: Sequence[PickedPoint], survey: Survey, heights: Lattice) -> 
     def net(p: np.ndarray) -> float:
         return float((z - _plane_at(p, x, y)).sum() * d**2)
 
-    unit, covered = f"{survey.place.unit}³", f"{known.sum() / own.sum():.0%} of the outline measured"
+    share = _measured_share(heights, outline, float(known.sum()), own)
+    unit, covered = f"{survey.place.unit}³", f"{share:.0%} of the outline measured"
     kinds = (("above", part(1)), ("below", part(-1)), ("net", net))
     return [
         _measured(f"volume {name} ({covered})", points, volume, survey, unit, 3, by_cells) for name, volume in kinds
@@ -155,8 +163,13 @@ def _measured(
     unit: str,
     power: int,
     further: float = 0.0,
+    *,
+    by_level: bool = False,
 ) -> Measurement:
-    """The value of a function of points, with the deviation that points and scale cause, and a further one."""
+    """The value of a function of points, with the deviation that points and scale cause, and a further one.
+
+    `by_level`: the value is against the level, and changes where up does.
+    """
     xyz = np.stack([point.xyz for point in points])
     value = function(xyz)
     step = max(_STEP * float(np.ptp(xyz, axis=0).max()), 1e-9)
@@ -172,7 +185,35 @@ def _measured(
     metric, scale_std = survey.place.scale is not None, survey.place.scale_std
     known = all(point.known for point in points) and not (metric and scale_std is None)
     variance += (power * (scale_std or 0.0) * value) ** 2
+    if by_level:
+        tilt = _tilt_std(survey)
+        known = known and tilt is not None
+        variance += 0.0 if tilt is None else float(((tilt * _by_turn(xyz, function)) ** 2).sum())
     return Measurement(name, value, float(np.sqrt(variance)) if known else None, unit)
+
+
+def _tilt_std(survey: Survey) -> Float[np.ndarray, "2"] | None:
+    """Standard deviations of up about local east and north, radians; None where up is that of the scene."""
+    if survey.place.rotation_std_deg is not None:
+        return np.radians(survey.place.rotation_std_deg[:2])
+    return None if survey.rec.up is None else np.radians([_GRAVITY_STD_DEG] * 2)
+
+
+def _by_turn(p: Float[np.ndarray, "n 3"], function: Callable[[np.ndarray], float]) -> Float[np.ndarray, "2"]:
+    """Derivatives of a function of points by their turn about local east and north."""
+    middle, found = p.mean(0), []
+    for axis in np.eye(3)[:2]:
+        ends = [function(middle + Rotation.from_rotvec(side * _STEP * axis).apply(p - middle)) for side in (1, -1)]
+        found.append((ends[0] - ends[1]) / (2 * _STEP))
+    return np.array(found)
+
+
+def _level_distance(p: Float[np.ndarray, "2 3"]) -> float:
+    return float(np.hypot(*(p[1] - p[0])[:2]))
+
+
+def _rise(p: Float[np.ndarray, "2 3"]) -> float:
+    return float(p[1, 2] - p[0, 2])
 
 
 def _length(p: Float[np.ndarray, "n 3"]) -> float:
@@ -206,6 +247,13 @@ def _plane_at(p: Float[np.ndarray, "n 3"], x: np.ndarray, y: np.ndarray) -> np.n
 def _cell_heights(values: Float[np.ndarray, "h w"]) -> Float[np.ndarray, "h1 w1"]:
     """Heights in the middle of the squares between four."""
     return (values[:-1, :-1] + values[:-1, 1:] + values[1:, :-1] + values[1:, 1:]) / 4
+
+
+def _measured_share(heights: Lattice, outline: Area, squares: float, own: Bool[np.ndarray, "h w"]) -> float:
+    """Share of an outline that so many measured squares make up, by the squares inside of it that are on the map."""
+    if lies_on_map(heights, outline):
+        return squares / float(own.sum())
+    return min(1.0, squares * heights.spacing**2 / outline.exact_area)
 
 
 def _outline(points: Sequence[PickedPoint]) -> Area:

@@ -1,6 +1,7 @@
 """Small images of the maps, for the report and for a first look: PNG, with a color bar where colors are numbers."""
 
 import math
+from collections.abc import Collection
 from pathlib import Path
 
 import cv2
@@ -22,10 +23,11 @@ _BAR = 0.02  # width of the color bar by the long side of the image
 _MARKS = 5
 
 
-def write_previews(folder: Path, unit: str) -> None:
-    """Write the previews of the maps in a folder."""
+def write_previews(folder: Path, unit: str, made: Collection[str]) -> None:
+    """Write the previews of the maps in a folder that were `made` now, and drop those of others."""
     for name in ("orthophoto", "orthophoto_filmed"):
-        if (folder / f"{name}.tif").is_file():
+        (folder / f"preview_{name}.png").unlink(missing_ok=True)
+        if f"{name}.tif" in made:
             with StoredMap(folder / f"{name}.tif") as stored:
                 rgba = stored.overview(_LONG_SIDE)
             _write(folder, name, _on_paper(rgba[:3].transpose(1, 2, 0), rgba[3] > 127))

@@ -22,7 +22,7 @@ from swimm3r.products.habitat.areas import Area, Line, read_areas
 from swimm3r.products.habitat.tables import Lattice, lattice, write_areas, write_profiles, write_squares
 from swimm3r.products.packages import require_packages
 from swimm3r.products.preview import write_previews
-from swimm3r.products.record import FOLDER, HabitatRecord, ProductsRecord, summary_section
+from swimm3r.products.record import FOLDER, RECORD, HabitatRecord, ProductsRecord, read_record, summary_section
 from swimm3r.products.settings import ProductSettings
 from swimm3r.products.solids.write import write_solids
 from swimm3r.products.survey import Colors, Survey, open_survey
@@ -45,16 +45,27 @@ def write_products(
     shapes = None if settings.areas is None else read_areas(settings.areas, survey.place)  # before the work
     grid = grid_of(survey, settings.gsd)
     with output_folder(out or run / FOLDER) as folder, watched(progress) as told:
+        before = _made_before(folder)
         totals = _write_maps(survey, grid, folder, settings, told)
         heights = lattice(folder, grid, survey.place, settings)
         notes, habitat = _write_habitat(heights, settings, shapes, totals.files)
         notes += write_solids(survey, grid.gsd, folder, settings, totals.files, told)
+        left = [name for name in before if name not in totals.files and (folder / name).is_file()]
+        notes += [f"of an earlier swimm3r products, and not made again: {', '.join(left)}"] if left else []
         record = _record(survey, grid, totals, notes, habitat)
-        write_previews(folder, record.unit)
+        write_previews(folder, record.unit, totals.files)
         record.save(folder)
     if out is None:
         _add_to_summary(run)
     return record
+
+
+def _made_before(folder: Path) -> tuple[str, ...]:
+    """The files that the record in a folder lists; none where there is no record that can be read."""
+    with suppress(InputError):
+        record = read_record(folder)
+        return () if record is None else record.files
+    return ()
 
 
 def _add_to_summary(run: Path) -> None:
@@ -103,6 +114,7 @@ def _write_maps(survey: Survey, grid: Grid, folder: Path, settings: ProductSetti
                 f" {settings.min_views} depth maps",
                 hint="without --gsd and --min-views",
             )
+        (folder / RECORD).unlink(missing_ok=True)  # of maps that are replaced from here on, one by one
         about = {"TIFFTAG_SOFTWARE": f"Swimm3R {version('swimm3r')}"}
         totals.files += [map.finish(**about).name for map in maps.values()]
     return totals

@@ -42,22 +42,21 @@ class KnownDistance:
 
 
 class FrameNames:
-    """Registered frames by their names, with folder and suffix or without."""
+    """Registered frames by their names, with folder and suffix or without, where these tell one frame."""
 
     def __init__(self, names: Sequence[str], width: int, height: int, unregistered: Sequence[str] = ()) -> None:
         self.names, self.width, self.height = tuple(names), width, height
         self._index = {name: i for i, name in enumerate(names)}
-        for i, name in enumerate(names):
-            path = PurePosixPath(name)
-            for short in (path.name, path.stem, str(path.with_suffix(""))):
-                self._index.setdefault(short, i)
-        self._others = {short for name in unregistered for short in (name, PurePosixPath(name).stem)}
+        self._named: dict[str, list[str]] = defaultdict(list)  # frames by a name, with a pose or without
+        for name in dict.fromkeys((*names, *unregistered)):
+            for short in {name, *_shorter(name)}:
+                self._named[short].append(name)
 
     def sighting(self, where: str, frame: str, x: float, y: float) -> Sighting:
         """A point in a frame. Raises InputError, which says `where`, for a frame or pixel that is not there."""
-        key = frame if frame in self._index else PurePosixPath(frame).stem
-        if key not in self._index:
-            known = key in self._others or frame in self._others
+        name = self._frame(where, frame)
+        if name is None or name not in self._index:
+            known = name is not None
             raise InputError(
                 f"{where} names the frame {frame}, which " + ("has no pose" if known else "this run does not have"),
                 cause="it is a test frame, or could not be placed" if known else "a slip in the name",
@@ -70,7 +69,32 @@ class FrameNames:
                 cause="pixels of the original image, or x and y exchanged",
                 hint="pixels of the prepared frame, RUN/prepare",
             )
-        return Sighting(self._index[key], (x, y))
+        return Sighting(self._index[name], (x, y))
+
+    def _frame(self, where: str, frame: str) -> str | None:
+        """The whole name of a frame; None where the run has none. Raises InputError where several are called so."""
+        path = PurePosixPath(frame)
+        if frame in self._named.get(frame, ()):
+            return frame
+        for given in (frame, frame.removesuffix(path.suffix), path.stem):  # an original's suffix, a path to a frame
+            found = self._named.get(given, [])
+            if "/" in frame and given == path.stem:  # of another folder is another frame
+                found = [name for name in found if "/" not in name]
+            if len(found) > 1:
+                raise InputError(
+                    f"{where} names the frame {frame}, and several are called so: {', '.join(found[:4])}",
+                    cause="frames of several cameras or folders have one name",
+                    hint=f"the whole name, as {found[0]}",
+                )
+            if found:
+                return found[0]
+        return None
+
+
+def _shorter(name: str) -> tuple[str, str, str]:
+    """A name without its folder, without folder and suffix, and without its suffix."""
+    path = PurePosixPath(name)
+    return path.name, path.stem, str(path.with_suffix(""))
 
 
 def read_scale_bars(words: Sequence[str], frames: FrameNames) -> list[ScaleBar]:

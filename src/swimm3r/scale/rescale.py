@@ -44,7 +44,11 @@ _POSES = (
 )
 _TRAJECTORIES = ("sfm/trajectory.tum", "splat/trajectory.tum", "localization/poses.tum")
 _CLOUDS = ("points", "backdrop")
-_EXPORTS = ("products/products.json", "gaussians*", "*.splat", "*.spz", "*.glb", "transforms.json")
+_EXPORTS = (  # of other commands, where they are by default, and splats anywhere near
+    "products/products.json", "export/*", "localization/stream.*", "sfm/*.glb",
+    *(f"{room}{name}" for room in ("", "splat/") for name in ("gaussians*", "*.splat", "*.spz", "*.glb")),
+    "transforms.json",
+)  # fmt: skip
 
 Change = tuple[str, Callable[[Path, Path], None]]  # a file of the run, and the function from the old one to the new
 
@@ -101,7 +105,7 @@ def _changes(folder: Path, factor: float) -> list[Change]:
         return [path.relative_to(folder).as_posix() for path in sorted(folder.glob(pattern)) if path.is_file()]
 
     clouds = [name for stem in _CLOUDS for name in below(f"sfm/{stem}*.ply")]
-    cameras = [*there(_POSES), *below("renders/**/cameras.json")]
+    cameras = [*there(_POSES), *below("renders/**/rendered_cameras.json")]
     changes: list[Change] = [("sfm/sparse/points3D.bin", lambda old, new: _sparse(old.parent, new.parent, factor))]
     changes += [(name, lambda old, new: _poses(old, new, factor)) for name in cameras]
     changes += [(name, lambda old, new: _trajectory(old, new, factor)) for name in there(_TRAJECTORIES)]
@@ -248,5 +252,5 @@ def _moved(cam2world: torch.Tensor, factor: float) -> torch.Tensor:
 
 def _exports(folder: Path) -> tuple[str, ...]:
     """Files for other programs, which keep the unit they were written in."""
-    found = {path for pattern in _EXPORTS for place in (folder, folder / "splat") for path in place.glob(pattern)}
+    found = {path for pattern in _EXPORTS for path in folder.glob(pattern)}
     return tuple(sorted(path.relative_to(folder).as_posix() for path in found))

@@ -243,7 +243,8 @@ def _camera_height(rec: Reconstruction, settings: ScaleSettings, navigation: Nav
 def _altimeter(rec: Reconstruction, settings: ScaleSettings, navigation: NavigationFit) -> ScaleEstimate:
     altitude = navigation.matched.navigation.altitude
     heights = ground_below(rec, _vertical(rec, navigation))[navigation.matched.frame]
-    both = np.isfinite(heights) & (np.isfinite(altitude) if altitude is not None else False)
+    known = False if altitude is None else np.isfinite(altitude) & (altitude > 0)  # 0 or -1: no echo
+    both = np.isfinite(heights) & known
     if altitude is None or not both.any():
         if altitude is None:
             raise InputError(

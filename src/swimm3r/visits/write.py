@@ -16,7 +16,7 @@ from swimm3r.progress import Progress, watched
 from swimm3r.scene.reconstruction import Reconstruction
 from swimm3r.sim3 import Sim3
 from swimm3r.visits import color
-from swimm3r.visits.alignment.misfit import Fit, misfit_at
+from swimm3r.visits.alignment.misfit import Fit, fits_between, misfit_at
 from swimm3r.visits.alignment.place import Placed, place_visits
 from swimm3r.visits.change import Change, compare
 from swimm3r.visits.ground import Ground, common_grid, observe
@@ -106,7 +106,8 @@ def _write(
     factors = [color.neutral(visits[0].ground.color)]  # on linear colors, into the light of the first visit
     compared: list[_Compared] = []
     for k, (earlier, later) in enumerate(pairwise(visits), 1):
-        misfit = misfit_at(earlier.fit, later.fit, earlier.ground, grid, place)
+        fits = fits_between(earlier.name, later.name, {visit.name: visit.fit for visit in visits})
+        misfit = misfit_at(fits, earlier.ground, grid, place)
         change = compare(earlier.ground, later.ground, misfit, grid.gsd, factors[-1], settings)
         factors.append(factors[-1] * change.gains)
         names = earlier.name, later.name

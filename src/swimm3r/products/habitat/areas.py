@@ -61,7 +61,7 @@ def read_areas(path: Path, place: Georeference) -> tuple[tuple[Area, ...], tuple
     Raises InputError where the file holds none, or is of a reference system that the run cannot be related to.
     """
     with guard(path, _REMEDY):
-        document = json.loads(path.read_text(encoding="utf-8"))
+        document = json.loads(path.read_text(encoding="utf-8-sig"))
         try:
             shapes = list(_shapes(document))
             epsg = _declared(document)
@@ -95,7 +95,7 @@ def _shapes(document: Any) -> Iterator[tuple[str, str, list[list[Ring]]]]:
         properties = feature.get("properties") or {}
         name = properties.get("name") if isinstance(properties, dict) else None
         name = str(name if name is not None else feature.get("id", number))
-        if geometry is None:
+        if geometry is None or geometry.get("coordinates") == []:  # empty, which RFC 7946 has for null
             continue
         yield name, *_parts(geometry, name)
 
@@ -106,20 +106,24 @@ def _parts(geometry: dict[str, Any], name: str) -> tuple[str, list[list[Ring]]]:
         case "Polygon":
             return "polygon", [_rings(at, 3)]
         case "MultiPolygon":
-            return "polygon", [_rings(part, 3) for part in at or ()]
+            return "polygon", [_rings(part, 3) for part in _some(at)]
         case "LineString":
             return "line", [_rings([at], 2)]
         case "MultiLineString":
-            return "line", [_rings([part], 2) for part in at or ()]
+            return "line", [_rings([part], 2) for part in _some(at)]
         case other:
             raise ValueError(f"{name} is a {other}; polygons and lines were expected")
 
 
-def _rings(rings: Any, least: int) -> list[Ring]:
-    if not isinstance(rings, list) or not rings:
+def _some(parts: Any) -> list[Any]:
+    if not isinstance(parts, list) or not parts:
         raise ValueError("a polygon or a line has no coordinates")
+    return parts
+
+
+def _rings(rings: Any, least: int) -> list[Ring]:
     found = []
-    for ring in rings:
+    for ring in _some(rings):
         nodes = np.array([[float(value) for value in node[:2]] for node in ring], np.float64)
         if nodes.ndim != 2 or nodes.shape[1] != 2 or len(nodes) < least or not np.isfinite(nodes).all():
             raise ValueError(f"a ring of {len(ring)} points; at least {least} of two finite coordinates were expected")

@@ -28,6 +28,7 @@ from swimm3r.scene.georeference import Georeference
 _CELL_M, _RESOLUTION_M = 1.0, 0.01  # of runs with scale, as coral reefs are surveyed
 _CELLS = 256  # of the map, along a square of a run without scale
 _COARSE = 5  # cells of the map between two heights, at least: the width of the windows that depth is matched by
+_PIECE = 8_000_000  # cells of the map that are in memory at a time
 _KNOWN = 0.5  # share of the cells of a mean
 
 
@@ -52,10 +53,18 @@ class Lattice:
 
     def heights(self, window: Window, name: str = "elevation") -> Float[np.ndarray, "h w"]:
         """Means over blocks, NaN where less than half of one is known."""
-        b = self.block
-        cells = Window(window.row * b, window.column * b, window.rows * b, window.columns * b)
+        step = max(1, _PIECE // max(1, window.columns * self.block**2))
+        pieces = [np.zeros((0, window.columns))]
         with StoredMap(self.folder / f"{name}.tif") as stored:
-            values = stored.read(cells).astype(np.float64)
+            for row in range(0, window.rows, step):
+                part = Window(window.row + row, window.column, min(step, window.rows - row), window.columns)
+                pieces.append(self._means(stored, part))
+        return np.concatenate(pieces)
+
+    def _means(self, stored: StoredMap, window: Window) -> Float[np.ndarray, "h w"]:
+        b = self.block
+        values = stored.read(Window(window.row * b, window.column * b, window.rows * b, window.columns * b))
+        values = values.astype(np.float64)
         blocks = values.reshape(window.rows, b, window.columns, b).transpose(0, 2, 1, 3).reshape(*_size(window), b * b)
         known = ~np.isnan(blocks)
         count = known.sum(-1)
@@ -124,7 +133,7 @@ def write_areas(heights: Lattice, areas: Sequence[Area], files: list[str]) -> li
         if found is None:
             outside.append(area.name)
             continue
-        found = _of_exact_area(found, area.exact_area, whole=window == _around(heights, area))
+        found = _of_exact_area(found, area.exact_area, whole=lies_on_map(heights, area))
         noise = heights.heights(window, "elevation_std")
         middle = np.mean(area.bounds, axis=0) * heights.place.grid_scale + heights.place.origin[:2]
         table.append(_row(area.name, (float(middle[0]), float(middle[1])), found, heights, _median(noise)))
@@ -142,22 +151,23 @@ def write_profiles(heights: Lattice, lines: Sequence[Line], files: list[str]) ->
         z = sampled(heights, points)
         std = sampled(heights, points, "elevation_std")
         on_map = points * place.grid_scale + place.origin[:2]
-        for at, (east, north), height, deviation in zip(distance, on_map, z, std, strict=True):
+        for at, (east, north), height, noise in zip(distance, on_map, z, std, strict=True):
             profiles.append(
-                [line.name, *(f"{value:.6g}" for value in (at,)), *_place(east, north), _f(height), _f(deviation)]
+                [line.name, *(f"{value:.6g}" for value in (at,)), *_place(east, north), _f(height), _f(noise)]
             )
         known = ~np.isnan(z)
         steps = known[1:] & known[:-1]
-        if not steps.any():
+        straight = np.diff(distance)[steps]
+        s, length = place.scale_std, float(straight.sum())
+        if not length:  # outside, or both ends are one point
             outside.append(line.name)
             continue
-        straight = np.diff(distance)[steps]
         over = float(np.hypot(straight, np.diff(z)[steps]).sum())
-        s, length = place.scale_std, float(straight.sum())
-        noise, relief = _median(std), float(np.ptp(z[known]))
+        relief = float(np.ptp(z[known]))
+        deviation = relief_std(relief, place, _median(std))
         table.append([
             line.name, _f(steps.mean()), _f(length), _f(None if s is None else s * length), _f(over),
-            _f(None if s is None else s * over), _f(over / length), _f(relief), _f(_relief_std(relief, s, noise)),
+            _f(None if s is None else s * over), _f(over / length), _f(relief), _f(deviation),
             _f(heights.spacing),
         ])  # fmt: skip
     head = ["name", f"distance_{u}", "easting", "northing", f"height_{u}", f"height_std_{u}"]
@@ -231,6 +241,12 @@ def squares_inside(heights: Lattice, area: Area) -> tuple[Window, Bool[np.ndarra
     return window, np.asarray(burned, bool)
 
 
+def lies_on_map(heights: Lattice, area: Area) -> bool:
+    """Return whether all of a polygon does: squares beyond the map are in no window of it."""
+    around = _around(heights, area)
+    return _clipped(around, *heights.shape) == around
+
+
 def _around(heights: Lattice, area: Area) -> Window:
     """The heights around a polygon, also those beyond the map."""
     low, high = area.bounds
@@ -267,7 +283,7 @@ def _row(name: str, at: tuple[float, float], found: Figures, heights: Lattice, n
     stds = {
         "planar_area": None if s is None else 2 * s * found.planar_area,
         "surface_area": None if s is None else 2 * s * found.surface_area,
-        "relief": _relief_std(found.relief, s, noise),
+        "relief": relief_std(found.relief, heights.place, noise),
     }
     row = [name, *_place(*at)]
     for figure, value in asdict(found).items():
@@ -276,11 +292,14 @@ def _row(name: str, at: tuple[float, float], found: Figures, heights: Lattice, n
     return [*row, _f(heights.spacing)]
 
 
-def _relief_std(relief: float, scale_std: float | None, noise: float | None) -> float | None:
-    """Of the difference of two heights: by the scale, and by the noise of both."""
-    if noise is None:
+def relief_std(relief: float, place: Georeference, noise: float | None) -> float | None:
+    """The standard deviation of a difference of two heights, by the scale and by the noise of both.
+
+    None where either is not known.
+    """
+    if noise is None or (place.scale is not None and place.scale_std is None):
         return None
-    return math.hypot((scale_std or 0.0) * relief, math.sqrt(2) * noise)
+    return math.hypot((place.scale_std or 0.0) * relief, math.sqrt(2) * noise)
 
 
 def _median(values: np.ndarray) -> float | None:

@@ -90,6 +90,7 @@ def write_laz(path: Path, cloud: OrientedCloud, place: Georeference) -> None:
     colors = (np.clip(cloud.rgb, 0, 1) * 65535 + 0.5).astype(np.uint16)
     file.red, file.green, file.blue = colors.T
     file.classification = np.ones(len(on_map), np.uint8)  # processed, not classified
+    file.return_number = file.number_of_returns = np.ones(len(on_map), np.uint8)  # LAS counts from 1
     with atomic_path(path) as draft:
         file.write(str(draft))
 

@@ -17,6 +17,7 @@ from swimm3r.errors import UsageError
 
 _A, _F = 6_378_137.0, 1 / 298.257223563
 _E2 = _F * (2 - _F)
+_WGS84 = 4326  # EPSG code; the datum of a national system may lie 100 m and more from it
 
 
 @dataclass(frozen=True)
@@ -64,7 +65,10 @@ def utm_zone(latitude: float, longitude: float) -> int:
 
 
 def grid_at(epsg: int, origin: Origin) -> Grid:
-    """A projected reference system at a place. Raises UsageError where pyproj is missing or knows no such system."""
+    """A projected reference system at a place (WGS 84), its datum accounted for.
+
+    Raises UsageError where pyproj is missing or knows no such system.
+    """
     crs, transformer = _projection(epsg)
     easting, northing = transformer.transform(origin.longitude, origin.latitude)
     factors = _pyproj().Proj(crs).get_factors(origin.longitude, origin.latitude)
@@ -81,7 +85,7 @@ def grid_at(epsg: int, origin: Origin) -> Grid:
 
 
 def geodetic_from_projected(projected: Float[np.ndarray, "n 3"], epsg: int) -> Float[np.ndarray, "n 3"]:
-    """Latitudes, longitudes and heights of eastings, northings and heights."""
+    """Latitudes, longitudes (WGS 84) and heights of eastings, northings and heights."""
     _, transformer = _projection(epsg)
     longitude, latitude = transformer.transform(projected[:, 0], projected[:, 1], direction="INVERSE")
     return np.stack([latitude, longitude, projected[:, 2]], -1)
@@ -101,7 +105,7 @@ def _projection(epsg: int) -> tuple[Any, Any]:
             cause="a geographic system, as EPSG:4326, has degrees",
             hint="--crs auto for the UTM zone, or the projected system of the region",
         )
-    return crs, pyproj.Transformer.from_crs(crs.geodetic_crs, crs, always_xy=True)
+    return crs, pyproj.Transformer.from_crs(_WGS84, crs, always_xy=True)
 
 
 def _pyproj() -> Any:

@@ -48,16 +48,14 @@ def localized(navigation: Navigation, settings: ScaleSettings, place: Place | No
     navigation = _geodetic(navigation, settings)
     position = navigation.position
     if navigation.frame != "geodetic":
+        if place is not None and place.origin is not None:
+            raise _other_system()
         place = place or _unprojected(position, settings)
         local = position - np.array(place.base)
         return LocalNavigation(replace(navigation, position=local, frame="local"), place)
     place = place or _projected(Origin(*(float(v) for v in position.mean(0))), settings)
     if place.origin is None:
-        raise UsageError(
-            "control points and navigation are in different reference systems",
-            cause="one has latitude and longitude, the other eastings and northings of an unknown system",
-            hint="--nav-crs EPSG:n, the system of the eastings and northings",
-        )
+        raise _other_system()
     local = local_from_geodetic(position, place.origin)
     return LocalNavigation(replace(navigation, position=local, frame="local"), place)
 
@@ -87,3 +85,11 @@ def _unprojected(position: Float[np.ndarray, "n 3"], settings: ScaleSettings) ->
         )
     east, north, up = (float(v) for v in np.floor(position.mean(0)))
     return Place(None, (east, north, up), None)
+
+
+def _other_system() -> UsageError:
+    return UsageError(
+        "control points and navigation are in different reference systems",
+        cause="one has latitude and longitude, the other eastings and northings of an unknown system",
+        hint="--nav-crs EPSG:n, the system of the eastings and northings",
+    )

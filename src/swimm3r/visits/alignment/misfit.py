@@ -11,6 +11,7 @@ uncertainty grows away from the points that both visits share. With too few chec
 similarity takes their place.
 """
 
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any
 
@@ -100,11 +101,22 @@ def fit_of(
     return Fit(onto, alignment, len(check), merged, error, level, up, bends)
 
 
-def misfit_at(earlier: Fit | None, later: Fit | None, ground: Ground, grid: Grid, georeference: Georeference) -> Misfit:
-    """The misfit of two visits on the earlier one's ground; one that was not aligned with the other adds its own."""
-    fits = [fit for fit in (earlier, later) if fit is not None]
-    if later is not None and earlier is not None and later.onto != earlier.onto:
-        fits = [later]
+def fits_between(earlier: str, later: str, fits: Mapping[str, Fit | None]) -> list[Fit]:
+    """The fits that lead from one visit to another, by way of those that they were aligned with."""
+    chains: list[list[str]] = []
+    for name in (earlier, later):
+        chain: list[str] = []
+        at = name
+        while (fit := fits[at]) is not None:
+            chain.append(at)
+            at = fit.onto
+        chains.append(chain)
+    apart = [name for chain in chains for name in chain if not all(name in each for each in chains)]
+    return [fit for name in apart if (fit := fits[name]) is not None]
+
+
+def misfit_at(fits: Sequence[Fit], ground: Ground, grid: Grid, georeference: Georeference) -> Misfit:
+    """The misfit of two visits on the earlier one's ground, by the fits that lead from one to the other."""
     x, y = grid.centers(Window(0, 0, grid.rows, grid.columns))
     height = np.where(np.isnan(ground.height), np.nanmedian(ground.height), ground.height)
     step = max(1, min(grid.rows, grid.columns) // 64)  # bends and covariance are smooth
