@@ -23,6 +23,7 @@ from swimm3r.io import cameras_json, images
 from swimm3r.io.files.atomic import write_text
 from swimm3r.io.image_header import read_header
 from swimm3r.io.trajectory import write_tum
+from swimm3r.localization.lenses import has_several_lenses, lens_of_camera, unnamed_camera
 from swimm3r.localization.localizer import STAGES, Evidence, Localization, Localizer
 from swimm3r.localization.settings import LocalizationSettings
 from swimm3r.progress import Progress, silent
@@ -44,6 +45,7 @@ class Query:
     image: Float[Tensor, "h w 3"]
     mask: Bool[Tensor, "h w"] | None = None
     clip_time: float | None = None  # seconds of the map's clip, where the image is part of it
+    frame: str | None = None  # its name there
 
 
 @dataclass(frozen=True)
@@ -65,23 +67,29 @@ def localize_run(
     progress: Progress = silent,
     *,
     map_device: MapDevice = "auto",
+    camera: str | None = None,
 ) -> tuple[list[Answer], Path]:
     """Places images, by default the run's test frames, in the run's map; the record goes to `out`.
 
-    Poses are in the axes and unit of RUN/sfm.
+    Poses are in the axes and unit of RUN/sfm. `camera` is the one of the run's rig that took the images.
 
-    Raises InputError where the run has no map, RegistrationError where not one image could be placed.
+    Raises InputError where the run has no map, an image cannot be read or is of another shape than its lens, or a rig
+    has several lenses and `camera` is not given, UsageError where the rig has no such camera, RegistrationError where
+    not one image could be placed.
     """
-    camera = None if lens is None else cameras_of(cameras_json.read_cameras(lens))[0]
+    own = None if lens is None else cameras_of(cameras_json.read_cameras(lens))[0]
     for path in image_files:
         read_header(path)  # before minutes of matching
     open_run(folder, "splat")
     scene = load_map(folder / "splat" / "map.safetensors").to(devices.for_maps(map_device))
     frames = run_frames(folder)
     rec = load_reconstruction(folder / "sfm", frames)
+    own = own if camera is None else lens_of_camera(rec, frames, camera)
+    if image_files and own is None and has_several_lenses(rec, frames):
+        raise unnamed_camera()
     localizer = Localizer(scene, rec, rec.still(frames), settings, progress=progress)
     out = out or folder / "localization"
-    rectification = run_rectification(folder) if camera is None else None
+    rectification = run_rectification(folder) if own is None else None
     answers = []
     names = [path.name for path in image_files] or list(frames.test.names)
     if len(set(names)) < len(names):
@@ -97,8 +105,8 @@ def localize_run(
         else:
             f = frames.index(name)
             time = frames.frames[f].time
-            query = Query(name, time, frames.image(f), frames.mask(f), time)
-        found = answer(localizer, query, camera)
+            query = Query(name, time, frames.image(f), frames.mask(f), time, name)
+        found = answer(localizer, query, own)
         answers.append(_in_axes_of_sfm(found, localizer))
         if found.found is not None and found.found.evidence is not None:
             images.write_rgb(out / "matches" / f"{name}.png", match_image(found.found.evidence))
@@ -116,7 +124,7 @@ def localize_run(
 def answer(localizer: Localizer, query: Query, lens: Cameras | None = None) -> Answer:
     """The query's place, or the reason why none was found."""
     try:
-        found = localizer.locate(query.image, query.mask, lens, query.clip_time)
+        found = localizer.locate(query.image, query.mask, lens, query.clip_time, query.frame)
         return Answer(query.name, query.time, found)
     except RegistrationError as failure:
         return Answer(query.name, query.time, None, failure.what)

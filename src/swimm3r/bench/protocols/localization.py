@@ -163,7 +163,7 @@ def _answers(localizer: Localizer, sfm: FinishedSfm, folder: Path) -> list[Answe
     queries = []
     for frame in sfm.frames.test:
         f = sfm.frames.index(frame.name)
-        queries.append(Query(frame.name, frame.time, sfm.frames.image(f), sfm.frames.mask(f), frame.time))
+        queries.append(Query(frame.name, frame.time, sfm.frames.image(f), sfm.frames.mask(f), frame.time, frame.name))
     answer(localizer, queries[0])  # once more than needed: kernels are loaded, references described
     found = [answer(localizer, query) for query in queries]
     for place in found:

@@ -10,6 +10,7 @@ from swimm3r.io.files.array_file import read_npz
 from swimm3r.io.files.atomic import atomic_path
 from swimm3r.io.files.cache_key import cache_key, code_version, content_digest
 from swimm3r.io.files.damage import guard, remake
+from swimm3r.localization.lenses import has_several_lenses
 from swimm3r.localization.online.landmark_map import LandmarkMap, landmark_map
 from swimm3r.progress import Progress, silent
 from swimm3r.scene.reconstruction import Reconstruction
@@ -36,7 +37,12 @@ def landmarks_of_run(folder: Path, settings: FeatureSettings, progress: Progress
         with atomic_path(path) as draft:
             arrays = {name: getattr(found, name).numpy() for name in _ARRAYS}
             np.savez(draft, key=np.array(key), distance=np.array(found.distance), **arrays)
-    return replace(found, rectification=run_rectification(folder), rows_rectified=frames.rows_rectified)
+    return replace(
+        found,
+        rectification=run_rectification(folder),
+        several_lenses=has_several_lenses(rec, frames),
+        rows_rectified=frames.rows_rectified,
+    )
 
 
 def _read(path: Path, key: str, rec: Reconstruction) -> LandmarkMap | None:
