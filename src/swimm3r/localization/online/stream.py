@@ -87,6 +87,8 @@ def localize_stream(
         raise unnamed_camera()
     counts: Counter[str] = Counter()
     started, interrupted = perf_counter(), False
+    if not tum:  # one of an earlier stream would lie beside the record of this one
+        (out / "stream.tum").unlink(missing_ok=True)
     with ExitStack() as files:
         record = files.enter_context((out / "stream.jsonl").open("w", encoding="utf-8"))
         path = files.enter_context((out / "stream.tum").open("w", encoding="utf-8")) if tum else None
