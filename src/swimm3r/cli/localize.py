@@ -1,8 +1,9 @@
 """`swimm3r localize`: camera poses of images, or of a stream of images, in a run's map."""
 
 from collections.abc import Sequence
+from dataclasses import fields
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated
+from typing import TYPE_CHECKING, Annotated, Any
 
 from rich.table import Table
 from tyro.conf import Positional, arg
@@ -60,8 +61,12 @@ def localize(
                 cause="single images are placed one by one, those of a stream each from the last pose",
                 hint="one of the two",
             )
+        _refuse(_changed(settings), "of single images, and --stream is given")
+        if not source.follow:
+            _refuse([word for word in _changed(source) if word in ("--idle", "--latest")], "of --follow")
         _stream(run, stream, lens, camera, out or run / "localization", source, tracking, tum=tum)
         return
+    _refuse([*_changed(source), *_changed(tracking, "tracking."), *["--tum"] * tum], "of --stream")
     from swimm3r.io.files.outputs import output_folder
     from swimm3r.localization.batch import localize_run
     from swimm3r.localization.settings import with_checkpoint_of
@@ -74,6 +79,23 @@ def localize(
         answers, folder = localize_run(run, images, lens, out, settings, progress, map_device=map_device, camera=camera)
     outcome_console().print(_table(answers))
     print(f"Poses: {folder}")
+
+
+def _changed(given: Any, prefix: str = "") -> list[str]:
+    """The options of a record that are not as by default, as they are typed."""
+    default = type(given)()
+    names = [one.name for one in fields(given) if getattr(given, one.name) != getattr(default, one.name)]
+    return [f"--{prefix}{name.replace('_', '-')}" for name in names]
+
+
+def _refuse(options: Sequence[str], kind: str) -> None:
+    """Raises UsageError for options that would change nothing."""
+    if options:
+        raise UsageError(
+            f"{', '.join(options)}: only an option {kind}",
+            cause="single images, streams and followed folders are localized with options of their own",
+            hint="swimm3r localize --help-all, which lists them",
+        )
 
 
 def _table(answers: "Sequence[Answer]") -> Table:
