@@ -24,6 +24,7 @@ from swimm3r.errors import InputError, RegistrationError
 from swimm3r.evaluate import NotComputed
 from swimm3r.io.files.atomic import write_text
 from swimm3r.io.files.cache_key import cache_key, code_version
+from swimm3r.localization.lenses import has_several_lenses
 from swimm3r.pipeline.finished_sfm import FinishedSfm
 from swimm3r.progress import Progress, silent
 from swimm3r.scene.frames import Frames
@@ -60,8 +61,11 @@ def required(references: Path | None, scenes: Sequence[str]) -> None:
 def of_clip(sfm: FinishedSfm, folder: Path, progress: Progress = silent) -> GroundTruth | NotComputed:
     """The reference of a run's clip, by the run's own settings where COLMAP found its poses, else by the defaults.
 
-    NotComputed where frames cannot be placed, and where rows of training frames are rectified but not of test frames.
+    NotComputed where frames cannot be placed, where rows of training frames are rectified but not of test frames, and
+    where the cameras of a rig have different lenses, of which one alone would be held.
     """
+    if has_several_lenses(sfm.rec, sfm.frames):
+        return NotComputed("no reference: the cameras of the rig have different lenses, and one would be held for all")
     if sfm.frames.rows_rectified:
         return NotComputed("no reference: the camera turned within exposures; test frames are placed by their matches")
     settings = sfm.settings.sfm if isinstance(sfm.settings.sfm, ColmapSettings) else ColmapSettings()

@@ -1,5 +1,6 @@
 """Run folders as scenes and methods of a table: one scene per clip, one method per way its poses were found."""
 
+from collections import Counter
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
@@ -58,9 +59,7 @@ def clips_of(folders: Sequence[Path]) -> list[Clip]:
     prints: dict[str, str] = {}
     for folder in folders:
         sfm, run = open_finished_sfm(folder), open_run(folder, "sfm")
-        source = Path(run.input.path)
-        named = source.parent if source.name.lower() in IMAGES else source
-        name = named.stem if named.suffix and not named.is_dir() else named.name
+        name = clip_name(Path(run.input.path))
         if prints.setdefault(name, run.input.fingerprint) != run.input.fingerprint:
             raise InputError(
                 f"two clips have the name {name}",
@@ -70,6 +69,12 @@ def clips_of(folders: Sequence[Path]) -> list[Clip]:
         label = sfm_label(sfm.settings, sfm.rec.backend)
         found.setdefault(name, []).append(SfmRun(folder, name, label, run.stages["prepare"].key))
     return [Clip(name, _told_apart(runs)) for name, runs in found.items()]
+
+
+def clip_name(source: Path) -> str:
+    """The name of a video or of a folder of images; of one called `images` that of the folder around it."""
+    named = source.parent if source.name.lower() in IMAGES else source
+    return named.stem if named.suffix and not named.is_dir() else named.name
 
 
 def made_runs(
@@ -82,14 +87,21 @@ def made_runs(
     """Run folders as they are; of clips, new ones up to their structure from motion in OUT/runs.
 
     With `given_poses` a clip is a folder of images with their COLMAP model, whose poses are taken. Raises InputError
-    where it has none.
+    where it has none, or two clips have one name.
     """
-    runs = []
+    runs, clips = [], {given: clip_name(given.absolute()) for given in dict.fromkeys(inputs) if not is_run(given)}
+    twice = sorted(name for name, count in Counter(clips.values()).items() if count > 1)
+    if twice:
+        raise InputError(
+            f"two of the clips have one name: {', '.join(twice)}",
+            cause="their runs are made in folders of the clips' names",
+            hint="another name for one of them; or run folders of swimm3r sfm in their place",
+        )
     for given in inputs:
         if is_run(given):
             runs.append(given)
             continue
-        runs.append(out / "runs" / given.stem)
+        runs.append(out / "runs" / clips[given])
         source, chosen = _with_given_poses(given, settings) if given_poses else (given, settings)
         run_pipeline(source, runs[-1], chosen, redo=True, last_stage="sfm", progress=progress)
     return tuple(runs)

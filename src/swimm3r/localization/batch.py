@@ -96,7 +96,7 @@ def localize_run(
     scene = load_map(folder / "splat" / "map.safetensors").to(devices.for_maps(map_device))
     localizer = Localizer(scene, rec, rec.still(frames), settings, progress=progress)
     out = out or folder / "localization"
-    rectification = run_rectification(folder) if own is None else None
+    rectification = run_rectification(folder) if lens is None else None
     answers = []
     for i, name in enumerate(names):
         progress("localizing", i, len(names))

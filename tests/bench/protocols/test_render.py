@@ -8,6 +8,8 @@ from pathlib import Path
 import numpy as np
 import pytest
 import torch
+from tests.rig_scene import reconstruction as rig_reconstruction
+from tests.rig_scene import stereo
 
 from swimm3r.bench import map_scores, reference, tables
 from swimm3r.bench.cells import Result
@@ -18,7 +20,7 @@ from swimm3r.bench.runs import clips_of, made_runs
 from swimm3r.errors import InputError, UsageError
 from swimm3r.evaluate import NotComputed
 from swimm3r.io.images import read_rgb, write_rgb
-from swimm3r.pipeline.finished_sfm import open_finished_sfm
+from swimm3r.pipeline.finished_sfm import FinishedSfm, open_finished_sfm
 from swimm3r.pipeline.presets import RunSettings
 from swimm3r.pipeline.scores import held_out
 from swimm3r.sfm.plane_sweep.settings import PlaneSweepSettings
@@ -83,6 +85,31 @@ def test_clips_are_reconstructed_once_and_runs_are_taken_as_they_are(
     clip = tmp_path / "dive.mp4"
     assert made_runs([run, clip], tmp_path, RunSettings()) == (run, tmp_path / "runs" / "dive")
     assert made == [(clip, tmp_path / "runs" / "dive", "sfm")]
+
+
+def test_clips_in_folders_called_images_are_told_apart_and_two_of_one_name_are_refused(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+):
+    monkeypatch.setattr("swimm3r.bench.runs.run_pipeline", lambda *_, **__: None)
+    clips = [tmp_path / "reef" / "images", tmp_path / "wreck" / "images", tmp_path / "dive.1", tmp_path / "dive.2"]
+    for clip in clips:
+        clip.mkdir(parents=True)
+    made = made_runs(clips, tmp_path, RunSettings())
+    assert [run.name for run in made] == ["reef", "wreck", "dive.1", "dive.2"]
+    with pytest.raises(InputError, match="two of the clips have one name: reef"):
+        made_runs([*clips, tmp_path / "other" / "reef"], tmp_path, RunSettings())
+
+
+def test_a_rig_of_several_lenses_has_no_reference_of_one_lens(tmp_path: Path):
+    poses, frames = stereo(count=6)
+    rec = rig_reconstruction(poses, frames)
+    sides = torch.tensor([500.0, 650.0]).double().repeat(6)
+    K = rec.cameras.K.clone()
+    K[:, 0, 0] = K[:, 1, 1] = sides
+    rec = replace(rec, cameras=replace(rec.cameras, K=K))
+    found = reference.of_clip(FinishedSfm(tmp_path, frames, rec, RunSettings(), None, ""), tmp_path)
+    assert isinstance(found, NotComputed)
+    assert "different lenses" in found.reason
 
 
 def test_a_scene_with_a_model_lends_its_poses_where_asked(run: Path, tmp_path: Path):
