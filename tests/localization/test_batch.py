@@ -25,23 +25,26 @@ def found() -> Localization:
     return Localization(torch.eye(4).double(), "refined", (), 20, 3, 3, 0.5, evidence, dict.fromkeys(STAGES, 0.1))
 
 
+class Exact(Localizer):
+    """Places every image of 10 x 8 pixels."""
+
+    matcher: Any = SimpleNamespace(name="SIFT")
+
+    def __init__(self, *_: Any, **__: Any) -> None:
+        pass
+
+    def locate(self, image: torch.Tensor, *_: Any, **__: Any) -> Localization:
+        if image.shape[:2] != (8, 10):
+            raise InputError("the image is of another shape", cause="cropped", hint="its own lens")
+        return found()
+
+    def in_axes_of_sfm(self, cam2world: torch.Tensor) -> torch.Tensor:
+        return cam2world
+
+
 @pytest.fixture
 def run(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
-    """A run whose map places every image but those called lost.png."""
-
-    class Exact(Localizer):
-        matcher: Any = SimpleNamespace(name="SIFT")
-
-        def __init__(self, *_: Any, **__: Any) -> None:
-            pass
-
-        def locate(self, image: torch.Tensor, *_: Any, **__: Any) -> Localization:
-            if image.shape[:2] != (8, 10):
-                raise InputError("the image is of another shape", cause="cropped", hint="its own lens")
-            return found()
-
-        def in_axes_of_sfm(self, cam2world: torch.Tensor) -> torch.Tensor:
-            return cam2world
+    """A run whose map places every image of 10 x 8 pixels."""
 
     parts = {
         "open_run": None,
@@ -83,7 +86,7 @@ def test_an_image_of_another_shape_is_named(run: Path):
     with pytest.raises(InputError, match=r"wide\.png: the image is of another shape"):
         localize_run(run, [image(run / "a.png"), image(run / "wide.png", 20)])
     with pytest.raises(InputError, match="x: the image"):
-        answer(batch.Localizer(*[Any] * 2), Query("x", 0.0, torch.zeros(8, 11, 3)))
+        answer(Exact(), Query("x", 0.0, torch.zeros(8, 11, 3)))
 
 
 def test_two_images_of_one_name_are_refused_before_the_map_is_read(run: Path, monkeypatch: pytest.MonkeyPatch):

@@ -5,6 +5,7 @@ from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
 from types import SimpleNamespace
+from typing import Any
 
 import av
 import numpy as np
@@ -98,7 +99,7 @@ def test_a_folder_that_cannot_be_written_is_said_on_the_page(number: int, tmp_pa
     def save() -> str:
         raise OSError(number, "refused", str(tmp_path))
 
-    page = SimpleNamespace(_kept=SimpleNamespace(content=""))
+    page: Any = SimpleNamespace(_kept=SimpleNamespace(content=""))
     Panel._keep(page, save)
     assert "Not saved" in page._kept.content
     assert str(tmp_path) in page._kept.content
