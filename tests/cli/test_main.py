@@ -96,6 +96,38 @@ def test_ctrl_c_is_exit_130_and_says_that_nothing_is_lost(
     assert "resumes from here" in message
 
 
+def test_ctrl_c_of_a_command_that_starts_over_does_not_say_that_it_resumes(
+    capsys: pytest.CaptureFixture[str], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+):
+    def interrupted(*_: object, **__: object) -> None:
+        raise KeyboardInterrupt
+
+    monkeypatch.setattr("swimm3r.scene.run_folder.open_run", interrupted)
+    code, message = outcome(capsys, "localize", str(tmp_path), "--stream", str(tmp_path))
+    assert code == 130
+    assert "Interrupted." in message
+    assert "resumes" not in message
+
+
+@pytest.mark.parametrize(
+    ("words", "refused"),
+    [
+        ("--follow", "--follow"),
+        ("a.png --fps 2 --tum", "--fps, --tum"),
+        ("--tracking.keypoints 500", "--tracking.keypoints"),
+        ("--stream in --candidates 3", "--candidates"),
+        ("--stream in --idle 3 --latest", "--idle, --latest"),
+        ("--lens a.json --camera left", "both --lens and --camera"),
+    ],
+)
+def test_options_of_localize_that_would_change_nothing_are_exit_2(
+    words: str, refused: str, capsys: pytest.CaptureFixture[str], tmp_path: Path
+):
+    code, message = outcome(capsys, "localize", str(tmp_path), *words.split())
+    assert code == 2
+    assert refused in message
+
+
 @pytest.mark.parametrize(
     "error", [MemoryError(), RuntimeError("can't start new thread"), OSError(12, "Cannot allocate")]
 )

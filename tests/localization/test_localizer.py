@@ -119,7 +119,7 @@ def test_a_smaller_copy_of_a_image_is_placed_and_another_shape_needs_its_lens(pl
     half = torch.nn.functional.interpolate(image, (135, 180), mode="area")[0].permute(1, 2, 0).contiguous()
     degrees, _ = off(localizer.locate(half).cam2world, place.cameras.cam2world[2])
     assert degrees < 0.2
-    with pytest.raises(InputError, match="another lens"):
+    with pytest.raises(InputError, match="its lens is of images of 240 x 180"):
         localizer.locate(place.frames.image(2)[:, :200])
 
 

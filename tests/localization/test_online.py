@@ -1,13 +1,16 @@
 """A camera tracked over a plane that is exactly known."""
 
+import errno
 import json
 import math
+import shutil
 import threading
 import time
 from collections.abc import Iterator
 from dataclasses import replace
 from itertools import islice
 from pathlib import Path
+from types import SimpleNamespace
 
 import cv2
 import numpy as np
@@ -21,7 +24,10 @@ from swimm3r.cli.main import main
 from swimm3r.errors import InputError, RegistrationError, UsageError
 from swimm3r.geometry import rotation_angle
 from swimm3r.imaging.turned_rows import half_time_pixels
+from swimm3r.io import image_folder
+from swimm3r.io.image_folder import GrowingFolder
 from swimm3r.io.images import write_rgb
+from swimm3r.localization.online import landmark_file
 from swimm3r.localization.online.images import StreamImage, stream_images
 from swimm3r.localization.online.landmark_map import LandmarkMap, landmark_map
 from swimm3r.localization.online.stream import localize_stream
@@ -253,6 +259,83 @@ def test_of_waiting_images_only_the_latest_is_taken(tmp_path: Path):
     folder = written(tmp_path / "in", 3)
     found = list(stream_images(folder, StreamSettings(follow=True, idle=0.3, latest=True)))
     assert [one.name for one in found] == ["2.png"]
+
+
+def test_a_folder_ends_after_seconds_without_an_image_not_after_a_slow_one(tmp_path: Path):
+    folder = written(tmp_path / "in", 1)
+    found = []
+    for one in stream_images(folder, StreamSettings(follow=True, idle=0.4)):
+        found.append(one.name)
+        if len(found) == 1:
+            time.sleep(0.5)  # an image that takes longer to place than --idle
+            shutil.copy(folder / "0.png", folder / "1.png")
+    assert found == ["0.png", "1.png"]
+
+
+def test_an_image_that_is_removed_before_its_turn_is_lost_and_the_stream_goes_on(tmp_path: Path):
+    folder = written(tmp_path / "in", 3)
+    for settings in (StreamSettings(), StreamSettings(follow=True, idle=0.3)):
+        written(folder, 3)
+        stream = stream_images(folder, settings)
+        first = next(stream)
+        (folder / "1.png").unlink()
+        rest = list(stream)
+        assert [one.name for one in rest] == ["1.png", "2.png"]
+        assert first.pixels is not None
+        assert rest[0].pixels is None
+        assert rest[0].fault
+        assert rest[1].pixels is not None
+        assert rest[0].time == first.time
+
+
+def test_a_followed_folder_that_vanishes_is_said(tmp_path: Path):
+    folder = written(tmp_path / "in", 1)
+    stream = stream_images(folder, StreamSettings(follow=True))
+    next(stream)
+    shutil.rmtree(folder)
+    with pytest.raises(InputError, match="no longer there"):
+        next(stream)
+
+
+def test_looking_for_new_images_reads_the_list_and_no_more(tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
+    growing = GrowingFolder(tmp_path)
+    for name in ("b10.jpg", "b9.jpg", "b9_mask.png", ".hidden.jpg", "notes.txt"):
+        (tmp_path / name).touch()
+    assert [path.name for path in growing.new_images()] == ["b9.jpg", "b10.jpg"]
+    keyed: list[Path] = []
+    monkeypatch.setattr(image_folder, "natural_key", lambda path, _: keyed.append(path) or [path.name])
+    (tmp_path / "b11.jpg").touch()
+    (tmp_path / "b10_mask.png").touch()
+    assert [path.name for path in growing.new_images()] == ["b11.jpg"]
+    assert growing.new_images() == []
+    assert keyed == [tmp_path / "b11.jpg"]
+
+
+def test_a_source_without_images_leaves_the_record_of_an_earlier_stream(tracker: Tracker, tmp_path: Path):
+    (tmp_path / "in").mkdir()
+    for source in ("in", "none.mp4"):
+        with pytest.raises(InputError):
+            stream_images(tmp_path / source, StreamSettings())  # before the record is opened
+    out = written(tmp_path / "out", 1)
+    (out / "stream.tum").write_text("of an earlier stream")
+    localize_stream(tracker, stream_images(out, StreamSettings()), out)
+    assert not (out / "stream.tum").exists()
+
+
+def test_landmarks_of_a_run_that_cannot_be_written_to_are_made_with_a_warning(
+    mapped: LandmarkMap, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture
+):
+    def refused(*_: object, **__: object) -> None:
+        raise OSError(errno.EROFS, "Read-only file system")
+
+    parts = {"run_frames": SimpleNamespace(rows_rectified=False), "run_rectification": None, "content_digest": ""}
+    parts |= {"load_reconstruction": SimpleNamespace(still=lambda _: None), "landmark_map": mapped}
+    for name, value in (parts | {"has_several_lenses": False}).items():
+        monkeypatch.setattr(landmark_file, name, lambda *_, value=value: value)
+    monkeypatch.setattr(landmark_file.np, "savez", refused)
+    found = landmark_file.landmarks_of_run(tmp_path, FEATURES)
+    assert found.xyz is mapped.xyz
+    assert "Read-only file system" in caplog.text
 
 
 def test_a_bag_keeps_its_stamps_and_its_rate_is_thinned(tmp_path: Path):

@@ -8,10 +8,13 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 from tests.report.conftest import Asked, write_run
+from tests.rig_scene import reconstruction, stereo
 
 from swimm3r.prepare import load_frames
 from swimm3r.report import write_report
+from swimm3r.report.page import _plan
 from swimm3r.report.rig import rig_section
+from swimm3r.report.scene import pack_scene
 from swimm3r.scene.frames import Frame, Frames
 from swimm3r.scene.rig import PlacedCamera, RigFit, pose_of
 
@@ -88,3 +91,14 @@ def test_the_page_shows_the_rig(tmp_path: Path):
     assert "Cameras of the rig" in page
     assert "0.10247 \u00b1 0.00020" in page
     assert load_frames(run / "prepare").rig is None
+
+
+def test_the_path_leads_through_one_camera_and_not_from_one_to_the_other():
+    poses, clip = stereo(count=14)
+    rec = reconstruction(poses, clip)
+    scene, plan = pack_scene(rec, clip), _plan(rec, clip)
+    assert scene is not None
+    assert plan is not None
+    left = rec.cameras.centers[::2].numpy()
+    np.testing.assert_allclose(json.loads(scene.header)["path"], left, atol=1e-3)
+    assert str(plan["overlay"]).count('r="2.5"') == len(left)

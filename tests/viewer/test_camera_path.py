@@ -1,7 +1,11 @@
 """Views and paths that are kept: what is written comes back, renders the same, and overwrites nothing."""
 
+import errno
 from collections.abc import Callable
 from dataclasses import replace
+from pathlib import Path
+from types import SimpleNamespace
+from typing import Any
 
 import av
 import numpy as np
@@ -14,8 +18,11 @@ from swimm3r.geometry import Similarity, so3_exp
 from swimm3r.io import images
 from swimm3r.pipeline.renders import render_run
 from swimm3r.pipeline.view_settings import ViewSettings
+from swimm3r.scene.rig import Rig, RigCamera
 from swimm3r.viewer.camera_path import KeyFrame, film, load_path, new_folder, save_path, save_view
 from swimm3r.viewer.layers import LayerChoice, Painter
+from swimm3r.viewer.panel import Panel
+from swimm3r.viewer.scene_nodes import path_rows
 from swimm3r.viewer.viewed_run import ViewedRun
 
 
@@ -85,3 +92,25 @@ def test_a_video_needs_two_views(copied: Callable[[], ViewedRun]):
     with pytest.raises(UsageError, match="at least 2"):
         film(run, path_of(run)[:1], 1.0)
     assert not (run.folder / "renders").exists()
+
+
+@pytest.mark.parametrize("number", [errno.EROFS, errno.EACCES, errno.ENOSPC])
+def test_a_folder_that_cannot_be_written_is_said_on_the_page(number: int, tmp_path: Path):
+    def save() -> str:
+        raise OSError(number, "refused", str(tmp_path))
+
+    page: Any = SimpleNamespace(_kept=SimpleNamespace(content=""))
+    Panel._keep(page, save)
+    assert "Not saved" in page._kept.content
+    assert str(tmp_path) in page._kept.content
+
+
+def test_the_line_through_the_cameras_of_a_rig_leads_through_one_of_them(wall: ViewedRun):
+    assert path_rows(wall) == list(range(len(wall.rec.names)))
+    sides = ("left", "right")
+    listed = tuple(replace(frame, camera=sides[i % 2]) for i, frame in enumerate(wall.frames))
+    rig = Rig((RigCamera("left"), RigCamera("right")))
+    rows = path_rows(replace(wall, frames=replace(wall.frames, frames=listed, rig=rig)))
+    own = {frame.name: frame.camera for frame in listed}
+    assert {own[wall.rec.names[row]] for row in rows} == {"left"}
+    assert rows == sorted(rows)

@@ -1,5 +1,6 @@
 """The pictures of the viewer: water by the model, frames where they were taken, boxes that hold what is inside."""
 
+import shutil
 from dataclasses import replace
 from pathlib import Path
 
@@ -12,6 +13,7 @@ from swimm3r.cameras import image_directions, ray_depth_from_z
 from swimm3r.medium import Medium, add_water, linear_from_srgb, srgb_from_linear
 from swimm3r.splat.primitives.beta import BetaPrimitives, with_time
 from swimm3r.splat.settings import InitialSettings
+from swimm3r.viewer import viewed_run
 from swimm3r.viewer.layers import BACKGROUND, CropBox, LayerChoice, Painter, ViewCamera, exposed, normal_colors, wiped
 from swimm3r.viewer.scene_nodes import vertical_fov
 from swimm3r.viewer.viewed_run import ViewedRun, open_viewed_run
@@ -191,3 +193,19 @@ def test_a_map_that_changes_with_time_is_drawn_at_the_second_that_is_asked_for(w
     assert end.z_depth is not None
     assert (start.z_depth > 0).mean() > 0.9
     assert (end.z_depth > 0).mean() < 0.1
+
+
+def test_restored_frames_in_folders_are_found_and_the_depth_of_a_metric_run_is_taken_once(
+    sfm_run: Path, monkeypatch: pytest.MonkeyPatch
+):
+    restored = sfm_run / "sfm" / "restored"
+    shutil.move(restored, sfm_run / "left")
+    shutil.move(sfm_run / "left", restored / "left")
+    run = open_viewed_run(sfm_run, "cpu")
+    assert run.has_restored_frames
+    assert "Frame restored" in Painter(run).layers
+    metric, asked = replace(run, rec=replace(run.rec, metric=True)), []
+    monkeypatch.setattr(viewed_run, "median_z_depth", lambda rec: asked.append(rec) or 2.0)
+    for camera in metric.cameras.cam2world[:3]:
+        metric.nearest(camera)
+    assert len(asked) == 1

@@ -25,6 +25,7 @@ from swimm3r.errors import InputError, RegistrationError
 from swimm3r.evaluate import NotComputed
 from swimm3r.io.files.atomic import write_text
 from swimm3r.io.files.cache_key import cache_key, code_version
+from swimm3r.localization.lenses import has_several_lenses
 from swimm3r.pipeline.finished_sfm import FinishedSfm
 from swimm3r.progress import Progress, silent
 from swimm3r.scene.frames import Frames
@@ -66,21 +67,10 @@ def of_clip(sfm: FinishedSfm, folder: Path, progress: Progress = silent) -> Grou
     """
     if sfm.frames.rows_rectified:
         return NotComputed("no reference: the camera turned within exposures; test frames are placed by their matches")
-    if _lenses(sfm) > 1:
+    if has_several_lenses(sfm.rec, sfm.frames):
         return NotComputed("no reference: the rig's cameras have lenses of their own; --references DIR gives one")
     settings = sfm.settings.sfm if isinstance(sfm.settings.sfm, ColmapSettings) else ColmapSettings()
     return whole_clip(sfm.frames, sfm.rec.cameras[0], settings, folder, progress)
-
-
-def _lenses(sfm: FinishedSfm) -> int:
-    """The number of lenses that the cameras of a rig have; 1 without a rig."""
-    if sfm.frames.rig is None:
-        return 1
-    rec, of_camera = sfm.rec, {}
-    for i, name in enumerate(rec.names):
-        of_camera.setdefault(sfm.frames.frames[sfm.frames.index(name)].camera, i)
-    rows = list(of_camera.values())
-    return len({(*rec.cameras.K[i].flatten().tolist(), *rec.cameras.distortion[i].tolist()) for i in rows})
 
 
 def whole_clip(

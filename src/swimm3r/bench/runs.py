@@ -58,9 +58,10 @@ def clip_name(source: Path) -> str:
 def clip_names(sources: Sequence[Path]) -> list[str]:
     """The names of clips. Raises InputError where two have one name."""
     names = [clip_name(source) for source in sources]
-    if len(set(names)) < len(names):
+    twice = sorted(name for name in names if names.count(name) > 1)
+    if twice:
         raise InputError(
-            f"two of the clips have one name: {', '.join(sorted(names))}",
+            f"two of the clips have one name: {', '.join(twice)}",
             cause="results are kept by the clips' names",
             hint="another name for one of them",
         )

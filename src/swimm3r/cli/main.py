@@ -54,6 +54,7 @@ from swimm3r.sfm.distillation.settings import RECIPES
 from swimm3r.weights.store import cache_folder
 
 _INTERRUPTED, _UNREAD = 130, 141  # 128 + SIGINT, SIGPIPE
+_RESUMED = ("run", "prepare", "sfm", "splat", "batch", "bench", "demo", "train-sfm", "weights")
 _DESCRIPTION = (
     "Underwater video in; camera poses, water, a restored cloud and a map that renders out. "
     "Options of a command: swimm3r COMMAND --help. Version: swimm3r --version."
@@ -85,7 +86,9 @@ def main(arguments: Sequence[str] | None = None) -> None:
     except Swimm3rError as error:
         _fail(error)
     except KeyboardInterrupt:
-        print("\nInterrupted. Finished work is kept: the same command resumes from here.", file=sys.stderr)
+        resumes = any(word in _RESUMED for word in arguments[:1])
+        kept = " Finished work is kept: the same command resumes from here." if resumes else ""
+        print(f"\nInterrupted.{kept}", file=sys.stderr)
         raise SystemExit(_INTERRUPTED) from None
     except BrokenPipeError:  # of `swimm3r ... | head`: nobody reads on
         os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())

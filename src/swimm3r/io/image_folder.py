@@ -2,7 +2,7 @@
 
 import os
 import re
-from collections.abc import Collection, Sequence
+from collections.abc import Callable, Collection, Iterator, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -32,11 +32,9 @@ def find_files(folder: Path, suffixes: tuple[str, ...], leave_out: Sequence[Path
             raise error
         unreadable.append(Path(error.filename))
 
-    found: list[Path] = []
-    for where, folders, files in os.walk(folder, onerror=pass_over):
-        here = Path(where)
-        folders[:] = [name for name in folders if not _hidden(name) and not _closed(here / name, closed)]
-        found += [here / name for name in files if not _hidden(name) and name.lower().endswith(suffixes)]
+    found = [
+        Path(where) / name for where, files in _walk(folder, closed, pass_over) for name in files if _is(name, suffixes)
+    ]
     return FilesBelow(sorted(found, key=lambda path: natural_key(path, folder)), unreadable)
 
 
@@ -47,16 +45,41 @@ def find_images(folder: Path, leave_out: Sequence[Path] = ()) -> FilesBelow:
     return FilesBelow([path for path in found.paths if path not in masks], found.unreadable)
 
 
+class GrowingFolder:
+    """A folder that images are being written into: each look takes as long as listing it, however many there are."""
+
+    def __init__(self, folder: Path) -> None:
+        self._folder = folder
+        self._listed: dict[str, set[str]] = {}  # names below each folder
+        self._files: set[Path] = set()
+        self._stems: set[Path] = set()
+
+    def new_images(self) -> list[Path]:
+        """The images, in natural order, that were not there at the last look; masks beside their images are none.
+
+        Raises OSError where the folder itself cannot be searched.
+        """
+
+        def pass_over(error: OSError) -> None:
+            if Path(error.filename) == self._folder:
+                raise error
+
+        new: list[Path] = []
+        for where, files in _walk(self._folder, set(), pass_over):
+            listed = self._listed.setdefault(where, set())
+            new += [Path(where) / name for name in files if name not in listed and _is(name, SUFFIXES)]
+            listed.update(files)
+        self._files.update(new)
+        self._stems.update(path.with_suffix("") for path in new)
+        images = (path for path in new if not _is_mask(path, self._files, self._stems))
+        return sorted(images, key=lambda path: natural_key(path, self._folder))
+
+
 def masks_beside(images: Sequence[Path]) -> set[Path]:
     """Those that are masks of others in the same folder: a_mask.png or a.jpg.png beside a.jpg."""
     files = set(images)
     stems = {path.with_suffix("") for path in images}
-    return {
-        path
-        for path in images
-        if path.with_suffix("") in files
-        or (path.stem.endswith("_mask") and path.with_name(path.stem.removesuffix("_mask")) in stems)
-    }
+    return {path for path in images if _is_mask(path, files, stems)}
 
 
 class MaskFolder:
@@ -90,9 +113,28 @@ def numbered(images: Sequence[Path]) -> bool:
     return len({path.parent for path in images}) == 1 and len(patterns) == 1 and "#" in patterns.pop()
 
 
+def _walk(
+    folder: Path, closed: Collection[Path], on_error: Callable[[OSError], None]
+) -> Iterator[tuple[str, list[str]]]:
+    """The folders below a folder and the names of their files, without what is hidden and run folders."""
+    for where, folders, files in os.walk(folder, onerror=on_error):
+        folders[:] = [name for name in folders if not _hidden(name) and not _closed(Path(where) / name, closed)]
+        yield where, [name for name in files if not _hidden(name)]
+
+
+def _is(name: str, suffixes: tuple[str, ...]) -> bool:
+    return name.lower().endswith(suffixes)
+
+
+def _is_mask(path: Path, files: Collection[Path], stems: Collection[Path]) -> bool:
+    return path.with_suffix("") in files or (
+        path.stem.endswith("_mask") and path.with_name(path.stem.removesuffix("_mask")) in stems
+    )
+
+
 def _hidden(name: str) -> bool:
     return name.startswith((".", "__"))  # .Trash, ._IMG_0001.jpg, __MACOSX
 
 
-def _closed(folder: Path, closed: set[Path]) -> bool:
+def _closed(folder: Path, closed: Collection[Path]) -> bool:
     return folder.resolve() in closed or os.path.isfile(folder / RUN_MARK)  # Path.is_file raises where it may not look

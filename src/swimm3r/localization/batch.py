@@ -23,6 +23,7 @@ from swimm3r.io import cameras_json, images
 from swimm3r.io.files.atomic import write_text
 from swimm3r.io.image_header import read_header
 from swimm3r.io.trajectory import write_tum
+from swimm3r.localization.lenses import has_several_lenses, lens_of_camera, unnamed_camera
 from swimm3r.localization.localizer import STAGES, Evidence, Localization, Localizer
 from swimm3r.localization.settings import LocalizationSettings
 from swimm3r.progress import Progress, silent
@@ -44,6 +45,7 @@ class Query:
     image: Float[Tensor, "h w 3"]
     mask: Bool[Tensor, "h w"] | None = None
     clip_time: float | None = None  # seconds of the map's clip, where the image is part of it
+    frame: str | None = None  # its name there
 
 
 @dataclass(frozen=True)
@@ -65,31 +67,37 @@ def localize_run(
     progress: Progress = silent,
     *,
     map_device: MapDevice = "auto",
+    camera: str | None = None,
 ) -> tuple[list[Answer], Path]:
     """Places images, by default the run's test frames, in the run's map; the record goes to `out`.
 
-    Poses are in the axes and unit of RUN/sfm.
+    Poses are in the axes and unit of RUN/sfm. `camera` is the one of the run's rig that took the images. Answers
+    come without evidence, which the match images show.
 
-    Raises InputError where the run has no map, RegistrationError where not one image could be placed.
+    Raises InputError where the run has no map, an image cannot be read or is of another shape than its lens, or a rig
+    has several lenses and `camera` is not given, UsageError where the rig has no such camera, RegistrationError where
+    not one image could be placed.
     """
-    camera = None if lens is None else cameras_of(cameras_json.read_cameras(lens))[0]
-    for path in image_files:
-        read_header(path)  # before minutes of matching
+    own = None if lens is None else cameras_of(cameras_json.read_cameras(lens))[0]
+    _check_files(image_files)
     open_run(folder, "splat")
-    scene = load_map(folder / "splat" / "map.safetensors").to(devices.for_maps(map_device))
     frames = run_frames(folder)
+    names = [path.name for path in image_files] or list(frames.test.names)
+    if not names:
+        raise InputError(
+            f"the run in {folder} has no test frames to place",
+            cause="stills that overlap by half or less are all needed for the map: none is held back",
+            hint=f"images of the place: swimm3r localize {folder} IMAGE",
+        )
     rec = load_reconstruction(folder / "sfm", frames)
+    own = own if camera is None else lens_of_camera(rec, frames, camera)
+    if image_files and own is None and has_several_lenses(rec, frames):
+        raise unnamed_camera()
+    scene = load_map(folder / "splat" / "map.safetensors").to(devices.for_maps(map_device))
     localizer = Localizer(scene, rec, rec.still(frames), settings, progress=progress)
     out = out or folder / "localization"
-    rectification = run_rectification(folder) if camera is None else None
+    rectification = run_rectification(folder) if lens is None else None
     answers = []
-    names = [path.name for path in image_files] or list(frames.test.names)
-    if len(set(names)) < len(names):
-        raise InputError(
-            "two of the images have the same name",
-            cause="they lie in different folders",
-            hint="one folder at a time, each with its own --out",
-        )
     for i, name in enumerate(names):
         progress("localizing", i, len(names))
         if image_files:
@@ -97,11 +105,8 @@ def localize_run(
         else:
             f = frames.index(name)
             time = frames.frames[f].time
-            query = Query(name, time, frames.image(f), frames.mask(f), time)
-        found = answer(localizer, query, camera)
-        answers.append(_in_axes_of_sfm(found, localizer))
-        if found.found is not None and found.found.evidence is not None:
-            images.write_rgb(out / "matches" / f"{name}.png", match_image(found.found.evidence))
+            query = Query(name, time, frames.image(f), frames.mask(f), time, name)
+        answers.append(with_match_image(_in_axes_of_sfm(answer(localizer, query, own), localizer), out))
         _write(out, answers, localizer.matcher.name, rec.metric)
     progress("localizing", len(names), len(names))
     if all(a.found is None for a in answers):
@@ -113,13 +118,37 @@ def localize_run(
     return answers, out
 
 
+def _check_files(paths: Sequence[Path]) -> None:
+    """Raises InputError where an image cannot be read, or two have one name: before minutes of matching."""
+    for path in paths:
+        read_header(path)
+    if len({path.name for path in paths}) < len(paths):
+        raise InputError(
+            "two of the images have the same name",
+            cause="they lie in different folders",
+            hint="one folder at a time, each with its own --out",
+        )
+
+
 def answer(localizer: Localizer, query: Query, lens: Cameras | None = None) -> Answer:
-    """The query's place, or the reason why none was found."""
+    """The query's place, or the reason why none was found. Raises InputError that names an image of another shape."""
     try:
-        found = localizer.locate(query.image, query.mask, lens, query.clip_time)
+        found = localizer.locate(query.image, query.mask, lens, query.clip_time, query.frame)
         return Answer(query.name, query.time, found)
     except RegistrationError as failure:
         return Answer(query.name, query.time, None, failure.what)
+    except InputError as error:
+        raise InputError(f"{query.name}: {error.what}", cause=error.cause, hint=error.hint) from error
+
+
+def with_match_image(a: Answer, out: Path) -> Answer:
+    """The answer without its evidence, which OUT/matches/NAME.png shows; one of an earlier call goes."""
+    path = out / "matches" / f"{a.name}.png"
+    if a.found is None or a.found.evidence is None:
+        path.unlink(missing_ok=True)
+        return a
+    images.write_rgb(path, match_image(a.found.evidence))
+    return replace(a, found=replace(a.found, evidence=None))
 
 
 def match_image(evidence: Evidence) -> UInt8[np.ndarray, "h w2 3"]:

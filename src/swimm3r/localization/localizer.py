@@ -28,10 +28,12 @@ import torch
 from jaxtyping import Bool, Float
 from torch import Tensor
 
-from swimm3r.cameras import Cameras, project, resized
-from swimm3r.errors import InputError, RegistrationError
+from swimm3r.cameras import Cameras, project
+from swimm3r.errors import RegistrationError
 from swimm3r.imaging.turned_rows import at_half_time, half_time_pixels, mask_at_half_time
 from swimm3r.imaging.undistortion import undistorted
+from swimm3r.localization.interpolation import lens_of
+from swimm3r.localization.lenses import has_several_lenses, lens_at_size, unnamed_camera
 from swimm3r.localization.matchers import Matcher, matcher_for
 from swimm3r.localization.pose_covariance import pose_jacobian
 from swimm3r.localization.references import FilmedReferences, Reference, References, RenderedReferences, rendered
@@ -123,7 +125,7 @@ class Localizer:
         progress: Progress = silent,
     ) -> None:
         to_map, rec = axes_of_map(rec, scene.poses), as_mapped(rec, scene.poses)
-        self.scene, self.rec = scene, rec
+        self.scene, self.rec, self.frames = scene, rec, frames
         self._to_sfm = None if to_map is None else to_map.inverse()
         self.settings = settings or LocalizationSettings()
         self.matcher = matcher or matcher_for(self.settings)
@@ -150,13 +152,16 @@ class Localizer:
         mask: Bool[Tensor, "h w"] | None = None,
         lens: Cameras | None = None,
         time: float | None = None,
+        frame: str | None = None,
     ) -> Localization:
         """The pose of one image (0..1), taken through `lens` (its pose unused), by default the reconstruction's.
 
-        `time`, seconds of the clip, matters to dynamic maps: it is the moment they are shown at, where it is known.
+        A lens of images of another size is scaled. `frame` names an image of the clip, and so the camera of the rig
+        that took it. `time`, seconds of the clip, matters to dynamic maps: it is the moment they are shown at, where it
+        is known.
 
         Raises RegistrationError where too few matches agree on any pose, InputError where the image's shape is not
-        that of the reconstruction's frames and no lens is given.
+        that of its lens, or a rig has several lenses and neither `lens` nor `frame` is given.
         """
         s = self.settings
         height, width = image.shape[:2]
@@ -167,7 +172,7 @@ class Localizer:
             likest = torch.argsort(self._likeness(query), descending=True, stable=True)[: s.candidates].tolist()
             candidates = tuple(self.rec.names[k] for k in likest)
         turning = self._turning and lens is None
-        lens = self._own_lens(likest[0], width, height) if lens is None else lens
+        lens = lens_at_size(self._own_lens(likest[0], frame) if lens is None else lens, width, height)
         with _timed(seconds, "coarse"):
             coarse = self._coarse(query, candidates, lens)
         if coarse.cam2world is None:
@@ -219,16 +224,20 @@ class Localizer:
         reference = self.references[name]
         return reference, self.matcher.describe(reference.rgb, reference.usable)
 
-    def _own_lens(self, nearest: int, width: int, height: int) -> Cameras:
-        """The lens of the nearest reference, for an image of this size."""
-        lens = self.rec.cameras[nearest]
-        if abs(width / height - lens.width / lens.height) > 0.01 * lens.width / lens.height:
-            raise InputError(
-                f"the image is {width} x {height}, the map's frames are {lens.width} x {lens.height}: another lens",
-                cause="it comes from another camera, or was cropped or turned",
-                hint="its own lens: --lens with a cameras.json that has it",
-            )
-        return resized(lens, width, height)
+    def _own_lens(self, nearest: int, frame: str | None) -> Cameras:
+        """The lens of a frame of the clip, else that of the nearest reference."""
+        if frame is not None and self.frames is not None:
+            own = lens_of(self.rec, self.frames, frame)
+            if own is None:
+                raise RegistrationError(
+                    f"{frame} could not be placed: its lens is not known",
+                    cause="no frame of the camera that took it is registered, and the rig is not calibrated",
+                    hint="swimm3r run with --rig-calibration, which states the lens of every camera",
+                )
+            return own
+        if has_several_lenses(self.rec, self.frames):
+            raise unnamed_camera()
+        return self.rec.cameras[nearest]
 
     def _coarse(self, query: Any, candidates: tuple[str, ...], lens: Cameras) -> _Solved:
         """The query's matches with the references, whose pixels are points of the world."""

@@ -26,7 +26,7 @@ from swimm3r.geometry import Similarity, pose_from, quaternion_from_rotation, ro
 from swimm3r.io import cameras_json
 from swimm3r.io.files.damage import Remedy, guard
 from swimm3r.pipeline.view_settings import PathName, ViewSettings
-from swimm3r.scene.frames import Frames
+from swimm3r.scene.frames import Frames, rows_of_one_camera
 
 _SMOOTH = 1.5  # frames of the dive over which the flight's hand steadies
 _MADE = 90  # cameras of a made path
@@ -77,18 +77,6 @@ def camera_path(dive: Dive, settings: ViewSettings) -> CameraPath:
             return _through(dive.frames, dive, count or _MADE)
         case "orbit" | "spiral":
             return _around(dive, settings.path, count or _MADE)
-
-
-def rows_of_one_camera(names: Sequence[str], clip: Frames) -> list[int]:
-    """Places in a list of frames of those that the first camera of a rig took, or the next that took any.
-
-    All of them without a rig, and where none is a frame of the clip.
-    """
-    camera = {frame.name: frame.camera for frame in clip}
-    own = [camera.get(name) for name in names]
-    cameras = () if clip.rig is None else clip.rig.names
-    first = next((each for each in cameras if each in own), None)
-    return [row for row, each in enumerate(own) if first is None or each == first]
 
 
 def smooth_path(cam2world: Float[Tensor, "c 4 4"], count: int) -> Float[Tensor, "f 4 4"]:

@@ -20,7 +20,7 @@ from swimm3r.report.plan_view import path_overlay, plan_view
 from swimm3r.report.rig import rig_section
 from swimm3r.report.scene import pack_scene, shown_points
 from swimm3r.report.style import page_template, style_sheet
-from swimm3r.scene.frames import Frames
+from swimm3r.scene.frames import Frames, rows_of_one_camera
 from swimm3r.scene.reconstruction import Reconstruction
 from swimm3r.scene.reconstruction_io import load_reconstruction
 from swimm3r.scene.run_folder import open_run
@@ -115,7 +115,7 @@ def _of_dive(frames: Frames, rec: Reconstruction | None, folder: Path) -> dict[s
         "moving": shown_frames.moving_objects(rec, frames),
         "bar": None if near_far is None else shown_frames.depth_bar(near_far, rec.metric),
         "scene": pack_scene(rec, frames),
-        "plan": _plan(rec),
+        "plan": _plan(rec, frames),
         "water": water.water_section(rec),
         "missing": [name for name in frames.train.names if name not in placed],
     }
@@ -138,13 +138,14 @@ def _made_with(folder: Path, remedy: Remedy) -> dict[str, object]:
     }
 
 
-def _plan(rec: Reconstruction) -> dict[str, object] | None:
+def _plan(rec: Reconstruction, frames: Frames) -> dict[str, object] | None:
     """The scene from above, as filmed and without the water, with the camera path; None without points."""
     points = shown_points(rec)
     if points is None:
         return None
     restored = points.filmed if points.restored is None else points.restored
-    view = plan_view(points.xyz, points.filmed, restored, rec.cameras.cam2world.numpy(), background=_DEEP)
+    poses, path = rec.cameras.cam2world.numpy(), rows_of_one_camera(rec.names, frames)
+    view = plan_view(points.xyz, points.filmed, restored, poses, background=_DEEP, path=path)
     return {
         "filmed": images.jpeg_uri(view.raw, 760, 88),
         "restored": None if points.restored is None else images.jpeg_uri(view.restored, 760, 88),

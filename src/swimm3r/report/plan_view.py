@@ -1,5 +1,6 @@
 """A cloud seen against the mean viewing direction, with the path of the camera over it."""
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 
 import cv2
@@ -29,8 +30,12 @@ def plan_view(
     cam2world: np.ndarray,
     width: int = 760,
     background: tuple[int, int, int] = WHITE,
+    path: Sequence[int] | slice = slice(None),
 ) -> PlanView:
-    """The cloud from above, where "above" is against the mean viewing direction, with the camera path over it."""
+    """The cloud from above, where "above" is against the mean viewing direction, with the camera path over it.
+
+    `path` are the cameras that it leads through, in order: those of one camera of a rig.
+    """
     down = cam2world[:, :3, 2].mean(0)
     down /= np.linalg.norm(down)
     forward = np.linalg.svd((cam2world[:, :3, 3] - cam2world[:, :3, 3].mean(0)) @ (np.eye(3) - np.outer(down, down)))[2]
@@ -53,7 +58,7 @@ def plan_view(
         canvas[cells[order, 1], cells[order, 0]] = (colors[order].clip(0, 1) * 255).astype(np.uint8)
         painted[cells[order, 1], cells[order, 0]] = True
         images.append(_without_pinholes(canvas, painted, background))
-    return PlanView(images[0], images[1], (centers - low) / units, units)
+    return PlanView(images[0], images[1], (centers[path] - low) / units, units)
 
 
 def path_overlay(view: PlanView, unit: str) -> str:

@@ -16,7 +16,7 @@ from scipy.spatial import KDTree
 from swimm3r.cameras import image_directions
 from swimm3r.report.head import caption
 from swimm3r.report.plan_view import least_extended
-from swimm3r.scene.frames import Frames
+from swimm3r.scene.frames import Frames, rows_of_one_camera
 from swimm3r.scene.reconstruction import Reconstruction
 
 _MOST_POINTS = 160_000  # 12 bytes each, 2.6 MB of text
@@ -78,7 +78,7 @@ def pack_scene(rec: Reconstruction, frames: Frames) -> Scene3d | None:
         "reach": reach,
         "spacing": _spacing(xyz),
         "up": (-_rounded(_down(points.xyz, poses))).tolist(),
-        "path": _rounded(poses[:, :3, 3]).tolist(),
+        "path": _rounded(poses[rows_of_one_camera(rec.names, frames), :3, 3]).tolist(),
         "cameras": _cameras(rec, frames, reach * _FRUSTUM),
     }
     return Scene3d(

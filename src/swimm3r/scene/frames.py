@@ -219,6 +219,18 @@ class Frames:
             )
 
 
+def rows_of_one_camera(names: Sequence[str], clip: Frames) -> list[int]:
+    """Places in a list of frames of those that the first camera of a rig took, or the next that took any.
+
+    All of them without a rig, and where none is a frame of the clip.
+    """
+    camera = {frame.name: frame.camera for frame in clip}
+    own = [camera.get(name) for name in names]
+    cameras = () if clip.rig is None else clip.rig.names
+    first = next((each for each in cameras if each in own), None)
+    return [row for row, each in enumerate(own) if first is None or each == first]
+
+
 def _unit(stored: np.ndarray) -> Float[Tensor, "*n 3"]:
     """Stored values as 0..1."""
     return torch.from_numpy(stored.astype(np.float32)) / (255.0 if stored.dtype == np.uint8 else 65535.0)

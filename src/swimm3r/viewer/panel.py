@@ -13,6 +13,7 @@ import torch
 from swimm3r.errors import Swimm3rError
 from swimm3r.geometry import quaternion_from_rotation
 from swimm3r.imaging.depth_colors import depth_image
+from swimm3r.io.files.refusals import refusal
 from swimm3r.viewer import camera_path, measuring
 from swimm3r.viewer.camera_path import KeyFrame
 from swimm3r.viewer.layers import CropBox, Layer, LayerChoice, Painter, Picture, ViewCamera
@@ -354,8 +355,12 @@ class Panel:
         self._kept.content = "Working ..."
         try:
             self._kept.content = save()
-        except Swimm3rError as error:
-            self._kept.content = f"**Not saved.** {error.what}. Try: {error.hint}."
+        except (Swimm3rError, OSError) as error:
+            told = error if isinstance(error, Swimm3rError) else refusal(error)
+            if told is None:
+                self._kept.content = f"**Not saved.** {error}"
+                raise
+            self._kept.content = f"**Not saved.** {told.what}. Try: {told.hint}."
 
     def _save_view(self) -> str:
         with self._work:

@@ -12,6 +12,7 @@ import torch
 
 from swimm3r.cameras import Cameras
 from swimm3r.geometry import pose_from, quaternion_from_rotation, rotation_from_quaternion
+from swimm3r.scene.frames import rows_of_one_camera
 from swimm3r.viewer.layers import CropBox, ViewCamera
 from swimm3r.viewer.viewed_run import ViewedRun
 
@@ -37,6 +38,7 @@ class SceneNodes:
         self._chosen: str | None = None
         self._frusta_shown = self._path_shown = False
         self._size = _frustum_size(run)
+        self._rows = {name: i for i, name in enumerate(run.rec.names)}
 
     def show_frusta(self, shown: bool) -> None:
         """Show or hide the frames."""
@@ -52,17 +54,17 @@ class SceneNodes:
         at = np.asarray(self._client.camera.position, np.float64)
         away = np.linalg.norm(self._run.cameras.centers.numpy() * self._run.scale - at, axis=1)
         for name, frustum in list(self._frusta.items()):
-            apart = bool(away[self._run.rec.index(name)] > _NEAR * self._size)
+            apart = bool(away[self._rows[name]] > _NEAR * self._size)
             _set_visible(frustum, self._frusta_shown and apart)
         if self._path is not None:
             _set_visible(self._path, self._path_shown and float(away.min()) > self._size / 2)
 
     def show_path(self, shown: bool) -> None:
-        """Show or hide the line through the cameras, in the order of time."""
-        if shown and self._path is None and len(self._run.rec.names) > 1:
-            centers = (self._run.cameras.centers * self._run.scale).numpy().astype(np.float32)
-            order = np.argsort([self._run.time_of(name) for name in self._run.rec.names], kind="stable")
-            segments = np.stack([centers[order][:-1], centers[order][1:]], 1)
+        """Show or hide the line through the cameras, of a rig those of one, in the order of time."""
+        rows = path_rows(self._run) if shown and self._path is None else []
+        if len(rows) > 1:
+            centers = (self._run.cameras.centers[rows] * self._run.scale).numpy().astype(np.float32)
+            segments = np.stack([centers[:-1], centers[1:]], 1)
             self._path = self._client.scene.add_line_segments(
                 "/path", segments, PATH_COLOR, thickness=2.0, thickness_units="screen"
             )
@@ -123,6 +125,13 @@ class SceneNodes:
             )
             frustum.on_click(lambda _, name=name: self._fly_to(name))
             self._frusta[name] = frustum
+
+
+def path_rows(run: ViewedRun) -> list[int]:
+    """The registered frames that a line through the cameras leads through: of a rig those of one, in time order."""
+    rows = rows_of_one_camera(run.rec.names, run.frames)
+    times = run.frames.times_of([run.rec.names[row] for row in rows])
+    return [row for _, row in sorted(zip(times, rows, strict=True))]
 
 
 def _set_visible(node: Any, visible: bool) -> None:

@@ -5,6 +5,7 @@ depth, so that a scene of any scale fits the browser's depth buffer. Everything 
 """
 
 from dataclasses import dataclass, field, replace
+from functools import cached_property
 from pathlib import Path
 
 import numpy as np
@@ -65,7 +66,7 @@ class ViewedRun:
         """The unit of length, for people."""
         return "m" if self.rec.metric else "scene units"
 
-    @property
+    @cached_property
     def median_depth(self) -> float:
         """Distance of the middle surface from the cameras, scene units."""
         return _WORKING_DEPTH / self.scale if not self.rec.metric else median_z_depth(self.rec)
@@ -73,7 +74,7 @@ class ViewedRun:
     @property
     def has_restored_frames(self) -> bool:
         """Return whether structure from motion restored any frame."""
-        return any((self.folder / "sfm" / "restored").glob("*.png"))
+        return any((self.folder / "sfm" / "restored").rglob("*.png"))  # frames of a rig lie in folders
 
     def time_of(self, name: str) -> float:
         """Time of a frame, seconds of the clip."""

@@ -29,9 +29,8 @@ from swimm3r.errors import InputError, WeightsError
 from swimm3r.evaluate import NotComputed
 from swimm3r.evaluate.poses import RelativePoseErrors, relative_pose_errors, rra, rta
 from swimm3r.geometry import best_similarity, rotation_angle
-from swimm3r.io import images
 from swimm3r.io.files.cache_key import content_digest
-from swimm3r.localization.batch import Answer, Query, answer, match_image
+from swimm3r.localization.batch import Answer, Query, answer, with_match_image
 from swimm3r.localization.localizer import STAGES, Localizer
 from swimm3r.localization.matchers import chosen_matcher
 from swimm3r.localization.settings import GS_CPR, LocalizationSettings, with_checkpoint_of
@@ -163,18 +162,22 @@ def _answers(localizer: Localizer, sfm: FinishedSfm, folder: Path) -> list[Answe
     queries = []
     for frame in sfm.frames.test:
         f = sfm.frames.index(frame.name)
-        queries.append(Query(frame.name, frame.time, sfm.frames.image(f), sfm.frames.mask(f), frame.time))
-    answer(localizer, queries[0])  # once more than needed: kernels are loaded, references described
-    found = [answer(localizer, query) for query in queries]
-    for place in found:
-        if place.found is not None and place.found.evidence is not None:
-            image = match_image(place.found.evidence)
-            images.write_rgb(folder / "matches" / f"{place.name}.png", image)
-    return found
+        queries.append(Query(frame.name, frame.time, sfm.frames.image(f), sfm.frames.mask(f), frame.time, frame.name))
+    for query in queries[:1]:
+        answer(localizer, query)  # once more than needed: kernels are loaded, references described
+    return [with_match_image(answer(localizer, query), folder) for query in queries]
 
 
 def localization_scores(answers: Sequence[Answer]) -> dict[str, float | NotComputed]:
     """The scores that need no reference: localized frames, their evidence, and speed."""
+    if not answers:
+        names = (
+            "located_pct",
+            "inlier_5px_pct",
+            "reprojection_px",
+            *(f"fps_{stage}" for stage in (*STAGES, "localize")),
+        )
+        return dict.fromkeys(names, NotComputed("the run has no test frames"))
     found = [a.found for a in answers if a.found is not None]
     nothing = NotComputed("no test frame was located")
     refined = [f.reprojection_px for f in found if f.reprojection_px is not None]

@@ -18,6 +18,7 @@ from swimm3r.bench.runs import Clip, clips_of
 from swimm3r.bench.scores import columns
 from swimm3r.bench.tables import Table
 from swimm3r.io.files.cache_key import content_digest
+from swimm3r.io.view_names import view_stems
 from swimm3r.pipeline.scores.restored import no_reference_scores
 from swimm3r.progress import Progress, silent
 from swimm3r.scene.frames import Frames
@@ -77,4 +78,4 @@ def _side_by_side(out: Path, clip: Clip, frames: Frames, i: int) -> None:
     filmed = (frames.image(i) * 255).round().to(torch.uint8).numpy()
     panels = [Panel(_FILMED, filmed)]
     panels += [stored(run.sfm, run.folder / "sfm" / "restored" / f"{name}.png") for run in clip.runs]
-    write_grid(out / "images" / clip.name / f"{Path(name).stem}.png", [panels])
+    write_grid(out / "images" / clip.name / f"{view_stems(frames.names)[name]}.png", [panels])

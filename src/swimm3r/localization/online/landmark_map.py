@@ -18,6 +18,7 @@ from swimm3r.errors import InputError
 from swimm3r.imaging.rectification import Rectification
 from swimm3r.io.colmap.model import silence_log
 from swimm3r.localization.keypoint_places import measured_depth, tracked_points
+from swimm3r.localization.lenses import has_several_lenses
 from swimm3r.progress import Progress, silent
 from swimm3r.scene.frames import Frames
 from swimm3r.scene.reconstruction import Reconstruction
@@ -43,6 +44,7 @@ class LandmarkMap:
     looks: Float[Tensor, "c d"]  # VLAD descriptors of the frames
     distance: float  # median z depth of landmarks in the frames that saw them
     rectification: Rectification | None = None  # of images as the camera takes them, where the run rectified its frames
+    several_lenses: bool = False  # of the cameras of a rig: images come with the lens of theirs
     rows_rectified: bool = False  # the camera turned while it exposed the frames' rows, which were redrawn
 
     def alike(self, descriptors: Float[Tensor, "m 128"], count: int) -> list[int]:
@@ -122,6 +124,7 @@ def landmark_map(
         words=words,
         looks=torch.stack([vlad.summed(each, words) if len(each) else unlike for each in descriptors]),
         distance=_median_depth(rec.cameras, xyz, point, frame),
+        several_lenses=has_several_lenses(rec, frames),
         rows_rectified=frames.rows_rectified,
     )
 

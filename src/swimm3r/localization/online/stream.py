@@ -32,6 +32,7 @@ import torch
 from swimm3r.cameras import Cameras
 from swimm3r.errors import InputError, RegistrationError
 from swimm3r.io.trajectory import tum_line
+from swimm3r.localization.lenses import unnamed_camera
 from swimm3r.localization.online.images import StreamImage
 from swimm3r.localization.online.tracker import Keypoints, TrackedPose, Tracker
 from swimm3r.prepare.candidates import scaled_down
@@ -80,10 +81,14 @@ def localize_stream(
 
     Of a `live` stream the next image is asked for when the one before is answered; of others keypoints are found ahead,
     in a second thread. Ctrl-C ends the stream with everything written. Raises RegistrationError where every image is
-    lost, unless it was interrupted.
+    lost, unless it was interrupted, InputError where the map is of several lenses and none is given.
     """
+    if lens is None and tracker.map.several_lenses:
+        raise unnamed_camera()
     counts: Counter[str] = Counter()
     started, interrupted = perf_counter(), False
+    if not tum:  # one of an earlier stream would lie beside the record of this one
+        (out / "stream.tum").unlink(missing_ok=True)
     with ExitStack() as files:
         record = files.enter_context((out / "stream.jsonl").open("w", encoding="utf-8"))
         path = files.enter_context((out / "stream.tum").open("w", encoding="utf-8")) if tum else None

@@ -20,12 +20,12 @@ import torch
 from jaxtyping import Bool, Float, Int
 from torch import Tensor
 
-from swimm3r.cameras import Cameras, project, resized
-from swimm3r.errors import InputError
+from swimm3r.cameras import Cameras, project
 from swimm3r.geometry import rotation_angle
 from swimm3r.imaging.turned_rows import half_time_pixels
 from swimm3r.io.colmap.model import silence_log
 from swimm3r.localization.interpolation import between
+from swimm3r.localization.lenses import lens_at_size, unnamed_camera
 from swimm3r.localization.online.landmark_map import LandmarkMap
 from swimm3r.localization.pose_covariance import pose_covariance
 from swimm3r.localization.settings import TrackingSettings
@@ -40,7 +40,6 @@ _RETRIEVED = 5  # map frames that a lost image is matched with
 _MAX_RATIO = 0.85  # of descriptors, where the place already tells most candidates apart
 _NEAR_ENOUGH = 2.0  # times the agreement: radius of the second matching
 _LEAST_STEP = 0.2  # seconds that pass between two images at least, whatever their stamps
-_SAME_SHAPE = 0.01  # of the ratio of width to height
 _SLACK = 0.05, 5.0  # median distances and degrees: errors of two poses and jerks between them
 
 
@@ -120,13 +119,16 @@ class Tracker:
         """The keypoints of an image (0..1) taken through `lens`, by default that of the map; no state is touched.
 
         Where the map is of rectified frames, an image without a `lens` may be as the camera takes it, and has no mask.
-        Raises InputError where the image's shape is not that of its lens.
+        Raises InputError where the image's shape is not that of its lens, or the map is of several lenses and none is
+        given.
         """
         if lens is None and mask is None and self.map.rectification is not None:
             image = torch.from_numpy(self.map.rectification.any_image(image.numpy()))
         height, width = image.shape[:2]
         turning = self.map.rows_rectified and lens is None
-        lens = _at_size(self.map.cameras[0] if lens is None else lens, width, height)
+        if lens is None and self.map.several_lenses:
+            raise unnamed_camera()
+        lens = lens_at_size(self.map.cameras[0] if lens is None else lens, width, height)
         usable = torch.ones(height, width, dtype=torch.bool) if mask is None else mask
         found = extract_features(image, usable, self._features, upsample=False)
         xy = torch.from_numpy(found.keypoints[:, :2]).double()
@@ -246,14 +248,3 @@ class Tracker:
         if turn > s.most_turn_rate * seconds + _SLACK[1]:
             return f"the pose is turned by {turn:.0f} degrees from the last one, {seconds:.2g} s before"
         return ""
-
-
-def _at_size(lens: Cameras, width: int, height: int) -> Cameras:
-    """A lens for an image of this size, which may be reduced. Raises InputError for another shape."""
-    if abs(width / height - lens.width / lens.height) > _SAME_SHAPE * lens.width / lens.height:
-        raise InputError(
-            f"the image is {width} x {height}, its lens is of images of {lens.width} x {lens.height}",
-            cause="it comes from another camera, or was cropped or turned",
-            hint="its own lens: --lens with a cameras.json that has it",
-        )
-    return resized(lens, width, height)
