@@ -26,7 +26,7 @@ from swimm3r.io.images import write_rgb
 from swimm3r.medium import MediumFit, linear_from_srgb, remove_water
 from swimm3r.progress import Progress, silent
 from swimm3r.sfm.distillation.water_augmentation import nearest_known
-from swimm3r.sfm.medium.samples import WaterSamples, quiet
+from swimm3r.sfm.medium.samples import WaterSamples
 from swimm3r.sfm.medium.seathru import fit_medium
 from swimm3r.sfm.medium.settings import SeathruSettings
 
@@ -62,7 +62,7 @@ def scene_water(sequence: Sequence, settings: SeathruSettings) -> MediumFit:
             raise ValueError(f"{sequence.shots[i].name} has no raw image or no depth")
         known = torch.nonzero(view.z_depth.flatten() > 0)[:, 0]
         known = known[:: max(1, -(-len(known) // most))]
-        colors.append(quiet(view.raw).reshape(-1, 3)[known])
+        colors.append(view.raw.reshape(-1, 3)[known])
         depths.append(view.z_depth.flatten()[known])
         frames.append(torch.full_like(known, i))
     if not shots:

@@ -155,13 +155,11 @@ def _depth_everywhere(
     return filled, (blur(known.float()[..., None], reach)[..., 0] > 0.1) & ~sea, sea
 
 
-def quiet(image: Float[Tensor, "h w 3"], mask: Bool[Tensor, "h w"] | None = None) -> Float[Tensor, "h w 3"]:
+def quiet(image: Float[Tensor, "h w 3"], mask: Bool[Tensor, "h w"]) -> Float[Tensor, "h w 3"]:
     """An image whose pixels are averaged with those around them, with none outside the mask.
 
     The darkest of single pixels are those with the most negative noise, which lie below the backscatter.
     """
-    if mask is None:
-        return blur(image, _QUIET)
     share = mask[..., None].float()
     return blur(image * share, _QUIET) / blur(share, _QUIET).clamp_min(1e-6)
 
