@@ -117,7 +117,7 @@ def test_ctrl_c_of_a_command_that_starts_over_does_not_say_that_it_resumes(
         ("--tracking.keypoints 500", "--tracking.keypoints"),
         ("--stream in --candidates 3", "--candidates"),
         ("--stream in --idle 3 --latest", "--idle, --latest"),
-        ("--lens a.json --camera left", "both --lens and --camera"),
+        ("--lens a.json --rig-camera left", "both --lens and --rig-camera"),
     ],
 )
 def test_options_of_localize_that_would_change_nothing_are_exit_2(

@@ -57,7 +57,7 @@ BRIEF: dict[tuple[str, ...], Groups] = {
         "": _MESSAGES,
     },
     ("localize",): {
-        "input": ("--lens", "--camera", "--stream", "--follow", "--idle", "--fps"),
+        "input": ("--lens", "--rig-camera", "--stream", "--follow", "--idle", "--fps"),
         "output": ("--out", "--tum"),
         "matching": ("--matcher", "--weights", "--device", "--candidates", "--rounds", "--min-inliers"),
         "": _MESSAGES,

@@ -25,7 +25,7 @@ def localize(
     /,
     stream: Path | None = None,
     lens: Path | None = None,
-    camera: str | None = None,
+    rig_camera: str | None = None,
     out: OutOrDefault = None,
     tum: bool = False,
     map_device: MapDevice = "auto",
@@ -40,7 +40,7 @@ def localize(
         images: Images of the same place.
         stream: Folder of images (--follow if it is being written), video or ROS bag: a line of JSON per image.
         lens: File cameras.json whose first camera took the images; by default they share the run's lens.
-        camera: Camera of the run's rig that took the images; needed where its cameras have different lenses.
+        rig_camera: Camera of the run's rig that took the images; needed where its cameras have different lenses.
         out: Folder for poses.json, poses.tum and the match images; RUN/localization by default.
         tum: Write the poses of a stream to stream.tum, too.
         map_device: Device that renders the map; auto uses CUDA if a GPU and NVIDIA Warp are present.
@@ -48,9 +48,9 @@ def localize(
         source: The images of a stream.
         tracking: Localization of a stream.
     """
-    if lens is not None and camera is not None:
+    if lens is not None and rig_camera is not None:
         raise UsageError(
-            "both --lens and --camera are given",
+            "both --lens and --rig-camera are given",
             cause="each says which lens the images were taken through",
             hint="one of the two",
         )
@@ -64,7 +64,7 @@ def localize(
         _refuse(_changed(settings), "of single images, and --stream is given")
         if not source.follow:
             _refuse([word for word in _changed(source) if word in ("--idle", "--latest")], "of --follow")
-        _stream(run, stream, lens, camera, out or run / "localization", source, tracking, tum=tum)
+        _stream(run, stream, lens, rig_camera, out or run / "localization", source, tracking, tum=tum)
         return
     _refuse([*_changed(source), *_changed(tracking, "tracking."), *["--tum"] * tum], "of --stream")
     from swimm3r.io.files.outputs import output_folder
@@ -76,7 +76,9 @@ def localize(
     open_run(run, "splat")
     settings = with_checkpoint_of(settings, from_yaml(run / "settings.yaml").sfm)
     with output_folder(out or run / "localization"), drawn_progress() as progress:
-        answers, folder = localize_run(run, images, lens, out, settings, progress, map_device=map_device, camera=camera)
+        answers, folder = localize_run(
+            run, images, lens, out, settings, progress, map_device=map_device, rig_camera=rig_camera
+        )
     outcome_console().print(_table(answers))
     print(f"Poses: {folder}")
 
@@ -116,7 +118,7 @@ def _stream(
     run: Path,
     stream: Path,
     lens: Path | None,
-    camera: str | None,
+    rig_camera: str | None,
     out: Path,
     source: StreamSettings,
     tracking: TrackingSettings,
@@ -141,9 +143,9 @@ def _stream(
     own = None if lens is None else cameras_of(cameras_json.read_cameras(lens))[0]
     images = stream_images(stream, source)
     with output_folder(out):
-        if camera is not None:
+        if rig_camera is not None:
             frames = run_frames(run)
-            own = lens_of_camera(load_reconstruction(run / "sfm", frames), frames, camera)
+            own = lens_of_camera(load_reconstruction(run / "sfm", frames), frames, rig_camera)
         with drawn_progress() as progress:
             landmarks = landmarks_of_run(run, from_yaml(run / "settings.yaml").sfm.features, progress)
         say = (lambda _: None) if is_quiet() else (lambda line: print(line, flush=True))

@@ -67,16 +67,16 @@ def localize_run(
     progress: Progress = silent,
     *,
     map_device: MapDevice = "auto",
-    camera: str | None = None,
+    rig_camera: str | None = None,
 ) -> tuple[list[Answer], Path]:
     """Places images, by default the run's test frames, in the run's map; the record goes to `out`.
 
-    Poses are in the axes and unit of RUN/sfm. `camera` is the one of the run's rig that took the images. Answers
+    Poses are in the axes and unit of RUN/sfm. `rig_camera` is the one of the run's rig that took the images. Answers
     come without evidence, which the match images show.
 
     Raises InputError where the run has no map, an image cannot be read or is of another shape than its lens, or a rig
-    has several lenses and `camera` is not given, UsageError where the rig has no such camera, RegistrationError where
-    not one image could be placed.
+    has several lenses and `rig_camera` is not given, UsageError where the rig has no such camera, RegistrationError
+    where not one image could be placed.
     """
     own = None if lens is None else cameras_of(cameras_json.read_cameras(lens))[0]
     _check_files(image_files)
@@ -90,7 +90,7 @@ def localize_run(
             hint=f"images of the place: swimm3r localize {folder} IMAGE",
         )
     rec = load_reconstruction(folder / "sfm", frames)
-    own = own if camera is None else lens_of_camera(rec, frames, camera)
+    own = own if rig_camera is None else lens_of_camera(rec, frames, rig_camera)
     if image_files and own is None and has_several_lenses(rec, frames):
         raise unnamed_camera()
     scene = load_map(folder / "splat" / "map.safetensors").to(devices.for_maps(map_device))

@@ -40,7 +40,7 @@ def unnamed_camera() -> InputError:
     return InputError(
         "the cameras of the rig have lenses of their own, and it is not known which of them took the image",
         cause="only the test frames of a run name their cameras",
-        hint="--camera with the name of the one that did, as in `rig` of RUN/summary.json; or --lens with its own",
+        hint="--rig-camera with the name of the one that did, as in `rig` of RUN/summary.json; or --lens with its own",
     )
 
 
@@ -53,8 +53,8 @@ def lens_of_camera(rec: Reconstruction, frames: Frames, camera: str) -> Cameras:
     if rig is None or camera not in rig.names:
         raise UsageError(
             f"there is no camera {camera} in the run: it has " + ("no rig" if rig is None else ", ".join(rig.names)),
-            cause="a slip in --camera, or another run",
-            hint="--camera with one of the rig's cameras; none where the run has no rig",
+            cause="a slip in --rig-camera, or another run",
+            hint="--rig-camera with one of the rig's cameras; none where the run has no rig",
         )
     name = next((name for name in rec.names if frames.frames[frames.index(name)].camera == camera), None)
     stated = stated_lens(next(each for each in rig.cameras if each.name == camera), frames)
