@@ -26,10 +26,7 @@ _UNCONFIRMED = 0.25  # rank of a frame that has no depth at a point: 4^32 times 
 _WIDE, _NARROW = 2, 32  # powers of the rank in the two bands
 _BLUR = 0.03  # of the long side, standard deviation of the low band
 _BLURRED = 8.0  # the same in pixels of the low band: between them, reading it linearly errs by 2e-4
-_NEARNESS = (
-    0.5,
-    2.0,
-)  # bounds of the usual pixel on the ground by that of a frame: what it has no depth at may be a fish
+_NEARNESS = 0.5, 2.0  # bounds of the usual pixel on the ground by that of a frame: a fish may be very near
 _TAPER = 0.15  # of the short side: within it of the border, the rank falls to 0
 _REACH = 0.3  # of the ground that a frame's depth map shows, beyond it, where the frame may show more
 _LEAST_FACING = 0.05  # cosine between ray and normal below which a frame sees a surface too obliquely
