@@ -171,12 +171,8 @@ def _answers(localizer: Localizer, sfm: FinishedSfm, folder: Path) -> list[Answe
 def localization_scores(answers: Sequence[Answer]) -> dict[str, float | NotComputed]:
     """The scores that need no reference: localized frames, their evidence, and speed."""
     if not answers:
-        names = (
-            "located_pct",
-            "inlier_5px_pct",
-            "reprojection_px",
-            *(f"fps_{stage}" for stage in (*STAGES, "localize")),
-        )
+        speeds = [f"fps_{stage}" for stage in (*STAGES, "localize")]
+        names = ["located_pct", "inlier_5px_pct", "reprojection_px", *speeds]
         return dict.fromkeys(names, NotComputed("the run has no test frames"))
     found = [a.found for a in answers if a.found is not None]
     nothing = NotComputed("no test frame was located")
